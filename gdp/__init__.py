@@ -7,7 +7,7 @@ A program without ROS opens a session::
     with gdp.open("robot/proxy") as session:
         session.publisher("camera").put(b"...")
 
-What is listed here is imported when it is first used, so ``import gdp`` costs nothing.
+A listed name is imported when it is first used, so ``import gdp`` costs nothing.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ _PLACES["open_async"] = ("gdp.session.aio", "open_session_async")
 
 
 def __getattr__(name: str) -> object:
-    """Import what a program uses, when it first does."""
+    """Import a name of the library when it is first used."""
     if name == "__version__":
         from importlib import metadata
 
@@ -111,5 +111,5 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    """Return what the library exports."""
+    """Return the names that the library exports."""
     return sorted({*globals(), *__all__})

@@ -1,8 +1,8 @@
-"""The one tree of errors, and the reasons for which a frame may be dropped.
+"""Error tree of the project, and the reasons for which a frame may be dropped.
 
-Place: ground floor; imports nothing of ours.
-An error answers "what may I do now?": a ``LocalError`` is our caller's fault, a ``RemoteError`` is a peer's (drop it,
-count it, carry on), a ``ConfigError`` names the place in the file, a ``StoreError`` may be tried again.
+Sans-I/O; imports nothing of this project. An error states what the caller may do. A ``LocalError`` is the fault of our
+caller. A ``RemoteError`` is the fault of a peer: drop, count, carry on. A ``ConfigError`` names the location in the
+file. After a ``StoreError`` the caller may try again.
 """
 
 from __future__ import annotations
@@ -25,41 +25,41 @@ __all__ = [
 
 
 class DropReason(IntEnum):
-    """Why a frame, a message or a statement went no further.
+    """Reason why a frame, a message or a statement was dropped.
 
-    The value is the metric label, the word in a trace and the counter index of a data plane at once, so new reasons are
+    The value is at once the metric label, the word in a trace and the counter index of a data plane. New reasons are
     only ever appended.
     """
 
     # the frame itself
-    TRUNCATED = 0  # fewer bytes than the header or the payload length says
+    TRUNCATED = 0  # fewer bytes than the header or the payload length requires
     BAD_VERSION = 1
     BAD_ETHERTYPE = 2
     UNKNOWN_KIND = 3
     BAD_PARTS = 4  # part >= parts, no parts, or more than the limit
     HOPS_EXPIRED = 5
-    TOO_BIG = 6  # longer than the next link carries
-    # the way
+    TOO_BIG = 6  # longer than the MTU of the next link
+    # forwarding
     NO_ROUTE = 7
-    NO_READER = 8  # a topic that nobody joined
+    NO_READER = 8  # a topic without readers
     PORT_DOWN = 9
     PORT_FULL = 10  # the device's queue refused it
     PENDING_FULL = 11
     PENDING_EXPIRED = 12
     # the message
-    BAD_TAG = 13  # AES-GCM refused the part
+    BAD_TAG = 13  # AES-GCM refused the fragment
     BAD_SIGNATURE = 14
     REPLAYED = 15
-    LATE = 16  # a part of a finished or abandoned message
+    LATE = 16  # a fragment of a finished or abandoned message
     DUPLICATE = 17
     WRONG_INCARNATION = 18
     UNKNOWN_EPOCH = 19
     NO_KEY = 20
     MEMORY_FULL = 21
-    ABANDONED = 22  # patience ran out before the last part came
+    ABANDONED = 22  # the timeout expired before the last fragment came
     # the statement
-    MALFORMED = 23  # not the CBOR it should be
-    WRONG_NAME = 24  # the name's hash does not come out
+    MALFORMED = 23  # not the expected CBOR
+    WRONG_NAME = 24  # the name differs from its hash
     WRONG_DOMAIN = 25  # the signer's domain is not trusted here
     BAD_CERTIFICATE = 26
     EXPIRED = 27
@@ -70,17 +70,17 @@ class DropReason(IntEnum):
     UNKNOWN_SENDER = 32  # not a neighbour (yet)
     NOT_FOR_US = 33
     REVOKED = 34
-    UNAVAILABLE = 35  # a RIB's store did not answer; the sender may try again
+    UNAVAILABLE = 35  # a RIB's store did not respond; the sender may try again
     IN_USE = 36  # another node with this identity is alive elsewhere
-    INTERNAL = 37  # it drew an error of this program's own
-    QUARANTINED = 38  # from a sender whose statements drew such errors
-    MISPLACED = 39  # no proof that a node is attached where this says
-    NO_CHANNEL = 40  # what must come in a channel came outside, or in one that is not known
-    WRONG_SIDE = 41  # a topic's frame from a port on the way to which its publisher is not
+    INTERNAL = 37  # it provoked an error of this program's own
+    QUARANTINED = 38  # from a sender whose statements provoked such errors
+    MISPLACED = 39  # no proof that a node is attached at the stated location
+    NO_CHANNEL = 40  # it must come in a channel, and came outside, or in an unknown one
+    WRONG_SIDE = 41  # a topic's frame from a port that does not lead to its publisher
     RATE_LIMITED = 42  # more hellos than are verified
     COOKIE_REQUIRED = 43  # a stranger's hello under load, without proof that it receives at its address
-    UNCONCERNED = 44  # a revocation by somebody of whom no certificate is held here
-    THROUGH_LEAF = 45  # the way leads through a leaf, or a leaf speaks for more than the nodes attached to it
+    UNCONCERNED = 44  # a revocation by an issuer of whose certificates none is held here
+    THROUGH_LEAF = 45  # the path leads through a leaf, or a leaf sends for more than the nodes attached to it
 
     @property
     def label(self) -> str:
@@ -88,7 +88,7 @@ class DropReason(IntEnum):
         return self.name.lower().replace("_", "-")
 
 
-DROP_COUNTERS: Final = max(DropReason) + 1  # length of a list of counters, of which each stands at its reason
+DROP_COUNTERS: Final = max(DropReason) + 1  # length of a list of counters, indexed by reason
 
 
 class GdpError(Exception):
@@ -96,7 +96,7 @@ class GdpError(Exception):
 
 
 class LocalError(GdpError):
-    """The caller on this machine asked for something that cannot be."""
+    """The caller on this machine requested something impossible."""
 
 
 class RemoteError(GdpError):
@@ -113,20 +113,20 @@ class FrameError(RemoteError):
 
 
 class StatementError(RemoteError):
-    """A signed statement, certificate or delegation does not hold."""
+    """A signed statement, certificate or delegation is invalid."""
 
 
 class EnvelopeError(RemoteError):
-    """A sealed part or message does not open."""
+    """A sealed fragment or message does not open."""
 
 
 class ConfigError(GdpError):
-    """A configuration is wrong; the text names the place and what was expected.
+    """A configuration is wrong; the text names the location and what was expected.
 
     Args:
         where: ``file:line:column`` as far as known.
         key: dotted path of the key, empty for the whole file.
-        expected: what should have stood there.
+        expected: the expected content.
     """
 
     def __init__(self, where: str, key: str, expected: str) -> None:
@@ -137,4 +137,4 @@ class ConfigError(GdpError):
 
 
 class StoreError(GdpError):
-    """The store did not answer; the caller may try again."""
+    """The store did not respond; the caller may try again."""

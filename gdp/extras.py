@@ -1,4 +1,7 @@
-"""Extras of the distribution: the error for a package that only some installations have."""
+"""Extras of the distribution: the error for a package that only some installations have.
+
+I/O: it searches the installed packages.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ __all__ = ["MissingExtraError", "require_extra"]
 
 
 class MissingExtraError(LocalError, ImportError):
-    """A package is missing that an extra installs; the text names the extra."""
+    """A package of an extra is not installed; the text names the extra."""
 
 
 def require_extra(extra: str, modules: Iterable[str], user: str) -> None:

@@ -1,6 +1,6 @@
-"""Every bound of the system, in one place.
+"""Bounds of the system, all in one file.
 
-Place: ground floor; imports nothing of ours. Units end the names.
+Sans-I/O; imports nothing of this project. Units end the names.
 """
 
 from __future__ import annotations
@@ -10,106 +10,109 @@ from typing import Final
 # Frames
 HOPS_MAX: Final = 64  # hops left at the source
 FRAME_MAX_BYTES: Final = 65_535  # largest Ethernet frame any port may carry, header included
-MTU_MIN_BYTES: Final = 576  # a link below this is refused: a signed hello would no longer fit in a few parts
-MTU_NARROWINGS: Final = 4  # times that a publisher's path may become narrower, which has what is kept sealed anew
-MTU_HOLD_S: Final = 10.0  # ... and once more after so long
+MTU_MIN_BYTES: Final = 576  # a link below this is refused: a signed hello would need too many fragments
+MTU_NARROWINGS: Final = 4  # times that a publisher's path may become narrower, each of which has the cache sealed again
+MTU_HOLD_S: Final = 10.0  # ... and once more after this time
 
 # Messages
-MESSAGE_MAX_BYTES: Final = 24 << 20  # serialised message, before sealing; it must fit, in parts, into JOIN_SOURCE_BYTES
-SEQUENCE_BYTES: Final = 8  # before each message, under its seal: which message of its publisher it is
-NUMBER_MAX: Final = (1 << 64) - 2  # message numbers have 64 bits, and each must have a next
+MESSAGE_MAX_BYTES: Final = 24 << 20  # serialised message, before sealing; its fragments must fit into JOIN_SOURCE_BYTES
+SEQUENCE_BYTES: Final = 8  # before each message, under its seal: its sequence number
+NUMBER_MAX: Final = (1 << 64) - 2  # message numbers have 64 bits, and each must have a successor
 PARTS_MAX: Final = 1 << 17  # 64 MiB over the smallest link
-JOIN_SOURCE_BYTES: Final = 48 << 20  # reassembly memory of one source, as long as no other one needs its fair part
+JOIN_SOURCE_BYTES: Final = 48 << 20  # reassembly memory of one source, as long as no other one needs its fair share
 JOIN_TOTAL_BYTES: Final = 96 << 20  # reassembly memory of a node; a third of it holds the largest message
 JOIN_MESSAGES_MAX: Final = 1_024  # unfinished messages of one source
-JOIN_PATIENCE_S: Final = 5.0  # an unfinished best-effort message is given back after this long without a new part
+JOIN_PATIENCE_S: Final = 5.0  # an unfinished best-effort message is dropped after this time without a new fragment
 REPLAY_WINDOW_MESSAGES: Final = 16_384
 
-# Repair
-WINDOW_BYTES: Final = 32 << 20  # what a reliable publisher keeps for repairs
+# Retransmission
+WINDOW_BYTES: Final = 32 << 20  # what a reliable publisher caches for repairs
 FLIGHT_MIN_BYTES: Final = 192 << 10  # above twice REPORT_EVERY_BYTES, so that a window rarely waits for a timer
 FLIGHT_START_BYTES: Final = 256 << 10
 FLIGHT_MAX_BYTES: Final = 4 << 20
 FLIGHT_MESSAGES_MAX: Final = 8_192  # below REPLAY_WINDOW_MESSAGES
-REPORT_EVERY_BYTES: Final = 80 << 10  # a reader reports after this much that is new
-REPORT_EVERY_MAX_BYTES: Final = 384 << 10  # ... or, while nothing is missing, a quarter of what came since, up to this
-REPORT_DELAY_S: Final = 0.02  # ... or this long after the first part it has not reported
+REPORT_EVERY_BYTES: Final = 80 << 10  # a reader reports after this many new bytes
+# ... or, while nothing is missing, after a quarter of the bytes since the last loss, up to this
+REPORT_EVERY_MAX_BYTES: Final = 384 << 10
+REPORT_DELAY_S: Final = 0.02  # ... or this long after the first fragment it has not reported
 REPORT_PAUSE_S: Final = 0.004  # ... within a message: its publisher may be waiting for a report
-REPORT_GAP_S: Final = 0.002  # ... or this long after it saw a gap: frames may overtake each other
+REPORT_GAP_S: Final = 0.002  # ... or this long after it detected a gap: frames may overtake each other
 PROBE_MIN_S: Final = 0.03
 PROBE_MAX_S: Final = 0.25
 REPORT_IDLE_S: Final = 1.0  # a live reader reports at least this often
-READER_LEASE_S: Final = 6.0  # a reader that does not report for this long no longer holds its publisher
-READER_GRACE_S: Final = 60.0  # ... but what it lacks is kept for it for this long, as far as the window has room
-CALL_LAG_S: Final = 1.0  # ... or of requests, that has not confirmed in this time what another server has
+READER_LEASE_S: Final = 6.0  # a reader that does not report for this time no longer blocks its publisher
+READER_GRACE_S: Final = 60.0  # ... but what it lacks is cached for this time, as far as the window allows
+CALL_LAG_S: Final = 1.0  # ... or a reader of requests that has not confirmed in this time what another server has
 CALL_IDLE_S: Final = 0.5  # a live server reports at least this often to its clients
-CALL_QUIET_S: Final = 2.0  # a server that does not report for this long is no peer meanwhile
-EPOCH_GRACE_S: Final = 10.0  # after a new epoch began, readers of before it are heard under the one before
-NACKS_PER_REPORT: Final = 24  # ranges: a report, sealed and alone in its frame, fits the smallest link there may be
+CALL_QUIET_S: Final = 2.0  # a server that does not report for this time is no peer meanwhile
+EPOCH_GRACE_S: Final = 10.0  # after a new epoch began, reports of readers under the previous one are still accepted
+NACKS_PER_REPORT: Final = 24  # ranges: a report, sealed and alone in its frame, fits the smallest supported link
 
 # Control plane
 CONTROL_MAX_BYTES: Final = 16 << 10  # one statement with its evidence
 ADVERTISEMENT_MAX_BYTES: Final = (
-    6_500  # with its evidence: a relay or an answer around one, a join around two fit a statement
+    6_500  # with its evidence, so that a relay or response around one, or a join around two, fits a statement
 )
 WITHDRAWAL_MAX_BYTES: Final = 1 << 10
-SEQUENCE_AHEAD_S: Final = 366 * 86_400.0  # sequence numbers are wall-clock milliseconds, at most so far ahead
-RECORD_OVERHEAD_BYTES: Final = 33  # what a channel puts around a statement: head and tag
+SEQUENCE_AHEAD_S: Final = 366 * 86_400.0  # sequence numbers are wall-clock milliseconds, at most this far ahead
+RECORD_OVERHEAD_BYTES: Final = 33  # what a channel adds to a statement: head and tag
 CONTROL_PARTS_MAX: Final = 64
 CONTROL_JOIN_BYTES: Final = 1 << 20  # reassembly of control messages, per node
 CONTROL_JOIN_SOURCE_BYTES: Final = 64 << 10
 CONTROL_PATIENCE_S: Final = 2.0
 CBOR_DEPTH_MAX: Final = 16
 CHAIN_MAX: Final = 4  # delegations between an owner's key and a node
-CERTIFICATE_LIFE_MAX_S: Final = 20 * 366 * 86_400.0  # of a membership or delegation; so long may a revocation count
-CLOCK_EARLY_S: Final = 3_600.0  # so long before it begins a certificate is believed
-CLOCK_SKEW_S: Final = 3_600.0  # so long after it has ended
+# of a membership or delegation; a revocation may count for this time
+CERTIFICATE_LIFE_MAX_S: Final = 20 * 366 * 86_400.0
+CLOCK_EARLY_S: Final = 3_600.0  # a certificate is accepted this long before it begins
+CLOCK_SKEW_S: Final = 3_600.0  # ... and this long after it has ended
 CLOCKS_APART_S: Final = 7_200.0  # two clocks, each an hour off at most
 
 # Leases
 LEASE_MIN_S: Final = 1.0
 LEASE_MAX_S: Final = 3_600.0
 ADVERTISEMENT_LEASE_S: Final = (
-    24.0  # what a node asks for unless its configuration says otherwise; renewed after a third
+    24.0  # lease that a node requests unless its configuration sets another; renewed after a third
 )
-NEGATIVE_LEASE_S: Final = 0.5  # short: a question may just miss the claim that answers it
+NEGATIVE_LEASE_S: Final = 0.5  # short: a query may just miss the advertisement that answers it
 
 # Neighbours and link state
-HELLO_S: Final = 0.25  # between hellos on a port, until its neighbours are heard by keepalives
+HELLO_S: Final = 0.25  # between hellos on a port, until keepalives of its neighbours arrive
 HELLO_IDLE: Final = 16  # hello intervals between two hellos, from then on
-DEAD_S: Final = 0.9  # a neighbour that sends no keepalives is gone when silent for so long
+DEAD_S: Final = 0.9  # a neighbour that sends no keepalives is lost after this time of silence
 KEEPALIVE_MS: Final = 70  # between keepalives to a neighbour that is up
-DETECT_MULTIPLIER: Final = 3  # of which it is gone
+DETECT_MULTIPLIER: Final = 3  # missed keepalives after which it is lost
 LINK_STATE_REFRESH_S: Final = 30.0
 LINK_STATE_LEASE_S: Final = 100.0
 LINK_STATE_AGE_MAX_S: Final = CLOCKS_APART_S + LINK_STATE_LEASE_S  # by two clocks
 JOIN_REFRESH_S: Final = 2.0
 JOIN_LEASE_S: Final = 7.0
 
-WAIT_REPORT_S: Final = 5.0  # a node that makes no progress for so long says why
+WAIT_REPORT_S: Final = 5.0  # a node that makes no progress for this time reports why
 
 # Tables
 TABLE_MAX: Final = 1 << 20
 PENDING_FRAMES_MAX: Final = 2_048
 PENDING_BYTES_MAX: Final = 4 << 20
 PENDING_S: Final = 1.5
-ATTACHED_MAX: Final = 16_384  # claims of the nodes attached to a switch, some 3 KiB each
-READERS_MAX: Final = 16_384  # claims of the readers attached to a switch
+ATTACHED_MAX: Final = 16_384  # advertisements of the nodes attached to a switch, some 3 KiB each
+READERS_MAX: Final = 16_384  # advertisements of the readers attached to a switch
 TREES_MAX: Final = 65_536  # branches of a switch's trees, some 4 KiB each
 JOINS_PER_S: Final = 2_000.0  # of one neighbouring switch; each is verified
 JOINS_BURST: Final = 16_384.0
-ADVERTISEMENTS_PER_S: Final = 2_048.0  # claims and withdrawals of one neighbour; each is verified and relayed
+ADVERTISEMENTS_PER_S: Final = 2_048.0  # advertisements and withdrawals of one neighbour; each is verified and relayed
 ADVERTISEMENTS_BURST: Final = 2.0 * ATTACHED_MAX
-ADVERTISEMENTS_WINDOW: Final = 1_024  # how far claims of one node may overtake each other
-QUESTIONS_PER_S: Final = 16.0  # new names that an attached node may have a RIB asked for
+ADVERTISEMENTS_WINDOW: Final = 1_024  # how far advertisements of one node may overtake each other
+QUESTIONS_PER_S: Final = 16.0  # new names that an attached node may cause queries to a RIB for
 QUESTIONS_BURST: Final = 256.0
 SWITCH_QUESTIONS_PER_S: Final = 256.0  # ... or a neighbouring switch
 SWITCH_QUESTIONS_BURST: Final = 2_048.0
 RIB_NAMES_PER_SENDER: Final = 200_000
 RIB_WATCHES_MAX: Final = 500_000
-ANSWER_BYTES_PER_S: Final = 4.0 * (1 << 20)  # that one asker's questions may draw from a RIB; some 2,000 answers
-ANSWER_BYTES_BURST: Final = 64.0 * (1 << 20)  # ... at once: all that a switch asks of a RIB that is new
-LINK_STATES_PER_S: Final = 10.0  # of one origin that are taken, and flooded
+# of responses that one sender's queries may cause at a RIB; some 2,000 responses
+ANSWER_BYTES_PER_S: Final = 4.0 * (1 << 20)
+ANSWER_BYTES_BURST: Final = 64.0 * (1 << 20)  # ... at once: all that a switch queries at a RIB that is new
+LINK_STATES_PER_S: Final = 10.0  # of one origin that are accepted, and flooded
 LINK_STATES_BURST: Final = 100.0
 
 # Revocations

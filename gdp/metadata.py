@@ -1,7 +1,6 @@
-"""The flat map that describes a topic, a service or a node, and its canonical bytes.
+"""Metadata: the flat map that describes a topic, a service or a node, and its canonical bytes.
 
-Place: ground floor; pure.
-Source: RFC 8949, section 4.2.1 (deterministic CBOR).
+Sans-I/O. Source: RFC 8949, section 4.2.1 (deterministic CBOR).
 """
 
 from __future__ import annotations
@@ -63,7 +62,7 @@ class Metadata(Mapping[str, "str | int"]):
         return cbor2.dumps(self._items, canonical=True)
 
     def digest(self) -> bytes:
-        """Return SHA-256 of the canonical bytes: all that an advertisement shows of them."""
+        """Return SHA-256 of the canonical bytes, which represents them in an advertisement."""
         return hashlib.sha256(self.to_wire()).digest()
 
     def name(self, owner_key: bytes = b"") -> Name:

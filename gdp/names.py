@@ -1,7 +1,6 @@
-"""A 256-bit name: what it is made of, and how it is written.
+"""Name: 256 bits, their derivation, and their text form.
 
-Place: ground floor; pure.
-Source: docs/explanation/design.md, section 2:
+Sans-I/O. Source: docs/explanation/design.md, section 2:
 ``name = SHA-256("gdp-name-1" || SHA-256(canonical metadata) || owner public key)``.
 """
 
@@ -20,7 +19,7 @@ _PREFIX: Final = b"gdp-name-1"
 
 
 class Name(bytes):
-    """Thirty-two bytes; equal to, and hashed like, the same plain bytes: a slice of a frame finds it in a table.
+    """Thirty-two bytes; equal to, and hashed like, the same plain bytes, so a slice of a frame finds it in a table.
 
     Raises:
         LocalError: not exactly 32 bytes.
@@ -65,7 +64,7 @@ ZERO: Final = Name(bytes(NAME_BYTES))
 
 
 def name_of(metadata_digest: bytes, owner_key: bytes) -> Name:
-    """Return the name that a metadata digest and an owner's key give.
+    """Return the name of a metadata digest and an owner's key.
 
     Args:
         metadata_digest: SHA-256 of the canonical metadata, 32 bytes.

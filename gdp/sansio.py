@@ -1,7 +1,7 @@
-"""What a thinking machine is given, and what it asks its shell to do.
+"""Sans-I/O interface: what a protocol core receives from its I/O layer, and what it returns.
 
-Place: ground floor; pure. A machine holds no socket and no clock: a shell feeds it arrivals and the time, and takes out
-frames to send and the moment at which it wants to be called again.
+Sans-I/O. Source: sans-io.readthedocs.io. A protocol core holds no socket and no clock. An I/O layer passes it received
+frames and the time, and takes out frames to send and the time of the next call.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ class Timestamps(NamedTuple):
 
 
 class ReceivedFrame(NamedTuple):
-    """A frame that was handed up."""
+    """A frame that was punted to the protocol core."""
 
     port: int
     mac: bytes  # the sender's, 6 bytes
     frame: bytes  # from the header on, without the Ethernet header; may end in padding
-    waited_s: float = 0.0  # between its arrival and the moment at which it is handed up, where that is known
+    waited_s: float = 0.0  # seconds between its arrival and its processing, if known
 
     @property
     def via(self) -> bytes:
@@ -44,7 +44,7 @@ class OutgoingFrames(NamedTuple):
 
 
 class ProtocolCore(Protocol):
-    """A switch, a RIB or a member of the overlay, as a shell or a simulated network drives it."""
+    """A switch, a RIB or a participant, as an I/O layer or a simulated network drives it."""
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Timestamps) -> None:
         """Begin to use a port.
@@ -54,13 +54,13 @@ class ProtocolCore(Protocol):
         """
 
     def receive(self, arrivals: Sequence[ReceivedFrame], now: Timestamps) -> None:
-        """Take frames in; never raises for what they contain."""
+        """Process received frames; never raises for what they contain."""
 
     def port_changed(self, port: int, up: bool, now: Timestamps) -> None:
-        """Learn that a port's link came or went."""
+        """Update the state of a port's link."""
 
     def handle_timer(self, now: Timestamps) -> None:
-        """Do what is due; harmless when nothing is."""
+        """Process the timers that are due; harmless when none is."""
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
@@ -69,4 +69,4 @@ class ProtocolCore(Protocol):
         """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
 
     def frames_to_send(self) -> list[OutgoingFrames]:
-        """Return, once, what is to be sent; more may come at the next call, until nothing does."""
+        """Return, once, the frames to send; call again until it returns none."""

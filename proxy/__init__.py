@@ -1,6 +1,6 @@
-"""The ROS side: endpoints that speak one dialect each, serialisation that speaks none, and the bridge between them.
+"""ROS side of the overlay: one endpoint per dialect, serialisation without dialects, and the bridge between them.
 
-Place: above ``gdp``, which knows nothing of it. ``proxy.serial`` thinks; ``proxy.endpoints`` does I/O.
+Depends on ``gdp``, which does not import it. ``proxy.serial`` is sans-I/O; ``proxy.endpoints`` is I/O.
 """
 
 from gdp.extras import require_extra

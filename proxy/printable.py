@@ -1,6 +1,6 @@
-"""Words of a far node as one line of a log or a terminal: no line breaks, no control characters, no end of memory.
+"""Printable form of a remote node's text, as one line: no line breaks, no control characters, bounded length.
 
-Layer: sans-I/O.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ _CHARS_MAX: Final = 300
 
 
 def printable(text: str, chars_max: int = _CHARS_MAX) -> str:
-    """Return a text of at most ``chars_max`` characters, and a mark where it was cut; what is unseen is escaped."""
+    """Return at most ``chars_max`` characters, and a mark where the text was cut; invisible ones are escaped."""
     kept = text[:chars_max]
     if not kept.isprintable():
         kept = "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in kept)

@@ -1,6 +1,6 @@
-"""``gdp audit``: look at what a node or an authority accepted, refused and revoked.
+"""``gdp audit``: verification of what a node or an authority accepted, refused and revoked.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ Folder = Annotated[Path, typer.Argument(metavar="DIR", help="the folder with aud
 
 @app.callback()
 def audit() -> None:
-    """Keep the sub-command's name, though it is the only one."""
+    """Keep the sub-command's name, although it is the only one."""
 
 
 @app.command("verify")
 def verify(folder: Folder, as_json: options.Json = False) -> None:
-    """Verify the chain of an audit log, and say how much is in it; a break is named with its file and line.
+    """Verify the chain of an audit log and print a summary; an error names the file and line of a break.
 
     \b
     Example:

@@ -1,6 +1,6 @@
-"""``gdp cert``: memberships: issue them, install them, look at them, take them back.
+"""``gdp cert``: commands for memberships: issue, install, show, renew and revoke.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -93,10 +93,10 @@ def issue(
     force: options.Force = False,
     as_json: options.Json = False,
 ) -> None:
-    """Admit a node to a domain, as what you say that it is. The domain's ledger, issued.jsonl, keeps what was issued.
+    """Admit a node to a domain in the given role. The domain's ledger, issued.jsonl, records every membership.
 
-    A switch may carry everybody's traffic. A leaf is a switch for its own nodes only: what a robot or a rented machine
-    brings along. The other switches send nothing through it, whatever it says.
+    A switch may carry the traffic of every node. A leaf is a switch for its own nodes only, as on a robot or a rented
+    machine. The other switches send no transit traffic through it, whatever it advertises.
 
     \b
     Examples:
@@ -133,7 +133,7 @@ def renew_(
     days: options.Days = MEMBER_DAYS,
     as_json: options.Json = False,
 ) -> None:
-    """Issue memberships again, for the same keys. A running node takes up its new certificate by itself.
+    """Issue memberships again, for the same keys. A running node reloads its new certificate by itself.
 
     \b
     Examples:
@@ -160,7 +160,7 @@ def trust(
     roots: Annotated[list[Path], typer.Option("--root", metavar="FILE", help="a root that a node trusts; repeatable")],
     as_json: options.Json = False,
 ) -> None:
-    """Replace a root that is trusted by its successor, if the present one vouches for it.
+    """Replace a trusted root by its successor, if the present root vouches for the successor.
 
     \b
     Example:
@@ -183,7 +183,7 @@ def succeed(
     key: options.KeyUri = None,
     as_json: options.Json = False,
 ) -> None:
-    """Let another key delegate an owner's names from now on. The names stay, and so does owner.pub.
+    """Let another key delegate an owner's names from now on. The names and owner.pub do not change.
 
     \b
     Example:
@@ -239,7 +239,7 @@ def install(
 
 @app.command("show")
 def show_(file: CertificateFile, root: RootFile, as_json: options.Json = False) -> None:
-    """Verify a membership under a root and say whose it is.
+    """Verify a membership under a root and print its holder.
 
     \b
     Example:
@@ -252,7 +252,7 @@ def show_(file: CertificateFile, root: RootFile, as_json: options.Json = False) 
 def revoke(
     file: CertificateFile, domain: Domain, out: OutFile, force: options.Force = False, as_json: options.Json = False
 ) -> None:
-    """Take a membership back: write the statement that RIBs are to be given.
+    """Revoke a membership: write the revocation for the RIBs.
 
     \b
     Example:
@@ -270,15 +270,15 @@ def revoke(
 def _state(
     domain: Path, name: Name, role: str, label: str, days: float, wanted: Role | None, called: str | None
 ) -> None:
-    """Say what is about to be signed, and see that it is what was meant.
+    """Print what is about to be signed, and check that it matches the caller's request.
 
     Args:
-        domain: whose audit log notes a request for something else.
-        name, role, label: as the request says.
-        wanted, called: as the caller says; None: a person at the terminal confirms.
+        domain: whose audit log records a request for something else.
+        name, role, label: as in the request.
+        wanted, called: as the caller states them; None: a person at the terminal confirms.
 
     Raises:
-        LocalError: the request asks for something else, or nobody can be asked.
+        LocalError: the request asks for something else, or there is no terminal.
     """
     if (wanted is not None and wanted.value != role) or (called is not None and called != label):
         why = "another role or label than was meant"

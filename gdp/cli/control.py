@@ -1,6 +1,6 @@
 """``gdp reload``, ``gdp status`` and ``gdp drain``: commands to a running node.
 
-Command. Exit codes: 0 done, 1 the node refused or ended before it was done, 2 wrong input, 3 no node runs there.
+I/O. Exit codes: 0 done, 1 the node refused or ended before it was done, 2 wrong input, 3 no node runs there.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ Timeout = Annotated[float, typer.Option(min=0.1, metavar="SECONDS", help="How lo
 def reload(
     node: NodeDirectory = None, socket: Socket = None, timeout: Timeout = 10.0, as_json: options.Json = False
 ) -> None:
-    """Have a running node read its configuration, certificates and delegations again.
+    """Make a running node read its configuration, certificates and delegations again.
 
-    The exit code is 1 if the node keeps the old configuration; the text says why.
+    The exit code is 1 if the node keeps the old configuration; the text gives the reason.
 
     \b
     Example:
@@ -52,7 +52,7 @@ def reload(
 def status(
     node: NodeDirectory = None, socket: Socket = None, timeout: Timeout = 10.0, as_json: options.Json = False
 ) -> None:
-    """Show who a running node is, how long it runs, and its counters.
+    """Show the identity, the uptime and the counters of a running node.
 
     \b
     Example:
@@ -65,7 +65,7 @@ def status(
 def drain(
     node: NodeDirectory = None, socket: Socket = None, timeout: Timeout = _DRAIN_S, as_json: options.Json = False
 ) -> None:
-    """Have a running node finish its work and end; return when it has ended its work.
+    """Make a running node finish its work and end; return when the node has finished.
 
     The exit code is 1 if work was left unfinished.
 

@@ -1,6 +1,6 @@
-"""``gdp delegate``: an owner lets a node act on a name; a node lets a switch attract its traffic.
+"""``gdp delegate``: commands by which an owner lets a node act on a name, and a node lets a switch attract its traffic.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def install(
     force: options.Force = False,
     as_json: options.Json = False,
 ) -> None:
-    """Check that a delegation is for this node and opens, and put it where the node finds it.
+    """Verify that a delegation is for this node and opens, and install it in the node's directory.
 
     \b
     Example:
@@ -128,7 +128,7 @@ def route(
     force: options.Force = False,
     as_json: options.Json = False,
 ) -> None:
-    """Let a switch attract a node's traffic (RtCert). A running proxy makes its own; this is for those that cannot.
+    """Let a switch attract a node's traffic (RtCert). A running proxy makes its own; other nodes need this command.
 
     \b
     Example:
@@ -155,7 +155,7 @@ def revoke(
     force: options.Force = False,
     as_json: options.Json = False,
 ) -> None:
-    """Take a delegation back: write the statement that RIBs are to be given.
+    """Revoke a delegation: write the revocation for the RIBs.
 
     \b
     Example:

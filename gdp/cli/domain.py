@@ -1,6 +1,6 @@
-"""``gdp domain``: found a trust domain, or look at one.
+"""``gdp domain``: commands that create and show a trust domain.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def init(
     force: options.Force = False,
     as_json: options.Json = False,
 ) -> None:
-    """Found a domain: a root key, and the certificate that others put among those they trust.
+    """Create a trust domain: a root key, and the certificate that other domains add to their trusted roots.
 
     \b
     Examples:
@@ -48,7 +48,7 @@ def init(
 
 @app.command("show")
 def show_(file: RootFile, as_json: options.Json = False) -> None:
-    """Check a root certificate and say whose it is.
+    """Verify a root certificate and print its domain.
 
     \b
     Example:

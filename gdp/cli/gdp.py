@@ -1,6 +1,6 @@
-"""The ``gdp`` command: names, keys, trust domains, memberships and delegations.
+"""``gdp`` command: names, keys, trust domains, memberships and delegations.
 
-Place: shell; each sub-command has a file of its own. Exit 0 when done, 2 when the input is wrong.
+I/O; each sub-command has a file of its own. Exit 0 when done, 2 when the input is wrong.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ app = typer.Typer(
 
 @app.callback()
 def _gdp(version: Version = False) -> None:
-    del version  # it ends the command by itself
+    del version  # the option's callback ends the command
 
 
 app.command("name", no_args_is_help=True)(name)
@@ -45,10 +45,10 @@ app.add_typer(audit.app, name="audit")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command and leave with its exit code.
+    """Run the command and exit with its code.
 
     Args:
-        arguments: as after the program's name; those of this process if not given.
+        arguments: as after the program's name; by default those of this process.
     """
     try:
         app(args=None if arguments is None else list(arguments), prog_name="gdp")

@@ -1,6 +1,6 @@
-"""``gdp key``: how the private keys of a domain, an owner or a node are guarded.
+"""``gdp key``: commands for the protection of private keys of a domain, an owner or a node.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def protect(directory: Folder, new: NewFile = None, as_json: options.Json = Fals
 
 @app.command("unprotect")
 def unprotect(directory: Folder, as_json: options.Json = False) -> None:
-    """Take the passphrase away, so that a node starts by itself: the files' mode (0600) guards them alone.
+    """Remove the passphrase, so that a node starts by itself: only the files' mode (0600) protects them then.
 
     \b
     Example:
@@ -62,7 +62,7 @@ def unprotect(directory: Folder, as_json: options.Json = False) -> None:
 
 @app.command("show")
 def show_(directory: Folder, as_json: options.Json = False) -> None:
-    """Say of each private key whether it is plain, under a passphrase, or in a token.
+    """Show for each private key whether it is plain, under a passphrase, or in a token.
 
     \b
     Example:
@@ -76,7 +76,7 @@ def generate(
     uri: Annotated[str, typer.Argument(metavar="URI", help="pkcs11:token=...;object=...?module-path=... (RFC 7512)")],
     as_json: options.Json = False,
 ) -> None:
-    """Make a signing key in a token; it cannot be read out. Its PIN comes from where passphrases come from.
+    """Make a signing key in a token; it cannot be read out. Its PIN comes from the sources of passphrases.
 
     \b
     Example:
@@ -90,7 +90,7 @@ def asked_passphrase(wanted: bool) -> bytes | None:
     """Return the passphrase for keys that are about to be made; None: they stay plain.
 
     Raises:
-        LocalError: it is wanted, and there is none.
+        LocalError: a passphrase is requested, and none is given.
     """
     return new_passphrase() if wanted else None
 
@@ -99,7 +99,7 @@ def token_key(uri: str | None) -> TokenKey | None:
     """Return the key in a token that an option names; None: the key is to be made here.
 
     Raises:
-        LocalError: no such key.
+        LocalError: there is no such key.
     """
     return None if uri is None else open_token_key(uri, Path(uri))
 

@@ -1,6 +1,6 @@
-"""``gdp keygen``: keys for an owner, keys for a node.
+"""``gdp keygen``: commands that make keys for an owner and keys for a node.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def owner(
     force: options.Force = False,
     as_json: options.Json = False,
 ) -> None:
-    """Make an owner's keys: owner.pub goes to whoever derives names, the rest stays private.
+    """Make an owner's keys. Programs that derive names need owner.pub; the other files are private.
 
     \b
     Examples:
@@ -56,7 +56,7 @@ def node(
     force: options.Force = False,
     as_json: options.Json = False,
 ) -> None:
-    """Make the keys of a switch, a leaf, a RIB or a proxy, and its request to belong to a domain.
+    """Make the keys of a switch, a leaf, a RIB or a proxy, and its request for a membership.
 
     \b
     Examples:

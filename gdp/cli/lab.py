@@ -1,6 +1,6 @@
-"""``gdp lab``: everything of a small lab but what crosses: keys, memberships, and the files of its switches and RIB.
+"""``gdp lab``: command that makes the keys, memberships and files of a small lab, except the rules of its proxies.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def lab(
 ) -> None:
     """Make a small lab: one trust domain, one owner, and for each machine a directory with a switch and a proxy.
 
-    A new domain's RIB is on the first machine. Where the domain is there already, machines are added to it.
+    A new domain's RIB is on the first machine. If the domain exists already, the command adds machines to it.
 
     \b
     Examples:
@@ -83,7 +83,7 @@ def lab(
 
 
 def _refuse_what_is_there(hosts: Sequence[Path]) -> None:
-    """Raise ``LocalError`` before anything is made, if not everything can be."""
+    """Raise ``LocalError`` before the first change if any part exists already."""
     for index, host in enumerate(hosts):
         if host.exists() or host in hosts[:index]:
             raise LocalError(f"{host} is there already")

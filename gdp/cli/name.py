@@ -1,6 +1,6 @@
-"""``gdp name``: the 256-bit name of a thing, from what it is and whose it is.
+"""``gdp name``: command that prints the 256-bit name of metadata and an owner.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def name(
     owner: Owner = None,
     as_json: options.Json = False,
 ) -> None:
-    """Print the 256-bit name that metadata and an owner's key give.
+    """Print the 256-bit name of metadata and an owner's key.
 
     \b
     Example:

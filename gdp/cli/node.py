@@ -1,6 +1,6 @@
-"""What the commands of long-running nodes share: how they log, say that they are ready, and fail.
+"""Common parts of the commands of long-running nodes: logging, events, errors.
 
-Place: command.
+I/O.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ __all__ = [
     "set_up_logging",
 ]
 
-# NumPy's OpenBLAS starts a thread for each core as soon as it is loaded. No command uses them, and a thread that is
-# there before rights are given away keeps them.
+# NumPy's OpenBLAS starts a thread for each core as soon as it is loaded. No command uses them, and a thread that exists
+# before the confinement of rights keeps its rights.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 _OURS: Final = ("gdp", "proxy", "fog")
@@ -57,12 +57,12 @@ def set_up_logging(*, verbose: bool) -> None:
 
 
 def _is_ours_or_serious(record: logging.LogRecord) -> bool:
-    """Leave out the debug messages of libraries: pyroute2 would print every netlink message, and sets its own level."""
+    """Exclude debug messages of libraries: pyroute2 sets its own level and would print every netlink message."""
     return record.levelno >= logging.WARNING or record.name.partition(".")[0] in _OURS
 
 
 def emit(event: str, **fields: object) -> None:
-    """Write one line of JSON and flush it: somebody waits for it."""
+    """Write one line of JSON and flush it, because a reader waits for it."""
     sys.stdout.buffer.write(orjson.dumps({"event": event, **fields}) + b"\n")
     sys.stdout.buffer.flush()
 
@@ -74,7 +74,7 @@ def emit_wait(reason: str, text: str) -> None:
 
 @contextlib.contextmanager
 def failing_clearly() -> Iterator[None]:
-    """Turn an error of ours into one line on standard error and exit code 2."""
+    """Print an error of ours as one line on standard error, and exit with code 2."""
     try:
         yield
     except ConfigError as error:

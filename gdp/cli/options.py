@@ -1,6 +1,6 @@
 """Options that several sub-commands of ``gdp`` share.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 Kind = Annotated[str, typer.Option("--kind", help="topic, service, action, switch, rib, proxy, ...")]
-# The command line's library reads these annotations at run time, on Python 3.10 too: hence Optional.
+# typer reads these annotations at run time, on Python 3.10 too: hence Optional.
 Name = Annotated[Optional[str], typer.Option("--name", help="its ROS name, such as /camera/image")]  # noqa: UP045
 Type = Annotated[Optional[str], typer.Option("--type", help="its type, such as sensor_msgs/msg/Image")]  # noqa: UP045
 Author = Annotated[Optional[str], typer.Option("--author", help="who made it")]  # noqa: UP045

@@ -1,6 +1,6 @@
-"""What the ``gdp`` command prints, and how it reads what several of its sub-commands share.
+"""Output of the ``gdp`` command, and the parsers that several of its sub-commands share.
 
-Place: shell. Results go to stdout, as ``key: value`` lines or as one JSON object; complaints go to stderr.
+I/O. Results go to stdout, as ``key: value`` lines or as one JSON object; errors go to stderr.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ __all__ = ["epochs_from_text", "items_from_text", "metadata_from_options", "mome
 
 
 def show(result: Mapping[str, object], *, as_json: bool, plain: str | None = None) -> None:
-    """Print a result; ``plain`` is all that people get to see, if given."""
+    """Print a result; ``plain``, if given, replaces the lines for people."""
     if as_json:
         typer.echo(json.dumps(result, ensure_ascii=False))
     elif plain is not None:
@@ -35,7 +35,7 @@ def show(result: Mapping[str, object], *, as_json: bool, plain: str | None = Non
 
 
 def moment(unix_s: int) -> str:
-    """Return a time as people and JSON read it, in UTC."""
+    """Return a time as text in UTC, for people and JSON."""
     return datetime.fromtimestamp(unix_s, timezone.utc).isoformat().replace("+00:00", "Z")
 
 
@@ -56,7 +56,7 @@ def metadata_from_options(
     more: Sequence[str],
     salt_file: Path | None = None,
 ) -> Metadata:
-    """Return the metadata that the options of ``gdp name`` describe; what is not given is not in them.
+    """Return the metadata that the options of ``gdp name`` describe; options that are not given are absent.
 
     Raises:
         LocalError: an unknown kind, a key given twice, a salt as an argument, or a value of the wrong form.
@@ -82,7 +82,8 @@ def items_from_text(texts: Iterable[str]) -> dict[str, str]:
     """Read ``key=value`` options.
 
     Raises:
-        LocalError: one without ``=``, a key twice, or the salt of a name, which every user of the host could read here.
+        LocalError: one without ``=``, a duplicate key, or the salt of a name, which every user of the host could read
+            here.
     """
     items: dict[str, str] = {}
     for text in texts:
@@ -104,7 +105,7 @@ def rights_from_text(texts: Iterable[str]) -> frozenset[Right]:
     """Read the rights to delegate.
 
     Raises:
-        LocalError: one that is none.
+        LocalError: an unknown right.
     """
     known = {right.value: right for right in Right}
     for text in texts:

@@ -1,6 +1,6 @@
-"""The ``gdp-rib`` command.
+"""``gdp-rib`` command.
 
-Place: command.
+I/O.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ def rib(
     verbose: Verbose = False,
     version: Version = False,
 ) -> None:
-    """Answer who advertises a name, and where, for one trust domain, until Ctrl-C."""
-    del version  # it ends the command by itself
+    """Answer queries for the nodes that advertise a name in one trust domain, until Ctrl-C."""
+    del version  # the option's callback ends the command
     set_up_logging(verbose=verbose)
     with failing_clearly():
         settings = RibConfig.load(config)

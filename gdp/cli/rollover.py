@@ -1,6 +1,6 @@
-"""``gdp cert rollover``: another root key for a domain, without a pause.
+"""``gdp cert rollover``: commands that replace the root key of a domain without an interruption.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def finish(domain: Domain, as_json: options.Json = False) -> None:
 
 
 def described_root(root: Root) -> dict[str, object]:
-    """Return what a command prints of a root."""
+    """Return the fields that a command prints about a root."""
     result: dict[str, object] = {"domain": root.domain.to_text(), "label": root.label, **span(root.validity)}
     result["key"] = root.key.compressed.hex()
     if root.predecessors:

@@ -1,6 +1,6 @@
-"""The salt of a name: its unguessable part, taken from a file, the environment or a prompt, never from an argument.
+"""Salt of a name: its unguessable part, read from a file, the environment or a prompt, never from an argument.
 
-Place: shell. An argument stands in ``/proc/PID/cmdline`` for every user of the host, and in the shell's history.
+I/O. An argument is visible in ``/proc/PID/cmdline`` to every user of the host, and in the shell's history.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from gdp.stores.files import read_private
 
 __all__ = ["SALT", "SaltFile", "hidden", "read_salt"]
 
-SALT: Final = "salt"  # its key in the metadata
+SALT: Final = "salt"  # the salt's key in the metadata
 _VARIABLE: Final = "GDP_SALT"
 _PROMPT: Final = Path("-")
 
@@ -33,14 +33,14 @@ SaltFile = Annotated[
 
 
 def read_salt(file: Path | None) -> dict[str, str]:
-    """Return the salt as an item of metadata; empty: nobody gave one.
+    """Return the salt as an item of metadata; empty if none is given.
 
     Args:
-        file: a private file (mode 0600) with the salt as its only line; ``-``: it is asked for, or read from standard
-            input where that is no terminal.
+        file: a private file (mode 0600) with the salt as its only line; ``-``: read it from a prompt, or from standard
+            input if that is not a terminal.
 
     Raises:
-        LocalError: the file is not private, or the salt is empty or no text.
+        LocalError: the file is not private, or the salt is empty or not text.
     """
     if file is None:
         where, text = _VARIABLE, os.environ.get(_VARIABLE)
@@ -61,5 +61,5 @@ def read_salt(file: Path | None) -> dict[str, str]:
 
 
 def hidden(metadata: Mapping[str, str | int]) -> dict[str, str | int]:
-    """Return metadata as they may be shown: without the salt's text."""
+    """Return metadata for display, without the salt's text."""
     return {key: "(hidden)" if key == SALT else value for key, value in metadata.items()}

@@ -1,6 +1,6 @@
-"""The ``gdp-switch`` command.
+"""``gdp-switch`` command.
 
-Place: command.
+I/O.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ def switch(
 ) -> None:
     """Switch frames by 256-bit names between layer-2 ports, until Ctrl-C.
 
-    With the identity of a leaf it serves the nodes attached to it, and passes nothing on between its neighbours.
+    With the identity of a leaf it serves its attached nodes, and forwards nothing between its neighbours.
     """
-    del version  # it ends the command by itself
+    del version  # the option's callback ends the command
     set_up_logging(verbose=verbose)
     with failing_clearly():
         settings = SwitchConfig.load(config).with_ifaces(iface or [])

@@ -1,6 +1,6 @@
-"""The option ``--version`` of every command.
+"""Option ``--version`` of every command.
 
-Layer: command.
+I/O.
 """
 
 from __future__ import annotations

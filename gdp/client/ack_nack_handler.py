@@ -1,10 +1,10 @@
-"""Acknowledgement handling of a writer: which readers there are, where they begin, and what their reports confirm.
+"""Acknowledgement handling of a writer: its readers, their first messages, and what their reports confirm.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
-A silent reader is suspended: it blocks nothing, and what it lacks is cached for a grace time, as far as there is room.
-A reader that stalls, or lags while others have acknowledged, no longer blocks the window. It gets what is sent, and is
-told to skip what is gone, until after a penalty it may block the window again.
+A silent reader is suspended: it blocks nothing, and what it lacks is cached for a grace time, as far as the cache
+allows. A reader that stalls, or lags while others have acknowledged, no longer blocks the window. It still gets what is
+sent, and skips what is gone. After a penalty it may block the window again.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from gdp.message.send_window import SendWindow
 
 __all__ = ["AckNackHandler"]
 
-_SETTLED_S: Final = 0.25  # after the last message of a best-effort topic, readers are told that it was the last
+_SETTLED_S: Final = 0.25  # after the last message of a best-effort topic, a Heartbeat states that it was the last
 
 
 class AckNackHandler:
-    """Processes the reports of the readers of one writer.
+    """Acknowledgement handler: processes the AckNacks of the readers of one writer.
 
     Args:
-        readers: who they are.
-        statuses: when a status is due, and where new readers begin.
+        readers: the known readers.
+        statuses: when a Heartbeat is due, and where new readers begin.
 
     Attributes:
         last_sent_s: when frames were last sent.
@@ -74,7 +74,7 @@ class AckNackHandler:
         (sent, _), (sequence, _) = queue.sent, queue.sequences
         is_settled = queue.is_acknowledged or now_s - self.last_sent_s > _SETTLED_S
         if report.sequence < sequence and is_settled and (report.next_number >= sent or not queue.is_acknowledged):
-            self._heartbeats.wanted = True  # it does not know what it has lost behind the last message that it has
+            self._heartbeats.wanted = True  # it does not know what it has lost behind its last message
 
     def handle_timer(self, now_s: float) -> None:
         """Suspend silent readers, drop slow ones from the window, and give up what was suspended for too long."""
@@ -94,7 +94,7 @@ class AckNackHandler:
             self._give_up(name, reader, now_s)
 
     def connect(self, name: bytes, incarnation: int, exchange: bytes, now_s: float) -> None:
-        """Make a reader active that is known without an introduction; an active one is left as it is.
+        """Make a reader active that is known without an introduction; an active one is left unchanged.
 
         Args:
             exchange: its X25519 key.
@@ -114,7 +114,7 @@ class AckNackHandler:
             self._window.add_reader(name, self._queue.next_number, now_s)
 
     def renumber(self, move: Renumbering) -> None:
-        """Translate where new readers begin, after all that is cached got new numbers."""
+        """Translate the start numbers of new readers, after everything cached got new numbers."""
         starts = self._heartbeats.starts
         for name, start in starts.items():
             starts[name] = start._replace(number=move.of(start.number))
@@ -146,7 +146,7 @@ class AckNackHandler:
         self._window.drop_reader(name)
 
     def _give_up(self, name: bytes, reader: ReaderProxy, now_s: float) -> None:
-        """Cache nothing any more for a reader whose window has been suspended for too long."""
+        """Cache nothing more for a reader whose window has been suspended for too long."""
         self._queue.seal_gathered()  # it is given up, too
         self._queue.ledger.give_up(reader.sequence, self._queue.ledger.last)
         if self._readers.is_suspended(name):
@@ -158,7 +158,7 @@ class AckNackHandler:
         self._heartbeats.wanted = True
 
     def _translate(self, report: AckNack) -> AckNack:
-        """Return a report under the present numbers; a status tells them to a reader that does not know them."""
+        """Return a report under the present numbers; a Heartbeat announces them to a reader that does not know them."""
         for move in self._queue.moves:
             if move.is_before(report.next_number):
                 report = report._replace(next_number=move.of(report.next_number), next_part=0, missing=())
@@ -166,7 +166,7 @@ class AckNackHandler:
         return report
 
     def _start(self, name: bytes, report: AckNack, now_s: float) -> None:
-        """Choose the first message of a new reader; one that asks again gets the same response."""
+        """Choose the first message of a new reader; a repeated request gets the same response."""
         reader, queue = self._readers[name], self._queue
         if name not in self._heartbeats.starts and not self._heartbeats.is_full:
             queue.seal_gathered()  # it was published before this reader came
@@ -186,7 +186,7 @@ class AckNackHandler:
         self._heartbeats.wanted = True
 
     def _first_of(self, report: AckNack) -> int:
-        """Return the message number at which a reader begins: where it was before, or with what is new."""
+        """Return the message number at which a reader begins: where it was before, or with the next message."""
         queue = self._queue
         if report.next_number and queue.is_acknowledged:
             return min(max(report.next_number, queue.oldest), queue.next_number)
@@ -198,12 +198,14 @@ class AckNackHandler:
         reader, window, queue = self._readers[name], self._window, self._queue
         oldest = queue.oldest
         if not (window.has_reader(name) or window.is_suspended(name)) and now_s >= reader.out_until_s:
-            if not is_new and report.next_number < oldest:  # it lagged; one that was forgotten was given up before
+            # it lagged; what a forgotten reader lacked was given up before
+            if not is_new and report.next_number < oldest:
                 end = queue.ledger.begin_of(oldest, queue.first_waiting)
                 queue.ledger.give_up(report.sequence, end - 1)
             window.add_reader(name, min(max(report.next_number, oldest), queue.next_number), now_s)
         if window.has_reader(name) or window.is_suspended(name):
             window.handle_acknack(name, report, now_s)
-        is_gone = report.next_number < oldest if is_new else report.missing and report.missing[0].number < oldest
+        lacks_from = report.missing[0].number if report.missing and not is_new else report.next_number
+        is_gone = lacks_from < oldest
         if is_gone or (window.is_suspended(name) and not report.missing):
-            self._heartbeats.wanted = True  # it asks for what is gone, or does not know what it lacks
+            self._heartbeats.wanted = True  # it requests what is gone, or does not know what it lacks

@@ -20,7 +20,7 @@ __all__ = ["AckNackSchedule"]
 
 
 class AckNackSchedule:
-    """When a report of one reader to one writer is due.
+    """Schedule of the reports of one reader to one writer.
 
     Args:
         data: reassembles the writer's messages.
@@ -43,11 +43,11 @@ class AckNackSchedule:
         self._unreported_bytes += size
 
     def handle_run(self, now_s: float) -> None:
-        """Reschedule after parts that came in order."""
+        """Reschedule after fragments that came in order."""
         self.due_s = min(self.due_s, now_s if self._is_owed() else now_s + REPORT_PAUSE_S)
 
     def handle_part(self, header: Header, highest: int, expected: int, now_s: float) -> None:
-        """Reschedule after a new part.
+        """Reschedule after a new fragment.
 
         Args:
             highest: highest message number before it.
@@ -57,7 +57,7 @@ class AckNackSchedule:
         if header.parts == 1 and number == highest + 1 == expected and self.due_s <= now_s + REPORT_DELAY_S:
             if self._is_owed():
                 self.due_s = now_s
-            return  # a whole message in order changes nothing else
+            return  # a complete message in order changes nothing else
         is_next = number == highest or (number == highest + 1 and (highest < expected or data.is_finished(highest)))
         is_in_order = is_next and (data.is_finished(number) or header.part == data.progress(number) - 1)
         if self._is_owed():
@@ -80,9 +80,9 @@ class AckNackSchedule:
         self.due_s = now_s + (REPORT_DELAY_S if is_missing else self.idle_s)
 
     def _is_owed(self) -> bool:
-        """Return whether enough bytes came for a report; the longer nothing is missing, the more that takes.
+        """Return whether enough bytes came for a report; the threshold grows while nothing is missing.
 
-        A writer's congestion window has grown by what was reported since the last loss, and must never run dry.
+        A writer's congestion window has grown by what was reported since the last loss, and must never run empty.
         """
         every_bytes = max(REPORT_EVERY_BYTES, min(self._clean_bytes // 4, REPORT_EVERY_MAX_BYTES))
         return self._unreported_bytes >= every_bytes

@@ -2,8 +2,9 @@
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
-Reports are sealed under the epoch of the newest verified message. A writer that is silent may have moved to another
-epoch, or have forgotten this reader: now and then reports are sealed under another epoch too, with an introduction.
+Reports are sealed under the epoch of the newest verified message. A silent writer may have moved to another epoch, or
+may have lost its state of this reader. Therefore reports are at times sealed under another epoch too, with an
+introduction.
 """
 
 from __future__ import annotations
@@ -20,17 +21,17 @@ from gdp.names import Name
 
 __all__ = ["AckNackSealer"]
 
-_SILENT_S: Final = 3.0  # without a message or a status, until the writer is sent another introduction
+_SILENT_S: Final = 3.0  # without a message or a Heartbeat, until the writer is sent another introduction
 _TRIES: Final = 3  # under one epoch, before the next is tried
 
 
 class AckNackSealer:
-    """Seals what one reader sends to one writer.
+    """Sealer of what one reader sends to one writer.
 
     Args:
         exchange: the writer's X25519 key.
         secrets: topic secrets by epoch.
-        introduces: introductions are sent; else the writer knows the reader's key otherwise.
+        introduces: introductions are sent; else the writer has the reader's key from another source.
 
     Attributes:
         epoch: under which reports are sealed.
@@ -60,8 +61,8 @@ class AckNackSealer:
         self._shared = reader.notes.shared(exchange)
         self._sealers: dict[int, ControlSealer] = {}
         self._tried = 0
-        self._epoch_at = -1  # number of the message that says so
-        self._silent_s = now_s  # since when the writer is silent, or was last introduced to
+        self._epoch_at = -1  # number of the message that had this epoch
+        self._silent_s = now_s  # start of the writer's silence, or time of the last introduction
         self.epoch = max(secrets)
 
     def handle_message(self, number: int, epoch: int, now_s: float) -> None:
@@ -71,7 +72,7 @@ class AckNackSealer:
             self.epoch, self._epoch_at = epoch, number
 
     def handle_status(self, epoch: int, now_s: float, *, is_newest: bool) -> None:
-        """Note the epoch of a verified status."""
+        """Note the epoch of a verified Heartbeat."""
         self._silent_s = now_s
         if is_newest:
             self.epoch = epoch
@@ -104,7 +105,7 @@ class AckNackSealer:
         return frames
 
     def sealer(self, epoch: int) -> ControlSealer:
-        """Return what seals reports under an epoch.
+        """Return the sealer of reports under an epoch.
 
         Raises:
             KeyError: there is no secret of that epoch.
@@ -118,7 +119,7 @@ class AckNackSealer:
         return sealer
 
     def _introduction(self, epoch: int) -> list[bytes]:
-        """Return the frames that prove whose reports these are, sealed under the secret of an epoch."""
+        """Return the frames that prove the sender of these reports, sealed under the secret of an epoch."""
         if not self._introduces:
             return []
         reader = self._reader
@@ -130,7 +131,7 @@ class AckNackSealer:
         return ControlSealer(key, epoch, kind, reader.name, reader.incarnation, *to, reader.note_numbers)
 
     def _epoch_to_try(self) -> int:
-        """Return the newest epoch, and in turn the others, for the writer may not have the newest yet."""
+        """Return the newest epoch, and in turn the others, because the writer may not have the newest yet."""
         epochs = sorted(self._secrets, reverse=True)
         epoch = epochs[self._tried // _TRIES % len(epochs)]
         self._tried += 1

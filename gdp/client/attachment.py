@@ -1,10 +1,10 @@
-"""How a node that is no switch holds on to the overlay: greet a switch, claim names there, renew, move on.
+"""Attachment of a node that is no switch: discovers a switch, advertises names there, renews them, and changes switch.
 
-Place: pure. Whoever publishes, reads or serves builds on this; so does a RIB.
+Sans-I/O. A participant builds on this, and so does a RIB.
 
 ::
 
-    ALONE --a switch is up--> CLAIMING --all claims judged--> ATTACHED
+    ALONE --a switch is up--> ADVERTISING --all acknowledged--> ATTACHED
       ^------------- the switch is gone, or another is nearer -----------'
 """
 
@@ -44,21 +44,23 @@ from gdp.trust.rtcert import RtCert
 
 __all__ = ["Attachment", "PendingAdvertisement", "attachment_waits"]
 
-_ADVERTISEMENT_AGAIN_S: Final = 0.5  # until it is judged
-_OWN_FIRST_S: Final = 0.5  # that other claims wait for the node's own; without a RIB they are good on this switch only
-_MOVED_S: Final = 5.0  # claims name the former switch for so long after a move
-_ECHO_S: Final = 0.02  # the greeter answers a new session within this time
-_IN_USE_SOON_S: Final = 0.1  # a refused node asks again: its earlier life may be known to be dead any moment
-_IN_USE_S: Final = 2.0  # ... and after so long this seldom
+_ADVERTISEMENT_AGAIN_S: Final = 0.5  # until it is acknowledged
+# delay of other advertisements after the node's own; without a RIB they are valid on this switch only
+_OWN_FIRST_S: Final = 0.5
+_MOVED_S: Final = 5.0  # after a move, advertisements name the former switch for this time
+_ECHO_S: Final = 0.02  # the hello protocol answers a new session within this time
+_IN_USE_SOON_S: Final = 0.1  # a refused node tries again: its earlier incarnation may prove ended at any moment
+_IN_USE_S: Final = 2.0  # ... and after this time with this interval
 _RTCERT_S: Final = 7_200
-_RTCERT_RENEW_S: Final = 1_800  # so that it holds at clocks that are an hour ahead, too
+_RTCERT_RENEW_S: Final = 1_800  # so that it is valid at clocks that are an hour ahead, too
 _RTCERTS_MAX: Final = 32
-_RTCERT_BEFORE_S: Final = 4_500  # it is dated back by so much: CLOCK_EARLY_S is for one clock, this is for the other
+# its begin is dated back by this: CLOCK_EARLY_S is for one clock, this is for the other
+_RTCERT_BEFORE_S: Final = 4_500
 
 
 @dataclass(slots=True)
 class PendingAdvertisement:
-    """A name that this node claims, and what became of it."""
+    """A name that this node advertises, and the state of its acknowledgement."""
 
     subject: Subject
     right: Right
@@ -71,15 +73,16 @@ class PendingAdvertisement:
 
     @property
     def is_acknowledged(self) -> bool:
-        """Return whether the overlay has said yes or no."""
+        """Return whether the overlay has accepted or rejected it."""
         return self.is_taken or self.refused is not None
 
 
 class Attachment:
-    """One node's hold on the overlay.
+    """Attachment of one node to the overlay.
 
     Args:
-        exchange: X25519 key of this life, for notes to what it claims to publish, serve or call; empty: it takes none.
+        exchange: X25519 key of this incarnation, for control datagrams about the names that it advertises to publish,
+            serve or call; empty: it accepts none.
     """
 
     def __init__(self, identity: Identity, policy: Policy, settings: NodeSettings, exchange: bytes = b"") -> None:
@@ -89,7 +92,7 @@ class Attachment:
         self._incarnation = settings.incarnation
         self._lease_s = settings.lease_s
         self._sequence = settings.first_sequence
-        self.started = settings.first_sequence  # above what earlier lives said here, as far as is known
+        self.started = settings.first_sequence  # above the numbers of earlier incarnations here, as far as known
         self.fragmenter = ControlFragmenter(identity.name, settings.incarnation)
         self.reassembler = ControlReassembler()
         is_rib = identity.member.role is Role.RIB
@@ -108,7 +111,7 @@ class Attachment:
         )
         self._now = Timestamps(0.0, 0.0)
         self._out: list[OutgoingFrames] = []
-        self._in_use_s = 0.0  # since when another node with this identity keeps its place
+        self._in_use_s = 0.0  # since when another node with this identity is accepted instead
         self.clashes = 0  # signs of another node with this identity
         self.conflict_at: Name | None = None  # switch of a newer node with this identity, once it was reported
         self.refusals: Counter[DropReason] = Counter()
@@ -120,7 +123,7 @@ class Attachment:
 
     @property
     def is_attached(self) -> bool:
-        """Return whether a switch is there and has judged every claim, and no other node has this identity."""
+        """Return whether a switch has acknowledged every advertisement, and no other node has this identity."""
         is_judged = all(each.is_acknowledged for each in self._advertisements.values())
         return self._switch is not None and is_judged and not self.is_in_use
 
@@ -136,12 +139,12 @@ class Attachment:
 
     @property
     def advertisements(self) -> list[PendingAdvertisement]:
-        """Return what is claimed."""
+        """Return the present advertisements."""
         return list(self._advertisements.values())
 
     @property
     def drops(self) -> Counter[DropReason]:
-        """Return which unfinished statements were given up."""
+        """Return the unfinished statements that were given up, by reason."""
         return self.reassembler.drops + self.hello_protocol.drops
 
     @property
@@ -151,11 +154,11 @@ class Attachment:
         return self.hello_protocol.ports[self._switch.port].mtu
 
     def advertisement(self, subject: Subject, right: Right, chain: tuple[bytes, ...], *, is_global: bool) -> None:
-        """Claim a name from now on."""
+        """Advertise a name from now on."""
         self._advertisements[subject.name, right] = PendingAdvertisement(subject, right, chain, is_global)
 
     def renew(self, name: Name, chain: tuple[bytes, ...]) -> None:
-        """Claim what is claimed of a name already by a newer delegation, at once."""
+        """Replace the delegation of an advertised name by a newer one, and advertise it at once."""
         for (its, _), pending_advertisement in self._advertisements.items():
             if its == name:
                 pending_advertisement.chain, pending_advertisement.advertisement_at_s, pending_advertisement.refused = (
@@ -165,14 +168,14 @@ class Attachment:
                 )
 
     def withdraw(self, name: Name, right: Right) -> None:
-        """Claim a name no more, and say so."""
+        """Stop advertising a name, and send the withdrawal."""
         if self._advertisements.pop((name, right), None) is not None and self._switch is not None:
             body = {"n": name, "right": right.value, "s": self._next_sequence()}
             wire = sign(StatementType.WITHDRAW, body, self._identity.name, self._identity.key)
             self._say(Kind.WITHDRAW, wire)
 
     def withdraw_all(self) -> None:
-        """Leave: claim nothing any more."""
+        """Leave: withdraw every advertisement."""
         for name, right in list(self._advertisements):
             self.withdraw(name, right)
 
@@ -184,10 +187,10 @@ class Attachment:
             self.refusals[DropReason.PORT_DOWN] += len(frames)
 
     def receive_control(self, arrival: ReceivedFrame, header: Header, now: Timestamps) -> Statement | None:
-        """Take a frame of a kind that is for neighbours; return a statement that is for the node above.
+        """Process a frame of a kind that is for neighbours; return a statement that is for the node above.
 
         Raises:
-            RemoteError: it does not hold.
+            RemoteError: the frame or its statement is invalid.
         """
         if header.kind == Kind.KEEPALIVE:
             self.hello_protocol.receive_keepalive(arrival, header, now)
@@ -209,7 +212,7 @@ class Attachment:
             if self.hello_protocol.receive(arrival, statement, now) is not None:
                 self._choose_switch(now.mono_s)
             return None
-        assert switch is not None  # seen above
+        assert switch is not None  # checked above
         if header.kind == Kind.ADVERTISE_ACK:
             return self._take_ack(statement, switch, now)
         if header.kind in (Kind.JOIN, Kind.LEAVE):
@@ -231,13 +234,13 @@ class Attachment:
     def receive_revocation(
         self, statement: Statement, now: Timestamps, holds: Callable[[bytes], bool]
     ) -> Revocation | None:
-        """Take a revocation that our switch passed on; return it if it is news.
+        """Process a revocation that our switch forwarded; return it if it is new.
 
         Args:
             holds: whether a certificate that a key (33 bytes) issued is held here.
 
         Raises:
-            StatementError: it does not hold, concerns nothing here, or there is no room for it.
+            StatementError: it is invalid, concerns nothing here, or the store of its issuer is full.
         """
         if self._switch is None:
             return None
@@ -247,12 +250,12 @@ class Attachment:
         return revocation
 
     def port_changed(self, port: int, up: bool, now: Timestamps) -> None:
-        """Learn that a port's link came or went."""
+        """Update the state of a port's link."""
         self.hello_protocol.port_changed(port, up, now.mono_s)
         self._choose_switch(now.mono_s)
 
     def handle_timer(self, now: Timestamps) -> None:
-        """Renew what is due."""
+        """Send the hellos, renewals and repetitions that are due."""
         self._now = now
         if self.hello_protocol.drop_silent(now.mono_s):
             self._choose_switch(now.mono_s)
@@ -276,17 +279,17 @@ class Attachment:
         return min((time for time in times if time is not None), default=None)
 
     def _due_advertisements(self) -> Iterable[PendingAdvertisement]:
-        """Return what may be claimed: while another node has this identity, the node's own name alone."""
+        """Return the advertisements that may be sent: only the node's own name while another has this identity."""
         own = self._own_advertisement
         return (own,) if own is not None and self.is_in_use else self._advertisements.values()
 
     def frames_to_send(self) -> list[OutgoingFrames]:
-        """Return, once, what is to be sent."""
+        """Return, once, the frames to send."""
         out, self._out = self._out, []
         return out
 
     def _choose_switch(self, now_s: float) -> None:
-        """Attach to the switch over the cheapest port; a new or restarted one hears every claim."""
+        """Attach to the switch over the cheapest port; a new or restarted one receives every advertisement."""
         switches = [each for each in self.hello_protocol.all_up() if each.role.is_switch]
         best = min(switches, key=lambda each: (self.hello_protocol.ports[each.port].cost, each.port), default=None)
         is_same = best is not None and best is self._switch and best.nonce == self._switch_nonce
@@ -303,9 +306,10 @@ class Attachment:
             echo_at_s = self.hello_protocol.ports[best.port].hello_at_s
             advertisement_at_s = (
                 echo_at_s if echo_at_s <= now_s + _ECHO_S else now_s
-            )  # what comes before our echo is dropped
+            )  # frames before our echo are dropped
             for each in self._advertisements.values():
-                # Who hears of a name asks for its node at once: that one is claimed first.
+                # A node that learns of a name queries its advertiser at once, so the node's own name is advertised
+                # first.
                 at_s = advertisement_at_s if each.right is Right.ATTACH else advertisement_at_s + _OWN_FIRST_S
                 each.advertisement_at_s, each.is_taken, each.refused, each.join_sequence = at_s, False, None, -1
 
@@ -338,10 +342,10 @@ class Attachment:
         return rtcert
 
     def _note_newest(self, join: Join) -> None:
-        """Note how new a join is.
+        """Note the sequence number of a join.
 
         Raises:
-            StatementError: REPLAYED: a newer one overtook it, and what it says of the tree is no longer so.
+            StatementError: REPLAYED: a newer one overtook it, and its state of the tree is outdated.
         """
         for right in HEARS.values():
             pending_advertisement = self._advertisements.get((join.topic, right))
@@ -352,7 +356,7 @@ class Attachment:
             pending_advertisement.join_sequence = join.sequence
 
     def _take_ack(self, statement: Statement, switch: Neighbour, now: Timestamps) -> Statement | None:
-        """Take what became of a claim, or pass a publisher's place on."""
+        """Process the acknowledgement of an advertisement, or return a statement about a publisher's location."""
         fields = statement.fields
         member = self._policy.verify_membership(fields.bytes_("c"), now.unix_s)
         if member.name != statement.signer or (member.name != switch.name and member.role is not Role.RIB):
@@ -387,7 +391,7 @@ class Attachment:
         each.is_taken = False
         if ack.refused is DropReason.STALE:
             self._sequence = self.started = max(self._sequence, ack.sequence)
-            each.advertisement_at_s = now_s  # an earlier life of ours was ahead: try again above it
+            each.advertisement_at_s = now_s  # an earlier incarnation of ours was ahead: retry above its number
         elif ack.refused is DropReason.IN_USE and each.right is Right.ATTACH:
             if each.refused is not ack.refused:
                 self._in_use_s = now_s
@@ -396,7 +400,8 @@ class Attachment:
             self.clashes += 1
         else:
             each.refused = ack.refused
-            each.advertisement_at_s = now_s + self._lease_s / 3  # it may be taken later, but not for asking often
+            # it may be accepted later; frequent repetition does not help
+            each.advertisement_at_s = now_s + self._lease_s / 3
 
     def _say_revoked(self, neighbour: Neighbour, wire: bytes) -> None:
         if neighbour is self._switch:

@@ -1,6 +1,6 @@
-"""The messages of a best-effort topic that have not left yet.
+"""Best-effort queue: messages of a best-effort topic that have not been sent yet.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ __all__ = ["BestEffortQueue", "Carried"]
 
 
 class Carried(NamedTuple):
-    """What one message number carries: so many messages, and the sequence number of the first."""
+    """Content of one message number: the count of messages, and the sequence number of the first."""
 
     number: int
     sequence: int
@@ -23,23 +23,23 @@ class Carried(NamedTuple):
 
 
 class BestEffortQueue:
-    """A queue of sealed messages, each with what it carries; the oldest go when nobody takes them."""
+    """Queue of sealed messages, each with its content; when it is full, the oldest are dropped."""
 
     def __init__(self) -> None:
         self._queue = deque[tuple[Sealed, Carried]]()
         self._held_bytes = 0
-        self._part = 0  # of the oldest: the first that has not left
+        self._part = 0  # of the oldest: the first that has not been sent
 
     def __len__(self) -> int:
         return len(self._queue)
 
     @property
     def oldest(self) -> Carried | None:
-        """Return what is the next to leave, or None."""
+        """Return the content that is sent next, or None."""
         return self._queue[0][1] if self._queue else None
 
     def add(self, frames: Sealed, carried: Carried) -> list[Carried]:
-        """Queue a message, or a bundle; return what was let go for it."""
+        """Queue a message, or a bundle; return what was dropped for it."""
         self._queue.append((frames, carried))
         self._held_bytes += frames.size_bytes
         gone = []
@@ -48,7 +48,7 @@ class BestEffortQueue:
         return gone
 
     def poll_frames(self, limit: int) -> list[bytes]:
-        """Return at most so many frames, in order, sealed as they are taken."""
+        """Return at most ``limit`` frames, in order, sealed as they are taken."""
         frames: list[bytes] = []
         while self._queue and len(frames) < limit:
             oldest, first = self._queue[0][0], self._part
@@ -60,7 +60,7 @@ class BestEffortQueue:
         return frames
 
     def requeue(self, mtu: int) -> list[tuple[bytes, Carried]]:
-        """Return everything, to be sealed anew, if something is too large for its path; else nothing."""
+        """Return everything, to be sealed again, if something is too large for its path; else nothing."""
         if all(frames.largest <= mtu for frames, _ in self._queue):
             return []
         taken = [(frames.message()[SEQUENCE_BYTES:], carried) for frames, carried in self._queue]

@@ -1,6 +1,6 @@
-"""The keys of one life of a member for notes: what it shares with each life of another.
+"""Control keys of one incarnation of a participant: the secret that it shares with each incarnation of a peer.
 
-Sans-I/O; remembers what it computed, within bounds.
+Sans-I/O. Computed secrets are cached, within bounds.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _PURPOSE: Final = b"gdp-note-shared-1"
 
 
 class ControlKeys:
-    """An X25519 key that is drawn for this life, and what comes of it."""
+    """X25519 key that is created for this incarnation, and the secrets derived from it."""
 
     def __init__(self, exchange: ExchangeKey) -> None:
         self._exchange = exchange
@@ -32,10 +32,10 @@ class ControlKeys:
         return self._exchange.public
 
     def shared(self, far_public: bytes) -> bytes:
-        """Return the 32 bytes that this life and the holder of another key share; about 0.1 ms, the first time.
+        """Return the 32 bytes shared with the holder of another key; the first call for a key takes about 0.1 ms.
 
         Raises:
-            StatementError: MALFORMED, it is no key, or one that makes a secret that everybody knows.
+            StatementError: MALFORMED, it is no key, or one that makes a publicly known secret.
         """
         shared = self._shared.get(far_public)
         if shared is None:
@@ -44,10 +44,10 @@ class ControlKeys:
         return shared
 
     def introduced(self, wire: bytes, name: Name, incarnation: int) -> Introduction:
-        """Return what a reader says of itself, verified.
+        """Return a verified introduction of a reader.
 
         Raises:
-            StatementError: it does not hold.
+            StatementError: it is invalid.
         """
         key = name + incarnation.to_bytes(8, "big") + wire
         introduction = self._introduced.get(key)

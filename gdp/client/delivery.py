@@ -1,7 +1,7 @@
 """Delivery of the messages of one writer: unbundles them in order, and accounts for those that are lost.
 
-Sans-I/O. Sequence numbers under the seal show what is lost between two messages; statuses show what is lost behind the
-last, and why.
+Sans-I/O. Sequence numbers under the seal show what is lost between two messages. Heartbeats show what is lost behind
+the last, and why.
 """
 
 from __future__ import annotations
@@ -30,8 +30,9 @@ class Delivered(NamedTuple):
     message: bytes
     parts: int
     hops: int
-    place: int = 0  # among the messages of one number: several come in one bundle
-    sequence: int = 0  # which message of its publisher's incarnation this is, from 1; one that is skipped is lost
+    place: int = 0  # index among the messages of one number: a bundle has several
+    # which message of its publisher's incarnation this is, from 1; a skipped number is a lost message
+    sequence: int = 0
 
 
 class DeliveryQueue:
@@ -43,8 +44,8 @@ class DeliveryQueue:
     Attributes:
         is_reliable: messages between two delivered ones were given up by the writer; else they are gaps.
         sequence: sequence number of the next message.
-        known: lowest sequence number that nothing is known of.
-        gone: what the writer says that no reader can get.
+        known: lowest sequence number of unknown fate.
+        gone: ranges that the writer reports as lost for every reader.
         skipped: why the next gap is skipped; None: unknown.
         losses: messages that were lost.
         delivered: messages that were delivered.
@@ -70,15 +71,15 @@ class DeliveryQueue:
 
     @property
     def gap_reason(self) -> LossReason:
-        """Return why messages are lost that nothing else is known of."""
+        """Return the reason of losses for which no other reason is known."""
         return LossReason.GIVEN_UP if self.is_reliable else LossReason.GAP
 
     def learn(self, sequence: int) -> None:
-        """Learn that messages before a sequence number were published."""
+        """Note that messages before a sequence number were published."""
         self.known = max(self.known, sequence)
 
     def lose_until(self, sequence: int, otherwise: LossReason) -> None:
-        """Count what lies before a sequence number as lost; ``otherwise`` where the writer gives no reason."""
+        """Count what lies before a sequence number as lost, with reason ``otherwise`` if the writer gives none."""
         if self.sequence < sequence:
             for lost in explain(self.sequence, sequence - 1, self.gone, otherwise):
                 self.losses.add(lost)

@@ -1,10 +1,10 @@
-"""When a publisher's next status goes, and what it tells: where new readers begin, and what the messages are.
+"""Schedule of a publisher's Heartbeats: when the next one is due, and which starts and description it carries.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds).
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
-A new reader asks until it is told what the messages are. Those that read already do not know that there is news, and
-nothing confirms a status: so news is said at once, before any message that it is about, and several times more, at
-growing distances.
+A new reader repeats its request until a Heartbeat brings the description. Present readers cannot know of a new
+description, and no reader acknowledges a Heartbeat. So a new description is sent at once, before any message that it
+describes, and repeated several times at growing intervals.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ __all__ = ["HeartbeatSchedule"]
 
 _GAP_S: Final = 0.02  # between two
 _BYTES_PER_S: Final = 8 << 20  # ... and longer after a large one
-_PAUSES_S: Final = (0.05, 0.2, 0.8, 3.2)  # after each saying of news but the last
+_PAUSES_S: Final = (0.05, 0.2, 0.8, 3.2)  # after each sending of a new description but the last
 _NEVER: Final = float("inf")
 
 
 class HeartbeatSchedule:
-    """The statuses of one publisher.
+    """Heartbeats of one publisher.
 
     Args:
-        number: of the last one, in this life.
+        number: of the last one, in this incarnation.
 
     Attributes:
-        wanted: there is something to tell.
+        wanted: a Heartbeat has to be sent.
         starts: new readers, and where they begin.
     """
 
@@ -37,12 +37,12 @@ class HeartbeatSchedule:
         self.wanted = False
         self.starts: dict[bytes, StreamStart] = {}
         self._description = description
-        self._said = len(_PAUSES_S) + 1  # times; it is no news
-        self._again_s = _NEVER  # when the news is to be said again
-        self._at_s = -_NEVER  # when the next status may go
+        self._said = len(_PAUSES_S) + 1  # times that the description was sent; beyond the last it is not new
+        self._again_s = _NEVER  # when the description is sent again
+        self._at_s = -_NEVER  # when the next Heartbeat may be sent
 
     def describe(self, description: bytes) -> bool:
-        """Take what the messages are; return whether it is news."""
+        """Set the description; return whether it is new."""
         if description == self._description:
             return False
         self._description, self._said, self.wanted = description, 0, True
@@ -51,27 +51,27 @@ class HeartbeatSchedule:
 
     @property
     def is_full(self) -> bool:
-        """Return whether further new readers must ask again."""
+        """Return whether further new readers must repeat their request."""
         return len(self.starts) >= STARTS_MAX
 
     def handle_timer(self, now_s: float) -> None:
-        """Want to say the news again, if it is time."""
+        """Request another Heartbeat if the description is to be repeated now."""
         self.wanted |= self._again_s <= now_s
 
     def get_timer(self) -> float | None:
-        """Return the monotonic second at which one may go or will be wanted, or None."""
+        """Return the monotonic second at which a Heartbeat may be sent or will be wanted, or None."""
         at_s = self._at_s if self.wanted else self._again_s
         return None if at_s == _NEVER else at_s
 
     def is_due(self, now_s: float) -> bool:
-        """Return whether one is wanted and may go."""
+        """Return whether a Heartbeat is wanted and may be sent."""
         return self.wanted and now_s >= self._at_s
 
     def poll_heartbeat(self, place: Heartbeat, now_s: float) -> bytes:
         """Return the wire form of the next one, whose number is then ``number``.
 
         Args:
-            place: what is kept, sent, moved and gone; starts and description are added.
+            place: what is cached, sent, renumbered and gone; starts and description are added.
         """
         is_news = self._said <= len(_PAUSES_S)
         about = self._description if self.starts or is_news else b""

@@ -18,11 +18,11 @@ __all__ = ["ReaderIdentity", "WriterIdentity"]
 
 @dataclass(frozen=True, slots=True)
 class WriterIdentity:
-    """One incarnation of a writer.
+    """Identity of one incarnation of a writer.
 
     Args:
         random_bytes: the system's randomness, called for each message that is sealed.
-        notes: keys for the notes of readers.
+        notes: keys for the control datagrams of readers.
     """
 
     name: Name
@@ -34,12 +34,12 @@ class WriterIdentity:
 
 @dataclass(frozen=True, slots=True)
 class ReaderIdentity:
-    """One incarnation of a reader; all its feeds share it, since they share its numbers for notes.
+    """Identity of one incarnation of a reader; its writer proxies share it, since they share its datagram numbers.
 
     Args:
-        notes: keys for notes.
-        introduction: returns the wire form of the statement that proves whose keys they are.
-        note_numbers: numbers of the next notes.
+        notes: keys for control datagrams.
+        introduction: returns the wire form of the statement that proves the owner of the keys.
+        note_numbers: numbers of the next control datagrams.
     """
 
     name: Name

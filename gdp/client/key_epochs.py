@@ -1,6 +1,6 @@
-"""Key epochs of a topic as its writer uses them: the newest seals, the one before still opens notes for a while.
+"""Key epochs of a topic at its writer: the newest seals; the previous one still opens reports for a while.
 
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: epochs of DTLS 1.3 (RFC 9147).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _NEVER: Final = float("-inf")
 
 
 class KeyEpochs:
-    """The secrets of one topic, and the sealers under the newest of them.
+    """Secrets of one topic, and the sealers under the newest of them.
 
     Args:
         topic: the name that the keys are derived from.
@@ -32,7 +32,7 @@ class KeyEpochs:
     Attributes:
         epoch: the newest.
         data: seals messages.
-        status: seals statuses.
+        status: seals Heartbeats.
 
     Raises:
         LocalError: there is no secret.
@@ -66,7 +66,7 @@ class KeyEpochs:
         return True
 
     def secret_of(self, epoch: int, now_s: float) -> bytes:
-        """Return the secret under which notes of an epoch are accepted now.
+        """Return the secret under which reports of an epoch are accepted now.
 
         Raises:
             EnvelopeError: UNKNOWN_EPOCH.

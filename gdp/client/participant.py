@@ -1,10 +1,11 @@
-"""A member of the overlay that publishes, reads, serves and calls: what a proxy, a replica or a capsule is to it.
+"""Participant of the overlay: publishes, reads, serves and calls names; the core of a proxy, a replica or a capsule.
 
-Place: pure; a shell or a simulated network feeds it frames and time, and takes out frames and messages.
+Sans-I/O; an I/O layer or a simulated network passes it frames and time, and takes out frames and messages.
 
-The walk of a message out: ``publish`` -> Publisher (number, seal, keep) -> the switch. And in: DATA or STATUS -> the
-feed of its topic and source -> ``take_messages``. Whoever serves or calls a name both publishes and reads it; what a
-server answers one client, and what a client asks one server, goes by private streams.
+A sent message passes ``publish``, the Publisher (number, seal, cache) and the switch. A received DATA or HEARTBEAT
+frame passes the writer proxy of its topic and source, and leaves by ``poll_messages``. A node that serves or calls a
+name both publishes and reads it. A server's responses to one client, and a client's requests to one server, use unicast
+streams.
 """
 
 from __future__ import annotations
@@ -44,13 +45,14 @@ from gdp.trust.verifier import AdvertisementVerifier
 
 _FOR_WRITER_PROXIES: Final = (int(Kind.DATA), int(Kind.HEARTBEAT))
 _NOTES: Final = (int(Kind.ACKNACK), int(Kind.INTRODUCTION))
-_STALL_S: Final = 2 * HELLO_S  # a member that is not called for longer, though hellos are due, had no time
+# a participant that is called later than this, although hellos are due, was not scheduled
+_STALL_S: Final = 2 * HELLO_S
 
 __all__ = ["Message", "Participant", "Topic"]
 
 
 class Participant:
-    """The machine of one member."""
+    """Protocol core of one participant."""
 
     def __init__(self, identity: Identity, policy: Policy, settings: NodeSettings) -> None:
         self._identity = identity
@@ -60,16 +62,16 @@ class Participant:
         self._publications = Publications(source, self._party_of)
         self._turns = self._publications.turns
         self._writer_proxies_due = TimerQueue[WriterProxy]()
-        self._reporting: dict[WriterProxy, None] = {}  # whose report may be due
-        self._introduced = (-1, b"")  # since when, and how
+        self._reporting: dict[WriterProxy, None] = {}  # writer proxies whose report may be due
+        self._introduced = (-1, b"")  # since when, and the introduction
         reader = ReaderIdentity(
             identity.name, settings.incarnation, notes, self._introduction
-        )  # one, for all its feeds
+        )  # one, for all its writer proxies
         self._subscriptions = Subscriptions(reader, self._verifier)
         self._messages: list[Message] = []
-        self._under_way: tuple[WriterProxy, Subscription] | None = None  # whose next part is expected
+        self._under_way: tuple[WriterProxy, Subscription] | None = None  # whose next fragment is expected
         self._now_s = 0.0
-        self._awake_s = 0.0  # since when this member has had time
+        self._awake_s = 0.0  # since when this participant has been scheduled without a stall
         self.boundary = ErrorBoundary()
         self._drops: Counter[DropReason] = Counter()
         self._source = source
@@ -78,7 +80,7 @@ class Participant:
 
     @property
     def name(self) -> Name:
-        """Return the member's name."""
+        """Return the participant's name."""
         return self._identity.name
 
     @property
@@ -96,7 +98,7 @@ class Participant:
         return total
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Timestamps) -> None:
-        """Begin to look for a switch on a port."""
+        """Begin to discover a switch on a port."""
         self.attachment.hello_protocol.add_port(index, mac, mtu, cost, now.mono_s)
 
     def advertise(
@@ -112,7 +114,7 @@ class Participant:
         """Publish a topic from now on.
 
         Raises:
-            LocalError: not delegated to this member, or no secret for it.
+            LocalError: not delegated to this participant, or no secret for it.
         """
         self._check(topic, Right.PUBLISH, is_free=topic.name not in self._publications)
         publisher = self._publications.add(
@@ -122,20 +124,20 @@ class Participant:
         return publisher
 
     def serve(self, topic: Topic, description: bytes, *, is_global: bool = True, urgent: bool = False) -> Publisher:
-        """Serve a name from now on; return the stream that all its clients hear. ``answer`` reaches one of them.
+        """Serve a name from now on; return the stream that all its clients receive. ``respond`` sends to one of them.
 
         Raises:
-            LocalError: not delegated to this member, no secret for it, or the name is in use here.
+            LocalError: not delegated to this participant, no secret for it, or the name is in use here.
         """
         return self._take_part(topic, Right.SERVE, description, is_global=is_global, urgent=urgent)
 
     def call(self, topic: Topic, description: bytes, *, is_global: bool = True, urgent: bool = False) -> Publisher:
-        """Call a name from now on; return the stream of requests, that all its servers hear. ``ask`` reaches one.
+        """Call a name from now on; return the stream of requests that all its servers receive. ``ask`` sends to one.
 
-        A request that is published while ``peers`` is empty reaches nobody.
+        A request that is published while ``peers`` is empty reaches no server.
 
         Raises:
-            LocalError: not delegated to this member, no secret for it, or the name is in use here.
+            LocalError: not delegated to this participant, no secret for it, or the name is in use here.
         """
         return self._take_part(topic, Right.CALL, description, is_global=is_global, urgent=urgent)
 
@@ -143,22 +145,24 @@ class Participant:
         """Send a message to one client of a name that is served here.
 
         Raises:
-            LocalError: that client is not heard (any more), or there are too many; or the message is above the limits.
+            LocalError: that client is not connected (any more), or there are too many; or the message is above the
+                limits.
         """
         self._tell(Right.SERVE, service, client, message)
 
     def ask(self, service: Name, server: Name, message: bytes) -> None:
-        """Send a request to one server of a name that is called here, beside the stream that all of them hear.
+        """Send a request to one server of a name that is called here, apart from the stream to all of them.
 
         Raises:
-            LocalError: that server is not heard (any more), or there are too many; or the message is above the limits.
+            LocalError: that server is not connected (any more), or there are too many; or the message is above the
+                limits.
         """
         self._tell(Right.CALL, service, server, message)
 
     def peers(self, service: Name) -> list[Name]:
-        """Return the servers of a name called here, or the clients of one served here, that are heard and follow.
+        """Return the servers of a name called here, or the clients of one served here, that are connected and keep up.
 
-        A server that falls behind the others, or is silent for ``CALL_QUIET_S``, is none until it confirms again.
+        A server that falls behind the others, or is silent for ``CALL_QUIET_S``, is excluded until it confirms again.
         """
         publisher = self._publications.get(service)
         if publisher is None:
@@ -166,7 +170,7 @@ class Participant:
         return [party for party in self.heard(service) if publisher.is_followed_by(party, self._now_s, self._awake_s)]
 
     def heard(self, service: Name) -> list[Name]:
-        """Return those of whom ``peers`` are some: whoever has joined us and is joined, keeping up or not."""
+        """Return all connected peers, those that do not keep up included; ``peers`` returns a subset."""
         publisher = self._publications.get(service)
         writer_proxies = [
             writer_proxy
@@ -180,9 +184,9 @@ class Participant:
         ]
 
     def withdraw(self, name: Name) -> None:
-        """Publish, serve or call a name no more; what is not, is not.
+        """Stop publishing, serving or calling a name; an unused name is ignored.
 
-        It may be taken up again at any time, and as something else.
+        The name may be used again at any time, also in another way.
         """
         if not self._publications.remove(name):
             return
@@ -194,24 +198,24 @@ class Participant:
         self.attachment.withdraw(name, right)
 
     def subscribe(self, topic: Topic) -> None:
-        """Read a topic from now on, from whoever may publish it.
+        """Read a topic from now on, from every publisher of it.
 
         Raises:
-            LocalError: not delegated to this member, or no secret for it.
+            LocalError: not delegated to this participant, or no secret for it.
         """
         self._check(topic, Right.READ, is_free=self._subscriptions.get(topic.name) is None)
         self._subscriptions.add(topic, Right.READ)
         self._advertisement(topic, Right.READ, is_global=False)
 
     def unsubscribe(self, name: Name) -> None:
-        """Read a topic no more; what is not read, is not. Read again, it goes on with what is new then."""
+        """Stop reading a topic; one that is not read is ignored. A later ``subscribe`` begins with new messages."""
         subscription = self._subscriptions.get(name)
         if subscription is not None and subscription.right is Right.READ:
             self._close(self._subscriptions.remove(name))
             self.attachment.withdraw(name, Right.READ)
 
     def renew(self, topic: Topic) -> None:
-        """Take a topic's delegation and secrets anew, for what is published or read of it."""
+        """Replace a topic's delegation and secrets, for what is published or read of it."""
         self._publications.renew(topic.name, topic.secrets, self._now_s)
         subscription = self._subscriptions.get(topic.name)
         if subscription is not None:
@@ -225,34 +229,34 @@ class Participant:
         return [subscription.topic for subscription in self._subscriptions if subscription.right is Right.READ]
 
     def publishers(self) -> list[Publisher]:
-        """Return what is being published, one publisher for each topic."""
+        """Return the publishers, one for each published topic."""
         return list(self._publications)
 
     def writer_proxies(self) -> Iterator[WriterProxy]:
-        """Yield what is being read: a feed for each publisher of each topic, and for what comes privately."""
+        """Yield the writer proxies: one for each publisher of each topic, and those of unicast streams."""
         for subscription in self._subscriptions:
             yield from subscription.all()
 
     def writer_proxies_of(self, topic: Name) -> list[WriterProxy]:
-        """Return the feeds of one topic, private ones apart."""
+        """Return the writer proxies of one topic, without unicast streams."""
         subscription = self._subscriptions.get(topic)
         return [] if subscription is None else list(subscription.writer_proxies.values())
 
     def losses_of(self, name: Name) -> Losses:
-        """Return what was lost of all that was heard on a name since it is heard."""
+        """Return what was lost of a name's messages since it was subscribed."""
         subscription = self._subscriptions.get(name)
         return Losses() if subscription is None else subscription.losses()
 
     def lost(self) -> Mapping[LossReason, int]:
-        """Return how many messages were lost on their way to this member, by reason."""
+        """Return how many messages to this participant were lost, by reason."""
         return self._subscriptions.lost()
 
     def unconfirmed(self) -> Mapping[LossReason, int]:
-        """Return how many messages of this member some reader did not get, as far as it is known here, by reason."""
+        """Return how many messages of this participant some reader did not get, as far as known here, by reason."""
         return self._publications.unconfirmed()
 
     def receive(self, arrivals: Sequence[ReceivedFrame], now: Timestamps) -> None:
-        """Take frames in."""
+        """Process received frames."""
         self._look_at_clock(now.mono_s)
         fed: dict[WriterProxy, Subscription] = {}
         at = 0
@@ -284,7 +288,7 @@ class Participant:
             elif header.kind >= CONTROL_FROM:
                 statement = self.attachment.receive_control(arrival, header, now)
                 if statement is not None:
-                    self._hand_out(fed, now.mono_s)  # it may close feeds
+                    self._hand_out(fed, now.mono_s)  # it may close writer proxies
                     self._take_statement(statement, now)
             else:
                 self._drops[DropReason.UNKNOWN_KIND] += 1
@@ -295,11 +299,11 @@ class Participant:
             self._drops[DropReason.INTERNAL] += 1
 
     def port_changed(self, port: int, up: bool, now: Timestamps) -> None:
-        """Learn that a port's link came or went."""
+        """Update the state of a port's link."""
         self.attachment.port_changed(port, up, now)
 
     def handle_timer(self, now: Timestamps) -> None:
-        """Do what is due."""
+        """Process the timers that are due."""
         self.attachment.handle_timer(now)
         self._look_at_clock(now.mono_s)
         self._publications.handle_timer(now.mono_s)
@@ -309,7 +313,7 @@ class Participant:
         self.flush(now.mono_s)
 
     def flush(self, now_s: float) -> None:
-        """Hand what publishers and feeds have ready to the switch."""
+        """Pass frames and reports that are ready to the switch."""
         if self.attachment.switch is None:
             return
         self._look_at_clock(now_s)
@@ -328,7 +332,7 @@ class Participant:
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         times = [self.attachment.get_timer()]
-        if self.attachment.switch is not None:  # alone, nothing can be sent: hellos alone are due
+        if self.attachment.switch is not None:  # without a switch nothing can be sent: hellos alone are due
             times += [self._publications.next_due(), self._writer_proxies_due.next_due()]
         return min((time for time in times if time is not None), default=None)
 
@@ -337,10 +341,10 @@ class Participant:
         return self.attachment.hello_protocol.poll_addresses()
 
     def frames_to_send(self) -> list[OutgoingFrames]:
-        """Return, once, what is to be sent; more comes at the next call, until nothing does.
+        """Return, once, the frames to send; call again until it returns none.
 
-        So the first frames of a large message are on their way while the next ones are being sealed, and the topics
-        take turns; urgent ones go first each time.
+        So the first frames of a large message are under way while the next ones are being sealed. The topics take
+        turns; urgent ones go first each time.
         """
         out = self.attachment.frames_to_send()
         if not out and (self._turns or self._reporting):
@@ -349,12 +353,12 @@ class Participant:
         return out
 
     def poll_messages(self) -> list[Message]:
-        """Return, once, the messages that arrived, in order within each feed."""
+        """Return, once, the messages that arrived, in order within each writer proxy."""
         messages, self._messages = self._messages, []
         return messages
 
     def leave(self) -> None:
-        """Say goodbye: close feeds, withdraw every name."""
+        """Leave the overlay: close writer proxies, withdraw every name."""
         self._close(self._subscriptions.leave())
         self.attachment.withdraw_all()
 
@@ -382,7 +386,7 @@ class Participant:
 
     def _look_at_clock(self, now_s: float) -> None:
         if now_s - self._now_s > _STALL_S:
-            self._awake_s = now_s  # what the others said meanwhile is still to be read
+            self._awake_s = now_s  # frames that the peers sent meanwhile are still to be processed
         self._now_s = now_s
 
     def _tell(self, right: Right, service: Name, party: Name, message: bytes) -> None:
@@ -392,7 +396,7 @@ class Participant:
         self._publications.send_to(service, party, message, self._now_s)
 
     def _writer_proxy(self, header: Header, frame: bytes, now_s: float, fed: dict[WriterProxy, Subscription]) -> None:
-        """Give a frame to the feed that it is for, and note that one."""
+        """Pass a frame to its writer proxy, and add that to ``fed``."""
         found = self._subscriptions.find(header, now_s)
         if found is None:
             self._drops[DropReason.NOT_FOR_US] += 1
@@ -412,7 +416,7 @@ class Participant:
             self._publications.receive_acknack(header, frame, now_s)
 
     def _introduction(self) -> bytes:
-        """Return what proves whose notes ours are, in this life; made anew when an earlier life proves to be ahead."""
+        """Return the introduction of this incarnation; signed again if an earlier incarnation proves to be ahead."""
         started, source = self.attachment.started, self._source
         if self._introduced[0] != started:
             wire = Introduction.make(
@@ -429,11 +433,11 @@ class Participant:
         elif statement.type is StatementType.ANSWER:
             change = self._subscriptions.receive_response(Response.from_fields(statement.fields), now)
             self._messages += change.rest
-            self._close(change.ended, goodbye=False)  # they may come back to what waits for them
+            self._close(change.ended, goodbye=False)  # they may return to what waits for them
             self._reporting.update(dict.fromkeys(change.opened))
 
     def _party_of(self, service: Name, party: bytes) -> Party | None:
-        """Return another party of a service that is heard now."""
+        """Return another party of a service that is connected now."""
         subscription = self._subscriptions.get(service)
         writer_proxy = None if subscription is None else subscription.writer_proxies.get(party)  # type: ignore[call-overload]
         return (
@@ -443,13 +447,13 @@ class Participant:
         )
 
     def _revoke(self, statement: Statement, now: Timestamps) -> None:
-        """Open nothing more of a publisher whose claim rests on what was taken back."""
+        """Close the writer proxies of publishers whose advertisement depends on a revoked certificate."""
         revocation = self.attachment.receive_revocation(statement, now, self._holds)
         if revocation is not None:
             self._close(self._subscriptions.recheck(revocation.fingerprint, now.unix_s))
 
     def _holds(self, issuer_key: bytes) -> bool:
-        """Return whether a certificate of this key is held here: our own delegations', or of whom we hear."""
+        """Return whether a certificate of this key is held here: in our own delegations, or in those of our peers."""
         is_own = any(
             issuer_key == pending_advertisement.subject.owner_key
             for pending_advertisement in self.attachment.advertisements
@@ -457,7 +461,7 @@ class Participant:
         return is_own or self._subscriptions.has_issuer(issuer_key)
 
     def _close(self, writer_proxies: list[WriterProxy], *, goodbye: bool = True) -> None:
-        """Say goodbye to whom these feeds are of, unless told otherwise; a party that goes is told nothing more."""
+        """Close writer proxies and the streams to ended peers; ``goodbye``: also send each publisher a goodbye."""
         self._under_way = None
         for writer_proxy in writer_proxies:
             note = writer_proxy.close()

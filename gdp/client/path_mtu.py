@@ -1,8 +1,8 @@
-"""The MTU of a tree as its publisher uses it: what joins say, as long as following them does not cost too much.
+"""Path MTU of a tree at its publisher: follows the joins, as long as that does not cost too much.
 
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds). What is kept for repairs is sealed anew when the path becomes
-too narrow for it: at most ``MTU_NARROWINGS`` times, and once more every ``MTU_HOLD_S``. Until then the path is not
-believed to be wider, and falls from plateau to plateau (RFC 1191, section 7.1), of which there are few.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Cached messages are sealed again when the path becomes too
+narrow for them: at most ``MTU_NARROWINGS`` times, and once more every ``MTU_HOLD_S``. Until then wider values are
+ignored, and the MTU falls from plateau to plateau (RFC 1191, section 7.1), of which there are few.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ PLATEAUS: Final = (FRAME_MAX_BYTES, 32_000, 17_914, 8_166, 4_352, 2_002, 1_492, 
 
 
 class PathMtu:
-    """The MTU of one tree, in bytes after the Ethernet header."""
+    """MTU of one tree, in bytes after the Ethernet header."""
 
     def __init__(self) -> None:
         self._mtu: int | None = None
-        self._narrowings = float(MTU_NARROWINGS)  # with something sealed anew, that may still come
+        self._narrowings = float(MTU_NARROWINGS)  # narrowings that may still cause a new seal
         self._counted_s = 0.0
 
     def receive_mtu(self, mtu: int, now_s: float) -> int:
-        """Take what a join says; return what holds."""
+        """Process the MTU of a join; return the MTU that is valid now."""
         more = max(now_s - self._counted_s, 0.0) / MTU_HOLD_S
         self._narrowings, self._counted_s = min(self._narrowings + more, MTU_NARROWINGS), now_s
         may_narrow = self._narrowings >= 1
@@ -36,5 +36,5 @@ class PathMtu:
         return self._mtu
 
     def count(self) -> None:
-        """Note that something had to be sealed anew."""
+        """Note that something had to be sealed again."""
         self._narrowings = max(self._narrowings - 1, 0.0)

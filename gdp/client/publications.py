@@ -1,6 +1,6 @@
-"""What a member says on its names: a publisher for each, and where it serves or calls, private streams besides.
+"""Publications of a participant: a publisher for each name, and unicast streams where it serves or calls.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds).
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ __all__ = ["Publications"]
 
 
 class Publications:
-    """All that one member publishes.
+    """All publishers of one participant.
 
     Args:
-        source: the member.
-        heard: returns another party of a service, if that is heard now.
+        source: the participant.
+        heard: returns another party of a service, if it is connected now.
     """
 
     def __init__(self, source: WriterIdentity, heard: Callable[[Name, bytes], Party | None]) -> None:
@@ -45,7 +45,7 @@ class Publications:
         self._sequence_registry = SequenceRegistry()
         self._timers = TimerQueue[Publisher]()
         self.turns = SendScheduler(self._timers.reschedule)
-        self._drops: Counter[DropReason] = Counter()  # of what is gone
+        self._drops: Counter[DropReason] = Counter()  # of closed publishers
         self._losses: Counter[LossReason] = Counter()
 
     def __iter__(self) -> Iterator[Publisher]:
@@ -61,7 +61,7 @@ class Publications:
         return sum((streams.drops for streams in self._private.values()), publishers)
 
     def unconfirmed(self) -> Counter[LossReason]:
-        """Return how many messages some reader did not get, as far as it is known here, by reason."""
+        """Return how many messages some reader did not get, as far as known here, by reason."""
         counts = sum((publisher.losses.counts for publisher in list(self)), self._losses)
         return sum((streams.losses for streams in list(self._private.values())), counts)
 
@@ -97,7 +97,7 @@ class Publications:
         return publisher
 
     def enable_unicast(self, name: Name, secrets: Secrets, *, urgent: bool) -> None:
-        """Have private streams on a published name from now on."""
+        """Enable unicast streams on a published name from now on."""
         self._private[name] = UnicastStreams(
             service=name,
             writer=self._source,
@@ -108,7 +108,7 @@ class Publications:
         )
 
     def remove(self, name: Name) -> bool:
-        """Say nothing on a name any more; return whether it was published."""
+        """Stop publishing a name; return whether it was published."""
         publisher, streams = self._publishers.pop(name, None), self._private.pop(name, None)
         self._paths.pop(name, None)
         if publisher is None:
@@ -124,7 +124,7 @@ class Publications:
         return True
 
     def renew(self, name: Name, secrets: Secrets, now_s: float) -> None:
-        """Take a name's secrets anew."""
+        """Replace a name's secrets."""
         for each in (self._publishers.get(name), self._private.get(name)):
             if each is not None:
                 each.renew(secrets, now_s)
@@ -133,7 +133,7 @@ class Publications:
         """Send a message to one other party of a service alone.
 
         Raises:
-            LocalError: it is not heard, there are too many, or the message is above the limits.
+            LocalError: it is not connected, there are too many, or the message is above the limits.
         """
         streams, heard = self._private.get(service), self._heard(service, party)
         if streams is None or heard is None:
@@ -141,16 +141,16 @@ class Publications:
         streams.stream(heard, self._publishers[service].mtu, now_s).publish(message)
 
     def forget(self, service: Name, party: PeerIncarnation) -> None:
-        """Let go of what waits for a party of a service that is gone."""
+        """Drop the stream to a party of a service that is gone."""
         streams = self._private.get(service)
         if streams is not None:
             streams.forget(party)
 
     def receive_introduction(self, header: Header, frame: bytes) -> None:
-        """Take a reader's introduction.
+        """Process a reader's introduction.
 
         Raises:
-            RemoteError: it is about nothing that is published here.
+            RemoteError: it concerns nothing that is published here.
         """
         publisher = self._publishers.get(topic_of(header, frame))  # type: ignore[call-overload]
         if publisher is None:
@@ -158,10 +158,10 @@ class Publications:
         publisher.receive_introduction(header, frame)
 
     def receive_acknack(self, header: Header, frame: bytes, now_s: float) -> None:
-        """Take a reader's note.
+        """Process a reader's sealed report.
 
         Raises:
-            RemoteError: it is about nothing that is published here, or there are too many private streams.
+            RemoteError: it concerns nothing that is published here, or there are too many unicast streams.
         """
         topic = topic_of(header, frame)
         publisher = self._publishers.get(topic) or self._stream(topic, header.source, now_s)  # type: ignore[call-overload]
@@ -169,7 +169,7 @@ class Publications:
         self.turns.add(publisher)
 
     def receive_join(self, join: Join, now_s: float) -> None:
-        """Learn that a tree stands, and how wide it is."""
+        """Note that a tree is installed, and its MTU."""
         publisher = self._publishers.get(join.topic)
         if publisher is not None and join.publisher == self._source.name and join.lease_s > 0:
             path = self._paths.setdefault(join.topic, PathMtu())
@@ -181,7 +181,7 @@ class Publications:
                 path.count()
 
     def handle_timer(self, now_s: float) -> None:
-        """Do what is due."""
+        """Process the timers that are due."""
         for publisher in self._timers.poll_due(now_s):
             publisher.handle_timer(now_s)
             self.turns.add(publisher)
@@ -193,7 +193,7 @@ class Publications:
         return self._timers.next_due()
 
     def _stream(self, stream: bytes, reader: bytes, now_s: float) -> Publisher:
-        """Return the private stream that a note is about."""
+        """Return the unicast stream that a report concerns."""
         for service, streams in self._private.items():
             heard = self._heard(service, reader)
             if heard is None or not streams.is_about(stream, heard.life):

@@ -1,13 +1,13 @@
 """Writer of one topic.
 
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Frames come out of ``take`` and go to the switch.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). ``poll_frames`` returns the frames for the switch.
 
 The writer joins ``send_queue.py`` (numbers, bundles and seals), ``gdp/message/send_window.py`` (caches and repairs),
 ``ack_nack_handler.py`` (readers and what they confirm), ``key_epochs.py`` (secrets) and ``heartbeat_schedule.py``.
-Small messages
-wait until frames are polled, and become one bundle, sealed and signed once; except on a latched topic, whose late
-joiners get a fixed number of messages. Without a reader nothing is sealed; the last ``depth`` messages of a latched
-topic wait for late joiners.
+
+Small messages wait until frames are polled, and become one bundle, sealed and signed once. A latched topic has no
+bundles, because its late joiners get a fixed number of messages. Without a reader nothing is sealed; the last ``depth``
+messages of a latched topic wait for late joiners.
 """
 
 from __future__ import annotations
@@ -39,20 +39,20 @@ _ALL: Final = 1 << 30
 
 
 class Publisher:
-    """Publishes one topic.
+    """Publisher of one topic.
 
     Args:
         secrets: topic secrets by epoch; the newest seals.
-        description: what a reader must know to understand the messages; travels sealed.
+        description: what a reader must know to understand the messages; it is sent sealed.
         depth: how many messages late joiners get (0: none).
         urgent: its frames go before those of other topics, wherever they queue.
-        past: where the one that published the same before, in this incarnation, ended.
+        past: last numbers of an earlier publisher of the same topic, in this incarnation.
         patience: timeouts of its readers.
         address: destination of the frames; None: the topic.
 
     Attributes:
-        published: called when something waits to be taken, and when the publisher closes.
-        has_more: the last ``take`` reached its limit.
+        published: called when frames are ready to be polled, and when the publisher closes.
+        has_more: the last ``poll_frames`` reached its limit.
         payload_bytes: size of the messages that were published to a reader.
 
     Raises:
@@ -94,7 +94,7 @@ class Publisher:
 
     @property
     def mtu(self) -> int | None:
-        """Return the smallest MTU on the tree, in bytes after the Ethernet header; None until one stands."""
+        """Return the smallest MTU on the tree, in bytes after the Ethernet header; None until one is installed."""
         return self._queue.mtu
 
     @property
@@ -114,46 +114,50 @@ class Publisher:
 
     @property
     def readers(self) -> int:
-        """Return how many readers have introduced themselves and are alive; none before a tree stands."""
+        """Return how many readers have introduced themselves and are alive; none before a tree is installed."""
         return 0 if self.mtu is None else len(self._readers)
 
     def is_followed_by(self, name: Name, now_s: float, awake_s: float) -> bool:
-        """Return whether a tree stands, and a reader is alive and keeps up; ``awake_s``: since when we receive."""
+        """Return whether a tree is installed, and a reader is alive and keeps up.
+
+        Args:
+            awake_s: monotonic second since which this participant has received without a stall.
+        """
         keeps_up = self._window.has_reader(name) or not self.confirms
         return self.mtu is not None and keeps_up and self._readers.is_alive(name, now_s, awake_s)
 
     def is_read_by(self, name: Name) -> bool:
-        """Return whether a tree stands, and ``name`` is a reader, keeping up or not."""
+        """Return whether a tree is installed, and ``name`` is a reader, keeping up or not."""
         return self.mtu is not None and name in self._readers
 
     @property
     def is_wanted(self) -> bool:
-        """Return whether what is published now is for a reader, or for one that may come back to its window."""
+        """Return whether a message published now is for a reader, or for one that may return to its window."""
         return self.mtu is not None and bool(self._readers or (self.confirms and self._window.suspended))
 
     @property
     def confirms(self) -> bool:
-        """Return whether readers acknowledge what they get: of a best-effort topic they do not."""
+        """Return whether readers acknowledge messages; those of a best-effort topic do not."""
         return self._queue.is_acknowledged
 
     @property
     def past(self) -> SequenceState:
-        """Return where it is, for another one that goes on with the same."""
+        """Return the last numbers, for a later publisher of the same topic."""
         return SequenceState(self._queue.next_number, self._heartbeats.number, self._queue.ledger.last)
 
     @property
     def messages(self) -> int:
-        """Return how many messages were published here, those that no reader could get included."""
+        """Return how many messages were published here, those without any possible reader included."""
         return self._queue.ledger.messages
 
     @property
     def losses(self) -> Losses:
-        """Return which messages some reader did not get, as far as it is known here, and why."""
+        """Return which messages some reader did not get, as far as known here, and why."""
         return self._queue.ledger.losses
 
     @property
     def repairs(self) -> int:
-        """Return how many parts were sent again."""
+        """Return how many fragments were sent again."""
         return self._window.retransmissions
 
     def has_room(self) -> bool:
@@ -161,7 +165,7 @@ class Publisher:
         return self._queue.has_room()
 
     def is_acknowledged(self) -> bool:
-        """Return whether every reader has confirmed everything, those that may come back included."""
+        """Return whether every reader has confirmed everything, those that may return included."""
         return self._queue.is_empty and self._window.is_acknowledged()
 
     @property
@@ -175,7 +179,8 @@ class Publisher:
     def renew(self, secrets: Secrets, now_s: float) -> None:
         """Replace the topic's secrets; messages from now on are sealed under the newest epoch.
 
-        A status tells the readers. For ``EPOCH_GRACE_S`` their notes may still be of the epoch before.
+        A Heartbeat announces the epoch to the readers. For ``EPOCH_GRACE_S`` their reports may still use the epoch
+        before.
 
         Raises:
             LocalError: there is no secret.
@@ -185,15 +190,15 @@ class Publisher:
             self.published(self)
 
     def describe(self, description: bytes) -> None:
-        """Change the description from now on; a status tells present readers at once.
+        """Change the description from now on; a Heartbeat brings it to present readers at once.
 
-        What is published right behind it may overtake the status, where a frame is lost.
+        If the frame of the Heartbeat is lost, the next messages may arrive before it.
         """
         if self._heartbeats.describe(description):
             self.published(self)
 
     def set_depth(self, depth: int) -> None:
-        """Keep another number of messages for late joiners from now on; 0: none."""
+        """Change how many messages are kept for late joiners; 0: none."""
         if depth == self._queue.depth:
             return
         self._queue.set_depth(depth)
@@ -207,11 +212,11 @@ class Publisher:
         """Forget all readers and what waits for them; nothing is sent any more."""
         self._queue.close()
         self._acknowledgements.close()
-        self.published(self)  # the last time: the one who waits for its frames finds none
+        self.published(self)  # the last time: the caller that waits for its frames finds none
         self.published = lambda _: None
 
     def tree_stands(self, mtu: int) -> bool:
-        """Learn that a tree reaches this publisher, and the smallest MTU on it (bytes after the Ethernet header).
+        """Note that a tree reaches this publisher, and the smallest MTU on it (bytes after the Ethernet header).
 
         Returns:
             whether something has to be sealed again for it.
@@ -224,9 +229,9 @@ class Publisher:
         return is_resealed or move is not None
 
     def publish(self, message: bytes) -> int | None:
-        """Queue a message; return how many that makes, or None when there is no reader.
+        """Queue a message; return the count of published messages, or None when there is no reader.
 
-        It is confirmed when ``acknowledged`` has come so far.
+        The message is confirmed when ``acknowledged`` reaches that count.
 
         Raises:
             LocalError: above the limits.
@@ -244,7 +249,7 @@ class Publisher:
         return self.messages
 
     def skip(self, reason: LossReason) -> None:
-        """Count a message that is published to no reader: readers find it missing, and a status says why."""
+        """Count a message that has no reader: readers find it missing, and a Heartbeat gives the reason."""
         self._queue.skip(reason)
         if self._readers:
             self._heartbeats.wanted = True
@@ -273,7 +278,7 @@ class Publisher:
         return True
 
     def connect(self, name: Name, incarnation: int, exchange: bytes, now_s: float) -> None:
-        """Make a reader active that is known without an introduction; an active one is left as it is.
+        """Make a reader active that is known without an introduction; an active one is left unchanged.
 
         Args:
             exchange: its X25519 key.
@@ -284,7 +289,7 @@ class Publisher:
         self._acknowledgements.connect(name, incarnation, exchange, now_s)
 
     def handle_timer(self, now_s: float) -> None:
-        """Suspend silent readers, drop slow ones from the window, and ask those that owe a report."""
+        """Suspend silent readers, drop slow ones from the window, and probe those that owe a report."""
         self._acknowledgements.handle_timer(now_s)
         self._heartbeats.wanted |= self._window.probe_due(now_s)
         self._heartbeats.handle_timer(now_s)

@@ -1,11 +1,12 @@
-"""Who reads a topic, as its publisher knows them by their notes: in which life, and since when they are silent.
+"""Reader proxies of a publisher: its matched readers, their incarnations, and the start of their silence.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds).
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: RTPS 2.5, section 8.4.7.
 
-A note opens under a key that its reader's introduction leads to, so nobody else moves what a reader has confirmed.
+A report opens under a key that depends on its reader's introduction, so no other node can change what a reader has
+confirmed.
 
-A reader that is silent for ``READER_LEASE_S`` is suspended: it may have moved. It is no reader until it reports again,
-and is forgotten ``READER_GRACE_S`` later.
+A reader that is silent for ``READER_LEASE_S`` is suspended: it may have moved. It does not count as a reader until it
+reports again, and is forgotten ``READER_GRACE_S`` later.
 """
 
 from __future__ import annotations
@@ -36,10 +37,10 @@ _SUSPENSION_MAX_LAGS: Final = 16
 
 
 class ReaderTimeouts(NamedTuple):
-    """How long a publisher bears with a reader.
+    """Timeouts of a publisher's readers, in seconds.
 
-    ``lag_s``: one that has not confirmed in this time what another has holds the window no longer; ``quiet_s``: one
-    from whom nothing is heard for this long does not follow; ``idle_s``: a live one reports at least so often.
+    ``lag_s``: a reader that has not confirmed in this time what another has no longer blocks the window. ``quiet_s``: a
+    reader that is silent for this time does not keep up. ``idle_s``: a live reader reports at least this often.
     """
 
     lag_s: float
@@ -52,7 +53,7 @@ CALLS: Final = ReaderTimeouts(CALL_LAG_S, CALL_QUIET_S, CALL_IDLE_S)  # other re
 
 
 class _Life:
-    """What opens the notes of one life of a reader, and which of them were opened."""
+    """Openers of the reports of one incarnation of a reader, and their replay window."""
 
     def __init__(self, topic: Name, source: WriterIdentity, incarnation: int, started: int, exchange: bytes) -> None:
         self.started = started
@@ -64,7 +65,7 @@ class _Life:
         self._openers: dict[bytes, ControlOpener] = {}  # by topic secret
 
     def open(self, header: Header, frame: bytes, secret: bytes, now_s: float) -> bytes:
-        """Return a note's body.
+        """Return a report's body.
 
         Raises:
             EnvelopeError: REPLAYED, MALFORMED or BAD_TAG.
@@ -84,13 +85,13 @@ class _Life:
 
 @dataclass(slots=True)
 class ReaderProxy:
-    """One reader, in one life of its process.
+    """One reader, in one incarnation of its process.
 
     Attributes:
-        life: what opens its notes.
-        sequence: it has confirmed every message before this one, but for ``lost`` of them that it counted as lost.
+        life: opens its reports.
+        sequence: it has confirmed every message before this one, except ``lost`` of them that it counted as lost.
         behind_s: since when its window has been suspended; None: it is not.
-        confirmed: what ``sequence`` was at the end of a former life; 0: not known.
+        confirmed: ``sequence`` at the end of a former incarnation; 0: not known.
     """
 
     incarnation: int
@@ -101,12 +102,12 @@ class ReaderProxy:
     behind_s: float | None = None
     confirmed: int = 0
     start: StreamStart | None = None  # None once it has begun to confirm
-    out_until_s: float = 0.0  # it may not hold the window before
+    out_until_s: float = 0.0  # it must not block the window before
     suspensions: int = 0
 
 
 class ReaderProxies:
-    """The readers of one publisher, by name."""
+    """Readers of one publisher, by name."""
 
     def __init__(self, topic: Name, source: WriterIdentity, patience: ReaderTimeouts = TOPICS) -> None:
         self._topic = topic
@@ -129,7 +130,7 @@ class ReaderProxies:
         return iter(list(self._readers))
 
     def readings(self) -> Iterator[ReaderProxy]:
-        """Return all of them."""
+        """Return all active ones."""
         return iter(self._readers.values())
 
     def names(self) -> list[bytes]:
@@ -145,22 +146,22 @@ class ReaderProxies:
         return [name for name, reading in self._readers.items() if now_s - reading.heard_s > READER_LEASE_S]
 
     def next_silent(self) -> float | None:
-        """Return the monotonic second at which ``silent`` or ``overdue`` has somebody to return, or None."""
+        """Return the monotonic second at which ``silent`` or ``overdue`` is no longer empty, or None."""
         due_s = [reading.heard_s + READER_LEASE_S + 0.001 for reading in self._readers.values()]
         due_s += [each.behind_s + READER_GRACE_S + 0.001 for each in self.all() if each.behind_s is not None]
         return min(due_s, default=None)
 
     def suspend(self, name: bytes, now_s: float) -> None:
-        """Take a silent reader for none, until it reports again or is forgotten."""
+        """Suspend a silent reader, until it reports again or is forgotten."""
         reading = self._suspended[name] = self._readers.pop(name)
         reading.behind_s = now_s if reading.behind_s is None else reading.behind_s
 
     def is_suspended(self, name: bytes) -> bool:
-        """Return whether somebody is a suspended reader."""
+        """Return whether a node is a suspended reader."""
         return name in self._suspended
 
     def resume(self, name: bytes, now_s: float) -> bool:
-        """Take a suspended reader for one again; return whether it was suspended."""
+        """Reactivate a suspended reader; return whether it was suspended."""
         reading = self._suspended.pop(name, None)
         if reading is None:
             return False
@@ -175,23 +176,23 @@ class ReaderProxies:
         return late or list(self._suspended.items())[: max(len(self._suspended) - READERS_MAX, 0)]
 
     def is_quiet(self, name: bytes, now_s: float) -> bool:
-        """Return whether a reader has missed two of its reports: it is not slow, it is not there."""
+        """Return whether a reader has missed two of its reports: it is absent rather than slow."""
         return now_s - self._readers[name].heard_s > 2 * self._patience.idle_s
 
     def is_alive(self, name: bytes, now_s: float, awake_s: float) -> bool:
-        """Return whether somebody is a reader, and was not silent for too long since ``awake_s``."""
+        """Return whether a node is a reader, and was not silent for too long since ``awake_s``."""
         reading = self._readers.get(name)
         return reading is not None and now_s - max(reading.heard_s, awake_s) <= self._patience.quiet_s
 
     def suspend_again(self, name: bytes, now_s: float) -> None:
-        """Have a reader hold no window for a while, each time for longer."""
+        """Exclude a reader from the window for a penalty time, each time for longer."""
         reading = self._readers[name]
         lags = min(_SUSPENSION_MIN_LAGS << reading.suspensions, _SUSPENSION_MAX_LAGS)
         reading.out_until_s = now_s + lags * self._patience.lag_s
         reading.suspensions = min(reading.suspensions + 1, _SUSPENSION_MAX_LAGS)
 
     def know(self, name: bytes, incarnation: int, started: int, exchange: bytes) -> None:
-        """Learn the key of one life of a reader, proven by its introduction or claim.
+        """Note the key of one incarnation of a reader, proven by its introduction or advertisement.
 
         Raises:
             StatementError: MALFORMED, it is no key.
@@ -203,24 +204,24 @@ class ReaderProxies:
                 self._lives.popitem(last=False)
 
     def admit(self, name: bytes, incarnation: int, now_s: float) -> ReaderProxy:
-        """Take somebody who is known for a reader, in place of a former life of his."""
+        """Make a known node a reader, in place of a former incarnation of it."""
         former = self._readers.get(name) or self._suspended.pop(name, None)
         life, confirmed = self._lives[name, incarnation], former.sequence if former else 0
         reading = self._readers[name] = ReaderProxy(incarnation, life, now_s, confirmed=confirmed)
         return reading
 
     def forget(self, name: bytes) -> bool:
-        """Let a reader go, suspended or not; return whether it was one."""
+        """Forget a reader, suspended or not; return whether it was one."""
         return (self._readers.pop(name, None) or self._suspended.pop(name, None)) is not None
 
     def introduce(self, header: Header, frame: bytes, secret: bytes) -> None:
-        """Take the sealed introduction of a reader; of a life that is known nothing is opened.
+        """Process the sealed introduction of a reader; that of a known incarnation is not opened.
 
         Args:
             secret: topic secret of the epoch in use.
 
         Raises:
-            RemoteError: it does not open, does not hold, or is of an earlier life than the reader's present one.
+            RemoteError: it does not open, is invalid, or is of an earlier incarnation than the reader's present one.
         """
         life, source = (header.source, header.incarnation), self._source
         reading = self._reading_of(header.source)
@@ -236,14 +237,14 @@ class ReaderProxies:
     def open(
         self, header: Header, frame: bytes, secret: bytes, now_s: float, *, may_begin: bool
     ) -> tuple[AckNack, bool]:
-        """Return what a reader's sealed report says, and whether that reader, or this life of his, is new.
+        """Return a reader's opened report, and whether that reader, or this incarnation of it, is new.
 
         Args:
-            secret: topic secret of the note's epoch.
-            may_begin: whether who is no reader yet may become one.
+            secret: topic secret of the report's epoch.
+            may_begin: whether a node that is no reader yet may become one.
 
         Raises:
-            RemoteError: it does not open, is a replay, or of a life that did not introduce itself or is over.
+            RemoteError: it does not open, is a replay, or is of an incarnation that is over or was not introduced.
         """
         name = header.source
         reading = self._reading_of(name)

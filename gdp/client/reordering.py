@@ -1,4 +1,4 @@
-"""Reordering buffer of one writer's messages: whole messages wait behind a gap.
+"""Reordering buffer of one writer's messages: complete messages wait behind a gap.
 
 Sans-I/O.
 """
@@ -24,7 +24,7 @@ class ReorderingBuffer:
     """Messages by number, and the number that is delivered next.
 
     Args:
-        budget: memory of all feeds; what waits is reserved there.
+        budget: memory of all writer proxies; waiting messages are reserved there.
 
     Attributes:
         expected: the number that is delivered next.
@@ -48,7 +48,7 @@ class ReorderingBuffer:
         return sorted(self._waiting)
 
     def put(self, joined: ReassembledMessage) -> bool:
-        """Let a message wait; return False where the budget has no room for it."""
+        """Add a message; return False if the budget is exhausted."""
         if not self._budget.reserve(self._publisher, len(joined.message) + _OVERHEAD_BYTES):
             return False
         self._waiting[joined.number] = joined
@@ -62,13 +62,13 @@ class ReorderingBuffer:
             yield joined
 
     def skip_to(self, number: int) -> Iterator[ReassembledMessage]:
-        """Move on to a number; remove and yield what waited before it."""
+        """Advance to a number; remove and yield what waited before it."""
         before = sorted(each for each in self._waiting if each < number)
         self.expected = number
         return iter([self._pop(each) for each in before])
 
     def start_at(self, number: int) -> None:
-        """Expect a first number; what waits too far from it is dropped."""
+        """Set the first expected number; what waits too far from it is dropped."""
         self.expected = number
         for each in [each for each in self._waiting if not 0 <= each - number < REPLAY_WINDOW_MESSAGES]:
             self._pop(each)

@@ -1,7 +1,7 @@
-"""A RIB on the overlay: the RIB's machine with a hold on a switch.
+"""RIB node on the overlay: the RIB's protocol core with an attachment to a switch.
 
-Place: pure; a shell or a simulated network feeds it frames and time. A RIB claims no name: its hello says what it is,
-and its switch says so to all (``control/link_state.py``).
+Sans-I/O; an I/O layer or a simulated network passes it frames and time. A RIB advertises no name: its hello states its
+role, and its switch announces it in its link state (``control/link_state.py``).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ __all__ = ["RibHost"]
 
 
 class RibHost:
-    """The machine of a RIB node."""
+    """Protocol core of a RIB node."""
 
     def __init__(self, identity: Identity, policy: Policy, rib: RibCore, settings: NodeSettings) -> None:
         self._identity = identity
@@ -50,11 +50,11 @@ class RibHost:
         return own + self.attachment.drops + self.rib.refusals
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Timestamps) -> None:
-        """Begin to look for a switch on a port."""
+        """Begin to discover a switch on a port."""
         self.attachment.hello_protocol.add_port(index, mac, mtu, cost, now.mono_s)
 
     def receive(self, arrivals: Sequence[ReceivedFrame], now: Timestamps) -> None:
-        """Take frames in."""
+        """Process received frames."""
         self._now_s = now.mono_s
         statements: list[tuple[bytes, Name]] = []
         for arrival in arrivals:
@@ -70,11 +70,11 @@ class RibHost:
         self._post()
 
     def port_changed(self, port: int, up: bool, now: Timestamps) -> None:
-        """Learn that a port's link came or went."""
+        """Update the state of a port's link."""
         self.attachment.port_changed(port, up, now)
 
     def handle_timer(self, now: Timestamps) -> None:
-        """Do what is due."""
+        """Process the timers that are due."""
         self._now_s = now.mono_s
         self.attachment.handle_timer(now)
         self._note_connection(now)
@@ -93,7 +93,7 @@ class RibHost:
         return self.attachment.hello_protocol.poll_addresses()
 
     def frames_to_send(self) -> list[OutgoingFrames]:
-        """Return, once, what is to be sent."""
+        """Return, once, the frames to send."""
         return self.attachment.frames_to_send()
 
     def _take(self, arrival: ReceivedFrame, now: Timestamps) -> list[tuple[bytes, Name]]:
@@ -134,12 +134,12 @@ class RibHost:
     def _post(self) -> None:
         letters = self.rib.statements_to_send()
         if self.attachment.switch is None:
-            return  # nobody to carry them: whoever asked will ask again
+            return  # no switch carries them: the querying node will query again
         for outgoing in letters:
             if outgoing.kind is Kind.RIB_REQUEST:
                 self._channels.ask(outgoing.to, outgoing.statement, self._now_s)
             elif not self._channels.send_response(outgoing.to, outgoing.statement):
-                self._send(outgoing.kind, outgoing.statement, outgoing.to)  # a question about presence, to any switch
+                self._send(outgoing.kind, outgoing.statement, outgoing.to)  # a presence query, to any switch
         for each in self._channels.records_to_send():
             self._send(Kind.RIB_ANSWER if each.is_answer else Kind.RIB_REQUEST, each.wire, each.to)
 

@@ -6,10 +6,9 @@ A message passes up to three stages::
 
     deferred (latched, before the first reader) -> gathered (small, waits for its bundle) -> sealed (window or queue)
 
-A message is sealed once. Where the path has become too narrow for what is cached, that is refragmented, and all that is
-cached gets new numbers; statuses announce which (``gdp/message/renumbering.py``). Each message has a sequence number
-under its
-seal, sent or not (``gdp/message/ledger.py``).
+A message is sealed once. If the path becomes too narrow for a cached message, it is refragmented, and everything cached
+gets new numbers. Heartbeats announce the new numbers (``gdp/message/renumbering.py``). Each message has a sequence
+number under its seal, sent or not (``gdp/message/ledger.py``).
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ _BUNDLE: Final = int(Flag.BUNDLE)
 
 
 class SendQueue:
-    """The messages of one writer, from the call that publishes them to their frames.
+    """Messages of one writer, from the call that publishes them to their frames.
 
     Args:
         keys: seals the frames.
@@ -99,7 +98,7 @@ class SendQueue:
 
     @property
     def sent(self) -> tuple[int, int]:
-        """Return the message number and the part before which everything has been sent."""
+        """Return the message number and the fragment before which everything has been sent."""
         if self.is_acknowledged:
             return self._window.sent
         best_effort_queue = self._best_effort.oldest
@@ -137,7 +136,7 @@ class SendQueue:
             self._seal_next()
 
     def skip(self, reason: LossReason) -> None:
-        """Use up a sequence number for a message that nobody gets."""
+        """Use up a sequence number for a message that no reader gets."""
         self.seal_gathered()
         sequence = self.ledger.next()
         self.ledger.lose(sequence, sequence, reason)
@@ -210,13 +209,16 @@ class SendQueue:
         return self._window.sent[0] < self.next_number if self.is_acknowledged else bool(self._best_effort)
 
     def _bundle_room(self) -> int:
-        """Return the largest bundle in bytes: one frame on a best-effort topic, which loses all of it with one part."""
+        """Return the largest bundle in bytes.
+
+        On a best-effort topic it is one frame, because the loss of one fragment loses the whole bundle.
+        """
         if self.is_acknowledged or self.mtu is None:
             return self.bundle_bytes
         return min(self.bundle_bytes, part_room(self.mtu) - SIGNATURE_BYTES - SEQUENCE_BYTES)
 
     def _seal_next(self) -> None:
-        """Seal as much of what was gathered as fits into one bundle."""
+        """Seal the part of the gathered messages that fits into one bundle."""
         first, together = self._gathered.first, self._gathered.poll_batch(self._bundle_room())
         self._seal_message(together[0] if len(together) == 1 else pack(together), first, len(together))
 

@@ -1,6 +1,6 @@
-"""Whose frames leave next, of the publishers of one member that may have some.
+"""Send scheduler of a participant: the order in which its publishers send; urgent first, then round robin.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds).
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: Linux ``sch_prio``.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from gdp.client.publisher import Publisher
 
 __all__ = ["BYTES_AT_ONCE", "BYTES_BESIDE_URGENT", "SendScheduler"]
 
-BYTES_AT_ONCE: Final = 96 << 10  # of what is not urgent, before anything else has its turn
-BYTES_BESIDE_URGENT: Final = 64 << 10  # ... where there is an urgent topic: it may have to wait for so much
+BYTES_AT_ONCE: Final = 96 << 10  # of ordinary frames, before any other publisher has its turn
+BYTES_BESIDE_URGENT: Final = 64 << 10  # ... with an urgent topic, whose frames may have to wait for this amount
 
 
 class SendScheduler:
-    """Publishers with something to send; urgent ones first, the others in turn.
+    """Publishers with frames to send; urgent ones first, the others in turn.
 
     Args:
-        asked: told of each publisher that was asked for frames.
+        asked: called with each publisher whose frames were polled.
     """
 
     def __init__(self, asked: Callable[[Publisher], None]) -> None:
@@ -33,7 +33,7 @@ class SendScheduler:
         return bool(self._urgent or self._ordinary)
 
     def add(self, publisher: Publisher) -> None:
-        """Note that a publisher may have something to send; one that waits for its turn keeps its place."""
+        """Note that a publisher may have frames; one that already waits for its turn keeps its position."""
         if publisher.is_urgent:
             self._at_once = BYTES_BESIDE_URGENT
             self._urgent[publisher] = None
@@ -41,7 +41,7 @@ class SendScheduler:
             self._ordinary[publisher] = None
 
     def poll_turn(self, now_s: float) -> list[list[bytes]]:
-        """Return the frames that leave now, those of a kind together; who has no more waits for no turn."""
+        """Return the frames that leave now, urgent and ordinary ones apart; an empty publisher leaves the queue."""
         urgent = [frame for publisher in list(self._urgent) for frame in self._ask(publisher, self._urgent, now_s)]
         urgent_bytes = sum(map(len, urgent))
         if 0 < urgent_bytes < self._at_once // 2:

@@ -1,7 +1,7 @@
-"""Where the publishers of one life ended, so that whoever goes on with the same begins above.
+"""Last used sequence numbers of ended publishers, so that a later publisher of the same topic begins above them.
 
-Place: pure. A number that comes twice under one key is a nonce that comes twice. What is forgotten here, for there is
-too much of it, raises the number at which everything unknown begins.
+Sans-I/O. A number that is used twice under one key is a nonce that is used twice. The registry is bounded. An evicted
+entry raises the number at which every unknown topic begins.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ SEQUENCE_REGISTRY_MAX: Final = 4_096
 
 
 class SequenceState(NamedTuple):
-    """The next number of a message, the last of a status, and the last sequence number of a message."""
+    """The next number of a message, the last of a Heartbeat, and the last sequence number of a message."""
 
     next_number: int = 1
     status_number: int = 0
@@ -28,7 +28,7 @@ FIRST: Final = SequenceState()
 
 
 class SequenceRegistry:
-    """The pasts of what is not published now, by topic."""
+    """Last numbers of topics that are not published now."""
 
     def __init__(self, maximum: int = SEQUENCE_REGISTRY_MAX) -> None:
         self._of: OrderedDict[Name, SequenceState] = OrderedDict()
@@ -39,7 +39,7 @@ class SequenceRegistry:
         return len(self._of)
 
     def put(self, topic: Name, past: SequenceState) -> None:
-        """Keep a past."""
+        """Store the last numbers of a topic."""
         self._of[topic] = past
         self._of.move_to_end(topic)
         if len(self._of) > self._maximum:
@@ -47,5 +47,5 @@ class SequenceRegistry:
             self._floor = SequenceState(*map(max, self._floor, gone))
 
     def of(self, topic: Name) -> SequenceState:
-        """Return where whoever publishes a topic now is to go on."""
+        """Return the numbers above which a publisher of a topic begins now."""
         return self._of.get(topic, self._floor)

@@ -1,10 +1,11 @@
-"""What a member hears on its names, and from whom: a feed for each party whose claim holds.
+"""Subscriptions of a participant: the names that it reads, with a writer proxy for each accepted advertiser.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds).
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
-Whose word counts is decided here, by the claim that the switch hands on and this member verifies itself: a reader hears
-who publishes, a server who calls, a client who serves. What a server answers one client, or a client asks one server,
-comes by a second feed from the same party, made when something does.
+This module decides which peers are accepted. The switch forwards an advertisement, and this participant verifies it
+itself. A reader accepts publishers, a server accepts callers, a client accepts servers. A server's responses to one
+client, and a client's requests to one server, use a second writer proxy of the same party. It is created with its first
+frame.
 """
 
 from __future__ import annotations
@@ -36,15 +37,15 @@ from gdp.trust.verifier import AdvertisementVerifier
 
 __all__ = ["Message", "StreamChanges", "Subscription", "Subscriptions", "Topic"]
 
-ENDED_MAX: Final = 4_096  # closed feeds whose end is remembered
-ABSENT_MAX: Final = 1_024  # publishers of one topic that went, and may come back
+ENDED_MAX: Final = 4_096  # closed writer proxies whose end is remembered
+ABSENT_MAX: Final = 1_024  # publishers of one topic that went, and may return
 _NOWHERE: Final = Ended()
 
 
 class Message(NamedTuple):
-    """A message that arrived, and what its publisher says the topic's messages are.
+    """A message that arrived, and its publisher's description of the topic's messages.
 
-    ``private``: a server's answer, or a client's request to one server; for nobody else.
+    ``private``: a server's response, or a client's request to one server; for this participant alone.
     """
 
     topic: Name
@@ -55,7 +56,7 @@ class Message(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """A name with what this member may do with it, and the topic's secrets by epoch."""
+    """A name with this participant's rights on it, and the topic's secrets by epoch."""
 
     delegation: Delegation
     secrets: Secrets
@@ -68,12 +69,12 @@ class Topic:
 
 @dataclass(slots=True)
 class Subscription:
-    """One name that is heard, by which right, and the feeds of it.
+    """One name that is read, the right of its peers, and its writer proxies.
 
     Attributes:
         private: by writer.
-        absent: publishers whose route has ended, in which life, and where their feeds were.
-        past_losses: of feeds that are gone.
+        absent: publishers whose route has ended, with their incarnation, and where their writer proxies ended.
+        past_losses: of closed writer proxies.
     """
 
     topic: Topic
@@ -84,7 +85,7 @@ class Subscription:
     past_losses: Losses = field(default_factory=Losses)
 
     def losses(self) -> Losses:
-        """Return what was lost of everything that is heard on this name."""
+        """Return what was lost of everything that is read on this name."""
         losses = Losses()
         losses.update(self.past_losses)
         for writer_proxy in self.all():
@@ -92,17 +93,17 @@ class Subscription:
         return losses
 
     def forget_absent(self, party: Name, why: LossReason) -> None:
-        """Expect nothing any more of a life of a publisher that went; what is known to lack of it is lost."""
+        """Forget an incarnation of an absent publisher; its messages that are known to be missing count as lost."""
         _, ended = self.absent.pop(party)
         if ended.sequence < ended.known:
             self.past_losses.add(LostRange(ended.sequence, ended.known - 1, why))
 
     def all(self) -> list[WriterProxy]:
-        """Return every feed."""
+        """Return every writer proxy."""
         return [*self.writer_proxies.values(), *self.private.values()]
 
     def poll_messages(self, source: Name) -> list[Message]:
-        """Return, once, the messages of one source; private ones not before it has said what they are."""
+        """Return, once, the messages of one source; unicast ones only once the source has sent their description."""
         writer_proxy, topic = self.writer_proxies.get(source), self.topic.name
         if writer_proxy is None:
             return []
@@ -114,7 +115,7 @@ class Subscription:
 
 
 class _UnicastRoute(NamedTuple):
-    """By which a party may say something to us alone."""
+    """Route by which a party may send to us alone."""
 
     subscription: Subscription
     stream: Name
@@ -122,7 +123,7 @@ class _UnicastRoute(NamedTuple):
 
 
 class StreamChanges(NamedTuple):
-    """Feeds that began, and that are to be closed: no frame finds them any more; and the last messages of these."""
+    """Writer proxies that began; those to close, which get no further frames; and the last messages of these."""
 
     opened: list[WriterProxy]
     ended: list[WriterProxy]
@@ -130,10 +131,10 @@ class StreamChanges(NamedTuple):
 
 
 class Subscriptions:
-    """All that one member hears.
+    """All subscriptions of one participant.
 
     Args:
-        reader: the member.
+        reader: the participant.
     """
 
     def __init__(self, reader: ReaderIdentity, verifier: AdvertisementVerifier) -> None:
@@ -141,10 +142,10 @@ class Subscriptions:
         self._verifier = verifier
         self._budget = ReassemblyQuota()
         self._by_name: dict[Name, Subscription] = {}
-        self._ways: dict[tuple[bytes, int], _UnicastRoute] = {}  # by writer and incarnation, as headers have them
+        self._ways: dict[tuple[bytes, int], _UnicastRoute] = {}  # by writer and incarnation, as in frame headers
         self._ended: Lru[Ended] = Lru(ENDED_MAX)
-        self.drops: Counter[DropReason] = Counter()  # of feeds that are gone, and of claims
-        self._past_losses: Counter[LossReason] = Counter()  # on names that are heard no more
+        self.drops: Counter[DropReason] = Counter()  # of closed writer proxies, and of advertisements
+        self._past_losses: Counter[LossReason] = Counter()  # on names that are no longer read
 
     def __iter__(self) -> Iterator[Subscription]:
         return iter(self._by_name.values())
@@ -159,15 +160,15 @@ class Subscriptions:
         return sum((each.losses().counts for each in list(self._by_name.values())), self._past_losses)
 
     def get(self, name: Name) -> Subscription | None:
-        """Return what is heard on a name, or None."""
+        """Return the subscription of a name, or None."""
         return self._by_name.get(name)
 
     def add(self, topic: Topic, right: Right) -> None:
-        """Hear others on a name from now on."""
+        """Read a name from now on."""
         self._by_name[topic.name] = Subscription(topic, right)
 
     def remove(self, name: Name) -> list[WriterProxy]:
-        """Hear nobody on a name any more; return the feeds that are to be closed."""
+        """Stop reading a name; return the writer proxies to close."""
         subscription = self._by_name.pop(name, None)
         if subscription is None:
             return []
@@ -176,7 +177,7 @@ class Subscriptions:
         return ended
 
     def find(self, header: Header, now_s: float) -> tuple[Subscription, WriterProxy] | None:
-        """Return whose frame this is, if it is anybody's."""
+        """Return the subscription and writer proxy of a frame, or None."""
         subscription = self._by_name.get(header.destination)  # type: ignore[call-overload]
         if subscription is not None:
             writer_proxy = subscription.writer_proxies.get(header.source)
@@ -187,10 +188,10 @@ class Subscriptions:
         return None if way is None else (way.subscription, self._private_writer_proxy(way, Name(header.source), now_s))
 
     def receive_response(self, answer: Response, now: Timestamps) -> StreamChanges:
-        """Take what the switch says of somebody: its claim, or that it is gone.
+        """Process a switch's response about a party: its advertisement, or its end.
 
         Raises:
-            StatementError: the claim does not hold, is about something else, or newer than what is gone.
+            StatementError: the advertisement is invalid or about something else, or the end is of an older one.
         """
         subscription, change = self._by_name.get(answer.name), StreamChanges([], [], [])
         if subscription is None or answer.advertiser == self._reader.name:
@@ -219,7 +220,7 @@ class Subscriptions:
         return change._replace(opened=self._open(subscription, advertisement, now.mono_s))
 
     def has_issuer(self, key: bytes) -> bool:
-        """Return whether a claim that is heard rests on a certificate that this key, 33 bytes, issued."""
+        """Return whether an accepted advertisement depends on a certificate that this key, 33 bytes, issued."""
         writer_proxies = (
             writer_proxy
             for subscription in self._by_name.values()
@@ -231,7 +232,7 @@ class Subscriptions:
         )
 
     def recheck(self, fingerprint: bytes, unix_s: float) -> list[WriterProxy]:
-        """Return the feeds that are to be closed, for their party's claim rested on what was revoked."""
+        """Return the writer proxies to close, because their party's advertisement depended on what was revoked."""
         ended: list[WriterProxy] = []
         for subscription in self._by_name.values():
             for writer_proxy in list(subscription.writer_proxies.values()):
@@ -245,7 +246,7 @@ class Subscriptions:
         return ended
 
     def leave(self) -> list[WriterProxy]:
-        """Return all feeds, which are to be closed."""
+        """Return all writer proxies, for the caller to close."""
         return [writer_proxy for subscription in self._by_name.values() for writer_proxy in self._end_all(subscription)]
 
     def _open(self, subscription: Subscription, advertisement: Advertisement, now_s: float) -> list[WriterProxy]:
@@ -282,7 +283,7 @@ class Subscriptions:
         return [writer_proxy]
 
     def _private_writer_proxy(self, way: _UnicastRoute, writer: Name, now_s: float) -> UnicastReceiver:
-        """Return what a party says to us alone."""
+        """Return the receiver of a party's unicast stream to us."""
         subscription = way.subscription
         writer_proxy = subscription.private.get(writer)
         if writer_proxy is None:
@@ -300,7 +301,7 @@ class Subscriptions:
         return writer_proxy
 
     def _stream_from(self, topic: Name, writer_proxy: WriterProxy) -> Name:
-        """Return the name of the stream by which the publisher of a feed says something to us alone."""
+        """Return the name of the stream by which a writer proxy's publisher sends to us alone."""
         reader = PeerIncarnation(self._reader.name, self._reader.incarnation)
         return private_name(topic, PeerIncarnation(writer_proxy.publisher, writer_proxy.incarnation), reader)
 
@@ -314,7 +315,7 @@ class Subscriptions:
         ]
 
     def _detach(self, subscription: Subscription, party: Name) -> list[WriterProxy]:
-        """End the feeds of a party that may come back, in this life or another."""
+        """End the writer proxies of a party that may return, in this incarnation or another."""
         writer_proxy = subscription.writer_proxies[party]
         if writer_proxy.ended.sequence:
             subscription.absent[party] = writer_proxy.incarnation, writer_proxy.ended._replace(resumes=True)

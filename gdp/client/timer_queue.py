@@ -1,9 +1,9 @@
-"""When each of many is due next, without asking them all: a look costs what those that were touched cost.
+"""Timer queue with lazy rescheduling: the cost of a check is proportional to the timers that changed.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds).
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: Linux hrtimer.
 
-Each stands in a heap under a time no later than its own. One that is put off stays where it is until its place comes
-up; one that is due sooner gets a second place, and the first is void.
+Each object has a heap entry at a time no later than its timer. An object whose timer moves later keeps its entry until
+that comes up. An object that is due sooner gets a second entry, and the first becomes void.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _NEVER: Final = float("inf")
 
 
 class HasTimer(Protocol):
-    """What has a timer."""
+    """An object that has a timer."""
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of its next timer, or None."""
@@ -29,17 +29,17 @@ T = TypeVar("T", bound=HasTimer)
 
 
 class TimerQueue(Generic[T]):
-    """The timers of many."""
+    """Timers of many objects."""
 
     def __init__(self) -> None:
-        self._touched: dict[T, None] = {}  # in order, so that a run can be played back
+        self._touched: dict[T, None] = {}  # in order, so that a run is reproducible
         self._due_s: dict[T, float] = {}
-        self._place_s: dict[T, float] = {}  # where it stands in the heap
+        self._place_s: dict[T, float] = {}  # time of its valid heap entry
         self._heap: list[tuple[float, int, T]] = []
         self._order = count()
 
     def reschedule(self, each: T) -> None:
-        """Note that one may be due at another time than before."""
+        """Note that an object may be due at another time than before."""
         self._touched[each] = None
 
     def next_due(self) -> float | None:
@@ -58,7 +58,7 @@ class TimerQueue(Generic[T]):
         return None
 
     def poll_due(self, now_s: float) -> list[T]:
-        """Return those that are due; each is asked anew after that."""
+        """Return the objects that are due; the next check reads their timers again."""
         taken: list[T] = []
         while (due_s := self.next_due()) is not None and due_s <= now_s:
             each = heapq.heappop(self._heap)[2]

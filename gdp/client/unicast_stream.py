@@ -1,13 +1,13 @@
-"""A private stream: what a server answers to one client, or a client asks one server; by unicast, reliable, in order.
+"""Unicast stream: a server's responses to one client, or a client's requests to one server; reliable and in order.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds).
-Source: docs/explanation/design.md, section 6
-("answers return by unicast"). It is an ordinary stream, but for three things:
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: docs/explanation/design.md, section 6 ("answers return
+by unicast"). It is an ordinary stream, with three differences:
 
-- its frames are addressed to the reader, so any switch finds their way;
-- a name that both ends derive from who they are, in this life, stands for the topic in keys and notes, and the header's
-  incarnation is derived from that: a later life of either end shares nothing with it;
-- nobody introduces himself. The writer knows its one reader by that one's claim, and the reader expects number 1.
+- Its frames are addressed to the reader, so any switch can route them.
+- A name that both ends derive from their incarnations replaces the topic in keys and reports. The header's incarnation
+  is derived from that name: a later incarnation of either end shares nothing with it.
+- There are no introductions. The writer knows its one reader by that reader's advertisement, and the reader expects
+  number 1.
 """
 
 from __future__ import annotations
@@ -49,29 +49,29 @@ class PeerIncarnation(NamedTuple):
 
 
 class Party(NamedTuple):
-    """A life of a node that is heard, and the X25519 key that its claim names."""
+    """Incarnation of a connected node, and the X25519 key that its advertisement names."""
 
     life: PeerIncarnation
     exchange: bytes
 
 
 def private_name(service: Name, writer: PeerIncarnation, reader: PeerIncarnation) -> Name:
-    """Return the name of what one says to another on a service's name; the other way is another stream."""
+    """Return the name of the stream from one party to another on a service's name; the reverse is another stream."""
     ends = b"".join(name + incarnation.to_bytes(8, "big") for name, incarnation in (writer, reader))
     return Name(hashlib.sha256(b"gdp-private-1" + service + ends).digest())
 
 
 def private_incarnation(name: Name) -> int:
-    """Return what stands as the source's incarnation in a private stream's headers."""
+    """Return the source incarnation in the headers of a unicast stream."""
     return int.from_bytes(hashlib.sha256(b"gdp-private-incarnation-1" + name).digest()[:8], "big")
 
 
 class UnicastStream(Publisher):
-    """The writer's end.
+    """Writer's end of a unicast stream.
 
     Args:
         writer: its source for all readers.
-        mtu: smallest on the way; None where that is not known yet.
+        mtu: smallest on the path; None if not known yet.
         past: of the same stream, if it was forgotten.
     """
 
@@ -110,7 +110,7 @@ class UnicastStream(Publisher):
         self.connect(*self.reader, self._exchange, now_s)
 
     def receive_acknack(self, header: Header, frame: bytes, now_s: float) -> bool:
-        """Take the reader's report; a silent one is a reader again by that."""
+        """Process the reader's report, which reactivates a silent reader."""
         is_taken = super().receive_acknack(header, frame, now_s)
         if is_taken:
             self.touch(now_s)
@@ -122,16 +122,16 @@ class UnicastStream(Publisher):
 
 
 class UnicastReceiver(WriterProxy):
-    """The reader's end.
+    """Reader's end of a unicast stream.
 
-    It is made for the first frame that comes, lost ones before that are asked for. What it brings is handed on when it
-    is known what its writer's messages are, and until then not much is taken.
+    It is created for the first frame that arrives; frames lost before that are requested. Its messages are delivered
+    once the description of its writer is known. Until then only few are accepted.
 
     Args:
         name: of the stream.
-        public: what the same writer says to all.
+        public: the writer proxy of the same writer's stream to all.
         verifier: of the writer's signatures.
-        ended: where the same stream ended before, in this life.
+        ended: where the same stream ended before, in this incarnation.
     """
 
     def __init__(
@@ -162,7 +162,7 @@ class UnicastReceiver(WriterProxy):
         )
 
     def receive(self, header: Header, frame: bytes, now_s: float) -> None:
-        """Process one DATA or STATUS frame of this writer; one that is refused is requested again."""
+        """Process one DATA or HEARTBEAT frame of this writer; one that is refused is requested again."""
         if self._public.state is WriterProxyState.NEW and self.delivered_bytes >= FLIGHT_START_BYTES:
             self.refuse(DropReason.MEMORY_FULL)
         else:

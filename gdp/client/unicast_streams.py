@@ -1,6 +1,6 @@
-"""What one node says on one name to each of the others alone: which streams there are, and which it may forget.
+"""Unicast streams of one node on one name: one for each peer, and the choice of those to forget.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds).
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ class UnicastStreams:
     """A server's streams to its clients, or a client's to its servers.
 
     Args:
-        urgent: whether what they carry goes before what is not.
-        pasts: of what was forgotten; shared by all that this life publishes.
-        published: told of each stream that has something to send.
+        urgent: whether their frames go before those that are not urgent.
+        pasts: last numbers of forgotten streams; shared by all publishers of this incarnation.
+        published: called with each stream that has frames to send.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class UnicastStreams:
         self._urgent = urgent
         self._streams: dict[Name, UnicastStream] = {}  # by reader
         self._look_at_s = 0.0  # no stream is idle for long enough before
-        self._drops: Counter[DropReason] = Counter()  # of streams that are gone
+        self._drops: Counter[DropReason] = Counter()  # of closed streams
         self._losses: Counter[LossReason] = Counter()
 
     def __iter__(self) -> Iterator[UnicastStream]:
@@ -66,25 +66,25 @@ class UnicastStreams:
 
     @property
     def losses(self) -> Counter[LossReason]:
-        """Return how many messages a reader did not get, as far as it is known here, by reason."""
+        """Return how many messages a reader did not get, as far as known here, by reason."""
         return sum((stream.losses.counts for stream in self), self._losses)
 
     def is_about(self, stream: bytes, reader: PeerIncarnation) -> bool:
-        """Return whether this is the name of the stream to a reader, whether there is one or not."""
+        """Return whether this is the name of the stream to a reader, existing or not."""
         known = self._streams.get(reader.name)
         return stream == (known.topic if known is not None else self._name_of(reader))
 
     def get(self, reader: PeerIncarnation) -> UnicastStream | None:
-        """Return the stream to a life of a reader, or None."""
+        """Return the stream to an incarnation of a reader, or None."""
         stream = self._streams.get(reader.name)
         return stream if stream is not None and stream.reader == reader else None
 
     def stream(self, party: Party, mtu: int | None, now_s: float) -> UnicastStream:
-        """Return the stream to a reader, made if it is not there.
+        """Return the stream to a reader, created if there is none.
 
         Args:
-            party: the reader, one that is heard.
-            mtu: smallest on the way to all of them; None where that is not known yet.
+            party: the reader, one that is connected.
+            mtu: smallest on the path to all of them; None if not known yet.
 
         Raises:
             LocalError: there are too many, all of them in use.
@@ -109,7 +109,7 @@ class UnicastStreams:
         return stream
 
     def forget(self, reader: PeerIncarnation) -> None:
-        """Let go of the stream to a reader, if there is one; another to the same life goes on above its numbers."""
+        """Drop the stream to a reader, if any; a later one to the same incarnation continues above its numbers."""
         stream = self._streams.get(reader.name)
         if stream is not None and stream.reader == reader:
             del self._streams[reader.name]
@@ -119,20 +119,20 @@ class UnicastStreams:
             self._losses += stream.losses.counts
 
     def forget_idle(self, now_s: float) -> None:
-        """Let go of streams that nobody has read or written for long."""
+        """Drop streams that have been idle for ``IDLE_S``."""
         if now_s >= self._look_at_s:
             self._look_at_s = now_s + IDLE_S / 4
             for reader in [stream.reader for stream in self if stream.is_idle(now_s)]:
                 self.forget(reader)
 
     def renew(self, secrets: Secrets, now_s: float) -> None:
-        """Take the service's secrets anew."""
+        """Replace the service's secrets."""
         self._secrets = secrets
         for stream in self:
             stream.renew(secrets, now_s)
 
     def close(self) -> None:
-        """Say nothing any more."""
+        """Close all streams."""
         for reader in [stream.reader for stream in self]:
             self.forget(reader)
 

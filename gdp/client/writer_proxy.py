@@ -1,14 +1,17 @@
-"""One publisher of one topic as a reader sees it (a writer proxy in RTPS).
+"""Writer proxy: the state that a reader keeps for one publisher of one topic (RTPS 2.5, section 8.4.10).
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
-A feed begins ``NEW``: it introduces itself until a status says where to begin and what messages are. ``LIVE`` it
-delivers: a reliable topic in order and complete, a best-effort one in order and never waiting.
+A writer proxy begins ``NEW``: it sends introductions until a Heartbeat brings its start and the description. When
+``LIVE`` it delivers: a reliable topic in order and complete, a best-effort one in order and without waiting.
 
-It joins the reassembly of ``gdp/message/reassembly.py`` with ``reordering.py`` (what waits behind a gap),
-``delivery.py``
-(messages in order, and losses), ``ack_nack_schedule.py`` (when a report is due) and ``ack_nack_sealer.py`` (under which
-keys it is sealed).
+It joins five parts:
+
+- ``gdp/message/reassembly.py``: reassembly of the fragments;
+- ``reordering.py``: messages that wait behind a gap;
+- ``delivery.py``: messages in order, and losses;
+- ``ack_nack_schedule.py``: when a report is due;
+- ``ack_nack_sealer.py``: the keys under which it is sealed.
 """
 
 from __future__ import annotations
@@ -47,21 +50,22 @@ _WAITING: Final = int(Flag.RELIABLE | Flag.LATCHED)  # topics whose readers wait
 
 
 class WriterProxyState(Enum):
-    """How far a feed is."""
+    """State of a writer proxy."""
 
     NEW = "new"
     LIVE = "live"
 
 
 class Ended(NamedTuple):
-    """Where a feed ended, for another one of the same: what came before is not opened again.
+    """Where a writer proxy ended, for a later one of the same publisher: earlier frames are not opened again.
 
     Args:
         number: of the next message.
-        status: the highest seen.
+        status: number of the newest Heartbeat seen.
         sequence: of the next message.
-        known: the first sequence number of which nothing is known: what lies between was published, and did not come.
-        resumes: the feed ended without its reader's will: what it misses meanwhile is lost, and asked for again.
+        known: the first sequence number of unknown fate: messages between the two were published, and did not arrive.
+        resumes: the writer proxy ended without its reader's will: what it misses meanwhile is lost, and requested
+            again.
     """
 
     number: int = 0
@@ -75,20 +79,20 @@ _NOT_BEGUN: Final = Ended()
 
 
 class WriterProxy:
-    """Reads one incarnation of one publisher of a topic.
+    """Reader's state of one incarnation of one publisher of a topic.
 
     Args:
-        exchange: the publisher's X25519 key, as its claim names it.
-        budget: memory of all feeds.
-        ended: where an earlier feed of the same ended. A latched topic's last messages come again all the same, as its
-            publisher says in a new status, unless this feed resumes that one.
+        exchange: the publisher's X25519 key, as its advertisement names it.
+        budget: memory of all writer proxies.
+        ended: where an earlier writer proxy of the same ended. A latched topic's last messages come again, as its
+            publisher announces in a new Heartbeat, unless this writer proxy resumes that one.
         restarted: this reader read another incarnation of the publisher before: what was published in this one is lost.
-        introduces: the publisher learns the reader's key by an introduction, and says where to begin. Else it knows
-            the key already, and the feed is reliable and begins at the first message.
+        introduces: the publisher gets the reader's key by an introduction, and announces where to begin. Else it knows
+            the key already, and the stream is reliable and begins at the first message.
 
     Attributes:
-        claim: newest claim of the publisher.
-        description: what the publisher says that its messages are.
+        advertisement: newest advertisement of the publisher.
+        description: the publisher's description of its messages.
 
     Raises:
         StatementError: MALFORMED, ``exchange`` is no key.
@@ -118,7 +122,7 @@ class WriterProxy:
         self._secrets = secrets
         self._before = ended
         self._is_restarted = restarted
-        self._described = 0  # by which status
+        self._described = 0  # number of the Heartbeat that brought it
         self._openers: dict[tuple[int, int], Opener] = {}
         self._sealer = AckNackSealer(
             topic=topic,
@@ -138,7 +142,7 @@ class WriterProxy:
         self._order = ReorderingBuffer(publisher, budget)
         self._delivery = DeliveryQueue(publisher, incarnation, self._data.drops)
         self._is_reliable: bool | None = None
-        self._sent = (0, 0)  # the publisher has sent everything before this (number, part)
+        self._sent = (0, 0)  # the publisher has sent everything before this (number, fragment)
         self.state = WriterProxyState.NEW
         self.description = b""
         self.advertisement: Advertisement | None = None
@@ -183,7 +187,7 @@ class WriterProxy:
 
     @property
     def ended(self) -> Ended:
-        """Return where it is, for one that goes on after it."""
+        """Return where it ended, for a later one that continues after it."""
         before, delivery = self._before, self._delivery
         status = max(self._status.window.top, before.status)
         if self.state is WriterProxyState.NEW:
@@ -192,7 +196,7 @@ class WriterProxy:
         return Ended(number, status, delivery.sequence, known)
 
     def finish(self) -> None:
-        """Deliver what is complete, and count what is known to lack: this incarnation publishes no more."""
+        """Deliver what is complete, and count what is known to be missing: this incarnation publishes no more."""
         if self.state is WriterProxyState.LIVE:
             delivery = self._delivery
             delivery.skipped = LossReason.PUBLISHER_RESTARTED
@@ -205,7 +209,7 @@ class WriterProxy:
         self._data.drops[reason] += 1
 
     def receive(self, header: Header, frame: bytes, now_s: float) -> None:
-        """Process one DATA or STATUS frame of this publisher."""
+        """Process one DATA or HEARTBEAT frame of this publisher."""
         if header.incarnation != self.incarnation:
             self._data.drops[DropReason.WRONG_INCARNATION] += 1
         elif header.kind == Kind.HEARTBEAT and header.number <= self._before.status:
@@ -227,7 +231,7 @@ class WriterProxy:
         return taken
 
     def handle_timer(self, now_s: float) -> None:
-        """Release what waited too long for its parts (best effort)."""
+        """Drop what waited too long for its fragments (best effort)."""
         is_final = self.state is WriterProxyState.LIVE and not self._is_reliable
         self._data.drop_expired(now_s, for_good=is_final)
         self._status.drop_expired(now_s, for_good=False)
@@ -238,7 +242,7 @@ class WriterProxy:
         return min([self._schedule.due_s, *(expiry for expiry in expiries if expiry is not None)])
 
     def control_to_send(self, now_s: float) -> list[bytes]:
-        """Return the frames of the report that is due, if one is, and of an introduction where it is wanted."""
+        """Return the frames of the report that is due, if one is, and of an introduction if it is wanted."""
         schedule = self._schedule
         if now_s < schedule.due_s:
             return []
@@ -258,7 +262,7 @@ class WriterProxy:
         return self._delivery.poll()
 
     def close(self) -> bytes:
-        """Release all memory; return the frame that says goodbye."""
+        """Release all memory; return the frame of the goodbye."""
         self._data.close()
         self._status.close()
         self._order.drain()
@@ -268,7 +272,7 @@ class WriterProxy:
         )
 
     def renew(self, secrets: Secrets) -> None:
-        """Replace the topic's secrets; what is sealed under an epoch that is still among them opens as before."""
+        """Replace the topic's secrets; an epoch that is still among them opens as before."""
         self._secrets = secrets
         self._openers.clear()
         self._sealer.renew(secrets)
@@ -306,11 +310,12 @@ class WriterProxy:
             reassembler.drops[DropReason.MEMORY_FULL] > refused and self.state is WriterProxyState.LIVE and self._order
         ):
             self._delivery.skipped = LossReason.READER_MEMORY
-            self._skip_to(self._order.numbers[0])  # what waits behind the gap leaves no room to fill it: go on without
+            # the memory behind the gap is exhausted: go on without the missing messages
+            self._skip_to(self._order.numbers[0])
             self._deliver()
 
     def _arrange(self, joined: ReassembledMessage) -> None:
-        """Order a complete message, and deliver what is next."""
+        """Order a complete message, and deliver the consecutive ones."""
         order, delivery = self._order, self._delivery
         if self.state is WriterProxyState.LIVE and (not self._is_reliable or joined.number == order.expected):
             if joined.number > order.expected:
@@ -330,7 +335,7 @@ class WriterProxy:
             self._deliver()
 
     def _missing(self) -> tuple[MissingRange, ...]:
-        """Return what is known to be lacking: gaps below the newest part, and all that a status announced."""
+        """Return what is known to be missing: gaps below the newest fragment, and all that a Heartbeat announced."""
         missing: list[MissingRange] = []
         sent_number, sent_part = self._sent
         end = max(self._data.highest + 1, sent_number + (sent_part > 0))
@@ -378,7 +383,7 @@ class WriterProxy:
         self._schedule.due_s = now_s
 
     def _begin(self, status: Heartbeat, start: StreamStart, *, is_latched: bool) -> None:
-        """Begin where the publisher says, and count what came between this and what was read before."""
+        """Begin at the publisher's start, and count what came between that and the last message read before."""
         before, delivery = self._before, self._delivery
         expected = start.number
         if before.resumes or not is_latched:
@@ -398,7 +403,7 @@ class WriterProxy:
         self._data.start_at(expected, self._order.numbers)
 
     def _begin_at(self, number: int, sequence: int, now_s: float) -> None:
-        """Begin a reliable feed at a message, without a status."""
+        """Begin a reliable stream at a message, without a Heartbeat."""
         self.state = WriterProxyState.LIVE
         self._is_reliable = self._delivery.is_reliable = True
         self._order.expected, self._delivery.sequence = number, sequence
@@ -409,7 +414,7 @@ class WriterProxy:
         self._is_reliable = self._delivery.is_reliable = bool(flags & _WAITING)
 
     def _renumber(self, move: Renumbering) -> None:
-        """Go on under new numbers: what waits under old ones waits under theirs."""
+        """Apply a renumbering, also to the messages that wait."""
         if self._order.expected < move.first:
             self._skip_to(move.first)
         moved = self._order.renumber(move)
@@ -419,7 +424,7 @@ class WriterProxy:
                 self._data.skip(joined.number)
 
     def _skip_to(self, number: int) -> None:
-        """Accept that what lies before ``number`` and is not here will not come."""
+        """Accept that missing messages before ``number`` will not come."""
         for joined in self._order.skip_to(number):
             self._delivery.deliver(joined)
         self._data.forget(number)
@@ -435,5 +440,5 @@ class WriterProxy:
 
 
 def _below(ranges: list[tuple[int, int]], end: int) -> list[tuple[int, int]]:
-    """Return inclusive ranges as far as they lie below ``end``."""
+    """Return the parts of inclusive ranges that lie below ``end``."""
     return [(first, min(last, end - 1)) for first, last in ranges if first < end]

@@ -1,16 +1,17 @@
-"""Admission of hellos: whose signature is verified, and how often, so that a flood costs a bounded share of a core.
+"""Admission of hellos: a bound on verified signatures, so that a flood costs a bounded share of a core.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: WireGuard (NDSS 2017), section 5.3, for cookies; RFC
-9000, section 8.1, for the bound on what goes to an address that has proved nothing; RFC 4732 for the order of checks.
+9000, section 8.1, for the bound on bytes to an unvalidated address; RFC 4732 for the order of checks.
 
-A hello is judged by what is cheap to see, before any signature is verified::
+The port checks what is cheap, before it verifies any signature::
 
     neighbour's certificate and address  -> a token bucket of that neighbour
     any other                            -> a token bucket of its address, then one for all strangers on the port
-    the strangers' bucket has run dry    -> verified with a valid cookie only; without one it gets a cookie, 128 bytes
+    the strangers' bucket is empty       -> verified with a valid cookie only; without one it gets a cookie, 128 bytes
 
-A cookie is a MAC over the port's session and the stranger's address. No state is kept for whoever gets one. The
-stranger shows it by a tag over its own session and sequence number, which stands under the signature of its hello.
+A cookie is a MAC over the port's session and the stranger's address. The port keeps no state for the receiver of a
+cookie. The stranger proves the cookie by a tag over its own session and sequence number. The signature of its hello
+covers the tag.
 """
 
 from __future__ import annotations
@@ -28,21 +29,26 @@ __all__ = ["Admission", "Cookies", "TokenBucket", "cookie_payload", "read_cookie
 
 _DIGEST: Final = "sha256"
 _SECRET_BYTES: Final = 32
-_SECRET_S: Final = 120.0  # a secret is used for so long, and its cookies are taken for as long again; WireGuard, 5.4.7
+# a secret is used for this time, and its cookies are accepted for as long again; WireGuard, 5.4.7
+_SECRET_S: Final = 120.0
 _PURPOSE: Final = b"gdp-cookie-1"
 
-NEIGHBOUR_HELLOS: Final = (25.0, 50.0)  # a second, and at once; a neighbour in a hurry says four a second
+# per second, and burst; a neighbour sends at most four per second after a change
+NEIGHBOUR_HELLOS: Final = (25.0, 50.0)
 ADDRESS_HELLOS: Final = (10.0, 20.0)
 STRANGER_HELLOS: Final = (100.0, 64.0)  # of all strangers on a port; 64 take 30 ms, a seventh of the time to detect
-PROVEN_HELLOS: Final = (50.0, 50.0)  # of strangers with a cookie, beside the former
+PROVEN_HELLOS: Final = (50.0, 50.0)  # of strangers with a cookie, in addition to the former
 COOKIES: Final = (100.0, 100.0)
-REFUSALS: Final = (100.0, 200.0)  # more of them are a flood, too
-_LOADED_S: Final = 10.0  # after the strangers' bucket has run dry
+REFUSALS: Final = (100.0, 200.0)  # a higher rate of refusals is a flood, too
+_LOADED_S: Final = 10.0  # after the strangers' bucket became empty
 _ADDRESSES_MAX: Final = 256
 
 
 class TokenBucket:
-    """At most ``rate`` a second on average and ``burst`` at once; source: RFC 2697, section 3, with one rate."""
+    """Token bucket of at most ``rate`` per second on average and ``burst`` at once.
+
+    Source: RFC 2697, section 3, with one rate.
+    """
 
     __slots__ = ("_at_s", "_burst", "_rate", "_tokens")
 
@@ -67,7 +73,7 @@ class TokenBucket:
 
 
 class Cookies:
-    """Cookies of one node, by a secret that it draws anew.
+    """Cookies of one node, made with a secret that changes.
 
     Args:
         random_bytes: source of secrets.
@@ -88,7 +94,7 @@ class Cookies:
         return _cookie(self._secrets[0], session, mac)
 
     def proves(self, hello: Hello, session: bytes, mac: bytes, now_s: float) -> bool:
-        """Return whether a hello shows a cookie that this address was given in this session of our port."""
+        """Return whether a hello proves a cookie that this address received in this session of our port."""
         tag = next((tag for asker, tag in hello.cookies if asker == session), None)
         if tag is None:
             return False
@@ -111,7 +117,7 @@ def _cookie(secret: bytes, session: bytes, mac: bytes) -> bytes:
 
 
 def seal_cookie(cookie: bytes, nonce: bytes, sequence: int) -> bytes:
-    """Return what a hello shows of a cookie; who only hears it cannot use the cookie for another hello."""
+    """Return the tag by which a hello proves a cookie; an eavesdropper cannot use it for another hello."""
     return hmac.digest(cookie, _PURPOSE + nonce + sequence.to_bytes(8, "big"), _DIGEST)[:COOKIE_BYTES]
 
 
@@ -119,8 +125,8 @@ def cookie_payload(session: bytes, nonce: bytes, cookie: bytes) -> bytes:
     """Return the payload of a frame of kind COOKIE.
 
     Args:
-        session: nonce of the port that gives it.
-        nonce: of the hello that it answers.
+        session: nonce of the port that issues it.
+        nonce: nonce of the hello that it answers.
     """
     return session + nonce + cookie
 
@@ -139,11 +145,11 @@ def read_cookie(payload: bytes) -> tuple[bytes, bytes, bytes]:
 
 @dataclass(slots=True)
 class Admission:
-    """What one port may still spend on hellos.
+    """Budget of one port for hellos.
 
     Attributes:
         loaded_until_s: strangers need a cookie until then.
-        flooded_until_s: hellos are refused unverified; a neighbour's may be among them.
+        flooded_until_s: hellos are refused unverified until then; a neighbour's may be among them.
     """
 
     begun_s: float
@@ -162,11 +168,11 @@ class Admission:
         self._refusals = TokenBucket(*REFUSALS, self.begun_s)
 
     def is_loaded(self, now_s: float) -> bool:
-        """Return whether more hellos come than are verified without a cookie."""
+        """Return whether more hellos arrive than are verified without a cookie."""
         return now_s < self.loaded_until_s
 
     def look(self, mac: bytes, now_s: float) -> None:
-        """Refuse, before anything is read, an address that has used up its share.
+        """Refuse an address that has used up its share, before anything is parsed.
 
         Raises:
             FrameError: RATE_LIMITED.
@@ -195,7 +201,7 @@ class Admission:
         """Take tokens of a stranger.
 
         Args:
-            has_cookie: whether its hello shows a valid cookie; asked under load only.
+            has_cookie: whether its hello proves a valid cookie; called under load only.
 
         Raises:
             StatementError: RATE_LIMITED, or COOKIE_REQUIRED.
@@ -208,7 +214,7 @@ class Admission:
                 return
             self._load(now_s)
         if not has_cookie():
-            if not self._strangers.spend(now_s):  # what comes without a cookie keeps the port loaded
+            if not self._strangers.spend(now_s):  # hellos without a cookie keep the port loaded
                 self._load(now_s)
             raise StatementError(DropReason.COOKIE_REQUIRED, "hello")
         if not self._proven.spend(now_s):

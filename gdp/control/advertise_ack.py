@@ -1,6 +1,6 @@
-"""What became of a claim: taken, or refused and why.
+"""Acknowledgement of an advertisement: accepted, or rejected with a reason.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ __all__ = ["AdvertiseAck"]
 
 @dataclass(frozen=True, slots=True)
 class AdvertiseAck:
-    """A RIB's or a switch's answer to an advertisement or a withdrawal.
+    """Reply of a RIB or a switch to an advertisement or a withdrawal.
 
     Args:
-        refused: None when it was taken.
-        sequence: of the claim that the judge now holds: a refused STALE claim must be above it.
+        refused: None when it was accepted.
+        sequence: of the advertisement that the sender now holds; one refused as STALE must be resent with a higher
+            number.
     """
 
     name: Name
@@ -31,7 +32,7 @@ class AdvertiseAck:
     sequence: int
 
     def to_wire(self, signer: Name, key: SigningKey, membership: bytes) -> bytes:
-        """Return the signed statement, shorter than any claim: a stranger's bytes are never multiplied."""
+        """Return the signed statement; shorter than any advertisement, it is useless for amplification."""
         body = {
             "n": self.name,
             "a": self.advertiser,
@@ -43,7 +44,7 @@ class AdvertiseAck:
 
     @classmethod
     def from_fields(cls, fields: Fields) -> AdvertiseAck:
-        """Read a parsed statement's body; a reason of a later version reads as MALFORMED.
+        """Read a parsed statement's body; a reason of a later version is read as MALFORMED.
 
         Raises:
             StatementError: MALFORMED.

@@ -1,7 +1,7 @@
-"""Error boundary around what a peer sent: an error of our own ends the statement, never the node.
+"""Error boundary around a peer's input: an error of our own ends the statement, never the node.
 
-Sans-I/O. Such an error is a fault of this program: it is counted as ``INTERNAL`` and logged once for each place in the
-code. A neighbour that draws it again and again in one signer's name is not listened to for a while.
+Sans-I/O. Such an error is a fault of this program. It is counted as ``INTERNAL`` and logged once for each location in
+the code. A neighbour that provokes it repeatedly in one signer's name is quarantined for a while.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _QUARANTINE_S: Final = 10.0
 _QUARANTINE_MAX_S: Final = 300.0
 _FORGIVEN_S: Final = 600.0  # after the last fault
 _OFFENDERS_MAX: Final = 256
-_PLACES_MAX: Final = 64  # in the code, that are logged
+_PLACES_MAX: Final = 64  # locations in the code that are logged
 
 
 @dataclass(slots=True)
@@ -31,7 +31,7 @@ class _Offender:
 
 
 class ErrorBoundary:
-    """Contains errors of our own that a peer's bytes provoke.
+    """Containment of errors of our own that a peer's bytes provoke.
 
     Attributes:
         reraises: lets errors through instead, so that tests see them.
@@ -58,7 +58,7 @@ class ErrorBoundary:
         """Count an error; its text is logged the first time.
 
         Raises:
-            Exception: the error itself, where ``reraises`` says so.
+            Exception: the error itself, if ``reraises`` is set.
         """
         if self.reraises:
             raise error
@@ -80,7 +80,7 @@ class ErrorBoundary:
         return offender is not None and now_s < offender.until_s
 
     def offend(self, origin: bytes, now_s: float) -> None:
-        """Note that an origin drew an error; from the third on it is quarantined, each time for twice as long."""
+        """Note that an origin provoked an error; from the third on it is quarantined, each time for twice as long."""
         offender = self._offenders.pop(origin, None)
         if offender is None or now_s - offender.last_s > _FORGIVEN_S:
             offender = _Offender(0, now_s)

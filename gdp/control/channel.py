@@ -1,16 +1,18 @@
-"""Channels: what a switch and a RIB, or two RIBs, say to each other is fresh, and from whom it says.
+"""Secure channels between a switch and a RIB, or two RIBs: records are fresh and of proven origin.
 
-Sans-I/O; time comes in as ``Timestamps``. Source: the handshake is SIGMA's (signed ephemeral X25519 keys, RFC 7296 in
-spirit), the records are those of RFC 9147. A signed statement alone proves who wrote it, not when. A recorded one could
-be played again after any restart. A record belongs to one channel, a channel to one life of both ends::
+Sans-I/O; time comes in as ``Timestamps``. Source: the handshake follows SIGMA (signed ephemeral X25519 keys, in the
+manner of RFC 7296); the records follow RFC 9147. A signed statement alone proves its signer, not its time. An attacker
+could replay a recorded one after any restart. Therefore a record belongs to one channel, and a channel to one
+incarnation of both ends::
 
-    asker --OPEN (its key, for whom)---------------------> RIB     padded: the reply is never longer
-    asker <--ACCEPT (of that OPEN, channel, its key)------ RIB
-    asker --record(channel, number, [query])-------------> RIB     the first one proves that the asker is there now
-    asker <--record(channel, number, [answer])------------ RIB
-    asker <--UNKNOWN (channel)---------------------------- a RIB that was restarted: a hint, which forces nothing
+    client --OPEN (its key, for which RIB)---------------> RIB     padded: the reply is never longer
+    client <--ACCEPT (of that OPEN, channel, its key)----- RIB
+    client --record(channel, number, [query])------------> RIB     the first one proves that the client is present now
+    client <--record(channel, number, [response])--------- RIB
+    client <--UNKNOWN (channel)--------------------------- a RIB that was restarted: a hint, which forces nothing
 
-A recorded OPEN costs the RIB one agreement and one signature, paced for each peer. It displaces no channel in use.
+A recorded OPEN costs the RIB one key agreement and one signature, rate-limited for each peer. It displaces no channel
+in use.
 """
 
 from __future__ import annotations
@@ -41,14 +43,15 @@ _UNKNOWN: Final = 0x02
 _ID_BYTES: Final = 8
 _NUMBER_BYTES: Final = 8
 _HEAD_BYTES: Final = 1 + _ID_BYTES + _NUMBER_BYTES
-_OFFER_BYTES: Final = 1_536  # of an OPEN at least: more than any ACCEPT
+_OFFER_BYTES: Final = 1_536  # minimum size of an OPEN: more than any ACCEPT
 _PURPOSES: Final = (b"gdp channel, from asker ", b"gdp channel, to asker ")
 _WINDOW: Final = 4_096  # records that may come out of order
-_AGAIN_S: Final = (0.1, 0.2, 0.4, 0.8)  # between repetitions of an OPEN; then it is given up until there is news
+# between repetitions of an OPEN; after the last one the channel waits for news of the peer
+_AGAIN_S: Final = (0.1, 0.2, 0.4, 0.8)
 _WAITING_MAX: Final = 256  # statements that wait for a channel
-_WAITING_S: Final = 1.0  # who sent one will send it again by then
+_WAITING_S: Final = 1.0  # by then the sender repeats a statement itself
 _RENEW_S: Final = 3_600.0
-_REOPEN_S: Final = 0.3  # a hint is followed at most so often
+_REOPEN_S: Final = 0.3  # minimum time between two reactions to a hint
 _CHANNELS_PER_PEER: Final = 2  # in use: the newest, and the one before
 _OFFERS_PER_PEER: Final = 4  # accepted, and not in use yet
 _PEERS_MAX: Final = 8_192
@@ -58,14 +61,14 @@ _PEER_ROLES: Final = (Role.SWITCH, Role.LEAF, Role.RIB)
 
 
 class Opened(NamedTuple):
-    """A statement that came, and whether in a channel with its sender."""
+    """A received statement, and whether it came in a channel with its sender."""
 
     wire: bytes
     is_fresh: bool
 
 
 class Outgoing(NamedTuple):
-    """What is to be sent; ``is_answer``: to a peer that asked."""
+    """A record to send; ``is_answer``: to a peer that opened the channel."""
 
     to: Name
     wire: bytes
@@ -110,7 +113,7 @@ class _Offer:
 
 @dataclass(slots=True)
 class _Asked:
-    """Our channel to a peer that we ask."""
+    """Our channel to a peer that we query."""
 
     channel: _Channel | None = None
     offer: _Offer | None = None
@@ -128,7 +131,7 @@ class _Asker:
 
 
 class Channels:
-    """The channels of one node.
+    """Channels of one node.
 
     Args:
         random_bytes: source of keys and identifiers.
@@ -149,7 +152,7 @@ class Channels:
         self.drops: Counter[DropReason] = Counter()
 
     def ask(self, peer: Name, statement: bytes, now_s: float) -> None:
-        """Send a statement to a peer that we ask, once there is a channel."""
+        """Send a statement to a peer that we query, once there is a channel."""
         asked = self._asked.setdefault(peer, _Asked())
         if asked.channel is None:
             asked.waiting.append((statement, now_s + _WAITING_S))
@@ -169,21 +172,21 @@ class Channels:
         return True
 
     def renew(self, peer: Name) -> None:
-        """Open a new channel before anything else is sent: the peer was restarted, its keys are gone."""
+        """Open a new channel before anything else is sent: the peer was restarted, and its keys are lost."""
         asked = self._asked.get(peer)
         if asked is not None:
             asked.channel = asked.offer = None
 
     def forget(self, peer: Name) -> None:
-        """Let go of everything with a peer."""
+        """Drop all state of a peer."""
         self._asked.pop(peer, None)
         self._askers.pop(peer, None)
 
     def receive(self, wire: bytes, sender: Name, now: Timestamps) -> Opened | None:
-        """Take what came for us; return the statement in it, if it is for more than the channel.
+        """Process a received record; return the statement in it, unless it concerns the channel only.
 
         Raises:
-            RemoteError: it does not hold.
+            RemoteError: the record or its signature is invalid.
         """
         if wire[:1] == bytes([_RECORD]):
             return Opened(self._take_record(wire, sender, now.mono_s), is_fresh=True)
@@ -223,11 +226,11 @@ class Channels:
         return min((asked.offer.again_s for asked in self._asked.values() if asked.offer is not None), default=None)
 
     def records_to_send(self) -> list[Outgoing]:
-        """Return, once, what is to be sent."""
+        """Return, once, the records to send."""
         out, self._out = self._out, []
         return out
 
-    # -- the side that asks
+    # -- the querying side
 
     def _open(self, peer: Name, asked: _Asked, now_s: float) -> None:
         if asked.offer is not None:
@@ -258,14 +261,14 @@ class Channels:
                 self._out.append(Outgoing(statement.signer, asked.channel.seal(wire)))
 
     def _take_hint(self, id_: bytes, sender: Name, now_s: float) -> None:
-        """Open anew if that may be; what is said meanwhile still goes over the channel that is known."""
+        """Reopen the channel if the interval allows it; until then statements still use the known channel."""
         asked = self._asked.get(sender)
         if asked is None or asked.channel is None or asked.channel.id != id_:
             raise FrameError(DropReason.NO_CHANNEL, "a hint about a channel that is not ours")
         if now_s - asked.reopened_s >= _REOPEN_S:
             self._open(sender, asked, now_s)
 
-    # -- the side that is asked
+    # -- the queried side
 
     def _take_offer(self, statement: Statement, now: Timestamps) -> None:
         fields = statement.fields
@@ -323,7 +326,7 @@ class Channels:
         raise FrameError(DropReason.NO_CHANNEL, "a record of a channel that is not known")
 
     def _verified(self, statement: Statement, now: Timestamps) -> Role:
-        """Return the role of who signed.
+        """Return the role of the signer.
 
         Raises:
             StatementError: the signer is no member of a trusted domain, or did not sign.
@@ -336,6 +339,6 @@ class Channels:
 
 
 def _keys(key: ExchangeKey, far: Fields, offer: bytes, accept: bytes) -> list[RecordKey]:
-    """Return the keys from the asker and to it."""
+    """Return the keys of both directions: from the querying end, then to it."""
     bound = [purpose + offer + accept for purpose in _PURPOSES]
     return [RecordKey(secret) for secret in key.agree(far.bytes_("k"), *bound)]

@@ -1,8 +1,9 @@
-"""A statement in frames: split where it is longer than a link carries, joined under tight bounds.
+"""Fragmentation and reassembly of control statements.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds). Statements are signed, not sealed; until one is whole
-nobody knows who wrote it, so memory is bounded per claimed source and in all, and patience is short. Where a bound is
-met the oldest unfinished statement makes room: a flood of beginnings ends its own, hardly one whose parts come at once.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Statements are signed, not sealed. Until one is complete, its
+author is unproven. So memory is bounded per source and in all, and the timeout is short. At a bound, the oldest
+unfinished statement is evicted. A flood of first fragments therefore evicts its own, and hardly a statement whose
+fragments arrive at once.
 """
 
 from __future__ import annotations
@@ -30,14 +31,14 @@ from gdp.names import ZERO
 
 __all__ = ["ControlFragmenter", "ControlReassembler"]
 
-_COST_BYTES: Final = 200  # what an unfinished statement costs beside its bytes
+_COST_BYTES: Final = 200  # overhead of an unfinished statement, in addition to its bytes
 _FAR_MTU: Final = MTU_MIN_BYTES  # behind the first link there may be a tunnel, or any link there may be
 
 _Key = tuple[bytes, int, int, int]  # origin, kind, incarnation, number
 
 
 class ControlFragmenter:
-    """Numbers and splits the statements of one node."""
+    """Numbering and fragmentation of the statements of one node."""
 
     def __init__(self, source: bytes, incarnation: int) -> None:
         self._source = source
@@ -49,7 +50,7 @@ class ControlFragmenter:
 
         Args:
             mtu: bytes after the Ethernet header on the first link. A statement that goes further than a neighbour is
-                split for the smallest link there may be.
+                split for the smallest supported link.
             destination: zero for the neighbour itself.
 
         Raises:
@@ -79,17 +80,17 @@ class _PartialStatement:
 
 
 class ControlReassembler:
-    """Joins statements of any source."""
+    """Reassembly of statements of any source."""
 
     def __init__(self) -> None:
         self._budget = ReassemblyQuota(CONTROL_JOIN_BYTES, CONTROL_JOIN_SOURCE_BYTES)
         self._unfinished: dict[_Key, _PartialStatement] = {}
-        self._by_source: dict[bytes, dict[_Key, None]] = {}  # in order of their beginning
+        self._by_source: dict[bytes, dict[_Key, None]] = {}  # in order of their first fragment
         self.drops: Counter[DropReason] = Counter()
 
     @property
     def unfinished(self) -> Mapping[_Key, object]:
-        """Return what waits for parts, keyed by (origin, kind, incarnation, number)."""
+        """Return the unfinished statements, keyed by (origin, kind, incarnation, number)."""
         return self._unfinished
 
     @property
@@ -98,14 +99,15 @@ class ControlReassembler:
         return self._budget.held_bytes
 
     def add(self, header: Header, frame: bytes, now_s: float, via: bytes = b"") -> bytes | None:
-        """Take a part; return the statement when it is whole.
+        """Add a fragment; return the statement when it is complete.
 
         Args:
-            via: whom it came from on which port. With the source it makes the origin, which has its own memory, and
-                whose parts alone are put together: a stranger on the link cannot spoil a neighbour's statement.
+            via: neighbour and port that it came from. With the source it makes the origin. Each origin has its own
+                memory, and only fragments of one origin are joined: a stranger on the link cannot corrupt a neighbour's
+                statement.
 
         Raises:
-            FrameError: it cannot be a part of a statement.
+            FrameError: it cannot be a fragment of a statement.
         """
         payload = frame[HEADER_BYTES : HEADER_BYTES + header.length]
         if header.parts == 1:
@@ -139,7 +141,7 @@ class ControlReassembler:
         return b"".join(waiting.chunks[part] for part in range(waiting.parts))
 
     def drop_expired(self, now_s: float) -> None:
-        """Give back what waited longer than ``CONTROL_PATIENCE_S``."""
+        """Drop statements that waited longer than ``CONTROL_PATIENCE_S``."""
         while self._unfinished:
             key, oldest = next(iter(self._unfinished.items()))
             if now_s - oldest.begun_s < CONTROL_PATIENCE_S:
@@ -148,7 +150,7 @@ class ControlReassembler:
             self.drops[DropReason.ABANDONED] += 1
 
     def _reserve(self, source: bytes, size: int) -> None:
-        """Take memory, from the oldest of this source or of all where there is none left."""
+        """Reserve memory; where none is left, evict the oldest statement of this source or of all."""
         while not self._budget.reserve(source, size):
             mine = self._by_source.get(source)
             held = sum(self._unfinished[key].held_bytes for key in mine or ())

@@ -1,6 +1,6 @@
-"""What neighbours say to each other over a link, again and again.
+"""Hello: the periodic message between neighbours on a link.
 
-Place: pure.
+Sans-I/O. Source: OSPF (RFC 2328, section 9.5).
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ MULTIPLIER_MAX: Final = 255
 
 
 class Timing(NamedTuple):
-    """What one end wants; the slower end decides. RFC 5880, section 6.8.1.
+    """Timing that one end requests; the slower end decides. Source: RFC 5880, section 6.8.1.
 
     Attributes:
         transmit_ms: desired minimum between keepalives that it sends; 0: it sends none.
-        receive_ms: required minimum between those that it takes; 0: it wants none.
-        multiplier: after how many of its intervals without a frame the other end may call it gone.
+        receive_ms: required minimum between those that it receives; 0: it wants none.
+        multiplier: after this number of its intervals without a frame the other end may declare it down.
     """
 
     transmit_ms: int
@@ -71,30 +71,30 @@ NO_KEEPALIVES: Final = Timing(0, 0, 1)
 
 
 def echo_of(nonce: bytes, name: Name) -> bytes:
-    """Return how another refers to a session of a port: by its nonce and by who was heard to say it.
+    """Return how other nodes refer to a session of a port: by its nonce and by the node that sent it.
 
-    A bare nonce would also be that of a member that says another's as its own (docs/model, H2 and J2).
+    A bare nonce does not suffice, because another member could send it as its own (docs/model, H2 and J2).
     """
     return hashlib.sha256(b"gdp echo\0" + nonce + name).digest()[:ECHO_BYTES]
 
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """One greeting on one port.
+    """One hello on one port.
 
     Args:
-        nonce: random for this session of the sender's port; its echo proves that the neighbour is there now.
+        nonce: random for this session of the sender's port; its echo proves that the neighbour is present now.
         sequence: rises within the session.
-        heard: the echo of each whom the sender hears on this port (``echo_of``).
-        mtu: bytes after the Ethernet header that the sender's port takes.
-        digest: of the link state that both ends should share; where it differs, they send each other all of it.
+        heard: the echo of each node that the sender receives on this port (``echo_of``).
+        mtu: bytes after the Ethernet header that the sender's port accepts.
+        digest: of the link state that both ends should share; if it differs, they send each other all of it.
         membership: the sender's certificate, DER.
-        timing: what the sender wants of keepalives.
-        exchange_key: X25519, for the key of keepalives; empty where the sender wants none.
-        life: mark of the sender's life, ``LIFE_BYTES``.
-        rtcerts: of a RIB, one for each switch that it hears here: which switch may speak of it.
-        rivals: echoes of those at this port whose identity another node has, too; refused are those not in ``heard``.
-        cookies: for each receiver that asked for one, the nonce of its port and what shows the cookie.
+        timing: the keepalive timing that the sender requests.
+        exchange_key: X25519, for the key of keepalives; empty if the sender wants none.
+        life: mark of the sender's incarnation, ``LIFE_BYTES``.
+        rtcerts: of a RIB, one for each switch that it receives here: permission to attract its traffic.
+        rivals: echoes of those at this port whose identity another node has, too; those not in ``heard`` are refused.
+        cookies: for each receiver that required one, the nonce of its port and the tag that proves the cookie.
     """
 
     nonce: bytes

@@ -1,9 +1,9 @@
-"""Two nodes with one identity (copied keys, a cloned disk), as a neighbour of both sees them.
+"""Identity conflicts: two nodes with one identity (copied keys, a cloned disk), as a neighbour of both sees them.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds). A node says in its hellos when its life began. Of two lives
-of one identity that are alive at once, the older one keeps its place; hellos of the other one are refused. Both are
-told: for ``_TOLD_S`` after the last refusal hellos name the sessions of both (``Hello.rivals``). Whoever finds its own
-session there, but not among those that are heard, is the refused one.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). A node states in its hellos when its incarnation began. Of two
+live incarnations of one identity, the older one stays; hellos of the newer one are refused. Both are notified: for
+``_TOLD_S`` after the last refusal, hellos name the sessions of both (``Hello.rivals``). A node that finds its own
+session there, but not in ``Hello.heard``, is the refused one.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ __all__ = ["IdentityConflicts"]
 _TOLD_S: Final = 3.0
 _K = TypeVar("_K")
 _V = TypeVar("_V")
-_CONFLICTS_MAX: Final = 64  # sessions, and identities; the one named first makes room
+_CONFLICTS_MAX: Final = 64  # sessions, and identities; the one named first is evicted
 
 
 @dataclass(slots=True)
@@ -35,11 +35,11 @@ class _Refused:
 
 
 class IdentityConflicts:
-    """The sessions at this node's ports whose identity another node has, too.
+    """Sessions at this node's ports whose identity another node has, too.
 
     Attributes:
         refusals: hellos that were refused because an older node has their identity.
-        changes: how often an identity came to be refused, or is no more because the same node was taken.
+        changes: how often an identity became refused, or was cleared because the same node was accepted.
     """
 
     def __init__(self) -> None:
@@ -56,14 +56,17 @@ class IdentityConflicts:
         _put(self._refused, name, _Refused(life, now_s + _TOLD_S))
 
     def accept(self, name: Name, life: bytes) -> None:
-        """Note that a hello was taken; if it was refused before, the older life was only not known to be dead."""
+        """Note that a hello was accepted.
+
+        If it was refused before, the older incarnation was already dead, but that was not known yet.
+        """
         known = self._refused.get(name)
         if known is not None and known.life == life:
             del self._refused[name]
             self.changes += 1
 
     def tell(self, port: int, nonce: bytes, name: Name, now_s: float) -> bool:
-        """See that a session hears of its rival; return whether it has not yet."""
+        """Schedule the notice of a conflict for a session; return whether it is new for the session."""
         known = self._sessions.get((port, nonce))
         _put(self._sessions, (port, nonce), _Session(name, now_s + _TOLD_S))
         return known is None or known.until_s <= now_s

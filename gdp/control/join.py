@@ -1,7 +1,7 @@
-"""A request of one switch to the next towards a publisher: let this tree grow (or shrink) here.
+"""Join and leave: a switch's request to the next one towards a publisher, to extend or prune a multicast tree.
 
-Place: pure. A recorded join or leave moves nothing: each names the present sessions of both ends and counts up within
-them. So a sender that has restarted is heard at once, whatever its clock says.
+Sans-I/O. Source: PIM-SM (RFC 7761). A recorded join or leave has no effect: each names the present sessions of both
+ends and counts up within them. So a restarted sender is accepted at once, independent of its clock.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ __all__ = ["Join"]
 
 @dataclass(frozen=True, slots=True)
 class Join:
-    """One tree: a topic from one publisher.
+    """Join of one tree: a topic from one publisher.
 
     Args:
-        switch: where the publisher is attached.
+        switch: the switch to which the publisher is attached.
         domain: of that switch.
-        allowed: domains that both ends let the traffic pass.
+        allowed: domains through which both ends let the traffic pass.
         mtu: smallest on the way down from here, in bytes after the Ethernet header.
-        lease_s: how long the branch stands unless renewed; 0 takes it down (LEAVE).
-        evidence: the signed claim of a reader further down; whoever passes a join on checks it.
-        session: echo of the receiver's port (``echo_of``), so that no other member can hand the join on to it.
+        lease_s: validity of the branch unless renewed; 0 removes it (LEAVE).
+        evidence: the signed advertisement of a reader further down; every switch that forwards a join verifies it.
+        session: echo of the receiver's port (``echo_of``), so that no other member can forward the join to it.
         sequence: rises with every join and leave of the sender within its session.
         version: sequence number of ``proof``; the newest decides.
-        backup_for: the switch below that has the tree another way, and wants copies only while that way is broken;
+        backup_for: the switch below that has the tree by another path, and wants copies only while that path is broken;
             ``ZERO`` in an ordinary join. Source: the secondary join of RFC 7431.
         sender_session: nonce of the sender's port.
-        proof: the signed claim of the publisher, which says that it is at ``switch``; empty in a leave.
+        proof: the signed advertisement of the publisher, which states that it is at ``switch``; empty in a leave.
     """
 
     topic: Name

@@ -1,15 +1,15 @@
 """Keepalives: short frames between neighbours that are up, authenticated by a key of their two sessions.
 
 Sans-I/O. Source: RFC 5880 (BFD): intervals and detection time, section 6.8; poll and final, section 6.5; keyed digest
-with a meticulously rising sequence number, section 6.7.4. What differs: sessions begin with signed hellos
-(``hello.py``), and a poll is sent where silence begins, so that a few lost frames do not end a session.
+with a meticulously rising sequence number, section 6.7.4. Two points differ. Sessions begin with signed hellos
+(``hello.py``). A poll is sent when silence begins, so that a few lost frames do not end a session.
 
 The payload of a frame of kind KEEPALIVE, whose message number is the sequence number::
 
     0 flags (1)  1 detect multiplier (1)  2 digest of link states (8)  10 tag (16)
 
-The tag is HMAC-SHA256 over header and payload up to the tag, cut to 16 bytes. A node that finds itself without time
-says a larger multiplier (``Slowness``), so that its neighbours are patient with it while its machine is busy.
+The tag is HMAC-SHA256 over header and payload up to the tag, cut to 16 bytes. An overloaded node requests a larger
+multiplier (``Slowness``), so that its neighbours wait longer for it while its machine is busy.
 """
 
 from __future__ import annotations
@@ -39,23 +39,23 @@ _PURPOSE: Final = b"gdp-keepalive-1"
 _SUSPECT_AFTER: Final = 1.25  # intervals without a frame, after which the neighbour is polled
 _POLLS_PER_INTERVAL: Final = 4
 _FORGET_S: Final = 10.0
-_JITTER: Final = 0.1 / 255  # of an interval, for each value of a byte; RFC 5880, 6.8.7 asks for up to 0.25
+_JITTER: Final = 0.1 / 255  # of an interval, for each value of a byte; RFC 5880, 6.8.7 requires up to 0.25
 
 
 class KeepaliveFlag(IntFlag):
-    """What a keepalive says besides being there."""
+    """Flags of a keepalive."""
 
     NONE = 0
-    POLL = 1  # answer at once
+    POLL = 1  # requests an answer at once
     FINAL = 2  # the answer to a poll
-    HEARD = 4  # the sender hears the receiver's keepalives
+    HEARD = 4  # the sender receives the receiver's keepalives
 
 
 _POLL, _FINAL, _HEARD = (int(each) for each in (KeepaliveFlag.POLL, KeepaliveFlag.FINAL, KeepaliveFlag.HEARD))
 
 
 def seal_keepalive(key: bytes, header: Header, flags: int, multiplier: int, digest: bytes) -> bytes:
-    """Return a frame."""
+    """Return a keepalive frame."""
     tagged = encode(header) + bytes((flags, multiplier)) + digest
     return tagged + hmac.digest(key, tagged, _DIGEST)[:_TAG_BYTES]
 
@@ -75,22 +75,22 @@ def open_keepalive(key: bytes, frame: bytes) -> tuple[int, int, bytes]:
 
 
 class Slowness:
-    """How late a node has been called lately, forgotten by half every ten seconds."""
+    """Recent lateness of a node's timers; it decays by half every ten seconds."""
 
     def __init__(self) -> None:
         self._late_s = 0.0
         self._at_s = float("-inf")
 
     def late(self, late_s: float, now_s: float) -> None:
-        """Note that a timer fired so late."""
+        """Note that a timer fired this late."""
         if late_s >= self._now(now_s):
             self._late_s, self._at_s = late_s, now_s
 
     def multiplier(self, timing: Timing, most_s: float, now_s: float) -> int:
-        """Return the detect multiplier that neighbours are asked for.
+        """Return the detect multiplier that this node requests of its neighbours.
 
         Args:
-            most_s: longest detection time; a node that is late by more counts as gone.
+            most_s: longest detection time; a node that is late by more is declared down.
         """
         late_ms = 1_000 * self._now(now_s)
         if not timing.transmit_ms or late_ms < timing.transmit_ms / 2:
@@ -104,15 +104,15 @@ class Slowness:
 
 @dataclass(slots=True)
 class KeepaliveSession:
-    """Keepalives with one neighbour, for as long as both ends' sessions last.
+    """Keepalive session with one neighbour, valid while both ends' sessions last.
 
     Attributes:
         out_interval_s: between those that are sent.
         in_interval_s: between those that the neighbour sends.
-        detect_s: the neighbour is gone when silent for so long.
+        detect_s: the neighbour is down after this time of silence.
         received: highest sequence number that came.
         is_heard: one has come.
-        hears_us: the neighbour says that ours come.
+        hears_us: the neighbour reports that it receives ours.
     """
 
     out_key: bytes
@@ -137,7 +137,7 @@ class KeepaliveSession:
         received: int,
         now_s: float,
     ) -> KeepaliveSession | None:
-        """Return a session, or None where one of the ends wants none.
+        """Return a session, or None if one of the ends wants none.
 
         Args:
             ends: nonce and name, ours and the neighbour's.
@@ -145,7 +145,7 @@ class KeepaliveSession:
             received: the sequence number above which its keepalives are new.
 
         Raises:
-            StatementError: MALFORMED, the neighbour's key is none.
+            StatementError: MALFORMED, the neighbour's key is invalid.
         """
         own, far = timings
         out_interval_s, in_interval_s = own.interval_s(far), far.interval_s(own)
@@ -165,7 +165,7 @@ class KeepaliveSession:
         *,
         poll: bool,
     ) -> bytes:
-        """Return the next keepalive, and set when another one is due.
+        """Return the next keepalive, and schedule the one after it.
 
         Args:
             source: our name and incarnation.
@@ -181,7 +181,7 @@ class KeepaliveSession:
         return frame
 
     def open(self, header: Header, frame: bytes, now_s: float) -> bytes:
-        """Take a keepalive of the neighbour; return the digest that it says.
+        """Process a keepalive of the neighbour; return the digest that it carries.
 
         Raises:
             FrameError: REPLAYED, it or a later one came before; or as ``open_keepalive``.

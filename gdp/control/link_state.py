@@ -1,10 +1,9 @@
-"""What a switch says about its links, flooded to those who compute paths.
+"""Link state: a switch's signed description of its links, flooded to the nodes that compute paths.
 
-Place: pure.
-Source: after OSPF (RFC 2328): newest sequence wins, a link counts when both ends name it. Two scopes: ``DOMAIN`` stays
-within the trust domain and names every link; ``BORDER`` goes to all domains that accept its signer's. It names the
-links that leave the domain, how far the other borders are, and which switches and RIBs are reachable behind it. When a
-failure parts a domain, each part is reached through the borders that list it.
+Sans-I/O. Source: OSPF (RFC 2328): the newest sequence number wins, and a link counts when both ends name it. There are
+two scopes. ``DOMAIN`` stays within the trust domain and names every link. ``BORDER`` goes to all domains that accept
+its signer's. It names the links that leave the domain, the distance to the other borders, and the switches and RIBs
+that are reachable behind it. When a failure partitions a domain, each part is reached through the borders that list it.
 """
 
 from __future__ import annotations
@@ -27,10 +26,10 @@ LINKS_MAX: Final = 128
 RIBS_MAX: Final = 16
 MEMBERS_MAX: Final = 128  # 4.4 kB; of a larger domain the rest is reached through the nearest border
 COST_MAX: Final = 1 << 24
-_HEAD_BYTES: Final = 330  # COSE, keys, heads, sequence number, life, time and signature
+_HEAD_BYTES: Final = 330  # COSE, keys, heads, sequence number, incarnation, time and signature
 _LINK_BYTES: Final = 80
 _NAME_BYTES: Final = 34
-_RIB_BYTES: Final = 110  # beside its two certificates
+_RIB_BYTES: Final = 110  # in addition to its two certificates
 
 _T = TypeVar("_T")
 
@@ -43,7 +42,7 @@ class Scope(Enum):
 
 
 class Adjacency(NamedTuple):
-    """A link to a neighbour, or, in ``inside``, the way to another border of the same domain."""
+    """A link to a neighbour, or, in ``inside``, the path to another border of the same domain."""
 
     name: Name
     domain: Name
@@ -57,9 +56,9 @@ class AttachedRib(NamedTuple):
     Args:
         domain: the RIB's own, which may differ from the switch's.
         session: nonce of its present session with its switch; a restarted or moved RIB has another one.
-        life: mark of its life (``LIFE_BYTES``), which tells two nodes with one identity apart.
+        life: mark of its incarnation (``LIFE_BYTES``), which distinguishes two nodes with one identity.
         membership: its certificate, DER.
-        rtcert: by which it lets a switch attract its traffic.
+        rtcert: the RIB's permission for a switch to attract its traffic.
     """
 
     name: Name
@@ -71,13 +70,13 @@ class AttachedRib(NamedTuple):
 
     @property
     def cost_bytes(self) -> int:
-        """Return what it takes of a statement, at most."""
+        """Return the bytes that it occupies in a statement, at most."""
         return _RIB_BYTES + len(self.membership) + len(self.rtcert)
 
 
 @dataclass(frozen=True, slots=True)
 class LinkState:
-    """All that one switch says in one scope."""
+    """Link state of one switch in one scope."""
 
     origin: Name
     domain: Name  # of the origin, from its certificate
@@ -87,14 +86,14 @@ class LinkState:
     inside: tuple[Adjacency, ...]  # BORDER only
     ribs: tuple[AttachedRib, ...]  # attached here (DOMAIN), or reachable within this domain (BORDER)
     members: tuple[Name, ...] = ()  # BORDER only: switches of the domain that are reachable within it from here
-    life: bytes = bytes(LIFE_BYTES)  # mark of the origin's life
-    refused: tuple[Name, ...] = ()  # identities refused at this switch, for an older node has them
+    life: bytes = bytes(LIFE_BYTES)  # mark of the origin's incarnation
+    refused: tuple[Name, ...] = ()  # identities refused at this switch, because an older node has them
     is_partial: bool = False  # there are members that are not listed
     said_unix_s: int = 0  # when it was signed, by the origin's wall clock
-    is_leaf: bool = False  # from the origin's certificate: nothing leads through it
+    is_leaf: bool = False  # from the origin's certificate: no path leads through it
 
     def fitted(self, membership: bytes) -> LinkState:
-        """Return as much of it as one statement carries beside the signer's certificate: RIBs and links first."""
+        """Return the part of it that fits one statement with the signer's certificate: RIBs and links first."""
         room = CONTROL_MAX_BYTES - _HEAD_BYTES - len(membership)
         ribs = _cut(self.ribs[:RIBS_MAX], [each.cost_bytes for each in self.ribs], room // 2)
         room -= sum(each.cost_bytes for each in ribs)
@@ -133,7 +132,7 @@ class LinkState:
 
     @classmethod
     def from_fields(cls, fields: Fields, origin: Name, domain: Name, *, is_leaf: bool = False) -> LinkState:
-        """Read a parsed statement's body; what the origin is stands in its certificate.
+        """Read a parsed statement's body; role and domain of the origin come from its certificate.
 
         Of a leaf, links that leave its domain are left out.
 

@@ -1,19 +1,20 @@
-"""Finding neighbours, proving who they are, and noticing when they are gone.
+"""Hello protocol: discovery of neighbours, proof of their identity, and detection of their loss.
 
-Place: pure; every node that has a port greets: switches, RIBs, proxies.
+Sans-I/O. Every node that has a port sends hellos: switches, RIBs, proxies. Source: OSPF (RFC 2328, sections 9.5 and
+10.5) for hellos and two-way state.
 
 A hello is signed by a member of a trusted domain and carries its certificate. It counts as two-way when it echoes the
-nonce of our port's present session, and is newer than all that came of its own, so a recorded hello brings nobody up:
-of sessions that ended, too, the last sequence number is remembered.
+nonce of our port's present session and its sequence number exceeds all received in its own session. So a recorded hello
+brings no neighbour up: the last sequence number is remembered for ended sessions, too.
 
-Whose signature is verified, and how often, ``admission.py`` decides. Who has not echoed our nonce is a candidate. Its
-place is apart from those of neighbours, and where none is left the oldest makes room. Candidates are answered
-with no more bytes than they have sent.
+``admission.py`` decides which signatures are verified, and how often. A node that has not echoed our nonce is a
+candidate. Candidates have entries of their own, apart from those of neighbours; where none is free, the oldest
+candidate is evicted. Candidates are answered with no more bytes than they have sent.
 
-Hellos also say what each end takes: a link is as wide as its narrowest end. Where an end changes, both know at once.
+Hellos also state the MTU of each end: a link is as wide as its narrowest end. When an end changes, both know at once.
 
-Between neighbours that are up, keepalives (``keepalive.py``) take over from most hellos: a silent cut is noticed after
-the negotiated detection time. Time in which this node itself was not called counts for nobody's silence.
+Between neighbours that are up, keepalives (``keepalive.py``) replace most hellos: a silent cut is detected after the
+negotiated detection time. Time in which this node itself was not scheduled does not count as a neighbour's silence.
 """
 
 from __future__ import annotations
@@ -68,8 +69,8 @@ from gdp.trust.rtcert import RtCertCache
 __all__ = ["Change", "HelloPort", "HelloProtocol"]
 
 NEIGHBOURS_MAX: Final = 64  # on one port
-CANDIDATES_MAX: Final = 32  # on one port, who have not echoed our nonce; the one silent for longest makes room
-PADDED_BYTES: Final = 1_400  # of a hello with its header; what it draws from who does not know us is not longer
+CANDIDATES_MAX: Final = 32  # on one port, that have not echoed our nonce; the one silent for longest is evicted
+PADDED_BYTES: Final = 1_400  # of a hello with its header; the answer of a node that does not know us is not longer
 _PARTS_MAX: Final = -(-HELLO_MAX_BYTES // (MTU_MIN_BYTES - HEADER_BYTES))
 _ADDRESSES_MAX: Final = 96  # of neighbours and former ones, whose frames the data plane keeps apart from strangers'
 _CREDIT_MAX_BYTES: Final = 16 << 10
@@ -79,15 +80,15 @@ _RTCERTS_REMEMBERED: Final = 256
 _ENDED_MAX: Final = 1_024  # sessions of the far ends, remembered for one session of a port
 _JOINS_WINDOW: Final = 1_024  # how far joins may overtake each other
 _ANSWER_S: Final = 0.02  # a stranger's hello is answered at once, but not more often than this
-_EAGER_HELLOS: Final = 4  # after a change, so that a lost one delays nobody
-_HELLOS_MISSED: Final = 5  # idle hello intervals after which keepalives alone keep nobody up
-_RECHECK_S: Final = 1.0  # a membership may be revoked or run out while keepalives come
-_LATE_S: Final = 0.02  # called later than this, a node had no time of its own
-_CLASH_S: Final = 3.0  # for so long another node must have our identity
+_EAGER_HELLOS: Final = 4  # after a change, so that a lost one causes no delay
+_HELLOS_MISSED: Final = 5  # idle hello intervals after which keepalives alone keep no neighbour up
+_RECHECK_S: Final = 1.0  # a membership may be revoked or expire while keepalives come
+_LATE_S: Final = 0.02  # later than this, the node itself was not scheduled in time
+_CLASH_S: Final = 3.0  # another node must have our identity for this time
 _CLASH_PAUSE_S: Final = 10.0  # above the time between two idle hellos
 _TOGETHER: Final = 0.125  # of an interval: keepalives due within it leave at once
 
-# A neighbour after the change, and its state before; the same state where only the link to it changed, MTU or cost.
+# A neighbour after the change, and its state before; the same state if only the link to it changed, MTU or cost.
 Change = tuple[Neighbour, NeighbourState]
 
 
@@ -98,7 +99,7 @@ class HelloPort:
     owner: Name  # the node whose port it is
     index: int
     mac: bytes
-    own_mtu: int  # what our end takes, in bytes after the Ethernet header
+    own_mtu: int  # what our end accepts, in bytes after the Ethernet header
     cost: int
     nonce: bytes
     exchange_key: ExchangeKey
@@ -108,16 +109,17 @@ class HelloPort:
     keepalive_sequence: int = 0
     eager: int = _EAGER_HELLOS  # hellos until they become rare
     hello_at_s: float = 0.0
-    answer_at_s: float = float("inf")  # of a hello to candidates, as far as ``credit_bytes`` go
-    credit_bytes: int = 0  # that came of them, and were not answered yet
-    owes_answer: bool = False  # for want of bytes
+    answer_at_s: float = float("inf")  # of a hello to candidates, as far as ``credit_bytes`` allow
+    credit_bytes: int = 0  # received from them, and not answered yet
+    owes_answer: bool = False  # an answer waits for credit
     said_s: float = float("-inf")
     neighbours: dict[Name, Neighbour] = field(default_factory=dict)
     ended: dict[tuple[Name, bytes], tuple[int, int]] = field(default_factory=dict)  # last numbers
-    joins: dict[bytes, ReplayWindow] = field(default_factory=dict)  # which were taken, by session of the far end
-    said_mtus: dict[Name, int] = field(default_factory=dict)  # what each neighbour's end takes
+    # joins that were accepted, by session of the far end
+    joins: dict[bytes, ReplayWindow] = field(default_factory=dict)
+    said_mtus: dict[Name, int] = field(default_factory=dict)  # what each neighbour's end accepts
     addresses: dict[bytes, None] = field(default_factory=dict)  # of neighbours, former ones too; the last proven last
-    strangers: Strangers = field(default_factory=Strangers)  # whose hellos were refused
+    strangers: Strangers = field(default_factory=Strangers)  # nodes whose hellos were refused
 
     @property
     def echo(self) -> bytes:
@@ -126,17 +128,17 @@ class HelloPort:
 
     @property
     def mtu(self) -> int:
-        """Return what our end and those of all neighbours that are up take, in bytes after the Ethernet header."""
+        """Return what our end and those of all neighbours that are up accept, in bytes after the Ethernet header."""
         up = [n.mtu for n in self.neighbours.values() if n.state is NeighbourState.UP]
         return min([self.own_mtu, *up])
 
     @property
     def hello_mtu(self) -> int:
-        """Return what everybody takes who was heard at all: a neighbour behind a narrow end must hear us to be up."""
+        """Return an MTU that every node heard so far accepts; a neighbour behind a narrow end must get our hellos."""
         return min([self.own_mtu, *self.said_mtus.values()])
 
     def last_of(self, name: Name, nonce: bytes) -> int:
-        """Return the last sequence number that came of a neighbour's session, or -1."""
+        """Return the last sequence number received in a neighbour's session, or -1."""
         known = self.neighbours.get(name)
         if known is not None and nonce in (known.nonce, known.candidate):
             return known.sequence if known.nonce == nonce else known.candidate_sequence
@@ -144,16 +146,16 @@ class HelloPort:
 
     @property
     def is_idle(self) -> bool:
-        """Return whether all neighbours hear us, and we them, by keepalives; whoever else is heard does not count."""
+        """Return whether keepalives pass both ways with all neighbours; candidates do not count."""
         sessions = [each.keepalives for each in self.neighbours.values() if each.is_proven]
         return bool(sessions) and all(each is not None and each.is_alive and each.hears_us for each in sessions)
 
     def hurry(self, at_s: float) -> None:
-        """Say hello at ``at_s`` or before, and then often for a while: what it says has changed."""
+        """Send a hello at ``at_s`` or before, and then often for a while: its content has changed."""
         self.hello_at_s, self.eager = min(self.hello_at_s, at_s), _EAGER_HELLOS
 
     def schedule_hello(self, received_bytes: int, now_s: float) -> None:
-        """Say hello soon to who has not proved itself, with at most as many bytes as came of such."""
+        """Send a hello to candidates soon, with at most as many bytes as came from candidates."""
         self.credit_bytes = min(self.credit_bytes + received_bytes, _CREDIT_MAX_BYTES)
         self.answer_at_s = min(self.answer_at_s, max(now_s, self.said_s + _ANSWER_S))
 
@@ -167,7 +169,7 @@ class HelloPort:
         return is_new
 
     def candidates(self) -> list[Neighbour]:
-        """Return who was heard, and has not echoed our nonce."""
+        """Return the nodes that were heard, and have not echoed our nonce."""
         return [each for each in self.neighbours.values() if not each.is_proven]
 
     def is_neighbour_at(self, mac: bytes) -> bool:
@@ -175,16 +177,16 @@ class HelloPort:
         return any(each.mac == mac and each.state is NeighbourState.UP for each in self.neighbours.values())
 
     def heard(self) -> tuple[bytes, ...]:
-        """Return what a hello echoes: neighbours first, then candidates, the newest first."""
+        """Return the echoes that a hello carries: neighbours first, then candidates, the newest first."""
         proven = [each for each in self.neighbours.values() if each.is_proven]
         others = sorted(self.candidates(), key=lambda each: each.heard_s, reverse=True)
         restarts = [echo_of(each.candidate, each.name) for each in proven if each.candidate]
         return *(each.echo for each in proven), *(each.echo for each in others), *restarts
 
     def end(self, neighbour: Neighbour) -> None:
-        """Remember how far a session came that has proved itself; others cannot bring anybody up again."""
+        """Remember the last number of a proven session; an unproven one cannot bring a neighbour up again."""
         if neighbour.is_proven:
-            session = neighbour.name, neighbour.nonce  # a nonce alone could be said by another member, too
+            session = neighbour.name, neighbour.nonce  # another member could also send a nonce alone
             _, received = self.ended.pop(session, _UNREACHABLE)
             if neighbour.keepalives is not None:
                 received = neighbour.keepalives.received
@@ -196,7 +198,8 @@ class HelloPort:
         """Note a verified join or leave of a neighbour.
 
         Raises:
-            StatementError: REPLAYED: it is of another session of either end, came before, or is too old to tell.
+            StatementError: REPLAYED: it is of another session of either end, came before, or is below the replay
+                window.
         """
         if (join.session, join.sender_session) != (self.echo, neighbour.nonce):
             raise StatementError(DropReason.REPLAYED, "a join of another session")
@@ -211,20 +214,20 @@ class HelloPort:
 
 
 class HelloProtocol:
-    """Greets on every port.
+    """Hello protocol of one node on all its ports.
 
     Args:
         random_bytes: source of nonces and of session keys.
-        timing: what this node wants of keepalives, where ``set_timing`` says nothing else of a port.
-        life: mark of this node's life, ``LIFE_BYTES``.
-        digest_for: what to say of our link state to the far end of a port.
+        timing: keepalive timing that this node requests, where ``set_timing`` sets no other for a port.
+        life: mark of this node's incarnation, ``LIFE_BYTES``.
+        digest_for: returns the digest of our link state for the far end of a port.
         life_elsewhere: the mark of a node with a name that is known to be alive, but at none of our ports; or None.
         rtcert_for: of a RIB, its RtCert for a switch; None of any other node.
 
     Attributes:
         rivals: nodes that share an identity with another one, at our ports.
-        clashes: how often we heard of another node with our own identity.
-        clash_told_by: the neighbour that said so last.
+        clashes: how often we received notice of another node with our own identity.
+        clash_told_by: the neighbour that reported it last.
     """
 
     def __init__(
@@ -252,9 +255,9 @@ class HelloProtocol:
         self._timing = timing
         self._timings: dict[int, Timing] = {}
         self._incarnation = incarnation
-        self._due_s = float("inf")  # when the next call was asked for
-        self._next_s: float | None = None  # no timer is due before; None: to be looked up
-        self._lateness_s = 0.0  # how long, in all, this node was called later than it had asked to be
+        self._due_s = float("inf")  # when the next call was requested
+        self._next_s: float | None = None  # no timer is due before; None: to be computed
+        self._lateness_s = 0.0  # how long, in all, this node was called later than it had requested
         self._slowness = Slowness()
         self._digest_for = digest_for
         self._life = life
@@ -286,7 +289,7 @@ class HelloProtocol:
         life_elsewhere: Callable[[Name], bytes | None] = lambda _: None,
         rtcert_for: Callable[[Name], bytes] | None = None,
     ) -> HelloProtocol:
-        """Return the greeter of a node with these settings."""
+        """Return the hello protocol of a node with these settings."""
         return cls(
             identity,
             policy,
@@ -303,14 +306,14 @@ class HelloProtocol:
         )
 
     def set_timing(self, index: int, timing: Timing) -> None:
-        """Want other keepalives on one port, from its next session on."""
+        """Request another keepalive timing on one port, from its next session on."""
         self._timings[index] = timing
         self._next_s = None
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now_s: float) -> list[Change]:
-        """Begin to greet on a port, or learn that the MTU or cost of one that is up has changed.
+        """Begin to send hellos on a port, or update the MTU or cost of one that is up.
 
-        Returns the neighbours to which the link has changed, and those that another address of ours takes away.
+        Returns the neighbours to which the link has changed, and those that another address of ours removes.
         """
         self._next_s = None
         port, own_mtu = self.ports.get(index), max(mtu, MTU_MIN_BYTES)
@@ -354,7 +357,7 @@ class HelloProtocol:
 
     @property
     def drops(self) -> Counter[DropReason]:
-        """Return which unfinished hellos were given up."""
+        """Return the unfinished hellos that were given up, by reason."""
         return self._reassembler.drops + self._strangers_reassembler.drops
 
     @property
@@ -363,7 +366,7 @@ class HelloProtocol:
         return self._strangers_reassembler.held_bytes
 
     def join(self, arrival: ReceivedFrame, header: Header, now_s: float) -> bytes | None:
-        """Take a frame of a hello; return the statement when it is whole.
+        """Add a frame of a hello; return the statement when it is complete.
 
         Raises:
             FrameError: BAD_PARTS, MEMORY_FULL and the like; RATE_LIMITED, its address has used up its share.
@@ -379,7 +382,7 @@ class HelloProtocol:
         return self._strangers_reassembler.add(header, arrival.frame, now_s, arrival.via)
 
     def receive_cookie(self, arrival: ReceivedFrame, header: Header) -> None:
-        """Take a cookie: of a neighbour that was heard, at its address, in answer to a hello of this session.
+        """Process a cookie of a neighbour that was heard, at its address, in answer to a hello of this session.
 
         Raises:
             FrameError: UNKNOWN_SENDER or TRUNCATED.
@@ -394,10 +397,10 @@ class HelloProtocol:
         port.hello_at_s = min(port.hello_at_s, port.said_s + self._hello_s)
 
     def receive(self, arrival: ReceivedFrame, statement: Statement, now: Timestamps) -> Change | None:
-        """Take a hello; return what it changed.
+        """Process a hello; return what it changed.
 
         Raises:
-            StatementError: it does not hold, or no more are verified now; nothing has changed.
+            StatementError: the hello is invalid, or no more are verified now; nothing has changed.
         """
         port = self.ports.get(arrival.port)
         if port is None or not port.is_up:
@@ -418,14 +421,14 @@ class HelloProtocol:
         if is_two_way:
             has_news = is_new_session or (port.owes_answer and not known.is_proven)
         else:
-            has_news = known.is_proven and not is_new_session  # it does not hear us any more
+            has_news = known.is_proven and not is_new_session  # it does not receive our hellos any more
             if not has_news:
                 port.schedule_hello(received_bytes, now.mono_s)
         if has_news:
             port.hurry(max(now.mono_s, port.said_s + _ANSWER_S))
         if is_new_session and not is_two_way and known.is_proven:
             known.candidate, known.candidate_sequence = hello.nonce, hello.sequence
-            # a restart, or an old hello played back: only an echo of our nonce will tell
+            # a restart, or a replayed hello: only an echo of our nonce decides
             return None
         if is_new_session or not is_two_way:
             port.end(known)
@@ -440,7 +443,7 @@ class HelloProtocol:
         known.cookie = b"" if is_new_session else known.cookie
         known.sequence, known.digest, known.greeted_s = hello.sequence, hello.digest, now.mono_s
         known.member, known.checked_s, known.life = member, now.mono_s, hello.life
-        known.role = member.role  # a root may have made a leaf of a switch
+        known.role = member.role  # a root may have changed a switch into a leaf
         had_proof, known.proof = known.proof is not None, proof
         self._note_clash(port, known, hello, now.mono_s)
         self._alive(known, now.mono_s)
@@ -448,7 +451,7 @@ class HelloProtocol:
             self._begin_keepalives(port, known, hello, now.mono_s)
         change = self._step(known, NeighbourEvent.TWO_WAY if is_two_way else NeighbourEvent.ONE_WAY)
         if change is None and is_new_session and is_two_way:
-            return known, NeighbourState.GONE  # it restarted, and has forgotten what we told it
+            return known, NeighbourState.GONE  # it restarted, and has lost the state that we sent it
         is_placed = (known.proof is not None) is not had_proof
         if change is None and (is_resized or is_placed) and known.state is NeighbourState.UP:
             return known, known.state
@@ -457,10 +460,10 @@ class HelloProtocol:
     def _verified(
         self, port: HelloPort, arrival: ReceivedFrame, statement: Statement, now: Timestamps
     ) -> tuple[Hello, Membership]:
-        """Return a hello and whose it is, cheap checks first.
+        """Return a verified hello and its membership, cheap checks first.
 
         Raises:
-            StatementError: it does not hold, or no more are verified now.
+            StatementError: the hello is invalid, or no more are verified now.
         """
         if len(statement.wire) > HELLO_MAX_BYTES:
             raise StatementError(DropReason.TOO_BIG, "hello")
@@ -487,10 +490,10 @@ class HelloProtocol:
         return hello, member
 
     def _admit(self, port: HelloPort, arrival: ReceivedFrame, signer: Name, hello: Hello, now_s: float) -> None:
-        """Decide by what is cheap to see whether a hello's signature is verified.
+        """Decide by cheap checks whether a hello's signature is verified.
 
         Raises:
-            StatementError: RATE_LIMITED; COOKIE_REQUIRED, and a cookie is on its way.
+            StatementError: RATE_LIMITED; COOKIE_REQUIRED, and a cookie is queued.
         """
         known = port.neighbours.get(signer)
         member = known.member if known is not None else None
@@ -514,7 +517,7 @@ class HelloProtocol:
 
     @staticmethod
     def _make_room(port: HelloPort, known: Neighbour | None, *, is_two_way: bool) -> None:
-        """See that there is a place: neighbours keep theirs, candidates give way to the next one.
+        """Ensure that an entry is free: neighbours keep theirs, the oldest candidate is evicted for the next one.
 
         Raises:
             StatementError: QUOTA, there are too many neighbours.
@@ -533,7 +536,7 @@ class HelloProtocol:
         """Return what proves to others that a RIB is attached to this switch, or None.
 
         Raises:
-            StatementError: its hello carries what it did not sign.
+            StatementError: its hello carries an RtCert that it did not sign.
         """
         if member.role is not Role.RIB:
             return None
@@ -546,7 +549,7 @@ class HelloProtocol:
     def _refuse_conflict(
         self, port: HelloPort, hello: Hello, name: Name, arrived: tuple[bytes, int], now_s: float
     ) -> None:
-        """Take a hello's word only if no older node with its identity is alive; a younger one is let go.
+        """Refuse a hello if an older node with its identity is alive; a younger one is removed.
 
         Args:
             arrived: from which address, and how many bytes.
@@ -567,7 +570,7 @@ class HelloProtocol:
             return  # it was restarted there
         elsewhere = self._life_elsewhere(name)
         is_outlived_here = any(other.life < hello.life for other in others)
-        is_proven = port.echo in hello.heard  # else it may be an old one played back
+        is_proven = port.echo in hello.heard  # else it may be a replayed one
         tell = self._tell_conflict if is_proven else self.conflicts.tell
         for other in others:
             if is_outlived_here:
@@ -583,7 +586,7 @@ class HelloProtocol:
         raise StatementError(DropReason.IN_USE, "an older node with this identity is alive")
 
     def recheck(self, fingerprint: bytes, now: Timestamps) -> None:
-        """Have ``expire`` let neighbours go whose membership, of this fingerprint, was revoked."""
+        """Have ``drop_silent`` remove the neighbours whose membership, of this fingerprint, was revoked."""
         for port in self.ports.values():
             for neighbour in port.neighbours.values():
                 member = neighbour.member
@@ -596,21 +599,21 @@ class HelloProtocol:
                     neighbour.heard_s = float("-inf")
 
     def let_go(self, neighbour: Neighbour, now_s: float) -> None:
-        """Have ``expire`` let a neighbour go, for an older node with its identity is alive."""
+        """Have ``drop_silent`` remove a neighbour, because an older node with its identity is alive."""
         self._next_s = None
         self.conflicts.refuse(neighbour.name, neighbour.life, now_s)
         self._tell_conflict(neighbour.port, neighbour.nonce, neighbour.name, now_s)
         neighbour.let_go_s = now_s
 
     def tell_conflicts(self, name: Name, now_s: float) -> None:
-        """Tell a neighbour, where it is one, that another node has its identity."""
+        """Notify a neighbour, if it is one, that another node has its identity."""
         for port in self.ports.values():
             held = port.neighbours.get(name)
             if held is not None:
                 self._tell_conflict(port.index, held.nonce, name, now_s)
 
     def _tell_conflict(self, port: int, nonce: bytes, name: Name, now_s: float) -> None:
-        """See that hellos tell a session of its rival, soon if that is news to it."""
+        """Have hellos notify a session of its conflict, soon if that is new to it."""
         if self.conflicts.tell(port, nonce, name, now_s):
             self._next_s = None
             self.ports[port].hurry(now_s)
@@ -619,7 +622,7 @@ class HelloProtocol:
         """Note that another node has our own identity.
 
         Args:
-            is_proven: it counts at once; else when it lasts, for an earlier life of ours may linger.
+            is_proven: it counts at once; else when it lasts, because an earlier incarnation of ours may linger.
         """
         if now_s > self._clash_s + _CLASH_PAUSE_S:
             self._clash_since_s = now_s
@@ -629,17 +632,17 @@ class HelloProtocol:
             self.clash_told_by = told_by
 
     def _note_clash(self, port: HelloPort, neighbour: Neighbour, hello: Hello, now_s: float) -> None:
-        """Note what a neighbour's hello says of our identity."""
+        """Note what a neighbour's hello states about our identity."""
         neighbour.refuses_us = port.echo in hello.conflicts and port.echo not in hello.heard
         if port.echo in hello.conflicts:
             self.note_clash(neighbour.name, now_s)
 
     def receive_keepalive(self, arrival: ReceivedFrame, header: Header, now: Timestamps) -> Neighbour:
-        """Take a keepalive; return the neighbour that it is of.
+        """Process a keepalive; return the neighbour that sent it.
 
         Raises:
             FrameError: UNKNOWN_SENDER, REPLAYED, BAD_TAG or TRUNCATED; nothing has changed.
-            StatementError: the neighbour's membership holds no longer.
+            StatementError: the neighbour's membership is no longer valid.
         """
         port = self.ports.get(arrival.port)
         known = port.neighbours.get(Name(header.source)) if port is not None else None
@@ -650,12 +653,12 @@ class HelloProtocol:
             known.checked_s = now.mono_s
         known.digest = known.keepalives.open(header, arrival.frame, now.mono_s)
         if known.keepalives.is_final_due:
-            self._next_s = None  # anything else only puts timers off
+            self._next_s = None  # any other change only delays timers
         self._alive(known, now.mono_s - arrival.waited_s)
         return known
 
     def port_changed(self, index: int, up: bool, now_s: float) -> list[Change]:
-        """Learn that a link came or went; return the neighbours that this took away."""
+        """Update the state of a link; return the neighbours that this removed."""
         self._next_s = None
         port = self.ports.get(index)
         if port is None or port.is_up == up:
@@ -671,8 +674,8 @@ class HelloProtocol:
         return self._lose(port, list(port.neighbours.values()), NeighbourEvent.LINK_LOST)
 
     def drop_silent(self, now_s: float) -> list[Change]:
-        """Let silent neighbours go; return them. What waits at the sockets must have been taken before."""
-        if float("-inf") < self._due_s < now_s - _LATE_S:  # who is let go is due at once: nobody is late
+        """Remove silent neighbours; return them. What waits at the sockets must have been received before."""
+        if float("-inf") < self._due_s < now_s - _LATE_S:  # a neighbour to remove is due at once: that is no lateness
             self._lateness_s += now_s - self._due_s
             self._slowness.late(now_s - self._due_s, now_s)
         self._due_s, self._next_s = float("inf"), None
@@ -683,7 +686,7 @@ class HelloProtocol:
             silent = [n for n in port.neighbours.values() if now_s >= self._gone_at_s(n)]
             if silent:
                 if any(each.is_proven for each in silent):
-                    port.hurry(now_s)  # who still hears us hears at once that we do not hear it
+                    port.hurry(now_s)  # a neighbour that still receives us learns at once that we do not receive it
                 changes += self._lose(port, silent, NeighbourEvent.SILENCE)
         return changes
 
@@ -739,7 +742,7 @@ class HelloProtocol:
         return due_s
 
     def _gone_at_s(self, neighbour: Neighbour) -> float:
-        """Return when a neighbour is gone if nothing comes of it; the node's own lateness is no silence of theirs."""
+        """Return when a neighbour is lost if it stays silent; the node's own lateness does not count as silence."""
         if neighbour.let_go_s is not None:
             return neighbour.let_go_s
         late_s = self._lateness_s - neighbour.lateness_s
@@ -766,7 +769,7 @@ class HelloProtocol:
         )
 
     def _scheduled_hello(self, port: HelloPort, now_s: float) -> list[bytes]:
-        """Return a hello, padded: who does not know us yet may answer with as many bytes."""
+        """Return a hello, padded, so that a node that does not know us yet may answer with as many bytes."""
         port.eager = max(port.eager - 1, 0)
         is_rare = port.is_idle and not port.eager and not port.admission.is_loaded(now_s)
         port.hello_at_s = now_s + self._hello_s * (HELLO_IDLE if is_rare else 1)
@@ -776,7 +779,7 @@ class HelloProtocol:
         return frames
 
     def _answer(self, port: HelloPort, now_s: float) -> list[bytes]:
-        """Return a hello for those who have not proved themselves, or nothing if they have sent fewer bytes."""
+        """Return a hello for the candidates, or nothing if they have sent fewer bytes."""
         port.answer_at_s = float("inf")
         frames = self._hello(port, now_s)
         size = sum(map(len, frames))
@@ -802,7 +805,7 @@ class HelloProtocol:
         return self._fragmenter.split(Kind.HELLO, hello.to_wire(identity.name, identity.key), port.hello_mtu)
 
     def _rtcerts_on(self, port: HelloPort) -> tuple[bytes, ...]:
-        """Return a RIB's RtCerts for the switches that it hears on a port."""
+        """Return a RIB's RtCerts for the switches whose hellos it receives on a port."""
         if self._rtcert_for is None:
             return ()
         heard = [each for each in port.neighbours.values() if each.role.is_switch]
@@ -823,7 +826,7 @@ class HelloProtocol:
 
 
 def _received_bytes(arrival: ReceivedFrame, statement: Statement) -> int:
-    """Return the bytes of all frames of a statement whose last one to come has arrived, its padding included."""
+    """Return the bytes of all frames of a statement, padding included; ``arrival`` is the last of them."""
     header = decode(arrival.frame)
     padding = len(arrival.frame) - HEADER_BYTES - header.length
     return header.parts * HEADER_BYTES + len(statement.wire) + max(padding, 0)

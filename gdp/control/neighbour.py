@@ -1,6 +1,6 @@
-"""A neighbour, and the states it can be in.
+"""Neighbour state machine.
 
-Place: pure.
+Sans-I/O. Source: OSPF (RFC 2328, section 10.1).
 
 ::
 
@@ -25,15 +25,15 @@ __all__ = ["TRANSITIONS", "Neighbour", "NeighbourEvent", "NeighbourState"]
 
 
 class NeighbourState(Enum):
-    """How far two neighbours know each other."""
+    """States of a neighbour."""
 
-    HEARD = "heard"  # we hear it; it has not shown that it hears us
+    HEARD = "heard"  # we receive its hellos; it has not shown that it receives ours
     UP = "up"
     GONE = "gone"
 
 
 class NeighbourEvent(Enum):
-    """What can happen between neighbours."""
+    """Events of a neighbour."""
 
     ONE_WAY = "one-way"  # a hello that does not echo our nonce
     TWO_WAY = "two-way"  # one that does
@@ -60,7 +60,7 @@ TRANSITIONS: Final[dict[tuple[NeighbourState, NeighbourEvent], NeighbourState]] 
 
 @dataclass(slots=True)
 class Neighbour:
-    """Who is at the other end of a port, as its verified hellos say."""
+    """The node at the other end of a port, as its verified hellos describe it."""
 
     name: Name
     role: Role
@@ -72,21 +72,22 @@ class Neighbour:
     nonce: bytes
     sequence: int
     digest: bytes
-    heard_s: float  # when it last gave a sign of life
+    heard_s: float  # when its last valid frame came
     state: NeighbourState = NeighbourState.GONE
     candidate: bytes = b""  # nonce of a session that has not proved itself yet
     candidate_sequence: int = -1  # of its last hello
     member: Membership | None = None
-    checked_s: float = 0.0  # when its membership was last seen to hold
+    checked_s: float = 0.0  # when its membership was last found valid
     greeted_s: float = 0.0  # when its last hello came
     keepalives: KeepaliveSession | None = None  # while it is up and both ends want them
     lateness_s: float = 0.0  # of this node, in all, when the neighbour was last heard
     life: bytes = bytes(LIFE_BYTES)
     proof: tuple[bytes, bytes] | None = None  # of a RIB that is attached here: its membership, its RtCert for us
-    let_go_s: float | None = None  # it goes then, unless it gives a sign of life before: an older node has its identity
-    refuses_us: bool = False  # its last hello said that an older node has our identity
+    # it is removed then, unless a frame of it comes before: an older node has its identity
+    let_go_s: float | None = None
+    refuses_us: bool = False  # its last hello reported that an older node has our identity
     is_proven: bool = False  # its present session has echoed our nonce: it is on this link now
-    cookie: bytes = b""  # that it gave us: it verifies strangers' hellos with one only
+    cookie: bytes = b""  # received from it: it verifies strangers' hellos with one only
     hellos: TokenBucket | None = None  # how many of its hellos are verified, once it is proven
 
     @property

@@ -1,14 +1,15 @@
-"""Whether the older of two nodes with one identity is still there.
+"""Presence query: whether the older of two nodes with one identity is still alive.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). A node that runs twice (copied keys, a cloned disk) has two
-incarnations. A node that was restarted has two as well, but the older one is dead. So a RIB that is brought a node's
-own name in a new incarnation, from another switch, asks the older one's switch::
+incarnations. A node that was restarted has two as well, but the older one has ended. When a RIB receives a known node's
+own name in a new incarnation, from another switch, it queries the older one's switch::
 
-    newer node --claim--> its switch --relay--> RIB --presence question--> older node's switch --the same--> older node
-                                     <-IN_USE--     <--presence answer--   (heard since: there; lost: gone)
+    newer node --advertisement--> its switch --relay--> RIB --query--> older node's switch --the same--> older node
+                                             <-IN_USE--     <--response--  (heard since: there; lost: gone)
 
-The newer one asks again until the older one is gone. Where the older one is of another domain, only the tier above
-knows of it: what that has refused is passed up again and again, and not believed here until it is taken there.
+The newer node repeats its advertisement until the older one is gone. If the older one is of another domain, only the
+tier above knows of it. An advertisement that the tier above refused is forwarded to it again and again, and not
+accepted here until it is accepted there.
 """
 
 from __future__ import annotations
@@ -25,21 +26,22 @@ from gdp.names import Name
 __all__ = ["IdentityChecks", "Presence"]
 
 NO_ANSWER_S: Final = 1.5  # above the time after which a switch gives up a silent neighbour
-_BELIEVED_S: Final = 0.5  # an answer "is there" stands for so long before the switch is asked again
-_REFUSED_ABOVE_S: Final = 10.0  # a refusal from above stands for so long; a refused node asks more often
+_BELIEVED_S: Final = 0.5  # an answer "is there" is valid for this time, before the switch is queried again
+# a refusal from above is valid for this time; a refused node repeats its advertisement more often
+_REFUSED_ABOVE_S: Final = 10.0
 _CHECKS_MAX: Final = 1_024
 
 
 @dataclass(frozen=True, slots=True)
 class Presence:
-    """A RIB's question about a node that is attached to a switch, or the switch's answer.
+    """A RIB's query about a node that is attached to a switch, or the switch's response.
 
     Args:
         node: the identity.
         incarnation: of the older node.
-        other: the switch that the newer node claims through.
-        question: Unix milliseconds at which it was asked; the answer repeats them, so that an old one is told.
-        is_answer: whether this answers the question; then ``is_there`` says how.
+        other: the switch through which the newer node advertises.
+        question: Unix milliseconds of the query; the response repeats them, so that an old one is recognised.
+        is_answer: whether this is a response; then ``is_there`` holds the result.
     """
 
     node: Name
@@ -84,7 +86,7 @@ class _Check:
 
 
 class IdentityChecks:
-    """A RIB's open questions, by identity; bounded.
+    """A RIB's open presence queries, by identity; bounded.
 
     Attributes:
         clashes: how often a newer node was refused because the older one is there.
@@ -96,7 +98,7 @@ class IdentityChecks:
         self.clashes = 0
 
     def is_free(self, node: Name, incarnation: int, switch: Name, now_s: float) -> bool:
-        """Return whether the older node of this incarnation, at that switch, is gone; not while that is unknown."""
+        """Return whether the older node of this incarnation, at that switch, is gone; False while that is unknown."""
         check = self._checks.get(node)
         if check is None or (check.incarnation, check.switch) != (incarnation, switch):
             return False
@@ -108,7 +110,7 @@ class IdentityChecks:
         return False
 
     def must_ask(self, node: Name, incarnation: int, switch: Name, question: int, now_s: float) -> bool:
-        """Return whether the switch is to be asked now, and note under which number it is."""
+        """Return whether the switch is to be queried now, and note the number of the query."""
         check = self._checks.get(node)
         is_same = check is not None and (check.incarnation, check.switch) == (incarnation, switch)
         if check is not None and is_same and (check.answer is None or now_s < check.answered_s + _BELIEVED_S):
@@ -127,16 +129,16 @@ class IdentityChecks:
         self._refused_above[node] = incarnation, now_s + _REFUSED_ABOVE_S
 
     def taken_above(self, node: Name) -> None:
-        """Note that the tier above takes a node's claim."""
+        """Note that the tier above accepts a node's advertisement."""
         self._refused_above.pop(node, None)
 
     def is_refused_above(self, node: Name, incarnation: int, now_s: float) -> bool:
-        """Return whether a node has to be taken by the tier above first."""
+        """Return whether a node must be accepted by the tier above first."""
         refused, until_s = self._refused_above.get(node, (incarnation, now_s))
         return refused == incarnation and now_s < until_s
 
     def answered(self, presence: Presence, switch: Name, now_s: float) -> None:
-        """Take a verified answer of a switch; one to no open question is ignored."""
+        """Process a verified response of a switch; one to no open query is ignored."""
         check = self._checks.get(presence.node)
         said = presence.incarnation, switch, presence.question
         if check is not None and (check.incarnation, check.switch, check.question) == said:

@@ -1,6 +1,6 @@
-"""A question to a RIB, and its answers: one for each advertiser of the name, or one that there is none.
+"""Query to a RIB, and its responses: one for each advertiser of the name, or one that there is none.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ TRANSIT_MAX: Final = 64
 
 @dataclass(frozen=True, slots=True)
 class Query:
-    """Who advertises ``name``? With ``watch_s`` above zero: and tell me of changes for so long.
+    """Query for the advertisers of ``name``; with ``watch_s`` above zero also a watch for that time.
 
     Args:
-        revoked: digest of what the asker knows that the name's owner took back; the RIB sends all where its own
-            differs. None: that does not concern the asker.
+        revoked: digest of the revocations of the name's owner that the sender has; the RIB sends all if its own
+            differs. None: revocations do not concern the sender.
     """
 
     name: Name
@@ -54,13 +54,13 @@ class Response:
     """One advertiser of a name, or none.
 
     Args:
-        name: what was asked for.
-        advertiser: who advertises it; equal to ``name`` with an empty ``claim`` when nobody does.
-        claim: the advertiser's own signed claim, for the asker to verify; empty: it is gone, or nobody is there.
+        name: the name that was queried.
+        advertiser: node that advertises it; equal to ``name`` with an empty ``claim`` when no node does.
+        claim: the advertiser's own signed advertisement, for the receiver to verify; empty: it ended, or there is none.
         domain: where it is attached.
         transit: domains through which that domain lets its traffic pass.
-        lease_s: how long this may be believed.
-        sequence: of the newest claim that is gone; whoever knows a newer one has heard an old answer.
+        lease_s: validity of this response.
+        sequence: of the newest advertisement that ended; a receiver that knows a newer one ignores this response.
     """
 
     name: Name
@@ -73,7 +73,7 @@ class Response:
 
     @property
     def is_nobody(self) -> bool:
-        """Return whether this says that no one advertises the name."""
+        """Return whether no node advertises the name."""
         return not self.advertisement and self.advertiser == self.name
 
     def to_wire(self, signer: Name, key: SigningKey, membership: bytes) -> bytes:

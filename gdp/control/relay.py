@@ -1,6 +1,7 @@
-"""A claim or a revocation passed on: by the switch that its maker is attached to, or by a RIB to the tier above.
+"""Relay: an advertisement or a revocation, forwarded by its node's switch, or by a RIB to the tier above.
 
-Place: pure. A switch speaks for claims of its own domain; a RIB says which domain a claim that it passes up is of.
+Sans-I/O. A switch relays advertisements of its own domain; a RIB names the domain of each advertisement that it
+forwards to the tier above.
 """
 
 from __future__ import annotations
@@ -20,13 +21,13 @@ __all__ = ["Relay", "relayed"]
 
 @dataclass(frozen=True, slots=True)
 class Relay:
-    """A claim, a withdrawal or a revocation on its way.
+    """An advertisement, a withdrawal or a revocation that is forwarded.
 
     Args:
-        statement: what is passed on, signed by its maker.
-        transit: domains through which the domain of the claim's switch lets its traffic pass.
+        statement: the forwarded statement, signed by its maker.
+        transit: domains through which the domain of the advertisement's switch lets its traffic pass.
         membership: the signer's certificate, DER.
-        domain: where the claim's switch stands; None: in the signer's domain.
+        domain: domain of the advertisement's switch; None: the signer's domain.
     """
 
     statement: bytes
@@ -56,5 +57,8 @@ class Relay:
 
 
 def relayed(statement: bytes, switch: Identity, transit: Iterable[Name]) -> bytes:
-    """Return a claim or withdrawal of a node attached to a switch, relayed by that; ``transit``: of its domain."""
+    """Return an advertisement or withdrawal, relayed by the switch to which its node is attached.
+
+    ``transit`` is that of the switch's domain.
+    """
     return Relay(statement, tuple(sorted(transit)), switch.membership).to_wire(switch.name, switch.key)

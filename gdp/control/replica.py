@@ -1,8 +1,8 @@
-"""What the RIBs of one domain say to each other, so that each holds what any of them took.
+"""Replication statements between the RIBs of one domain, so that each holds what any of them accepted.
 
-Layer: sans-I/O. A ``Digest`` says what a RIB holds below a prefix of names, by hashes; a ``Fetch`` asks for the detail
-of prefixes, or for entries; an ``Inventory`` lists names with their sequence numbers; ``Replicas`` carries the entries,
-which prove themselves. Source: Merkle-tree anti-entropy (DeCandia et al., Dynamo, 2007, section 4.7).
+Sans-I/O. A ``Digest`` summarises by hashes what a RIB holds below a prefix of names; a ``Fetch`` requests the detail of
+prefixes, or entries; an ``Inventory`` lists names with their sequence numbers; ``Replicas`` carries the entries, which
+prove themselves. Source: Merkle-tree anti-entropy (DeCandia et al., Dynamo, 2007, section 4.7).
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ FETCH_PREFIXES_MAX: Final = 16
 FETCH_KEYS_MAX: Final = 64
 INVENTORY_MAX: Final = 128  # items of 73 bytes: 9.3 KiB
 ENTRIES_MAX: Final = 64
-_ROOM_BYTES: Final = CONTROL_MAX_BYTES - 4_096  # beside the entries: a membership, which has at most 4 KiB
-_ENTRY_COST_BYTES: Final = 180  # keys, names and heads of one entry beside its byte strings
+_ROOM_BYTES: Final = CONTROL_MAX_BYTES - 4_096  # excludes a membership, which has at most 4 KiB
+_ENTRY_COST_BYTES: Final = 180  # keys, names and heads of one entry, in addition to its byte strings
 _KEY_BYTES: Final = 2 * NAME_BYTES
 
 Key = tuple[Name, Name]  # name, advertiser
@@ -102,12 +102,12 @@ class Item:
 
     @property
     def key(self) -> Key:
-        """Return what it is about."""
+        """Return the name and the advertiser."""
         return self.name, self.advertiser
 
     @property
     def rank(self) -> int:
-        """Return what is higher for what is newer: by sequence, then the withdrawal."""
+        """Return a rank that is higher for the newer item: by sequence number, then the withdrawal."""
         return 2 * self.sequence + self.is_withdrawn
 
 
@@ -139,18 +139,19 @@ class Inventory:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A claim or a withdrawal as one RIB hands it to another.
+    """An advertisement or a withdrawal as one RIB sends it to another.
 
     Args:
         statement: signed by its maker.
-        membership: of the maker of a withdrawal, whose claim need not be known; empty for a claim.
+        membership: of the maker of a withdrawal, whose advertisement need not be known; empty for an advertisement.
         sender: the switch or RIB that relayed it.
-        domain: where the claim's switch stands.
+        domain: domain of the advertisement's switch.
         via: the domain of ``sender``.
         transit: domains through which that domain lets its traffic pass.
         lease_s: what is left of the lease.
-        is_from_above: learnt from the tier above.
-        until_unix_s: when a withdrawal may be forgotten: the claim can be proven no more; 0 for a claim.
+        is_from_above: received from the tier above.
+        until_unix_s: when a withdrawal may be forgotten, because its advertisement is no longer provable; 0 for an
+            advertisement.
     """
 
     statement: bytes
@@ -198,7 +199,7 @@ class Entry:
 
     @property
     def cost_bytes(self) -> int:
-        """Return what the entry takes of a statement, at most."""
+        """Return the bytes that the entry occupies in a statement, at most."""
         return len(self.statement) + len(self.membership) + len(self.transit) * (NAME_BYTES + 2) + _ENTRY_COST_BYTES
 
 
@@ -226,7 +227,7 @@ class Replicas:
 
 
 def batches(entries: Sequence[Entry]) -> Iterator[tuple[Entry, ...]]:
-    """Yield entries in groups that fit one statement each; one that fits none is left out."""
+    """Yield entries in groups that fit one statement each; an entry that fits none is left out."""
     group: list[Entry] = []
     size = 0
     for entry in entries:

@@ -1,17 +1,18 @@
-"""Two neighbours bring the trusted domains' revocations that they keep to the same state.
+"""Revocation synchronisation: two neighbours reconcile the trusted domains' revocations that they keep.
 
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-Who comes up is told digests, one for each trusted domain, and nothing else. Where both ends' differ they exchange the
-digests of 256 buckets, and each asks for what it lacks, with short ids of what it has. So only what is missing crosses
-the link, and only towards a neighbour that is up and has asked. What is sent is paced, and bounded for each neighbour's
-name, however often its sessions begin. Nothing is acknowledged: digests are said again when a transfer ends, and each
-``AGAIN_S``.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: anti-entropy by digests, as in ``replica.py``.
+
+A neighbour that comes up gets digests, one for each trusted domain, and nothing else. If both ends' digests differ,
+they exchange the digests of 256 buckets, and each requests what it lacks, with short ids of what it has. So only what
+is missing crosses the link, and only towards a neighbour that is up and has requested it. Transfers are rate-limited,
+and bounded for each neighbour's name, however often its sessions begin. Nothing is acknowledged: digests are repeated
+when a transfer ends, and every ``AGAIN_S``.
 
 ::
 
     up ---> digests                           <- digests
-            (differ) digests of buckets  ->   (differ) what of them is lacking
-            what is lacking, paced       ->
+            (differ) digests of buckets  ->   (differ) request for what is missing
+            missing revocations, paced   ->
             digests                      ->
 """
 
@@ -35,18 +36,18 @@ from gdp.trust.token_buckets import TokenBuckets
 
 __all__ = ["AGAIN_S", "PER_S", "RevocationSync"]
 
-AGAIN_S: Final = 30.0  # digests are said again, so that a lost flood heals
+AGAIN_S: Final = 30.0  # digests are repeated, so that a lost flood is repaired
 PER_S: Final = 1_000.0  # statements to one neighbour, about 3 Mbit/s
 _TICK_S: Final = 0.02
 _PER_TICK: Final = round(PER_S * _TICK_S)
 _ASKS_PER_TICK: Final = 2
-_SOON_S: Final = 0.5  # digests go to one neighbour's name at most so often
-_REPLY_S: Final = 0.05  # ... or, where it has said that it keeps others, so soon
-_TAKEN_PER_S, _TAKEN_BURST = 16.0, 256.0  # of one neighbour's statements
-_SETTLE_S: Final = 0.3  # after a transfer, until what was sent last has been taken
-_FETCH_S: Final = 2.0  # without news in a transfer another neighbour may be asked
+_SOON_S: Final = 0.5  # minimum time between digests to one neighbour's name
+_REPLY_S: Final = 0.05  # ... or, if its digests differ, this shorter time
+_TAKEN_PER_S, _TAKEN_BURST = 16.0, 256.0  # accepted of one neighbour
+_SETTLE_S: Final = 0.3  # after a transfer, until the last statements have been processed
+_FETCH_S: Final = 2.0  # without progress of a transfer another neighbour may be queried
 _WINDOW_S: Final = 600.0  # in which a neighbour gets at most twice all there is
-_SPARE: Final = 4_096  # ... and so many more
+_SPARE: Final = 4_096  # ... and this many more
 _NAMES_MAX: Final = 1_024
 
 Say = Callable[[Neighbour, bytes], None]
@@ -64,18 +65,18 @@ class _Peer:
 
 @dataclass(slots=True)
 class _Drawn:
-    """What one neighbour's name got in a window of time."""
+    """What one neighbour's name received in a window of time."""
 
     since_s: float
     count: int = 0
 
 
 class RevocationSync:
-    """One node's part in it.
+    """Revocation synchronisation of one node.
 
     Args:
         say: sends a statement to a neighbour.
-        first_sequence: above those of an earlier life; wall-clock milliseconds do.
+        first_sequence: above those of an earlier incarnation; wall-clock milliseconds suffice.
     """
 
     def __init__(
@@ -87,14 +88,15 @@ class RevocationSync:
         self._say = say
         self._sequence = first_sequence
         self._peers: dict[tuple[int, Name], _Peer] = {}
-        self._said_s: dict[Name, float] = {}  # when digests went to a name
+        self._said_s: dict[Name, float] = {}  # when digests were sent to a name
         self._drawn: dict[Name, _Drawn] = {}
         self._taken = TokenBuckets(_TAKEN_PER_S, _TAKEN_BURST, _NAMES_MAX)
         self._received: dict[tuple[bytes, Name], int] = {}  # by session and name: the highest sequence number
-        self._fetches: dict[Name, tuple[tuple[int, Name], float]] = {}  # domain to whom it is had from, until when
+        # domain to the neighbour that sends it, until when
+        self._fetches: dict[Name, tuple[tuple[int, Name], float]] = {}
 
     def neighbour_up(self, neighbour: Neighbour, now_s: float) -> None:
-        """Have a neighbour told digests: it has come up, or has restarted."""
+        """Schedule digests for a neighbour that has come up, or has restarted."""
         at_s = max(now_s, self._said_s.get(neighbour.name, float("-inf")) + _SOON_S)
         self._peers[neighbour.port, neighbour.name] = _Peer(neighbour, at_s)
 
@@ -103,7 +105,7 @@ class RevocationSync:
         self._peers.pop((neighbour.port, neighbour.name), None)
 
     def receive(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
-        """Take a neighbour's digests, or what it lacks.
+        """Process a neighbour's digests, or its request.
 
         Raises:
             StatementError: MALFORMED, UNKNOWN_SENDER, BAD_SIGNATURE, REPLAYED or QUOTA.
@@ -130,7 +132,7 @@ class RevocationSync:
             self._answer(peer, said, now.mono_s)
 
     def took(self, neighbour: Neighbour, domain: Name, now_s: float) -> None:
-        """Note that a neighbour sent a revocation that was lacking here; the others are told digests in a while."""
+        """Note that a neighbour sent a revocation that was missing here; the others get digests after a delay."""
         key = neighbour.port, neighbour.name
         fetch = self._fetches.get(domain)
         if fetch is not None and fetch[0] == key:
@@ -140,7 +142,7 @@ class RevocationSync:
                 peer.summary_at_s = min(max(peer.summary_at_s, now_s), now_s + _FETCH_S)
 
     def handle_timer(self, now_s: float) -> None:
-        """Say what is due."""
+        """Send what is due."""
         for peer in list(self._peers.values()):
             if peer.tick_at_s <= now_s and (peer.asks or peer.sends):
                 self._tick(peer, now_s)
@@ -170,7 +172,7 @@ class RevocationSync:
         self._send(peer, Revoked(peer.neighbour.echo, self._next(), tuple(self._revoked.summary())))
 
     def _compare(self, peer: _Peer, said: Revoked, now: Timestamps) -> None:
-        """Ask for what is lacking here, or say more exactly what is here."""
+        """Request what is missing here, or send finer digests of what is here."""
         self._revoked.expire(now.unix_s)
         own = {domain: (count, digest) for domain, count, digest in self._revoked.summary()}
         if said.hashes:
@@ -180,7 +182,7 @@ class RevocationSync:
             if domain not in own or own[domain][1] == digest:
                 continue
             soon_s = self._said_s.get(peer.neighbour.name, float("-inf")) + _REPLY_S
-            peer.summary_at_s = min(peer.summary_at_s, max(soon_s, now.mono_s))  # it may have to ask, too
+            peer.summary_at_s = min(peer.summary_at_s, max(soon_s, now.mono_s))  # it may have to request, too
             if not own[domain][0]:
                 self._ask(peer, domain, [()], now.mono_s)
             elif count:
@@ -204,11 +206,11 @@ class RevocationSync:
         self._ask(peer, said.domain, groups, now_s)
 
     def _ask(self, peer: _Peer, domain: Name, groups: list[tuple[int, ...]], now_s: float) -> None:
-        """Ask one neighbour at a time for what is lacking of a domain."""
+        """Request what is missing of a domain, from one neighbour at a time."""
         key = peer.neighbour.port, peer.neighbour.name
         _, until_s = self._fetches.get(domain, (key, float("-inf")))
         if until_s > now_s or not groups:
-            return  # the next digests will show whether anything is lacking still
+            return  # the next digests will show whether anything is still missing
         self._fetches[domain] = key, now_s + _FETCH_S
         peer.asks.extend((domain, group) for group in groups)
 

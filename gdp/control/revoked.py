@@ -1,6 +1,6 @@
-"""What neighbours say of the revocations that they keep: digests, and what the sender lacks.
+"""Revocation digests of neighbours, and requests for missing revocations.
 
-Sans-I/O. Only revocations of trusted domains are compared; ``revocation_sync.py`` decides what is said when.
+Sans-I/O. Only revocations of trusted domains are compared; ``revocation_sync.py`` decides what is sent when.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ IDS_MAX: Final = 1_500  # 12,000 bytes: a statement has at most 16 KiB
 
 @dataclass(frozen=True, slots=True)
 class Revoked:
-    """Digests of what the sender keeps.
+    """Digests of the revocations that the sender keeps.
 
     Args:
         session: echo of the receiver's port (``echo_of``).
-        sequence: rises with everything that the sender says of revocations.
-        domains: trusted domain, how many it took back, digest of these.
+        sequence: rises with every statement of the sender about revocations.
+        domains: trusted domain, number of its revocations, digest of these.
         domain: of ``hashes``; ``ZERO``: there are none.
         hashes: digests of this domain's 256 buckets, or empty.
     """
@@ -69,9 +69,9 @@ class Lacking:
 
     Args:
         session, sequence: as in ``Revoked``.
-        domain: whose.
-        buckets: first bytes of the fingerprints that it is about; empty: all.
-        ids: what of these the sender has, at most ``IDS_MAX``.
+        domain: the revoking domain.
+        buckets: first bytes of the fingerprints that are requested; empty: all.
+        ids: those of them that the sender has, at most ``IDS_MAX``.
     """
 
     session: bytes

@@ -1,6 +1,6 @@
-"""What every node is given at its start: the marks of its new life, randomness, and how it greets.
+"""Node settings at start: marks of the new incarnation, randomness, and hello timing.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ __all__ = ["NodeSettings"]
 
 @dataclass(frozen=True, slots=True)
 class NodeSettings:
-    """The start of a switch, a RIB or a member.
+    """Start settings of a switch, a RIB or a participant.
 
     Args:
         incarnation: 64 random bits, new at each start.
-        first_sequence: above every sequence number of an earlier life; wall-clock milliseconds do.
+        first_sequence: above every sequence number of an earlier incarnation; wall-clock milliseconds suffice.
         random_bytes: source of nonces.
         hello_s: between two hellos on a port.
-        dead_s: a neighbour silent for so long is gone, while it sends no keepalives.
-        lease_s: lease of what the node keeps at RIBs: claims of a member or a RIB, watches of a switch.
+        dead_s: a neighbour silent for this time is lost, while it sends no keepalives.
+        lease_s: lease of what the node keeps at RIBs: advertisements of a participant or a RIB, watches of a switch.
         keepalive_ms: between keepalives, which neighbours negotiate; 0: none; None: in proportion to ``dead_s``.
-        detect_multiplier: a neighbour silent for so many keepalives is gone.
+        detect_multiplier: a neighbour silent for this number of keepalives is lost.
     """
 
     incarnation: int
@@ -40,11 +40,11 @@ class NodeSettings:
 
     @property
     def life(self) -> bytes:
-        """Return the mark of this life, ``LIFE_BYTES``: of two, that of the older one is less."""
+        """Return the mark of this incarnation, ``LIFE_BYTES``: of two, that of the older one is less."""
         return self.first_sequence.to_bytes(8, "big") + self.incarnation.to_bytes(8, "big")
 
     @property
     def timing(self) -> Timing:
-        """Return what this node wants of keepalives."""
+        """Return the keepalive timing that this node requests."""
         every_ms = round(KEEPALIVE_MS * self.dead_s / DEAD_S) if self.keepalive_ms is None else self.keepalive_ms
         return Timing(every_ms, every_ms, self.detect_multiplier)

@@ -1,7 +1,7 @@
-"""Nodes whose hellos were refused on a port, kept for a message to the operator.
+"""Refused neighbours of a port, kept for a message to the operator.
 
-Sans-I/O. Nothing here is proven: a refused certificate may say anything, so labels serve for reading only, and their
-number is bounded.
+Sans-I/O. Nothing here is proven: a refused certificate may contain anything. So labels serve for reading only, and
+their number is bounded.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from gdp.errors import DropReason
 
 __all__ = ["Stranger", "Strangers"]
 
-STRANGERS_MAX: Final = 8  # on one port; the one silent for longest makes room
+STRANGERS_MAX: Final = 8  # on one port; the one silent for longest is evicted
 
 
 @dataclass(slots=True)

@@ -1,7 +1,7 @@
-"""What a node that makes no progress waits for.
+"""Wait reasons: what a node that makes no progress waits for.
 
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds). ``port_waits`` and a node's own rules (in ``waiting.py`` of
-``gdp/client`` and ``gdp/switch``) say what is waited for now; ``WaitLog`` decides when to report it.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). ``port_waits`` and a node's own rules (such as
+``attachment_waits`` in ``gdp/client/attachment.py``) return the present waits; ``WaitLog`` decides when to report them.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from gdp.names import Name
 
 __all__ = ["Wait", "WaitLog", "WaitReason", "port_waits", "stranger_waits"]
 
-_SETTLE_S: Final = 1.0  # a change of the reason is reported after it has held for so long
+_SETTLE_S: Final = 1.0  # a change of the reason is reported after it has lasted this long
 _STRANGER_S: Final = 2.0  # a refused neighbour that was silent for longer is gone
 
 
 class WaitReason(Enum):
-    """Why a node makes no progress. The value is the label of the metric ``gdp_waiting``."""
+    """Reason why a node makes no progress; the value is the label of the metric ``gdp_waiting``."""
 
     LINK_DOWN = "link-down"
     NO_NEIGHBOUR = "no-neighbour"
     STRANGER = "neighbour-refused"  # its certificate is not accepted here
-    ONE_WAY = "not-heard"  # we hear a neighbour that does not hear us, or refuses us
+    ONE_WAY = "not-heard"  # a neighbour whose hellos we receive does not receive ours, or refuses us
     NO_SWITCH = "no-switch"  # neighbours, but none is a switch
     NO_RIB = "no-rib"
     REFUSED = "claim-refused"
     IN_USE = "identity-in-use"
-    THROUGH_LEAF = "through-leaf"  # switches of the domain that only a leaf joins to this one
+    THROUGH_LEAF = "through-leaf"  # switches of the domain that only a leaf connects to this one
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class Wait:
     """One thing that a node waits for.
 
     Args:
-        port: index of the port that it is about, where it is about one.
+        port: index of the port concerned, if any.
         domain: label of a stranger's domain; unproven, maybe empty.
         name: of the neighbour, of the advertisement that was refused, or of one switch that is cut off.
         refused: why a hello or an advertisement was refused.
@@ -68,7 +68,7 @@ class Wait:
 
 
 def port_waits(port: HelloPort, wanted: Collection[Role]) -> Iterator[Wait]:
-    """Yield why a port has no neighbour of a wanted role; nothing where it has one."""
+    """Yield the reasons why a port has no neighbour of a wanted role; nothing if it has one."""
     if not port.is_up:
         yield Wait(WaitReason.LINK_DOWN, port.index)
         return
@@ -102,7 +102,7 @@ class _Subject:
 
 
 class WaitLog:
-    """Picks what is to be reported: what lasts, once, and again when it changes.
+    """Choice of the waits to report: each lasting one, once, and again when it changes.
 
     Args:
         after_s: how long a node may make no progress before that is reported.
@@ -114,11 +114,11 @@ class WaitLog:
 
     @property
     def lasting(self) -> list[Wait]:
-        """Return what has been reported and still holds."""
+        """Return the waits that have been reported and still hold."""
         return [each.wait for each in self._subjects.values() if each.reported == each.wait]
 
     def update(self, waits: Sequence[Wait], now_s: float) -> list[Wait]:
-        """Learn what is waited for now; return what is to be reported."""
+        """Update the present waits; return those to report."""
         current = {wait.subject: wait for wait in waits}
         for subject in self._subjects.keys() - current.keys():
             del self._subjects[subject]

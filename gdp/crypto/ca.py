@@ -1,8 +1,8 @@
-"""Making certificates: a domain founds itself, a node asks, the domain admits it.
+"""Certificate authority of a domain: it creates the root and issues memberships on request.
 
-Place: pure, but for the randomness of serial numbers and signatures.
-Source: RFC 5280 (certificates), RFC 2986 (requests). What is written here, ``openssl x509`` and ``openssl verify``
-read; what ``openssl x509 -req -copy_extensions copy`` issues from such a request, ``certificates`` reads.
+Sans-I/O except for the randomness of serial numbers and signatures. Source: RFC 5280 (certificates), RFC 2986
+(requests). ``openssl x509`` and ``openssl verify`` read what this module writes. ``certificates`` reads what ``openssl
+x509 -req -copy_extensions copy`` issues from such a request.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _KEY_ID_BYTES: Final = 20
 
 @dataclass(frozen=True, slots=True)
 class CertificateAuthority:
-    """A trust domain's root with its private key: who holds it decides who belongs."""
+    """A trust domain's root with its private key: the holder of it decides which nodes belong."""
 
     key: SigningKey
     root: Root
@@ -47,7 +47,7 @@ class CertificateAuthority:
 
     @classmethod
     def create(cls, label: str, key: SigningKey, validity: Validity) -> CertificateAuthority:
-        """Return a new domain; its id is the name that kind, label and key give.
+        """Return a new domain; kind, label and key give its id, which is a name.
 
         Raises:
             LocalError: the label is empty, too long or not printable.
@@ -68,7 +68,7 @@ class CertificateAuthority:
         Args:
             key: the successor's.
             validity: of the successor.
-            retires_unix_s: until when what this key signed is believed, by whoever has the successor's root.
+            retires_unix_s: until when signatures of this key are valid for nodes that have the successor's root.
 
         Raises:
             LocalError: it is the same key.
@@ -89,24 +89,24 @@ class CertificateAuthority:
         """Issue a membership again, with the same key, role and label.
 
         Raises:
-            LocalError: it is of another domain, it would outlive the root, or the root has run out.
+            LocalError: it is of another domain, it would outlive the root, or the root has expired.
         """
         if member.domain != self.root.domain:
             raise LocalError("a membership of another domain")
         return self._issue(SubjectInfo(member.subject, member.role.value, member.label, member.key), validity)
 
     def issue(self, request: bytes, validity: Validity) -> Membership:
-        """Issue the membership that a request asks for.
+        """Issue the membership that a request describes.
 
-        Whoever calls has decided that this node belongs, in the role and under the label that it asks for.
+        The caller has decided that this node belongs, in the role and under the label of the request.
 
         Args:
             request: PKCS #10, DER or PEM.
             validity: as long as the node may stay; at most as long as the root's.
 
         Raises:
-            StatementError: BAD_CERTIFICATE or WRONG_NAME, the request does not hold.
-            LocalError: it would outlive the root, or the root has run out.
+            StatementError: BAD_CERTIFICATE or WRONG_NAME, the request is not valid.
+            LocalError: it would outlive the root, or the root has expired.
         """
         holder = read_request(request)
         if holder.unit not in [role.value for role in Role]:
@@ -130,11 +130,11 @@ class CertificateAuthority:
 
 
 def request_membership(key: SigningKey, role: Role, label: str, digest: bytes) -> bytes:
-    """Return a PKCS #10 request, PEM, by which a node asks a domain to admit it.
+    """Return a PKCS #10 request, PEM, by which a node requests its membership in a domain.
 
     Args:
         key: the node's own.
-        role: what it wants to be.
+        role: the requested role.
         label: its name for people.
         digest: that of the node's metadata.
 
@@ -170,7 +170,7 @@ def _builder(
 
 
 def _key_id(key: PublicKey) -> bytes:
-    """Return a successor's key id: another than the founder's, which is the domain's name."""
+    """Return a successor's key id: it differs from the founder's, which is the domain's name."""
     return hashlib.sha256(key.compressed).digest()[:_KEY_ID_BYTES]
 
 

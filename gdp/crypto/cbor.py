@@ -1,9 +1,8 @@
-"""Deterministic CBOR: written shortest (in ``cbor_writer``), read strictly (here).
+"""Deterministic CBOR: the strict reader (the writer is ``cbor_writer``).
 
-Place: pure.
-Source: RFC 8949, section 4.2.1. A peer's bytes have one reading or none: what this reader accepts, the writer would
-have written bit for bit, so that nothing signed can be worn in two forms. The reader is our own because it must bound
-depth and items *before* they cost anything; it takes some 13 us for a claim with its evidence.
+Sans-I/O. Source: RFC 8949, section 4.2.1. Bytes have one reading or none: the writer would have written bit for bit
+what this reader accepts. So no signed value has two encodings. The reader is our own because it must bound depth and
+items *before* they cost anything. It takes about 13 us for an advertisement with its evidence.
 
 Allowed are integers of 64 bits, byte and text strings, arrays, maps with text keys, false, true, null and floats. Not
 allowed: tags, indefinite lengths, other simple values, and anything not in its shortest form.
@@ -32,7 +31,7 @@ def decode(wire: bytes, max_bytes: int = CONTROL_MAX_BYTES) -> Value:
     """Read one deterministic item that fills ``wire`` exactly.
 
     Raises:
-        StatementError: MALFORMED, for whatever else these bytes are; never another exception.
+        StatementError: MALFORMED, for any other bytes; never another exception.
     """
     if len(wire) > max_bytes:
         _refuse(f"{len(wire)} bytes, at most {max_bytes} allowed")
@@ -111,7 +110,7 @@ class _Reader:
     def _key(self, depth: int) -> str:
         start = self.at
         length = self.wire[start] - 0x60 if start < len(self.wire) else -1
-        if 0 <= length < 24:  # the usual short key, without the general case's cost
+        if 0 <= length < 24:  # the usual short key, without the cost of the general case
             self.at = start + 1 + length
             raw = self.wire[start + 1 : self.at]
             if len(raw) != length:

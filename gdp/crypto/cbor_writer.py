@@ -1,8 +1,8 @@
-"""The writing half of ``cbor``: one value, one encoding.
+"""Deterministic CBOR: the writer, with one encoding for each value (the reader is ``cbor``).
 
-Place: pure.
-Source: RFC 8949, section 4.2.1. It is our own for the same reason as the reader: what is signed must not depend on the
-version of a library. (cbor2 before 6.0 does not write half-precision floats from 32768 on in their shortest form.)
+Sans-I/O. Source: RFC 8949, section 4.2.1. It is our own for the same reason as the reader: signed bytes must not depend
+on the version of a library. (cbor2 before 6.0 does not write half-precision floats from 32768 on in their shortest
+form.)
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""X.509 for trust domains: a root that vouches for itself, and the membership of a node that the root signs.
+"""X.509 certificates of trust domains: the self-signed root, and the membership of a node, which the root signs.
 
-Place: pure. The form of both stands in ``x509_form``, making them in ``issuing``.
-Source: RFC 5280.
+Sans-I/O. ``x509_profile`` defines the format of both; ``ca`` makes them. Source: RFC 5280.
 """
 
 from __future__ import annotations
@@ -26,10 +25,10 @@ _PEM_END: Final = b"-----END CERTIFICATE-----\n"
 
 
 class Role(str, Enum):
-    """What a node is in its domain.
+    """Role of a node in its domain.
 
     A leaf is a switch that carries the traffic of the nodes attached to it and no transit (RFC 6987, stub router).
-    Other switches hold it to that by its certificate.
+    Other switches enforce that by its certificate.
     """
 
     SWITCH = "switch"
@@ -39,15 +38,15 @@ class Role(str, Enum):
 
     @property
     def is_switch(self) -> bool:
-        """Return whether nodes attach to it and it speaks of links: a switch or a leaf."""
+        """Return whether nodes attach to it and it originates link states: a switch or a leaf."""
         return self in (Role.SWITCH, Role.LEAF)
 
 
 @dataclass(frozen=True, slots=True)
 class Root:
-    """A trust domain's own certificate; its signature, its name and its form have been checked.
+    """A trust domain's own certificate; its signature, its name and its format have been checked.
 
-    Trusting it is the policy's decision, made by putting it there.
+    A policy trusts it by including it.
     """
 
     subject: Subject
@@ -57,11 +56,11 @@ class Root:
     key_id: bytes
     distinguished_name: bytes = field(repr=False)  # DER
     wire: bytes = field(repr=False)  # DER
-    predecessors: tuple[Root, ...] = ()  # the oldest first; each ends when its successor says
+    predecessors: tuple[Root, ...] = ()  # the oldest first; each ends at the time in its successor
 
     @property
     def domain(self) -> Name:
-        """Return the domain's id, which is a name like all others: the founder's, whoever succeeded it."""
+        """Return the domain's id, which is a name: the founder's, also under successors."""
         return self.subject.name
 
     @property
@@ -71,12 +70,12 @@ class Root:
 
     @property
     def signer(self) -> Subject:
-        """Return as whom this root's key signs statements: the domain, or in its place the successor's key."""
+        """Return the subject under which this root's key signs: the domain, or in its place the successor's key."""
         return Subject(self.subject.digest, self.key.compressed)
 
     @classmethod
     def from_wire(cls, wire: bytes) -> Root:
-        """Read a root in DER or PEM; in PEM its successors may follow it, each vouched for by the one before.
+        """Read a root in DER or PEM; in PEM its successors may follow it, each signed by the one before.
 
         Raises:
             StatementError: BAD_CERTIFICATE or WRONG_NAME.
@@ -92,7 +91,7 @@ class Root:
         return root
 
     def succeeded_by(self, wire: bytes) -> Root:
-        """Return the root that this one vouches for as its successor; this one ends when the successor says.
+        """Return the successor that this root signed; this root ends at the time in the successor.
 
         Raises:
             StatementError: BAD_CERTIFICATE or WRONG_NAME: not by this root, or of another domain.
@@ -111,7 +110,7 @@ class Root:
         return replace(Root._of(certificate), predecessors=(*self.predecessors, retired))
 
     def to_pem(self) -> bytes:
-        """Return what ``from_wire`` reads: this root, after those that it succeeded."""
+        """Return what ``from_wire`` reads: this root, after its predecessors."""
         return b"".join(to_pem(each.wire) for each in self.lineage)
 
     @classmethod
@@ -129,7 +128,7 @@ class Root:
 
 @dataclass(frozen=True, slots=True)
 class Membership:
-    """A node's certificate that a root did sign. Time and revocation move on, so they are asked at each use."""
+    """A node's certificate whose root signature was verified. Time and revocation are checked at each use."""
 
     subject: Subject
     role: Role
@@ -137,7 +136,7 @@ class Membership:
     label: str
     key: PublicKey
     validity: Validity
-    fingerprint: bytes  # SHA-256 of the signed part: no second signature makes it another
+    fingerprint: bytes  # SHA-256 of the signed part: a second signature does not change it
     issuer_key: bytes  # of the root that signed it, 33 bytes
     wire: bytes = field(repr=False)  # DER
 
@@ -172,7 +171,7 @@ class Membership:
 
 
 def issuer_label(wire: bytes) -> str:
-    """Return the label of the domain that a certificate, DER, says it is of: unproven, printable, maybe empty."""
+    """Return the domain label in a certificate, DER: unproven, printable, maybe empty."""
     try:
         label = issuer_common_name(wire)
     except StatementError:
@@ -182,7 +181,7 @@ def issuer_label(wire: bytes) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Unverified:
-    """A membership whose name comes out, but whose issuer has not been asked for yet."""
+    """A membership whose name is right, but whose issuer has not been verified yet."""
 
     subject: Subject
     role: Role
@@ -198,7 +197,7 @@ class Unverified:
         """Read a membership in DER or PEM; costs about 0.1 ms.
 
         Raises:
-            StatementError: BAD_CERTIFICATE or WRONG_NAME; never another exception, whatever the bytes.
+            StatementError: BAD_CERTIFICATE or WRONG_NAME; never another exception, for any bytes.
         """
         certificate = read(wire)
         try:

@@ -1,15 +1,13 @@
-"""A short sealed note from one member of a topic to another, such as a reader's report; not signed.
+"""Sealing of control messages between members of a topic, such as a reader's AckNack; they are not signed.
 
-Place: pure.
-Source: docs/explanation/design.md, section 4;
-AES-256-GCM-SIV (RFC 8452), HKDF (RFC 5869), X25519 (RFC 7748). Layout: ``header | topic (32)
-| ciphertext | tag``; the nonce is number || 0; additional data is the header without hops left, the topic, and the
-incarnation of the one it is for.
+Sans-I/O. Source: docs/explanation/design.md, section 4; AES-256-GCM-SIV (RFC 8452), HKDF (RFC 5869), X25519 (RFC 7748).
+Layout: ``header | topic (32) | ciphertext | tag``. The nonce is number || 0. The additional data are the header without
+its hops-left field, the topic, and the incarnation of the recipient.
 
-The key of a report belongs to one life of each end: it comes from the agreement of their two X25519 keys and from the
-topic's secret. So a note proves which reader wrote it, and that this reader holds the secret of the note's epoch. A
-process that was copied, as by two machines resumed from one snapshot, may use a number twice: under GCM-SIV that tells
-no more than whether two notes are the same.
+The key of a control message belongs to one incarnation of each end. It is derived from the agreement of their two
+X25519 keys and from the topic's secret. So a control message proves which reader wrote it, and that this reader has the
+secret of the message's epoch. A copied process, such as two machines resumed from one snapshot, may use a number twice.
+Under GCM-SIV that reveals only whether two control messages are equal.
 """
 
 from __future__ import annotations
@@ -34,7 +32,8 @@ __all__ = ["JUMP_MAX", "ControlOpener", "ControlReplayWindow", "ControlSealer", 
 
 _NONCE: Final = struct.Struct("!QI")
 _INCARNATION: Final = struct.Struct("!Q")
-JUMP_MAX: Final = 4_096  # numbers between two notes that come together; a reader's feeds share its numbers
+# numbers between two messages that arrive together; the writer proxies of a reader share its numbers
+JUMP_MAX: Final = 4_096
 _NUMBERS_PER_S: Final = 100_000  # more than one process sends
 _BODY_AT: Final = HEADER_BYTES + NAME_BYTES
 
@@ -49,10 +48,10 @@ def note_key(
     destination_incarnation: int,
     topic: bytes,
 ) -> bytes:
-    """Return the 32-byte key of the notes that one life of a node sends to one life of another about one topic.
+    """Return the 32-byte key of control messages about one topic, from one node's incarnation to another's.
 
     Args:
-        shared: what the X25519 keys of both lives agree on.
+        shared: the secret that the X25519 keys of both incarnations agree on.
         secret: topic secret of the epoch.
     """
     ends = source + _INCARNATION.pack(incarnation) + destination + _INCARNATION.pack(destination_incarnation)
@@ -61,10 +60,10 @@ def note_key(
 
 
 def topic_of(header: Header, frame: bytes) -> bytes:
-    """Return the topic that a note is about; not yet authenticated.
+    """Return the topic of a control message; not yet authenticated.
 
     Raises:
-        EnvelopeError: too short for one.
+        EnvelopeError: shorter than a topic.
     """
     if header.length < NAME_BYTES + TAG_BYTES or header.parts != 1:
         raise EnvelopeError(DropReason.TRUNCATED, "note")
@@ -72,7 +71,7 @@ def topic_of(header: Header, frame: bytes) -> bytes:
 
 
 class ControlSealer:
-    """Seals notes of one source's incarnation about one topic to one incarnation of a destination.
+    """Seals control messages of one source's incarnation about one topic to one incarnation of a destination.
 
     Args:
         key: 32 bytes.
@@ -98,7 +97,7 @@ class ControlSealer:
         self._numbers = numbers
 
     def seal(self, body: bytes) -> bytes:
-        """Return the frame of the next note."""
+        """Return the frame of the next control message."""
         number = next(self._numbers)
         length = NAME_BYTES + len(body) + TAG_BYTES
         header = encode(self._header._replace(number=number, length=length))
@@ -107,14 +106,14 @@ class ControlSealer:
 
 
 class ControlOpener:
-    """Opens notes under one key, whatever their numbers; ``ControlReplayWindow`` says which are news."""
+    """Opens control messages under one key, whatever their numbers; ``ControlReplayWindow`` rejects replays."""
 
     def __init__(self, key: bytes, topic: bytes, destination_incarnation: int) -> None:
         self._aead = AESGCMSIV(key)
         self._context = topic + _INCARNATION.pack(destination_incarnation)
 
     def open(self, header: Header, frame: bytes) -> bytes:
-        """Return the note's body.
+        """Return the body of a control message.
 
         Raises:
             EnvelopeError: BAD_TAG, altered or under another key.
@@ -127,14 +126,14 @@ class ControlOpener:
 
 
 class ControlReplayWindow:
-    """Which numbers of one source's incarnation are news: those above the last, and not further than time allows."""
+    """Replay check for one source's incarnation: numbers must rise, and by no more than the elapsed time allows."""
 
     def __init__(self) -> None:
         self._last = 0
         self._last_s = 0.0
 
     def check(self, number: int, now_s: float) -> None:
-        """Return if a note of this number may be opened.
+        """Return if a control message of this number may be opened.
 
         Raises:
             EnvelopeError: REPLAYED, not newer than the last; MALFORMED, so far above it that no process counts so fast.
@@ -145,5 +144,5 @@ class ControlReplayWindow:
             raise EnvelopeError(DropReason.MALFORMED, "a note far ahead of its time")
 
     def accept(self, number: int, now_s: float) -> None:
-        """Note the number of a note that opened."""
+        """Record the number of an opened control message."""
         self._last, self._last_s = number, now_s

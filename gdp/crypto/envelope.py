@@ -1,9 +1,8 @@
-"""Sealing a message into frames, and opening its parts one by one.
+"""Message envelope: it seals a message into frames, and opens its fragments one by one.
 
-Place: pure; no clock, no memory of messages (that is ``gdp/message``).
-Source: docs/explanation/design.md, section 4;
-XAES-256-GCM (C2SP), NIST SP 800-38D (GCM), RFC 5869 (HKDF), FIPS 186-5 (ECDSA). To the byte:
-``frame/spec.md``.
+Sans-I/O; no clock, no memory of messages (that is ``gdp/message``). Source: docs/explanation/design.md, section 4;
+XAES-256-GCM (C2SP), NIST SP 800-38D (GCM), RFC 5869 (HKDF), FIPS 186-5 (ECDSA). ``frame/spec.md`` gives each byte. The
+header fields call a fragment a part.
 
 ::
 
@@ -11,9 +10,10 @@ XAES-256-GCM (C2SP), NIST SP 800-38D (GCM), RFC 5869 (HKDF), FIPS 186-5 (ECDSA).
     header|salt|c0|tag     header|salt|c1|tag    ...    header|salt|cn|tag|signature
 
 Each part is XAES-256-GCM under a key that belongs to (topic secret, kind, source, incarnation, destination). Its nonce
-of 24 bytes is salt || 0 (4) || message number || part, the additional data the header without hops left. The salt is
-drawn for each message, because two copies of one process, as two machines resumed from one snapshot, use the same
-numbers. The signature covers SHA-256 over the header fields that all parts share, the salt, each ciphertext and tag.
+of 24 bytes is salt || 0 (4) || message number || part. The additional data are the header without its hops-left field.
+The salt is drawn for each message, because copies of a process, such as two machines resumed from one snapshot, use the
+same numbers. The signature covers SHA-256 over the header fields that all parts share, the salt, each ciphertext and
+tag.
 """
 
 from __future__ import annotations
@@ -56,18 +56,18 @@ __all__ = [
 
 TAG_BYTES: Final = 16
 SALT_BYTES: Final = 8
-SEAL_BYTES: Final = SALT_BYTES + TAG_BYTES  # what a sealed part has beside its ciphertext
+SEAL_BYTES: Final = SALT_BYTES + TAG_BYTES  # bytes of a sealed part without its ciphertext
 SIGNATURE_BYTES: Final = 64
 SECRET_BYTES: Final = 32
 _NONCE: Final = struct.Struct("!QI")
 _COMMON: Final = struct.Struct("!BBBHQIQ32s32s")
-_LAST: Final = int(Flag.LAST)  # a plain number: an IntFlag's operators cost a microsecond each
+_LAST: Final = int(Flag.LAST)  # a plain integer: an IntFlag's operators cost a microsecond each
 _BODY_AT: Final = HEADER_BYTES + SALT_BYTES
-_KEYS_KEPT: Final = 64  # messages of one source whose parts may come in turns without a new derivation
+_KEYS_KEPT: Final = 64  # messages of one source whose parts may interleave without another derivation
 
 
 class Signer(Protocol):
-    """What the envelope needs of a writer's private key."""
+    """Signing key of a writer, as the envelope needs it."""
 
     def sign_digest(self, digest: bytes) -> bytes:
         """Return 64 bytes, r || s, over a SHA-256 digest."""
@@ -76,7 +76,7 @@ class Signer(Protocol):
 def seal_key(secret: bytes, kind: int, source: bytes, incarnation: int, destination: bytes) -> bytes:
     """Return the 32-byte key of one source's incarnation towards one destination.
 
-    A restarted source has a new incarnation, hence a new key: no nonce can come twice under one key, whatever crashed.
+    A restarted source has a new incarnation, hence a new key. So no nonce recurs under one key, even after a crash.
 
     Args:
         secret: topic secret of the epoch, 32 bytes.
@@ -102,7 +102,7 @@ class MessageKeys:
         self._mask = counters ^ (subkey << 128 | subkey)
 
     def of(self, salt: bytes) -> AESGCM:
-        """Return the cipher under a salt of up to 12 bytes: the first half of XAES's nonce, filled up with zeros."""
+        """Return the cipher under a salt of up to 12 bytes: the first half of XAES's nonce, padded with zeros."""
         first = int.from_bytes(salt, "big") << 8 * (12 - len(salt))
         return AESGCM(self._encrypt(((first << 128 | first) ^ self._mask).to_bytes(32, "big")))
 
@@ -143,9 +143,9 @@ class Sealer:
     """Seals one kind of message of one source towards one destination, under one epoch's key.
 
     Args:
-        random_bytes: the system's randomness, asked for each message and never ahead: what was drawn before a machine
-            was copied is no longer random.
-        address: what the headers name as destination; None: ``destination``, which the key is bound to.
+        random_bytes: the system's randomness, drawn for each message and never ahead: values drawn before a machine was
+            copied are no longer random.
+        address: the destination in the headers; None: ``destination``, which the key is bound to.
     """
 
     def __init__(
@@ -170,16 +170,16 @@ class Sealer:
     def seal(self, number: int, flags: int, message: bytes | Sealed, mtu: int) -> Sealed:
         """Return a message as its frames, each from the header on and at most ``mtu`` bytes long.
 
-        A part is encrypted when its frame is first asked for, so that the first ones may be on their way before the
-        last ones are sealed.
+        A part is encrypted when its frame is first requested. So the first frames may leave before the last ones are
+        sealed.
 
         Args:
-            number: message number; above every number this sealer was given before.
+            number: message number; above every earlier number of this sealer.
             flags: without ``Flag.LAST``.
-            message: one that was sealed before is opened when the first frame is asked for.
+            message: a ``Sealed`` message is opened when the first frame is requested.
 
         Raises:
-            LocalError: a number that is not newer (its nonces would come twice), or a message above the limits.
+            LocalError: a number that is not newer (its nonces would recur), or a message above the limits.
         """
         if number <= self._last_number:
             raise LocalError(f"message number {number} was sealed before")
@@ -196,7 +196,7 @@ class Sealer:
 
 
 class Sealed(Sequence[bytes]):
-    """The frames of one message, sealed in order and as far as they have been asked for; always the same bytes."""
+    """The frames of one message, sealed in order and on request; always the same bytes."""
 
     def __init__(
         self, aead: AESGCM, salt: bytes, signer: Signer, header: Header, message: bytes | Sealed, room: int
@@ -207,7 +207,8 @@ class Sealed(Sequence[bytes]):
         self._signer = signer
         self._header = header
         self._origin: Sealed | None = None
-        if isinstance(message, bytes):  # to ask whether it is a ``Sealed``, an abstract class's, costs a microsecond
+        # Checks for bytes first: an ``isinstance`` check for ``Sealed``, an abstract class's, costs a microsecond.
+        if isinstance(message, bytes):
             self._message, self.message_bytes = memoryview(message), len(message)
         else:
             self._message, self.message_bytes = memoryview(b""), message.message_bytes
@@ -239,7 +240,7 @@ class Sealed(Sequence[bytes]):
         return self.size_bytes if self._header.parts == 1 else self._room + HEADER_BYTES + SEAL_BYTES
 
     def message(self) -> bytes:
-        """Return what was sealed, to be sealed anew under another number."""
+        """Return the plaintext, to be sealed again under another number."""
         if self._origin is not None:
             return self._origin.message()
         if len(self._frames) < self._header.parts:
@@ -265,7 +266,7 @@ class Sealed(Sequence[bytes]):
             self._seal_one(part)
 
     def _seal_full(self, end: int) -> None:
-        """Seal the parts before ``end``, all of full length, by the shortest way."""
+        """Seal the parts before ``end``, all of full length, on the fast path."""
         first, room, message = len(self._frames), self._room, self._message
         encrypt, update, append = self._encrypt, self._running.update, self._frames.append
         headers = HeaderBatch(self._header._replace(length=room + SEAL_BYTES), first, end - first, self._salt)
@@ -297,18 +298,18 @@ class Opener:
 
     def __init__(self, secret: bytes, kind: int, source: bytes, incarnation: int, destination: bytes) -> None:
         self._keys = MessageKeys(seal_key(secret, kind, source, incarnation, destination))
-        self._known: dict[bytes, AESGCM] = {}  # by the salts of messages that parts have opened of
+        self._known: dict[bytes, AESGCM] = {}  # by the salts of messages with opened parts
 
     def open_run(
         self, headers: HeaderBatch, first: int, length: int, arrivals: Sequence[ReceivedFrame], at: int
     ) -> tuple[list[bytes], list[bytes]]:
-        """Open the parts from ``first`` on, as far as ``arrivals[at:]`` brings them in order; the shortest way.
+        """Open consecutive parts from ``first`` on in ``arrivals[at:]``; the fast path.
 
-        A frame that does not begin, to the bit, as ``heads`` foretell ends the run, as does one that was altered:
-        ``open`` must look at it.
+        A frame that does not begin, to the bit, as ``headers`` predict ends the run, as does an altered one: ``open``
+        must check it.
 
         Args:
-            length: payload bytes of each part; ``heads`` are of parts that are not the last.
+            length: payload bytes of each part; ``headers`` are of parts that are not the last.
 
         Returns:
             plaintexts and payloads.
@@ -337,7 +338,7 @@ class Opener:
             frame: from the header on; Ethernet padding may follow the payload.
 
         Raises:
-            EnvelopeError: too short, flagged wrongly, or altered; the part is worth nothing.
+            EnvelopeError: too short, flagged wrongly, or altered; the part must be dropped.
         """
         end = HEADER_BYTES + header.length
         is_last = header.part == header.parts - 1

@@ -1,7 +1,7 @@
 """Key agreement between two neighbours for one pair of sessions.
 
-Sans-I/O. Source: X25519, RFC 7748; HKDF-SHA256, RFC 5869. Both public keys travel in signed hellos, which
-makes the agreed key the neighbour's. A private key lives as long as a session of a port.
+Sans-I/O. Source: X25519, RFC 7748; HKDF-SHA256, RFC 5869. Both public keys are part of signed hellos, which binds the
+agreed key to the neighbour. A private key lives as long as a session of a port.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ class ExchangeKey:
         return cls(private, private.public_key().public_bytes(*raw))
 
     def agree(self, far_public: bytes, *purposes: bytes) -> list[bytes]:
-        """Return one 32-byte secret for each purpose, shared with the holder of the other key and nobody else.
+        """Return one 32-byte secret for each purpose, shared only with the holder of the other key.
 
         Raises:
-            StatementError: MALFORMED, the other key is no key, or one that makes a secret that everybody knows.
+            StatementError: MALFORMED, the other key is invalid, or its secret would be publicly known.
         """
         try:
             shared = self.private.exchange(x25519.X25519PublicKey.from_public_bytes(far_public))

@@ -1,6 +1,6 @@
-"""The body of a statement, read field by field: each accessor returns the one type that it names, or refuses.
+"""Typed accessors for the body of a statement: each returns the one type that it names, or raises.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _TEXT_MAX_CHARS = 4_096
 
 
 class Fields(Mapping[str, Value]):
-    """A decoded map. Unknown keys are no error: a later version may say more.
+    """A decoded map. Unknown keys are no error: a later version may have more.
 
     Every accessor raises ``StatementError`` (MALFORMED) where the key is missing or the value is of another type or out
     of its bounds. A bound left out is that of the wire.
@@ -72,7 +72,7 @@ class Fields(Mapping[str, Value]):
         return value
 
     def bytes_(self, key: str, size: int | None = None) -> bytes:
-        """Return bytes: exactly ``size`` of them, or however many there are."""
+        """Return bytes: exactly ``size`` of them, or any number."""
         value = self._items.get(key)
         if not isinstance(value, bytes) or (size is not None and len(value) != size):
             _refuse(key, "bytes" if size is None else f"{size} bytes")
@@ -139,10 +139,10 @@ class Fields(Mapping[str, Value]):
 
 
 def check_sequence(sequence: int, unix_s: float) -> None:
-    """Return if a sequence number leaves room for newer ones.
+    """Return if a sequence number leaves values for newer ones.
 
-    They are milliseconds of wall clocks, which may be wrong. One of the far future would be the last that its owner, or
-    whoever has to go above it, can use.
+    Sequence numbers are milliseconds of wall clocks, which may be wrong. A number of the far future would be the last
+    that its owner, or a node that has to exceed it, can use.
 
     Raises:
         StatementError: MALFORMED.

@@ -1,8 +1,7 @@
-"""What the parts of one message have before their bodies, made for many at once: headers, additional data, nonces.
+"""Header batch: headers, additional data and nonces for many parts of one message at once.
 
-Place: pure.
-Source: ``frame/spec.md``. From part to part nothing but the part's number changes, so a template is repeated and the
-numbers are laid over it, one byte column at a time::
+Sans-I/O. Source: ``frame/spec.md``. From part to part only the part's number changes. So a template is repeated and the
+numbers are written over it, one byte column at a time::
 
     headers      version kind flags hops | epoch length number PART parts incarnation destination source | salt
     additional   version kind flags      | the same as far as the source                                 95 bytes
@@ -31,7 +30,7 @@ _PART_IN_NONCE: Final = 8
 
 
 class HeaderBatch:
-    """The heads of the parts ``first`` to ``first + count`` of a message, all of one length and with one set of flags.
+    """The headers of parts ``first`` to ``first + count`` of a message, all of one length and one set of flags.
 
     Args:
         header: of any of them; its part does not matter.

@@ -1,6 +1,6 @@
-"""A node as it knows itself: its keys, its membership, its domain's root.
+"""Identity of a node: its keys, its membership, its domain's root.
 
-Place: pure; ``gdp/stores/files`` reads and writes the directory it lives in.
+Sans-I/O; ``gdp/stores/files`` reads and writes its directory.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ class NodeKeys:
     """A node that belongs to no domain yet.
 
     Args:
-        role: what it asks to be.
+        role: the role to request.
         label: its name for people.
-        digest: that of the metadata which name it.
-        key: signs what it says.
-        kem: opens what is sealed to it.
+        digest: of the metadata of its name.
+        key: signs its statements.
+        kem: opens secrets that are sealed to it.
     """
 
     role: Role
@@ -72,7 +72,7 @@ class NodeKeys:
         """Return the node with a membership that was issued elsewhere.
 
         Raises:
-            LocalError: it is another node's, of another domain, or not what the node asked for.
+            LocalError: it is another node's, of another domain, or not as requested.
         """
         identity = Identity(membership, root, self.key, self.kem)
         if (membership.subject, membership.role, membership.label) != (self.subject, self.role, self.label):
@@ -82,7 +82,7 @@ class NodeKeys:
 
 @dataclass(slots=True)
 class Identity:
-    """A node that can prove who it is. Its membership and root may be renewed while it runs, its keys and name not.
+    """A node that can prove its identity. Membership and root may be renewed while it runs, keys and name not.
 
     Raises:
         LocalError: the parts do not belong together.
@@ -100,7 +100,7 @@ class Identity:
             raise LocalError("the membership certificate is of another domain")
 
     def renew(self, member: Membership, root: Root) -> None:
-        """Take on a newer membership of the same node, which every statement carries from now on.
+        """Replace the membership by a newer one of the same node, which every statement carries from now on.
 
         Raises:
             LocalError: it is another node's, of another domain or role; nothing has changed then.
@@ -128,7 +128,7 @@ class Identity:
 
     @property
     def role(self) -> Role:
-        """Return what the node is in its domain."""
+        """Return the node's role in its domain."""
         return self.member.role
 
     @property
@@ -146,10 +146,10 @@ class Identity:
 
 
 def node_metadata(role: Role, label: str, more: Mapping[str, str | int] | None = None) -> Metadata:
-    """Return the metadata that name a node.
+    """Return the metadata of a node's name.
 
     Raises:
-        LocalError: ``more`` is of the wrong form, or names kind or name again.
+        LocalError: ``more`` is of the wrong form, or contains kind or name.
     """
     extra = dict(more or {})
     if extra.keys() & {"kind", "name"}:

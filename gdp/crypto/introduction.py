@@ -1,10 +1,11 @@
-"""Who a reader is, in this life: its key for notes, signed with the key that its name is the hash of.
+"""Introduction of a reader's incarnation: its X25519 key, signed with the key that is part of its name.
 
-Sans-I/O. A name is the hash of its metadata's digest and of its key, so nothing else is needed to prove who signed.
+Sans-I/O. A name is the hash of its metadata's digest and of its key, so nothing else is needed to prove the signer.
 Wire form, big-endian: ``started (8) | X25519 key (32) | digest of the name's metadata (32) | key, compressed (33) |
-signature (64)``, by ECDSA over ``"gdp-introduction-1" | name (32) | incarnation (8) | started (8) | X25519 key (32)``.
+signature (64)``. The signature is ECDSA over ``"gdp-introduction-1" | name (32) | incarnation (8) | started (8) |
+X25519 key (32)``.
 
-The X25519 key is drawn for one life of a process; the node's ECDSA key signs and does nothing else.
+The X25519 key is drawn for one incarnation of a process; the node's ECDSA key signs and does nothing else.
 """
 
 from __future__ import annotations
@@ -31,8 +32,9 @@ class Introduction:
 
     Args:
         name: of the reader.
-        incarnation: of its present life.
-        started: rises from life to life; wall-clock milliseconds of the start, or above those of earlier lives.
+        incarnation: of its present run.
+        started: rises with each incarnation; wall-clock milliseconds of the start, or above those of earlier
+            incarnations.
         exchange: its X25519 public key, 32 bytes.
     """
 
@@ -43,13 +45,13 @@ class Introduction:
 
     @classmethod
     def make(cls, subject: Subject, key: SigningKey, incarnation: int, started: int, exchange: bytes) -> bytes:
-        """Return a node's introduction of a life; costs a signature, about 25 us."""
+        """Return a node's introduction of an incarnation; costs a signature, about 25 us."""
         signature = key.sign(_signed(subject.name, incarnation, started, exchange))
         return _LAYOUT.pack(started, exchange, subject.digest, subject.owner_key, signature)
 
     @classmethod
     def from_wire(cls, wire: bytes, name: Name, incarnation: int) -> Introduction:
-        """Read what the node of a name says of one life of it; costs about 70 us.
+        """Read the introduction of an incarnation of the node with this name; costs about 70 us.
 
         Raises:
             StatementError: MALFORMED, WRONG_NAME or BAD_SIGNATURE.

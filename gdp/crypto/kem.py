@@ -1,13 +1,15 @@
-"""A node's key for receiving secrets: a hybrid of ML-KEM-768 and X25519, so that what is recorded today stays closed.
+"""KEM key of a node for receiving secrets: a hybrid of ML-KEM-768 and X25519.
 
-Place: pure, but for the randomness that the library draws.
-Source: HPKE, RFC 9180, single-shot, base mode, with KEM MLKEM768-X25519, HKDF-SHA256 and AES-256-GCM. On the wire::
+The hybrid keeps recorded secrets closed against later attacks on one of the two.
+
+Sans-I/O except for the randomness that the library draws. Source: HPKE, RFC 9180, single-shot, base mode, with KEM
+MLKEM768-X25519, HKDF-SHA256 and AES-256-GCM. On the wire::
 
     private  ML-KEM seed (64) || X25519 (32)
     public   ML-KEM (1184) || X25519 (32)
     sealed   encapsulated key (1120) || ciphertext || tag (16)
 
-The library has this from version 47 on, its wheels from 48; where it is missing, each call says so (``LocalError``).
+The library has this from version 47 on, its wheels from 48. Where it is missing, each call raises ``LocalError``.
 """
 
 from __future__ import annotations
@@ -33,13 +35,13 @@ _TOO_OLD: Final = "handing over topic secrets needs the package cryptography, ve
 
 @dataclass(frozen=True, slots=True)
 class KemPublicKey:
-    """What anyone may seal a secret to. A sealing costs about 0.2 ms."""
+    """Public key to seal a secret to. A sealing costs about 0.2 ms."""
 
     wire: bytes = field(repr=False)
 
     @classmethod
     def from_wire(cls, wire: bytes) -> KemPublicKey:
-        """Read ``KEM_PUBLIC_BYTES``; whether they are a key shows when it is used.
+        """Read ``KEM_PUBLIC_BYTES``; the first use shows whether they are a key.
 
         Raises:
             StatementError: MALFORMED, another length.
@@ -49,7 +51,7 @@ class KemPublicKey:
         return cls(wire)
 
     def seal(self, secret: bytes, info: bytes) -> bytes:
-        """Return ``secret`` sealed to this key; ``info`` must be known again to open it.
+        """Return ``secret`` sealed to this key; the same ``info`` is needed to open it.
 
         Raises:
             StatementError: MALFORMED, the bytes are no key.
@@ -68,7 +70,7 @@ class KemPublicKey:
 
 @dataclass(frozen=True, slots=True)
 class KemPrivateKey:
-    """The other half; it never appears in a ``repr``."""
+    """Private key; it never appears in a ``repr``."""
 
     wire: bytes = field(repr=False)
     public: KemPublicKey
@@ -125,7 +127,7 @@ class _Library:
         self.hpke = hpke
         self.mlkem = mlkem
         self.suite = hpke.Suite(hpke.KEM.MLKEM768_X25519, hpke.KDF.HKDF_SHA256, hpke.AEAD.AES_256_GCM)
-        mlkem.MLKEM768PrivateKey.generate()  # a back end without ML-KEM shows itself only here
+        mlkem.MLKEM768PrivateKey.generate()  # a back end without ML-KEM raises only here
 
 
 @lru_cache(maxsize=1)

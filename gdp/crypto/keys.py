@@ -1,8 +1,7 @@
-"""ECDSA keys on P-256: they sign bytes or a digest of bytes, and prove it.
+"""ECDSA keys on P-256: they sign bytes or a SHA-256 digest, and verify signatures.
 
-Place: pure, but for the randomness that the library draws for new keys and signatures.
-Source: FIPS 186-5; points in the compressed form of SEC 1, section 2.3.3; signatures as r || s of 32 bytes each (RFC
-9053, section 2.1).
+Sans-I/O except for the randomness that the library draws for new keys and signatures. Source: FIPS 186-5; points in the
+compressed form of SEC 1, section 2.3.3; signatures as r || s of 32 bytes each (RFC 9053, section 2.1).
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ _ECDSA_DIGEST: Final = ec.ECDSA(Prehashed(hashes.SHA256()))
 
 @dataclass(frozen=True, slots=True)
 class PublicKey:
-    """A point that verifies; equal to another when the compressed bytes are. A verification costs about 70 us."""
+    """Public key; equal to another when the compressed bytes are. A verification costs about 70 us."""
 
     compressed: bytes
     point: ec.EllipticCurvePublicKey = field(repr=False, compare=False)
@@ -58,7 +57,7 @@ class PublicKey:
 
     @classmethod
     def from_point(cls, point: object) -> PublicKey:
-        """Take over a library key.
+        """Wrap a library key.
 
         Raises:
             StatementError: MALFORMED, another kind of key or another curve.
@@ -93,7 +92,7 @@ class PublicKey:
         self._verify(_to_der(signature), data, _ECDSA)
 
     def verify_digest(self, signature: bytes, digest: bytes) -> None:
-        """The same for a SHA-256 digest (32 bytes) that the caller already has.
+        """Return if ``signature`` over a SHA-256 digest (32 bytes) is by this key.
 
         Raises:
             StatementError: BAD_SIGNATURE.
@@ -103,7 +102,7 @@ class PublicKey:
         self._verify(_to_der(signature), digest, _ECDSA_DIGEST)
 
     def verify_der(self, signature: bytes, data: bytes) -> None:
-        """The same for a signature in DER, as X.509 carries it.
+        """Return if ``signature`` in DER, as X.509 carries it, over ``data`` is by this key.
 
         Raises:
             StatementError: BAD_SIGNATURE.
@@ -118,10 +117,10 @@ class PublicKey:
 
 
 class SigningKey(ABC):
-    """A private key, wherever it lies: in this process (``SoftwareKey``), or in a token that signs by itself.
+    """A private key: in this process (``SoftwareKey``), or in a token that signs by itself.
 
     Args:
-        public: its other half.
+        public: the corresponding public key.
     """
 
     __slots__ = ()
@@ -138,7 +137,7 @@ class SigningKey(ABC):
 
         Args:
             pem: PKCS #8, encrypted or not, or the older form of OpenSSL.
-            passphrase: opens an encrypted one; not looked at where the key is not encrypted.
+            passphrase: opens an encrypted one; ignored where the key is not encrypted.
 
         Raises:
             LocalError: not a P-256 private key in PEM, or it does not open with this passphrase.
@@ -182,7 +181,7 @@ class SigningKey(ABC):
 
     @abstractmethod
     def to_file(self, protect: Callable[[bytes], bytes] | None = None) -> bytes:
-        """Return what a private file holds of this key, in PEM.
+        """Return the content of this key's private file, in PEM.
 
         Args:
             protect: encrypts a PrivateKeyInfo, DER; without it the caller guards the file.
@@ -198,7 +197,7 @@ class SoftwareKey(SigningKey):
 
     @classmethod
     def of(cls, private: ec.EllipticCurvePrivateKey) -> SoftwareKey:
-        """Take over a library key on P-256."""
+        """Wrap a library key on P-256."""
         return cls(private, PublicKey.from_point(private.public_key()))
 
     def to_pem(self) -> bytes:
@@ -208,15 +207,22 @@ class SoftwareKey(SigningKey):
         )
 
     def to_file(self, protect: Callable[[bytes], bytes] | None = None) -> bytes:
+        """Return the content of this key's private file, in PEM; ``protect`` encrypts a PrivateKeyInfo, DER."""
         if protect is None:
             return self.to_pem()
         form = serialization.Encoding.DER, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
         return protect(self.private.private_bytes(*form))
 
     def sign(self, data: bytes) -> bytes:
+        """Return r || s (64 bytes) over SHA-256 of ``data``; costs about 25 us."""
         return _from_der(self.private.sign(data, _ECDSA))
 
     def sign_digest(self, digest: bytes) -> bytes:
+        """Return r || s (64 bytes) over a SHA-256 digest.
+
+        Raises:
+            LocalError: not 32 bytes.
+        """
         if len(digest) != _HALF:
             raise LocalError("a SHA-256 digest has 32 bytes")
         return _from_der(self.private.sign(digest, _ECDSA_DIGEST))

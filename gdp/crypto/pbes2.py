@@ -1,10 +1,9 @@
 """Private files under a passphrase: PBES2 with scrypt and AES-256-CBC.
 
-Place: pure; randomness comes in as an argument.
-Source: RFC 8018 (PBES2), RFC 7914 (scrypt and its place in PBES2), RFC 5958 (EncryptedPrivateKeyInfo). A signing key is
-a PKCS #8 file that ``openssl pkey`` reads. Other secrets, for which PKCS #8 has no algorithm, lie in the same structure
-under a PEM label of this project. The library's own ``BestAvailableEncryption`` derives its key with 2,048 rounds of
-PBKDF2, which is why it is not used.
+Sans-I/O; randomness comes in as an argument. Source: RFC 8018 (PBES2), RFC 7914 (scrypt and its use in PBES2), RFC 5958
+(EncryptedPrivateKeyInfo). A signing key is a PKCS #8 file that ``openssl pkey`` reads. Other secrets, for which PKCS #8
+has no algorithm, use the same structure under a PEM label of this project. The library's own
+``BestAvailableEncryption`` derives its key with 2,048 rounds of PBKDF2, which is why it is not used.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ _BLOCK: Final = 8
 _PARALLEL: Final = 5
 _KEY_BYTES: Final = 32
 _LINE_CHARS: Final = 64
-_DERIVED_KEPT: Final = 16  # whoever reads this process's memory finds the keys themselves
+_DERIVED_KEPT: Final = 16  # an attacker that reads this process's memory finds the keys themselves
 
 _PBES2: Final = bytes.fromhex("06092a864886f70d01050d")  # 1.2.840.113549.1.5.13
 _SCRYPT: Final = bytes.fromhex("06092b06010401da47040b")  # 1.3.6.1.4.1.11591.4.11
@@ -68,7 +67,7 @@ def protect(plain: bytes, passphrase: bytes, random: bytes, label: str) -> bytes
 
 
 def is_own_form(pem: bytes) -> bool:
-    """Return whether ``open_secret`` can open a file, whatever its label; another tool may protect keys otherwise."""
+    """Return whether ``open_secret`` can open a file with any label; other tools may protect keys in other forms."""
     try:
         _parts(pem)
     except LocalError:
@@ -82,7 +81,7 @@ def is_secret(data: bytes) -> bool:
 
 
 def open_secret(pem: bytes, passphrase: bytes) -> bytes:
-    """Return what ``protect`` took; costs about 0.3 s the first time in a process.
+    """Return the plaintext that ``protect`` encrypted; costs about 0.3 s the first time in a process.
 
     Raises:
         LocalError: a wrong passphrase, or an altered file.
@@ -118,7 +117,7 @@ def _unknown() -> LocalError:
 
 
 def _taken(tag: int, der: bytes) -> tuple[bytes, bytes]:
-    """Return the content of the first element, and what follows it."""
+    """Return the content of the first element, and the rest."""
     if len(der) < 2 or der[0] != tag:
         raise _unknown()
     size = der[1] & 0x7F if der[1] & 0x80 else 0

@@ -22,7 +22,7 @@ class RecordKey:
     """The key of one direction.
 
     Args:
-        secret: 32 bytes, known to both ends and nobody else.
+        secret: 32 bytes, known to both ends only.
     """
 
     __slots__ = ("_aead",)

@@ -1,13 +1,12 @@
-"""A signed statement: a CBOR map that says what it is, who says it, and nothing twice.
+"""Signed statements: CBOR maps with a type and a signer, in one canonical form.
 
-Place: pure.
-Source: COSE_Sign1, RFC 9052, section 4.2, with ES256 (RFC 9053). The form is fixed so far that reading it needs no
-general COSE parser::
+Sans-I/O. Source: COSE_Sign1, RFC 9052, section 4.2, with ES256 (RFC 9053). The form is fixed, so that reading it needs
+no general COSE parser::
 
     tag 18 [ h'{1: -7 (ES256), 4: signer's name (32)}', {}, h'payload', h'r || s (64)' ]
     payload = deterministic CBOR map, text keys, "t": the type
 
-A parsed statement is a stranger's word: ``verify`` makes it the signer's.
+A parsed statement is unverified: ``verify`` proves its signer.
 """
 
 from __future__ import annotations
@@ -29,23 +28,23 @@ __all__ = ["Fields", "Statement", "StatementType", "Value", "assemble", "parse",
 
 
 class StatementType(str, Enum):
-    """The one registry of statements; the value stands in the payload under ``t``."""
+    """Registry of statement types; the value stands in the payload under ``t``."""
 
-    ADVERTISE = "advertise"  # a node's claim on a name, to its switch, and on to RIBs
+    ADVERTISE = "advertise"  # a node's advertisement of a name, to its switch, and on to RIBs
     WITHDRAW = "withdraw"
     QUERY = "query"
     ANSWER = "answer"
     JOIN = "join"
     LINK_STATE = "link-state"
     HELLO = "hello"
-    ADCERT = "adcert"  # owner to node: may do this with the name
-    RTCERT = "rtcert"  # node to switch: may attract its traffic
-    CARD = "card"  # a node's public face, for owners
+    ADCERT = "adcert"  # owner to node: the node has these rights on the name
+    RTCERT = "rtcert"  # node to switch: the switch may attract its traffic
+    CARD = "card"  # a node's descriptor, for owners
     GRANT = "grant"  # owner to node: a topic secret, sealed
-    RELAY = "relay"  # a claim passed on by a switch or a RIB
+    RELAY = "relay"  # an advertisement that a switch or a RIB relays
     REVOKE = "revoke"
-    REVOKED = "revoked"  # between neighbours: digests of what each trusted domain has revoked
-    LACKING = "lacking"  # ... and which of it the sender has, so that it is sent the rest
+    REVOKED = "revoked"  # between neighbours: digests of the revocations of each trusted domain
+    LACKING = "lacking"  # ... and which of them the sender has, so that it receives the rest
     ADVERTISE_ACK = "advertise-ack"
     PRESENCE = "presence"  # RIB to switch and back: is the older of two nodes with one identity still there?
     DIGEST = "digest"  # between RIBs of one domain
@@ -64,7 +63,7 @@ _UNPROTECTED: Final = b"\xa0"
 _SIGNATURE_HEAD: Final = b"\x58\x40"
 _SIGNER_AT: Final = len(_HEAD)
 _PROTECTED_END: Final = _SIGNER_AT + NAME_BYTES
-_PAYLOAD_AT: Final = _PROTECTED_END + 1  # behind the empty unprotected map
+_PAYLOAD_AT: Final = _PROTECTED_END + 1  # after the empty unprotected map
 _TAIL_BYTES: Final = 2 + SIGNATURE_BYTES
 _SIGNED_HEAD: Final = b"\x84\x6aSignature1"  # Sig_structure; RFC 9052, section 4.4
 _NO_EXTERNAL_DATA: Final = b"\x40"
@@ -72,11 +71,11 @@ _NO_EXTERNAL_DATA: Final = b"\x40"
 
 @dataclass(frozen=True, slots=True)
 class Statement:
-    """What was read, UNVERIFIED until ``verify`` returns.
+    """A parsed statement, UNVERIFIED until ``verify`` returns.
 
     Args:
-        type: what it is.
-        signer: the name that it says it is from; whoever verifies must know that name's key.
+        type: the statement type.
+        signer: the name of the alleged signer; the verifier must know that name's key.
         fields: the body.
         signature: r || s.
         signed_bytes: the Sig_structure.
@@ -97,7 +96,7 @@ class Statement:
 
     @property
     def fingerprint(self) -> bytes:
-        """Return SHA-256 of what is signed: the same for every signature that could stand under it."""
+        """Return SHA-256 of the signed bytes: the same for every valid signature over them."""
         return hashlib.sha256(self.signed_bytes).digest()
 
     def expect(self, expected: StatementType) -> Fields:
@@ -111,7 +110,7 @@ class Statement:
         return self.fields
 
     def verify(self, public: PublicKey) -> None:
-        """Return if ``public`` signed it. That the key belongs to ``signer`` is the caller's to know.
+        """Return if ``public`` signed it. The caller must know that the key belongs to ``signer``.
 
         Raises:
             StatementError: BAD_SIGNATURE.
@@ -128,7 +127,7 @@ def sign(type_: StatementType, body: Mapping[str, object], signer: Name, key: Si
     if "t" in body:
         raise LocalError("'t' is the statement's type")
     encoded = encode({**body, "t": type_.value})
-    _check_size(len(encoded))  # before two bytes have to hold it
+    _check_size(len(encoded))  # before its length must fit into two bytes
     payload = _byte_string(encoded)
     protected = _HEAD[2:] + signer
     signature = key.sign(_SIGNED_HEAD + protected + _NO_EXTERNAL_DATA + payload)
@@ -143,10 +142,10 @@ def assemble(type_: StatementType, body: Mapping[str, object], signer: Name, sig
 
 
 def parse(wire: bytes) -> Statement:
-    """Read a statement without believing it; costs 5 to 20 us.
+    """Parse a statement without verifying it; costs 5 to 20 us.
 
     Raises:
-        StatementError: MALFORMED, for whatever else these bytes are; never another exception.
+        StatementError: MALFORMED, for any other bytes; never another exception.
     """
     payload_end = len(wire) - _TAIL_BYTES
     if (
@@ -192,7 +191,7 @@ def _byte_string(payload: bytes) -> bytes:
 
 
 def _unboxed(boxed: bytes) -> bytes:
-    """Return what a deterministic byte string holds; ``boxed`` is at most ``CONTROL_MAX_BYTES``."""
+    """Return the content of a deterministic byte string; ``boxed`` is at most ``CONTROL_MAX_BYTES``."""
     if boxed[0] == 0x58 and len(boxed) >= 2 + 24 and boxed[1] == len(boxed) - 2:
         return boxed[2:]
     if boxed[0] == 0x59 and len(boxed) >= 3 + 256 and int.from_bytes(boxed[1:3], "big") == len(boxed) - 3:

@@ -1,7 +1,7 @@
-"""A name together with what proves it: the digest of its metadata and its owner's key.
+"""Subject: a name together with its proof, which is the digest of its metadata and its owner's key.
 
-Place: pure. Holding one means that the hash came out, so nobody need check it again.
-Source: docs/explanation/design.md, section 2.
+Sans-I/O. A ``Subject`` exists only where the hash is right, so it needs no second check. Source:
+docs/explanation/design.md, section 2.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ __all__ = ["Subject"]
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """What a claim or a delegation is about.
+    """Subject of an advertisement or a delegation.
 
     Args:
         digest: SHA-256 of the canonical metadata.
-        owner_key: compressed P-256 point, or empty for an unowned name. Whether it is a point shows at its first use.
+        owner_key: compressed P-256 point, or empty for an unowned name. Its first use shows whether it is a point.
 
     Raises:
         LocalError: a length is wrong.
@@ -40,7 +40,7 @@ class Subject:
 
     @classmethod
     def of(cls, metadata: Metadata, owner_key: bytes = b"") -> Subject:
-        """Return the subject that this metadata and this owner make."""
+        """Return the subject of this metadata and this owner."""
         return cls(metadata.digest(), owner_key)
 
     @classmethod
@@ -48,7 +48,7 @@ class Subject:
         """Read ``digest`` and ``owner`` of a statement's body and prove ``name`` by them.
 
         Raises:
-            StatementError: MALFORMED, or WRONG_NAME where the hash does not come out.
+            StatementError: MALFORMED, or WRONG_NAME where the hash differs.
         """
         return cls.proving(name, fields.bytes_("digest"), fields.bytes_("owner"))
 
@@ -57,7 +57,7 @@ class Subject:
         """Return the subject if its hash is ``name``.
 
         Raises:
-            StatementError: MALFORMED, or WRONG_NAME where the hash does not come out.
+            StatementError: MALFORMED, or WRONG_NAME where the hash differs.
         """
         try:
             subject = cls(digest, owner_key)
@@ -68,5 +68,5 @@ class Subject:
         return subject
 
     def to_fields(self) -> dict[str, object]:
-        """Return what ``from_fields`` reads, but for the name."""
+        """Return the fields that ``from_fields`` reads, without the name."""
         return {"digest": self.digest, "owner": self.owner_key}

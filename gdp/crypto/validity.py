@@ -1,7 +1,7 @@
-"""From when until when: the one test of time for certificates and delegations.
+"""Validity period: the one time check for certificates and delegations.
 
-Place: pure. Clocks of honest machines differ. What ended is believed for ``CLOCK_SKEW_S`` more. What begins later is
-believed ``CLOCK_EARLY_S`` before: the beginning keeps nobody out who has the certificate, and a machine whose clock was
+Sans-I/O. Clocks of honest machines differ. An expired certificate is accepted for ``CLOCK_SKEW_S`` more. A future one
+is accepted ``CLOCK_EARLY_S`` before its start. The start keeps no certificate holder out, and a machine whose clock was
 set back must not lose the certificates of the last hour.
 """
 
@@ -18,17 +18,17 @@ __all__ = ["Validity"]
 
 @dataclass(frozen=True, slots=True)
 class Validity:
-    """A span of wall-clock time in whole seconds, both ends included."""
+    """A period of wall-clock time in whole seconds, both ends included."""
 
     not_before_unix_s: int
     not_after_unix_s: int
 
     @classmethod
     def lasting(cls, unix_s: float, duration_s: float) -> Validity:
-        """Return the span that begins at ``unix_s``.
+        """Return the period that begins at ``unix_s``.
 
         Raises:
-            LocalError: it would last no second, or begin before 1970.
+            LocalError: it would last less than a second, or begin before 1970.
         """
         if unix_s < 0 or duration_s < 1:
             raise LocalError("a validity begins after 1970 and lasts a second or longer")
@@ -44,11 +44,11 @@ class Validity:
         return cls(fields.uint("from"), fields.uint("until"))
 
     def to_fields(self) -> dict[str, object]:
-        """Return what ``from_fields`` reads."""
+        """Return the fields that ``from_fields`` reads."""
         return {"from": self.not_before_unix_s, "until": self.not_after_unix_s}
 
     def check(self, unix_s: float, what: str) -> None:
-        """Return if ``unix_s`` lies within, give or take what clocks differ.
+        """Return if ``unix_s`` lies within the period, with a tolerance for clock differences.
 
         Raises:
             StatementError: EXPIRED, or not valid yet; ``what`` names it for people.

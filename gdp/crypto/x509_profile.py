@@ -1,7 +1,6 @@
-"""The form of every certificate here, and the one place that reads X.509.
+"""X.509 profile of every certificate in the project, and the only module that parses X.509.
 
-Place: pure.
-Source: RFC 5280; ECDSA P-256 with SHA-256 throughout. What is ours stands in standard places::
+Sans-I/O. Source: RFC 5280; ECDSA P-256 with SHA-256 throughout. Project data use standard fields::
 
     subject   OU = role (switch | rib | proxy; "domain" in a root), CN = the label for people
     SAN       URI gdp:<64 hex, the name>   URI gdp-metadata:<64 hex, digest of the metadata>
@@ -9,8 +8,8 @@ Source: RFC 5280; ECDSA P-256 with SHA-256 throughout. What is ours stands in st
                                            URI gdp-retires:<unix second at which the predecessor is trusted no more>
     key ids   the first 20 bytes of the domain's name; another tool may use another method (RFC 7093)
 
-A name is the hash of digest and key, so a certificate whose three do not fit is refused before any signature is tried.
-A domain keeps its name when another root key succeeds the first: its root then names the founder's key.
+A name is the hash of digest and key. So a certificate whose three do not fit is rejected before any signature check. A
+domain keeps its name when another root key succeeds the first: its root then contains the founder's key.
 """
 
 from __future__ import annotations
@@ -75,13 +74,13 @@ _FOREIGN_ERRORS: Final = (
     x509.DuplicateExtension,
     x509.ExtensionNotFound,
     x509.UnsupportedGeneralNameType,
-    Warning,  # what the library only warns about is refused here
+    Warning,  # a library warning is an error here
 )
 
 
 @dataclass(frozen=True, slots=True)
 class SubjectInfo:
-    """Whom a certificate, or the request for one, is about; the name's hash has come out."""
+    """Subject of a certificate or a request; the name's hash is right."""
 
     subject: Subject
     unit: str  # role, or "domain"
@@ -92,7 +91,7 @@ class SubjectInfo:
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """A certificate of our form; nobody has looked at its signature, its time or its issuer."""
+    """A certificate of this profile; its signature, time and issuer are not checked."""
 
     holder: SubjectInfo
     validity: Validity
@@ -107,7 +106,7 @@ class Certificate:
 
 
 def bad(detail: str) -> StatementError:
-    """Return the refusal of a certificate."""
+    """Return the error for a certificate."""
     return StatementError(DropReason.BAD_CERTIFICATE, detail)
 
 
@@ -115,16 +114,16 @@ def read(wire: bytes) -> Certificate:
     """Read a certificate in DER or PEM; costs about 0.1 ms.
 
     Raises:
-        StatementError: BAD_CERTIFICATE or WRONG_NAME; never another exception, whatever the bytes.
+        StatementError: BAD_CERTIFICATE or WRONG_NAME; never another exception, for any bytes.
     """
     return _strictly(wire, _certificate)
 
 
 def read_request(wire: bytes) -> SubjectInfo:
-    """Read a certificate request (PKCS #10) in DER or PEM; its own signature proves that the asker holds the key.
+    """Read a certificate request (PKCS #10) in DER or PEM; its own signature proves possession of the key.
 
     Raises:
-        StatementError: BAD_CERTIFICATE or WRONG_NAME; never another exception, whatever the bytes.
+        StatementError: BAD_CERTIFICATE or WRONG_NAME; never another exception, for any bytes.
     """
     return _strictly(wire, _request)
 
@@ -133,7 +132,7 @@ def issuer_common_name(wire: bytes) -> str:
     """Return the issuer's CN of a certificate in DER, at most ``LABEL_MAX_CHARS`` of it; nothing is verified.
 
     Raises:
-        StatementError: BAD_CERTIFICATE; never another exception, whatever the bytes.
+        StatementError: BAD_CERTIFICATE; never another exception, for any bytes.
     """
     return _strictly(wire, _issuer_common_name)
 
@@ -165,7 +164,7 @@ def distinguished_name(unit: str, label: str) -> x509.Name:
 
 
 def alternative_names(subject: Subject, retires_unix_s: int | None = None) -> x509.SubjectAlternativeName:
-    """Return the URIs that carry a name and what it is made of.
+    """Return the URIs that carry a name and its parts.
 
     Args:
         retires_unix_s: of a root that succeeds another: until when that one is trusted.
@@ -177,7 +176,7 @@ def alternative_names(subject: Subject, retires_unix_s: int | None = None) -> x5
 
 
 def _strictly(wire: bytes, reader: Callable[[bytes], _T]) -> _T:
-    """Translate whatever the library may say about a stranger's bytes into the one error."""
+    """Translate any exception of the library about received bytes into the one error."""
     if len(wire) > CERTIFICATE_MAX_BYTES:
         raise bad(f"longer than {CERTIFICATE_MAX_BYTES} bytes")
     with warnings.catch_warnings():
@@ -208,7 +207,7 @@ def _certificate(wire: bytes) -> Certificate:
     if any(extension.critical and extension.oid not in _UNDERSTOOD for extension in extensions):
         raise bad("a critical extension that is not understood")
     der, signature = certificate.public_bytes(Encoding.DER), certificate.signature
-    if not der.endswith(bytes((0x03, len(signature) + 1, 0)) + signature):  # the library lets unused bits pass
+    if not der.endswith(bytes((0x03, len(signature) + 1, 0)) + signature):  # the library ignores unused bits
         raise bad("a signature that is not in DER")
     return Certificate(
         holder=_holder(certificate.subject, extensions, PublicKey.from_point(certificate.public_key())),
@@ -245,7 +244,7 @@ def _holder(distinguished: x509.Name, extensions: x509.Extensions, key: PublicKe
 
 
 def _succession(uris: list[str]) -> tuple[bytes | None, int | None]:
-    """Return the founder's key and the predecessor's last second from a root that succeeds another."""
+    """Return the founder's key and the predecessor's last second from a root with a predecessor."""
     founders = [uri.removeprefix(FOUNDER_URI) for uri in uris if uri.startswith(FOUNDER_URI)]
     moments = [uri.removeprefix(RETIRES_URI) for uri in uris if uri.startswith(RETIRES_URI)]
     if not founders and not moments:

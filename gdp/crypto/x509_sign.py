@@ -1,8 +1,8 @@
-"""Signing X.509 with any key, also one that a token holds.
+"""X.509 signing with any key, also one in a token.
 
-Place: pure, but for the randomness of signatures.
-Source: RFC 5280, section 4.1; RFC 2986, section 4. The library signs with keys of its own only. For another key the
-part that is to be signed is taken from what a key drawn for the purpose signed, and gets the real key's signature.
+Sans-I/O except for the randomness of signatures. Source: RFC 5280, section 4.1; RFC 2986, section 4. The library signs
+with its own keys only. For another key, a temporary key signs first; the part to be signed is taken from its result and
+gets the real key's signature.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def signed_request(builder: x509.CertificateSigningRequestBuilder, key: SigningK
         return builder.sign(key.private, hashes.SHA256()).public_bytes(Encoding.PEM)
     drawn = SigningKey.generate()
     draft = builder.sign(drawn.private, hashes.SHA256()).tbs_certrequest_bytes
-    # Both are P-256 keys, so that what stands in for the other has its length.
+    # Both are P-256 keys, so that the temporary one has the same length.
     wire = _completed(draft.replace(_info(drawn.public), _info(key.public)), key)
     return x509.load_der_x509_csr(wire).public_bytes(Encoding.PEM)
 

@@ -1,7 +1,7 @@
-"""The frame header as a struct: the fast twin of the Scapy layer.
+"""Frame header codec as a struct: the fast twin of the Scapy layer.
 
-Place: pure; the only codec that a data path imports. ``gdp/frame/layers.py`` is the normative definition; generated
-tests hold the two together. Offsets count from the first byte after the EtherType (see ``spec.md``)::
+Sans-I/O; the only codec that a data path imports. ``gdp/frame/layers.py`` is the normative definition; generated tests
+compare the two. Offsets count from the first byte after the EtherType (see ``spec.md``)::
 
     0 version  1 kind  2 flags  3 hops left  4 key epoch (2)  6 payload length (2)  8 message number (8)
     16 part (4)  20 parts (4)  24 incarnation (8)  32 destination (32)  64 source (32)  96 payload
@@ -56,7 +56,7 @@ assert _HEADER.size == HEADER_BYTES
 
 
 class Header(NamedTuple):
-    """One frame's header; a tuple because it stands on the hot path. Field meanings: ``spec.md``."""
+    """Header of one frame; a tuple because it is on the hot path. Field meanings: ``spec.md``."""
 
     kind: int
     flags: int
@@ -72,7 +72,7 @@ class Header(NamedTuple):
 
 
 def layout() -> dict[str, tuple[int, int]]:
-    """Return offset and size in bytes of every header field; that of the Scapy layer is the same, as a test holds."""
+    """Return offset and size in bytes of every header field; a test compares them with the Scapy layer."""
     sizes = [struct.calcsize(f"!{each}") for each in re.findall("[0-9]*[A-Zs]", _HEADER.format)]
     return {
         name: (sum(sizes[:index]), size)
@@ -86,10 +86,10 @@ def encode(header: Header) -> bytes:
 
 
 def decode(frame: bytes | bytearray | memoryview, at: int = 0) -> Header:
-    """Read the header at ``frame[at:]`` (the byte after the EtherType); what follows the payload is Ethernet padding.
+    """Read the header at ``frame[at:]`` (the byte after the EtherType); bytes behind the payload are Ethernet padding.
 
     Raises:
-        FrameError: truncated, another version, or a part that cannot be; never anything else, whatever the bytes.
+        FrameError: truncated, another version, or an impossible part; never anything else, whatever the bytes.
     """
     if len(frame) - at < HEADER_BYTES:
         raise FrameError(DropReason.TRUNCATED, "header")

@@ -1,9 +1,8 @@
-"""CBOR of a stranger, written for people; anything else is None.
+"""Diagnostic notation of a stranger's CBOR, for people; anything else is None.
 
-Place: pure; used where frames are shown, never where they are forwarded or trusted.
-Source: diagnostic notation, RFC 8949, section 8; a byte string that holds CBOR itself is shown as ``<<...>>``
-(RFC 8610, appendix G.3). Read is what a statement may contain, and no deeper than ``CBOR_DEPTH_MAX``: no indefinite
-lengths, no simple values but false, true and null.
+Sans-I/O. It serves displays of frames, never forwarding or trust. Source: diagnostic notation, RFC 8949, section 8; a
+byte string that holds CBOR itself is shown as ``<<...>>`` (RFC 8610, appendix G.3). The reader accepts what a statement
+may contain, no deeper than ``CBOR_DEPTH_MAX``: no indefinite lengths, no simple values but false, true and null.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from gdp.limits import CBOR_DEPTH_MAX, CONTROL_MAX_BYTES
 
 __all__ = ["byte_string", "diagnose"]
 
-_SHOWN_BYTES: Final = 32  # a name is shown whole, a longer string by its beginning and its size
+_SHOWN_BYTES: Final = 32  # a name is shown completely, a longer string by its beginning and its size
 _SIMPLE: Final = {20: "false", 21: "true", 22: "null"}
 _FLOATS: Final = {2: struct.Struct("!e"), 4: struct.Struct("!f"), 8: struct.Struct("!d")}
 _UINT, _NEGATIVE, _BYTES, _TEXT, _ARRAY, _MAP, _TAG, _OTHER = range(8)
@@ -37,7 +36,7 @@ def byte_string(data: bytes) -> tuple[int, int]:
     """Return where the byte string at the start of ``data`` begins and ends, its head excluded.
 
     Raises:
-        ValueError: there is no whole byte string.
+        ValueError: there is no complete byte string.
     """
     major, length, at = _head(data, 0)
     if major != _BYTES or at + length > len(data):

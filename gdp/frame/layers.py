@@ -1,8 +1,8 @@
-"""The frame as Scapy layers: the normative definition.
+"""Scapy layers of the frame: the normative definition.
 
-Place: for people, for tests and for the ``scapy`` data plane; no data path imports it.
-Source: ``spec.md`` beside this file; IEEE 802-2014, clause 9.2.4 (local experimental EtherTypes); COSE_Sign1, RFC 9052,
-section 4.2. ``gdp/frame/codec.py`` is the fast twin of ``GDP``; generated tests hold the two together.
+Sans-I/O; for people, for tests and for the ``scapy`` data plane; no data path imports it. Source: ``spec.md`` in this
+folder; IEEE 802-2014, clause 9.2.4 (local experimental EtherTypes); COSE_Sign1, RFC 9052, section 4.2.
+``gdp/frame/codec.py`` is the fast twin of ``GDP``; generated tests compare the two.
 
     >>> Ether(dst="02:00:00:00:00:02") / GDP(kind="echo-request", destination="75e0…") / b"hello"
 """
@@ -41,7 +41,7 @@ __all__ = ["GDP", "Cookie", "Keepalive", "Statement", "layout"]
 
 KIND_NAMES: Final = {int(kind): kind.name.lower().replace("_", "-") for kind in Kind}
 FLAG_NAMES: Final = [next((f.name.lower() for f in Flag if f.name and f == 1 << bit), f"bit{bit}") for bit in range(8)]
-_NO_STATEMENTS: Final = frozenset({Kind.KEEPALIVE, Kind.COOKIE})  # of those for the neighbour itself
+_NO_STATEMENTS: Final = frozenset({Kind.KEEPALIVE, Kind.COOKIE})  # of the kinds for the neighbour itself
 _STATEMENTS: Final = frozenset(
     {Kind.RIB_REQUEST, Kind.RIB_ANSWER, *(kind for kind in Kind if kind >= CONTROL_FROM and kind not in _NO_STATEMENTS)}
 )
@@ -53,12 +53,17 @@ _COOKIE_BYTES: Final = 32
 
 
 class NameField(XStrFixedLenField):
-    """A name of 32 bytes; takes 64 hex digits too, and shows them."""
+    """A name of 32 bytes; accepts 64 hex digits too, and shows them."""
 
     def __init__(self, name: str) -> None:
         super().__init__(name, bytes(ZERO), length=NAME_BYTES)
 
     def any2i(self, _pkt: Packet | None, x: object) -> bytes:
+        """Return the 32 bytes of a name given as bytes or as hex digits.
+
+        Raises:
+            LocalError: another type, or not 32 bytes.
+        """
         if isinstance(x, str):
             return bytes(Name.from_text(x))
         if isinstance(x, bytes):
@@ -67,13 +72,19 @@ class NameField(XStrFixedLenField):
 
 
 class CborBytesField(StrField):
-    """A CBOR byte string, its head left out of the value; shown in diagnostic notation where it holds CBOR."""
+    """A CBOR byte string; the value excludes its head, and diagnostic notation shows it if it holds CBOR."""
 
     def getfield(self, _pkt: Packet, s: bytes) -> tuple[bytes, bytes]:
+        """Return the bytes behind the string, and its content.
+
+        Raises:
+            ValueError: there is no complete byte string.
+        """
         start, end = byte_string(s)
         return s[end:], s[start:end]
 
     def addfield(self, _pkt: Packet, s: bytes, val: bytes | None) -> bytes:
+        """Return ``s`` with the string appended in its shortest form, up to 65,535 bytes."""
         value = val or b""
         size = len(value)
         if size < 24:
@@ -83,11 +94,12 @@ class CborBytesField(StrField):
         return s + b"\x59" + size.to_bytes(2, "big") + value
 
     def i2repr(self, _pkt: Packet | None, x: bytes) -> str:
+        """Return the diagnostic notation, or hex digits where the content is no CBOR."""
         return diagnose(x) or f"h'{x.hex()}'"
 
 
 class GDP(Packet):
-    """The 96-byte header; ``length`` is filled in, and what follows the payload is Ethernet padding."""
+    """The 96-byte header; ``length`` is filled in, and bytes behind the payload are Ethernet padding."""
 
     name = "GDP"
     fields_desc = [  # noqa: RUF012  (the form that Scapy prescribes)
@@ -107,18 +119,21 @@ class GDP(Packet):
 
     @classmethod
     def dispatch_hook(cls, _pkt: bytes | None = None, *_args: object, **_kwargs: object) -> type[Packet]:
-        """Show what is shorter than a header as raw bytes."""
+        """Show a frame that is shorter than a header as raw bytes."""
         return conf.raw_layer if _pkt is not None and len(_pkt) < HEADER_BYTES else cls
 
     def post_build(self, pkt: bytes, pay: bytes) -> bytes:
+        """Fill in the payload length, unless it was given."""
         if self.length is None:
             pkt = pkt[:_LENGTH_AT] + len(pay).to_bytes(2, "big") + pkt[_LENGTH_AT + 2 :]
         return pkt + pay
 
     def extract_padding(self, s: bytes) -> tuple[bytes, bytes]:
+        """Split the payload from the Ethernet padding behind it."""
         return s[: self.length], s[self.length :]
 
     def guess_payload_class(self, payload: bytes) -> type[Packet]:
+        """Return the layer of the payload; raw bytes where it is malformed or of another kind."""
         if self.version == VERSION and self.kind in _STATEMENTS and self.parts == 1 and _is_statement(payload):
             return Statement
         if self.version == VERSION and self.kind == Kind.KEEPALIVE and len(payload) >= _KEEPALIVE_BYTES:
@@ -128,15 +143,15 @@ class GDP(Packet):
         return conf.raw_layer
 
     def hashret(self) -> bytes:
-        """Return what a question and its answer share: an echo its number, too."""
+        """Return the key that a query and its response share; that of an echo includes its number."""
         asked = _ANSWER_TO.get(self.kind, self.kind)
         number = int(self.number).to_bytes(8, "big") if asked == Kind.ECHO_REQUEST else b""
         return bytes([asked]) + number + bytes(strxor(self.destination, self.source))
 
     def answers(self, other: Packet) -> bool:
-        """An answer has the names of its question the other way round; an echo has its number, too.
+        """Return whether this is the response to ``other``: its names are swapped; an echo keeps its number.
 
-        A RIB numbers its answers itself, since one question may have several.
+        A RIB numbers its responses itself, since one query may have several.
         """
         return (
             isinstance(other, GDP)
@@ -147,13 +162,14 @@ class GDP(Packet):
         )
 
     def mysummary(self) -> str:
+        """Return the line that Scapy shows for the frame."""
         source, destination = Name(self.source).short, Name(self.destination).short
         which = f"#{self.number} {self.part + 1}/{self.parts}"
         return f"GDP {self.sprintf('%kind%')} {source} > {destination} {which} hops {self.hops_left}"
 
 
 class Keepalive(Packet):
-    """The payload of a keepalive: what it says, and the tag of the two sessions' key (``control/keepalive.py``)."""
+    """The payload of a keepalive: its fields, and the tag of the two sessions' key (``control/keepalive.py``)."""
 
     name = "GDP keepalive"
     fields_desc = [  # noqa: RUF012  (the form that Scapy prescribes)
@@ -165,7 +181,7 @@ class Keepalive(Packet):
 
 
 class Cookie(Packet):
-    """The payload of a cookie: both ports' sessions, and what the next hello shows (``control/admission.py``)."""
+    """The payload of a cookie: both ports' sessions, and the cookie for the next hello (``control/admission.py``)."""
 
     name = "GDP cookie"
     fields_desc = [  # noqa: RUF012  (the form that Scapy prescribes)
@@ -176,7 +192,7 @@ class Cookie(Packet):
 
 
 class Statement(Packet):
-    """A COSE_Sign1 statement of one part; a longer one is shown raw, part by part."""
+    """A COSE_Sign1 statement of one fragment; each fragment of a longer one is shown raw."""
 
     name = "Statement"
     fields_desc = [  # noqa: RUF012
@@ -189,7 +205,7 @@ class Statement(Packet):
 
 
 def _is_statement(payload: bytes) -> bool:
-    """Whether the payload is well-formed and has the form of the ``Statement`` layer."""
+    """Return whether the payload is well-formed and has the form of the ``Statement`` layer."""
     if payload[:2] != _COSE_SIGN1.to_bytes(2, "big") or diagnose(payload) is None:
         return False
     try:
@@ -201,7 +217,7 @@ def _is_statement(payload: bytes) -> bool:
 
 
 def layout() -> dict[str, tuple[int, int]]:
-    """Return offset and size in bytes of every header field: what the twins must agree with."""
+    """Return offset and size in bytes of every header field; the codec must agree with them."""
     places: dict[str, tuple[int, int]] = {}
     at = 0
     for field in GDP.fields_desc:

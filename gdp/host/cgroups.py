@@ -1,7 +1,7 @@
-"""A control group: a bound on what a set of processes takes, and a hand that holds or kills all of them at once.
+"""Control group: bounds on the resources of a set of processes, which can also be frozen or killed together.
 
-Place: shell; needs writable cgroups, which containers and plain users often lack. Both versions are served, also side
-by side: a bound is set wherever its file is found.
+I/O; needs writable cgroups, which containers and plain users often lack. It supports both versions, also at the same
+time: a bound is set in the version that has its file.
 Source: cgroups(7); Linux, Documentation/admin-guide/cgroup-v2.rst (cpu.max, memory.max, cgroup.freeze, cgroup.kill) and
 cgroup-v1/ (cpu.cfs_quota_us, memory.limit_in_bytes).
 """
@@ -23,8 +23,8 @@ __all__ = ["Cgroup"]
 
 _MOUNTS: Final = Path("/proc/self/mounts")
 _OLD_CONTROLLERS: Final = frozenset({"cpu", "memory"})
-_PERIOD_US: Final = 20_000  # a fifth of the kernel's own, so that a slow machine is slow rather than jerky
-_LEAST_US: Final = 1_000  # the kernel takes no quota below this
+_PERIOD_US: Final = 20_000  # a fifth of the kernel's default, so that a slow machine runs evenly
+_LEAST_US: Final = 1_000  # the kernel accepts no quota below this
 _LONGEST_PERIOD_US: Final = 1_000_000
 _PATIENCE_S: Final = 3.0
 _LOOK_S: Final = 0.005
@@ -32,7 +32,10 @@ _GONE: Final = (errno.ENOENT, errno.ENODEV)
 
 
 class Cgroup:
-    """The group called ``name`` directly below each root that has a use here. To name it makes nothing."""
+    """The group called ``name`` directly below each usable root.
+
+    The constructor makes no group; see ``make``.
+    """
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -42,20 +45,23 @@ class Cgroup:
             self._folders["all"] = self._new / name
 
     def make(self) -> bool:
-        """Make the group; return whether every bound can be set. Where nothing can, no process is ever in it."""
+        """Make the group; return whether every bound can be set.
+
+        If no hierarchy is writable, the group stays empty.
+        """
         for kind, folder in list(self._folders.items()):
             try:
                 folder.mkdir(exist_ok=True)
-            except OSError:  # read-only or another's: without this one
+            except OSError:  # read-only or owned by another user: continue without this one
                 del self._folders[kind]
         if self._new is not None and "all" in self._folders:
             for controller in sorted(_OLD_CONTROLLERS - self._folders.keys()):
-                with suppress(OSError):  # held by version 1, or processes are in the root: told by what is missing
+                with suppress(OSError):  # version 1 has it, or the root has processes: the missing file shows it
                     (self._new / "cgroup.subtree_control").write_text(f"+{controller}")
         return all(map(self._find, (("cpu.max", "cpu.cfs_quota_us"), ("memory.max", "memory.limit_in_bytes"))))
 
     def add(self, pid: int) -> None:
-        """Put a process in; what it starts from then on is in, too.
+        """Add a process; the processes that it starts later join the group, too.
 
         Raises:
             LocalError: the kernel refuses.
@@ -64,10 +70,10 @@ class Cgroup:
             self._write(folder / "cgroup.procs", str(pid))
 
     def limit_cpu(self, cpus: float | None) -> None:
-        """Let the group take as much time as ``cpus`` processors have; None: all.
+        """Limit the group to the time of ``cpus`` processors; None: no limit.
 
         Raises:
-            LocalError: there is no such bound here.
+            LocalError: this host has no such bound.
         """
         period_us = _PERIOD_US
         if cpus is not None and cpus * period_us < _LEAST_US:
@@ -83,10 +89,10 @@ class Cgroup:
             self._write(path, str(-1 if quota_us is None else quota_us))
 
     def limit_memory(self, size_bytes: int | None) -> None:
-        """Let the group take this much memory, and the kernel kill in it what wants more; None: all there is.
+        """Limit the group's memory; the kernel kills processes in it that exceed the limit; None: no limit.
 
         Raises:
-            LocalError: there is no such bound here.
+            LocalError: this host has no such bound.
         """
         path = self._find(("memory.max", "memory.limit_in_bytes"))
         if path is None:
@@ -95,14 +101,14 @@ class Cgroup:
         self._write(path, nothing if size_bytes is None else str(size_bytes))
 
     def hold(self, *, held: bool) -> bool:
-        """Stop all processes where they are, or let them go on; return whether that can be done here."""
+        """Freeze all processes, or resume them; return whether this host can do that."""
         path = self._find(("cgroup.freeze",))
         if path is not None:
             self._write(path, "1" if held else "0")
         return path is not None
 
     def kill(self) -> None:
-        """Kill every process of the group; fine if somebody else removes it meanwhile.
+        """Kill every process of the group; no error if another process removes it in the meantime.
 
         Raises:
             LocalError: the kernel refuses.
@@ -120,7 +126,7 @@ class Cgroup:
                     os.kill(pid, signal.SIGKILL)
 
     def remove(self) -> None:
-        """Kill what is left in the group, and remove it; fine if it is gone.
+        """Kill the remaining processes of the group, and remove it; no error if it is gone.
 
         Raises:
             LocalError: the kernel refuses.
@@ -128,13 +134,13 @@ class Cgroup:
         end_s = time.monotonic() + _PATIENCE_S
         for folder in self._standing():
             while True:
-                self.kill()  # again: without cgroup.kill, one may have started another meanwhile
+                self.kill()  # in the loop: without cgroup.kill, a process may have started another
                 try:
                     folder.rmdir()
                     break
                 except FileNotFoundError:
                     break
-                except OSError as error:  # busy until the last one is gone, of which version 1 tells nobody
+                except OSError as error:  # busy until the last process ends, which version 1 does not report
                     if time.monotonic() > end_s:
                         raise LocalError(f"{folder} cannot be removed: {error.strerror}") from error
                     time.sleep(_LOOK_S)
@@ -154,12 +160,12 @@ class Cgroup:
 
 
 def _pids(folder: Path) -> Iterator[int]:
-    with suppress(OSError):  # gone meanwhile
+    with suppress(OSError):  # removed in the meantime
         yield from map(int, (folder / "cgroup.procs").read_text(encoding="ascii").split())
 
 
 def _roots() -> tuple[Path | None, dict[str, Path]]:
-    """Return where groups of version 2 are, and by controller where those of version 1 are."""
+    """Return the root of version 2, and the roots of version 1 by controller."""
     new, old = None, {}
     for line in _MOUNTS.read_text(encoding="utf-8", errors="replace").splitlines():
         _, place, kind, options, *_ = line.split()

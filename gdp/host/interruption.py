@@ -1,6 +1,6 @@
-"""Work that a signal breaks off, wherever it is, so that what it made can still be taken down.
+"""Interruption of work by a signal, so that the caller can still remove what the work made.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -17,8 +17,12 @@ T = TypeVar("T")
 _ENDING_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-class Interrupted(Exception):  # noqa: N818  nothing is wrong
-    """A signal cancelled the work; ``exit_code``: what a shell says of that."""
+class Interrupted(Exception):  # noqa: N818  (not an error)
+    """A signal cancelled the work.
+
+    Attributes:
+        exit_code: exit code of a shell for that signal.
+    """
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
@@ -26,7 +30,7 @@ class Interrupted(Exception):  # noqa: N818  nothing is wrong
 
 
 async def interruptible(work: Coroutine[None, None, T]) -> T:
-    """Do the work and return what it comes to.
+    """Do the work and return its result.
 
     Raises:
         Interrupted: a signal cancelled it.
@@ -36,6 +40,7 @@ async def interruptible(work: Coroutine[None, None, T]) -> T:
     caught: list[int] = []
 
     def stop(number: int) -> None:
+        """Cancel the work, and remember the signal."""
         caught.append(number)
         task.cancel()
 
@@ -48,6 +53,6 @@ async def interruptible(work: Coroutine[None, None, T]) -> T:
 
 
 def let_nothing_interrupt() -> None:
-    """Ignore these signals from now on: what follows takes seconds at most, and must be done to the end."""
+    """Ignore these signals from now on: what follows takes seconds at most, and must run to its end."""
     for number in _ENDING_SIGNALS:
         signal.signal(number, signal.SIG_IGN)

@@ -1,6 +1,6 @@
-"""File systems in memory that a run mounts, and what takes any mount away again.
+"""Mounts of a run: file systems in memory, and the removal of any mount.
 
-Place: shell; mounting needs CAP_SYS_ADMIN in the user namespace that owns the mount namespace.
+I/O; mounting needs CAP_SYS_ADMIN in the user namespace that owns the mount namespace.
 Source: mount(2), umount2(2), tmpfs(5).
 """
 
@@ -34,7 +34,7 @@ def mount_tmpfs(path: Path, size_bytes: int) -> None:
 
 
 def unmount(path: Path) -> None:
-    """Unmount what lies on ``path``; fine if nothing does, since mounts go with their mount namespace.
+    """Unmount ``path``; no error if nothing is mounted there, since mounts end with their mount namespace.
 
     Raises:
         LocalError: the kernel refuses.

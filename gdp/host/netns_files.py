@@ -1,9 +1,9 @@
-"""Network namespaces held by files: made, entered and released.
+"""Network namespaces held by files: creation, entry and release.
 
-Place: shell; needs CAP_SYS_ADMIN in the user namespace it runs in.
-Source: network_namespaces(7), setns(2). A namespace is bound to a file, as ip-netns(8) does it; for root of the machine
-the file lies in ``/run/netns``, so that ``ip netns`` finds it; inside a user namespace that folder may be missing or
-closed, so it lies in the run's own directory and ``nsenter --net=FILE`` enters it.
+I/O; needs CAP_SYS_ADMIN in the user namespace of the process.
+Source: network_namespaces(7), setns(2). A namespace is bound to a file, as in ip-netns(8). For root of the machine the
+file lies in ``/run/netns``, so that ``ip netns`` finds it. Inside a user namespace that folder may be missing or
+closed. Then the file lies in the run's own directory, and ``nsenter --net=FILE`` enters it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def create(path: Path) -> None:
     Raises:
         LocalError: the kernel refuses.
     """
-    from pyroute2 import netns  # 0.2 s to load, which whoever only asks for a namespace's file need not wait for
+    from pyroute2 import netns  # takes 0.2 s to load, which callers that only need the file avoid
 
     try:
         netns.create(str(path))
@@ -43,10 +43,10 @@ def create(path: Path) -> None:
 
 
 def inside(path: Path, work: Callable[[], T]) -> T:
-    """Do ``work`` in a thread that has entered the namespace, and return its result; the caller stays where it is.
+    """Do ``work`` in a thread that has entered the namespace, and return its result; the caller's thread stays outside.
 
     Raises:
-        OSError: no such namespace, or what ``work`` raises.
+        OSError: the namespace does not exist, or ``work`` raises it.
     """
     from pyroute2 import netns
 
@@ -54,6 +54,7 @@ def inside(path: Path, work: Callable[[], T]) -> T:
     failures: list[BaseException] = []
 
     def visit() -> None:
+        """Enter the namespace and do the work."""
         try:
             descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
             try:
@@ -73,7 +74,7 @@ def inside(path: Path, work: Callable[[], T]) -> T:
 
 
 def processes_inside(paths: Collection[Path]) -> list[Process]:
-    """Return the processes in these namespaces that we may look at; a file that holds none counts for nothing."""
+    """Return the processes in these namespaces that this user may inspect; files without a namespace are skipped."""
     held = {where for path in paths if (where := _identity(path)) is not None}
     found = []
     for folder in Path("/proc").iterdir() if held else ():
@@ -84,19 +85,19 @@ def processes_inside(paths: Collection[Path]) -> list[Process]:
 
 
 def release(path: Path) -> None:
-    """Unbind the namespace and delete its file; the kernel frees it with its last process. Fine if it is gone already.
+    """Unbind the namespace and delete its file; the kernel frees it with its last process. No error if it is gone.
 
     Raises:
         LocalError: the kernel refuses.
     """
     unmount(path)
     if path.parent != IP_NETNS_DIRECTORY:
-        unmount(path.parent)  # which ``create`` has bound onto itself, as ip-netns(8) does with its own folder
+        unmount(path.parent)  # ``create`` bound the folder onto itself, as ip-netns(8) does
     path.unlink(missing_ok=True)
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
-    """Return what tells namespaces apart; None where there is none, or we may not look."""
+    """Return a value that identifies a namespace; None if there is none, or this user may not inspect it."""
     try:
         status = path.stat()
     except OSError:
@@ -105,7 +106,7 @@ def _identity(path: Path) -> tuple[int, int] | None:
 
 
 def disable_ipv6() -> None:
-    """Disable IPv6 in the current namespace; called before its first device, it prevents neighbour solicitations."""
+    """Disable IPv6 in the current namespace; called before its first device, this prevents neighbour solicitations."""
     for scope in _NO_IPV6:
         setting = _IPV6_SETTINGS / scope / "disable_ipv6"
         if setting.exists() and os.access(setting, os.W_OK):  # containers may have it read-only

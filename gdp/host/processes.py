@@ -1,6 +1,6 @@
-"""Processes known by id and start time, so that an id which the kernel gave to somebody else is never signalled.
+"""Processes identified by id and start time, so that a reused process id is never signalled.
 
-Place: shell. Source: proc(5), field 22 of ``/proc/PID/stat``; pidfd_open(2).
+I/O. Source: proc(5), field 22 of ``/proc/PID/stat``; pidfd_open(2).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ __all__ = ["Process", "boot_id", "end_all"]
 
 @dataclass(frozen=True, slots=True)
 class Process:
-    """One process, leader of a group of its own: id, and start in clock ticks since boot."""
+    """One process, leader of its own process group: id, and start in clock ticks since boot."""
 
     pid: int
     started: int
@@ -29,7 +29,7 @@ class Process:
         """Return the running process ``pid``.
 
         Raises:
-            ProcessLookupError: there is none.
+            ProcessLookupError: there is no such process.
         """
         started = _started(pid)
         if started is None:
@@ -38,12 +38,12 @@ class Process:
 
     @property
     def alive(self) -> bool:
-        """Tell whether this very process still runs (a zombie does not)."""
+        """Return whether this exact process still runs (a zombie does not)."""
         return _started(self.pid) == self.started
 
 
 def boot_id() -> str:
-    """Return what changes with every boot of this machine, after which no process id means anything."""
+    """Return a value that changes with every boot of this machine; process ids are valid within one boot only."""
     return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
 
 
@@ -57,10 +57,12 @@ def _started(pid: int) -> int | None:
 
 
 def end_all(processes: Iterable[Process], patience_s: float = 3.0, *, are_leaders: bool = True) -> None:
-    """End the groups of these processes: SIGTERM, and after ``patience_s`` SIGKILL. Those gone already are fine.
+    """End the groups of these processes: SIGTERM, and after ``patience_s`` SIGKILL.
+
+    Processes that have ended are skipped.
 
     Args:
-        are_leaders: of groups; otherwise each is ended alone.
+        are_leaders: whether they lead groups; otherwise each is ended alone.
     """
     signal_to = os.killpg if are_leaders else os.kill
     waiting: dict[int, Process] = {}
@@ -82,7 +84,7 @@ def end_all(processes: Iterable[Process], patience_s: float = 3.0, *, are_leader
 
 
 def _still_running(waiting: dict[int, Process], patience_s: float) -> list[Process]:
-    """Wait for the process descriptors to become readable, which they do at the end of their process."""
+    """Wait for the process descriptors to become readable, which happens when their process ends."""
     poller = select.poll()
     left = {descriptor: process for descriptor, process in waiting.items() if process.alive}
     for descriptor in left:

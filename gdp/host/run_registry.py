@@ -1,7 +1,8 @@
-"""A run and the record of what it made, so that a later start can take down what a killed one left behind.
+"""Run registry: a record of the resources of each run, so that a later start can remove those of a killed run.
 
-Place: shell. A record is written *before* the thing it names is made, and replaced atomically, so it may name what was
-never made but never misses what was. It lives in ``/run/gdp``, or without root in ``$XDG_RUNTIME_DIR/gdp``.
+I/O. A record is written *before* the resource that it names is made, and it is replaced atomically. So it may name
+resources that were never made, but it never misses one. It lies in ``/run/gdp``, or without root in
+``$XDG_RUNTIME_DIR/gdp``.
 """
 
 from __future__ import annotations
@@ -30,17 +31,17 @@ log = logging.getLogger(__name__)
 
 _ID_BYTES: Final = 3
 _FRESH: Final = ".new"  # of a record that is being written
-_WRITTEN_S: Final = 60.0  # ... which takes no longer than this
+_WRITTEN_S: Final = 60.0  # a longer write counts as abandoned
 _ALL_IDS: Final = 4_294_967_295  # length of the first user namespace's map; user_namespaces(7)
 
 
 def in_first_user_namespace() -> bool:
-    """Tell whether root here is root of the machine, not of a user namespace."""
+    """Return whether root here is root of the machine, not of a user namespace."""
     return int(_uid_map()[2]) == _ALL_IDS
 
 
 def outer_uid() -> int:
-    """Return the user id that the machine knows us by, also inside a user namespace."""
+    """Return this user's id outside any user namespace."""
     inside, outside, _ = map(int, _uid_map()[:3])
     return os.getuid() - inside + outside
 
@@ -51,7 +52,10 @@ def _uid_map() -> list[str]:
 
 @dataclass(slots=True)
 class Record:
-    """What one run made. ``owner`` is the process that answers for it; a kept run stands without one."""
+    """Resources of one run.
+
+    ``owner`` is the process that is responsible for it; a kept run exists without one.
+    """
 
     run: str
     boot: str
@@ -62,11 +66,11 @@ class Record:
     files: list[str] = field(default_factory=list)  # files and directories to delete
     cgroups: list[str] = field(default_factory=list)  # names
     mounts: list[str] = field(default_factory=list)  # paths that a file system is mounted on
-    passive: bool = False  # kept, and has no process whose end would end it
+    passive: bool = False  # kept, and without a process whose end would end it
 
     @classmethod
     def from_text(cls, text: str) -> Record:
-        """Read what ``to_text`` wrote.
+        """Read the text of ``to_text``.
 
         Raises:
             ValueError: it is something else.
@@ -85,7 +89,7 @@ class Record:
 
     @property
     def dead(self) -> bool:
-        """Tell whether nobody answers for the run any more."""
+        """Return whether no live process is responsible for the run."""
         if self.boot != boot_id():
             return True
         if self.kept and self.passive:
@@ -94,7 +98,7 @@ class Record:
 
 
 class Run:
-    """A run under way: a scratch directory of its own, and a record that grows with what it makes."""
+    """An active run: a scratch directory of its own, and a record that grows with its resources."""
 
     def __init__(self, record: Record, path: Path, directory: Path) -> None:
         self._record = record
@@ -105,7 +109,7 @@ class Run:
 
     @classmethod
     def resumed(cls, record: Record, path: Path) -> Run:
-        """Return the run of a record that is there already."""
+        """Return the run of an existing record."""
         run = cls.__new__(cls)
         run._record, run._path, run.directory = record, path, Path(record.files[0])
         return run
@@ -117,32 +121,32 @@ class Run:
 
     @property
     def record(self) -> Record:
-        """Return what it made until now."""
+        """Return the resources recorded until now."""
         return self._record
 
     def plan_namespace(self, path: Path) -> None:
-        """Note a namespace that is about to be made."""
+        """Record a namespace that is about to be made."""
         self._record.namespaces.append(str(path))
         self._save()
 
     def plan_cgroup(self, name: str) -> None:
-        """Note a control group that is about to be made."""
+        """Record a control group that is about to be made."""
         self._record.cgroups.append(name)
         self._save()
 
     def plan_mount(self, path: Path) -> None:
-        """Note a path that a file system is about to be mounted on."""
+        """Record a path that a file system is about to be mounted on."""
         self._record.mounts.append(str(path))
         self._save()
 
     def note_process(self, pid: int) -> None:
-        """Note a process that was just started as the leader of its group; one that has ended already is left out."""
+        """Record a process that was just started as the leader of its group, unless it has already ended."""
         with suppress(ProcessLookupError):
             self._record.processes.append(Process.of(pid))
             self._save()
 
     def keep(self, *, passive: bool = False) -> None:
-        """Let everything stand after this process ends, until ``RunRegistry.take_down``.
+        """Keep all resources after this process ends, until ``RunRegistry.take_down``.
 
         Args:
             passive: the run has namespaces and devices only; it is dead after a reboot, and never before.
@@ -152,7 +156,7 @@ class Run:
         self._save()
 
     def end(self) -> None:
-        """Take down everything that the record names, and the record."""
+        """Remove everything that the record names, and the record."""
         _take_down(self._record, self._path)
 
     def _save(self) -> None:
@@ -167,10 +171,10 @@ class RunRegistry:
     """The directory of records of one user.
 
     Args:
-        directory: where records lie; by default the place for run-time files of this user.
+        directory: of the records; by default the run-time directory of this user.
 
     Raises:
-        LocalError: the directory belongs to somebody else, or others may write to it.
+        LocalError: the directory belongs to another user, or others may write to it.
     """
 
     def __init__(self, directory: Path | None = None) -> None:
@@ -190,10 +194,10 @@ class RunRegistry:
         return [record for record, _ in self._records()]
 
     def resume(self, run: str) -> Run:
-        """Go on with a run that was kept, to add to it or to end it; or with a dead one, to end it.
+        """Resume a run that was kept, to add to it or to end it; or a dead one, to end it.
 
         Raises:
-            LocalError: there is none, or its owner is at it.
+            LocalError: there is no such run, or its owner is alive.
         """
         for record, path in self._records():
             if record.run == run and (record.kept or record.dead):
@@ -201,18 +205,18 @@ class RunRegistry:
         raise LocalError(f"no run {run} to go on with")
 
     def sweep(self) -> list[str]:
-        """Take down every run that nobody answers for; return their ids."""
+        """Remove every dead run; return their ids."""
         self._remove_unfinished()
         return [record.run for record, path in self._records() if record.dead and _take_down(record, path)]
 
     def take_down(self) -> list[str]:
-        """Take down every run that was kept, and every dead one; return their ids. Runs under way are left alone."""
+        """Remove every kept and every dead run; return their ids. Active runs stay."""
         return [r.run for r, path in self._records() if (r.kept or r.dead) and _take_down(r, path)]
 
     def _remove_unfinished(self) -> None:
-        """Remove what a process that was killed had begun to write, before it had made anything."""
+        """Remove half-written records of processes that were killed before they made a resource."""
         for path in self._directory.glob(f"*{_FRESH}"):
-            with suppress(FileNotFoundError):  # it was renamed, or another start was quicker
+            with suppress(FileNotFoundError):  # it was renamed, or another process removed it first
                 if time.time() - path.stat().st_mtime > _WRITTEN_S and not path.with_suffix(".json").exists():
                     path.unlink()
 
@@ -222,7 +226,7 @@ class RunRegistry:
             try:
                 found.append((Record.from_text(path.read_text(encoding="utf-8")), path))
             except FileNotFoundError:
-                continue  # another start was quicker
+                continue  # another process removed it first
             except ValueError as error:
                 log.warning("record left alone path=%s reason=%s", path, error)
         return found
@@ -238,14 +242,14 @@ def _default_directory() -> Path:
 
 
 def _take_down(record: Record, path: Path) -> bool:
-    """Undo what the record names; what is gone already is fine."""
+    """Remove what the record names; resources that are already gone are skipped."""
     # pyroute2 takes 0.2 s to load, and most records need none of it
     from gdp.host.netns_files import processes_inside, release
 
     if record.boot == boot_id():
         end_all(record.processes)
         spaces = [Path(namespace) for namespace in record.namespaces]
-        end_all(processes_inside(spaces), are_leaders=False)  # daemons that nobody could note in time
+        end_all(processes_inside(spaces), are_leaders=False)  # daemons that were not recorded in time
         for group in record.cgroups:
             Cgroup(group).remove()
         for space in spaces:
@@ -255,7 +259,7 @@ def _take_down(record: Record, path: Path) -> bool:
     for name in record.files:
         target = Path(name)
         if target.is_dir() and not target.is_symlink():
-            with suppress(FileNotFoundError):  # somebody else sweeps as well
+            with suppress(FileNotFoundError):  # another process removes it as well
                 shutil.rmtree(target)
         else:
             target.unlink(missing_ok=True)

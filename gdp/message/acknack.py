@@ -1,7 +1,9 @@
-"""What a reader tells its publisher: how far it is, and what it lacks.
+"""AckNack: a reader's report of the messages it has and the ones it lacks.
 
-Place: pure. Wire form, big-endian: ``flags (1) | next number (8) | next part (4) | next sequence number (8) | lost (8)
-| ranges (2)`` and for each range ``number (8) | first part (4) | last part (4)``.
+Sans-I/O. Source: RTPS 2.5, section 8.3.8.1. Wire form, big-endian::
+
+    flags (1) | next number (8) | next part (4) | next sequence number (8) | lost (8) | ranges (2)
+    for each range: number (8) | first part (4) | last part (4)
 """
 
 from __future__ import annotations
@@ -21,15 +23,15 @@ _RANGE: Final = struct.Struct("!QII")
 
 
 class AckNackFlag(IntFlag):
-    """What the reader is in the middle of."""
+    """State of the reader."""
 
     NONE = 0
-    NEW = 1  # it has not seen a status: tell it where to begin
+    NEW = 1  # it has not seen a Heartbeat: it requests its start
     BYE = 2  # it leaves
 
 
 class MissingRange(NamedTuple):
-    """Parts ``first`` to ``last``, both included, of one message; ``last`` may lie beyond its end."""
+    """Fragments ``first`` to ``last``, both included, of one message; ``last`` may lie beyond its end."""
 
     number: int
     first: int
@@ -37,10 +39,10 @@ class MissingRange(NamedTuple):
 
 
 class AckNack(NamedTuple):
-    """Everything before (next_number, next_part) is held; of what follows, ``missing`` is known to lack.
+    """Everything before (next_number, next_part) is held; of what follows, ``missing`` is known to be missing.
 
-    Messages with sequence numbers before ``sequence`` were delivered, but for ``lost`` of them. A report flagged NEW
-    names what its reader had of this publisher's life before, and zeros if nothing.
+    Messages with sequence numbers before ``sequence`` were delivered, except ``lost`` of them. A report flagged NEW
+    names what its reader had of this incarnation of the publisher before, and zeros if nothing.
     """
 
     flags: AckNackFlag
@@ -62,7 +64,7 @@ class AckNack(NamedTuple):
         """Read the wire form.
 
         Raises:
-            FrameError: not exactly that.
+            FrameError: the bytes are not exactly one AckNack.
         """
         if len(wire) < _HEAD.size:
             raise FrameError(DropReason.TRUNCATED, "report")

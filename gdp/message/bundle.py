@@ -1,8 +1,7 @@
-"""Several small messages of one topic under one seal and one signature.
+"""Bundle: several small messages of one topic under one seal and one signature.
 
-Place: pure. Source: docs/explanation/design.md, section 4:
-natural batching, never an added delay: what goes together is what waits together
-when frames are asked for.
+Sans-I/O. Source: docs/explanation/design.md, section 4: natural batching, never an added delay. Messages that wait
+together when frames are requested are sent together.
 
 Wire form, big-endian: for each message ``length (4) | message``; at least one message, nothing behind the last.
 """
@@ -18,11 +17,13 @@ from gdp.errors import DropReason, FrameError
 
 __all__ = ["BUNDLE_BYTES", "BUNDLE_MAX_BYTES", "Gathered", "pack", "unpack"]
 
-BUNDLE_BYTES: Final = 48 << 10  # what a publisher makes; larger ones save hardly more, and the first in it waits longer
-BUNDLE_MAX_BYTES: Final = 64 << 10  # what a reader takes: it bounds how many messages one frame may turn into
+# the largest bundle that a publisher makes; larger ones save hardly more, and the first message in it waits longer
+BUNDLE_BYTES: Final = 48 << 10
+# the largest bundle that a reader accepts: it bounds how many messages one frame may yield
+BUNDLE_MAX_BYTES: Final = 64 << 10
 _LENGTH: Final = struct.Struct("!I")
-_SMALL: Final = 4  # so many of them, or more, go into one bundle
-_ALONE_BYTES: Final = 184  # what sealing it alone would add: what waits is not to weigh less than what is sealed
+_SMALL: Final = 4  # this number of them, or more, go into one bundle
+_ALONE_BYTES: Final = 184  # overhead of a seal of its own: the waiting bytes must not weigh less than the sealed ones
 
 
 def pack(messages: Iterable[bytes]) -> bytes:
@@ -34,7 +35,7 @@ def unpack(wire: bytes) -> list[bytes]:
     """Read the wire form.
 
     Raises:
-        FrameError: not exactly that; nothing of it counts.
+        FrameError: the bytes are not exactly one bundle; none of its messages counts.
     """
     if not 0 < len(wire) <= BUNDLE_MAX_BYTES:
         raise FrameError(DropReason.MALFORMED, "bundle")
@@ -51,7 +52,7 @@ def unpack(wire: bytes) -> list[bytes]:
 
 
 class Gathered:
-    """Small messages that wait for their seal, oldest first; their sequence numbers follow each other."""
+    """Small messages that wait for their seal, oldest first; their sequence numbers are consecutive."""
 
     def __init__(self) -> None:
         self._messages = deque[bytes]()
@@ -63,18 +64,18 @@ class Gathered:
 
     @staticmethod
     def is_small(message: bytes, room: int) -> bool:
-        """Return whether several messages of this size go into a bundle of ``room`` bytes."""
+        """Return whether several messages of this size fit into a bundle of ``room`` bytes."""
         return _SMALL * (len(message) + _LENGTH.size) <= room
 
     def add(self, sequence: int, message: bytes) -> None:
-        """Let a message wait."""
+        """Add a message."""
         if not self._messages:
             self.first = sequence
         self._messages.append(message)
         self.held_bytes += len(message) + _ALONE_BYTES
 
     def poll_batch(self, room: int) -> list[bytes]:
-        """Return the oldest, and what follows it as far as ``room`` bytes of wire form hold it."""
+        """Remove and return the oldest message, and those after it that fit into ``room`` bytes of wire form."""
         together: list[bytes] = []
         while self._messages:
             room -= len(self._messages[0]) + _LENGTH.size

@@ -1,4 +1,4 @@
-"""A queue that serves its owners in turn (round robin), however much one of them puts in.
+"""Fair queue: serves its owners in turn (round robin), however much one of them puts in.
 
 Sans-I/O. Source: J. Nagle, On Packet Switches With Infinite Storage, RFC 970.
 """
@@ -45,7 +45,7 @@ class FairQueue(Generic[_T]):
         return item
 
     def discard(self, owner: bytes, item: _T) -> None:
-        """Take an item out; nothing happens if it is not there."""
+        """Remove an item; nothing happens if it is not there."""
         items = self._of.get(owner)
         if items is not None:
             items.pop(item, None)
@@ -53,5 +53,5 @@ class FairQueue(Generic[_T]):
                 del self._of[owner]
 
     def clear(self) -> None:
-        """Take everything out."""
+        """Remove every item."""
         self._of.clear()

@@ -1,8 +1,8 @@
-"""Flow control of a reliable writer: congestion window, round-trip time, and the timer that asks silent readers.
+"""Flow control of a reliable writer: congestion window, round-trip time, and the timer that probes silent readers.
 
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
-Source: window growth and halving after RFC 5681, sections 3.1 and 3.2; round-trip estimate after RFC 6298, section 2,
-with Karn's rule. Positions count bytes of frames from the first message on.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: window growth and halving after RFC 5681, sections 3.1
+and 3.2; round-trip estimate after RFC 6298, section 2, with Karn's rule. Positions count bytes of frames from the first
+message on.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class RoundTripEstimator:
             self._sample = None
 
     def discard_sample(self) -> None:
-        """Discard the running sample: an acknowledgement of what was sent twice is ambiguous (Karn's rule)."""
+        """Discard the running sample: the acknowledgement of a retransmitted frame is ambiguous (Karn's rule)."""
         self._sample = None
 
     def _update(self, sample_s: float) -> None:
@@ -53,7 +53,7 @@ class RoundTripEstimator:
 
 
 class FlowControl:
-    """How many bytes may be under way, and when silent readers are asked.
+    """Bound of the bytes under way, and the probe timer of silent readers.
 
     Attributes:
         window_bytes: the congestion window.
@@ -94,7 +94,7 @@ class FlowControl:
         self._quiet_s = now_s
 
     def next_probe(self) -> float:
-        """Return the monotonic second at which readers are asked, if something is under way."""
+        """Return the monotonic second at which readers are probed, if something is under way."""
         return self._quiet_s + self._probe_s
 
     def probe_due(self, now_s: float) -> bool:

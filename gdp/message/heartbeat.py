@@ -1,10 +1,13 @@
-"""What a publisher tells its readers about its topic: what it still holds, where each begins, what the messages are.
+"""Heartbeat: a writer's report of its first and last available message, new readers' starts, and the description.
 
-Place: pure. It travels as a sealed and signed message. Wire form, big-endian: ``oldest (8) | its sequence number (8) |
-sent number (8) | sent part (4) | its sequence number (8) | starts (2) | moves (1) | gone (1)``, for each start ``reader
-(32) | its incarnation (8) | number (8) | sequence number (8) | confirmed (8)``, for each move ``first (8) | span (8) |
-to (8)``, for each range that is gone ``first (8) | last (8) | reason (1)``, then the description, empty when this
-status brings none.
+Sans-I/O. Source: RTPS 2.5, section 8.3.8.6. It is sent as a sealed and signed message. Wire form, big-endian::
+
+    oldest (8) | its sequence number (8) | sent number (8) | sent part (4) | its sequence number (8)
+    | starts (2) | moves (1) | gone (1)
+    for each start: reader (32) | its incarnation (8) | number (8) | sequence number (8) | confirmed (8)
+    for each move: first (8) | span (8) | to (8)
+    for each range that is gone: first (8) | last (8) | reason (1)
+    description, empty when this Heartbeat brings none
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ from gdp.message.renumbering import MOVES_MAX, Renumbering
 
 __all__ = ["STARTS_MAX", "Heartbeat", "StreamStart"]
 
-STARTS_MAX: Final = 64  # readers that one status tells where to begin; more get the next one
+STARTS_MAX: Final = 64  # readers whose start one Heartbeat carries; more get the next one
 _HEAD: Final = struct.Struct("!QQQIQHBB")
 _START: Final = struct.Struct("!32sQQQQ")
 _MOVE: Final = struct.Struct("!QQQ")
@@ -32,10 +35,10 @@ class StreamStart(NamedTuple):
     """Where a new reader begins.
 
     Args:
-        incarnation: of the reader; a recorded status opens nothing to a later life.
-        number: the first message number that is its.
+        incarnation: of the reader; a recorded Heartbeat opens nothing to a later incarnation.
+        number: the reader's first message number.
         sequence: the first sequence number under it.
-        confirmed: below which a former life of this reader had confirmed everything; 0: not known.
+        confirmed: below this a former incarnation of this reader had confirmed everything; 0: not known.
     """
 
     incarnation: int
@@ -47,8 +50,9 @@ class StreamStart(NamedTuple):
 class Heartbeat(NamedTuple):
     """Messages from ``oldest`` on can be repaired; everything before (sent_number, sent_part) has been sent.
 
-    What has not been sent is not announced: it would be taken for lost. Sequence numbers below ``oldest_sequence`` go
-    with numbers below ``oldest``, and those below ``sent_sequence`` with numbers below ``sent_number``, or with none.
+    Unsent messages are not announced, because readers would count them as lost. Sequence numbers below
+    ``oldest_sequence`` belong to numbers below ``oldest``. Those below ``sent_sequence`` belong to numbers below
+    ``sent_number``, or to none.
     """
 
     oldest: int
@@ -56,10 +60,10 @@ class Heartbeat(NamedTuple):
     sent_part: int
     starts: dict[bytes, StreamStart]  # by new reader
     description: bytes
-    moves: tuple[Renumbering, ...] = ()  # the latest, oldest first; for readers that have not heard of them
+    moves: tuple[Renumbering, ...] = ()  # the latest, oldest first; for readers that have not received them yet
     oldest_sequence: int = 0
     sent_sequence: int = 0
-    gone: tuple[LostRange, ...] = ()  # messages that no reader can get, and why; the latest
+    gone: tuple[LostRange, ...] = ()  # messages that no reader can get, with the reason; the latest
 
     def to_wire(self) -> bytes:
         """Return the wire form."""
@@ -98,7 +102,7 @@ def _range(first: int, last: int, reason: int) -> LostRange:
     """Return a range as read.
 
     Raises:
-        FrameError: it is none. A reason of a later version counts as GIVEN_UP.
+        FrameError: it is invalid. A reason of a later version counts as GIVEN_UP.
     """
     if first > last:
         raise FrameError(DropReason.MALFORMED, "status")

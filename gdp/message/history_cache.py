@@ -1,8 +1,7 @@
-"""Cache of the messages that a reliable writer can send again.
+"""History cache: the messages that a reliable writer can send again.
 
-Sans-I/O.
-Source: HistoryCache of the RTPS specification (OMG DDSI-RTPS 2.5, section 8.2.2). Positions count bytes of frames from
-the first message on.
+Sans-I/O. Source: HistoryCache of the RTPS specification (OMG DDSI-RTPS 2.5, section 8.2.2). Positions count bytes of
+frames from the first message on.
 """
 
 from __future__ import annotations
@@ -28,11 +27,11 @@ class CachedMessage(NamedTuple):
         return self.begin_at + self.size
 
     def position(self, part: int) -> int:
-        """Return the position at which a part begins; all parts but the last have one length."""
+        """Return the position at which a fragment begins; all fragments but the last have one length."""
         return self.begin_at + min(part * len(self.frames[0]), self.size)
 
     def sent_parts(self, sent_at: int) -> int:
-        """Return how many parts begin before the position ``sent_at``."""
+        """Return how many fragments begin before the position ``sent_at``."""
         return max(-(-(sent_at - self.begin_at) // len(self.frames[0])), 0)
 
 

@@ -1,7 +1,7 @@
-"""Sequence numbers of one publisher's messages: which message number carries which, and what nobody confirmed.
+"""Ledger of one publisher's sequence numbers: their message numbers, and the messages that were not confirmed.
 
-Sans-I/O. A message number belongs to what is sealed as one, which may be a bundle of several messages. A sequence
-number belongs to each message that the application published, sealed or not.
+Sans-I/O. A message number belongs to one sealed unit, which may be a bundle of several messages. A sequence number
+belongs to each message that the application published, sealed or not.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ __all__ = ["Ledger"]
 
 
 class Ledger:
-    """The sequence numbers of one publisher.
+    """Sequence numbers of one publisher.
 
     Args:
         last: the highest sequence number that was used before.
 
     Attributes:
         last: the highest sequence number in use.
-        losses: what this publisher did not bring to a reader that was due to get it.
-        gone: the latest ranges that no reader can get, for statuses.
+        losses: messages that a reader should have received from this publisher, and did not.
+        gone: the latest ranges that no reader can get, for Heartbeats.
     """
 
     def __init__(self, last: int) -> None:
@@ -54,21 +54,21 @@ class Ledger:
         return self._of[number][1] > 1
 
     def begin_of(self, number: int, otherwise: int) -> int:
-        """Return the first sequence number that a message number carries; ``otherwise`` if nothing is known of it."""
+        """Return the first sequence number that a message number carries; ``otherwise`` if it is unknown."""
         known = self._of.get(number)
         return otherwise if known is None else known[0]
 
     def forget(self, below: int) -> None:
-        """Keep nothing of message numbers under ``below``."""
+        """Forget message numbers under ``below``."""
         while self._of and (first := next(iter(self._of))) < below:
             del self._of[first]
 
     def move(self, move: Renumbering) -> None:
-        """Go on under new message numbers."""
+        """Apply a renumbering."""
         self._of = {move.of(number): carried for number, carried in self._of.items()}
 
     def let_go(self, numbers: Iterable[int], reason: LossReason) -> int:
-        """Note that message numbers are gone before every reader had them; return how many messages that are."""
+        """Note that message numbers are gone before every reader had them; return how many messages they carried."""
         gone = 0
         for number in numbers:
             sequence, messages = self._of[number]

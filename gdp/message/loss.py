@@ -1,7 +1,7 @@
 """Lost messages: which ones, how many, and why.
 
-Sans-I/O. Messages are named by their sequence numbers. A publisher gives one to each message of its life, sent or not,
-so a gap between two of them is exactly what was lost.
+Sans-I/O. Sequence numbers identify messages. A publisher numbers each message of its incarnation, sent or not, so a gap
+between two numbers is exactly what was lost.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ class LossReason(IntEnum):
     The value is on the wire and the label in metrics and JSON, so new reasons are only ever appended.
     """
 
-    GAP = 1  # lost on the way, on a best-effort topic
-    GIVEN_UP = 2  # no longer kept for a reader that was silent, or behind the others, for too long
-    WINDOW_OVERFLOW = 3  # pushed out of the publisher's full window, or refused for lack of room in it
-    QUEUE_OVERFLOW = 4  # pushed out of the publisher's full queue, on a best-effort topic
+    GAP = 1  # lost on the path, on a best-effort topic
+    GIVEN_UP = 2  # no longer cached for a reader that was silent, or behind the others, for too long
+    WINDOW_OVERFLOW = 3  # evicted from the publisher's full window, or refused because the window was full
+    QUEUE_OVERFLOW = 4  # evicted from the publisher's full queue, on a best-effort topic
     NO_READER = 5  # published while its publisher knew of no reader
     TOO_LARGE = 6  # above the limit of its rule
     READER_MEMORY = 7  # the reader had no memory left to wait for it
     PUBLISHER_RESTARTED = 8  # its publisher started again in between
-    READER_RESTARTED = 9  # this reader did
+    READER_RESTARTED = 9  # this reader restarted
     DETACHED = 10  # the route to the publisher was gone in between
 
     @property
@@ -51,7 +51,7 @@ class LostRange(NamedTuple):
 
     @property
     def messages(self) -> int:
-        """Return how many that are."""
+        """Return the number of messages."""
         return self.last - self.first + 1
 
 
@@ -73,7 +73,7 @@ class Losses:
         append(self.ranges, lost)
 
     def update(self, other: Losses) -> None:
-        """Count what another has counted."""
+        """Add the losses that another object has counted."""
         self.counts += other.counts
         self.ranges.extend(other.ranges)
 
@@ -82,7 +82,7 @@ class Losses:
         return {label: count for label, count in by_label(self.counts).items() if count}
 
     def words(self) -> str:
-        """Return the total and what it is made of, such as ``5 lost (gap 3, given-up 2)``."""
+        """Return the total and its composition, such as ``5 lost (gap 3, given-up 2)``."""
         reasons = ", ".join(f"{label} {count}" for label, count in self.by_label().items())
         return f"{self.total} lost ({reasons})" if reasons else "0 lost"
 
@@ -135,7 +135,7 @@ def explain(first: int, last: int, known: Iterable[LostRange], otherwise: LossRe
 
     Args:
         known: disjoint ranges, in any order.
-        otherwise: the reason of all that ``known`` does not name.
+        otherwise: the reason of numbers outside ``known``.
     """
     found: list[LostRange] = []
     at = first

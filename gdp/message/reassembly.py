@@ -1,15 +1,15 @@
-"""Joining the parts of one source's messages, in whatever order they come.
+"""Reassembly of the fragments of one source's messages, in any order of arrival.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds).
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: IPv4 reassembly (RFC 815).
 
-A part is opened before it is kept, so that nothing injected or altered costs memory. What is kept is bounded by a
-``ReassemblyQuota`` and given back after a patience. The running hash follows the parts in order; a part that came
-early keeps
-its ciphertext until the hash has reached it.
+A fragment is opened before it is kept, so injected or altered bytes cost no memory. A ``ReassemblyQuota`` bounds the
+memory, and a timeout releases it. The running hash follows the fragments in order. A fragment that came early keeps its
+ciphertext until the hash has reached it.
 
-Whoever holds the topic's secret can make parts that open, though never a message that verifies. So nothing that such
-a part says lasts: a message whose signature is bad is forgotten, not finished; of two counts of parts, or two
-salts, the later one holds; and when there are too many unfinished messages, the one that is needed last gives way.
+A holder of the topic's secret can make fragments that open, though never a message that verifies. So the effect of such
+a fragment is never permanent. A message whose signature is bad is forgotten, not finished. Of two counts of fragments,
+or two salts, the later one is valid. When there are too many unfinished messages, the one that is needed last is
+evicted.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ __all__ = ["ALL_PARTS", "OpensParts", "ReassembledMessage", "Reassembler", "Veri
 
 ALL_PARTS = 0xFFFF_FFFF
 _SHARED_FLAGS = 0xFF & ~int(Flag.LAST)  # a plain number: an IntFlag's operators cost a microsecond each
-_PREPAID_BYTES = 32 << 10  # memory is taken ahead for so much of a message whose parts come in order
-_PART_OVERHEAD_BYTES = 128  # what a kept part costs beside its bytes
+_PREPAID_BYTES = 32 << 10  # memory is reserved ahead for this many bytes of a message whose fragments come in order
+_PART_OVERHEAD_BYTES = 128  # overhead of a kept fragment, in addition to its bytes
 _NUMBER_AND_PART = struct.Struct("!QI")
 _AHEAD_PARTS = 64  # heads made at once
-_SCAN_PARTS = 4_096  # above the parts that an honest publisher has under way
+_SCAN_PARTS = 4_096  # above the fragments that an honest publisher has under way
 
 
 class OpensParts(Protocol):
@@ -50,26 +50,26 @@ class OpensParts(Protocol):
     def open_run(
         self, headers: HeaderBatch, first: int, length: int, arrivals: Sequence[ReceivedFrame], at: int
     ) -> tuple[list[bytes], list[bytes]]:
-        """Return plaintexts and payloads of the inner parts that follow each other from ``first`` on."""
+        """Return plaintexts and payloads of the consecutive inner fragments from ``first`` on."""
 
 
 class VerifiesDigest(Protocol):
-    """A writer's public key."""
+    """A writer's public key, by which a message's digest is verified."""
 
     def verify_digest(self, signature: bytes, digest: bytes) -> None:
-        """Return, or raise a ``RemoteError``."""
+        """Verify a signature; raise a ``RemoteError`` if it is invalid."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReassembledMessage:
-    """A whole message, opened and verified."""
+    """A complete message, opened and verified."""
 
     number: int
     flags: int
     message: bytes
     parts: int
-    hops: int  # switches passed by the part that took the longest way
-    head: bytes = b""  # what came before the message, as many bytes as its joiner was told
+    hops: int  # switches passed by the fragment with the longest path
+    head: bytes = b""  # the first bytes under the seal, before the message: ``head_bytes`` of its reassembler
 
 
 class _Hash(Protocol):
@@ -85,12 +85,12 @@ class _PartialMessage:
     opener: OpensParts
     running: _Hash
     touched_s: float
-    header: Header  # of the newest part that came in order
-    headers: HeaderBatch | None = None  # of the parts expected next
+    header: Header  # of the newest fragment that came in order
+    headers: HeaderBatch | None = None  # of the fragments expected next
     plain: dict[int, bytes] = field(default_factory=dict)
     early: dict[int, bytes] = field(default_factory=dict)  # ciphertext ahead of the hash
-    hashed: int = 0  # parts the hash has taken
-    top: int = -1  # highest part held
+    hashed: int = 0  # fragments the hash has taken
+    top: int = -1  # highest fragment held
     signature: bytes = b""
     held_bytes: int = 0
     prepaid_bytes: int = 0  # of ``held_bytes``, not yet used
@@ -98,15 +98,15 @@ class _PartialMessage:
 
 
 class Reassembler:
-    """Joins the messages of one source's incarnation towards one destination.
+    """Reassembler of the messages of one source's incarnation to one destination.
 
     Args:
-        source: whose budget is charged.
-        opener_of: gives the opener for a key epoch, or raises ``EnvelopeError`` (UNKNOWN_EPOCH).
+        source: name whose quota is charged.
+        opener_of: returns the opener of a key epoch, or raises ``EnvelopeError`` (UNKNOWN_EPOCH).
         writer: the key that must have signed.
-        budget: shared by all joiners of the node.
-        patience_s: an unfinished message is given back this long after its last new part.
-        head_bytes: how many bytes come before each message; fewer than any first part has.
+        budget: shared by all reassemblers of the node.
+        patience_s: an unfinished message is dropped this long after its last new fragment.
+        head_bytes: how many bytes come before each message; fewer than any first fragment has.
     """
 
     def __init__(
@@ -130,17 +130,17 @@ class Reassembler:
         budget.register(self, source)
         self.window = ReplayWindow()
         self.drops: Counter[DropReason] = Counter()
-        self.highest = -1  # highest message number of which an authentic part came
+        self.highest = -1  # highest message number of which an authentic fragment came
         self.new_parts = 0
-        self._under_way = -1  # number of the message whose next parts are expected
+        self._under_way = -1  # number of the message whose next fragments are expected
 
     def add_batch(self, arrivals: Sequence[ReceivedFrame], at: int, now_s: float) -> int:
-        """Take what ``arrivals[at:]`` brings of the message under way, as long as its inner parts come in order.
+        """Add frames of ``arrivals[at:]`` that continue the message under way with inner fragments in order.
 
-        Almost every part of a large message comes so, and goes this short way. What ends the run is for ``add``.
+        Almost every fragment of a large message takes this short path. The frame that ends the run is for ``add``.
 
         Returns:
-            how many were taken.
+            how many were added.
         """
         message = self._unfinished.get(self._under_way)
         if message is None or message.early:
@@ -150,7 +150,7 @@ class Reassembler:
             frame[NUMBER_AT:PARTS_AT] != _NUMBER_AND_PART.pack(header.number, message.hashed)
             or frame[DESTINATION_AT:HEADER_BYTES] != header.destination + header.source
         ):
-            return 0  # another message's turn
+            return 0  # a frame of another message
         taken, first = 0, message.hashed
         while at + taken < len(arrivals):
             part, headers = message.hashed, message.headers
@@ -182,7 +182,7 @@ class Reassembler:
         return taken
 
     def add(self, header: Header, frame: bytes, now_s: float) -> ReassembledMessage | None:
-        """Take one part; return the message it completes, if any. What is wrong with it is counted in ``drops``."""
+        """Add one fragment; return the message that it completes, if any. Errors are counted in ``drops``."""
         number = header.number
         if self.window.is_finished(number):
             self.drops[DropReason.LATE] += 1
@@ -215,7 +215,7 @@ class Reassembler:
         running.update(sealed)
         if not self._is_signed(signature, running):
             return None
-        if number in self._unfinished:  # somebody else said that it has more parts
+        if number in self._unfinished:  # another sender stated a larger number of fragments
             self._drop(number)
             self.drops[DropReason.BAD_PARTS] += 1
         self.highest = max(self.highest, number)
@@ -227,7 +227,7 @@ class Reassembler:
         )
 
     def _start(self, header: Header, salt: bytes, opener: OpensParts, now_s: float) -> _PartialMessage:
-        """Return a message of which nothing is kept yet; one with another number of parts, or salt, gives way."""
+        """Return a new partial message; it replaces one with another number of fragments, or another salt."""
         if header.number in self._unfinished:
             self.drops[DropReason.BAD_PARTS] += 1
             self._drop(header.number)
@@ -273,7 +273,7 @@ class Reassembler:
         number = header.number
         self._drop(number)
         if not self._is_signed(message.signature, message.running):
-            return None  # not finished: the writer's own parts may still come
+            return None  # not finished: the writer's own fragments may still come
         self.window.finish(number)
         first, size = message.plain[0], self._head_bytes
         whole = b"".join([first[size:], *(message.plain[part] for part in range(1, message.parts))])
@@ -298,7 +298,7 @@ class Reassembler:
         return self._unfinished_bytes
 
     def give_way(self) -> None:
-        """Drop the message that is needed last: somebody who holds less needs the memory."""
+        """Drop the message that is needed last, because a stream that holds less needs the memory."""
         if self._unfinished:
             self._drop(max(self._unfinished))
             self.drops[DropReason.ABANDONED] += 1
@@ -313,7 +313,7 @@ class Reassembler:
         self._budget.release(self._source, size)
 
     def _make_room(self, number: int) -> bool:
-        """Return whether one more message may be begun; the highest number gives way to a lower one."""
+        """Return whether one more message may begin; the highest number is evicted for a lower one."""
         if len(self._unfinished) < JOIN_MESSAGES_MAX:
             return True
         highest = max(self._unfinished)
@@ -324,7 +324,7 @@ class Reassembler:
         return True
 
     def _reserve(self, number: int, cost: int) -> bool:
-        """Take memory for a part of a message, if need be from messages with higher numbers."""
+        """Reserve memory for a fragment of a message, if need be from messages with higher numbers."""
         while not self._take(cost):
             highest = max(self._unfinished, default=-1)
             if number >= highest:
@@ -334,7 +334,7 @@ class Reassembler:
         return True
 
     def start_at(self, first: int, finished: Collection[int]) -> None:
-        """Start to count at ``first``: forget what was believed until now, but for these finished messages.
+        """Set the first number that counts; forget all earlier state, except for these finished messages.
 
         Unfinished messages from ``first`` on stay as far as the replay window reaches.
         """
@@ -346,7 +346,7 @@ class Reassembler:
         self.highest = max([first - 1, *finished, *self._unfinished])
 
     def skip(self, number: int) -> None:
-        """Take a message as finished: it is here under another number."""
+        """Mark a message as finished: it is here under another number."""
         if number in self._unfinished:
             self._drop(number)
         self.window.finish(number)
@@ -362,10 +362,10 @@ class Reassembler:
         return ended
 
     def drop_expired(self, now_s: float, *, for_good: bool = True) -> int:
-        """Give back what waited longer than the patience; return how many messages that ended.
+        """Drop messages that waited longer than the timeout; return how many.
 
         Args:
-            for_good: their late parts are dropped; otherwise they may begin again, and be asked for.
+            for_good: their late fragments are dropped; otherwise they may begin again, and be requested.
         """
         late = [n for n, message in self._unfinished.items() if now_s - message.touched_s >= self._patience_s]
         for number in late:
@@ -374,11 +374,11 @@ class Reassembler:
             if for_good:
                 self.window.finish(number)
         if late and not for_good:
-            self.highest = max([self.window.top, *self._unfinished])  # what expired may never have been
+            self.highest = max([self.window.top, *self._unfinished])  # an expired message may never have existed
         return len(late)
 
     def next_expiry(self) -> float | None:
-        """Return the monotonic second at which ``expire`` has something to do, or None."""
+        """Return the monotonic second at which ``drop_expired`` has something to do, or None."""
         if not self._unfinished:
             return None
         return min(message.touched_s for message in self._unfinished.values()) + self._patience_s
@@ -388,10 +388,10 @@ class Reassembler:
         return self.window.is_finished(number)
 
     def missing(self, number: int, limit: int, *, to_end: bool = False) -> list[tuple[int, int]]:
-        """Return the lacking parts of a message as inclusive ranges; of one never seen, ``(0, 2**32 - 1)``.
+        """Return the missing fragments of a message as inclusive ranges; of one never seen, ``(0, 2**32 - 1)``.
 
-        Of the newest message only gaps count, unless ``to_end``: what lies beyond its highest part may be on its way.
-        No more than ``_SCAN_PARTS`` parts are looked at; further gaps show when these are filled.
+        Of the newest message only gaps count, unless ``to_end``: fragments beyond the highest one may be under way. No
+        more than ``_SCAN_PARTS`` fragments are examined; further gaps show when these are filled.
         """
         if self.window.is_finished(number):
             return []
@@ -414,11 +414,11 @@ class Reassembler:
         return ranges[:limit]
 
     def progress(self, number: int) -> int:
-        """Return the first part of a message that is lacking (0 for one never seen)."""
+        """Return the first missing fragment of a message (0 for one never seen)."""
         message = self._unfinished.get(number)
         return 0 if message is None else message.hashed
 
     def close(self) -> None:
-        """Give back everything."""
+        """Release all memory."""
         for number in list(self._unfinished):
             self._drop(number)

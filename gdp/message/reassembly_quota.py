@@ -1,8 +1,8 @@
-"""How many bytes unfinished messages may hold, per source and in all.
+"""Reassembly quota: the memory that unfinished messages may use, per source and in all.
 
-Place: pure. One budget serves every joiner of a node. Where memory is short, whoever holds most gives way to whoever
-holds less, among sources and among the streams of one source: parts made in one publisher's name, which a reader can
-make too, leave every other stream its fair part.
+Sans-I/O. Source: Linux ``ipfrag_high_thresh``. One quota serves every reassembler of a node. Where memory is short, the
+largest holder releases memory for a smaller one, among sources and among the streams of one source. So fragments in one
+publisher's name, which a reader can make too, leave every other stream its fair share.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ __all__ = ["QuotaHolder", "ReassemblyQuota"]
 
 
 class QuotaHolder(Protocol):
-    """What keeps unfinished messages, and can give some of them up."""
+    """Holder of unfinished messages, some of which it can drop."""
 
     @property
     def unfinished_bytes(self) -> int:
-        """Return how much it could give back."""
+        """Return how many bytes it could release."""
 
     def give_way(self) -> None:
-        """Drop the message that is needed last, and release what it held."""
+        """Drop the message that is needed last, and release its memory."""
 
 
 class ReassemblyQuota:
-    """Counts bytes that are held, and refuses what would pass a bound."""
+    """Counter of reserved bytes that refuses to pass a bound."""
 
     def __init__(self, total_bytes: int = JOIN_TOTAL_BYTES, source_bytes: int = JOIN_SOURCE_BYTES) -> None:
         self._total_max = total_bytes
@@ -39,14 +39,14 @@ class ReassemblyQuota:
         self.held_bytes = 0
 
     def register(self, holder: QuotaHolder, source: bytes) -> None:
-        """Let a holder be asked to give way; it is forgotten with its last reference."""
+        """Register a holder that may have to release memory; it is forgotten with its last reference."""
         self._holders[holder] = source
 
     def reserve(self, source: bytes, size: int, holder: QuotaHolder | None = None) -> bool:
-        """Take ``size`` bytes for a source; False, and nothing taken, when a bound stands against it.
+        """Reserve ``size`` bytes for a source; return False, and reserve nothing, if that would pass a bound.
 
         Args:
-            holder: of the source, for which it is; others that hold more than it give way.
+            holder: of the source, the one that needs the bytes; others that hold more than it release theirs.
         """
         while self._by_source.get(source, 0) + size > self._source_max:
             if holder is None or not self._relieve(holder, source, holder.unfinished_bytes + size):
@@ -65,7 +65,7 @@ class ReassemblyQuota:
         return sorted(larger, key=lambda source: -self._by_source[source])
 
     def _relieve(self, asker: QuotaHolder | None, source: bytes, above: int) -> bool:
-        """Have that holder of a source give way that could give back most, if it is more than ``above`` bytes."""
+        """Release memory of the source's largest holder, if that could release more than ``above`` bytes."""
         others = [each for each, of in self._holders.items() if of == source and each is not asker]
         victim = max(others, key=lambda each: each.unfinished_bytes, default=None)
         if victim is None or victim.unfinished_bytes <= above:
@@ -74,7 +74,7 @@ class ReassemblyQuota:
         return True
 
     def release(self, source: bytes, size: int) -> None:
-        """Give ``size`` bytes back.
+        """Release ``size`` bytes.
 
         Raises:
             LocalError: more than the source holds.

@@ -1,14 +1,14 @@
-"""Messages that had to be split anew, and so got new numbers: the links had become too narrow for their frames.
+"""Renumbering of messages that were fragmented again, because the path MTU fell below the size of their frames.
 
-Place: pure. Source: docs/explanation/design.md, section 4: what must be split anew gets a new number.
+Sans-I/O. Source: docs/explanation/design.md, section 4: a message that is fragmented again gets a new number.
 
-All that a publisher keeps moves together, in order; the number between the old ones and the new ones stays unused, so
-that every number is either an old or a new one::
+All messages that a publisher caches are renumbered together, in order. The number between the old ones and the new ones
+stays unused, so that every number is either an old or a new one::
 
     old   first ... end-1   end   ->   new   to ... to+span-1   to+span        end = first + span = to - 1
 
-A reader whose next message would have been ``first + n`` goes on at ``to + n``, with what it has of the old ones under
-their new numbers. So nothing comes twice, and nothing out of order.
+A reader whose next message would have been ``first + n`` goes on at ``to + n``, with its old messages under their new
+numbers. So no message comes twice or out of order.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from typing import NamedTuple
 
 __all__ = ["MOVES_MAX", "Renumbering"]
 
-MOVES_MAX = 16  # that a publisher repeats; a reader that missed more has been silent for long
+MOVES_MAX = 16  # renumberings that a publisher repeats; a reader that missed more has been silent for long
 
 
 class Renumbering(NamedTuple):
-    """Messages ``first`` to ``first + span - 1`` go on as ``to`` and what follows it."""
+    """Messages ``first`` to ``first + span - 1`` go on as ``to`` and the numbers after it."""
 
     first: int
     span: int
     to: int
 
     def is_before(self, number: int) -> bool:
-        """Return whether a number is of the time before the move."""
+        """Return whether a number dates from before the renumbering."""
         return number < self.to
 
     def of(self, number: int) -> int:
-        """Return the new number of a message: of one that is kept no more the first, of a new one its own."""
+        """Return the new number of a message: the first for one that is no longer cached, its own for a new one."""
         return number if number >= self.to else self.to + max(number - self.first, 0)

@@ -1,7 +1,6 @@
-"""Which message numbers are finished: a sliding window.
+"""Replay window: a sliding window of the message numbers that are finished.
 
-Place: pure.
-Source: the anti-replay window of RFC 4303, section 3.4.3, with messages for packets.
+Sans-I/O. Source: the anti-replay window of RFC 4303, section 3.4.3, with messages for packets.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ __all__ = ["ReplayWindow"]
 
 
 class ReplayWindow:
-    """Remembers the last ``size`` message numbers of one incarnation; what is older counts as finished."""
+    """The last ``size`` message numbers of one incarnation; older ones count as finished."""
 
     __slots__ = ("_bits", "_size", "_top")
 
@@ -29,12 +28,12 @@ class ReplayWindow:
         return self._top
 
     def is_finished(self, number: int) -> bool:
-        """Return whether a message was finished, or is too old to tell."""
+        """Return whether a message was finished, or is older than the window."""
         behind = self._top - number
         return behind >= 0 and (behind >= self._size or bool(self._bits >> behind & 1))
 
     def finish(self, number: int) -> None:
-        """Note a message as finished: opened, or given up for good."""
+        """Mark a message as finished: opened, or given up for good."""
         ahead = number - self._top
         if ahead > 0:
             self._bits = (self._bits << ahead | 1) & ((1 << self._size) - 1) if ahead < self._size else 1

@@ -1,9 +1,9 @@
-"""Retransmission of the parts that readers report as missing.
+"""Retransmission of the fragments that readers report as missing.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
-A reader can make work for its writer, but only so much. All readers together get at most a congestion window of repairs
-in a round trip, and each has an allowance of parts that are examined for its reports.
+A bound limits the work that a reader can cause at its writer. All readers together get at most a congestion window of
+repairs in a round trip. Each reader has an allowance of fragments that are examined for its reports.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from gdp.message.history_cache import CachedMessage
 
 __all__ = ["RepairAllowance", "RetransmissionQueue"]
 
-_SCAN_PARTS: Final = 8_192  # parts examined for reports of one reader at once; a window of small frames has fewer
+_SCAN_PARTS: Final = 8_192  # fragments examined for reports of one reader at once; a window of small frames has fewer
 _SCAN_PARTS_PER_S: Final = 131_072  # ... and in a second: more than a process sends, and 2 % of a core
 _ROUND_MIN_S: Final = PROBE_MIN_S / 3
 _NEVER: Final = float("-inf")
@@ -27,7 +27,7 @@ _NEVER: Final = float("-inf")
 
 @dataclass(slots=True)
 class RepairAllowance:
-    """Token bucket of the parts that may still be examined for one reader."""
+    """Token bucket of the fragments that may still be examined for one reader."""
 
     parts: float = _SCAN_PARTS
     refilled_s: float = 0.0
@@ -39,25 +39,25 @@ class RepairAllowance:
 
 
 class RetransmissionQueue:
-    """Parts to be sent again, in the order of the requests.
+    """Fragments to be sent again, in the order of the requests.
 
     Attributes:
-        retransmissions: parts sent again so far.
+        retransmissions: fragments sent again so far.
     """
 
     def __init__(self) -> None:
         self.retransmissions = 0
         self._queue: OrderedDict[tuple[int, int], None] = OrderedDict()
-        self._sent_s: dict[int, dict[int, float]] = {}  # message -> part -> when it was last sent again
+        self._sent_s: dict[int, dict[int, float]] = {}  # message -> fragment -> when it was last sent again
         self._round_s = _NEVER  # when the present round began
-        self._round_bytes = 0  # what it may still send again
+        self._round_bytes = 0  # bytes that it may still send again
 
     def __bool__(self) -> bool:
         return bool(self._queue)
 
     @property
     def has_repaired(self) -> bool:
-        """Return whether a part of a message that is still cached was sent again."""
+        """Return whether a fragment of a message that is still cached was sent again."""
         return bool(self._sent_s)
 
     def request(
@@ -71,9 +71,8 @@ class RetransmissionQueue:
         window_bytes: int,
         now_s: float,
     ) -> bool:
-        """Queue what is missing and was sent, but not sent again within a round trip; return whether any was.
-
-        What a reader requests beyond its allowance is not examined; it requests it again.
+        """Queue missing fragments that were sent, but not again within a round trip; return whether any was.
+        A request beyond a reader's allowance is not examined; the reader repeats it.
 
         Args:
             sent_at: position before which everything has been sent.
@@ -104,7 +103,7 @@ class RetransmissionQueue:
         return queued
 
     def frames_to_send(self, messages: Mapping[int, CachedMessage], limit: int, now_s: float) -> list[bytes]:
-        """Remove and return at most ``limit`` frames from the queue, those that are no longer cached left out."""
+        """Remove and return at most ``limit`` frames from the queue; those that are no longer cached are left out."""
         frames: list[bytes] = []
         while self._queue and len(frames) < limit:
             (number, part), _ = self._queue.popitem(last=False)

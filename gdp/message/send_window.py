@@ -10,8 +10,8 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Positions count bytes 
 The window joins four parts: ``history_cache.py`` (what can be sent again), ``flow_control.py`` (how much may be under
 way), ``retransmission.py`` (what is sent again) and ``acknowledgement.py`` (what readers have).
 
-A suspended reader is silent, and may have moved. It blocks neither the congestion window nor ``has_room``, but what it
-lacks stays cached as long as the budget has room. When it reports again it gets repairs, and becomes active once it has
+A suspended reader is silent, and may have moved. It blocks neither the congestion window nor ``has_room``. What it
+lacks stays cached as long as the budget allows. When it reports again it gets repairs, and becomes active once it has
 caught up.
 """
 
@@ -58,7 +58,7 @@ class SendWindow:
         self._flow = FlowControl()
         self._readers = ReaderPositions(lag_s)
         self._repairs = RetransmissionQueue()
-        self._best_effort_queue = deque[tuple[int, int]]()  # (number, first part not sent), oldest first
+        self._best_effort_queue = deque[tuple[int, int]]()  # (number, first fragment not sent), oldest first
         self._newest = first_number - 1
         self._sent_at = 0
         self.evicted = 0
@@ -80,7 +80,7 @@ class SendWindow:
 
     @property
     def retransmissions(self) -> int:
-        """Return how many parts were sent again."""
+        """Return how many fragments were sent again."""
         return self._repairs.retransmissions
 
     @property
@@ -113,7 +113,7 @@ class SendWindow:
 
     @property
     def sent(self) -> tuple[int, int]:
-        """Return the message number and the part before which everything has been sent."""
+        """Return the message number and the fragment before which everything has been sent."""
         return self._best_effort_queue[0] if self._best_effort_queue else (self._newest + 1, 0)
 
     @property
@@ -185,7 +185,7 @@ class SendWindow:
             self._release_acknowledged()
 
     def suspend(self, reader: bytes) -> None:
-        """Suspend a silent reader: it blocks nothing, but what it lacks stays cached while there is room."""
+        """Suspend a silent reader: it blocks nothing, but what it lacks stays cached while the budget allows."""
         self._readers.suspend(reader)
 
     def resume(self, reader: bytes, now_s: float) -> None:
@@ -277,14 +277,14 @@ class SendWindow:
         return frames
 
     def _budget_now(self) -> int:
-        """Return how many bytes may be cached: fewer where the oldest is cached for suspended readers alone."""
+        """Return how many bytes may be cached: fewer if the oldest message is cached for suspended readers alone."""
         oldest, readers = self._cache.oldest, self._readers
         is_spare = len(self._cache.messages) > self._cache.depth
         is_spare = is_spare and oldest is not None and oldest < readers.least_active()
         return self._budget_bytes if readers.suspended and is_spare else 2 * self._budget_bytes
 
     def _request_repairs(self, reader: bytes, report: AckNack, now_s: float) -> bool:
-        """Queue what a reader lacks; return whether any was queued."""
+        """Queue the fragments that a reader lacks; return whether any was queued."""
         position = self._readers.active.get(reader) or self._readers.suspended[reader]
         return self._repairs.request(
             report.missing,

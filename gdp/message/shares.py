@@ -1,8 +1,8 @@
-"""Shares: how a bounded room is divided among those who use it, so that nobody fills it.
+"""Shares: division of a bounded capacity among its owners, so that no owner exhausts it.
 
 Sans-I/O. Source: dynamic thresholds, A. Choudhury and E. Hahne, IEEE/ACM Transactions on Networking 6(2), 1998. An
-owner may hold at most as much as is free. One owner alone gets half of the room, n greedy ones 1/(n+1) each. As much
-as one of them holds stays free for the next one, and nothing is taken away from anybody.
+owner may hold at most as much as is free. One owner alone gets half of the capacity, n greedy ones 1/(n+1) each. As
+much as one of them holds stays free for the next one, and no owner loses what it holds.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ __all__ = ["Shares"]
 
 
 class Shares:
-    """What each owner holds of a room.
+    """Shares of a capacity, by owner.
 
     Args:
-        size: of the whole room.
+        size: the whole capacity.
     """
 
     __slots__ = ("_held", "_of", "_size")
@@ -32,9 +32,9 @@ class Shares:
         return self._of.get(owner, 0)
 
     def reserve(self, *owners: bytes, size: int = 1) -> bool:
-        """Take room for something in the name of all these owners (a member and its domain, say) and return True.
+        """Reserve capacity in the name of all these owners (a participant and its domain, say) and return True.
 
-        Returns False, and takes none, where one of them would hold more than is left free.
+        Returns False, and reserves none, if one of them would hold more than is left free.
         """
         free = self._size - self._held - size
         if free < 0 or any(self.held_by(owner) + size > free + size for owner in owners):
@@ -45,7 +45,7 @@ class Shares:
         return True
 
     def release(self, *owners: bytes, size: int = 1) -> None:
-        """Give back what was taken in the name of the same owners."""
+        """Release what was reserved in the name of the same owners."""
         self._held -= size
         for owner in owners:
             left = self._of[owner] - size

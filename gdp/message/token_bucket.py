@@ -1,6 +1,6 @@
-"""Token bucket: how much of something a peer may cause.
+"""Token bucket: a rate limit on what a peer may cause.
 
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: RFC 2697 in spirit, with one colour.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: RFC 2697, with one colour.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ class TokenBucket:
     """Tokens that refill at a rate, up to a burst; it starts full.
 
     Args:
-        per_s: tokens a second.
-        burst: most tokens that are held.
+        per_s: tokens per second.
+        burst: largest number of tokens.
     """
 
     __slots__ = ("_burst", "_per_s", "_seen_s", "_tokens")
@@ -38,12 +38,12 @@ class TokenBucket:
 
 
 class Paces:
-    """A token bucket for each owner; of too many, the one that was used longest ago is forgotten.
+    """Token buckets by owner; of too many, the one that was used longest ago is forgotten.
 
     Args:
-        per_s: tokens a second.
-        burst: most tokens that an owner holds.
-        owners: most buckets that are kept.
+        per_s: tokens per second.
+        burst: largest number of tokens of an owner.
+        owners: largest number of buckets.
     """
 
     def __init__(self, per_s: float, burst: float, owners: int = 4_096) -> None:

@@ -1,7 +1,7 @@
-"""Audit of a running node: its trail, its refusals by reason, and the folder in which they are kept.
+"""Audit of a running node: its trail, its rejections by reason, and the folder that keeps them.
 
-Place: shell. A node audits where its configuration names a folder (``audit``), or where systemd gives it one to keep
-state in (``StateDirectory=``, systemd.exec(5)).
+I/O. A node keeps an audit log if its configuration names a folder (``audit``), or if systemd gives it one for state
+(``StateDirectory=``, systemd.exec(5)).
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ _SAID: Final = frozenset(
         DropReason.UNKNOWN_SENDER,
         DropReason.QUOTA,
     }
-)  # refusals of what somebody said; losses on the way are no matter of trust
+)  # rejected statements; losses in transit do not concern trust
 
 
 def audit_folder(configured: Path | None) -> Path | None:
-    """Return where a node keeps its audit log, or None: it keeps none."""
+    """Return the folder of a node's audit log, or None if the node keeps none."""
     if configured is not None:
         return configured
     state = os.environ.get(_STATE, "").split(":")[0]
@@ -52,10 +52,10 @@ def audit_folder(configured: Path | None) -> Path | None:
 
 
 class NodeAudit:
-    """Writes what a trail has to say.
+    """Writer of a trail to the audit log.
 
     Args:
-        folder: where to.
+        folder: folder of the audit log.
         trail: of the node's policy.
         drops: what the node dropped, by reason; counts only rise.
 
@@ -72,7 +72,7 @@ class NodeAudit:
         trail.begin()
 
     def look(self, now: Timestamps) -> None:
-        """Write what has happened since the last look."""
+        """Write what has happened since the last call."""
         drops = self._drops()
         for reason, before in self._known.items():
             count = drops.get(reason, 0)
@@ -95,7 +95,7 @@ def keep_audit(
     runtime: Runtime,
     stack: ExitStack,
 ) -> None:
-    """Have a runtime write a node's audit log, where the node keeps one, until the stack is left.
+    """Let a runtime write a node's audit log, if the node keeps one, until the stack is left.
 
     Raises:
         LocalError: the folder cannot be made.

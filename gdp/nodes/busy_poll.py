@@ -1,9 +1,9 @@
-"""Whether to look again for a moment before going to sleep.
+"""Busy polling: the decision whether to poll for a moment before the thread sleeps.
 
-Place: pure; time comes in as seconds. A sleeping process is woken within 30 to 60 us, on a virtual machine often later:
-as long as a small message takes over three switches. Where frames follow each other closely it pays to keep looking
-for about as long; where they do not it would only cost power. So it is tried only while more than half of the last
-waits were short enough (compare the kernel's ``halt_poll_ns`` for idle virtual processors).
+Sans-I/O; time comes in as seconds. The kernel wakes a sleeping process within 30 to 60 us, and often later on a virtual
+machine. A small message crosses three switches in that time. If frames follow each other closely, polling for about
+that long pays; otherwise it only costs power. So a node polls only while more than half of the last waits were short
+enough (compare the kernel's ``halt_poll_ns`` for idle virtual processors).
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ _PAYS: Final = 0.5
 
 
 class BusyPoll:
-    """Remembers how waits went.
+    """Statistics of recent waits.
 
     Args:
-        longest_s: how long to keep looking; 0: never.
+        longest_s: longest time to poll; 0: never.
     """
 
     __slots__ = ("_short", "longest_s")
 
     def __init__(self, longest_s: float) -> None:
         self.longest_s = longest_s
-        self._short = 0.0  # share of the last waits that spinning would have caught
+        self._short = 0.0  # share of the last waits that polling would have caught
 
     @property
     def pays(self) -> bool:
@@ -37,5 +37,5 @@ class BusyPoll:
         return self._short > _PAYS
 
     def waited(self, seconds: float) -> None:
-        """Learn how long the wait for the last frames was."""
+        """Record how long the wait for the last frames was."""
         self._short += (float(seconds < self.longest_s) - self._short) * _WEIGHT

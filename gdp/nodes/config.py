@@ -1,6 +1,6 @@
-"""The configuration of a switch and of a RIB: every key, its bounds and its default.
+"""Configuration of a switch and of a RIB: every key, its bounds and its default.
 
-Place: shell; loading reads files and changes nothing. ``docs/reference/configuration.md`` explains the keys to people.
+I/O; loading reads files and changes nothing. ``docs/reference/configuration.md`` explains the keys to users.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ DataPlane = Literal["auto", "kernel", "raw", "scapy"]
 
 COST_DEFAULT: Final = 10
 _KEEPALIVE_MIN_MS: Final = 10
-_ATTACH_MAX: Final = 13  # leaves room for the "-s" of the switch's end
+_ATTACH_MAX: Final = 13  # leaves space for the "-s" of the switch's end
 
 
 def _attach_name(text: str) -> str:
@@ -79,9 +79,9 @@ DetectMultiplier = Annotated[int, Field(ge=2, le=50)]
 
 
 class PortConfig(Section):
-    """A layer-2 device towards neighbours; one that is ``optional`` may appear later.
+    """A layer-2 device towards neighbours; an ``optional`` one may appear later.
 
-    What is not given of keepalives is the switch's.
+    Keepalive settings that are absent here come from the switch.
     """
 
     iface: Ifname
@@ -92,9 +92,11 @@ class PortConfig(Section):
 
 
 class SwitchConfig(Section):
-    """``switch.yaml``. For each ``NAME`` of ``attach`` the command makes a veth pair ``NAME``/``NAME-s``; a RIB or
-    proxy on this host takes ``NAME`` as its device. Files in ``revocations`` are read at start and on SIGHUP. The
-    kernel plane holds ``table_max`` entries, and the process forwards by the others.
+    """``switch.yaml``.
+
+    For each ``NAME`` of ``attach`` the command makes a veth pair ``NAME``/``NAME-s``; a RIB or proxy on this host uses
+    ``NAME`` as its device. The node reads the files in ``revocations`` at start and on SIGHUP. The kernel plane holds
+    ``table_max`` entries, and the process forwards by the others.
     """
 
     identity: Directory
@@ -117,7 +119,7 @@ class SwitchConfig(Section):
     sandbox: bool = True
 
     def timing_of(self, port: PortConfig) -> Timing:
-        """Return what is wanted of keepalives on a port."""
+        """Return the keepalive settings of a port."""
         every_ms = self.keepalive_ms if port.keepalive_ms is None else port.keepalive_ms
         return Timing(every_ms, every_ms, port.detect_multiplier or self.detect_multiplier)
 
@@ -126,12 +128,12 @@ class SwitchConfig(Section):
         """Read ``switch.yaml``.
 
         Raises:
-            ConfigError: every error of the file, each with line and column.
+            ConfigError: all errors of the file, each with line and column.
         """
         return load(cls, path)
 
     def with_ifaces(self, ifaces: Iterable[str]) -> SwitchConfig:
-        """Return this configuration with a port of default cost for each device that has none yet."""
+        """Return this configuration with a port of default cost for each device that has no port."""
         known = {port.iface for port in self.ports}
         added = tuple(PortConfig(iface=iface) for iface in dict.fromkeys(ifaces) if iface not in known)
         return self.model_copy(update={"ports": self.ports + added})
@@ -164,7 +166,7 @@ class SwitchConfig(Section):
 
 
 class Quotas(Section):
-    """What one RIB does for others at most."""
+    """Upper bounds on what one RIB does for others."""
 
     names_per_sender: int = Field(default=RIB_NAMES_PER_SENDER, ge=1)
     watches: int = Field(default=RIB_WATCHES_MAX, ge=1)
@@ -182,10 +184,10 @@ class ClusterConfig(Section):
     key: ExistingFile | None = None
 
     def address(self) -> ClusterAddress:
-        """Return what the store connects to; the password's file is read now.
+        """Return the address of the cluster; reads the file of the password.
 
         Raises:
-            LocalError: that file is not private.
+            LocalError: the file of the password is not private.
         """
         file = self.password_file
         password = "" if file is None else read_private(file).decode("utf-8", "replace").strip()
@@ -197,7 +199,7 @@ class ClusterConfig(Section):
 
 
 class SharedStore(Section):
-    """A store outside the process, shared by the RIBs of a domain."""
+    """A store outside the process, which the RIBs of a domain share."""
 
     cluster: ClusterConfig
 
@@ -210,8 +212,10 @@ def _as_names(value: object) -> object:
 
 
 class RibConfig(Section):
-    """``rib.yaml``. ``upper`` names the RIB of the tier above, or several of which any may be used; ``null``: none.
-    ``peers`` names other RIBs of this domain: they hold the same routes.
+    """``rib.yaml``.
+
+    ``upper`` names the RIB of the tier above, or several of which any may be used; ``null``: none. ``peers`` names
+    other RIBs of this domain, which hold the same routes.
     """
 
     identity: Directory
@@ -242,6 +246,6 @@ class RibConfig(Section):
         """Read ``rib.yaml``.
 
         Raises:
-            ConfigError: every error of the file, each with line and column.
+            ConfigError: all errors of the file, each with line and column.
         """
         return load(cls, path)

@@ -1,7 +1,7 @@
 """Client of control sockets: finds the socket of a node and sends it a command.
 
-I/O. The socket of a node is named after the node's identity and lies beside the locks of running nodes
-(``single_instance``), so it is found from the directory of the node's keys alone.
+I/O. The socket of a node is named after the node's identity and lies in the lock directory (``single_instance``). The
+directory of the node's keys is therefore enough to find it.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def find_control_socket(directory: Path) -> Path:
     """Return the control socket of the node whose keys, or whose state, are in a directory.
 
     Raises:
-        LocalError: the directory is of no node.
+        LocalError: the directory belongs to no node.
     """
     own = directory / CONTROL_SOCKET
     if own.exists():
@@ -62,7 +62,7 @@ def find_control_socket(directory: Path) -> Path:
 
 
 def find_control_socket_of(name: Name) -> Path:
-    """Return the control socket of a node of this host, which this user or root runs."""
+    """Return the control socket of a node on this host that this user or root runs."""
     own = control_path(name)
     return next((each / own.name for each in lock_directories() if (each / own.name).exists()), own)
 
@@ -74,9 +74,9 @@ def request_control(path: Path, command: Command, timeout_s: float) -> Iterator[
         timeout_s: seconds to wait for each response.
 
     Raises:
-        NotRunningError: nobody serves the socket.
+        NotRunningError: no process serves the socket.
         LocalError: the user may not reach it, or no response comes in time.
-        ControlRequestError: the answer cannot be read.
+        ControlRequestError: the response cannot be read.
     """
     try:
         with connect_control(path, timeout_s) as connection:
@@ -97,7 +97,7 @@ def ask_node(path: Path, command: Command, timeout_s: float) -> Response:
     """Send a command and return the first response.
 
     Raises:
-        GdpError: as for ``request_control``, or the node ended before it answered.
+        GdpError: as for ``request_control``, or the node ended before it responded.
     """
     for response in request_control(path, command, timeout_s):
         return response

@@ -40,11 +40,11 @@ _QUOTED_CHARS: Final = 40
 
 
 class ControlRequestError(GdpError):
-    """A request or response cannot be read; a node answers with the text, and goes on."""
+    """A request or response cannot be parsed; a node responds with the text, and continues."""
 
 
 class Command(Enum):
-    """What a client asks of a node."""
+    """Command of a client to a node."""
 
     RELOAD = "reload"
     STATUS = "status"
@@ -53,10 +53,10 @@ class Command(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """Answer of a node.
+    """Response of a node.
 
     Args:
-        result: JSON fields; empty where ``error`` says why the node refused.
+        result: JSON fields; empty if ``error`` gives the reason of a refusal.
     """
 
     result: Mapping[str, object] = field(default_factory=dict)
@@ -64,12 +64,12 @@ class Response:
 
     @property
     def is_ok(self) -> bool:
-        """Return whether the node did what was asked."""
+        """Return whether the node executed the command."""
         return not self.error
 
 
 class LineBuffer:
-    """Splits received bytes into lines.
+    """Buffer that splits received bytes into lines.
 
     Args:
         max_bytes: largest line, its line feed included.
@@ -83,7 +83,7 @@ class LineBuffer:
         """Return the lines that are now complete, without their line feed.
 
         Raises:
-            ControlRequestError: a line is longer than allowed; the connection cannot go on.
+            ControlRequestError: a line is longer than allowed; the connection is unusable after that.
         """
         *lines, rest = (self._rest + data).split(b"\n")
         if max(map(len, (*lines, rest))) >= self._max_bytes:
@@ -101,7 +101,7 @@ def decode_request(line: bytes) -> Command:
     """Return the command of a request.
 
     Raises:
-        ControlRequestError: the line is no request; the text says why.
+        ControlRequestError: the line is not a request; the text gives the reason.
     """
     fields = _decode_object(line)
     if set(fields) != {"command"} or not isinstance(fields["command"], str):
@@ -132,7 +132,7 @@ def decode_response(line: bytes) -> Response:
     """Return the response that a line holds.
 
     Raises:
-        ControlRequestError: the line is no response.
+        ControlRequestError: the line is not a response.
     """
     match _decode_object(line):
         case {"ok": True, "result": dict(result)}:

@@ -1,8 +1,8 @@
 """Control socket of a running node: a Unix socket of mode 0600 that serves ``control_protocol``.
 
 I/O. All sockets of a server are in one epoll, whose descriptor becomes readable when one of them has work. A node
-watches that descriptor in its loop; the supervisor of ``fog`` polls it in a thread. The socket of a dead process is
-replaced; a socket that answers belongs to a live process and is left alone.
+watches that descriptor in its loop; the supervisor of ``fog`` polls it in a thread. The server replaces the socket of a
+dead process. A socket that accepts a connection belongs to a live process and stays.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ __all__ = ["CONTROL_SOCKET", "ControlHandlers", "ControlServer", "connect_contro
 
 log = logging.getLogger(__name__)
 
-CONTROL_SOCKET: Final = "control.sock"  # in the folder of a process that has no identity of its own
+CONTROL_SOCKET: Final = "control.sock"  # in the folder of a process without an identity
 _MODE: Final = 0o600
 _BACKLOG: Final = 8
 _CONNECTIONS_MAX: Final = 16
-_IDLE_S: Final = 10.0  # a connection without a request is closed for a newer one
+_IDLE_S: Final = 10.0  # a connection without a request closes in favour of a newer one
 _RECEIVE_BYTES: Final = 4_096
 _PROBE_S: Final = 0.5
 _TIMEVAL: Final = struct.Struct("@ll")
@@ -49,13 +49,13 @@ _TIMEVAL: Final = struct.Struct("@ll")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlHandlers:
-    """What a node does on request.
+    """Actions of a node on request.
 
     Attributes:
-        reload: read the configuration again; raises ``GdpError`` where the old one stays in use.
+        reload: read the configuration again; raises ``GdpError`` if the old one stays in use.
         status: return JSON fields about the node.
-        drain: begin to drain; the node ends when it has drained, and closes the server then.
-        is_drained: whether all work that the drain waited for was finished; asked once, at the end.
+        drain: begin to drain; the node ends when it has drained, and then closes the server.
+        is_drained: whether all work that the drain waited for was finished; called once, at the end.
     """
 
     reload: Callable[[], None]
@@ -73,7 +73,7 @@ class _Client:
 
 
 class ControlServer:
-    """Serves one control socket.
+    """Server of one control socket.
 
     Args:
         path: of the socket; its folder must exist.
@@ -98,7 +98,7 @@ class ControlServer:
         return self._epoll.fileno()
 
     def handle_events(self) -> None:
-        """Accept connections and answer requests; never blocks."""
+        """Accept connections and respond to requests; never blocks."""
         for fd, _ in self._epoll.poll(0.0):
             if fd == self._listener.fileno():
                 self._accept()
@@ -122,7 +122,7 @@ class ControlServer:
     def _accept(self) -> None:
         try:
             peer, _ = self._listener.accept()
-        except OSError:  # the client is gone already
+        except OSError:  # the client has already closed the connection
             return
         peer.setblocking(False)
         now_s = time.monotonic()
@@ -176,7 +176,7 @@ class ControlServer:
             return Response(error=str(error) or type(error).__name__)
 
     def _respond(self, client: _Client, response: Response) -> None:
-        if client.peer.fileno() < 0:  # it did not read an earlier response
+        if client.peer.fileno() < 0:  # the client did not read an earlier response
             return
         try:
             line = encode_response(response)
@@ -186,7 +186,7 @@ class ControlServer:
             sent = client.peer.send(line)
         except OSError:
             sent = 0
-        if sent < len(line):  # it does not read, or has gone
+        if sent < len(line):  # the client does not read, or has closed the connection
             self._end(client)
 
     def _end(self, client: _Client) -> None:
@@ -206,6 +206,7 @@ def serve_control_in_thread(path: Path, handlers: ControlHandlers) -> Iterator[C
     ended, waking = socket.socketpair()
 
     def serve() -> None:
+        """Handle events until the context ends."""
         poll = select.poll()
         poll.register(server, select.POLLIN)
         poll.register(ended, select.POLLIN)
@@ -228,11 +229,11 @@ def connect_control(path: Path, timeout_s: float) -> socket.socket:
     """Return a socket that is connected to a control socket.
 
     Raises:
-        OSError: no such socket, no process that listens, or no right to reach it.
+        OSError: the socket does not exist, no process listens, or this user may not connect.
     """
     made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
-        # A non-blocking connect would fail at once while the node has not accepted others yet; unix(7), SO_SNDTIMEO.
+        # A non-blocking connect would fail while the node has other connections to accept; unix(7), SO_SNDTIMEO.
         made.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(int(timeout_s), int(timeout_s % 1 * 1e6)))
         with _short_path(path) as short:
             made.connect(short)
@@ -252,7 +253,7 @@ def _bind(path: Path) -> socket.socket:
         _remove_stale(path)
         with _short_path(path) as short:
             made.bind(short)
-        path.chmod(_MODE)  # before listen: until then nobody can connect
+        path.chmod(_MODE)  # before listen: until then no process can connect
         made.listen(_BACKLOG)
         made.setblocking(False)
     except OSError as error:
@@ -268,7 +269,7 @@ def _remove_stale(path: Path) -> None:
     """Remove the socket of a dead process.
 
     Raises:
-        LocalError: a live process listens there, or the file is no socket.
+        LocalError: a live process listens there, or the file is not a socket.
     """
     try:
         mode = path.lstat().st_mode
@@ -278,7 +279,7 @@ def _remove_stale(path: Path) -> None:
         raise LocalError(f"{path} exists and is no socket; remove it, or name another control_socket")
     try:
         connect_control(path, _PROBE_S).close()
-    except TimeoutError:  # it is alive, but busy
+    except TimeoutError:  # the process is alive, but busy
         pass
     except OSError as error:
         if error.errno not in (errno.ECONNREFUSED, errno.ENOENT):

@@ -1,4 +1,4 @@
-"""What ``gdp status`` shows of a node: who it is, how long it runs, and its counters.
+"""Status of a node for ``gdp status``: identity, uptime and counters.
 
 Sans-I/O.
 """

@@ -1,6 +1,6 @@
 """Counts by reason in the form that metrics take.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations

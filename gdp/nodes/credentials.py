@@ -1,8 +1,8 @@
-"""Renewal of a running node's credentials: its membership and the roots that it trusts, when their files change.
+"""Credentials of a running node: reload of its membership and trusted roots when their files change.
 
-Place: shell; looks at files. Whoever issues replaces ``node.crt``, ``root.crt`` or a root of ``domain.trusts``; the
-node takes them up within ``gdp.nodes.node_log.LOOK_S``, or at once on SIGHUP, and goes on under the same name and
-session. What does not hold is logged, and the node stays with what it has.
+I/O; it polls files. The issuer replaces ``node.crt``, ``root.crt`` or a root of ``domain.trusts``. The node reloads
+them within ``gdp.nodes.node_log.LOOK_S``, or at once on SIGHUP, and keeps its name and session. The node logs
+credentials that are not valid, and keeps the present ones.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 _DAY_S: Final = 86_400
 _SOON_S: Final = 7 * _DAY_S
 _PUBLIC: Final = (".crt", ".pem", ".cer")
-_SHARE: Final = 5  # or the last fifth of a shorter validity
+_SHARE: Final = 5  # 1/5: warn in the last fifth of a shorter validity
 _NodeState = tuple[tuple[int, int, int] | None, ...]
 
 
@@ -38,7 +38,7 @@ class Credentials:
     Args:
         directory: the node's.
         domain: the roots' files.
-        identity, policy: what is renewed.
+        identity, policy: objects to renew.
     """
 
     def __init__(self, directory: Path, domain: Domain, identity: Identity, policy: Policy) -> None:
@@ -51,18 +51,21 @@ class Credentials:
         self._warned: bytes = b""
 
     def look(self, now: Timestamps) -> None:
-        """Take up what has changed since the last look, and warn of a membership that ends soon."""
+        """Reload what has changed since the last call, and warn of a membership that ends soon."""
         state = self._state()
         if state != self._seen:
             self._take_up(now.unix_s, state)
         self._warn(now.unix_s)
 
     def seconds_left(self, unix_s: float) -> float:
-        """Return how long the membership holds still; negative: it has run out."""
+        """Return for how many seconds the membership is still valid; negative: it has expired."""
         return self._identity.member.not_after_unix_s - unix_s
 
     def _take_up(self, unix_s: float, state: _NodeState) -> None:
-        """Take files that are replaced one by one: what does not hold yet is tried again, and told the second time."""
+        """Reload files, which are replaced one by one.
+
+        The call retries files that are not yet valid together, and logs the error the second time.
+        """
         try:
             roots = [load_root(path) for path in self._roots]
             own = load_root(self._root)
@@ -98,10 +101,10 @@ class Credentials:
 
 
 def watched_folders(directory: Path, domain: Domain) -> tuple[Path, ...]:
-    """Return what a node has to be able to read again: folders, since a replaced file is another one.
+    """Return the paths that a node must be able to read again: folders, because a replaced file is another one.
 
-    Beside the node's own these are folders with nothing but certificates. A root that lies elsewhere, as beside its
-    domain's key, is read at the start, and again only if it was written in place.
+    Apart from the node's own folder, these are folders that hold only certificates. A root that lies elsewhere, such as
+    next to its domain's key, is read at the start, and again only if it was written in place.
     """
     roots = (domain.root, *domain.trusts)
     return tuple(dict.fromkeys([directory, *(path.parent if _is_public(path.parent) else path for path in roots)]))
@@ -115,7 +118,7 @@ def _is_public(folder: Path) -> bool:
 
 
 def _stamp(path: Path) -> tuple[int, int, int] | None:
-    """Return what changes when a file is replaced."""
+    """Return a value that changes when a file is replaced."""
     try:
         status = os.stat(path)
     except OSError:

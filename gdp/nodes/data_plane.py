@@ -1,6 +1,6 @@
-"""Which data plane a switch takes, and why not a better one.
+"""Choice of the data plane of a switch, with the reason why it is not a better one.
 
-Place: shell. From the best on: ``kernel``, ``raw``; ``scapy`` only when asked for.
+I/O. In order of preference: ``kernel``, ``raw``; ``scapy`` only on request.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ _BEST: Final = "kernel"
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """A data plane that is open.
+    """An open data plane.
 
     Attributes:
         name: ``kernel``, ``raw`` or ``scapy``.
-        reason: one line: why it is not the best one; empty when it is, or when another was asked for.
+        reason: one line: why it is not the best one; empty if it is, or if another was requested.
         entry_counts: frames and bytes by the busiest entries, where the plane counts them.
     """
 
@@ -40,15 +40,15 @@ class Chosen:
 
 
 def choose_plane(wanted: str, ifnames: Sequence[str], table: Table, entries_max: int) -> Chosen:
-    """Open the data plane that was asked for; for ``auto``, the best one that this machine allows.
+    """Open the requested data plane; for ``auto``, the best one that this machine allows.
 
     Args:
         wanted: ``auto``, ``kernel``, ``raw`` or ``scapy``.
         entries_max: most entries that the kernel is to hold.
 
     Raises:
-        MissingExtraError: Scapy is asked for and not installed.
-        LocalError: a port cannot be opened, or what was asked for by name is refused, and why.
+        MissingExtraError: Scapy is requested and not installed.
+        LocalError: a port cannot be opened, or the system refuses the requested plane; the text gives the reason.
     """
     if wanted == "scapy":
         require_extra("scapy", ("scapy",), "data plane scapy")
@@ -66,5 +66,5 @@ def choose_plane(wanted: str, ifnames: Sequence[str], table: Table, entries_max:
         if wanted == _BEST:
             raise LocalError(f"data plane kernel: {refused}") from refused
         log.debug("kernel plane refused: %s", refused)
-        plane = RawPlane(ifnames, table)  # says itself where the ports are what is wrong
+        plane = RawPlane(ifnames, table)  # raises with the right text if the ports are the cause
         return Chosen(plane, "raw", str(refused).partition("\n")[0])

@@ -1,6 +1,6 @@
 """Delegations of a node, each verified, with the secrets in them.
 
-Layer: I/O; it reads files.
+I/O; it reads files.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ log = logging.getLogger(__name__)
 
 
 class DelegationStore:
-    """What a node may do with which name.
+    """Delegations by name.
 
     Args:
-        directory: of delegation files; one that is not valid is logged and left out.
+        directory: of delegation files; an invalid delegation is logged and left out.
 
     Raises:
         LocalError: a file is malformed, or readable for others.
@@ -48,7 +48,7 @@ class DelegationStore:
         return iter(self._topics.values())
 
     def get(self, name: Name) -> Topic | None:
-        """Return the delegation of a name, whatever its rights; None where there is none."""
+        """Return the delegation of a name with any rights; None if there is none."""
         return self._topics.get(name)
 
     def find(self, name: Name, right: Right) -> Topic | None:
@@ -67,7 +67,7 @@ def open_delegation(delegation: Delegation, identity: Identity) -> Topic:
     """Return a delegation verified, with its secrets.
 
     Raises:
-        GdpError: it does not hold now, or has no secret.
+        GdpError: it is not valid now, or has no secret.
     """
     delegation.verify(identity, time.time())
     secrets = {epoch: grant.secret for epoch, grant in delegation.open(identity).items()}

@@ -1,6 +1,6 @@
-"""From a configuration's files to who a node is and whom it believes.
+"""Identity and policy of a node, loaded from the files of its configuration, and the randomness of its start.
 
-Place: shell; reads files.
+I/O; reads files.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ def load_member(directory: Directory, domain: Domain, role: Role) -> tuple[Ident
     """Return a node's identity and its domain's policy.
 
     Args:
-        role: what the node has to be; a leaf is a switch.
+        role: required role of the node; a leaf counts as a switch.
 
     Raises:
-        LocalError: the files do not hold, or are of another role or domain.
+        LocalError: the files are not valid, or belong to another role or domain.
     """
     identity = load_identity(directory, time.time())
     policy = load_policy(domain)
@@ -50,10 +50,10 @@ def load_member(directory: Directory, domain: Domain, role: Role) -> tuple[Ident
 
 
 def load_policy(domain: Domain) -> Policy:
-    """Return whom the members of a domain believe.
+    """Return the policy that states which domains the members of a domain trust.
 
     Raises:
-        LocalError: a root certificate does not hold, or transit names a domain that is not trusted.
+        LocalError: a root certificate is not valid, or transit names a domain that is not trusted.
     """
     own = load_root(domain.root)
     trusted = [load_root(path) for path in domain.trusts]
@@ -67,31 +67,31 @@ def load_policy(domain: Domain) -> Policy:
 
 
 def fresh_bytes(size: int) -> bytes:
-    """Return up to 64 bytes that two machines resumed from one snapshot do not share; about 2 us.
+    """Return up to 64 bytes that differ between two machines resumed from one snapshot; about 2 us.
 
-    The kernel's generator answers each call, and Linux (5.18 and later) reseeds it when the hypervisor shows a new VM
-    generation ID, before a process runs on. Where there is none, nothing tells a process in time. So two clocks go
-    in, in nanoseconds: two copies are unlikely, but not certain, to differ by these alone.
+    The kernel's generator answers each call. Linux (5.18 and later) reseeds it when the hypervisor shows a new VM
+    generation ID, before a process continues. Without such an ID, a process does not learn of the resume in time.
+    Therefore two clocks go in, in nanoseconds: these alone make two copies likely, but not certain, to differ.
     """
     mixed = os.urandom(32) + _CLOCKS.pack(time.monotonic_ns(), time.time_ns())
     return hashlib.blake2b(mixed, digest_size=size).digest()
 
 
 def incarnation() -> int:
-    """Return 64 random bits: a new life of a node.
+    """Return 64 random bits that identify one run of a node.
 
     The machine's start, its identifiers and the process go in as well, for a machine whose generator is not seeded.
     """
     parts = [fresh_bytes(32), os.getpid().to_bytes(8, "big")]
     with suppress(OSError):
-        parts.append(Path("/proc/self/stat").read_bytes())  # with the ticks at which this process began
+        parts.append(Path("/proc/self/stat").read_bytes())  # includes the clock tick at which this process began
     for path in _MACHINE_IDS:
-        with suppress(OSError):  # not there, or not for this user: the other parts do
+        with suppress(OSError):  # missing or unreadable for this user: the other parts suffice
             parts.append(path.read_bytes())
     digest = hashlib.sha256(b"".join(len(part).to_bytes(4, "big") + part for part in parts)).digest()
     return int.from_bytes(digest[:8], "big")
 
 
 def wall_clock_ms() -> int:
-    """Return milliseconds since 1970: above every sequence number of an earlier life."""
+    """Return milliseconds since 1970: above every sequence number of an earlier incarnation."""
     return time.time_ns() // 1_000_000

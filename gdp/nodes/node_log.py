@@ -1,6 +1,6 @@
-"""What the log of a node says about its neighbours and about what it waits for, in words with device names.
+"""Log of a node about its neighbours and about what it waits for, with device names.
 
-Layer: I/O; it looks at the control plane twice a second and logs what changed.
+I/O; it polls the control plane twice a second and logs what changed.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ OnWait = Callable[[str, str], None]  # reason and text
 
 
 def no_name(name: Name) -> str:
-    """Return a name as logs show one that this node knows no better word for."""
+    """Return the short form of a name that has no local name."""
     return name.short
 
 
 class NodeLog:
-    """Logs neighbours that come and go, the RIB in use, errors that were contained, and what a node waits for.
+    """Log of neighbours that come and go, the RIB in use, contained errors, and what a node waits for.
 
     Args:
-        waits: what is waited for at a monotonic second.
-        rib: the RIB that a switch uses; None where a node uses none itself.
-        rival: the switch of a newer node with this identity, once it has been reported.
-        local_name: what the node's user calls an advertised name.
+        waits: returns what the node waits for at a monotonic second.
+        rib: the RIB that a switch uses; None for a node that uses none itself.
+        conflict: the switch that refused another node with this identity, once it is known.
+        local_name: the user's word for an advertised name.
         on_wait: called for each report as well, for JSON output.
     """
 
@@ -73,7 +73,7 @@ class NodeLog:
         self._wait_log = WaitLog()
 
     def look(self, now: Timestamps) -> None:
-        """Log what changed since the last look."""
+        """Log what changed since the last call."""
         for text in self._boundary.poll_tracebacks():
             log.error("a statement drew an error of this program and was dropped; the node goes on\n%s", text)
         self._look_at_neighbours()
@@ -96,7 +96,7 @@ class NodeLog:
                 self._on_wait(wait.reason.value, text)
 
     def waiting_for(self, now_s: float) -> list[str]:
-        """Return what the node waits for now, each as a sentence; empty when it waits for nothing."""
+        """Return what the node waits for now, each as a sentence; empty if it waits for nothing."""
         return [self._text(wait) for wait in self._waits(now_s)]
 
     def metrics(self) -> Mapping[str, int]:

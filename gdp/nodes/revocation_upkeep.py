@@ -1,6 +1,6 @@
-"""A node's revocations across its restarts: read at the start, written when there is news.
+"""Persistence of a node's revocations across restarts: loaded at the start, written when they change.
 
-Layer: I/O.
+I/O.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ WRITE_S: Final = 0.05  # between two slices
 
 
 def load_revocations(folder: Path | None, revoked: Revocations, stack: ExitStack) -> RevocationUpkeep:
-    """Return the care of a node's revocations, those of an earlier life taken back; ``stack`` ends it.
+    """Return the upkeep of a node's revocations, with the stored ones restored; ``stack`` closes it.
 
     Raises:
         LocalError: others may write to the folder.
@@ -38,7 +38,7 @@ def load_revocations(folder: Path | None, revoked: Revocations, stack: ExitStack
 
 
 class RevocationUpkeep:
-    """The care of one node's revocations.
+    """Upkeep of one node's revocations.
 
     Args:
         folder: the node's state folder; None: they are kept in memory only.
@@ -52,7 +52,7 @@ class RevocationUpkeep:
         self._revoked = revoked
 
     def load(self, at: Timestamps) -> None:
-        """Take back what was kept in an earlier life, each statement verified."""
+        """Restore the revocations of earlier runs, each statement verified."""
         if self._file is None:
             return
         refused = 0
@@ -65,7 +65,7 @@ class RevocationUpkeep:
         log.info("revocations read kept=%d refused=%d", len(self._revoked), refused)
 
     def start(self, runtime: Runtime | None = None) -> None:
-        """Begin to write; after rights were given away, which threads do not share.
+        """Begin to write; call it after the confinement of rights, which applies only to threads started later.
 
         Args:
             runtime: calls ``work`` from now on; None: the caller does.
@@ -76,7 +76,7 @@ class RevocationUpkeep:
                 runtime.every(WRITE_S, self.work)
 
     def work(self, at: Timestamps) -> None:
-        """Hand one slice of changes to the file, if it is not behind."""
+        """Pass one slice of changes to the file, if it is ready."""
         del at
         changes = self._revoked.changes
         if changes and self._file is not None and self._file.is_ready:
@@ -85,7 +85,7 @@ class RevocationUpkeep:
             self._file.write([(key, self._revoked.kept(key)) for key in keys])
 
     def close(self) -> None:
-        """Write what is left, and end."""
+        """Write the remaining changes, and end."""
         if self._file is None:
             return
         while self._revoked.changes and self._file.is_ready:

@@ -1,6 +1,6 @@
-"""``gdp-rib``: a RIB's machine on a real device, with its routes in memory or in a cluster.
+"""RIB node (``gdp-rib``): the core of a RIB on a real device, with its routes in memory or in a cluster.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ log = logging.getLogger(__name__)
 
 
 def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | None = None) -> None:
-    """Run a RIB until it is told to stop.
+    """Run a RIB until a signal or a drain ends it.
 
     Args:
-        ready: called once with the RIB's name, when its switch has been found.
+        ready: called once with the RIB's name, when it has found its switch.
         on_wait: called with reason and text when the RIB reports what it waits for.
 
     Raises:
-        LocalError: keys or the device are not as the configuration says, or this RIB already runs.
+        LocalError: keys or the device differ from the configuration, or this RIB already runs.
     """
     identity, policy = load_member(config.identity, config.domain, Role.RIB)
     quotas = config.quotas
@@ -66,8 +66,8 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
         folder = audit_folder(config.audit)
         if config.sandbox:
             if folder is not None:
-                AuditLog(folder)  # makes it
-            confine_rib(config)  # before the thread that keeps copies; the device can still be opened
+                AuditLog(folder)  # makes the folder
+            confine_rib(config)  # before the thread of the store starts; the device can still be opened
         revocations = load_revocations(config.state, policy.revoked, stack)
         upkeep = _upkeep(config, policy)
         stack.callback(upkeep.close)

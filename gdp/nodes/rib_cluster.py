@@ -1,6 +1,6 @@
-"""The care of a store that is a cluster: other RIBs' changes are heard and told to who watches.
+"""Upkeep of a store in a cluster: changes by other RIBs are received and passed to the RIB's watchers.
 
-Layer: I/O.
+I/O.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ __all__ = ["ClusterUpkeep"]
 log = logging.getLogger(__name__)
 
 KEEP_ALIVE_S: Final = 0.25
-LOAD_S: Final = 1.0  # between two tries to bring functions to a primary
+LOAD_S: Final = 1.0  # between two attempts to load functions into a primary
 
 
 class ClusterUpkeep:
@@ -35,7 +35,7 @@ class ClusterUpkeep:
         is_complete: each primary has the RIB's functions, as far as is known.
 
     Raises:
-        LocalError: the cluster cannot be reached, or does not take the RIB's functions.
+        LocalError: the cluster is not reachable, or refuses the RIB's functions.
     """
 
     def __init__(self, address: ClusterAddress, policy: Policy, *, allow_unowned: bool) -> None:
@@ -55,7 +55,7 @@ class ClusterUpkeep:
 
     @property
     def every_s(self) -> float:
-        """Return how often the connections are looked after."""
+        """Return the period of the connections' upkeep, in seconds."""
         return KEEP_ALIVE_S
 
     def begin(self, rib: RibCore, now: Timestamps) -> None:
@@ -68,7 +68,7 @@ class ClusterUpkeep:
         return (self._link,)
 
     def work(self, now: Timestamps) -> None:
-        """Tell of what other RIBs changed; look after the connections."""
+        """Report the changes of other RIBs, and maintain the connections."""
         self._link.keep_alive(now.mono_s)
         if not self.is_complete and now.mono_s >= self._load_at_s:
             self._complete(now.mono_s)
@@ -79,7 +79,7 @@ class ClusterUpkeep:
             self._failures = self._link.failures
 
     def _complete(self, now_s: float) -> None:
-        """Bring the functions to the primaries that did not answer at the start."""
+        """Load the functions into the primaries that did not respond at the start."""
         self._load_at_s = now_s + LOAD_S
         try:
             self.is_complete = load_functions(self._link)

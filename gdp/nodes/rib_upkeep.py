@@ -1,6 +1,6 @@
-"""What a RIB's store needs beside the machine's own calls: a snapshot kept up to date, or a cluster listened to.
+"""Upkeep of a RIB's store: a snapshot kept current, or a cluster listened to.
 
-Layer: I/O.
+I/O.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ __all__ = ["MemoryUpkeep", "Upkeep"]
 log = logging.getLogger(__name__)
 
 SNAPSHOT_S: Final = 0.1  # between two slices
-CHANGES_MAX: Final = 65_536  # that wait for a disk with space, or twice what is kept
+CHANGES_MAX: Final = 65_536  # that wait for disk space, or twice the number of kept routes
 
 
 class Upkeep(Protocol):
-    """The care of one store."""
+    """Upkeep of one store."""
 
     @property
     def store(self) -> Store:
@@ -34,19 +34,19 @@ class Upkeep(Protocol):
 
     @property
     def every_s(self) -> float:
-        """Return how often ``work`` is due."""
+        """Return the period of ``work``, in seconds."""
 
     def begin(self, rib: RibCore, now: Timestamps) -> None:
-        """Fill the store with what is known from before."""
+        """Fill the store with what an earlier run stored."""
 
     def sources(self) -> Sequence[HasFileno]:
-        """Return what makes ``work`` due when it can be read."""
+        """Return the sources that make ``work`` due when they are readable."""
 
     def work(self, now: Timestamps) -> None:
         """Do what is due."""
 
     def close(self) -> None:
-        """End."""
+        """End the upkeep."""
 
 
 class MemoryUpkeep:
@@ -64,7 +64,7 @@ class MemoryUpkeep:
 
     @property
     def every_s(self) -> float:
-        """Return how often a slice of changes is handed over."""
+        """Return the period in seconds at which a slice of changes is passed on."""
         return SNAPSHOT_S
 
     def begin(self, rib: RibCore, now: Timestamps) -> None:
@@ -80,17 +80,17 @@ class MemoryUpkeep:
         self._snapshot.start()
 
     def sources(self) -> Sequence[HasFileno]:
-        """Return nothing."""
+        """Return no sources."""
         return ()
 
     def work(self, now: Timestamps) -> None:
-        """Hand one slice of changes to the snapshot, if it is not behind."""
+        """Pass one slice of changes to the snapshot, if it is ready."""
         changes, snapshot, rib = self._memory.changes, self._snapshot, self._rib
         if changes is None or snapshot is None or rib is None or not changes:
             return
         if not snapshot.is_ready:
             if len(changes) > CHANGES_MAX and len(changes) > 2 * sum(1 for _ in self._memory.known()):
-                snapshot.begin_again()  # most of the changes are of names that are gone
+                snapshot.begin_again()  # most of the changes concern names that are gone
                 self._memory.changes = set(self._memory.known())
             return
         keys = list(islice(changes, SLICE))
@@ -98,6 +98,6 @@ class MemoryUpkeep:
         snapshot.write([(key, rib.entry_of(key, now.mono_s)) for key in keys], now.unix_s)
 
     def close(self) -> None:
-        """Write what waits in the snapshot's queue."""
+        """Write the changes that wait in the snapshot's queue."""
         if self._snapshot is not None:
             self._snapshot.close()

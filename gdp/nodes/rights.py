@@ -1,10 +1,10 @@
-"""What each kind of node needs once it is up, and giving away the rest.
+"""Rights of each kind of node after its start, and the confinement to them.
 
-Place: shell. A switch goes on to open ports that come back and to take its veth pairs down (CAP_NET_RAW,
-CAP_NET_ADMIN), and by the kernel data plane to load and attach its program there (CAP_BPF, CAP_PERFMON). A RIB or proxy
-opens its device again when it comes back. A node reads again what the operator put into folders: on SIGHUP, or when its
-certificates are replaced. Where another user owns these, as in a shell of sudo, the capability to read or write past
-the owner is kept, and Landlock bounds it.
+I/O. A switch continues to open ports that come back and to remove its veth pairs (CAP_NET_RAW, CAP_NET_ADMIN). With the
+kernel data plane it also loads and attaches its program there (CAP_BPF, CAP_PERFMON). A RIB or proxy opens its device
+again when it comes back. A node reads the operator's folders again on SIGHUP, or when its certificates are replaced. If
+another user owns these, as in a shell of sudo, the node keeps the capability to read or write past the owner, and
+Landlock bounds it.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _WRITABLE_BY_ALL: Final = stat.S_IWOTH
 
 
 def confine_switch(config: SwitchConfig, plane: str) -> None:
-    """Give away what a switch does not need.
+    """Drop the rights that a switch does not need.
 
     Args:
         plane: the name of its data plane.
@@ -59,7 +59,7 @@ def confine_switch(config: SwitchConfig, plane: str) -> None:
 
 
 def confine_rib(config: RibConfig) -> None:
-    """Give away what a RIB does not need."""
+    """Drop the rights that a RIB does not need."""
     is_shared = config.store != "memory"
     again = watched_folders(config.identity, config.domain)
     secrets = () if config.store == "memory" else _files_of(config.store.cluster)
@@ -78,10 +78,10 @@ def confine_rib(config: RibConfig) -> None:
 
 
 def confine_proxy(reads: Iterable[Path], writes: Iterable[Path], *, has_ros: bool) -> None:
-    """Give away what a proxy does not need.
+    """Drop the rights that a proxy does not need.
 
     Args:
-        reads: what it reads again on SIGHUP.
+        reads: paths that it reads again on SIGHUP.
         writes: folders of its recording and of its state.
         has_ros: whether it takes part in a graph. ROS middleware writes logs and shared memory, which it shares with
             nodes of other users: CAP_DAC_OVERRIDE is kept for that.
@@ -100,7 +100,7 @@ def _confine(needs: Needs) -> None:
 
 
 def _past_owners(reads: Iterable[Path] = (), writes: Iterable[Path] = ()) -> frozenset[Capability]:
-    """Return the capabilities without which root could not read or change what another user has."""
+    """Return the capabilities that root needs to read or change files of another user."""
     kept = set()
     if os.geteuid() == 0:
         if any(_is_foreign(path) for path in reads):
@@ -125,7 +125,7 @@ def _files_of(store: ClusterConfig) -> tuple[Path, ...]:
 
 
 def _is_foreign(path: Path) -> bool:
-    """Return whether a folder, or one that it lies in, is another user's."""
+    """Return whether another user owns a folder or one of its parents."""
     try:
         return any(each.stat().st_uid != os.geteuid() for each in (path.absolute(), *path.absolute().parents))
     except OSError:
@@ -133,15 +133,15 @@ def _is_foreign(path: Path) -> bool:
 
 
 def _code() -> tuple[Path, ...]:
-    """Return where Python finds what it has not loaded yet."""
+    """Return the folders from which Python loads further modules."""
     folders = {*sys.path, sys.prefix, sys.base_prefix, sys.exec_prefix, *site.getsitepackages()}
-    folders -= {"", "/", str(Path.cwd()), str(Path.home())}  # where people keep other things
+    folders -= {"", "/", str(Path.cwd()), str(Path.home())}  # users keep other files there
     own = Path(__file__).resolve().parents[1]
     return (*_SYSTEM, own, *map(Path, sorted(folders)))
 
 
 def _ros_folders() -> list[Path]:
-    """Return where ROS writes logs; the folder must be there, or no rule can name it."""
+    """Return the folders of ROS logs; they must exist, because a rule needs an open folder."""
     home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
     folders = [home, *(Path(given) for given in (os.environ.get("ROS_LOG_DIR"),) if given)]
     for folder in folders:

@@ -1,7 +1,7 @@
-"""One node at work: a machine, a data plane, two clocks and the signals that end it.
+"""Runtime of one node: a protocol core, a data plane, two clocks and the signals that end it.
 
-Place: shell. One thread, one loop: wait for frames or for the machine's next timer, let the machine think, send what it
-says.
+I/O. One thread runs one loop: it waits for frames or for the core's next timer, calls the core, and sends the frames of
+the core.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ __all__ = ["DRAIN_MAX_S", "Runtime", "now"]
 log = logging.getLogger(__name__)
 
 COST_DEFAULT = 10
-DRAIN_MAX_S = 2.0  # a switch or RIB that drains ends then, finished or not
+DRAIN_MAX_S = 2.0  # a draining switch or RIB ends after this time, finished or not
 _STREAK_MAX = 8
-_DRAIN_LOOK_S = 0.05  # between looks at what is left, where nothing else wakes the loop
+_DRAIN_LOOK_S = 0.05  # between checks of the remaining work, if nothing else wakes the loop
 
 
 def now() -> Timestamps:
-    """Return the present moment."""
+    """Return the present time of both clocks."""
     return Timestamps(time.monotonic(), time.time())
 
 
@@ -46,11 +46,11 @@ class _Look:
 
 
 class Runtime:
-    """Drives a machine over a plane.
+    """Loop that drives a protocol core over a plane.
 
     Args:
         costs: of ports by device name; others cost ``COST_DEFAULT``.
-        spin_s: for how long to look again before going to sleep, where frames follow each other closely; 0: never.
+        spin_s: seconds to poll before sleeping, if frames follow each other closely; 0: never.
     """
 
     def __init__(
@@ -61,8 +61,8 @@ class Runtime:
         self._costs = dict(costs or {})
         self._spin = BusyPoll(spin_s)
         self._is_stopped = False
-        self._is_woken = False  # by a watched source: whoever drives us has work
-        self._streak = 0  # steps in a row that brought frames, without a look at the timers
+        self._is_woken = False  # by a watched source: the driver has work
+        self._streak = 0  # consecutive steps with frames and without a check of the timers
         self._deadline_s: float | None = None
         self._looks: list[_Look] = []
         self._drain_until_s: float | None = None
@@ -75,7 +75,7 @@ class Runtime:
 
     @property
     def is_stopped(self) -> bool:
-        """Return whether the node was asked to end."""
+        """Return whether ``stop`` was called."""
         return self._is_stopped
 
     def stop(self) -> None:
@@ -83,7 +83,7 @@ class Runtime:
         self._is_stopped = True
 
     def run(self, until: Callable[[], bool] | None = None, deadline_s: float | None = None) -> bool:
-        """Work until stopped, until ``until`` is true (asked after each step), or until a monotonic second.
+        """Work until stopped, until ``until`` is true (checked after each step), or until a monotonic second.
 
         Returns whether ``until`` came true (without one: whether the node was stopped).
         """
@@ -97,9 +97,10 @@ class Runtime:
         return until is None
 
     def watch(self, source: HasFileno, ready: Callable[[], None] | None = None) -> None:
-        """End a step as soon as ``source`` can be read, after calling ``ready`` from within it."""
+        """End a step as soon as ``source`` is readable, after calling ``ready`` from within it."""
 
         def wake() -> None:
+            """Call ``ready``, and end the step."""
             self._is_woken = True
             if ready is not None:
                 ready()
@@ -108,12 +109,12 @@ class Runtime:
 
     @contextlib.contextmanager
     def control(self, path: Path, handlers: ControlHandlers) -> Iterator[None]:
-        """Serve a control socket from within the loop while within.
+        """Serve a control socket from within the loop until the context ends.
 
         Raises:
             LocalError: the socket cannot be made.
         """
-        if not path.parent.is_dir():  # no locks can be held here either, and that was logged
+        if not path.parent.is_dir():  # locks are not possible here either, which was logged
             log.warning("no control socket: no such directory path=%s", path.parent)
             yield
             return
@@ -144,10 +145,10 @@ class Runtime:
         self._plane.unwatch(source)
 
     def step(self, latest_s: float | None = None) -> None:
-        """Wait for something to do, no longer than a monotonic second, and do it.
+        """Wait for an event, no longer than until a monotonic second, and handle it.
 
-        While the machine has more to say, nothing is waited for, but what came meanwhile is heard: a large message on
-        its way out holds up nobody.
+        While the core has more to send, the step does not wait, but it handles frames that arrived: a large outgoing
+        message does not delay received frames.
         """
         self._is_woken = False
         is_sending, arrivals = self.send(), list[ReceivedFrame]()
@@ -178,12 +179,12 @@ class Runtime:
             self.stop()
 
     def next_due_s(self) -> float | None:
-        """Return the monotonic second at which a step has something to do without frames, or None."""
+        """Return the monotonic second at which a step has work without frames, or None."""
         times = [self._machine.get_timer(), *(look.due_s for look in self._looks)]
         return min((time for time in times if time is not None), default=None)
 
     def _wait(self, timeout_s: float | None) -> list[ReceivedFrame]:
-        """Wait for frames; where they follow each other closely, look again for a moment before going to sleep."""
+        """Wait for frames; if they follow each other closely, poll for a moment before sleeping."""
         begun_s = time.monotonic()
         if self._spin.pays:
             spin_s = self._spin.longest_s if timeout_s is None else min(self._spin.longest_s, timeout_s)
@@ -192,7 +193,7 @@ class Runtime:
                 if arrivals or self._is_woken:
                     self._spin.waited(waited_s)
                     return arrivals
-                os.sched_yield()  # whoever else wants this core goes first
+                os.sched_yield()  # lets other threads use this CPU first
             if timeout_s is not None:
                 timeout_s = max(timeout_s - waited_s, 0.0)
         arrivals = self._plane.poll(timeout_s)
@@ -201,7 +202,7 @@ class Runtime:
         return arrivals
 
     def send(self) -> bool:
-        """Send what the machine has to say next; return whether there may be more."""
+        """Send the core's next frames; return whether there may be more."""
         for index, macs in self._machine.poll_neighbours().items():
             self._plane.set_neighbours(index, macs)
         transmits = self._machine.frames_to_send()
@@ -211,7 +212,7 @@ class Runtime:
 
     @contextlib.contextmanager
     def signals(self, reload: Callable[[], None] | None = None) -> Iterator[None]:
-        """End ``run`` on SIGINT and SIGTERM while within; a blocked ``poll`` wakes up for them.
+        """End ``run`` on SIGINT and SIGTERM until the context ends; a blocked ``poll`` wakes up for them.
 
         Args:
             reload: called within the loop after a SIGHUP.
@@ -221,15 +222,17 @@ class Runtime:
         writing.setblocking(False)
 
         def stop(number: int, frame: FrameType | None) -> None:
+            """End ``run`` on a signal."""
             del frame
             log.info("stopping signal=%d", number)
             self.stop()
 
         def hang_up(number: int, frame: FrameType | None) -> None:
-            """Do nothing here: the number on the socket is what counts."""
+            """Do nothing here: ``drain`` handles the number on the socket."""
             del number, frame
 
         def drain() -> None:
+            """Read the numbers of signals, and reload on SIGHUP."""
             with contextlib.suppress(BlockingIOError):
                 while numbers := reading.recv(64):
                     if signal.SIGHUP in numbers and reload is not None:
@@ -262,7 +265,7 @@ class Runtime:
         port = self._plane.ports.get(index)
         log.info("link port=%s up=%s mtu=%d", "?" if port is None else port.ifname, up, 0 if port is None else port.mtu)
         if up and port is not None:
-            self._add(index, moment)  # it may have come back with another address, or only its MTU has changed
+            self._add(index, moment)  # the port may have another address, or only its MTU changed
         else:
             self._machine.port_changed(index, up, moment)
         self._deadline_s = moment.mono_s

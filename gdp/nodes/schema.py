@@ -1,7 +1,6 @@
-"""What every configuration file shares: strict fields, paths relative to the file, errors that point into it.
+"""Common schema of configuration files: strict fields, paths relative to the file, errors with their position in it.
 
-Place: shell; loading reads files and changes nothing. ``gdp/nodes/config.py`` and ``proxy/config/config.py`` state
-the keys.
+I/O; loading reads files and changes nothing. ``gdp/nodes/config.py`` and ``proxy/config/config.py`` state the keys.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ __all__ = [
     "relative",
 ]
 
-_SHOULD_BE: Final = "Input should be "  # how pydantic begins when a value is of the wrong kind or out of bounds
+_SHOULD_BE: Final = "Input should be "  # prefix of pydantic for a value of the wrong kind or out of bounds
 _PATH_SHOWN: Final = 200  # characters
 _IFNAME_MAX: Final = 15  # IFNAMSIZ - 1; Linux, include/uapi/linux/if.h
 _WORDS: Final = {
@@ -51,7 +50,7 @@ T = TypeVar("T")
 
 
 class Section(BaseModel):
-    """One mapping of a configuration file: immutable, and without a key that is not stated here.
+    """One mapping of a configuration file: immutable, and without undeclared keys.
 
     Attributes:
         renamed: old keys of this mapping with their new names; an old key is an error that names the new one. A new
@@ -64,7 +63,7 @@ class Section(BaseModel):
 
 
 def relative(path: Path, info: ValidationInfo) -> Path:
-    """Return ``path`` as seen from the file that names it; ``load`` puts that folder into the context."""
+    """Return ``path`` relative to the file that names it; ``load`` puts that folder into the context."""
     base = info.context["base"] if isinstance(info.context, dict) else Path()
     try:
         return Path(base) / path.expanduser()
@@ -73,7 +72,7 @@ def relative(path: Path, info: ValidationInfo) -> Path:
 
 
 def _is_there(look: Callable[[], bool]) -> bool:
-    """Return what a look at a path says; a path that the system does not take, such as one too long, is not there."""
+    """Return the result of a check on a path; a path that the system refuses, such as a too long one, is missing."""
     try:
         return look()
     except OSError:
@@ -156,10 +155,10 @@ def load(
 
     Args:
         more: further context of the model's validators.
-        locate: which file, and which key of it, a key of the model comes from; None: the same key of this file.
+        locate: the file, and its key, that a key of the model comes from; None: the same key of this file.
 
     Raises:
-        ConfigError: the file cannot be read, or holds anything but what the model states (then every error is listed).
+        ConfigError: the file cannot be read, or holds anything outside the model; then the error lists every finding.
     """
     source = read_yaml(path)
     context = {"base": path.parent, **(more or {})}
@@ -183,7 +182,7 @@ def _line_and_column(where: str) -> tuple[int, int]:
 
 
 def _translated(model: type[Section], source: YamlSource, details: list[ErrorDetails]) -> Iterator[ConfigError]:
-    """Yield pydantic's findings in our words; what it says about each member of a union becomes one error."""
+    """Yield pydantic's findings in our words; findings about each member of a union become one error."""
     wrong_kind: dict[KeyPath, tuple[list[str], object]] = {}
     for detail in details:
         key = tuple(detail["loc"])
@@ -203,7 +202,7 @@ def _translated(model: type[Section], source: YamlSource, details: list[ErrorDet
 
 
 def _unknown_key(section: type[Section], key: str | int) -> str:
-    """Return the error for a key that the section does not have."""
+    """Return the error for a key that is not in the section."""
     new_name = section.renamed.get(str(key))
     if new_name is not None:
         return f"this key is now called {new_name}"
@@ -211,14 +210,14 @@ def _unknown_key(section: type[Section], key: str | int) -> str:
 
 
 def _shown(source: YamlSource, key: KeyPath) -> KeyPath:
-    """Drop what pydantic appends to a path for its own purposes, such as the member of a union."""
+    """Remove what pydantic appends to a path for its own purposes, such as the member of a union."""
     while key and key not in source.values:
         key = key[:-1]
     return key
 
 
 def _section_at(model: type[Section], key: KeyPath) -> type[Section]:
-    """Return the model of the mapping at this path, which validation has already walked."""
+    """Return the model of the mapping at this path, which validation has already visited."""
     for part in key:
         for name, field in model.model_fields.items():
             if part == (field.alias or name):

@@ -1,11 +1,11 @@
 """Locks of a running node: one process for each identity on a host, one for each device of a network namespace.
 
-Layer: I/O. Source: fcntl_locking(2). A lock is a POSIX record lock on a file of the lock directory. The kernel releases
-it when its process ends, whatever ends that, and ``F_GETLK`` says which process holds it. The directory is host-wide,
-so the same identity is found in another network namespace or another folder, too::
+I/O. Source: fcntl_locking(2). A lock is a POSIX record lock on a file of the lock directory. The kernel releases it
+when its process ends in any way, and ``F_GETLK`` reports the process that holds it. The directory is host-wide, so it
+also shows the same identity in another network namespace or another folder::
 
     root                    /run/gdp-locks
-    any other user          $XDG_RUNTIME_DIR/gdp-locks, or /tmp/gdp-locks-UID; it also looks at the locks of root
+    any other user          $XDG_RUNTIME_DIR/gdp-locks, or /tmp/gdp-locks-UID; it also checks the locks of root
 
     <64 hex digits>.lock                     an identity
     device-<inode of the namespace>-<name>.lock
@@ -42,7 +42,7 @@ _COMMAND_MAX: Final = 200
 
 @contextlib.contextmanager
 def run_alone(role: str, name: Name) -> Iterator[None]:
-    """Hold the identity ``name`` while within.
+    """Hold the identity ``name`` until the context ends.
 
     Args:
         role: word for the node in the error, such as ``switch``.
@@ -56,7 +56,7 @@ def run_alone(role: str, name: Name) -> Iterator[None]:
 
 @contextlib.contextmanager
 def own_devices(ifnames: Iterable[str]) -> Iterator[None]:
-    """Hold devices of this network namespace while within, whether they exist yet or not.
+    """Hold devices of this network namespace until the context ends, whether they already exist or not.
 
     Raises:
         LocalError: another node uses one of them; the text names it.
@@ -95,12 +95,12 @@ def _locked(path: Path, refusal: str) -> int:
         except OSError as error:
             holder = _holder(descriptor)
             os.close(descriptor)
-            if holder is None:  # released in between
+            if holder is None:  # the holder released it in the meantime
                 continue
             raise LocalError(refusal.format(holder=holder)) from error
         if _is_linked(descriptor, path):
             return descriptor
-        os.close(descriptor)  # its last holder deleted it at its end
+        os.close(descriptor)  # its last holder deleted the file when it ended
 
 
 def _is_linked(descriptor: int, path: Path) -> bool:
@@ -114,7 +114,7 @@ def _refuse_if_held(path: Path, refusal: str) -> None:
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
     except OSError:
-        return  # no such lock, or not ours to know
+        return  # no such lock, or no right to read it
     try:
         holder = _holder(descriptor)
     finally:
@@ -124,7 +124,7 @@ def _refuse_if_held(path: Path, refusal: str) -> None:
 
 
 def _holder(descriptor: int) -> str | None:
-    """Return who holds the lock, in words; None when nobody does."""
+    """Return the holder of the lock, in words; None if the lock is free."""
     asked = _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)
     kind, _, _, _, pid = _FLOCK.unpack(fcntl.fcntl(descriptor, fcntl.F_GETLK, asked))
     if kind == fcntl.F_UNLCK:
@@ -136,7 +136,7 @@ def _holder(descriptor: int) -> str | None:
 
 
 def _command(pid: int) -> str:
-    """Return a process's command line as a person typed it; empty when it may not be read."""
+    """Return a process's command line as typed; empty if this user may not read it."""
     try:
         words = Path(f"/proc/{pid}/cmdline").read_text(encoding="utf-8", errors="replace").split("\0")[:-1]
     except OSError:
@@ -148,17 +148,17 @@ def _command(pid: int) -> str:
 
 
 def lock_directory() -> Path:
-    """Return where this user's locks lie, whether it is there or not."""
+    """Return the directory of this user's locks, whether it exists or not."""
     return _place()
 
 
 def lock_directories() -> tuple[Path, ...]:
-    """Return where locks that concern this user lie: its own directory, then that of root."""
+    """Return the directories of locks that concern this user: its own, then that of root."""
     return tuple(dict.fromkeys((_place(), _ROOT_DIRECTORY)))
 
 
 def _directory() -> Path | None:
-    """Return the lock directory, made if need be; None, with a warning, where there can be none."""
+    """Return the lock directory, made if necessary; None, with a warning, if it cannot exist."""
     path = _place()
     try:
         path.mkdir(mode=0o755, exist_ok=True)

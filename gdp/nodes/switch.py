@@ -1,6 +1,6 @@
-"""``gdp-switch``: a switch's machine on real devices.
+"""Switch node (``gdp-switch``): the core of a switch on real devices.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ _MTU_FALLBACK = 1_500
 def run_switch(
     config: SwitchConfig, ready: Callable[[Identity, str, str], None], on_wait: OnWait | None = None
 ) -> None:
-    """Run a switch until it is told to stop.
+    """Run a switch until a signal or a drain ends it.
 
     Args:
-        ready: called once when it has begun, with who it is, its data plane, and why that is not a better one.
+        ready: called once after the start, with the identity, its data plane, and why that is not a better one.
         on_wait: called with reason and text when the switch reports what it waits for.
 
     Raises:
-        LocalError: keys, devices or ports are not as the configuration says, or this switch already runs. Nothing has
+        LocalError: keys, devices or ports differ from the configuration, or this switch already runs. Nothing has
             been touched then.
     """
     identity, policy = load_member(config.identity, config.domain, Role.SWITCH)
@@ -129,7 +129,7 @@ def run_switch(
 
 
 def _serve_metrics(sources: Sources, port: int) -> Callable[[], None]:
-    """Serve metrics on a loopback port; return what ends that."""
+    """Serve metrics on a loopback port; return the function that ends it."""
     from gdp.telemetry.metrics import Metrics
 
     metrics = Metrics(sources)
@@ -148,6 +148,7 @@ def _control_handlers(
     begun_s = now().mono_s
 
     def status() -> dict[str, object]:
+        """Return the JSON fields of this switch."""
         neighbours = len(list(switch.hello_protocol.all_up()))
         more = {"data_plane": chosen.name, "ports": len(chosen.plane.ports), "neighbours": neighbours}
         return node_status(identity, sources, uptime_s=now().mono_s - begun_s, **more)
@@ -161,12 +162,12 @@ def _control_handlers(
 
 
 def _absent(plane: Plane, ports: Collection[int]) -> set[int]:
-    """Return those of these ports whose device is not there; nobody waits for an optional one."""
+    """Return the ports of this set whose device is missing; a node does not wait for an optional one."""
     return {index for index in ports if plane.ports[index].mac == bytes(MAC_BYTES)}
 
 
 def _revoke(switch: SwitchCore, directory: Path | None) -> None:
-    """Take in, and spread, the revocations that the operator has put into a directory; known ones are no news."""
+    """Accept and flood the revocations in the operator's directory; known ones have no effect."""
     for path in sorted(directory.iterdir()) if directory is not None else ():
         try:
             switch.revoke(path.read_bytes(), now())
@@ -175,13 +176,13 @@ def _revoke(switch: SwitchCore, directory: Path | None) -> None:
 
 
 def _end_if_displaced(switch: SwitchCore) -> None:
-    """Raise a ``LocalError`` where an older switch with this identity is alive."""
+    """Raise a ``LocalError`` if an older switch with this identity is alive."""
     if switch.is_displaced:
         raise LocalError("an older switch with this identity is alive; this one ends: give it keys of its own")
 
 
 def _widest(ifaces: Sequence[str]) -> int:
-    """Return the largest MTU of these devices; what is not there, opening the port will tell."""
+    """Return the largest MTU of these devices; opening the port reports a missing one."""
     with contextlib.closing(LinkMonitor()) as links:
         mtus = [link.mtu for link in links.all() if link.ifname in ifaces]
     return max(mtus, default=_MTU_FALLBACK)
@@ -191,6 +192,7 @@ def _sources(switch: SwitchCore, chosen: Chosen, node_log: NodeLog) -> Sources:
     plane = chosen.plane
 
     def frames() -> dict[str, int]:
+        """Return the frame counts by direction."""
         now = plane.counters
         return {"in": now.frames_in, "out": now.frames_out, "forwarded": now.forwarded, "punted": now.punted}
 

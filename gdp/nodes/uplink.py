@@ -1,6 +1,6 @@
-"""The one device of a RIB or proxy: locked against a second node, and opened with advice where that fails.
+"""Uplink device of a RIB or proxy: locked against a second node, and opened with advice in the error.
 
-Layer: I/O.
+I/O.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def open_uplink(ifname: str) -> Iterator[RawPlane]:
     """Open a node's device; close it on leaving.
 
     Raises:
-        LocalError: there is no such device, another node uses it, or raw sockets are not allowed.
+        LocalError: the device does not exist, another node uses it, or the process may not open raw sockets.
     """
     refuse_loopback([ifname])
     with own_devices([ifname]):
@@ -42,7 +42,7 @@ def refuse_loopback(ifnames: Iterable[str]) -> None:
     """Refuse the loopback device as a port.
 
     Raises:
-        LocalError: it is among them.
+        LocalError: it is among the devices.
     """
     if "lo" in ifnames:
         raise LocalError("lo is the loopback device, which leads to no neighbour; name a network device such as eth0")

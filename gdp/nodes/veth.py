@@ -1,10 +1,10 @@
-"""Veth pairs for nodes attached on the same host: made by the switch's command, gone when it ends.
+"""Veth pairs for nodes attached on the same host: the switch's command makes them and removes them when it ends.
 
-Place: shell; netlink through pyroute2, imported only here because it is large.
+I/O; netlink through pyroute2, imported only here because it is large.
 
-Each pair carries its switch's name as an alias. What a killed run of the same switch left behind is known by it and is
-replaced; a device of that name without the alias is somebody else's and is refused. The switch's ends are locked while
-the pairs stand (``single_instance.py``), so the pair of a switch that still runs is never touched.
+Each pair carries its switch's name as an alias. The alias identifies the pairs of a killed run of the same switch,
+which are replaced. A device of that name without the alias belongs to another program and is refused. The switch's ends
+are locked while the pairs exist (``single_instance.py``), so the pair of a running switch is never touched.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ def switch_end(name: str) -> str:
 
 @contextlib.contextmanager
 def attach_pairs(names: Sequence[str], switch: Name, mtu: int) -> Iterator[None]:
-    """Make the pairs ``NAME``/``NAME-s`` while within, and hold the locks of the switch's ends.
+    """Make the pairs ``NAME``/``NAME-s`` until the context ends, and hold the locks of the switch's ends.
 
     Args:
         mtu: bytes after the Ethernet header.
 
     Raises:
-        LocalError: a device of that name belongs to somebody else or to a switch that runs, or devices cannot be made
-            here.
+        LocalError: a device of that name belongs to another program or to a running switch, or the system refuses to
+            make devices.
     """
     if not names:
         yield
@@ -72,7 +72,7 @@ def attach_pairs(names: Sequence[str], switch: Name, mtu: int) -> Iterator[None]
 
 
 def _reason(error: NetlinkError, mtu: int) -> str:
-    """Return what the kernel refused and what to do about it."""
+    """Return what the kernel refused and how to proceed."""
     if error.code in (errno.EPERM, errno.EACCES):
         return f"not permitted; {AS_ROOT}"
     if error.code == errno.EINVAL:
@@ -96,7 +96,7 @@ def _make(links: IPRoute, name: str, alias: str, mtu: int) -> None:
         (index,) = links.link_lookup(ifname=ifname)
         quiet = Path(f"/proc/sys/net/ipv6/conf/{ifname}/disable_ipv6")
         if quiet.exists():
-            with contextlib.suppress(OSError):  # read-only in some containers: only a few stray frames
+            with contextlib.suppress(OSError):  # read-only in some containers; the cost is only a few stray frames
                 quiet.write_text("1")
         links.link("set", index=index, ifalias=alias)
         links.link("set", index=index, state="up")

@@ -1,6 +1,6 @@
-"""Waiting for a device that another node of this host is just making.
+"""Waiting for a device that another node of this host is about to create.
 
-Place: I/O.
+I/O.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ log = logging.getLogger(__name__)
 
 
 def wait_for_device(ifname: str, patience_s: float) -> None:
-    """Return when there is a device of this name, or after ``patience_s``: opening it tells that it is not there."""
+    """Return when a device of this name exists, or after ``patience_s``; opening it then reports its absence."""
     end_s = time.monotonic() + patience_s
     with contextlib.closing(LinkMonitor()) as links:
         found = links.all()

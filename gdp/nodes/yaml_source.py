@@ -1,8 +1,8 @@
-"""A YAML file as plain data that remembers where each value stood.
+"""YAML source: a file as plain data with the position of each value.
 
-Place: shell; reads the one file it is given and changes nothing.
-Source: YAML 1.2, core schema (section 10.3) for what an unquoted word means: ``yes``, ``0x10:20`` or a date stay text,
-as in every other modern reader. Anchors and tags are refused: a configuration says what it means where it stands.
+I/O; reads the one file that it is given and changes nothing.
+Source: YAML 1.2, core schema (section 10.3) for the meaning of an unquoted word: ``yes``, ``0x10:20`` or a date stay
+text, as in every other modern reader. Anchors and tags are refused: a configuration states each value in its place.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Plain: TypeAlias = "bool | int | float | str | list[Plain] | dict[str, Plain] | 
 KeyPath: TypeAlias = "tuple[str | int, ...]"
 Mark: TypeAlias = "tuple[int, int]"  # line and column, both from 1
 
-# libyaml, where PyYAML was built with it: 8 KiB of brackets take the reader in Python 0.3 s, and more than linear time
+# libyaml, if PyYAML has it: for 8 KiB of brackets the reader in Python takes 0.3 s, and more than linear time
 LOADER: Final[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _FILE_MAX_BYTES: Final = 1 << 20
 _DEPTH_MAX: Final = 32
@@ -36,7 +36,7 @@ _FLOAT: Final = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0
 
 
 class ConfigFileError(ConfigError):
-    """Everything that is wrong with one file, in the order of the file; reads as one line per error.
+    """All errors of one file, in the order of the file; as text one line per error.
 
     Args:
         errors: at least one.
@@ -53,7 +53,7 @@ class ConfigFileError(ConfigError):
 
 @dataclass(frozen=True, slots=True)
 class YamlSource:
-    """The data of a file, and the places of its keys and values."""
+    """The data of a file, and the positions of its keys and values."""
 
     path: Path
     data: Plain
@@ -61,7 +61,7 @@ class YamlSource:
     values: Mapping[KeyPath, Mark]
 
     def error(self, key: KeyPath, expected: str, *, at_key: bool = False) -> ConfigError:
-        """Return the error about ``key``, placed at it or, where it is missing, at what should have held it."""
+        """Return the error about ``key``, at its position or, if it is missing, at that of its parent."""
         known = key
         while known not in self.values:
             known = known[:-1]
@@ -70,7 +70,7 @@ class YamlSource:
 
 
 def dotted(key: KeyPath) -> str:
-    """Return a path of keys as people write it, such as ``expose[0].type``."""
+    """Return a path of keys in the usual notation, such as ``expose[0].type``."""
     text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in key)
     return text.removeprefix(".")
 
@@ -79,7 +79,8 @@ def read_yaml(path: Path) -> YamlSource:
     """Read one YAML document.
 
     Raises:
-        ConfigError: no such file, not UTF-8, too large or too deep, not YAML, a key twice, an anchor or a tag.
+        ConfigError: the file is missing, not UTF-8, too large or too deep, not YAML, or has a duplicate key, an anchor
+            or a tag.
     """
     try:
         with path.open("rb") as file:
@@ -102,7 +103,7 @@ def read_yaml(path: Path) -> YamlSource:
 
 
 class _Reader:
-    """Turns the node tree of one file into data and marks."""
+    """Converter of the node tree of one file into data and marks."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -110,6 +111,7 @@ class _Reader:
         self._values: dict[KeyPath, Mark] = {}
 
     def read(self, text: str) -> YamlSource:
+        """Return the data of the file, with the marks stored."""
         loader = LOADER(text)
         try:
             self._refuse_anchors(text)
@@ -124,7 +126,7 @@ class _Reader:
         return YamlSource(self._path, data, self._keys, self._values)
 
     def _refuse_anchors(self, text: str) -> None:
-        """Look at the events first: composing a deep or self-containing tree is what this spares us."""
+        """Check the events first, which avoids composing a deep or self-containing tree."""
         depth = 0
         for event in yaml.parse(text, Loader=LOADER):
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
@@ -169,12 +171,12 @@ def _mark(node: yaml.Node | yaml.Event) -> Mark:
 
 
 def _char(character: int | str | bytes) -> str | bytes:
-    """Return the character that an error is about; libyaml gives its number."""
+    """Return the character that an error concerns; libyaml gives its number."""
     return chr(character) if isinstance(character, int) else character
 
 
 def _scalar(text: str) -> Plain:
-    """Read an unquoted word; what is none of null, a truth value or a number is text."""
+    """Convert an unquoted word; a word that is not null, a boolean or a number is text."""
     if _NULL.match(text):
         return None
     if text in _BOOL:

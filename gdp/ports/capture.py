@@ -1,16 +1,17 @@
-"""What an eavesdropper on these links would see, as a pcap file.
+"""Packet capture of the frames on network devices, written as a pcap file.
 
     python -m gdp.ports.capture --iface eth0 --iface eth1 FILE
 
-Place: I/O; a command of its own, which needs no other part of a node.
+I/O. This command needs no other part of a node.
 Source: packet(7); the pcap format, draft-ietf-opsawg-pcap, with nanosecond stamps (magic A1B23C4D)::
 
     file    magic (4)  2 (2)  4 (2)  zero (4)  zero (4)  longest frame (4)  link type 1, Ethernet (4)
     frame   seconds (4)  nanoseconds (4)  bytes here (4)  bytes on the wire (4)  frame
 
-Everything that comes and goes is written, both ways, of every EtherType. Where there are several devices a frame of one
-may stand before an earlier one of another; the stamps are the kernel's and right. It prints one JSON line when it
-listens and one when it ends (on SIGINT or SIGTERM), and leaves a whole file even then.
+The capture holds every frame of both directions and of every EtherType, as an eavesdropper on the links sees it. With
+several devices, a frame of one may precede an earlier frame of another; the stamps come from the kernel and are
+correct. The command prints one JSON line when it starts to capture and one when it ends (on SIGINT or SIGTERM). The
+file is complete at the end.
 """
 
 from __future__ import annotations
@@ -38,17 +39,17 @@ _FILE_HEAD: Final = struct.Struct("=IHHiIII")
 _FRAME_HEAD: Final = struct.Struct("=IIII")
 _MAGIC_NS: Final = 0xA1B23C4D
 _LONGEST_BYTES: Final = 1 << 18
-_BURST: Final = 256  # frames of one device before the others have their turn
+_BURST: Final = 256  # frames of one device before the next device is read
 
 
 class Capture:
-    """Sockets that hear everything on some devices, and the file it goes to.
+    """Sockets that receive every frame on some devices, and the file that they are written to.
 
     Args:
         file: open for writing bytes; the caller closes it.
 
     Raises:
-        LocalError: no such device, or raw sockets are not allowed here.
+        LocalError: a device does not exist, or the process may not open raw sockets.
     """
 
     def __init__(self, ifnames: Sequence[str], file: BinaryIO) -> None:
@@ -68,12 +69,12 @@ class Capture:
 
     @property
     def lost(self) -> int:
-        """Frames that the kernel dropped because this was too slow."""
+        """Frames that the kernel dropped because the capture was too slow."""
         self._lost += sum(map(kernel_drops, self._sockets))
         return self._lost
 
     def run(self, stop: socket.socket) -> None:
-        """Write what comes until ``stop`` can be read; then what was already there, and return."""
+        """Write frames until ``stop`` is readable; then write the frames that have already arrived, and return."""
         epoll = select.epoll()
         with epoll:
             for source in (stop, *self._sockets):
@@ -101,7 +102,7 @@ class Capture:
         for count in range(_BURST):
             try:
                 size, stamps, _, _ = opened.recvmsg_into([self._buffer], socket.CMSG_SPACE(_STAMP.size))
-            except OSError:  # nothing more, or the device went down: what comes after it is heard again
+            except OSError:  # no more frames, or the device went down; it is read again when it is up
                 return count
             seconds, nanoseconds = _STAMP.unpack(stamps[0][2]) if stamps else (0, 0)
             self._file.write(_FRAME_HEAD.pack(seconds, nanoseconds, size, size))
@@ -127,7 +128,7 @@ def _listen(ifname: str) -> socket.socket:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return its exit code (2: no such device, no such folder, not allowed)."""
+    """Run the command and return its exit code: 2 if a device or folder does not exist or the user lacks the right."""
     parser = argparse.ArgumentParser(
         prog="python -m gdp.ports.capture",
         description="Write every frame on some devices to a pcap file, until interrupted.",
@@ -148,7 +149,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _say(event="done", frames=capture.frames, lost=capture.lost)
             capture.close()
     except (LocalError, OSError) as error:
-        print(f"capture: {error}", file=sys.stderr)  # noqa: T201  (a command speaks)
+        print(f"capture: {error}", file=sys.stderr)  # noqa: T201  (output of a command)
         return 2
     finally:
         signal.set_wakeup_fd(-1)
@@ -160,7 +161,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _say(**facts: str | int) -> None:
-    print(json.dumps(facts), flush=True)  # noqa: T201  (a command speaks)
+    print(json.dumps(facts), flush=True)  # noqa: T201  (output of a command)
 
 
 if __name__ == "__main__":

@@ -1,14 +1,14 @@
-"""Many frames in one system call: a pool of slots, filled from one port and emptied into another.
+"""mmsg pool: many frames per system call, received from one port into slots and forwarded from them to another.
 
-Place: I/O; no decision is taken here.
-Source: recvmmsg(2), sendmmsg(2), through ctypes; where the C library cannot be reached that way, ``recv_into`` and
+I/O; no forwarding decision is made here.
+Source: recvmmsg(2), sendmmsg(2), through ctypes; if the C library is not reachable that way, ``recv_into`` and
 ``sendmsg`` do the same. One slot holds one frame from its Ethernet header on::
 
-    slot i      [ Ethernet header 14 | frame ... ]     take() fills slots from the first on
-    on leaving  [ head 14 ] + [ frame ... ]            put() gathers a new Ethernet header and the frame in its slot
+    slot i      [ Ethernet header 14 | frame ... ]     receive() fills slots from the first on
+    on leaving  [ head 14 ] + [ frame ... ]            forward() gathers a new Ethernet header and the frame in its slot
 
-So a frame that is forwarded is never copied here: its hops left is changed in the slot, and one head serves a whole run
-of frames to the same neighbour. Nor is a frame of our own: ``send`` points at the bytes where they lie.
+A forwarded frame is therefore never copied here: its hops left change in the slot, and one head serves a whole run of
+frames to the same neighbour. A frame of our own is not copied either: ``send`` points at the bytes of the caller.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from gdp.frame.kinds import ETHERTYPE
 __all__ = ["SLOTS", "MmsgBatch", "MmsgPool", "PlainBatch", "make_batch", "put_one", "send_failure"]
 
 SLOTS: Final = 64
-_TAKE_BYTES: Final = 128 << 10  # about as much is taken at once, so that nothing urgent waits long behind it
+_TAKE_BYTES: Final = 128 << 10  # approximate size of one batch, so that urgent frames wait only briefly
 _ETHERTYPE: Final = ETHERTYPE.to_bytes(2, "big")
 _DONTWAIT: Final = int(socket.MSG_DONTWAIT)
 
@@ -39,7 +39,7 @@ _SEND_ERRORS: Final = {
 
 
 def send_failure(number: int) -> tuple[DropReason, bool]:
-    """Return what the errno of a send means, and whether the frames after it may still leave."""
+    """Return the drop reason for the errno of a send, and whether the frames after it may still be sent."""
     return _SEND_ERRORS.get(number, (DropReason.PORT_DOWN, False))
 
 
@@ -47,34 +47,34 @@ class MmsgPool(Protocol):
     """A pool of ``SLOTS`` slots.
 
     Attributes:
-        pool: the slots, one after the other.
-        slot_bytes: size of one; a longer frame arrives cut short.
+        pool: the slots, contiguous.
+        slot_bytes: size of one slot; a longer frame arrives truncated.
     """
 
     pool: bytearray
     slot_bytes: int
 
     def receive(self, source: socket.socket) -> list[int]:
-        """Fill slots with what has arrived, without waiting; return the bytes after each Ethernet header."""
+        """Fill slots with the frames that arrived, without waiting; return their bytes after each Ethernet header."""
 
     def fill(self, frames: list[bytes]) -> None:
-        """Put frames (from the GDP header on, at most ``SLOTS``, each fitting a slot) into the slots."""
+        """Write frames (from the GDP header on, at most ``SLOTS``, each fitting a slot) into the slots."""
 
     def send(self, sink: socket.socket, frames: Sequence[bytes], macs: bytes, drops: list[int]) -> int:
-        """Send frames (from the GDP header on, at most ``SLOTS``), from where they lie.
+        """Send frames (from the GDP header on, at most ``SLOTS``) from the caller's memory.
 
-        Returns how many left; the others are counted in ``drops``.
+        Returns how many were sent; the others are counted in ``drops``.
         """
 
     def forward(self, sink: socket.socket, first: int, count: int, macs: bytes, drops: list[int]) -> int:
-        """Send the slots ``first`` to ``first + count``, last filled by ``take`` or ``fill``, under new addresses.
+        """Send the slots ``first`` to ``first + count``, last filled by ``receive`` or ``fill``, under new addresses.
 
-        Returns how many left; the others are counted in ``drops``.
+        Returns how many were sent; the others are counted in ``drops``.
         """
 
 
 def _take_max(slot_bytes: int) -> int:
-    """Return how many slots are filled at once."""
+    """Return how many slots one call fills."""
     return max(8, min(SLOTS, _TAKE_BYTES // slot_bytes))
 
 
@@ -102,7 +102,7 @@ class MmsgBatch:
     """``MmsgPool`` over ``recvmmsg`` and ``sendmmsg``.
 
     Raises:
-        OSError, AttributeError: the C library cannot be reached, or lacks them.
+        OSError, AttributeError: the C library is not reachable, or lacks the functions.
     """
 
     def __init__(self, slot_bytes: int) -> None:
@@ -145,9 +145,9 @@ class MmsgBatch:
         self._sizes = memoryview(self._out_vectors).cast("B").cast("L")[3::4]  # size_t
 
     def receive(self, source: socket.socket) -> list[int]:
-        """Receive what waits at a socket; return the bytes of each frame after its Ethernet header, as ``MmsgPool``."""
+        """Receive the frames that wait at a socket; return their bytes after each Ethernet header, as ``MmsgPool``."""
         got = self._receive(source.fileno(), self._in_at, self._take_max, _DONTWAIT, None)
-        if got <= 0:  # nothing there, or the device went down: the link watch tells
+        if got <= 0:  # no frames, or the device went down: the link monitor reports it
             return []
         sizes = [length - ETHER_BYTES for length in self._taken[:got].tolist()]
         self._sizes[:got] = memoryview(array("L", sizes))
@@ -161,7 +161,7 @@ class MmsgBatch:
         self._sizes[: len(frames)] = memoryview(array("L", map(len, frames)))
 
     def send(self, sink: socket.socket, frames: Sequence[bytes], macs: bytes, drops: list[int]) -> int:
-        """Send frames to one pair of addresses; return how many left, as ``MmsgPool``."""
+        """Send frames to one pair of addresses; return how many were sent, as ``MmsgPool``."""
         count = len(frames)
         self._pointers[:count] = list(frames)
         self._own_addresses[:count] = self._addresses[:count]
@@ -169,7 +169,7 @@ class MmsgBatch:
         return self._submit(sink, self._own_at, 0, count, macs, drops)
 
     def forward(self, sink: socket.socket, first: int, count: int, macs: bytes, drops: list[int]) -> int:
-        """Send ``count`` slots from ``first`` on to one pair of addresses; return how many left, as ``MmsgPool``."""
+        """Send ``count`` slots from ``first`` on to one pair of addresses; return how many were sent."""
         return self._submit(sink, self._out_at, first, count, macs, drops)
 
     def _submit(self, sink: socket.socket, table: int, first: int, count: int, macs: bytes, drops: list[int]) -> int:
@@ -190,7 +190,7 @@ class MmsgBatch:
 
 
 class PlainBatch:
-    """``MmsgPool`` with one system call a frame."""
+    """``MmsgPool`` with one system call per frame."""
 
     def __init__(self, slot_bytes: int) -> None:
         self.slot_bytes = slot_bytes
@@ -201,12 +201,12 @@ class PlainBatch:
         self._sizes: list[int] = []
 
     def receive(self, source: socket.socket) -> list[int]:
-        """Receive what waits at a socket; return the bytes of each frame after its Ethernet header, as ``MmsgPool``."""
+        """Receive the frames that wait at a socket; return their bytes after each Ethernet header, as ``MmsgPool``."""
         sizes: list[int] = []
         for slot in self._slots[: self._take_max]:
             try:
                 sizes.append(source.recv_into(slot) - ETHER_BYTES)
-            except OSError:  # nothing more, or the device went down: the link watch tells
+            except OSError:  # no more frames, or the device went down: the link monitor reports it
                 break
         self._sizes = sizes
         return sizes
@@ -218,11 +218,11 @@ class PlainBatch:
         self._sizes = [len(frame) for frame in frames]
 
     def send(self, sink: socket.socket, frames: Sequence[bytes], macs: bytes, drops: list[int]) -> int:
-        """Send frames to one pair of addresses; return how many left, as ``MmsgPool``."""
+        """Send frames to one pair of addresses; return how many were sent, as ``MmsgPool``."""
         return self._submit(sink, frames, macs, drops)
 
     def forward(self, sink: socket.socket, first: int, count: int, macs: bytes, drops: list[int]) -> int:
-        """Send ``count`` slots from ``first`` on to one pair of addresses; return how many left, as ``MmsgPool``."""
+        """Send ``count`` slots from ``first`` on to one pair of addresses; return how many were sent."""
         slots = [self._slots[at][ETHER_BYTES : ETHER_BYTES + self._sizes[at]] for at in range(first, first + count)]
         return self._submit(sink, slots, macs, drops)
 
@@ -244,7 +244,7 @@ class PlainBatch:
 
 
 def put_one(sink: socket.socket, frame: bytes, macs: bytes, drops: list[int]) -> int:
-    """Send one frame (from the GDP header on), quicker so than by a batch; return how many left: 0 or 1."""
+    """Send one frame (from the GDP header on), faster than as a batch; return how many were sent: 0 or 1."""
     try:
         sink.send(macs + _ETHERTYPE + frame)
     except OSError as error:
@@ -254,7 +254,7 @@ def put_one(sink: socket.socket, frame: bytes, macs: bytes, drops: list[int]) ->
 
 
 def make_batch(slot_bytes: int) -> MmsgPool:
-    """Return the quicker kind that this C library allows."""
+    """Return the fastest pool that this C library allows."""
     try:
         return MmsgBatch(slot_bytes)
     except (OSError, AttributeError):

@@ -1,11 +1,11 @@
-"""What the planes on real devices share: ports that come and go with their devices, one epoll, the counters.
+"""Base of the planes over network devices: ports that follow their devices, one epoll, the counters.
 
-Place: I/O; how a frame is read, decided on and sent is left to the plane that builds on this.
-A port outlives its device. When the device is deleted, or moved away, the port is down; when one of that name appears,
-the port opens it anew. The kernel's own word (netlink) decides, so a cut link is known within milliseconds. A device
-that cannot be opened (another process may still have it) is tried again until it can.
+I/O. A subclass defines how a frame is read, decided on and sent.
+A port outlives its device. The port goes down when the device is deleted or moved away. When a device of that name
+appears, the port reopens it. The kernel's link messages (netlink) decide, so a port detects a cut link within
+milliseconds. If a device cannot be opened (another process may still use it), the port retries until it can.
 
-A port's life::
+States of a port::
 
     add_port -> open, up or down <-> up or down (carrier) -> absent (device deleted) -> open (device of that name) ...
        `-----> absent, where it may be
@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 
 _OPEN_AGAIN_S: Final = 0.2
 _MTU_MAX_BYTES: Final = FRAME_MAX_BYTES - ETHER_BYTES
-_AUDIT_POLLS: Final = 256  # a busy plane asks the kernel for its drops this often, an idle one each time
+_AUDIT_POLLS: Final = 256  # a busy plane reads the kernel's drops every so many polls, an idle one at each poll
 
 
 class NoDeviceError(LocalError):
@@ -46,7 +46,7 @@ class NetdevPlane(ABC):
 
     Args:
         ifnames: devices to open at once.
-        table: what to forward by; None hands every frame up.
+        table: entries to forward by; None punts every frame.
 
     Raises:
         LocalError: as ``add_port``.
@@ -77,39 +77,39 @@ class NetdevPlane(ABC):
             self.close()
             raise
 
-    # what a plane adds
+    # implemented by a plane
 
     @abstractmethod
     def _open(self, port: Port) -> None:
         """Open the port's device and watch it.
 
         Raises:
-            LocalError: it cannot be opened.
+            LocalError: the device cannot be opened.
         """
 
     @abstractmethod
     def _shut(self, index: int) -> None:
-        """Close whatever ``_open`` opened; nothing may be open."""
+        """Close everything that ``_open`` opened; nothing may be open."""
 
     @abstractmethod
     def _is_open(self, index: int) -> bool: ...
 
     def _widen(self, port: Port) -> None:
-        """Make room for the larger frames of an open device; to open it anew loses what waits at its socket.
+        """Prepare an open device for larger frames; reopening it loses the frames that wait at its socket.
 
         Raises:
-            LocalError: it cannot be opened.
+            LocalError: the device cannot be opened.
         """
         self._close_device(port.index)
         self._open(port)
 
     @abstractmethod
     def _kernel_drops(self) -> int:
-        """Return the frames that the kernel dropped at open ports since last asked."""
+        """Return the frames that the kernel dropped at open ports since the last call."""
 
     @abstractmethod
     def transmit(self, port: int, destination_mac: bytes, frames: Sequence[bytes]) -> int:
-        """Send frames to one neighbour; return how many left, as ``Plane.transmit``."""
+        """Send frames to one neighbour; return how many were sent, as ``Plane.transmit``."""
 
     # the Plane protocol
 
@@ -124,7 +124,7 @@ class NetdevPlane(ABC):
         return self._counters
 
     def poll(self, timeout_s: float | None) -> list[ReceivedFrame]:
-        """Wait for events and serve them, the lowest rank first; return what is handed up, as ``Plane.poll``."""
+        """Wait for events and serve them, the lowest rank first; return the punted frames, as ``Plane.poll``."""
         if self._unopened:
             timeout_s = self._open_again(timeout_s)
         events = self._epoll.poll(timeout_s)
@@ -135,35 +135,35 @@ class NetdevPlane(ABC):
             events.sort(key=lambda event: self._ranks[event[0]])
         for fd, _ in events:
             ready = self._ready.get(fd)
-            if ready is not None:  # an earlier one of this round may have closed it
+            if ready is not None:  # an earlier callback of this round may have closed it
                 ready()
         arrivals, self._arrivals = self._arrivals, []
         self._counters.punted += len(arrivals)
         return arrivals
 
     def fileno(self) -> int:
-        """Return a descriptor that can be read while ``poll`` has something to do, for another event loop."""
+        """Return a descriptor that is readable while ``poll`` has work, for another event loop."""
         return self._epoll.fileno()
 
     def watch(self, source: HasFileno, ready: Callable[[], None], *, rank: int = 0) -> None:
-        """Call ``ready`` from within ``poll`` whenever ``source`` can be read; a lower ``rank`` comes first."""
+        """Call ``ready`` from within ``poll`` whenever ``source`` is readable; a lower ``rank`` comes first."""
         fd = source.fileno()
         self._epoll.register(fd, select.EPOLLIN)
         self._ready[fd] = ready
         self._ranks[fd] = rank
 
     def unwatch(self, source: HasFileno) -> None:
-        """Undo ``watch``; nothing happens if the source is not watched."""
+        """Undo ``watch``; does nothing if the source is not watched."""
         fd = source.fileno()
         if self._ready.pop(fd, None) is not None:
             del self._ranks[fd]
             self._epoll.unregister(fd)
 
     def add_port(self, ifname: str, *, may_be_absent: bool = False) -> int:
-        """Open a device and return its port index; one that may be absent is opened when it appears.
+        """Open a device and return its port index; a device that may be absent is opened when it appears.
 
         Raises:
-            NoDeviceError: there is no such device.
+            NoDeviceError: the device does not exist.
             LocalError: as ``Plane.add_port``.
         """
         if any(port.ifname == ifname for port in self._ports.values()):
@@ -187,7 +187,7 @@ class NetdevPlane(ABC):
         return port.index
 
     def remove_port(self, index: int) -> None:
-        """Close a port; nothing happens if there is none of this index."""
+        """Close a port; does nothing if no port has this index."""
         if self._ports.pop(index, None) is not None:
             self._unopened.pop(index, None)
             self._close_device(index)
@@ -207,7 +207,7 @@ class NetdevPlane(ABC):
         """Store the addresses of a port's neighbours, as ``Plane.set_neighbours``."""
 
     def close(self) -> None:
-        """Close every port, the link monitor and the poll."""
+        """Close every port, the link monitor and the epoll."""
         for index in list(self._ports):
             self.remove_port(index)
         self._links.close()
@@ -216,16 +216,16 @@ class NetdevPlane(ABC):
     # links
 
     def _close_device(self, index: int) -> None:
-        """Close, not losing what the kernel counted."""
+        """Close a device after adding the kernel's drops to the counters."""
         self._audit()
         self._shut(index)
 
     def _audit(self) -> None:
-        """Bring the kernel's own drops into the counters."""
+        """Add the kernel's own drops to the counters."""
         self._counters.drops[DropReason.PORT_FULL] += self._kernel_drops()
 
     def _know(self, port: Port) -> None:
-        """Remember a port as it now is, and tell if it went up or down, or came to be another while up."""
+        """Store the state of a port, and report if it went up or down, or changed its address while up."""
         before = self._ports.get(port.index)
         self._ports[port.index] = port
         if port.up:
@@ -249,7 +249,7 @@ class NetdevPlane(ABC):
             self._follow(self._ports[index], link)
 
     def _open_again(self, timeout_s: float | None) -> float:
-        """Try the devices that could not be opened, if it is time; return how long to wait at most."""
+        """Retry the devices that could not be opened, if it is time; return the longest wait in seconds."""
         now_s = time.monotonic()
         if now_s >= self._open_again_s:
             self._open_again_s = now_s + _OPEN_AGAIN_S
@@ -261,7 +261,7 @@ class NetdevPlane(ABC):
         return left_s if timeout_s is None else min(timeout_s, left_s)
 
     def _follow(self, port: Port, link: Link) -> None:
-        """Bring a port in step with its device."""
+        """Synchronise a port with its device."""
         if link.gone:
             self._unopened.pop(port.index, None)
             self._close_device(port.index)
@@ -274,13 +274,13 @@ class NetdevPlane(ABC):
         self._know(after)
 
     def _reopen_if_needed(self, before: Port, after: Port) -> Port:
-        """Open a device that is new, and make room where its frames have become larger."""
+        """Open a new device, or prepare an open one for larger frames."""
         is_open = self._is_open(before.index)
         if is_open and after.mtu <= before.mtu:
             return after
         try:
             self._widen(after) if is_open else self._open(after)
-        except LocalError as error:  # gone again, not ready, or another process has it
+        except LocalError as error:  # gone again, not ready, or in use by another process
             if before.index not in self._unopened:
                 log.warning("%s; it is tried again", error)
             self._unopened[before.index] = str(error)

@@ -60,16 +60,16 @@ _RTM_NEWTFILTER, _RTM_GETTFILTER = 44, 46
 _NLM_F_REQUEST, _NLM_F_DUMP = 0x1, 0x300
 _NESTED: Final = 0x8000  # NLA_F_NESTED
 _TCA_KIND, _TCA_OPTIONS, _TCA_BPF_NAME = 1, 2, 7
-_FOREVER_S: Final = 5.0  # the kernel answers at once; this only keeps a bug from hanging a node
+_FOREVER_S: Final = 5.0  # the kernel replies at once; the limit only keeps a bug from blocking a node
 
 
 class LinkAttribute(IntEnum):
-    """Attributes of a device, as far as they are used."""
+    """Attributes of a device, as far as they are used here."""
 
     ADDRESS = 1
     IFNAME = 3
     MTU = 4
-    LINK = 5  # the other end of a pair, by its ifindex there
+    LINK = 5  # ifindex of the other end of a pair, in its namespace
     QDISC = 6
     LINKINFO = 18
     STATS64 = 23
@@ -96,13 +96,13 @@ class DeviceInfo(NamedTuple):
 
     @classmethod
     def from_body(cls, body: bytes) -> DeviceInfo:
-        """Return what a message of type ``RTM_NEWLINK`` or ``RTM_DELLINK`` says."""
+        """Return the device of a message of type ``RTM_NEWLINK`` or ``RTM_DELLINK``."""
         family, _, ifindex, flags, _ = _INFO.unpack_from(body)
         return cls(family, ifindex, flags, nested(body[_INFO.size :]))
 
 
 class _RefusedError(LocalError):
-    """The kernel's answer is an error.
+    """The kernel replied with an error.
 
     Attributes:
         number: its errno.
@@ -114,13 +114,13 @@ class _RefusedError(LocalError):
 
 
 class NetlinkSocket:
-    """One socket to ask by. For one thread at a time.
+    """One socket for requests. For one thread at a time.
 
-    Every question raises ``LocalError`` where the kernel refuses it, or there is no answer; that never reads as an
-    answer of nothing. The next question may be asked all the same.
+    Every request raises ``LocalError`` if the kernel refuses it or does not reply; an error never looks like an empty
+    reply. The next request may follow all the same.
 
     Raises:
-        LocalError: no socket is to be had.
+        LocalError: the socket cannot be opened.
     """
 
     def __init__(self) -> None:
@@ -138,22 +138,22 @@ class NetlinkSocket:
         return self._ask(_RTM_GETLINK, _INFO.pack(socket.AF_UNSPEC, 0, 0, 0, 0), _NLM_F_DUMP)
 
     def link_named(self, ifname: str) -> list[Message]:
-        """Return the message about the device of this name; none where there is no such device."""
+        """Return the message about the device of this name; none if it does not exist."""
         name = ifname.encode() + b"\0"
         body = _INFO.pack(socket.AF_UNSPEC, 0, 0, 0, 0)
         body += _ATTRIBUTE.pack(_ATTRIBUTE.size + len(name), LinkAttribute.IFNAME) + name + bytes(-len(name) % 4)
         try:
             return self._ask(_RTM_GETLINK, body, 0)
         except _RefusedError as error:
-            if error.number in (errno.ENODEV, errno.ERANGE, errno.EINVAL):  # the last two: no device can have the name
+            if error.number in (errno.ENODEV, errno.ERANGE, errno.EINVAL):  # ERANGE, EINVAL: an invalid name
                 return []
             raise
 
     def link(self, ifindex: int, namespace: int | None = None) -> dict[int, bytes]:
-        """Return the attributes of one device; none where there is no such device.
+        """Return the attributes of one device; none if it does not exist.
 
         Args:
-            namespace: where else the device is, by this namespace's number for that one.
+            namespace: another namespace that holds the device, by this namespace's number for it.
         """
         body = _INFO.pack(socket.AF_UNSPEC, 0, ifindex, 0, 0)
         if namespace is not None:
@@ -178,7 +178,7 @@ class NetlinkSocket:
         return found
 
     def filters(self, ifindex: int, parent: int) -> list[str]:
-        """Return the filters at one place of a device, by the names of those that are programs; the others have none.
+        """Return the filters at one location of a device, by the names of those that are programs; others have none.
 
         A filter's chain may be listed with it.
         """
@@ -216,7 +216,7 @@ class NetlinkSocket:
                 return answers
 
     def _forget(self) -> None:
-        """Read what a question that failed left behind: while its dump lasts, the kernel begins no other."""
+        """Read the rest of a failed request: while its dump lasts, the kernel starts no other."""
         self._socket.setblocking(False)
         try:
             while True:
@@ -250,7 +250,7 @@ def nested(body: bytes) -> dict[int, bytes]:
 
 
 def listen(groups: int) -> socket.socket:
-    """Return a non-blocking socket that receives news of these groups: ``LINK_GROUP``, ``TRAFFIC_GROUP``.
+    """Return a non-blocking socket that receives notifications of these groups: ``LINK_GROUP``, ``TRAFFIC_GROUP``.
 
     Raises:
         LocalError: the kernel opens no such socket.

@@ -1,9 +1,9 @@
-"""What a data plane is to the node that runs it: ports, frames handed up, frames to send.
+"""Interface of a data plane to its node: ports, punted frames, frames to send.
 
-Place: I/O floor; the Protocol and its nouns, no system call.
+I/O layer; this module has only the Protocol and its data types, and makes no system call.
 Source: docs/explanation/design.md, section 7.
-A plane forwards by itself whatever the table decides; a node sees only what was handed up.
-A plane without a table (a proxy's, a RIB's) hands everything up.
+A plane forwards by itself what the table decides; a node sees only the punted frames.
+A plane without a table (of a proxy or a RIB) punts every frame.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ MAC_BYTES: Final = 6
 
 @dataclass(frozen=True, slots=True)
 class Port:
-    """One layer-2 device, as it was last heard of.
+    """One layer-2 device in its last known state.
 
     Attributes:
-        index: the plane's own number of this port; never given to another one, unlike the kernel's.
+        index: the plane's own number of this port; unlike the kernel's, it is never reused.
         mac: its address, 6 bytes.
         mtu: bytes after the Ethernet header.
         up: switched on and with a carrier.
@@ -40,14 +40,14 @@ class Port:
 
 @dataclass(slots=True)
 class Counters:
-    """What a plane has done since it was made.
+    """Counts of a plane since its creation.
 
     Attributes:
-        frames_in: frames taken from ports.
-        frames_out: frames put on ports, forwarded copies and our own.
-        forwarded: the copies among them that the table asked for.
-        punted: frames given to the node.
-        drops: by ``DropReason``; a frame with several hops may be counted for each.
+        frames_in: frames received from ports.
+        frames_out: frames sent on ports, forwarded copies and our own.
+        forwarded: the copies among them that the table requested.
+        punted: frames delivered to the node.
+        drops: by ``DropReason``; a frame with several hops may count once for each.
     """
 
     frames_in: int = 0
@@ -58,7 +58,7 @@ class Counters:
 
 
 class HasFileno(Protocol):
-    """Anything that epoll can watch."""
+    """Object that epoll can watch."""
 
     def fileno(self) -> int:
         """Return the descriptor to wait on."""
@@ -76,54 +76,58 @@ class Plane(Protocol):
 
     @property
     def counters(self) -> Counters:
-        """The live counts; any thread may read them. What the kernel dropped at a full socket (``PORT_FULL``) comes in
-        with the next idle ``poll``, or the 256th busy one."""
+        """The live counts; any thread may read them.
+
+        Frames that the kernel dropped at a full socket (``PORT_FULL``) are added in the next idle ``poll``, or in the
+        256th busy one.
+        """
 
     def poll(self, timeout_s: float | None) -> list[ReceivedFrame]:
-        """Wait for frames, forward what the table decides, return what is handed up.
+        """Wait for frames, forward what the table decides, return the punted frames.
 
-        Returns early, perhaps with nothing, whenever anything happened: frames forwarded, a link that came or went,
-        a watched file that was ready. Call it in a loop.
+        Returns early, perhaps with an empty list, after any event: frames forwarded, a link that changed, a watched
+        file that was ready. Call it in a loop.
 
         Args:
-            timeout_s: longest wait; 0 only looks, None waits for as long as it takes.
+            timeout_s: longest wait; 0 does not wait, None waits without a limit.
         """
 
     def transmit(self, port: int, destination_mac: bytes, frames: Sequence[bytes]) -> int:
-        """Send frames of ours (from the GDP header on; the Ethernet header is added) to one neighbour.
+        """Send frames of ours (from the GDP header on; the plane adds the Ethernet header) to one neighbour.
 
-        Returns how many left. The others are lost, and counted as ``PORT_FULL``, ``PORT_DOWN`` or ``TOO_BIG``; a port
-        that was removed is down.
+        Returns how many were sent. The others are lost, and counted as ``PORT_FULL``, ``PORT_DOWN`` or ``TOO_BIG``; a
+        removed port counts as down.
         """
 
     def watch(self, source: HasFileno, ready: Callable[[], None]) -> None:
-        """Call ``ready`` from within ``poll`` whenever ``source`` can be read."""
+        """Call ``ready`` from within ``poll`` whenever ``source`` is readable."""
 
     def unwatch(self, source: HasFileno) -> None:
         """Undo ``watch``, before the source is closed."""
 
     def add_port(self, ifname: str, *, may_be_absent: bool = False) -> int:
-        """Open a device and return its port index; one that may be absent is opened when it appears.
+        """Open a device and return its port index; a device that may be absent is opened when it appears.
 
         Raises:
-            LocalError: no such device, its MTU is too small, it is a port already, or raw sockets are not allowed here.
+            LocalError: the device does not exist, its MTU is too small, it is already a port, or the process may not
+                open raw sockets.
         """
 
     def remove_port(self, index: int) -> None:
         """Close a port; hops that still name it count as ``PORT_DOWN``."""
 
     def port_state(self, index: int) -> bool:
-        """Say whether the port exists, is up and has a carrier."""
+        """Return whether the port exists, is up and has a carrier."""
 
     def on_link(self, callback: LinkCallback) -> None:
         """Call ``callback(port, up)`` from within ``poll`` each time a port goes up or down.
 
-        It is called with ``up`` again where only the MTU changed, and with down and up where the address did: to its
-        neighbours that is another port. ``ports`` has the new facts.
+        If only the MTU changed, the callback gets ``up`` again. If the address changed, it gets down and then up: to
+        its neighbours the port is another one. ``ports`` has the new state.
         """
 
     def set_neighbours(self, port: int, macs: Collection[bytes]) -> None:
-        """Learn the addresses of a port's neighbours; what they say goes before what strangers say."""
+        """Store the addresses of a port's neighbours; their frames precede those of strangers."""
 
     def close(self) -> None:
-        """Close every socket; the plane is of no use afterwards."""
+        """Close every socket; the plane is unusable afterwards."""

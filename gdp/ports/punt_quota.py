@@ -1,4 +1,4 @@
-"""A share of time for what may come in floods: so many frames a second, beyond which a socket rests.
+"""Rate limit for frames that may arrive in floods: so many frames a second, beyond which a socket pauses.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: a leaky bucket as a meter (ITU-T I.371), charged after
 the fact, because a batch is read before its size is known.
@@ -10,7 +10,7 @@ __all__ = ["PuntQuota"]
 
 
 class PuntQuota:
-    """What one source of frames has left.
+    """The remaining quota of one source of frames.
 
     Args:
         rate: frames a second.
@@ -25,7 +25,7 @@ class PuntQuota:
         self._at_s = now_s
 
     def charge(self, frames: int, now_s: float) -> float:
-        """Take frames off; return the seconds to rest, 0 while something is left."""
+        """Charge frames; return the seconds to pause, 0 while some quota is left."""
         self._left = min(self._left + (now_s - self._at_s) * self._rate, self._burst) - frames
         self._at_s = now_s
         return max(-self._left, 0.0) / self._rate

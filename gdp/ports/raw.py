@@ -1,14 +1,13 @@
-"""The data plane on AF_PACKET sockets: batches in, a decision each, batches out.
+"""Data plane on AF_PACKET sockets: it receives batches, decides on each frame, and sends batches.
 
-Place: I/O; no Scapy, and the struct codec's offsets only.
+I/O; without Scapy, and with the struct codec's offsets only.
 Source: docs/explanation/design.md, section 7.
-What is ordinary is decided here, in one pass over the batch; whatever is not goes to
-``gdp.switch.forwarder.decide``, and fixtures hold the two together. Neighbouring frames of a batch that go the same way
-leave in one call, a *run*; each lane of a port has its own socket, and the first one goes first. Of hellos, and of all
-that strangers say, a port takes so many frames a second; the others are left to the kernel, which drops them when the
-socket is full::
+One pass over the batch decides the ordinary frames here. ``gdp.switch.forwarder.decide`` decides all others, and
+fixtures hold the two decisions equal. Consecutive frames of a batch with the same hops leave in one call, a *run*. Each
+traffic class (lane) of a port has its own socket, and the first one is served first. A port accepts a limited number of
+hellos and of strangers' frames per second. The kernel keeps the others, and drops them when the socket is full::
 
-    take  | A A A A B B A |      decide      runs: A A A A | B B | A      put, put, put
+    receive | A A A A B B A |    decide      runs: A A A A | B B | A      forward, forward, forward
 """
 
 from __future__ import annotations
@@ -46,13 +45,13 @@ _LANES: Final = (
     TrafficClass.URGENT,
     TrafficClass.ORDINARY,
     TrafficClass.GUEST,
-)  # as they are served
-_GREETINGS: Final = (500.0, 128.0)  # a second, and at once; each costs 30 us at most before it is refused
+)  # in the order of service
+_GREETINGS: Final = (500.0, 128.0)  # per second, and at once; each costs at most 30 us before its rejection
 
 
-@lru_cache(maxsize=4_096)  # more than the sizes that come often
+@lru_cache(maxsize=4_096)  # more than the number of frequent sizes
 def _shape(size: int) -> struct.Struct:
-    """Return what takes the sender's address and a frame of ``size`` bytes out of a slot, in one call."""
+    """Return the struct that reads the sender's address and a frame of ``size`` bytes from a slot."""
     return struct.Struct(f"{MAC_BYTES}x{MAC_BYTES}s{ETHER_BYTES - 2 * MAC_BYTES}x{size}s")
 
 
@@ -67,7 +66,7 @@ class RawPlane(NetdevPlane):
 
     Args:
         ifnames: devices to open at once.
-        table: what to forward by; None hands every frame up.
+        table: entries to forward by; None punts every frame.
         bypass_qdisc: send past traffic control.
 
     Raises:
@@ -79,7 +78,7 @@ class RawPlane(NetdevPlane):
         self._lanes: dict[TrafficClass, dict[int, socket.socket]] = {lane: {} for lane in _LANES}  # by port
         self._batch: MmsgPool = make_batch(OVERHEAD_BYTES)
         self._neighbours: dict[int, frozenset[bytes]] = {}  # addresses, by port
-        self._resting: dict[int, tuple[socket.socket, float]] = {}  # not read until then, by file descriptor
+        self._resting: dict[int, tuple[socket.socket, float]] = {}  # sockets that pause until then, by file descriptor
         super().__init__(ifnames, table)
 
     def _open(self, port: Port) -> None:
@@ -104,7 +103,7 @@ class RawPlane(NetdevPlane):
         tell_neighbours(opened, lane, self._neighbours.get(port.index, ()))
 
     def set_neighbours(self, port: int, macs: Collection[bytes]) -> None:
-        """Store the addresses of a port's neighbours: their frames get the lanes ahead of strangers'."""
+        """Store the addresses of a port's neighbours: their frames get lanes ahead of strangers'."""
         before, after = self._neighbours.get(port, frozenset()), frozenset(macs)
         self._neighbours[port] = after
         steps = (
@@ -113,13 +112,13 @@ class RawPlane(NetdevPlane):
             (TrafficClass.HELLO, after),
             (TrafficClass.GUEST, after),
         )
-        for lane, known in steps:  # in this order, so that no frame falls between two lanes
+        for lane, known in steps:  # in this order, so that each frame always has a lane
             opened = self._lanes[lane].get(port)
             if opened is not None:
                 tell_neighbours(opened, lane, known)
 
     def poll(self, timeout_s: float | None) -> list[ReceivedFrame]:
-        """End the rests of sockets that are due, then as ``Plane.poll``."""
+        """End the pauses of sockets that are due; then as ``Plane.poll``."""
         if self._resting:
             now_s = time.monotonic()
             for fd in [fd for fd, (_, until_s) in self._resting.items() if until_s <= now_s]:
@@ -135,7 +134,7 @@ class RawPlane(NetdevPlane):
         self._neighbours.pop(index, None)
 
     def _take_some(self, source: socket.socket, ration: PuntQuota, ready: Callable[[], None]) -> None:
-        """Take a batch; leave the socket alone for a while where that was more than its share."""
+        """Receive a batch; pause the socket if it exceeded its quota."""
         before = self._counters.frames_in
         ready()
         rest_s = ration.charge(self._counters.frames_in - before, now_s := time.monotonic())
@@ -161,10 +160,11 @@ class RawPlane(NetdevPlane):
                 opened.close()
 
     def _finish(self, sources: Sequence[socket.socket]) -> None:
-        """Take what has arrived at sockets before they are closed, which would lose it without a word."""
+        """Receive the frames at sockets before they are closed, because closing loses them uncounted."""
         for source in sources:
             attach_drop_all_filter(source)
-            source.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)  # that its device went down would be read first
+            # Clears the error of a device that went down, which the next read would return first.
+            source.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
             ready, before = self._ready.get(source.fileno()), -1
             while ready is not None and self._counters.frames_in > before:
                 before = self._counters.frames_in
@@ -178,7 +178,7 @@ class RawPlane(NetdevPlane):
         return sum(kernel_drops(opened) for sockets in self._lanes.values() for opened in sockets.values())
 
     def transmit(self, port: int, destination_mac: bytes, frames: Sequence[bytes]) -> int:
-        """Send frames to one neighbour; return how many left, as ``Plane.transmit``."""
+        """Send frames to one neighbour; return how many were sent, as ``Plane.transmit``."""
         counters, facts, batch = self._counters, self._ports.get(port), self._batch
         if facts is None or not facts.up:
             counters.drops[DropReason.PORT_DOWN] += len(frames)
@@ -218,7 +218,7 @@ class RawPlane(NetdevPlane):
         source: socket.socket,
         sinks: Mapping[int, socket.socket],
     ) -> None:
-        """Take one batch from a port and forward it by ``sinks``, handing up what is for the node."""
+        """Receive one batch from a port and forward it by ``sinks``; punt the frames for the node."""
         batch, get = self._batch, entries.get
         pool, step, glance = batch.pool, batch.slot_bytes, _GLANCE.unpack_from
         sizes = batch.receive(source)
@@ -244,7 +244,7 @@ class RawPlane(NetdevPlane):
         self._send(sinks, run_hops, run_start, len(sizes) - run_start)
 
     def _narrowest(self, hops: Hops) -> int:
-        """Return the size that every hop's link takes; 0 where one is down or there is none."""
+        """Return the size that the links of all hops accept; 0 if one is down or there is none."""
         return min((self._mtus.get(hop[0], 0) for hop in hops), default=0)
 
     def _consider(
@@ -256,7 +256,7 @@ class RawPlane(NetdevPlane):
         slot: int,
         size: int,
     ) -> None:
-        """Decide on the one frame in a slot by the reference, and do what it says."""
+        """Decide on one frame in a slot with the reference, and act on the decision."""
         batch, drops = self._batch, self._counters.drops
         at = slot * batch.slot_bytes
         ack = decide(batch.pool[at : at + ETHER_BYTES + size], entries, self._mtus, sides, port)

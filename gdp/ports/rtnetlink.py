@@ -1,6 +1,6 @@
-"""Link monitor: what the kernel says about network devices (address, MTU, carrier), and when they change.
+"""Link monitor: the state of network devices (address, MTU, carrier) as the kernel reports it, and its changes.
 
-I/O; two NETLINK_ROUTE sockets (``netlink.py``), so that no news comes between a request and its answer.
+I/O; two NETLINK_ROUTE sockets (``netlink.py``), so that no notification comes between a request and its reply.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Link(NamedTuple):
 
 
 class LinkMonitor:
-    """The links of this namespace, and news of them.
+    """The links of this namespace, and notifications of their changes.
 
     Raises:
         LocalError: the kernel has no such sockets (never on an ordinary Linux).
@@ -62,7 +62,7 @@ class LinkMonitor:
             opened.pop_all()
 
     def fileno(self) -> int:
-        """Return what to wait on; readable when there is news."""
+        """Return the descriptor to wait on; readable when there are notifications."""
         return self._news.fileno()
 
     def close(self) -> None:
@@ -71,29 +71,29 @@ class LinkMonitor:
         self._questions.close()
 
     def get(self, ifname: str) -> Link | None:
-        """Return one device; None when there is none of that name.
+        """Return one device; None if there is none of that name.
 
-        A device with a carrier swallows what is sent until the kernel has activated it, a little later; since Linux 6.8
-        this question (and no other) waits for that, so ``up`` is true of the first frame.
+        A device with a carrier drops sent frames until the kernel activates it a little later. Since Linux 6.8 this
+        request (and no other) waits for that, so ``up`` holds for the first frame.
 
         Raises:
-            LocalError: the kernel refused the question.
+            LocalError: the kernel refused the request.
         """
         return next((link for each in self._questions.link_named(ifname) for link in _links(each)), None)
 
     def all(self) -> list[Link]:
-        """Return every device there is now.
+        """Return every present device.
 
         Raises:
-            LocalError: the kernel refused the question.
+            LocalError: the kernel refused the request.
         """
         return [link for each in self._questions.links() for link in _links(each)]
 
     def poll(self) -> list[Link]:
-        """Return what changed since last asked, in order.
+        """Return the changes since the last call, in order.
 
-        Where news came faster than it was read, the kernel skips some; then all there is comes last, and what is
-        missing from it before, as gone.
+        If notifications arrived faster than they were read, the kernel skips some. Then all present devices come last,
+        preceded by the missing ones, marked as gone.
         """
         links: list[Link] = []
         skipped = False
@@ -102,7 +102,7 @@ class LinkMonitor:
                 data = self._news.recv(READ_BYTES)
             except BlockingIOError:
                 break
-            except OSError as error:  # told before the older news that is still waiting
+            except OSError as error:  # ENOBUFS precedes older notifications that still wait
                 if error.errno != errno.ENOBUFS:
                     raise
                 skipped = True

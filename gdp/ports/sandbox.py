@@ -1,8 +1,8 @@
-"""Least rights at run time: what a node gives away once its sockets and programs are open.
+"""Sandbox: the rights that a node drops after its sockets and programs are open.
 
-Place: I/O. In this order: ``no_new_privs``, Landlock, seccomp, the bounding set, capabilities. Each step that this
-kernel or this user's rights do not allow is left out, and ``Rights`` says so: it is what the kernel reports afterwards.
-Capabilities and Landlock are a thread's own, so this comes before a node starts its threads.
+I/O. The order is: ``no_new_privs``, Landlock, seccomp, the bounding set, capabilities. A step that this kernel or this
+user's rights do not allow is left out; ``Rights`` is what the kernel reports afterwards. Capabilities and Landlock
+belong to a thread, so a node calls this before it starts its threads.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ _TASKS: Final = Path("/proc/self/task")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Needs:
-    """What a process goes on to do.
+    """Rights that a process continues to need.
 
     Args:
-        capabilities: that it keeps, as far as it has them.
+        capabilities: capabilities that it keeps, as far as it has them.
         writes: files and folders that it changes.
-        reads: those that it reads beside them; None: any.
-        tcp_ports: on which it listens, and it connects to none by TCP; None: any.
-        starts_programs: whether it starts some; they get no capability.
+        reads: files and folders that it reads in addition; None: any.
+        tcp_ports: TCP ports on which it listens, and it opens no TCP connection; None: any.
+        starts_programs: whether it starts programs; they get no capability.
         spared_calls: system calls of ``seccomp.denied`` that it makes.
         only_reads: it opens no socket, starts no process or thread, sends no signal, and marks no file.
     """
@@ -51,13 +51,13 @@ class Needs:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rights:
-    """What this thread may still do, as the kernel says.
+    """Rights that this thread still has, as the kernel reports them.
 
     Args:
-        capabilities: in effect; ``CAP_`` left out, lower case, a number where it has no name here.
-        bounding: how many capabilities a program of root's that it starts could get.
+        capabilities: in effect; lower case without ``CAP_``, or a number if it has no name here.
+        bounding: number of capabilities that a root program started from here could get.
         landlock: the version in use; 0: none.
-        threads: of this process; more than one: the others keep capabilities and files.
+        threads: number of threads of this process; if more than one, the others keep capabilities and files.
     """
 
     capabilities: tuple[str, ...]
@@ -77,7 +77,7 @@ class Rights:
 
 
 def confine(needs: Needs) -> Rights:
-    """Give away what a process does not need; there is no way back. Return what is left."""
+    """Drop the rights that a process does not need, irreversibly; return the remaining ones."""
     version = 0
     has_filter = False
     try:

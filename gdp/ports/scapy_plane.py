@@ -1,9 +1,9 @@
-"""The data plane by Scapy: sniff, dissect, decide, build, send. The reference, for learning and for tests.
+"""Data plane with Scapy: sniff, dissect, decide, build, send. It is the reference, for learning and for tests.
 
-Place: I/O; the only plane that imports Scapy, and imported only when chosen.
+I/O; the only plane that imports Scapy, and imported only when chosen.
 Source: docs/explanation/design.md, section 7.
-It decides by the very ``decide`` that the others are tested against, and leaves the bytes of
-a frame alone but for addresses and hops left, because Scapy builds anew only what was changed.
+It uses the same ``decide`` that the other planes are tested against. It leaves the bytes of a frame unchanged except
+for addresses and hops left, because Scapy rebuilds only changed layers.
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ from gdp.switch.table import Table
 
 __all__ = ["ScapyPlane"]
 
-_BURST: Final = 64  # frames of one port before the others have their turn
+_BURST: Final = 64  # frames of one port before the next port is read
 
 
 class ScapyPlane(NetdevPlane):
-    """``Plane`` over one Scapy socket a port.
+    """``Plane`` over one Scapy socket per port.
 
     Args:
         ifnames: devices to open at once.
-        table: what to forward by; None hands every frame up.
+        table: entries to forward by; None punts every frame.
 
     Raises:
         LocalError: as ``add_port``.
     """
 
     def __init__(self, ifnames: Sequence[str] = (), table: Table | None = None) -> None:
-        self._sockets: dict[int, tuple[L2Socket, int]] = {}  # and its file descriptor, known even after it closed
+        self._sockets: dict[int, tuple[L2Socket, int]] = {}  # with the file descriptor, which is needed after a close
         super().__init__(ifnames, table)
 
     def _open(self, port: Port) -> None:
@@ -71,7 +71,7 @@ class ScapyPlane(NetdevPlane):
         opened, fd = self._sockets.pop(index, (None, -1))
         if opened is None:
             return
-        if opened.closed:  # by Scapy, after an error; the kernel has forgotten the descriptor
+        if opened.closed:  # closed by Scapy after an error; the kernel has released the descriptor
             self._ready.pop(fd, None)
         else:
             self.unwatch(opened)
@@ -84,7 +84,7 @@ class ScapyPlane(NetdevPlane):
         return sum(kernel_drops(opened.ins) for opened, _ in self._sockets.values() if not opened.closed)
 
     def transmit(self, port: int, destination_mac: bytes, frames: Sequence[bytes]) -> int:
-        """Send frames to one neighbour, one by one; return how many left, as ``Plane.transmit``."""
+        """Send frames to one neighbour, one by one; return how many were sent, as ``Plane.transmit``."""
         drops, facts, left = self._counters.drops, self._ports.get(port), 0
         if facts is None or not facts.up:
             drops[DropReason.PORT_DOWN] += len(frames)
@@ -98,13 +98,13 @@ class ScapyPlane(NetdevPlane):
         return left
 
     def set_neighbours(self, port: int, macs: Collection[bytes]) -> None:
-        """Do nothing: one socket a port takes frames as they come."""
+        """Do nothing: one socket per port receives frames in order of arrival."""
 
     def _sniff(self, index: int) -> None:
         """Read a burst from one port that is ready; return when it is empty."""
         opened, _ = self._sockets[index]
         if opened.ins.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
-            return  # the device went down: asking has cleared it, and the link watch tells
+            return  # the device went down: the read cleared the error, and the link monitor reports it
         sniff(
             opened_socket=opened,
             prn=partial(self._consider, index),
@@ -113,12 +113,12 @@ class ScapyPlane(NetdevPlane):
             stop_filter=lambda _: not select.select([opened], [], [], 0)[0],
             chainCC=True,
         )
-        if opened.closed:  # an error all the same
+        if opened.closed:  # Scapy closed it because of an error
             self._shut(index)
             self._know(self._reopen_if_needed(self._ports[index], self._ports[index]))
 
     def _consider(self, index: int, packet: Packet) -> None:
-        """Decide on one frame, and do what the verdict says."""
+        """Decide on one frame, and act on the decision."""
         counters, frame = self._counters, bytes(packet)
         counters.frames_in += 1
         if self._entries is None:

@@ -1,19 +1,19 @@
-"""AF_PACKET sockets that see our frames and nothing else.
+"""AF_PACKET sockets with filters that accept only our frames.
 
-Place: I/O; opens and asks sockets, keeps nothing.
+I/O; it opens and queries sockets, and keeps no state.
 Source: packet(7), socket(7), ``linux/filter.h`` (classic BPF, which needs no privilege beyond the raw socket itself).
 
-What a port lets in is settled in the kernel, by a few loads and compares, so that no frame that is someone else's costs
-Python anything: frames to the port's own address, and broadcast frames whose kind is for the neighbour itself. A frame
-to another station (``PACKET_OTHERHOST``, seen on a shared or promiscuous link), a multicast, an echo of our own
-sending, and a data frame that was broadcast (which every switch on a shared link would forward once more) are none of
-our business: neither forwarded nor counted.
+A short filter in the kernel decides what a port accepts, so a frame of another protocol costs Python nothing. Accepted
+are frames to the port's own address, and broadcast frames whose kind is for the neighbour itself. These are neither
+forwarded nor counted: a frame to another station (``PACKET_OTHERHOST``, seen on a shared or promiscuous link), a
+multicast, an echo of our own sending, and a broadcast data frame (which every switch on a shared link would forward
+again).
 
-A port may have a socket for each *lane*, so that nothing waits in a queue behind what matters less: what neighbours
-say to each other, their hellos, frames flagged urgent, all the rest, and last what strangers say to us. A flood on one
-lane fills that lane's queue alone. Who is a neighbour is told by its address, which the filters are given with each
-change. What leaves by the lanes of neighbours and of urgent frames carries a priority that every queueing discipline
-with bands honours (``pfifo_fast``, ``prio``, and the access categories of Wi-Fi).
+A port may have a socket for each *lane* (``TrafficClass``), so that no frame queues after less important ones. The
+lanes in order are: control frames of neighbours, their hellos, urgent frames, ordinary frames, and control frames of
+strangers. A flood on one lane fills only the queue of that lane. A neighbour is identified by its address, which the
+filters get with each change. Frames that leave by the lanes of neighbours and of urgent frames carry a priority. Every
+queueing discipline with bands honours it (``pfifo_fast``, ``prio``, and the access categories of Wi-Fi).
 """
 
 from __future__ import annotations
@@ -53,11 +53,11 @@ _PACKET_IGNORE_OUTGOING: Final = 23  # Linux 4.20; older kernels rely on the fil
 _SO_ATTACH_FILTER: Final = 26
 _SO_SNDBUFFORCE: Final = 32
 _SO_RCVBUFFORCE: Final = 33
-_GREETING_BUFFER_BYTES: Final = 128 << 10  # about a hundred hellos: those of a flood are old before they are read
+_GREETING_BUFFER_BYTES: Final = 128 << 10  # about a hundred hellos: in a flood, more would be stale when read
 _BUFFER_BYTES: Final = 16 << 20  # a 921,600-byte message is 1.6 MB of socket memory at MTU 1500
 
-_Step = tuple[int, int, int, int]  # code, steps to jump if it holds, if it does not, value
-_LOAD_BYTE: Final = 0x30  # BPF_LD | BPF_B | BPF_ABS; beyond the frame's end, the frame is left
+_Step = tuple[int, int, int, int]  # code, steps to jump if true, if false, value
+_LOAD_BYTE: Final = 0x30  # BPF_LD | BPF_B | BPF_ABS; a load beyond the frame's end rejects the frame
 _LOAD_HALF: Final = 0x28  # BPF_LD | BPF_H | BPF_ABS
 _LOAD_WORD: Final = 0x20  # BPF_LD | BPF_W | BPF_ABS
 _LOAD_LENGTH: Final = 0x80  # BPF_LD | BPF_W | BPF_LEN
@@ -71,7 +71,7 @@ _PRIORITY: Final = 6  # TC_PRIO_INTERACTIVE: the first band; 7 would need CAP_NE
 _KIND: Final = (_LOAD_BYTE, 0, 0, ETHER_BYTES + KIND_AT)
 _FLAGS: Final = (_LOAD_BYTE, 0, 0, ETHER_BYTES + FLAGS_AT)
 _TYPE: Final = (_LOAD_BYTE, 0, 0, _PACKET_TYPE)
-_LANED_BYTES: Final = ETHER_BYTES + FLAGS_AT + 1  # what tells a frame's lane
+_LANED_BYTES: Final = ETHER_BYTES + FLAGS_AT + 1  # the bytes that determine a frame's lane
 _LENGTH: Final = (_LOAD_LENGTH, 0, 0, 0)
 _TAKE: Final = (_RETURN, 0, 0, _WHOLE)
 _LEAVE: Final = (_RETURN, 0, 0, 0)
@@ -93,7 +93,7 @@ _HELLO_ONLY: Final = ((_JUMP_EQUAL, 1, 0, Kind.HELLO), _LEAVE)
 
 
 class TrafficClass(Enum):
-    """Which of our frames a socket sees: steps of (code, jump if true, jump if false, value).
+    """Traffic class of a socket (lane): filter steps of (code, jump if true, jump if false, value).
 
     In the lanes of ``_BY_ADDRESS`` the sender's address decides what follows.
     """
@@ -109,7 +109,7 @@ class TrafficClass(Enum):
     )
     CONTROL = (*_CONTROL_ONLY, *_NO_HELLO)  # of neighbours
     HELLO = (*_CONTROL_ONLY, *_HELLO_ONLY)  # of neighbours
-    GUEST = _CONTROL_ONLY  # of everybody else
+    GUEST = _CONTROL_ONLY  # of all other senders
     URGENT = (
         _TYPE,
         (_JUMP_EQUAL, 0, 5, socket.PACKET_HOST),
@@ -124,7 +124,7 @@ class TrafficClass(Enum):
         _TYPE,
         (_JUMP_EQUAL, 0, 7, socket.PACKET_HOST),
         _LENGTH,
-        (_JUMP_GREATER_EQUAL, 0, 4, _LANED_BYTES),  # shorter ones are for the plane to count
+        (_JUMP_GREATER_EQUAL, 0, 4, _LANED_BYTES),  # the plane counts shorter ones
         _KIND,
         (_JUMP_GREATER_EQUAL, 3, 0, CONTROL_FROM),
         _FLAGS,
@@ -145,7 +145,7 @@ def steps_of(lane: TrafficClass, neighbours: Iterable[bytes] = ()) -> tuple[_Ste
     """Return the filter of a lane.
 
     Args:
-        neighbours: addresses, 6 bytes each; five steps for each of them.
+        neighbours: addresses, 6 bytes each; each one adds five steps.
     """
     steps: tuple[_Step, ...] = lane.value
     if lane not in _BY_ADDRESS:
@@ -163,10 +163,10 @@ def steps_of(lane: TrafficClass, neighbours: Iterable[bytes] = ()) -> tuple[_Ste
 
 
 def tell_neighbours(opened: socket.socket, lane: TrafficClass, neighbours: Iterable[bytes]) -> None:
-    """Give a socket the addresses of a port's neighbours.
+    """Set the addresses of a port's neighbours in the filter of a socket.
 
     Raises:
-        OSError: not a packet socket.
+        OSError: it is not a packet socket.
     """
     _filter(opened, steps_of(lane, neighbours))
 
@@ -175,14 +175,14 @@ def open_port(ifname: str, lane: TrafficClass = TrafficClass.ALL, *, bypass_qdis
     """Open a non-blocking socket for our EtherType on one device.
 
     Args:
-        lane: which of our frames it sees.
-        bypass_qdisc: hand frames to the driver past traffic control; quicker, but shaping (tc) is skipped too.
+        lane: which of our frames it accepts.
+        bypass_qdisc: pass frames to the driver without traffic control; faster, but shaping (tc) is skipped too.
 
     Raises:
-        LocalError: raw sockets are not allowed here, or no such device.
+        LocalError: the process may not open raw sockets, or the device does not exist.
     """
     try:
-        opened = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)  # protocol 0: hears nothing before it is bound
+        opened = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)  # protocol 0: receives nothing before it is bound
     except PermissionError as error:
         raise LocalError(NO_RAW_SOCKETS) from error
     try:
@@ -204,10 +204,10 @@ def open_port(ifname: str, lane: TrafficClass = TrafficClass.ALL, *, bypass_qdis
 
 
 def attach_ethertype_filter(opened: socket.socket, lane: TrafficClass = TrafficClass.ALL) -> None:
-    """Let in what the head of this module says, as far as it belongs on this lane.
+    """Attach the filter of a lane, which the head of this module describes.
 
     Raises:
-        OSError: not a packet socket.
+        OSError: it is not a packet socket.
     """
     _filter(opened, steps_of(lane))
     try:
@@ -218,10 +218,10 @@ def attach_ethertype_filter(opened: socket.socket, lane: TrafficClass = TrafficC
 
 
 def attach_drop_all_filter(opened: socket.socket) -> None:
-    """Let nothing more in; what has arrived can still be taken.
+    """Attach a filter that rejects every new frame; frames that already arrived can still be read.
 
     Raises:
-        OSError: not a packet socket.
+        OSError: it is not a packet socket.
     """
     _filter(opened, (_LEAVE,))
 
@@ -232,12 +232,12 @@ def _filter(opened: socket.socket, steps: Sequence[_Step]) -> None:
 
 
 def kernel_drops(opened: socket.socket) -> int:
-    """Return how many frames the kernel dropped at this socket, its buffer being full, since last asked."""
+    """Return how many frames the kernel dropped at this socket's full buffer since the last call."""
     return int(struct.unpack("=II", opened.getsockopt(_SOL_PACKET, _PACKET_STATISTICS, 8))[1])
 
 
 def large_buffers(opened: socket.socket) -> None:
-    """Ask for large buffers both ways: past the system's limit where that is allowed, else up to it."""
+    """Set large buffers in both directions: past the system's limit if allowed, else up to it."""
     for forced, plain in (_SO_RCVBUFFORCE, socket.SO_RCVBUF), (_SO_SNDBUFFORCE, socket.SO_SNDBUF):
         try:
             opened.setsockopt(socket.SOL_SOCKET, forced, _BUFFER_BYTES)

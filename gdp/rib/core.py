@@ -1,11 +1,12 @@
-"""A RIB: who advertises a name, and where, by proof alone.
+"""RIB of a domain: which nodes advertise a name, and at which switches, by proof alone.
 
-Place: pure; it takes statements and gives back statements to send, each for a name. How they travel is its host's
-business (``gdp/client/rib_host.py``).
+Sans-I/O; it takes statements and returns statements to send, each for a name. Their transport is the task of its host
+(``gdp/client/rib_host.py``).
 
-It accepts an advertisement only if the name's hash comes out, the chain from the owner's key to the claimant holds, the
-relay is a member of this domain (or a RIB of a trusted one), the sequence number is newer, the lease is in bounds and
-the quota not spent. Global names climb to the tier above; what this tier does not know is asked there.
+It accepts an advertisement only if the name's hash is right and the chain from the owner's key to the advertiser is
+valid. The relay must be a member of this domain (or a RIB of a trusted one). The sequence number must be newer, the
+lease in bounds, and the quota not used up. Global names are also advertised to the tier above; names that this tier
+does not know are queried there.
 """
 
 from __future__ import annotations
@@ -57,12 +58,12 @@ from gdp.trust.verifier import AdvertisementVerifier
 
 __all__ = ["OutgoingStatement", "RibCore", "RibSettings"]
 
-_ADVISED_S: Final = 30.0  # who was answered is told of a move for so long
+_ADVISED_S: Final = 30.0  # how long members that received a response also receive moves
 _UNTOLD_S: Final = 1.0  # ... where there are too many for that
-_NAMES_OF_ISSUER_MAX: Final = 256  # whose watchers are told of what somebody revoked who is not their owner
-_QUESTION_BYTES: Final = 1_024  # what a question costs, asked on above or denied
-_ANSWER_BYTES: Final = 1_024  # what an answer costs beside the claim in it
-_DOUBT_S: Final = 0.1  # a RIB above that said nothing for so long is asked for a sign of life beside a question
+_NAMES_OF_ISSUER_MAX: Final = 256  # names whose watchers receive a revocation by an issuer that is not the names' owner
+_QUESTION_BYTES: Final = 1_024  # cost of a query, forwarded upstream or answered in the negative
+_ANSWER_BYTES: Final = 1_024  # cost of a response without the advertisement in it
+_DOUBT_S: Final = 0.1  # a RIB above that is silent for so long receives a probe with the next query
 _PEER_MESSAGES: Final[dict[StatementType, type[Message]]] = {
     StatementType.DIGEST: Digest,
     StatementType.FETCH: Fetch,
@@ -77,12 +78,12 @@ class OutgoingStatement(NamedTuple):
     to: Name
     kind: Kind
     statement: bytes
-    about: Key | None = None  # what it says was kept: not sent if the store did not take that
+    about: Key | None = None  # the stored entry that it reports: not sent if the store did not accept that
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RibSettings:
-    """What an operator may choose.
+    """Options of an operator.
 
     Args:
         upper: RIBs of the tier above, any of which may be used; empty at the top.
@@ -98,7 +99,7 @@ class RibSettings:
 
 
 class RibCore:
-    """The machine of one RIB."""
+    """Sans-I/O core of one RIB."""
 
     def __init__(self, identity: Identity, policy: Policy, store: Store, settings: RibSettings) -> None:
         self._identity = identity
@@ -111,7 +112,7 @@ class RibCore:
         self._revocations = RibRevocations(
             self._verifier, store, lambda name: bool(self._watches.watchers(name, self._now_s))
         )
-        self._holders = Watches(settings.watches)  # who was answered, for the lease of the answer
+        self._holders = Watches(settings.watches)  # members that received a response, for its lease
         self._above = UpstreamQueries(is_top=not settings.upper)
         self._upstream = UpstreamAdvertisements(settings.upper)
         self._replication = self._replication_over(store.digests)
@@ -127,16 +128,16 @@ class RibCore:
 
     @property
     def names(self) -> int:
-        """Return how many routes are kept."""
+        """Return how many routes are stored."""
         return len(self._store)
 
     @property
     def watching(self) -> int:
-        """Return how many watches stand."""
+        """Return the number of watches."""
         return len(self._watches)
 
     def receive(self, wire: bytes, sender: Name, now: Timestamps) -> None:
-        """Take a statement that came from ``sender`` (as the frame says; unproven). What does not hold is counted."""
+        """Handle a statement from ``sender`` (from the frame header; unproven). Each invalid statement is counted."""
         self._now_s = now.mono_s
         try:
             statement = parse(wire)
@@ -159,20 +160,20 @@ class RibCore:
         except RemoteError as error:
             self.refusals[error.reason] += 1
         except StoreError:
-            self.refusals[DropReason.UNAVAILABLE] += 1  # no answer: who sent it will try again
-        except Exception as error:  # one statement must not end the RIB
+            self.refusals[DropReason.UNAVAILABLE] += 1  # no response: the sender will try again
+        except Exception as error:  # one statement must not stop the RIB
             self.boundary.note(error)
             self.refusals[DropReason.INTERNAL] += 1
 
     def receive_all(self, wires: Sequence[tuple[bytes, Name]], now: Timestamps) -> None:
-        """Take statements, each with its sender; what they are about is read from the store in one go."""
+        """Handle statements, each with its sender; the entries that they concern are read from the store in one go."""
         if self._store.digests is None:
             self._store.prefetch([name for wire, _ in wires if (name := _name_in(wire)) is not None], now)
         for wire, sender in wires:
             self.receive(wire, sender, now)
 
     def changed(self, names: Iterable[tuple[Name, list[Route]]], now: Timestamps) -> None:
-        """Tell who watches what another RIB changed in a shared store, given the routes that were known before."""
+        """Send watchers what another RIB changed in a shared store, given the routes that were known before."""
         self._now_s = now.mono_s
         concerned = [(name, before) for name, before in names if self._concerns(name, now.mono_s)]
         self._store.prefetch([name for name, _ in concerned], now)
@@ -189,7 +190,7 @@ class RibCore:
                 self._tell_gone(known[advertiser], now.mono_s)
 
     def load(self, entries: Iterable[Entry], now: Timestamps) -> int:
-        """Take entries of a snapshot, each verified; return how many are live. What does not hold is counted."""
+        """Load entries of a snapshot, each verified; return how many are live. Each invalid entry is counted."""
         before = self.names
         for entry in entries:
             try:
@@ -199,12 +200,12 @@ class RibCore:
         return self.names - before
 
     def revoke(self, wire: bytes, origin: Name, now: Timestamps) -> None:
-        """Take a certificate back: what rests on it is gone, and whomever it concerns is told.
+        """Revoke a certificate: routes that depend on it are removed, and every affected node receives the revocation.
 
-        What does not hold is counted.
+        An invalid revocation is counted.
 
         Args:
-            giver: the neighbour that it came over.
+            origin: the neighbour that it came over.
         """
         self._now_s = now.mono_s
         try:
@@ -215,7 +216,7 @@ class RibCore:
             self.refusals[DropReason.UNAVAILABLE] += 1
 
     def handle_timer(self, now: Timestamps) -> None:
-        """Let expired routes go and tell who watched them; ask above again what is open."""
+        """Expire routes and notify their watchers; repeat open queries upstream."""
         for route in self._store.expire(now.mono_s, now.unix_s):
             self._tell_gone(route, now.mono_s)
         self._now_s = now.mono_s
@@ -228,7 +229,7 @@ class RibCore:
             self._send_up(passed)
 
     def connected(self, now: Timestamps) -> None:
-        """Note that what is sent arrives from now on: there is a switch."""
+        """Record that statements arrive from now on: there is a switch."""
         self._now_s = now.mono_s
         if self._replication is not None:
             self._replication.connected(now.mono_s)
@@ -241,7 +242,7 @@ class RibCore:
         return min((time for time in times if time is not None), default=None)
 
     def statements_to_send(self) -> list[OutgoingStatement]:
-        """Return, once, what is to be sent."""
+        """Return, once, the statements to send."""
         if refused := set(self._store.commit()):
             self._letters = [outgoing for outgoing in self._letters if outgoing.about not in refused]
         letters, self._letters = self._letters, []
@@ -300,10 +301,10 @@ class RibCore:
             self._pass_up(route, relay.statement, route.sequence, now.mono_s)
 
     def _check_identity(self, advertisement: Advertisement, now: Timestamps) -> None:
-        """Refuse a node's own name in another incarnation while the older node lives at another switch.
+        """Reject a node's own name in another incarnation while the older node lives at another switch.
 
         Raises:
-            StatementError: IN_USE; the older one's switch has been asked whether it is there.
+            StatementError: IN_USE; the older node's switch has received a presence question.
         """
         held = self._store.get(advertisement.name, advertisement.node) if advertisement.right is Right.ATTACH else None
         if not isinstance(held, Route) or held.switch == advertisement.switch:
@@ -328,7 +329,7 @@ class RibCore:
             self.identities.answered(presence, member.name, now.mono_s)
 
     def _check_news(self, advertisement: Advertisement, member: Membership) -> Route | Withdrawn | None:
-        """Return what was known before of a claim that may be taken.
+        """Return what was known before of an advertisement that may be accepted.
 
         Raises:
             StatementError: STALE, LEASE_BOUNDS or QUOTA.
@@ -348,7 +349,7 @@ class RibCore:
         return known
 
     def _check_quota(self, sender: Name, node: Name) -> None:
-        """Return if a sender may bring another name, and a node have one: as many as the sender has left, at most.
+        """Return if sender and node may have another name; a node gets at most as many as the sender has left.
 
         Raises:
             StatementError: QUOTA.
@@ -415,11 +416,11 @@ class RibCore:
         )
 
     def _refuse(self, passed_on: Statement, member: Membership, error: StatementError, now_s: float) -> None:
-        """Tell a proven relay why a claim was not taken, and where its maker is now if it has moved."""
+        """Send a proven relay a rejecting AdvertiseAck, with the advertiser's present location if it has moved."""
         try:
             name = UnverifiedAdvertisement.from_statement(passed_on).subject.name
         except StatementError:
-            return  # not even a claim: nothing to name in an answer; the caller counts it
+            return  # not even an advertisement: a response could name nothing; the caller counts it
         who, reason = passed_on.signer.to_text(), error.reason.label
         self._audit.note(Action.REFUSED, "name", who=who, about=name.to_text(), reason=reason)
         known = self._store.get(name, passed_on.signer)
@@ -436,7 +437,7 @@ class RibCore:
         about = (name, advertiser) if refused is None else None
         self._letters.append(OutgoingStatement(to, Kind.RIB_ANSWER, wire, about))
 
-    # -- questions
+    # -- queries
 
     def _take_query(self, statement: Statement, now: Timestamps) -> None:
         fields = statement.fields
@@ -467,16 +468,16 @@ class RibCore:
             self._answer_nobody(query.name, member.name)
 
     def _watch(self, query: Query, asker: Asker, now_s: float) -> None:
-        """Watch for an asker; where there are too many watches it is answered all the same, and will ask again."""
+        """Add a watch for an asker; above the watch limit it still gets a response, and will send its query again."""
         try:
             self._watches.add(query.name, asker, now_s + query.watch_s)
         except StatementError as error:
             self.refusals[error.reason] += 1
 
     def _may_tell(self, route: Route, asker: Asker) -> bool:
-        """Return whether an asker may learn of a route.
+        """Return whether an asker may receive a route.
 
-        A local name stays in its domain. A RIB below is not told what its own domain brought.
+        A local name stays in its domain. A RIB below does not receive what its own domain advertised.
         """
         if asker.domain == self._policy.own:
             return True
@@ -494,7 +495,7 @@ class RibCore:
 
     def _answer_nobody(self, name: Name, to: Name) -> None:
         if self._replication is not None and self._replication.is_cold(self._now_s):
-            return  # a peer may know; who asks will ask again, or ask that peer
+            return  # a peer may know; the asker repeats its query, here or at that peer
         self._deny(name, to)
 
     def _deny(self, name: Name, to: Name) -> None:
@@ -506,12 +507,12 @@ class RibCore:
         self._letters.append(OutgoingStatement(to, Kind.RIB_ANSWER, wire, about))
 
     def _concerns(self, name: Name, now_s: float) -> bool:
-        """Return whether anybody is to be told of a name."""
+        """Return whether any node is to be notified of a name."""
         is_held = self._watches.watchers(name, now_s) or self._holders.watchers(name, now_s)
         return bool(is_held) or self._above.is_waiting(name)
 
     def _tell(self, route: Route, known: Route | Withdrawn | None, now_s: float, askers: Sequence[Asker] = ()) -> None:
-        """Tell of a route: ``askers``, who watches its name, and after a move who holds or brought the old place."""
+        """Send a route to ``askers``, to watchers, and after a move to holders and the sender of the old location."""
         told = dict.fromkeys((*askers, *self._watches.watchers(route.name, now_s)))
         if isinstance(known, Route) and known.place != route.place:
             told |= dict.fromkeys(self._holders.watchers(route.name, now_s))
@@ -522,12 +523,12 @@ class RibCore:
                 self._answer(route, asker, now_s)
 
     def _sender_of(self, route: Route) -> dict[Asker, None]:
-        """Return who relayed a route, unless that was the tier above."""
+        """Return the relay of a route, unless that was the tier above."""
         is_rib = route.sender != route.switch
         return {} if route.is_from_above else {Asker(route.sender, route.via, is_rib): None}
 
     def _tell_gone(self, route: Route, now_s: float, by: Name | None = None) -> None:
-        """Tell those who watch a name, hold a route of it or brought it that one is gone; ``by`` knows."""
+        """Notify a name's watchers, holders and sender that a route is gone, except ``by``, which knows."""
         told = dict.fromkeys((*self._watches.watchers(route.name, now_s), *self._holders.watchers(route.name, now_s)))
         if by not in (None, route.sender):
             told |= self._sender_of(route)
@@ -539,7 +540,7 @@ class RibCore:
     # -- the tier above
 
     def _ask_what_is_due(self, now_s: float) -> None:
-        """Repeat questions to the tier above; of several RIBs there, leave one that is silent."""
+        """Repeat queries to the tier above; of several RIBs there, replace a silent one."""
         if self._upstream.turn_over(now_s):
             self._above.ask_again(now_s)
         ask, given_up = self._above.due(now_s)
@@ -551,7 +552,7 @@ class RibCore:
         self._probe(now_s, PROBE_S)
 
     def _probe(self, now_s: float, quiet_s: float) -> None:
-        """Ask one of several RIBs above for a sign of life if it gave none for ``quiet_s``."""
+        """Send one of several RIBs above a probe if it gave no sign of life for ``quiet_s``."""
         if self._upstream.probe(now_s, quiet_s):
             self._query_above(self._upstream.rib, 0.0)
 
@@ -568,7 +569,7 @@ class RibCore:
         self._letters.append(OutgoingStatement(upper, Kind.RIB_REQUEST, wire))
 
     def _upper_member(self, statement: Statement, now: Timestamps) -> Membership:
-        """Return who signed what came from the tier above.
+        """Return the signer of a statement from the tier above.
 
         Raises:
             StatementError: it is not from there.
@@ -625,7 +626,7 @@ class RibCore:
             isinstance(known, Route) and not known.is_from_above and known.advertisement == advertisement.wire
         )
         if answer.domain == self._policy.own or is_from_below:
-            return  # our own, or of a tier below, come back from above
+            return  # our own, or of a tier below, returned from above
         if isinstance(known, Route) and advertisement.sequence < known.sequence:
             raise StatementError(DropReason.STALE, "the tier above is behind")
         route = replace(
@@ -636,17 +637,17 @@ class RibCore:
         )
         self._store.put(route)
         if isinstance(known, Route) and not known.is_from_above:
-            self._replicate(route.name, route.advertiser)  # a peer holds the old place
+            self._replicate(route.name, route.advertiser)  # a peer has the old location
         self._tell(route, known, now.mono_s, self._above.answered(answer.name, now.mono_s))
 
     # -- revocations
 
     def _take_revocation(self, statement: Statement, origin: Name, now: Timestamps) -> None:
-        """Take a revocation that a neighbour or a relay brought.
+        """Handle a revocation from a neighbour or a relay.
 
         Raises:
-            StatementError: it does not hold, concerns nothing here, or there is no room for it.
-            StoreError: a shared store did not answer.
+            StatementError: it is not valid, concerns nothing here, or exceeds a quota.
+            StoreError: a shared store did not respond.
         """
         try:
             revocation = self._revocations.receive_revocation(statement, origin, now)
@@ -655,16 +656,17 @@ class RibCore:
                 self._pass_revocation_up(statement, origin, now)
             raise
         if revocation is None:
-            self._pass_revocation_up(statement, origin, now)  # it is repeated for those that did not know it
+            self._pass_revocation_up(statement, origin, now)  # it is repeated for those that lacked it
             return
         who, about = revocation.issuer.name.to_text(), revocation.fingerprint.hex()
         self._audit.note(Action.REVOKED, "certificate", who=who, about=about)
         told: dict[Asker, None] = {}
         closed = self._revocations.closed(revocation, now)
-        if not self._policy.revoked.is_root(revocation.issuer.owner_key):  # switches carry those of roots everywhere
+        # switches flood revocations of roots everywhere
+        if not self._policy.revoked.is_root(revocation.issuer.owner_key):
             for name in dict.fromkeys((revocation.issuer.name, *(route.name for route in closed))):
                 told |= self._concerned_by(name, now.mono_s)
-            if not told:  # it signs in its own name: an owner's successor, or a delegate
+            if not told:  # the issuer signs in its own name: an owner's successor, or a delegate
                 others = self._store.resting_on(revocation.issuer.owner_key)
                 for name in list(dict.fromkeys(route.name for route in others))[:_NAMES_OF_ISSUER_MAX]:
                     told |= self._concerned_by(name, now.mono_s)
@@ -676,7 +678,7 @@ class RibCore:
             self._tell_gone(route, now.mono_s)
 
     def _pass_revocation_up(self, statement: Statement, sender: Name, now: Timestamps) -> None:
-        """Send a revocation that changes nothing here to the tier above, where it may."""
+        """Forward a revocation that changes nothing here to the tier above, if that is allowed."""
         upper = self._upstream.rib
         is_root = self._policy.revoked.is_root(statement.fields.bytes_("owner"))
         if upper is None or is_root or self._upstream.has(sender) or sender in self._settings.peers:
@@ -685,14 +687,14 @@ class RibCore:
             self._send_revocations([statement.wire], [upper], Kind.RIB_REQUEST)
 
     def _concerned_by(self, name: Name, now_s: float) -> dict[Asker, None]:
-        """Return who brought, holds or watches a name."""
+        """Return the nodes that advertised, hold or watch a name."""
         told = dict.fromkeys((*self._watches.watchers(name, now_s), *self._holders.watchers(name, now_s)))
         for route in self._store.routes(name):
             told |= self._sender_of(route)
         return told
 
     def _above_and_beside(self, origin: Name) -> list[Name]:
-        """Return the RIBs that a revocation goes to, whatever they asked for: the tier above, and peers."""
+        """Return the RIBs that receive every revocation: the tier above, and peers."""
         if self._upstream.has(origin):
             return list(self._settings.peers)
         above = [] if self._upstream.rib is None else [self._upstream.rib]
@@ -720,7 +722,7 @@ class RibCore:
         return None if known is None else _rank(known)
 
     def entry_of(self, key: Key, now_s: float) -> Entry | None:
-        """Return what is kept of an advertiser of a name, for a peer or a snapshot, or None."""
+        """Return the stored entry of an advertiser of a name, for a peer or a snapshot, or None."""
         known = self._store.get(*key)
         if isinstance(known, Route) and known.expires_s > now_s:
             lease_s = min(known.expires_s - now_s, LEASE_MAX_S)
@@ -751,10 +753,10 @@ class RibCore:
                 self.refusals[error.reason] += 1
 
     def _take_entry(self, entry: Entry, now: Timestamps) -> None:
-        """Take what a peer holds, as if it had come here.
+        """Handle an entry of a peer as if it had arrived here.
 
         Raises:
-            StatementError: it does not hold; what is merely no news raises nothing.
+            StatementError: it is not valid; an entry that is merely no news raises nothing.
         """
         statement = parse(entry.statement)
         if statement.type is StatementType.WITHDRAW:
@@ -768,7 +770,7 @@ class RibCore:
         if known is not None and not self._is_newer(advertisement, known, now.mono_s + lease_s):
             return
         if entry.is_from_above and (not isinstance(known, Route) or known.is_from_above):
-            return  # nothing here that it corrects
+            return  # no entry here that it corrects
         if known is None:
             self._check_quota(entry.sender, advertisement.node)
         route = Route.of(
@@ -784,7 +786,7 @@ class RibCore:
         self._tell(route, known, now.mono_s, self._above.answered(route.name, now.mono_s))
 
     def _is_newer(self, advertisement: Advertisement, known: Route | Withdrawn, expires_s: float) -> bool:
-        """Return whether a peer's claim replaces what is known: a higher sequence, or the same for longer."""
+        """Return whether a peer's advertisement replaces the known one: a higher sequence, or the same for longer."""
         if advertisement.sequence != known.sequence:
             return advertisement.sequence > known.sequence
         is_same = isinstance(known, Route) and known.advertisement == advertisement.wire
@@ -799,10 +801,10 @@ class RibCore:
         member = self._sender(entry.membership, withdrawal, now)
         withdrawal.verify(member.key)
         until_unix_s = min(entry.until_unix_s, member.not_after_unix_s + int(CLOCK_SKEW_S))
-        if known is not None:  # a peer cannot have us forget sooner what we know
+        if known is not None:  # a peer must not shorten the lease of a known entry
             until_unix_s = max(until_unix_s, known.valid_until_unix_s)
         if until_unix_s <= now.unix_s:
-            return  # forgotten here already
+            return  # expired here already
         if known is None:
             self._check_quota(entry.sender, withdrawal.signer)
         gone = Withdrawn(entry.sender, sequence, until_unix_s, withdrawal.wire, entry.membership)
@@ -821,7 +823,7 @@ class RibCore:
 
 
 def _name_in(wire: bytes) -> Name | None:
-    """Return the name that a query or a relay is about, unverified; None for anything else."""
+    """Return the name that a query or a relay is about, unverified; None for other statements."""
     try:
         statement = parse(wire)
         if statement.type is StatementType.RELAY:
@@ -832,7 +834,7 @@ def _name_in(wire: bytes) -> Name | None:
 
 
 def _revocable(statement: Statement) -> list[tuple[bytes, bytes]]:
-    """Return the fingerprints in a claim's evidence, each with every key that may revoke it; nothing is verified."""
+    """Return the unverified fingerprints in an advertisement's evidence, each with every key that may revoke it."""
     body = UnverifiedAdvertisement.from_statement(statement)
     found, issuer_key = [], body.subject.owner_key
     for wire in body.chain:
@@ -843,10 +845,10 @@ def _revocable(statement: Statement) -> list[tuple[bytes, bytes]]:
 
 
 def _withdrawal(statement: Statement, now: Timestamps) -> Fields:
-    """Return what a withdrawal says.
+    """Return the fields of a withdrawal.
 
     Raises:
-        StatementError: MALFORMED, or TOO_BIG to be passed on.
+        StatementError: MALFORMED, or TOO_BIG to be forwarded.
     """
     fields = statement.expect(StatementType.WITHDRAW)
     if len(statement.wire) > WITHDRAWAL_MAX_BYTES:
@@ -856,7 +858,7 @@ def _withdrawal(statement: Statement, now: Timestamps) -> Fields:
 
 
 def _rank(known: Route | Withdrawn) -> int:
-    """Return ``Item.rank`` of what is kept; a lease that ended ranks like the claim."""
+    """Return ``Item.rank`` of a stored entry; a lease that ended ranks like the advertisement."""
     return 2 * known.sequence + (isinstance(known, Withdrawn) and bool(known.proof))
 
 

@@ -1,7 +1,7 @@
-"""Hashes over the names that a RIB holds, kept up to date with each change: equal hashes, equal contents.
+"""Digest tree over the names that a RIB stores, updated with each change: equal hashes mean equal contents.
 
-Layer: sans-I/O. Two levels of 256 by the first two bytes of the name; a hash is the exclusive or of its entries'
-hashes, so that one change costs three of them, in any order.
+Sans-I/O. Two levels of 256 by the first two bytes of the name. A hash is the exclusive or of its entries' hashes, so
+that one change costs three of them, in any order.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class DigestTree:
         self._flip(leaf, _hash(name, advertiser, sequence, is_withdrawn))
 
     def remove(self, name: Name, advertiser: Name) -> None:
-        """Take an entry away, if it is there."""
+        """Remove an entry, if it is there."""
         leaf = int.from_bytes(name[:2], "big")
         entries = self._entries.get(leaf)
         known = None if entries is None else entries.pop((name, advertiser), None)
@@ -71,7 +71,7 @@ class DigestTree:
         return found.tobytes()
 
     def differing(self, prefix: bytes, hashes: bytes) -> list[bytes]:
-        """Return the longer prefixes whose hash is another than in ``hashes``, 256 of them."""
+        """Return the longer prefixes whose hash differs from the one in ``hashes``, 256 of them."""
         own = self.hashes(prefix)
         at = range(0, len(own), HASH_BYTES)
         return [

@@ -1,9 +1,9 @@
-"""Replication between the RIBs of one domain: what one takes, all hold.
+"""Replication between the RIBs of one domain: each stores what any of them accepts.
 
-Layer: sans-I/O; time comes in as ``now_s`` (monotonic seconds). News is pushed at once and unconfirmed. Once a second
-each RIB tells its peers a hash over all that it holds; who differs fetches the detail, level by level, and then the
-entries that it lacks. The fetching side drives this, one request under way for each peer, so that the slower of both
-sets the pace. Whether an entry is taken, the RIB's machine decides: entries prove themselves.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Changes are pushed at once and unacknowledged. Once a second
+each RIB sends its peers a hash over all its entries. A RIB whose hash differs fetches the detail, level by level, and
+then the entries that it lacks. The fetching side drives this, one request under way for each peer, so that the slower
+of both sets the pace. The RIB's core decides whether an entry is accepted: entries prove themselves.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from gdp.rib.digest_tree import DigestTree
 __all__ = ["Replication"]
 
 DIGEST_S: Final = 1.0
-ANSWER_DIGEST_S: Final = 0.2  # a peer that differs is told our hash too, at most this often
-FETCH_S: Final = 0.5  # a reply that is not complete by then is given up; the next digest begins again
-COLD_S: Final = 3.0  # a RIB that just started denies no name before it heard from a peer, for so long at most
+ANSWER_DIGEST_S: Final = 0.2  # a peer that differs also receives our hash, at most this often
+FETCH_S: Final = 0.5  # a reply that is incomplete by then is cancelled; the next digest begins again
+COLD_S: Final = 3.0  # a RIB that just started denies no name before the first message of a peer, for so long at most
 PEERS_MAX: Final = 16
 QUEUE_MAX: Final = 65_536
 
@@ -48,7 +48,7 @@ Message = Digest | Fetch | Inventory | Replicas
 class _Peer:
     prefixes: deque[bytes] = field(default_factory=deque)
     keys: deque[Key] = field(default_factory=deque)
-    until_s: float | None = None  # when the reply under way is given up
+    until_s: float | None = None  # when the reply under way is cancelled
     digest_sent_s: float = float("-inf")
 
     @property
@@ -60,9 +60,9 @@ class Replication:
     """One RIB's exchange with its peers.
 
     Args:
-        peers: the RIBs to begin with; others of the domain are learnt when they speak.
-        entry_of: returns what is kept of a key at a monotonic second, or None.
-        rank_of: returns ``Item.rank`` of what is kept of a key, or None.
+        peers: the RIBs to begin with; others of the domain are added when their first message comes.
+        entry_of: returns the stored entry of a key at a monotonic second, or None.
+        rank_of: returns ``Item.rank`` of the stored entry of a key, or None.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class Replication:
         return not self._is_warm
 
     def add_peer(self, name: Name) -> bool:
-        """Note a RIB that proved to be of this domain; return whether it is a peer now."""
+        """Add a RIB that proved to be of this domain; return whether it is a peer now."""
         if name not in self._peers:
             if len(self._peers) >= PEERS_MAX or name == self._identity.name:
                 return False
@@ -105,12 +105,12 @@ class Replication:
         return True
 
     def news(self, key: Key) -> None:
-        """Have what is kept of a key pushed to all peers."""
+        """Push the stored entry of a key to all peers."""
         if self._peers:
             self._news[key] = None
 
     def receive(self, message: Message, sender: Name, now_s: float) -> Sequence[Entry]:
-        """Take a peer's message; return the entries in it, for the caller to verify and to keep."""
+        """Handle a peer's message; return the entries in it, for the caller to verify and to store."""
         peer = self._peers[sender]
         if isinstance(message, Digest):
             self._compare(message, sender, peer, now_s)
@@ -132,7 +132,7 @@ class Replication:
         self._digest_at_s = now_s
 
     def handle_timer(self, now_s: float) -> None:
-        """Send digests when due; give up replies that did not come."""
+        """Send digests when due; cancel replies that did not come."""
         for name, peer in self._peers.items():
             if peer.until_s is not None and peer.until_s <= now_s:
                 peer.prefixes.clear()
@@ -161,7 +161,7 @@ class Replication:
         out, self._out = self._out, []
         return out
 
-    # -- what the peer holds
+    # -- entries of the peer
 
     def _compare(self, digest: Digest, sender: Name, peer: _Peer, now_s: float) -> None:
         if len(digest.hashes) == HASH_BYTES:
@@ -205,7 +205,7 @@ class Replication:
             self._fetch(sender, peer, now_s)
 
     def _fetch(self, sender: Name, peer: _Peer, now_s: float) -> None:
-        """Ask for entries first, so that the queue of prefixes is worked off depth first and stays short."""
+        """Request entries first, so that the queue of prefixes is processed depth first and stays short."""
         prefixes: list[bytes] = []
         keys = [peer.keys.popleft() for _ in range(min(len(peer.keys), FETCH_KEYS_MAX))]
         if not keys:
@@ -213,7 +213,7 @@ class Replication:
         peer.until_s = now_s + FETCH_S
         self._out.append((sender, self._signed(Fetch(tuple(prefixes), tuple(keys)))))
 
-    # -- what is held here
+    # -- entries of this RIB
 
     def _serve(self, fetch: Fetch, sender: Name, now_s: float) -> None:
         replies: list[Message] = []

@@ -1,8 +1,9 @@
-"""Revocations at a RIB: which it keeps, what it closes, and whom it tells.
+"""Revocations at a RIB: which it stores, which routes they close, and which nodes receive them.
 
-Sans-I/O. A RIB keeps what trusted domains took back, and what an owner took back of a name that is stored or watched
-here. It tells whoever brought, holds or watches that name, in the tiers above and below, and who asks about the name
-later. What concerns nothing here goes on to the tier above only, at a bounded rate, and is not kept.
+Sans-I/O. A RIB stores revocations by trusted domains, and an owner's revocations for a name that is stored or watched
+here. It sends them to the nodes that advertised, hold or watch that name, in the tiers above and below. Later askers
+about the name receive them, too. A revocation that concerns nothing here is only forwarded to the tier above, at a
+bounded rate, and is not stored.
 """
 
 from __future__ import annotations
@@ -22,16 +23,16 @@ from gdp.trust.verifier import AdvertisementVerifier
 
 __all__ = ["RibRevocations"]
 
-_PASSED_PER_S, _PASSED_BURST = 8.0, 128.0  # to the tier above, of one sender
+_PASSED_PER_S, _PASSED_BURST = 8.0, 128.0  # forwarded to the tier above, of one sender
 _TOLD_PER_S, _TOLD_BURST = 64.0, 2_048.0  # to one asker, of what it lacks
-_TOLD_ABOUT_MAX: Final = 1_024  # in one answer
+_TOLD_ABOUT_MAX: Final = 1_024  # in one response
 
 
 class RibRevocations:
-    """Takes revocations for one RIB.
+    """Handles revocations for one RIB.
 
     Args:
-        is_watched: whether somebody watches a name.
+        is_watched: whether any node watches a name.
     """
 
     def __init__(self, verifier: AdvertisementVerifier, store: Store, is_watched: Callable[[Name], bool]) -> None:
@@ -43,11 +44,11 @@ class RibRevocations:
         self._told = TokenBuckets(_TOLD_PER_S, _TOLD_BURST)
 
     def receive_revocation(self, statement: Statement, origin: Name, now: Timestamps) -> Revocation | None:
-        """Take a revocation; return it if it is news.
+        """Handle a revocation; return it if it is news.
 
         Raises:
-            StatementError: it does not hold, concerns nothing here (UNCONCERNED), or there is no room for it.
-            StoreError: a shared store did not answer.
+            StatementError: it is not valid, concerns nothing here (UNCONCERNED), or exceeds a quota.
+            StoreError: a shared store did not respond.
         """
         issued_for = Revocation.read(statement).issuer.name
         return self._revoked.receive_revocation(
@@ -55,7 +56,7 @@ class RibRevocations:
         )
 
     def closed(self, revocation: Revocation, now: Timestamps) -> list[Route]:
-        """Return the routes that rest on what was revoked, and hold no more."""
+        """Return the routes that depend on what was revoked, and are no longer valid."""
         closed = []
         for route in self._store.resting_on(revocation.fingerprint):
             try:
@@ -65,10 +66,10 @@ class RibRevocations:
         return closed
 
     def may_pass_up(self, statement: Statement, sender: Name, now: Timestamps) -> bool:
-        """Return whether a revocation that is not kept here goes on to the tier above.
+        """Return whether a revocation that is not stored here goes on to the tier above.
 
         Raises:
-            StatementError: its signature does not hold.
+            StatementError: its signature is not valid.
         """
         if not self._passed.spend(sender, now.mono_s):
             return False
@@ -76,14 +77,14 @@ class RibRevocations:
         return True
 
     def lacked_by(self, asker: Name, name: Name, digest: bytes, now_s: float) -> list[bytes]:
-        """Return what an asker about a name is to be sent, given the digest of what it has."""
+        """Return the revocations about a name that an asker lacks, given the digest of what it has."""
         if digest == self._revoked.digest_about(name):
             return []
         wires = self._revoked.about(name)[:_TOLD_ABOUT_MAX]
         return [wire for wire in wires if self._told.spend(asker, now_s)]
 
     def behind(self, fingerprints: list[tuple[bytes, bytes]]) -> list[bytes]:
-        """Return the statements that took these certificates back, each by its fingerprint and a key that may."""
+        """Return the statements that revoked these certificates, each a fingerprint and a key that may revoke it."""
         found = (self._revoked.wire(key, fingerprint) for fingerprint, key in fingerprints)
         return [wire for wire in found if wire is not None]
 

@@ -1,6 +1,6 @@
-"""What a RIB keeps of one advertisement.
+"""Route: the stored form of one advertisement in a RIB.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -19,17 +19,18 @@ class Route:
     """One advertiser of a name, verified.
 
     Args:
-        sender: the switch or RIB that relayed the claim, whose quota it counts against.
-        switch: where the advertiser is attached, as its RtCert says.
-        domain: where that switch stands.
-        via: the domain of ``sender``: another one where the claim came over several tiers.
+        sender: the switch or RIB that relayed the advertisement, and whose quota it uses.
+        switch: where the advertiser is attached, from its RtCert.
+        domain: the domain of that switch.
+        via: the domain of ``sender``: another one where the advertisement came over several tiers.
         transit: domains through which that domain lets its traffic pass.
-        claim: the signed bytes.
-        is_from_above: learnt from the tier above, to be passed down only.
+        advertisement: the signed bytes.
+        is_from_above: learnt from the tier above, and sent downwards only.
         expires_s: end of the lease, monotonic seconds.
-        valid_until_unix_s: ``CLOCK_SKEW_S`` after the claim's evidence runs out; it cannot be played back after that.
+        valid_until_unix_s: ``CLOCK_SKEW_S`` after the advertisement's evidence expires; no replay is possible after
+            that.
         fingerprints: of that evidence; a revocation names one of them.
-        issuers: keys that may revoke something of it, the domain's root apart.
+        issuers: keys that may revoke part of it, apart from the domain's root.
     """
 
     name: Name
@@ -60,7 +61,7 @@ class Route:
         expires_s: float,
         is_from_above: bool = False,
     ) -> Route:
-        """Return what is kept of a verified claim."""
+        """Return the route of a verified advertisement."""
         return cls(
             name=advertisement.name,
             advertiser=advertisement.node,
@@ -87,12 +88,12 @@ class Route:
 
 @dataclass(frozen=True, slots=True)
 class Withdrawn:
-    """What stays of a withdrawn or expired advertisement: the sequence number that a new one must pass.
+    """What remains of a withdrawn or expired advertisement: the sequence number that a new one must exceed.
 
-    It counts against its sender's quota like a route: else claiming and withdrawing in turn would fill the store.
+    It uses its sender's quota like a route; otherwise, alternate advertisements and withdrawals would fill the store.
 
     Args:
-        proof: the signed withdrawal; empty for a lease that ended, which every RIB notices by itself.
+        proof: the signed withdrawal; empty for a lease that ended, which every RIB detects by itself.
         membership: of its maker, whose key signed it.
     """
 

@@ -1,7 +1,6 @@
-"""Where a RIB keeps its routes.
+"""Store of a RIB's routes: the interface, and the embedded store in memory.
 
-Place: pure; the interface, and the embedded store, which is memory. Leases, other RIBs of the domain
-(``replication.py``) or a snapshot refill it after a restart.
+Sans-I/O. Leases, other RIBs of the domain (``replication.py``) or a snapshot refill it after a restart.
 """
 
 from __future__ import annotations
@@ -23,21 +22,21 @@ __all__ = ["MemoryStore", "Store"]
 class Store(Protocol):
     """Routes by name and advertiser.
 
-    Every method may raise ``StoreError``: try again.
+    Every method may raise ``StoreError``: the caller may try again.
     """
 
     @property
     def digests(self) -> DigestTree | None:
-        """Return hashes over what is kept, for replication; None where several RIBs share the store itself."""
+        """Return hashes over the contents, for replication; None where several RIBs share the store itself."""
 
     def __len__(self) -> int:
-        """Return how many routes are kept."""
+        """Return how many routes are stored."""
 
     def prefetch(self, names: Collection[Name], now: Timestamps) -> None:
-        """Make ready what the next calls are about, all in one go."""
+        """Prefetch the entries that the next calls concern, all in one go."""
 
     def commit(self) -> list[Key]:
-        """End a turn of changes; return the keys whose change was not taken: the cause has told, or may try again."""
+        """End a turn of changes; return the keys whose change was not accepted, which a later statement may repeat."""
 
     def routes(self, name: Name) -> list[Route]:
         """Return a name's routes."""
@@ -49,25 +48,25 @@ class Store(Protocol):
         """Add or replace a route."""
 
     def withdraw(self, name: Name, advertiser: Name, withdrawn: Withdrawn | None = None) -> Route | None:
-        """Take a route away and return it; keep ``withdrawn``, by default the sequence number that it had."""
+        """Remove a route and return it; store ``withdrawn``, by default its sequence number."""
 
     def expire(self, now_s: float, unix_s: float) -> list[Route]:
-        """Take away, keeping sequence numbers, and return the routes whose lease ended."""
+        """Remove and return the routes whose lease ended; their sequence numbers stay."""
 
     def next_expiry(self) -> float | None:
         """Return the monotonic second of the next lease end, or None."""
 
     def count_of(self, owner: Name) -> int:
-        """Return how many routes are kept that a sender relayed, or a node advertises.
+        """Return how many routes are stored that a sender relayed, or a node advertises.
 
-        Withdrawn ones that are not forgotten count too.
+        Withdrawn ones that have not expired count too.
         """
 
     def resting_on(self, mark: bytes) -> list[Route]:
         """Return the routes whose evidence includes a certificate, by its fingerprint, or one that a key issued."""
 
     def has_issuer(self, key: bytes) -> bool:
-        """Return whether a route rests on a certificate that this key, 33 bytes, issued."""
+        """Return whether a route depends on a certificate that this key, 33 bytes, issued."""
 
 
 class MemoryStore:
@@ -81,22 +80,23 @@ class MemoryStore:
         self._forget: list[tuple[int, Name, Name]] = []
         self._size = 0
         self._evidence = EvidenceIndex[Key]()
-        self.changes: set[Key] | None = None  # what changed since a snapshot was told; None: there is none
-        self.digests = DigestTree()  # over what replicates: all but what the tier above told, and leases that ended
+        self.changes: set[Key] | None = None  # what changed since the last snapshot; None: there are no snapshots
+        # over the replicated entries: all but those from the tier above, and leases that ended
+        self.digests = DigestTree()
 
     def __len__(self) -> int:
         return self._size
 
     def known(self) -> Iterator[Key]:
-        """Yield the name and advertiser of each route and of each withdrawal that is not forgotten."""
+        """Yield the name and advertiser of each route and of each withdrawal that has not expired."""
         yield from ((name, advertiser) for name, routes in self._routes.items() for advertiser in routes)
         yield from self._withdrawn
 
     def prefetch(self, names: Collection[Name], now: Timestamps) -> None:
-        """Do nothing: all of it is in memory."""
+        """Do nothing: everything is in memory."""
 
     def commit(self) -> list[Key]:
-        """Return nothing: memory takes everything."""
+        """Return nothing: memory accepts every change."""
         return []
 
     def routes(self, name: Name) -> list[Route]:
@@ -123,7 +123,7 @@ class MemoryStore:
         heapq.heappush(self._ends, (route.expires_s, route.name, route.advertiser))
 
     def withdraw(self, name: Name, advertiser: Name, withdrawn: Withdrawn | None = None) -> Route | None:
-        """Take a route away and return it; keep ``withdrawn``, by default the sequence number that it had."""
+        """Remove a route and return it; store ``withdrawn``, by default its sequence number."""
         route = self._take(name, advertiser)
         if withdrawn is None:
             if route is None:
@@ -140,7 +140,7 @@ class MemoryStore:
         return route
 
     def expire(self, now_s: float, unix_s: float) -> list[Route]:
-        """Take away, keeping sequence numbers, and return the routes whose lease ended."""
+        """Remove and return the routes whose lease ended; their sequence numbers stay."""
         gone = []
         while self._ends and self._ends[0][0] <= now_s:
             _, name, advertiser = heapq.heappop(self._ends)
@@ -162,7 +162,7 @@ class MemoryStore:
         return self._ends[0][0] if self._ends else None
 
     def count_of(self, owner: Name) -> int:
-        """Return how many routes are kept that a sender relayed, or a node advertises."""
+        """Return how many routes are stored that a sender relayed, or a node advertises."""
         return self._counts.get(owner, 0)
 
     def resting_on(self, mark: bytes) -> list[Route]:
@@ -170,7 +170,7 @@ class MemoryStore:
         return [self._routes[name][advertiser] for name, advertiser in self._evidence.resting_on(mark)]
 
     def has_issuer(self, key: bytes) -> bool:
-        """Return whether a route rests on a certificate that this key, 33 bytes, issued."""
+        """Return whether a route depends on a certificate that this key, 33 bytes, issued."""
         return self._evidence.has(key)
 
     def _take(self, name: Name, advertiser: Name) -> Route | None:

@@ -1,7 +1,7 @@
-"""Advertisements on their way to the tier above: repeated until one of its RIBs has judged them.
+"""Advertisements for the tier above: each is repeated until one of its RIBs has acknowledged it.
 
-Layer: sans-I/O; time comes in as ``now_s`` (monotonic seconds). Of several RIBs above one is used; where it does not
-answer, the next one is. While none answers, what waits is kept to the end of its lease, within a bound.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Of several RIBs above one is used; where it does not respond,
+the next one is. While none responds, pending advertisements are kept to the end of their leases, within a bound.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ __all__ = ["Passed", "UpstreamAdvertisements"]
 RETRY_S: Final = 0.3
 RETRY_MAX_S: Final = 5.0
 SILENT_MIN_S: Final = 0.12  # a RIB above that leaves a probe unanswered for so long, or three round trips more ...
-SILENT_MAX_S: Final = 1.0  # ... but no longer than this, makes room for the next one
-PROBE_S: Final = 1.0  # with several RIBs above, the one in use is asked something at least this often
-SEND_MAX: Final = 256  # at once, so that verdicts are heard in between
+SILENT_MAX_S: Final = 1.0  # ... but no longer than this, is replaced by the next one
+PROBE_S: Final = 1.0  # with several RIBs above, the one in use receives a query or a probe at least this often
+SEND_MAX: Final = 256  # at once, so that AdvertiseAcks are received in between
 GONE_S: Final = 1.0  # a tier above that is silent for so long is sent one advertisement at a time
 WAITING_MAX: Final = 65_536
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Passed:
-    """A claim or withdrawal to pass up, until ``until_s`` at most."""
+    """An advertisement or withdrawal for the tier above, until ``until_s`` at most."""
 
     key: Key
     sequence: int
@@ -56,9 +56,9 @@ class UpstreamAdvertisements:
         self._at = 0
         self._waiting: dict[Key, _Waiting] = {}
         self._due: list[tuple[float, Key]] = []
-        self._asked_s: float | None = None  # since when something is unanswered
+        self._asked_s: float | None = None  # since when a message is unanswered
         self._heard_s = float("-inf")
-        self._round_trip_s = 0.0  # smoothed, as RFC 6298 does it
+        self._round_trip_s = 0.0  # smoothed, as in RFC 6298
         self.given_up = 0
 
     def __len__(self) -> int:
@@ -74,31 +74,31 @@ class UpstreamAdvertisements:
         return name in self._ribs
 
     def put(self, passed: Passed, now_s: float) -> None:
-        """Pass something up, at once and until it is judged; it replaces what waited for the same advertiser."""
+        """Send an advertisement upstream until it is acknowledged; it replaces the same advertiser's pending one."""
         if passed.key not in self._waiting and len(self._waiting) >= WAITING_MAX:
             self._drop(next(iter(self._waiting)))
         self._waiting[passed.key] = _Waiting(passed, now_s)
         heapq.heappush(self._due, (now_s, passed.key))
 
     def settle(self, key: Key, sequence: int) -> None:
-        """Note a verdict on a sequence number, or on an older claim than one that is held above."""
+        """Record an AdvertiseAck for a sequence number, or for an older advertisement than one stored above."""
         waiting = self._waiting.get(key)
         if waiting is not None and sequence >= waiting.passed.sequence:
             del self._waiting[key]
 
     def refused(self, key: Key) -> None:
-        """Note that what waits for an advertiser will not be taken."""
+        """Record that an advertiser's pending advertisement was rejected."""
         self._waiting.pop(key, None)
 
     def probe(self, now_s: float, quiet_s: float) -> bool:
-        """Return whether to ask the RIB in use, one of several and silent for ``quiet_s``, for a sign of life."""
+        """Return whether to probe the RIB in use, if it is one of several and silent for ``quiet_s``."""
         if len(self._ribs) < 2 or self._asked_s is not None or now_s - self._heard_s < quiet_s:
             return False
         self._asked_s = now_s
         return True
 
     def heard(self, rib: Name, now_s: float) -> None:
-        """Note a sign of life of the RIB in use; after a long silence all that waits is due."""
+        """Record a sign of life of the RIB in use; after a long silence all pending advertisements are due."""
         if rib != self.rib:
             return
         if self._asked_s is not None:
@@ -108,7 +108,7 @@ class UpstreamAdvertisements:
         self._asked_s, self._heard_s = None, now_s
 
     def turn_over(self, now_s: float) -> bool:
-        """Go on to the next RIB above if the one in use is silent; return whether that is so."""
+        """Select the next RIB above if the one in use is silent; return whether that is so."""
         if len(self._ribs) < 2 or self._asked_s is None or now_s - self._asked_s < self._silent_s():
             return False
         self._at = (self._at + 1) % len(self._ribs)
@@ -117,7 +117,7 @@ class UpstreamAdvertisements:
         return True
 
     def due(self, now_s: float) -> list[Passed]:
-        """Return what to send to ``rib`` now; what outlived its lease is given up, and counted."""
+        """Return the advertisements to send to ``rib`` now; those with ended leases are dropped, and counted."""
         found: list[Passed] = []
         most = 1 if self._is_gone(now_s) else SEND_MAX
         while self._due and self._due[0][0] <= now_s and len(found) < SEND_MAX:
@@ -138,7 +138,7 @@ class UpstreamAdvertisements:
         return found
 
     def next_due(self) -> float | None:
-        """Return a monotonic second that is no later than the next thing to do, or None."""
+        """Return a monotonic second that is no later than the next timer, or None."""
         times = [self._due[0][0]] if self._due else []
         if len(self._ribs) > 1:
             times.append(self._heard_s + PROBE_S if self._asked_s is None else self._asked_s + self._silent_s())

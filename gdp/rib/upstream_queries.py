@@ -1,7 +1,7 @@
-"""What was asked of the tier above, for whom, and what is to be asked again.
+"""Queries to the tier above: for which askers, and when each is repeated.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds). A question that stays open too long is answered in the
-negative rather than left to time out at the asker.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). A query that stays open too long gets a negative response,
+rather than a timeout at the asker.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ class _Open:
 
 
 class UpstreamQueries:
-    """Questions to the tier above.
+    """Queries to the tier above.
 
     Args:
-        is_top: there is no tier above: nothing is ever asked.
+        is_top: there is no tier above: no query is ever sent.
     """
 
     def __init__(self, *, is_top: bool) -> None:
         self._is_top = is_top
         self._open: dict[Name, _Open] = {}
-        self._due_s = float("inf")  # no question is due before
+        self._due_s = float("inf")  # no query is due before
 
     def want(self, name: Name, asker: Asker, watch_s: float, now_s: float, *, is_known: bool) -> bool:
-        """Note that somebody asks; return whether the tier above must be asked now.
+        """Record an asker's query; return whether a query to the tier above must be sent now.
 
-        A known name is asked for only when it is watched: others may advertise it elsewhere.
+        A known name is queried only when it is watched: others may advertise it elsewhere.
         """
         if self._is_top or (is_known and watch_s == 0):
             return False
@@ -66,33 +66,33 @@ class UpstreamQueries:
         return is_new
 
     def ask_again(self, now_s: float) -> None:
-        """Have every open question and every watch asked at once: there is another RIB above."""
+        """Make every open query and every watch due at once: there is another RIB above."""
         for question in self._open.values():
             question.again_s = now_s
         self._due_s = min(self._due_s, now_s)
 
     def watch_s(self, name: Name) -> float:
-        """Return for how long to watch a name above: longer than until it is asked again."""
+        """Return for how long to watch a name above: longer than until its query is repeated."""
         question = self._open.get(name)
         return 3 * WATCH_AGAIN_S if question is not None and question.watch_until_s else 0.0
 
     def is_waiting(self, name: Name) -> bool:
-        """Return whether an answer from above is still awaited."""
+        """Return whether a response from above is still pending."""
         question = self._open.get(name)
         return question is not None and not question.is_answered
 
     def answered(self, name: Name, now_s: float) -> list[Asker]:
-        """Note an answer; return who waited for it. There may be more answers to come, for the same askers."""
+        """Record a response; return the askers that waited for it. More responses may come for the same askers."""
         question = self._open.get(name)
         if question is None:
             return []
-        if not question.is_answered:  # what is pushed later renews no watch
+        if not question.is_answered:  # a later update renews no watch
             question.is_answered = True
             question.again_s = now_s + WATCH_AGAIN_S
         return list(question.askers)
 
     def due(self, now_s: float) -> tuple[list[tuple[Name, float]], list[tuple[Name, list[Asker]]]]:
-        """Return what to ask now, as (name, watch seconds), and what was given up, as (name, askers)."""
+        """Return the queries to send now, as (name, watch seconds), and those given up, as (name, askers)."""
         ask: list[tuple[Name, float]] = []
         given_up: list[tuple[Name, list[Asker]]] = []
         if now_s < self._due_s:
@@ -115,5 +115,5 @@ class UpstreamQueries:
         return ask, given_up
 
     def next_due(self) -> float | None:
-        """Return a monotonic second that is no later than the next question, or None."""
+        """Return a monotonic second that is no later than the next query, or None."""
         return self._due_s if self._open else None

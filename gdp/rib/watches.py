@@ -1,6 +1,6 @@
-"""Who wants to be told of changes to a name, and until when.
+"""Watches: which members are notified of changes to a name, and until when.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds).
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ __all__ = ["Asker", "Watches"]
 
 
 class Asker(NamedTuple):
-    """A proven member that asks or watches."""
+    """A proven member that queries or watches."""
 
     name: Name
     domain: Name
@@ -25,10 +25,10 @@ class Asker(NamedTuple):
 
 
 class Watches:
-    """Watches by name and asker; their ends in a heap, whose entries are renewed when they come up.
+    """Watches by name and asker; their ends are in a heap, whose entries are renewed when they reach the top.
 
     Args:
-        maximum: how many there may be at once, shared among those who watch and their domains.
+        maximum: how many there may be at once, shared among the askers and their domains.
     """
 
     def __init__(self, maximum: int = RIB_WATCHES_MAX) -> None:
@@ -40,7 +40,7 @@ class Watches:
         return len(self._shares)
 
     def add(self, name: Name, asker: Asker, until_s: float) -> None:
-        """Watch, or watch on.
+        """Add or renew a watch.
 
         Raises:
             StatementError: QUOTA.
@@ -56,7 +56,7 @@ class Watches:
         heapq.heappush(self._ends, (until_s, name, asker))
 
     def watchers(self, name: Name, now_s: float) -> list[Asker]:
-        """Return who watches a name now."""
+        """Return the askers that watch a name now."""
         return [asker for asker, until_s in self._by_name.get(name, {}).items() if until_s > now_s]
 
     def names(self) -> list[Name]:
@@ -64,7 +64,7 @@ class Watches:
         return list(self._by_name)
 
     def expire(self, now_s: float) -> None:
-        """Forget watches that ended."""
+        """Remove watches that ended."""
         while self._ends and self._ends[0][0] <= now_s:
             _, name, asker = self._ends[0]
             until_s = self._by_name[name][asker]

@@ -1,7 +1,7 @@
-"""How many second copies requests may have.
+"""Hedge budget: how many second copies requests may have.
 
-Place: pure.
-Source: Dean and Barroso, "The Tail at Scale", CACM 56(2), 2013: a few percent of hedged requests take the tail away.
+Sans-I/O. Source: Dean and Barroso, "The Tail at Scale", CACM 56(2), 2013: a few percent of hedged requests remove the
+tail.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ from typing import Final
 
 __all__ = ["HedgeBudget"]
 
-SAVED_MAX: Final = 10.0  # second copies that quiet times leave for a burst
+SAVED_MAX: Final = 10.0  # second copies that quiet times save for a burst
 
 
 class HedgeBudget:
-    """Earned by requests, spent by second copies.
+    """Budget that requests earn and second copies spend.
 
     Args:
         share: second copies per request, 0 to 1.
@@ -27,11 +27,11 @@ class HedgeBudget:
         self._saved = 0.0
 
     def earn(self) -> None:
-        """Note a request."""
+        """Record a request."""
         self._saved = min(self._saved + self._share, SAVED_MAX)
 
     def spend(self) -> bool:
-        """Return whether a second copy may go; that counts as one."""
+        """Return whether a second copy may be sent; that spends one."""
         if self._saved < 1 - 1e-9:  # fifty shares of 0.02 are one
             return False
         self._saved -= 1

@@ -1,9 +1,8 @@
-"""The calls of one service that are under way: who waits for which answer, and until when.
+"""Calls of one service that are under way: which caller waits for which response, and until when.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds).
-Source: docs/explanation/design.md, section 6:
-the first answer wins. A call ends once: by its first answer, by its time running out, or
-with all others; whatever comes for it later finds nobody.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: docs/explanation/design.md, section 6: the first
+response wins. A call ends once: by its first response, by its timeout, or with all others. Whatever comes for it later
+finds no call.
 """
 
 from __future__ import annotations
@@ -19,22 +18,22 @@ __all__ = ["Calls"]
 T = TypeVar("T")
 
 _NUMBERS: Final = 1 << 64
-_SPARE: Final = 64  # timers of ended calls that are worth no clearing
+_SPARE: Final = 64  # timers of ended calls that are not worth a clean-up
 
 
 class Calls(Generic[T]):
-    """Calls under way, each with what its caller wants to find again.
+    """Calls under way, each with its caller's context.
 
     Args:
         limit: of calls at once.
-        start: the first call's number, random in 64 bits: no number of an earlier life is met again.
+        start: the first call's number, random in 64 bits: no number of an earlier incarnation recurs.
     """
 
     def __init__(self, limit: int, start: int) -> None:
         self._limit = limit
         self._next = start % _NUMBERS
-        self._contexts: dict[int, T] = {}  # in the order of their beginning
-        self._timers: list[tuple[float, int]] = []  # a heap; of ended calls, too
+        self._contexts: dict[int, T] = {}  # in the order of their start
+        self._timers: list[tuple[float, int]] = []  # a heap; includes ended calls
 
     def __len__(self) -> int:
         return len(self._contexts)
@@ -47,15 +46,15 @@ class Calls(Generic[T]):
         return iter(list(self._contexts.items()))
 
     def add_call(self, now_s: float, timeout_s: float | None, context: T) -> int:
-        """Return the number of a new call; none comes twice.
+        """Add a call and return its number; no number recurs.
 
         Args:
             now_s: the present moment.
-            timeout_s: how long it may take; None: as long as it likes.
-            context: what ``end``, ``expired`` or ``fail_all`` gives back.
+            timeout_s: how long it may take; None: no limit.
+            context: what ``end``, ``expired`` or ``fail_all`` returns.
 
         Raises:
-            LocalError: as many as there may be are under way.
+            LocalError: the limit of calls under way is reached.
         """
         if len(self._contexts) >= self._limit:
             raise LocalError(f"{self._limit} calls are under way: no more at once")
@@ -67,11 +66,11 @@ class Calls(Generic[T]):
         return number
 
     def get(self, number: int) -> T | None:
-        """Return the context of a call that is under way, or None."""
+        """Return the context of a call under way, or None."""
         return self._contexts.get(number)
 
     def end(self, number: int) -> T | None:
-        """End a call; return its context, or None where it has ended before."""
+        """End a call; return its context, or None where it ended before."""
         context = self._contexts.pop(number, None)
         if context is not None and len(self._timers) > 2 * len(self._contexts) + _SPARE:
             self._timers = [timer for timer in self._timers if timer[1] in self._contexts]
@@ -79,7 +78,7 @@ class Calls(Generic[T]):
         return context
 
     def expired(self, now_s: float) -> list[tuple[int, T]]:
-        """End the calls whose time has run out; return their numbers and contexts, the longest overdue first."""
+        """End the calls whose timeout has passed; return their numbers and contexts, the longest overdue first."""
         ended = []
         while self._timers and self._timers[0][0] <= now_s:
             number = heapq.heappop(self._timers)[1]
@@ -88,13 +87,13 @@ class Calls(Generic[T]):
         return ended
 
     def get_timer(self) -> float | None:
-        """Return the monotonic second at which a call's time runs out, or None."""
+        """Return the monotonic second of the next timeout, or None."""
         while self._timers and self._timers[0][1] not in self._contexts:
             heapq.heappop(self._timers)
         return self._timers[0][0] if self._timers else None
 
     def fail_all(self) -> list[tuple[int, T]]:
-        """End every call, since nobody is left to answer; return their numbers and contexts, the oldest first."""
+        """End every call, since no server is left to respond; return their numbers and contexts, the oldest first."""
         ended = list(self._contexts.items())
         self._contexts.clear()
         self._timers.clear()

@@ -1,15 +1,16 @@
-"""Requests to a service that has several servers: whom to ask, whose answer counts, whom to tell that it is over.
+"""Dispatch of requests to several servers: which servers to ask, which response counts, which servers to stop.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds); what is to be sent comes out of ``take``.
-Source: FogROS2-FT: all replicas are asked and the first answer wins; hedging after "The Tail at Scale" (2013).
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds); ``poll_effects`` returns what to send. Source: FogROS2-FT: all
+replicas are asked and the first response wins; hedging after "The Tail at Scale" (2013).
 
-A call under way has asked some servers, which owe it an answer; others said no. It ends once::
+A call under way has sent its request to some servers, which owe it a response; others refused or declined. It ends
+once::
 
-    first valid answer of one that owes it  ->  answered;  after GATHER_S those still owing are told to stop
-    its time is up                          ->  failed (or answered with the best that was declined)
-    nobody owes it, and nobody is left      ->  likewise
+    first valid response of a server that owes one  ->  answered;  after GATHER_S the servers still owing get a stop
+    its timeout passes                              ->  failed (or answered with the best response that declined)
+    no server owes one, and no server is left       ->  likewise
 
-When one that owes an answer says no or goes, the next one not yet asked is asked at once.
+When a server that owes a response refuses, declines or goes, the next untried server is asked at once.
 """
 
 from __future__ import annotations
@@ -32,17 +33,19 @@ __all__ = ["STOP_MAX", "Ask", "Dispatch", "Effect", "Failure", "Stop"]
 A = TypeVar("A")
 
 CALLS_MAX: Final = 65_536  # under way at once
-HELD_MAX_BYTES: Final = 128 << 20  # of their requests, kept for servers that are asked later; the last may pass it
-GATHER_S: Final = 0.004  # servers that answer so soon after the first need no word
-STOP_MAX: Final = 1_024  # calls in one word
-HEDGE_PERCENTILE: Final = 0.95  # of recent answers, after which a second copy may go
-HEDGE_LATER_MAX: Final = 4.0  # times that, where a small budget is better spent on the slowest few
-HEDGE_FIRST_S: Final = 0.05  # while there are too few of them
+# of their requests, kept for servers that are asked later; the last request may exceed it
+HELD_MAX_BYTES: Final = 128 << 20
+GATHER_S: Final = 0.004  # servers that respond so soon after the first need no stop
+STOP_MAX: Final = 1_024  # calls in one stop message
+HEDGE_PERCENTILE: Final = 0.95  # of recent response times, after which a second copy may be sent
+# multiple of that wait, where a small budget is better spent on the slowest few
+HEDGE_LATER_MAX: Final = 4.0
+HEDGE_FIRST_S: Final = 0.05  # while there are too few response times
 _HEDGE_MIN_S: Final = 0.0005
 
 
 class Failure(Enum):
-    """Why a call ended without an answer."""
+    """Why a call ended without a response."""
 
     TIMED_OUT = "timed out"
     NO_SERVER = "no server"
@@ -50,7 +53,7 @@ class Failure(Enum):
 
 
 class Ask(NamedTuple):
-    """Send a request to these servers; None: to everybody, by the tree."""
+    """Send a request to these servers; None: to all, by the tree."""
 
     call: int
     request: bytes
@@ -58,7 +61,7 @@ class Ask(NamedTuple):
 
 
 class Stop(NamedTuple):
-    """Tell a server that calls have ended; None: tell everybody, by the tree."""
+    """Tell servers to stop ended calls; None: all servers, by the tree."""
 
     calls: tuple[int, ...]
     server: Name | None
@@ -74,9 +77,9 @@ class _Call(Generic[A]):
     begun_s: float
     request: bytes = b""
     owing: dict[Name, float] = field(default_factory=dict)  # and since when
-    tried: set[Name] = field(default_factory=set)  # whoever was asked, there still or not
+    tried: set[Name] = field(default_factory=set)  # every server that was asked, still there or not
     refused: set[Name] = field(default_factory=set)
-    declined: list[A] = field(default_factory=list)  # an answer that says no, should nobody say yes
+    declined: list[A] = field(default_factory=list)  # responses that decline, used if no server does better
 
 
 class _Ended(NamedTuple):
@@ -85,15 +88,15 @@ class _Ended(NamedTuple):
 
 
 class Dispatch(Generic[A]):
-    """The calls of one service from here.
+    """The calls of one service from this client.
 
     Args:
         start: the first call's number, random in 64 bits.
-        stops: whether servers that still owe an answer are to be told when a call has ended.
+        stops: whether servers that still owe a response receive a stop when a call has ended.
 
     Attributes:
-        late: answers that came for a call that had ended.
-        strange: answers of servers that were not asked, or that said no before.
+        late: responses that came for a call that had ended.
+        strange: responses of servers that were not asked, or that refused or declined before.
     """
 
     def __init__(
@@ -110,12 +113,12 @@ class Dispatch(Generic[A]):
         self._calls: Calls[_Call[A]] = Calls(calls_max, start)
         self._held_max_bytes = held_max_bytes
         self._held_bytes = 0
-        self._servers: dict[Name, bool] = {}  # whether it leaves
+        self._servers: dict[Name, bool] = {}  # whether it is leaving
         self._latencies = Latencies()
         self._budget = HedgeBudget(replication.budget)
-        self._hedges: list[tuple[float, int]] = []  # a heap; of ended calls, too
-        self._late: dict[int, None] = {}  # whose second copy waits for the budget, the oldest first
-        self._ended: dict[int, _Ended] = {}  # in the order of their time
+        self._hedges: list[tuple[float, int]] = []  # a heap; includes ended calls
+        self._late: dict[int, None] = {}  # calls whose second copy waits for the budget, the oldest first
+        self._ended: dict[int, _Ended] = {}  # in the order of their end
         self._effects: list[Effect] = []
         self.late = 0
         self.strange = 0
@@ -129,12 +132,12 @@ class Dispatch(Generic[A]):
 
     @property
     def servers(self) -> list[Name]:
-        """Return the servers that are there, those that leave included."""
+        """Return the servers that are there, leaving ones included."""
         return list(self._servers)
 
     @property
     def held_bytes(self) -> int:
-        """Return how much the requests of calls under way take."""
+        """Return the bytes that the requests of calls under way use."""
         return self._held_bytes
 
     def begin(
@@ -146,14 +149,14 @@ class Dispatch(Generic[A]):
         failed: Callable[[Failure, str], None],
         first: Sequence[Name] = (),
     ) -> int:
-        """Return the number of a new call; one of the callbacks is called, once, and never from here.
+        """Begin a call and return its number; one of the callbacks is called, once, and never from here.
 
         Args:
-            write: returns the request under its number; not called where this raises.
-            timeout_s: how long it may take; None: as long as it likes.
-            answered: called with the first valid answer.
-            failed: called with why there is none, and the last server's words.
-            first: servers that are asked at first, in place of what the replication says.
+            write: returns the request under its number; not called where ``begin`` raises.
+            timeout_s: how long it may take; None: no limit.
+            answered: called with the first valid response.
+            failed: called with the failure, and the last server's reason.
+            first: servers to ask at first, instead of those that the replication selects.
 
         Raises:
             LocalError: there is no server, or too much is under way.
@@ -182,7 +185,7 @@ class Dispatch(Generic[A]):
         return number
 
     def came(self, server: Name, now_s: float) -> None:
-        """Learn of a server; where all are asked, it is asked what is under way, too, but for what it was asked."""
+        """Add a server; where all are asked, it also receives the calls under way that it has not received yet."""
         if server in self._servers:
             self._servers[server] = False
             return
@@ -193,12 +196,12 @@ class Dispatch(Generic[A]):
                     self._ask(number, call, [server], now_s)
 
     def leaves(self, server: Name) -> None:
-        """Learn that a server goes soon: it is asked only where no other is left, and its answers are good."""
+        """Record that a server goes soon: it is asked only where no other is left, and its responses count."""
         if server in self._servers:
             self._servers[server] = True
 
     def gone(self, server: Name, now_s: float, reason: str) -> None:
-        """Learn that a server is no more, or no longer confirms."""
+        """Remove a server that is gone, or no longer confirms."""
         if self._servers.pop(server, None) is None:
             return
         self._latencies.forget(server)
@@ -210,7 +213,7 @@ class Dispatch(Generic[A]):
                 self._go_on(number, call, Failure.NO_SERVER, reason, now_s)
 
     def answered(self, number: int, server: Name, answer: A, now_s: float) -> None:
-        """Take a valid answer."""
+        """Handle a valid response."""
         call = self._take(number, server, now_s)
         if call is None:
             return
@@ -222,14 +225,14 @@ class Dispatch(Generic[A]):
         call.answered(answer)
 
     def refused(self, number: int, server: Name, reason: str, now_s: float) -> None:
-        """Take a server's word that it has no answer."""
+        """Handle a server's refusal: it has no response."""
         call = self._take(number, server, now_s, says_no=True)
         if call is not None:
             call.refused.add(server)
             self._go_on(number, call, Failure.REFUSED, reason, now_s)
 
     def declined(self, number: int, server: Name, answer: A, now_s: float) -> None:
-        """Take an answer that says no: it counts if nobody says yes."""
+        """Handle a response that declines: it counts if no server gives a better one."""
         call = self._take(number, server, now_s, says_no=True)
         if call is not None:
             call.refused.add(server)
@@ -237,7 +240,7 @@ class Dispatch(Generic[A]):
             self._go_on(number, call, Failure.REFUSED, "", now_s)
 
     def handle_timer(self, now_s: float) -> None:
-        """Do what is due."""
+        """Run the timers that are due."""
         for number, call in self._calls.expired(now_s):
             self._fail(number, call, Failure.TIMED_OUT, "")
         while self._hedges and self._hedges[0][0] <= now_s:
@@ -255,7 +258,7 @@ class Dispatch(Generic[A]):
         return min((time for time in times if time is not None), default=None)
 
     def fail_all(self, reason: str) -> None:
-        """End every call, for nobody is asked any more."""
+        """End every call, because no server is asked any more."""
         for number, call in self._calls:
             if self._calls.end(number) is not None:
                 self._fail(number, call, Failure.NO_SERVER, reason)
@@ -263,12 +266,12 @@ class Dispatch(Generic[A]):
         self._ended.clear()
 
     def poll_effects(self) -> list[Effect]:
-        """Return, once, what is to be sent, in order; no request of a call that has ended meanwhile."""
+        """Return, once, what to send, in order; no request of a call that has ended meanwhile."""
         effects, self._effects = self._effects, []
         return [each for each in effects if isinstance(each, Stop) or each.call in self._calls]
 
     def _take(self, number: int, server: Name, now_s: float, *, says_no: bool = False) -> _Call[A] | None:
-        """Return the call to which this server owed an answer, and note that it owes none any more."""
+        """Return the call to which this server owed a response, and record that it owes none any more."""
         call = self._calls.get(number)
         if call is None:
             self.late += 1
@@ -288,7 +291,7 @@ class Dispatch(Generic[A]):
         return call
 
     def _go_on(self, number: int, call: _Call[A], failure: Failure, reason: str, now_s: float) -> None:
-        """Ask the next in place of one that has no answer; fail where nobody is left."""
+        """Ask the next server instead of one without a response; fail where no server is left."""
         if number not in self._calls:
             return  # a callback ended it
         self._ask(number, call, self._untried(call, now_s)[:1], now_s)
@@ -297,7 +300,7 @@ class Dispatch(Generic[A]):
             self._fail(number, call, failure, reason)
 
     def _untried(self, call: _Call[A], now_s: float) -> list[Name]:
-        """Return whom to ask next, the best first; those that leave come last."""
+        """Return the servers to ask next, the best first; leaving ones come last."""
         free = [server for server in self._servers if server not in call.owing and server not in call.refused]
         return sorted(self._latencies.ranked(free, now_s), key=self._servers.__getitem__)
 
@@ -310,7 +313,7 @@ class Dispatch(Generic[A]):
             self._effects.append(Ask(number, call.request, tuple(servers)))
 
     def _hedge(self, now_s: float) -> None:
-        """Send second copies of late calls, as far as the budget goes; what it lacks, requests to come will bring."""
+        """Send second copies of late calls within the budget; later requests earn what is missing."""
         while self._late:
             number = next(iter(self._late))
             call = self._calls.get(number)
@@ -323,7 +326,7 @@ class Dispatch(Generic[A]):
             del self._late[number]
 
     def _hedge_after_s(self) -> float:
-        """Return how long a first copy has."""
+        """Return the time that a first copy has, in seconds."""
         soon_s = self._latencies.percentile(HEDGE_PERCENTILE)
         late_s = self._latencies.percentile(max(HEDGE_PERCENTILE, 1 - 0.75 * self._replication.budget))
         if soon_s is None or late_s is None:

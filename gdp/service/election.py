@@ -1,9 +1,9 @@
-"""Election of the log that orders a service: which replica it begins with, and which sequencer yields.
+"""Election of the log that orders a service: with which replica it begins, and which sequencer yields.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
-The log begins with the replica that is furthest, and of these the one with the least name: of two sequencers that begin
-at once one gets it. Of two logs the greater holds.
+The log begins with the replica that is furthest, and among equals the one with the least name. So of two sequencers
+that begin at once only one gets it. Of two logs the greater wins.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from gdp.service.replication_messages import LogId, ReplicaStatus
 
 __all__ = ["Elected", "Election"]
 
-COLLECT_S: Final = 1.0  # after the last replica came, before the log begins without those that are silent
+COLLECT_S: Final = 1.0  # after the last replica joined, before the log begins without silent replicas
 _UNKNOWN: Final = "what state its server is in is not known; start it anew"
 
 
@@ -47,11 +47,11 @@ class Election:
         self._collect_until_s = now_s + COLLECT_S
 
     def is_due(self, now_s: float) -> bool:
-        """Return whether silent replicas have had their time."""
+        """Return whether the time for silent replicas is over."""
         return now_s >= self._collect_until_s
 
     def must_yield(self, log: LogId, own: LogId, replicas: Replicas) -> bool:
-        """Return whether another log holds: unless the own one has begun and is greater."""
+        """Return whether another log wins: unless the own one has begun and is greater."""
         return not (replicas.following() and log < own)
 
     def elect(self, replicas: Replicas, instance: int) -> Elected | None:

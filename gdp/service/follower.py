@@ -1,9 +1,9 @@
-"""A replica of a service that keeps state: it gives its server one log's entries, in order, one at a time, each once.
+"""Follower: a replica of a service with state, which applies one log's entries in order, one at a time, each once.
 
-Place: pure; what is to be done comes out of ``take``.
+Sans-I/O; ``poll_effects`` returns what to do.
 
-The server does one thing at a time: an entry, or telling its state, or taking one on. What comes meanwhile waits. Where
-it fails at one of these its state is unknown, and stays so until it takes on a told one, or is started anew.
+The server does one operation at a time: it applies an entry, saves a snapshot, or loads one. Other work waits
+meanwhile. Where an operation fails, the server's state is unknown until it loads a snapshot or restarts.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from gdp.service.replication_messages import (
 
 __all__ = ["Apply", "Doing", "Fetch", "Follower", "Load", "Refuse", "Say"]
 
-HELD_MAX: Final = 1_024  # how far ahead of its server it takes entries
+HELD_MAX: Final = 1_024  # how far ahead of its server it accepts entries
 HELD_MAX_BYTES: Final = 64 << 20
 UNKEPT: Final = "this service takes requests in order, and follows nobody's yet"
 
 
 class Apply(NamedTuple):
-    """Give the server an entry."""
+    """Apply an entry at the server."""
 
     client: Name
     call: int
@@ -50,7 +50,7 @@ class Load(NamedTuple):
 
 
 class Say(NamedTuple):
-    """Tell a client."""
+    """Send a client a message."""
 
     client: Name
     word: FollowerMessage
@@ -68,7 +68,7 @@ Effect: TypeAlias = "Apply | Fetch | Load | Say | Refuse"
 
 
 class Doing(Enum):
-    """What the server is at."""
+    """What the server is doing."""
 
     NOTHING = "nothing"
     APPLYING = "applying"
@@ -77,7 +77,7 @@ class Doing(Enum):
 
 
 class Follower:
-    """Where one server is.
+    """The position and pending work of one server.
 
     Args:
         tells: whether its state can be read and written.
@@ -90,29 +90,29 @@ class Follower:
         self._index = 0
         self._is_lost = False
         self._sequencer: Name | None = None
-        self._held: dict[int, tuple[int, bytes]] = {}  # index -> call and request; of this log, not done yet
+        self._held: dict[int, tuple[int, bytes]] = {}  # index -> call and request; of this log, not applied yet
         self._held_bytes = 0
         self._gap_told = -1
-        self._follow: AttachReplica | None = None  # with a state that waits, or is being taken on
+        self._follow: AttachReplica | None = None  # with a snapshot that waits, or is being loaded
         self._asked_state = False
         self._effects: list[Effect] = []
         self.doing = Doing.NOTHING
 
     @property
     def sequencer(self) -> Name | None:
-        """Return whose log it follows."""
+        """Return the sequencer whose log it follows."""
         return self._sequencer
 
     def poll_effects(self) -> list[Effect]:
-        """Return, once, what is to be done, in order."""
+        """Return, once, what to do, in order."""
         effects, self._effects = self._effects, []
         return effects
 
     def heard(self, client: Name, word: ReplicaProbe | AttachReplica | SnapshotRequest) -> None:
-        """Take a keeper's word."""
+        """Handle a sequencer's message."""
         if isinstance(word, ReplicaProbe):
             if client == self._sequencer and word.life != self._log.life and self._follow is None:
-                self._sequencer = None  # it keeps this log no more
+                self._sequencer = None  # the sequencer keeps this log no more
             if self._follow is None or client != self._sequencer:
                 self._say(client)
         elif isinstance(word, AttachReplica):
@@ -124,18 +124,18 @@ class Follower:
         self._go_on()
 
     def entry(self, client: Name, call: int, request: bytes) -> None:
-        """Take an entry, or what somebody takes for one."""
+        """Handle an entry, or a request that a client sent as one."""
         life, index = place_of(call)
         if client != self._sequencer:
             reason = UNKEPT if self._sequencer is None else f"kept in order by {self._sequencer.short}"
             self._effects.append(Refuse(client, call, reason))
             return
         if life != self._log.life or self._is_lost or index <= self._index or index in self._held:
-            return  # of a log that is over or not begun here, or there already
+            return  # of a log that is over or unknown here, or a duplicate
         if index > self._index + HELD_MAX:
-            return  # the keeper sees that it is not done, and sends it again
+            return  # the sequencer detects that it is not applied, and sends it again
         if index > self._index + 1 and self._held_bytes + len(request) > HELD_MAX_BYTES:
-            return  # likewise; the next one always has room
+            return  # likewise; the next entry always fits
         self._held[index] = call, request
         self._held_bytes += len(request)
         self._go_on()
@@ -145,20 +145,20 @@ class Follower:
             self._say(client)
 
     def applied(self) -> None:
-        """Learn that the server has done the entry."""
+        """Record that the server has applied the entry."""
         self._end(Doing.APPLYING)
         self._index += 1
         self._held_bytes -= len(self._held.pop(self._index)[1])
         self._go_on()
 
     def failed(self) -> None:
-        """Learn that the server failed at the entry: whether it has done it is not known."""
+        """Record that the server failed at the entry: whether it has applied it is not known."""
         self._end(Doing.APPLYING)
         self._lose()
         self._go_on()
 
     def told(self, state: bytes | None) -> None:
-        """Learn the server's state; None: it has none to tell."""
+        """Handle the server's state; None: it has none."""
         self._end(Doing.TELLING)
         self._asked_state = False
         self._can_tell = self._can_tell and state is not None
@@ -167,7 +167,7 @@ class Follower:
         self._go_on()
 
     def loaded(self, *, is_done: bool) -> None:
-        """Learn whether the server has taken on the state."""
+        """Record whether the server has loaded the state."""
         self._end(Doing.LOADING)
         follow, self._follow = self._follow, None
         if follow is None:
@@ -180,10 +180,10 @@ class Follower:
         self._go_on()
 
     def renewed(self, *, is_doubtful: bool) -> None:
-        """Learn that the server was started anew.
+        """Record that the server restarted.
 
         Args:
-            is_doubtful: it may have been given an entry since.
+            is_doubtful: it may have received an entry since.
         """
         self.doing = Doing.NOTHING
         self._follow, self._asked_state, self._can_tell = None, False, self._tells
@@ -193,14 +193,14 @@ class Follower:
             self._say(self._sequencer)
 
     def gone(self) -> None:
-        """Learn that the keeper is no more: another may come. What is held is done all the same."""
+        """Record that the sequencer is gone: another may come. Held entries are still applied."""
         self._sequencer = None
 
     def _take_follow(self, client: Name, word: AttachReplica) -> None:
         if self._sequencer not in {None, client}:
             self._say(client)
         elif self._follow is not None:
-            pass  # it hears when the state is taken on that it brought
+            pass  # the sequencer gets a status when the server has loaded its snapshot
         elif word.state is None:
             at = (self._log, self._index) == (word.log_before, word.at_before)
             if at and not self._is_lost and self.doing is Doing.NOTHING:
@@ -215,7 +215,7 @@ class Follower:
             self._clear()
 
     def _go_on(self) -> None:
-        """Let the server do the next thing."""
+        """Start the server's next operation."""
         if self.doing is not Doing.NOTHING:
             return
         if self._follow is not None and self._follow.state is not None:
@@ -227,11 +227,11 @@ class Follower:
         elif self._index + 1 in self._held:
             self.doing = Doing.APPLYING
             call, request = self._held[self._index + 1]
-            # One whose client is gone is done as well, and answered to nobody.
+            # An entry whose client is gone is applied as well, without a response.
             self._effects.append(Apply(self._sequencer or _NOBODY, call, request))
 
     def _stand(self, log: LogId, index: int) -> None:
-        """Stand in a log; what is held of it stays."""
+        """Set the log and the position in it; held entries of this log stay."""
         if log != self._log:
             self._clear()
         self._log, self._index, self._is_lost = log, index, False
@@ -247,7 +247,7 @@ class Follower:
             self._say(self._sequencer)
 
     def _clear(self) -> None:
-        """Forget what is held, but for the entry that the server is at."""
+        """Discard held entries, except the one that the server is applying."""
         now = self._index + 1
         self._held = {now: self._held[now]} if self.doing is Doing.APPLYING else {}
         self._held_bytes = sum(len(request) for _, request in self._held.values())

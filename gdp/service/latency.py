@@ -1,6 +1,6 @@
-"""How long recent answers took, and which server answered fastest lately.
+"""Latency of recent responses, and which server responded fastest recently.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds).
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 """
 
 from __future__ import annotations
@@ -15,24 +15,24 @@ from gdp.names import Name
 
 __all__ = ["Latencies"]
 
-RECENT: Final = 512  # answers that percentiles are of
-ENOUGH: Final = 32  # of them; fewer say nothing of a tail
-LATELY_S: Final = 10.0  # a server without an answer for so long is tried again, however slow it was
-_WEIGHT: Final = 0.2  # of the newest answer in a server's average
-_SORT_EVERY: Final = 16  # answers
-_UNANSWERED_MAX: Final = 3  # requests that were stopped, one after the other, before a server is asked last
+RECENT: Final = 512  # responses in the percentiles
+ENOUGH: Final = 32  # of them; fewer give no tail
+LATELY_S: Final = 10.0  # a server without a response for so long is tried again, however slow it was
+_WEIGHT: Final = 0.2  # of the newest response in a server's average
+_SORT_EVERY: Final = 16  # responses
+_UNANSWERED_MAX: Final = 3  # stopped requests in succession, after which a server is asked last
 
 
 @dataclass(slots=True)
 class _Server:
     average_s: float | None = None
-    seen_s: float = -inf  # when it was asked or answered last
-    owing_s: float | None = None  # since when it is asked without an answer to anything
-    unanswered: int = 0  # stopped since its last answer
+    seen_s: float = -inf  # when it was last asked or responded
+    owing_s: float | None = None  # since when it is asked without any response
+    unanswered: int = 0  # stopped since its last response
 
 
 class Latencies:
-    """The answers of one service's servers."""
+    """The response times of one service's servers."""
 
     def __init__(self) -> None:
         self._recent = deque[float](maxlen=RECENT)
@@ -41,35 +41,35 @@ class Latencies:
         self._servers: dict[Name, _Server] = {}
 
     def asked(self, server: Name, now_s: float) -> None:
-        """Note that a server is being tried."""
+        """Record that a server is being tried."""
         entry = self._servers.setdefault(server, _Server())
         entry.seen_s = now_s
         entry.owing_s = now_s if entry.owing_s is None else entry.owing_s
 
     def answered(self, server: Name, seconds: float, now_s: float) -> None:
-        """Note how long a server took."""
+        """Record the response time of a server, in seconds."""
         self._learn(server, seconds, now_s).unanswered = 0
 
     def stopped(self, server: Name, seconds: float, now_s: float) -> None:
-        """Note how long a server had before another one answered: it may be nearly as fast, or dead."""
+        """Record the time that a server had before another one responded: it may be nearly as fast, or dead."""
         self._learn(server, seconds, now_s).unanswered += 1
 
     def refused(self, server: Name, now_s: float) -> None:
-        """Note that a server said no, which is no feat however fast it was."""
+        """Record that a server refused or declined; its speed does not count."""
         entry = self._servers.setdefault(server, _Server())
         entry.seen_s, entry.owing_s, entry.unanswered = now_s, None, _UNANSWERED_MAX
 
     def ended(self, seconds: float) -> None:
-        """Note how long the first copy of a request took, or had when another was answered."""
+        """Record the time of the first copy of a request, complete or until another responded."""
         self._recent.append(seconds)
         self._unsorted += 1
 
     def forget(self, server: Name) -> None:
-        """A server is gone."""
+        """Remove a server."""
         self._servers.pop(server, None)
 
     def percentile(self, share: float) -> float | None:
-        """Return within how many seconds so large a share of recent answers came, or None: too few to say."""
+        """Return within how many seconds this share of recent responses came, or None: too few."""
         if len(self._recent) < ENOUGH:
             return None
         if self._unsorted >= _SORT_EVERY or not self._sorted:
@@ -77,11 +77,11 @@ class Latencies:
         return self._sorted[min(int(share * len(self._sorted)), len(self._sorted) - 1)]
 
     def ranked(self, servers: Iterable[Name], now_s: float) -> list[Name]:
-        """Return servers in the order in which to ask them: untried ones, the fastest lately, those without answers."""
+        """Return servers in the order to ask them: untried ones, the fastest recently, those without responses."""
         return sorted(servers, key=lambda server: self._expected(server, now_s))
 
     def _expected(self, server: Name, now_s: float) -> tuple[bool, float]:
-        """Return whether a server seems to answer nothing, and after how many seconds it would."""
+        """Return whether a server seems not to respond, and after how many seconds it would."""
         entry = self._servers.get(server)
         if entry is None or now_s - entry.seen_s > LATELY_S:
             return False, -1.0

@@ -15,8 +15,8 @@ from gdp.service.replication_messages import LogId, ReplicaCommand, call_of
 
 __all__ = ["STALL_S", "LogReplication"]
 
-WINDOW: Final = 256  # entries sent to one replica ahead of what it has done
-STALL_S: Final = 1.0  # without progress of one that follows, before it is asked
+WINDOW: Final = 256  # entries sent to one replica ahead of what it has applied
+STALL_S: Final = 1.0  # without progress of a follower, before it receives a probe
 
 
 class LogReplication:
@@ -24,7 +24,7 @@ class LogReplication:
 
     Args:
         entries: the log.
-        effects: what is to be sent is appended here.
+        effects: messages to send are appended here.
 
     Attributes:
         is_sent: an entry of this log was sent.
@@ -58,13 +58,13 @@ class LogReplication:
         return self._entries.forgotten <= position <= self._entries.last
 
     def follow(self, server: Name, replica: Replica, held: int, now_s: float) -> None:
-        """Let a replica follow that has the entries up to ``held``."""
+        """Make a replica follow that has the entries up to ``held``."""
         replica.quiet_until_s = now_s + STALL_S
         replica.sent = held
         self.send_missing(server, replica)
 
     def send_missing(self, server: Name, replica: Replica) -> None:
-        """Send a replica the entries that it lacks, a few ahead of what it has done."""
+        """Send a replica the entries that it lacks, a few ahead of what it has applied."""
         if not self._is_ready(replica) or replica.position is None:
             return
         until = min(self._entries.last, replica.position.at + WINDOW)
@@ -77,7 +77,7 @@ class LogReplication:
         replica.sent = max(replica.sent, until)
 
     def handle_done(self, server: Name, life: int, index: int, now_s: float) -> bool:
-        """Note that a replica has done every entry up to ``index``; return False where it does not follow this log."""
+        """Record that a replica has applied all entries up to ``index``; return False where it does not follow."""
         replica = self._replicas.get(server)
         if replica is None or not replica.follows or replica.position is None:
             return False
@@ -92,13 +92,13 @@ class LogReplication:
         return True
 
     def is_behind(self, replica: Replica) -> bool:
-        """Return whether a replica that follows has entries left to do."""
+        """Return whether a replica that follows has entries left to apply."""
         return replica.follows and replica.position is not None and replica.position.at < self._entries.last
 
     def trim(self) -> None:
-        """Remove the entries that a snapshot stands for and no replica lacks."""
+        """Remove the entries that a snapshot replaces and no replica lacks."""
         self._entries.trim(position.at for position in self._replicas.following().values())
 
     def _is_ready(self, replica: Replica) -> bool:
-        """Return whether it may have entries: where snapshots exist, none is sent before the first of them is here."""
+        """Return whether it may receive entries: where replicas have snapshots, the first must be here before."""
         return replica.follows and (self._entries.state is not None or not self._replicas.tellers())

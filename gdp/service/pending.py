@@ -1,6 +1,6 @@
-"""The calls that wait for an entry of a log to be done by somebody.
+"""Pending calls of a replicated log: each waits until one replica has applied its entry.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds).
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 """
 
 from __future__ import annotations
@@ -47,22 +47,22 @@ class Pending(Generic[A]):
         answered: Callable[[A], None],
         failed: Callable[[Failure, str], None],
     ) -> int:
-        """Return the number of a new call, one above the last.
+        """Begin a call and return its number, one above the last.
 
         Raises:
-            LocalError: as many as there may be are under way.
+            LocalError: the limit of calls under way is reached.
         """
         return self._calls.add_call(now_s, timeout_s, _Call(answered, failed))
 
     def handle_response(self, number: int, answer: A) -> bool:
-        """Answer a call; return whether it was still under way."""
+        """Complete a call with its response; return whether it was still under way."""
         call = self._calls.end(number)
         if call is not None:
             call.answered(answer)
         return call is not None
 
     def refuse(self, number: int, server: Name, reason: str, asked: Set[Name]) -> None:
-        """Take a replica's word that it has no answer; fail the call when all that are asked say so."""
+        """Handle a replica's refusal; fail the call when all replicas that were asked refuse."""
         call = self._calls.get(number)
         if call is not None:
             call.refused.add(server)
@@ -71,12 +71,12 @@ class Pending(Generic[A]):
                 call.failed(Failure.REFUSED, reason)
 
     def fail_expired(self, now_s: float) -> None:
-        """Fail the calls whose time has run out."""
+        """Fail the calls whose timeout has passed."""
         for _, call in self._calls.expired(now_s):
             call.failed(Failure.TIMED_OUT, "")
 
     def get_timer(self) -> float | None:
-        """Return the monotonic second at which a call's time runs out, or None."""
+        """Return the monotonic second of the next timeout, or None."""
         return self._calls.get_timer()
 
     def fail_all(self, failure: Failure, reason: str) -> None:

@@ -1,6 +1,6 @@
-"""The replicas of a service that keeps state, as its keeper knows them.
+"""Replicas of a service with state, as its sequencer knows them.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ class Replica:
     """One replica.
 
     Args:
-        quiet_until_s: until when it is not asked again.
-        follows: it said that it stands in the keeper's log.
-        is_offered: it was told to follow, and has not said yet whether it does.
+        quiet_until_s: until when it receives no further probe.
+        follows: it reported that it follows the sequencer's log.
+        is_offered: it was asked to follow, and has not yet replied.
         sent: it has, or was sent, the entries up to here.
         why_not: why it cannot follow; empty: it can.
     """
@@ -33,28 +33,28 @@ class Replica:
     why_not: str = ""
 
     def begin_anew(self) -> None:
-        """Follow nothing; who keeps it otherwise is remembered until it says another thing."""
+        """Reset the replica to follow nothing; a report of another sequencer stays until a newer report."""
         self.follows, self.is_offered, self.quiet_until_s = False, False, 0.0
         if self.position is not None and self.position.kept_by is None:
             self.position = None
 
 
 class Replicas(dict[Name, Replica]):
-    """All of them, by name."""
+    """All replicas, by name."""
 
     def following(self) -> dict[Name, ReplicaStatus]:
-        """Return where those are that follow."""
+        """Return the positions of those that follow."""
         places = ((name, each.position) for name, each in self.items() if each.follows)
         return {name: position for name, position in places if position is not None}
 
     def tellers(self) -> dict[Name, int]:
-        """Return those that follow and can tell their state, and after which entry."""
+        """Return those that follow and can save a snapshot, and after which entry."""
         return {name: position.at for name, position in self.following().items() if position.tells}
 
     def known(self) -> dict[Name, ReplicaStatus]:
-        """Return where those are that have said so."""
+        """Return the positions of those that have reported one."""
         return {name: each.position for name, each in self.items() if each.position is not None}
 
     def is_kept_otherwise(self) -> bool:
-        """Return whether one follows another keeper."""
+        """Return whether one follows another sequencer."""
         return any(position.kept_by is not None for position in self.known().values())

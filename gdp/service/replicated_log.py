@@ -1,4 +1,4 @@
-"""Replicated log of one service: its entries, and the state that stands for those that were removed.
+"""Replicated log of one service: its entries, and the snapshot that replaces those that were removed.
 
 Sans-I/O.
 """
@@ -14,16 +14,16 @@ __all__ = ["ReplicatedLog"]
 
 ENTRIES_MAX: Final = 65_536
 LOG_MAX_BYTES: Final = 64 << 20
-STATE_EVERY: Final = 1_024  # entries after which another state is wanted
+STATE_EVERY: Final = 1_024  # entries after which another snapshot is due
 STATE_EVERY_BYTES: Final = 4 << 20
 
 
 class ReplicatedLog:
-    """Requests in their order, from 1, without a gap; the oldest are forgotten when a state stands for them.
+    """Requests in their order, from 1, without a gap; a snapshot replaces the oldest.
 
     Attributes:
         last: the newest.
-        state: the newest known; None: the log begins where it began.
+        state: the newest snapshot; None: none yet.
     """
 
     def __init__(
@@ -49,39 +49,39 @@ class ReplicatedLog:
 
     @property
     def forgotten(self) -> int:
-        """Return the newest entry that is not there any more; 0: all are."""
+        """Return the newest entry that was removed; 0: none was."""
         return self.last - len(self._requests)
 
     @property
     def is_full(self) -> bool:
-        """Return whether no more may come."""
+        """Return whether the log is full."""
         return len(self._requests) >= self._entries_max or self._bytes >= self._max_bytes
 
     @property
     def wants_state(self) -> bool:
-        """Return whether it is time for a state, the first or another."""
+        """Return whether a snapshot is due, the first or another."""
         after = self.last - (self.state.at if self.state is not None else 0)
         return self.state is None or after >= self._state_every or self._bytes_after_state >= STATE_EVERY_BYTES
 
     def append(self, request: bytes) -> None:
-        """Take the next entry."""
+        """Append the next entry."""
         self.last += 1
         self._requests[self.last] = request
         self._bytes += len(request)
         self._bytes_after_state += len(request)
 
     def learn(self, state: Snapshot) -> None:
-        """Take a state, if it is newer."""
+        """Store a snapshot, if it is newer."""
         if self.state is None or state.at > self.state.at:
             self.state = state
             newer = range(max(state.at, self.forgotten) + 1, self.last + 1)
             self._bytes_after_state = sum(len(self._requests[index]) for index in newer)
 
     def trim(self, done: Iterable[int]) -> None:
-        """Forget what the state stands for; what a replica still lacks stays while there is room.
+        """Remove entries that the snapshot replaces; those that a replica lacks stay while the log has space.
 
         Args:
-            done: the last entry that each replica has done.
+            done: the last entry that each replica has applied.
         """
         if self.state is None:
             return

@@ -1,8 +1,7 @@
-"""How a service's requests are spread over its replicas.
+"""Replication modes: how a service's requests are spread over its replicas.
 
-Place: pure.
-Source: FogROS2-FT (all replicas, the first answer wins); hedged requests after Dean and Barroso, "The Tail at Scale",
-CACM 56(2), 2013.
+Sans-I/O. Source: FogROS2-FT (all replicas, the first response wins); hedged requests after Dean and Barroso, "The Tail
+at Scale", CACM 56(2), 2013.
 """
 
 from __future__ import annotations
@@ -15,16 +14,16 @@ __all__ = ["ALL", "Mode", "Replication"]
 
 
 class Mode(Enum):
-    """Who gets a request at first."""
+    """Which replicas get a request at first."""
 
     ALL = "all"  # every replica, by the tree: one copy on the client's link
-    SOME = "some"  # ``copies`` of them, those that answered fastest lately
-    HEDGED = "hedged"  # one; a second one after the 95th percentile of recent answers, within the budget
+    SOME = "some"  # ``copies`` of them, those that responded fastest recently
+    HEDGED = "hedged"  # one; a second one after the 95th percentile of recent responses, within the budget
 
 
 @dataclass(frozen=True, slots=True)
 class Replication:
-    """What a rule says.
+    """The replication of a rule.
 
     Args:
         copies: with ``SOME``: how many replicas get each request.

@@ -1,21 +1,20 @@
-"""Requests in one order for services that keep state: the log, where a replica stands in it, and who says what.
+"""Messages of replicated logs: requests in one order for services with state, and the positions of replicas.
 
-Place: pure.
-Source: state machine replication (Schneider, ACM Computing Surveys 22(4), 1990), with the client's side as the one that
-orders. No majority is asked: an answer is given once one replica has it, as for services without state.
+Sans-I/O. Source: state machine replication (Schneider, ACM Computing Surveys 22(4), 1990), with the client's side as
+the sequencer. No majority is needed: a response is given once one replica has it, as for services without state.
 
-The client's proxy keeps the log, ``keeper.py``; each replica's proxy follows it, ``follower.py``::
+The client's proxy keeps the log (``sequencer.py``); each replica's proxy follows it (``follower.py``)::
 
-    keeper                                        follower
-    Keep      where are you? my log is ...   ->
-                                             <-   Position
-    Follow    my log from here on, perhaps   ->
-              with this state
-                                             <-   Position
-    entries, by the tree or again to one     ->
-                                             <-   an answer to each
-    Tell      what is your state?            ->
-                                             <-   State
+    sequencer                                         follower
+    ReplicaProbe     where are you? my log is ... ->
+                                                  <-  ReplicaStatus
+    AttachReplica    my log from here on, perhaps ->
+                     with this snapshot
+                                                  <-  ReplicaStatus
+    entries, by the tree or again to one          ->
+                                                  <-  a response to each
+    SnapshotRequest  what is your state?          ->
+                                                  <-  Snapshot
 """
 
 from __future__ import annotations
@@ -40,13 +39,14 @@ __all__ = [
     "place_of",
 ]
 
-LIFE_BITS: Final = 32  # the upper half of a call's number says which log, the lower which entry
+LIFE_BITS: Final = 32  # the upper half of a call's number is the log, the lower half the entry
 
 
 class LogId(NamedTuple):
-    """A log. Of two the greater holds.
+    """Identifier of a log. Of two the greater wins.
 
-    ``generation``: above that of every log its keeper heard of. ``life``: 32 random bits, for two that began at once.
+    ``generation``: above that of every log that its sequencer received. ``life``: 32 random bits, for two that began at
+    once.
     """
 
     generation: int
@@ -57,16 +57,16 @@ NO_LOG: Final = LogId(0, 0)  # of a server that has just started
 
 
 class ReplicaProbe(NamedTuple):
-    """A keeper's question where a replica is; one that followed another log of its is free by that."""
+    """A sequencer's probe for a replica's position; it releases a follower of the sequencer's other log."""
 
     life: int
 
 
 class AttachReplica(NamedTuple):
-    """A keeper's word that a replica stands after entry ``at`` of its log.
+    """A sequencer's message that attaches a replica after entry ``at`` of its log.
 
-    ``state``: which the replica is to take on first. None: it has it, if it is where ``log_before`` and ``at_before``
-    say.
+    ``state``: the snapshot to load first. None: the replica has the state, if it is where ``log_before`` and
+    ``at_before`` indicate.
     """
 
     log: LogId
@@ -77,7 +77,7 @@ class AttachReplica(NamedTuple):
 
 
 class SnapshotRequest(NamedTuple):
-    """A keeper's question for a replica's state."""
+    """A sequencer's request for a replica's state."""
 
     log: LogId
 
@@ -86,18 +86,18 @@ SequencerMessage: TypeAlias = "ReplicaProbe | AttachReplica | SnapshotRequest"
 
 
 class ReplicaCommand(NamedTuple):
-    """What a keeper tells one replica."""
+    """A sequencer's message to one replica."""
 
     server: Name
     word: SequencerMessage
 
 
 class ReplicaStatus(NamedTuple):
-    """Where a replica is.
+    """The position of a replica.
 
-    ``at``: the last entry that its server has done; ``held``: the last that it will do without hearing more.
-    ``is_lost``: what state its server is in is not known. ``tells``: whether that can be read and written.
-    ``kept_by``: whose log it follows, if that is not who hears this.
+    ``at``: the last entry that its server has applied; ``held``: the last that it will apply without further messages.
+    ``is_lost``: its server's state is not known. ``tells``: whether that can be read and written. ``kept_by``: the
+    sequencer whose log it follows, if that is not the receiver.
     """
 
     log: LogId = NO_LOG
@@ -114,7 +114,7 @@ class ReplicaStatus(NamedTuple):
 
 
 class Snapshot(NamedTuple):
-    """A server's state after entry ``at``; None: it does not tell."""
+    """A server's state after entry ``at``; None: it provides none."""
 
     log: LogId
     at: int
@@ -125,10 +125,10 @@ FollowerMessage: TypeAlias = "ReplicaStatus | Snapshot"
 
 
 def call_of(log: LogId, index: int) -> int:
-    """Return the number under which an entry travels."""
+    """Return the call number of an entry."""
     return log.life << LIFE_BITS | index
 
 
 def place_of(call: int) -> tuple[int, int]:
-    """Return the life of a log, and the index in it."""
+    """Return the ``life`` of a log, and the index in it."""
     return call >> LIFE_BITS, call & (1 << LIFE_BITS) - 1

@@ -1,16 +1,16 @@
-"""Sequencer of one service that keeps state, at its client: every request goes to all replicas in one order.
+"""Sequencer of one service with state, at its client: every request goes to all replicas in one order.
 
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds), randomness as ``life``; what is to be sent comes out of
-``take``. It has the methods of a ``Dispatch``, which serves services without state.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds), randomness as ``life``; ``poll_effects`` returns what to send.
+It has the methods of a ``Dispatch``, which serves services without state.
 
 ::
 
-    collecting: asks every replica for its position   --COLLECT_S after the last one came-->   sequencing
-    sequencing: entries go to all that follow         --one has followed a greater log-->      collecting; calls fail
+    collecting: every replica gets a probe            --COLLECT_S after the last one joined-->  sequencing
+    sequencing: entries go to all followers           --one has followed a greater log-->       collecting; calls fail
 
-It joins ``election.py`` (which log holds), ``replicated_log.py`` (its entries), ``log_replication.py`` (who has which)
-and ``snapshots.py`` (states that stand for entries). Replicas that did not begin at the root load a snapshot; without
-snapshots, only those follow that are where the root was.
+It joins ``election.py`` (which log wins), ``replicated_log.py`` (its entries), ``log_replication.py`` (which replica
+has which entries) and ``snapshots.py`` (snapshots that replace entries). Replicas that did not begin at the root load a
+snapshot. Without snapshots, only those follow that are where the root was.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ __all__ = ["Effect", "Sequencer"]
 
 A = TypeVar("A")
 
-GENERATION_MAX: Final = 1 << 63  # no log comes so far; the next one must still fit into 64 bits
-AGAIN_S: Final = 0.25  # between questions to one that does not follow
-SILENT_S: Final = 10.0  # for one that has a snapshot to load
+GENERATION_MAX: Final = 1 << 63  # no log gets this far; the next generation must still fit into 64 bits
+AGAIN_S: Final = 0.25  # between probes of a replica that does not follow
+SILENT_S: Final = 10.0  # for a replica that has a snapshot to load
 _UNLIKE: Final = "its state differs from the others', and theirs cannot be told to it"
 _UNKNOWN: Final = "what state its server is in is not known; start it anew"
 
@@ -57,7 +57,7 @@ Effect: TypeAlias = "Ask | ReplicaCommand"
 
 
 class Sequencer(Generic[A]):
-    """The calls of one service from here, and the log of them.
+    """The calls of one service from this client, and the log of them.
 
     Args:
         life: returns 32 random bits.
@@ -66,7 +66,7 @@ class Sequencer(Generic[A]):
     Attributes:
         late: responses that came for a call that had ended: those of all replicas but the first.
         strange: responses of replicas that do not follow.
-        hedged: none; every replica gets everything.
+        hedged: always none; every replica gets every request.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class Sequencer(Generic[A]):
 
     @property
     def log(self) -> LogId:
-        """Return which log it keeps; of generation 0 before it begins."""
+        """Return the log that it keeps; of generation 0 before it begins."""
         return self._log
 
     @property
@@ -135,7 +135,7 @@ class Sequencer(Generic[A]):
         A call that fails may have been applied all the same, or be applied later; one that raises is not.
 
         Raises:
-            LocalError: there is no replica, another keeps this service in order, or the log is full.
+            LocalError: there is no replica, another sequencer orders this service, or the log is full.
         """
         assert not first
         if not self._replicas:
@@ -152,25 +152,25 @@ class Sequencer(Generic[A]):
         return number
 
     def came(self, server: Name, now_s: float) -> None:
-        """Learn of a replica."""
+        """Add a replica."""
         if server not in self._replicas:
             self._replicas[server] = Replica(0.0)
             self._election.restart(now_s)
             self._look(now_s)
 
     def leaves(self, server: Name) -> None:
-        """Learn that a replica goes soon: where others follow it is let go."""
+        """Record that a replica goes soon: where others follow it is detached."""
         if any(replica.follows for name, replica in self._replicas.items() if name != server):
             self._let_go(server)
 
     def gone(self, server: Name, now_s: float, reason: str) -> None:
-        """Learn that a replica is no more. Calls wait on, for the log reaches whoever comes."""
+        """Remove a replica. Its calls stay pending, for later replicas get the log."""
         del reason
         self._let_go(server)
         self._look(now_s)
 
     def positioned(self, server: Name, word: FollowerMessage, now_s: float) -> None:
-        """Take a replica's word about itself."""
+        """Handle a replica's message about itself."""
         replica = self._replicas.get(server)
         if replica is None or word.log.generation >= GENERATION_MAX:
             self.strange += 1
@@ -181,44 +181,44 @@ class Sequencer(Generic[A]):
         self._look(now_s)
 
     def answered(self, number: int, server: Name, answer: A, now_s: float) -> None:
-        """Take a replica's answer: it has done everything up to there."""
+        """Handle a replica's response: it has applied everything up to there."""
         if self._replication.handle_done(server, *place_of(number), now_s):
             self.late += not self._calls.handle_response(number, answer)
         else:
             self.strange += 1
 
     def refused(self, number: int, server: Name, reason: str, now_s: float) -> None:
-        """Take a replica's word that it has no answer: perhaps it follows another by now."""
+        """Handle a replica's refusal: it may follow another sequencer by now."""
         replica = self._replicas.get(server)
         if replica is not None and replica.follows:
             self._ask(server, replica, now_s)
             self._calls.refuse(number, server, reason, self._replicas.following().keys())
 
     def declined(self, number: int, server: Name, answer: A, now_s: float) -> None:
-        """Take an answer; a service's are all the same."""
+        """Handle a response that declines; for a service with state all responses are equal."""
         self.answered(number, server, answer, now_s)
 
     def handle_timer(self, now_s: float) -> None:
-        """Do what is due."""
+        """Run the timers that are due."""
         self._calls.fail_expired(now_s)
         self._look(now_s)
 
     def get_timer(self) -> float | None:
-        """Return the monotonic second at which a call's time runs out, or None; all else can wait for a tick."""
+        """Return the monotonic second of the next timeout of a call, or None; all else can wait for a tick."""
         return self._calls.get_timer()
 
     def fail_all(self, reason: str) -> None:
-        """End every call. The log stays: whoever comes gets it."""
+        """End every call. The log stays: later replicas get it."""
         self._calls.fail_all(Failure.NO_SERVER, reason)
 
     def poll_effects(self) -> list[Effect]:
-        """Return, once, what is to be sent, in order."""
+        """Return, once, what to send, in order."""
         effects = self._effects.copy()
         self._effects.clear()
         return effects
 
     def _look(self, now_s: float) -> None:
-        """Ask replicas that owe a position; begin the log when all have sent theirs."""
+        """Probe replicas that owe a position; begin the log when all have sent theirs."""
         for server, replica in self._replicas.items():
             is_behind = self._replication.is_behind(replica)
             if now_s >= replica.quiet_until_s and (is_behind or not replica.follows):
@@ -226,7 +226,7 @@ class Sequencer(Generic[A]):
         self._snapshots.handle_timer(now_s)
         is_sent = self._replication.is_sent
         if not is_sent and not any(each.follows or each.is_offered for each in self._replicas.values()):
-            self._is_keeping = False  # no replica took it up: it may begin from another one
+            self._is_keeping = False  # no replica accepted it: it may begin from another one
         if not self._is_keeping and self._replicas and self._election.is_due(now_s):
             self._begin_log(now_s)
         self._request_snapshot_if_wanted(now_s)
@@ -264,7 +264,7 @@ class Sequencer(Generic[A]):
             self._admit(server, replica, position, now_s)
 
     def _handle_leader(self, leader: Name, log: LogId, now_s: float) -> None:
-        """Note that a replica follows another sequencer, and yield to it if its log holds."""
+        """Record that a replica follows another sequencer, and yield to it if its log wins."""
         if not self._election.must_yield(log, self._log, self._replicas):
             return
         self._election.leader = leader
@@ -280,7 +280,7 @@ class Sequencer(Generic[A]):
             return
         best = elected.position
         self._log = self._replication.log = elected.log
-        if best.log.life != self._log.life:  # else it took up this log, and its word was lost
+        if best.log.life != self._log.life:  # otherwise it accepted this log, and its status was lost
             self._base = best.log, best.at
         self._is_keeping, self._election.leader = True, None
         for replica in self._replicas.values():
@@ -293,7 +293,7 @@ class Sequencer(Generic[A]):
         self._effects.append(ReplicaCommand(server, word))
 
     def _admit(self, server: Name, replica: Replica, position: ReplicaStatus, now_s: float) -> None:
-        """Let a replica follow, from where it can."""
+        """Make a replica follow, from where it can."""
         state, is_level = self._entries.state, self._is_level(position) and not self._entries.forgotten
         if not self._replicas.following() and not self._replication.is_sent:
             return  # the root comes first
@@ -310,7 +310,7 @@ class Sequencer(Generic[A]):
             replica.why_not = _UNKNOWN if position.is_lost else _UNLIKE
 
     def _is_level(self, position: ReplicaStatus) -> bool:
-        """Return whether a replica stands where the log begins."""
+        """Return whether a replica is where the log begins."""
         is_begun = position.log.life == self._log.life and position.at == 0
         return not position.is_lost and (is_begun or (position.log, position.at) == self._base)
 

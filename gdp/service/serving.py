@@ -1,12 +1,13 @@
-"""Requests at the server's side: which wait for their turn, which the local server has, which ended lately.
+"""Serving side of requests: which wait for their turn, which the local server has, which ended recently.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds).
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
-A client may send one request twice (by the tree, and again to one that it takes for new): the second time the answer is
-given again, or nothing happens while the first is under way. And it may end a call: what waits then is never given to
-the local server; what that has already keeps its place until the server is done with it, for it works all the same.
+A client may send one request twice (by the tree, and again to a server that it takes for new). The second time the
+response is repeated, or nothing happens while the first is under way. A client may also end a call. A waiting request
+is then never passed to the local server. A request that the server has already keeps its slot until the server is done,
+for the server works on it all the same.
 
-Clients take turns, and one may take as much room as it leaves free: half of it alone, and the next always finds some.
+Clients take turns, and one may use as much memory as it leaves free: half of it alone, and the next always finds some.
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ __all__ = ["Asked", "Expired", "Serving", "Turn"]
 R = TypeVar("R", bound=Sized)
 
 CALLS_MAX: Final = 65_536
-WAITING_MAX_BYTES: Final = 128 << 20  # of requests that the local server has not got yet
+WAITING_MAX_BYTES: Final = 128 << 20  # of requests that the local server has not received yet
 ENDED_MAX: Final = 4_096  # ended calls that are remembered
-ANSWER_KEPT_BYTES: Final = 4_096  # larger answers are not: the request is served again
+ANSWER_KEPT_BYTES: Final = 4_096  # larger responses are not kept: the request is served again
 
 
 class Asked(NamedTuple):
-    """A call: whose, and under which number of theirs."""
+    """A call: its client, and the client's number for it."""
 
     client: Name
     part: int
@@ -41,7 +42,7 @@ class Asked(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Turn(Generic[R]):  # Python 3.10 has no generic named tuple
-    """A request whose turn it is, with the number under which it is under way here."""
+    """A request whose turn it is, with its local number."""
 
     number: int
     asked: Asked
@@ -51,7 +52,7 @@ class Turn(Generic[R]):  # Python 3.10 has no generic named tuple
 class Expired(NamedTuple):
     """A call that took too long, or whose client is gone.
 
-    ``asked``: None where nobody waited any more. ``is_given``: whether the local server has it.
+    ``asked``: None where no client waited any more. ``is_given``: whether the local server has it.
     """
 
     number: int
@@ -87,7 +88,7 @@ class Serving(Generic[R]):
         self._calls: Calls[_Served[R]] = Calls(limit, start)
         self._numbers: dict[Asked, int] = {}
         self._waiting = FairQueue[int]()  # owned by clients
-        self._held_back: dict[Asked, dict[int, None]] = {}  # call -> those that wait for its end
+        self._held_back: dict[Asked, dict[int, None]] = {}  # call -> requests that wait for its end
         self._ended: dict[Name, OrderedDict[Asked, bytes]] = {}  # by client
         self._ended_count = 0
         self._limit = limit
@@ -104,21 +105,21 @@ class Serving(Generic[R]):
         return asked in self._numbers
 
     def answer_of(self, asked: Asked) -> bytes | None:
-        """Return what a call that ended lately was answered: nothing where it was stopped. None: it did not."""
+        """Return the response of a call that ended recently: empty where it was stopped. None: it did not end."""
         ended = self._ended.get(asked.client)
         return None if ended is None else ended.get(asked)
 
     def begin(
         self, now_s: float, patience_s: float | None, asked: Asked, request: R, after: Asked | None = None
     ) -> int:
-        """Take a request; return its number.
+        """Add a request; return its number.
 
         Args:
-            patience_s: how long its client waits; None: as long as it takes.
-            after: a call whose end it waits for, if that is under way.
+            patience_s: how long its client waits; None: no limit.
+            after: a call to wait for, if that is under way.
 
         Raises:
-            LocalError: this client has as many under way, or as much waiting, as there is room left for others.
+            LocalError: this client's calls or waiting bytes have reached its share.
         """
         client, size = asked.client, len(request)
         room, room_bytes = self._limit - len(self._calls), self._waiting_max_bytes - self._waiting_bytes.total()
@@ -149,7 +150,7 @@ class Serving(Generic[R]):
         return turns
 
     def end(self, number: int) -> Asked | None:
-        """Learn that the local server is done with a call; return whose it is, None where nobody waits any more."""
+        """Record that the local server is done with a call; return the call, None where no client waits any more."""
         served = self._calls.end(number)
         if served is None:
             return None
@@ -157,7 +158,7 @@ class Serving(Generic[R]):
         return served.asked if served.is_wanted else None
 
     def remember(self, asked: Asked, answer: bytes) -> None:
-        """Keep what was answered for a while; nothing: the call was stopped."""
+        """Keep a response for a while; empty: the call was stopped."""
         if len(answer) <= ANSWER_KEPT_BYTES:
             ended = self._ended.setdefault(asked.client, OrderedDict())
             self._ended_count += asked not in ended
@@ -170,7 +171,7 @@ class Serving(Generic[R]):
                     del self._ended[client]
 
     def stop(self, asked: Asked) -> int | None:
-        """Learn that a client's call has ended, known here or on its way; return its number if the server has it."""
+        """Record that a client's call has ended, known here or on its way; return its number if the server has it."""
         number = self._numbers.pop(asked, None)
         if number is None:
             if self.answer_of(asked) is None:
@@ -188,13 +189,13 @@ class Serving(Generic[R]):
 
     @property
     def clients(self) -> list[Name]:
-        """Return those who have calls under way here, wanted still or not."""
+        """Return the clients with calls under way here, still wanted or not."""
         return list(self._shares)
 
     def gone(self, client: Name) -> list[Expired]:
-        """Learn that a client is no more; return its calls that were wanted, ended. Asked again, they are served anew.
+        """Remove a client; end and return its wanted calls. A repeated request is served again.
 
-        What the local server has keeps its place as after ``stop``.
+        A request that the local server has keeps its slot as after ``stop``.
         """
         ended = []
         for asked in [each for each in self._numbers if each.client == client]:
@@ -210,7 +211,7 @@ class Serving(Generic[R]):
         return ended
 
     def expired(self, now_s: float) -> list[Expired]:
-        """End what took too long."""
+        """End and return the calls that took too long."""
         ended = []
         for number, served in self._calls.expired(now_s):
             self._forget(number, served)
@@ -219,11 +220,11 @@ class Serving(Generic[R]):
         return ended
 
     def get_timer(self) -> float | None:
-        """Return the monotonic second at which a call has taken too long, or None."""
+        """Return the monotonic second of the next timeout of a call, or None."""
         return self._calls.get_timer()
 
     def fail_all(self) -> list[Asked]:
-        """End every call; return whose they are."""
+        """End every call; return them."""
         ended = [served.asked for _, served in self._calls.fail_all() if served.is_wanted]
         self._numbers.clear()
         self._waiting.clear()

@@ -30,7 +30,7 @@ class SnapshotRequests:
         return self._server is not None
 
     def request(self, replicas: Replicas, entries: ReplicatedLog, now_s: float) -> Name | None:
-        """Return the replica that is to be asked: the furthest that has a newer state; None: there is none."""
+        """Return the replica to ask: the furthest that has a newer state; None: there is none."""
         tellers = replicas.tellers()
         server = max(tellers, key=lambda name: tellers[name], default=None)
         if server is None or (entries.state is not None and tellers[server] <= entries.state.at):
@@ -40,7 +40,7 @@ class SnapshotRequests:
         return server
 
     def handle_state(self, server: Name, state: Snapshot, log: LogId, entries: ReplicatedLog) -> bool:
-        """Return whether a state is the one that was requested; if so, the request is over."""
+        """Return whether a snapshot is the one that was requested; if so, the request is over."""
         if server != self._server or state.log != log or state.at > entries.last:
             return False
         self._server = None
@@ -52,6 +52,6 @@ class SnapshotRequests:
             self._server = None
 
     def handle_timer(self, now_s: float) -> None:
-        """Drop a request whose time has run out."""
+        """Drop a request whose timeout has passed."""
         if self._server is not None and now_s >= self._until_s:
             self._server = None

@@ -1,6 +1,6 @@
-"""Sessions for asyncio: the same as ``session.py`` over the same core, in the program's own event loop.
+"""Sessions for asyncio: the interface of ``session.py`` over the same core, in the program's own event loop.
 
-Layer: I/O, by its driver. Only the loop in which a session was opened may use it.
+I/O, by its driver. Only the loop in which a session was opened may use it.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ log = logging.getLogger(__name__)
 
 
 class AsyncPublisher:
-    """Publishes one name; made by ``AsyncSession.publisher``. See ``Publisher`` for what each method does."""
+    """Publisher of one name; made by ``AsyncSession.publisher``. See ``Publisher`` for each method."""
 
     def __init__(self, session: AsyncSession, topic: Topic, publisher: MemberPublisher, *, reliable: bool) -> None:
         self._session = session
@@ -60,7 +60,7 @@ class AsyncPublisher:
 
     @property
     def readers(self) -> int:
-        """Return how many readers are there."""
+        """Return the number of matched readers."""
         return self._publisher.readers
 
     @property
@@ -70,12 +70,12 @@ class AsyncPublisher:
 
     @property
     def lost(self) -> int:
-        """Return how many messages some reader did not get, as far as it is known here."""
+        """Return how many messages some reader did not get, as far as this node knows."""
         return self._publisher.losses.total
 
     @property
     def resent(self) -> int:
-        """Return how many parts were sent again because a reader lacked them."""
+        """Return how many fragments were retransmitted because a reader lacked them."""
         return self._publisher.repairs
 
     async def put(self, payload: bytes, timeout_s: float | None = None) -> None:
@@ -102,10 +102,10 @@ class AsyncPublisher:
         self._driver.publish(publisher, message_to_wire(time.time_ns(), payload))
 
     async def wait_for_readers(self, count: int = 1, timeout_s: float | None = None) -> None:
-        """Wait until so many readers are there.
+        """Wait until at least ``count`` readers are matched.
 
         Raises:
-            SessionTimeoutError: they did not come in time.
+            SessionTimeoutError: the readers did not appear in time.
         """
         if not await self._driver.wait(lambda: self._publisher.readers >= count, _deadline_s(timeout_s)):
             label = self._session.core.label(self._topic)
@@ -116,14 +116,14 @@ class AsyncPublisher:
         """Wait until every reader has confirmed every message.
 
         Raises:
-            SessionTimeoutError: they did not in time.
+            SessionTimeoutError: some reader did not confirm in time.
         """
         if not await self._driver.wait(self._publisher.is_acknowledged, _deadline_s(timeout_s)):
             label = self._session.core.label(self._topic)
             raise SessionTimeoutError(f"{label}: not every reader has confirmed within {timeout_s:g} s")
 
     def close(self) -> None:
-        """Publish no more; what readers lack is lost, so ``flush`` first. Idempotent."""
+        """Stop publishing; unconfirmed messages are lost, so ``flush`` first. Idempotent."""
         if not self._is_closed:
             self._is_closed = True
             self._session.forget(self)
@@ -140,7 +140,7 @@ class AsyncPublisher:
 
 
 class AsyncSubscription:
-    """The messages of one name, an asynchronous iterator; made by ``AsyncSession.subscribe``."""
+    """Messages of one name as an asynchronous iterator; made by ``AsyncSession.subscribe``."""
 
     def __init__(self, session: AsyncSession, topic: Topic, inbox: Inbox) -> None:
         self._session = session
@@ -157,7 +157,7 @@ class AsyncSubscription:
 
     @property
     def publishers(self) -> int:
-        """Return how many publishers are there."""
+        """Return the number of matched publishers."""
         return len(self._session.core.member.writer_proxies_of(self.name))
 
     @property
@@ -167,11 +167,11 @@ class AsyncSubscription:
 
     @property
     def dropped(self) -> int:
-        """Return how many messages were dropped here because the program took too few."""
+        """Return how many messages this node dropped because the program received too few."""
         return self._inbox.dropped
 
     async def receive(self, timeout_s: float | None = None) -> Message:
-        """Return the next message; from one publisher they come in order.
+        """Return the next message; messages of one publisher come in order.
 
         Raises:
             SessionTimeoutError: no message came in time.
@@ -198,7 +198,7 @@ class AsyncSubscription:
             raise StopAsyncIteration from None
 
     def close(self) -> None:
-        """Subscribe no more; idempotent."""
+        """Unsubscribe. Idempotent."""
         if not self._is_closed:
             self._is_closed = True
             self._session.forget(self)
@@ -218,7 +218,7 @@ Handler = Callable[[Request], Awaitable[bytes]]
 
 
 class AsyncServer:
-    """Serves one name with a coroutine function; made by ``AsyncSession.serve``."""
+    """Server of one name with a coroutine function; made by ``AsyncSession.serve``."""
 
     def __init__(self, session: AsyncSession, topic: Topic, server: ServerCore, handler: Handler, workers: int) -> None:
         self._session = session
@@ -236,11 +236,11 @@ class AsyncServer:
 
     @property
     def clients(self) -> int:
-        """Return how many clients are there."""
+        """Return the number of clients."""
         return self._core.clients
 
     async def close(self, linger_s: float = LINGER_S) -> None:
-        """Serve no more: clients ask other servers, what is under way is finished. Idempotent."""
+        """Stop serving: clients use other servers, and active requests finish. Idempotent."""
         if self._is_closed:
             return
         self._session.forget(self)
@@ -271,7 +271,7 @@ class AsyncServer:
             while True:
                 await self._driver.wait(lambda: bool(turns), None)
                 if not turns:
-                    continue  # another worker has it
+                    continue  # another worker handles it
                 turn = turns.popleft()
                 self._core.finish(turn.number, await self._outcome(Request(turn.request, turn.asked.client)))
                 self._driver.schedule()
@@ -281,7 +281,7 @@ class AsyncServer:
     async def _outcome(self, request: Request) -> bytes | str:
         try:
             return checked_response(await self._handler(request))
-        except Exception as error:  # the program's own
+        except Exception as error:  # an error of the program's handler
             log.exception("a handler failed client=%s", request.client.short)
             return f"{type(error).__name__}: {error}"
 
@@ -303,12 +303,12 @@ class AsyncSession:
 
     @property
     def delegations(self) -> list[DelegatedName]:
-        """Return the names that this node may use, and how."""
+        """Return the names that this node holds delegations for, with its rights."""
         return self.core.delegations
 
     @property
     def is_attached(self) -> bool:
-        """Return whether a switch has accepted the node and what it advertises."""
+        """Return whether a switch has accepted the node and its advertisements."""
         return self.core.member.attachment.is_attached
 
     def publisher(
@@ -420,7 +420,7 @@ class AsyncSession:
         self.driver.schedule()
 
     async def close(self, linger_s: float = LINGER_S) -> None:
-        """Close everything that was opened, and leave the overlay. Idempotent."""
+        """Close all publishers, subscriptions and servers, and leave the overlay. Idempotent."""
         if self._is_closed:
             return
         self._is_closed = True
@@ -436,20 +436,20 @@ class AsyncSession:
         """Wait until a switch has accepted the node.
 
         Raises:
-            AttachError: none did in time; the text says what the node waits for.
+            AttachError: no switch accepted it in time; the text states what the node waits for.
         """
         if not await self.driver.wait(lambda: self.is_attached, time.monotonic() + timeout_s):
             raise AttachError(f"not attached within {timeout_s:g} s: {self._node.waiting_for()}")
 
     def why_not(self, name: Name, otherwise: str) -> str:
-        """Return the end of an error's sentence: why nothing crosses on a name, as far as it is known here."""
+        """Return the end of an error's sentence: why no data flows on a name, as far as this node knows."""
         if not self.is_attached:
             return f"; the node is not attached: {self._node.waiting_for()}"
         refused = self._node.refused(name)
         return f"; the advertisement was refused: {refused}" if refused else f"; {otherwise}"
 
     def forget(self, opened: AsyncPublisher | AsyncSubscription | AsyncServer) -> None:
-        """Close this one no more: it has been closed by itself."""
+        """Remove an object from the session's list after it closed itself."""
         if opened in self._opened:
             self._opened.remove(opened)
 
@@ -476,7 +476,7 @@ class AsyncSession:
 
 
 class _Opening:
-    """A session that is being opened: to be awaited, or entered with ``async with``."""
+    """A session that is being opened: await it, or enter it with ``async with``."""
 
     def __init__(self, config: SessionConfig, timeout_s: float) -> None:
         self._config = config
@@ -523,7 +523,7 @@ def open_session_async(
     The options are those of ``gdp.open``.
 
     Raises:
-        LocalError: keys, delegations or the device are not as the options say, or this node already runs.
+        LocalError: keys, delegations or the device differ from the options, or this node already runs.
         ConfigError: the configuration file is wrong.
         AttachError: no switch accepted the node in time.
     """

@@ -1,7 +1,7 @@
-"""One name called by a session: which servers get a request, and which response counts.
+"""Client of one name in a session: it selects the servers of a request and the response that counts.
 
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds). ``gdp/service/dispatch.py`` decides; this file connects
-it with the member's streams. A call that begins while no server is there waits for one, as long as its time allows.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). ``gdp/service/dispatch.py`` decides; this file connects it
+with the participant's streams. A call that begins without a server waits for one, within its time limit.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from gdp.session.wire import LEAVING, PATIENCE_MAX_MS, SERVING, RequestFrame, St
 
 __all__ = ["Call", "ClientCore"]
 
-_FOLLOW_S: Final = 0.05  # between two looks at which servers are there, while calls are under way
+_FOLLOW_S: Final = 0.05  # between two checks of the present servers, while calls are active
 _GONE: Final = "the server has gone"
 
 
@@ -31,9 +31,9 @@ class Call:
     """One call.
 
     Attributes:
-        timeout_s: how long it may take; None: as long as it takes.
+        timeout_s: its time limit in seconds; None: no limit.
         response: the first response, once there is one.
-        error: why there is none, once it has failed.
+        error: the reason of its failure, once it has failed.
     """
 
     payload: bytes
@@ -50,10 +50,10 @@ class Call:
 
 
 class ClientCore:
-    """One called name.
+    """Client of one name.
 
     Args:
-        label: what errors call the name.
+        label: word for the name in errors.
         start: number of the first call, random in 64 bits.
 
     Raises:
@@ -69,24 +69,25 @@ class ClientCore:
         self._start = start
         self._publisher: Publisher = member.call(topic, SERVING, is_global=is_global, urgent=urgent)
         self._dispatches: dict[Replication, Dispatch[Response]] = {}
-        self._servers: dict[Name, int] = {}  # and in which life
+        self._servers: dict[Name, int] = {}  # server to its incarnation
         self._leaving: set[Name] = set()
         self._unasked: list[Call] = []  # calls that wait for a server
-        self._for_all: deque[tuple[Dispatch[Response], Effect]] = deque()  # wait for the window of the common stream
+        # effects that wait for the window of the common stream
+        self._for_all: deque[tuple[Dispatch[Response], Effect]] = deque()
         self._follow_at_s = 0.0
 
     @property
     def servers(self) -> list[Name]:
-        """Return the servers that are there."""
+        """Return the present servers."""
         return list(self._servers)
 
     @property
     def is_idle(self) -> bool:
-        """Return whether no call is under way."""
+        """Return whether no call is active."""
         return not self._unasked and not any(len(each) for each in self._dispatches.values())
 
     def begin(self, call: Call, now_s: float) -> None:
-        """Begin a call; it ends later, by ``response`` or ``error``."""
+        """Begin a call; it ends later with ``response`` or ``error``."""
         call.deadline_s = None if call.timeout_s is None else now_s + call.timeout_s
         self._follow(now_s)
         if self._servers:
@@ -96,13 +97,13 @@ class ClientCore:
         self._send_out(now_s)
 
     def receive(self, message: Message, now_s: float) -> None:
-        """Take a server's response.
+        """Process a server's response.
 
         Raises:
             RemoteError: MALFORMED or BAD_VERSION.
         """
         if not message.private:
-            return  # servers say nothing on the stream that all clients hear but what they are
+            return  # on the stream for all clients, servers send only their description
         server = Name(message.delivered.publisher)
         frame = read_response(message.delivered.message)
         if server not in self._servers:
@@ -110,7 +111,7 @@ class ClientCore:
         dispatches = list(self._dispatches.values())
         found = next((each for each in dispatches if frame.call in each), dispatches[0] if dispatches else None)
         if found is None:
-            return  # of a life of this session that has ended
+            return  # a response to an earlier incarnation of this session
         if frame.is_failure:
             found.refused(frame.call, server, frame.reason, now_s)
         else:
@@ -118,7 +119,7 @@ class ClientCore:
         self._send_out(now_s)
 
     def handle_timer(self, now_s: float) -> None:
-        """Do what is due."""
+        """Handle the timers that are due."""
         if now_s >= self._follow_at_s:
             self._follow(now_s)
         for call in [each for each in self._unasked if each.deadline_s is not None and now_s >= each.deadline_s]:
@@ -140,7 +141,7 @@ class ClientCore:
         return min((time for time in times if time is not None), default=None)
 
     def close(self) -> None:
-        """Call the name no more; calls under way fail."""
+        """Stop calling the name; active calls fail."""
         error = CallError(f"{self._label}: the session was closed during the call")
         for call in self._unasked:
             call.error = error
@@ -150,10 +151,10 @@ class ClientCore:
         self._member.withdraw(self._name)
 
     def _follow(self, now_s: float) -> None:
-        """Learn which servers came and went."""
+        """Update the set of servers."""
         self._follow_at_s = now_s + _FOLLOW_S
         member = self._member
-        peers = set(member.peers(self._name) or member.heard(self._name))  # one that lags is better than none
+        peers = set(member.peers(self._name) or member.heard(self._name))  # a slow server is better than none
         heard = {
             writer_proxy.publisher: writer_proxy
             for writer_proxy in member.writer_proxies_of(self._name)
@@ -186,12 +187,15 @@ class ClientCore:
         patience_ms = 0 if left_s is None else min(max(int(left_s * 1e3), 1), PATIENCE_MAX_MS)
 
         def write(number: int) -> bytes:
+            """Return the wire form of the request under a call's number."""
             return RequestFrame(number, patience_ms, call.payload).to_wire()
 
         def responded(response: Response) -> None:
+            """Store the response in the call."""
             call.response = response
 
         def failed(failure: Failure, reason: str) -> None:
+            """Store the error in the call."""
             call.error = self._error_of(call, failure, reason)
 
         try:
@@ -203,7 +207,8 @@ class ClientCore:
         known = self._dispatches.get(replication)
         if known is not None:
             return known
-        start = (self._start + (len(self._dispatches) << 48)) % (1 << 64)  # so that no two give the same numbers
+        # so that no two dispatches use the same numbers
+        start = (self._start + (len(self._dispatches) << 48)) % (1 << 64)
         dispatch = self._dispatches[replication] = Dispatch(replication, start=start)
         for name in self._servers:
             dispatch.came(name, now_s)
@@ -212,7 +217,7 @@ class ClientCore:
         return dispatch
 
     def _send_out(self, now_s: float) -> None:
-        """Send what was decided; what all servers get waits for the window of their common stream."""
+        """Send the effects; those for all servers wait for the window of their common stream."""
         for dispatch in self._dispatches.values():
             while effects := dispatch.poll_effects():
                 for effect in effects:
@@ -224,7 +229,7 @@ class ClientCore:
         while self._for_all and self._publisher.has_room():
             dispatch, effect = self._for_all.popleft()
             if isinstance(effect, Ask) and effect.call not in dispatch:
-                continue  # it has ended meanwhile
+                continue  # it ended in the meantime
             try:
                 self._publisher.publish(_wire_of(effect))
             except LocalError as error:

@@ -1,7 +1,7 @@
-"""What a session does with its member of the overlay: queues of messages, servers, clients.
+"""Core of a session: it connects a participant of the overlay with queues of messages, servers and clients.
 
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds). A driver feeds the member with frames, calls ``handle`` after
-each step, and wakes the callers whose condition has come true.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). A driver passes frames to the participant, calls ``handle``
+after each step, and wakes the callers whose condition has come true.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ _HEX: Final = frozenset("0123456789abcdefABCDEF")
 
 
 class _Receiver(Protocol):
-    """Whatever takes the member's messages of one name."""
+    """Receiver of the participant's messages of one name."""
 
     def receive(self, message: MemberMessage, now_s: float) -> None:
-        """Take one message; raises ``RemoteError`` for one that is wrong."""
+        """Process one message; raises ``RemoteError`` if it is malformed."""
 
 
 class Inbox:
-    """The messages of one subscription that the program has not taken yet.
+    """Messages of one subscription that the program has not received yet.
 
     Args:
-        limit: most messages that wait; the oldest one beyond it is dropped, and counted.
+        limit: most messages that wait; beyond it the oldest one is dropped and counted.
 
     Attributes:
-        messages: what waits, the oldest first.
-        dropped: messages that were dropped because the program took too few.
+        messages: the waiting messages, the oldest first.
+        dropped: messages that were dropped because the program received too few.
     """
 
     def __init__(self, name: Name, limit: int) -> None:
@@ -54,10 +54,10 @@ class Inbox:
         self.messages: deque[Message] = deque()
         self.dropped = 0
         self._limit = limit
-        self._bytes = 0  # of all that were put in, less those dropped; recounted where the bound seems near
+        self._bytes = 0  # of all added messages, minus the dropped ones; recounted near the bound
 
     def receive(self, message: MemberMessage, now_s: float) -> None:
-        """Put a message in.
+        """Add a message.
 
         Raises:
             RemoteError: MALFORMED or BAD_VERSION.
@@ -77,25 +77,26 @@ class Inbox:
     def _drop_oldest(self) -> None:
         messages = self.messages
         if self._bytes > QUEUE_MAX_BYTES:
-            self._bytes = sum(len(each.payload) for each in list(messages))  # without what the program has taken
+            # without the messages that the program has received
+            self._bytes = sum(len(each.payload) for each in list(messages))
         while len(messages) > self._limit or (self._bytes > QUEUE_MAX_BYTES and len(messages) > 1):
             try:
                 self._bytes -= len(messages.popleft().payload)
-            except IndexError:  # the program took the last one meanwhile
+            except IndexError:  # the program received the last one in the meantime
                 return
             self.dropped += 1
 
 
 class SessionCore:
-    """One session over one member.
+    """One session over one participant.
 
     Args:
         topics: the delegations of the node.
         random_start: returns 64 random bits, for the numbers of calls.
-        delegations_at: where delegations are kept, for errors.
+        delegations_at: location of the delegations, for errors.
 
     Attributes:
-        malformed: messages that were dropped because their content was wrong.
+        malformed: messages that were dropped because their content was malformed.
     """
 
     def __init__(
@@ -119,7 +120,7 @@ class SessionCore:
 
     @property
     def delegations(self) -> list[DelegatedName]:
-        """Return the names that the node may use."""
+        """Return the names that the node holds delegations for."""
         found = (topic.delegation for topic in self._topics.values())
         return [DelegatedName(each.name, each.rights, each.metadata) for each in found]
 
@@ -127,7 +128,7 @@ class SessionCore:
         """Return the delegation for a name.
 
         Raises:
-            DelegationError: none gives this right, or several do.
+            DelegationError: no delegation gives this right, or several do.
         """
         found = [topic for topic in self._topics.values() if _is_meant(topic, name)]
         allowed = [topic for topic in found if right in topic.delegation.rights]
@@ -144,17 +145,17 @@ class SessionCore:
         )
 
     def label(self, topic: Topic) -> str:
-        """Return what errors and logs call a name."""
+        """Return the word for a name in errors and logs."""
         delegation = topic.delegation
         return DelegatedName(delegation.name, delegation.rights, delegation.metadata).label
 
     def renew(self, topics: Iterable[Topic]) -> None:
-        """Take the delegations again: new epochs, longer validity and new names take effect."""
+        """Replace the delegations: new epochs, longer validity and new names take effect."""
         self._topics = {topic.name: topic for topic in topics}
         for topic in self._topics.values():
             self.member.renew(topic)
 
-    # what a program opens
+    # calls of a program
 
     def advertise(
         self, topic: Topic, *, reliable: bool, urgent: bool, latched: int, is_global: bool, description: bytes
@@ -169,7 +170,7 @@ class SessionCore:
         )
 
     def subscribe(self, topic: Topic, limit: int) -> Inbox:
-        """Read a name.
+        """Subscribe to a name.
 
         Raises:
             LocalError: the name is read, served or called already in this session.
@@ -179,7 +180,7 @@ class SessionCore:
         return inbox
 
     def unsubscribe(self, inbox: Inbox) -> None:
-        """Read a name no more."""
+        """Unsubscribe from a name."""
         if self._receivers.get(inbox.name) is inbox:
             del self._receivers[inbox.name]
             self.member.unsubscribe(inbox.name)
@@ -198,14 +199,14 @@ class SessionCore:
         return server
 
     def close_server(self, server: ServerCore, now_s: float) -> None:
-        """Serve a name no more; what is under way fails."""
+        """Stop serving a name; active requests fail."""
         for name in [name for name, each in self._servers.items() if each is server]:
             del self._servers[name], self._receivers[name]
             self._services.remove(server)
             server.close(now_s)
 
     def call(self, topic: Topic, call: Call, now_s: float) -> None:
-        """Begin a call; the first one on a name advertises that this node calls it.
+        """Begin a call; the first call on a name advertises that this node calls it.
 
         Raises:
             LocalError: the name is read or served already in this session.
@@ -218,7 +219,7 @@ class SessionCore:
         client.begin(call, now_s)
 
     def close(self, now_s: float) -> None:
-        """End everything, and say goodbye."""
+        """Close everything, and send a goodbye."""
         for server in list(self._servers.values()):
             self.close_server(server, now_s)
         for client in self._clients.values():
@@ -228,7 +229,7 @@ class SessionCore:
         self._services.clear()
         self.member.leave()
 
-    # what a driver calls
+    # calls of a driver
 
     @property
     def has_services(self) -> bool:
@@ -236,11 +237,11 @@ class SessionCore:
         return bool(self._services)
 
     def handle(self, now_s: float) -> None:
-        """Distribute what has arrived, and do what is due."""
+        """Distribute the received messages, and handle the timers that are due."""
         for message in self.member.poll_messages():
             receiver = self._receivers.get(message.topic)
             if receiver is None:
-                continue  # it arrived while its subscription was being closed
+                continue  # it arrived during the close of its subscription
             try:
                 receiver.receive(message, now_s)
             except RemoteError:
@@ -251,7 +252,7 @@ class SessionCore:
                 service.handle_timer(now_s)
 
     def get_timer(self) -> float | None:
-        """Return the monotonic second of the next timer beyond the member's own, or None."""
+        """Return the monotonic second of the next timer beyond the participant's own, or None."""
         if not self._services:
             return None
         times = [service.get_timer() for service in self._services]
@@ -259,7 +260,7 @@ class SessionCore:
 
 
 def replication_of(value: str | int | Replication) -> Replication:
-    """Return how a request is spread.
+    """Return how a request is replicated.
 
     Args:
         value: ``"all"``, ``"hedged"``, the number of servers that get a copy, or a ``Replication``.

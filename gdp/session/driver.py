@@ -1,14 +1,14 @@
-"""Driver of a session for programs with threads: the thread that waits drives the node.
+"""Thread driver of a session: the thread that waits drives the node.
 
-Layer: I/O. One thread at a time leads: it holds the lock, waits for frames, and lets the core distribute them.
+I/O. One thread at a time leads: it holds the lock, waits for frames, and lets the core distribute them.
 
     a thread that waits for a message   leads until it has one; so a message wakes one thread, not two
     further threads that wait           follow: the leader wakes them when their condition has come true
     no thread waits                     the background thread leads, once none has for ``_GRACE_S``
-    a thread that publishes             does it itself if no thread leads; else it hands the message to the leader
+    a thread that publishes             does it itself if no thread leads; else it passes the message to the leader
 
-Hand-over of commands is free of lost wake-ups: who finds the lock taken has queued its command before, and who gives
-the lock back looks at the queue afterwards (flat combining; Hendler et al., SPAA 2010).
+Commands are passed without lost wake-ups: a thread queues its command before it finds the lock taken, and the thread
+that releases the lock checks the queue afterwards (flat combining; Hendler et al., SPAA 2010).
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-_GRACE_S: Final = 0.02  # after the last leader left, before the background thread leads
-_QUEUED_MAX: Final = 1_024  # messages handed to the leader; who has more waits until it took them
-_COPY_MAX_BYTES: Final = 65_536  # a larger message is handed over only when the leader takes it at once
-_SMALL_BYTES: Final = 1_024  # such a message leaves with one send
+_GRACE_S: Final = 0.02  # from the end of the last leader until the background thread leads
+_QUEUED_MAX: Final = 1_024  # messages queued for the leader; a thread with more waits for the leader
+_COPY_MAX_BYTES: Final = 65_536  # a larger message is passed only if the leader takes it at once
+_SMALL_BYTES: Final = 1_024  # a message of this size leaves with one send
 
 
 class Driver(Protocol):
-    """What a session needs of its driver."""
+    """Interface of a driver to its session."""
 
     def now_s(self) -> float:
         """Return the present monotonic second."""
@@ -51,10 +51,10 @@ class Driver(Protocol):
         """Run a command on the node and return what it returns; it must not block."""
 
     def publish(self, publisher: Publisher, message: bytes) -> None:
-        """Publish a message, now or as soon as the leader takes it."""
+        """Publish a message, now or when the leader takes it."""
 
     def wait(self, is_ready: Callable[[], bool], deadline_s: float | None) -> bool:
-        """Work until ``is_ready``, or a monotonic second; return whether it came true."""
+        """Work until ``is_ready``, or until a monotonic second; return whether it came true."""
 
     def close(self) -> None:
         """End the background work."""
@@ -73,7 +73,7 @@ class _Wake:
 
     def set(self) -> None:
         """End the leader's wait; any thread may."""
-        if not self._is_set:  # one wake-up for many commands
+        if not self._is_set:  # one wake-up serves many commands
             self._is_set = True
             os.eventfd_write(self._fd, 1)
 
@@ -81,7 +81,7 @@ class _Wake:
         """Allow the leader to wait again."""
         with contextlib.suppress(BlockingIOError):
             os.eventfd_read(self._fd)
-        self._is_set = False  # last: a thread that sees it set has queued a command that the leader looks at next
+        self._is_set = False  # last: a thread that finds it set has queued a command that the leader checks next
 
     def close(self) -> None:
         """Close the descriptor."""
@@ -99,7 +99,7 @@ class _Follower:
 
 
 class ThreadDriver:
-    """Drives a core over a runtime; ``close`` ends it."""
+    """Driver of a core over a runtime; ``close`` ends it."""
 
     def __init__(self, core: SessionCore, runtime: Runtime) -> None:
         self._core = core
@@ -134,9 +134,10 @@ class ThreadDriver:
         errors: list[BaseException] = []
 
         def execute() -> None:
+            """Run the command and store its result or error."""
             try:
                 results.append(command())
-            except BaseException as error:  # it is raised in the thread that gave the command
+            except BaseException as error:  # re-raised in the thread that queued the command
                 errors.append(error)
             done.set()
 
@@ -151,7 +152,7 @@ class ThreadDriver:
         return results[0]
 
     def publish(self, publisher: Publisher, message: bytes) -> None:
-        """Publish a message, now or as soon as the leader takes it.
+        """Publish a message, now or when the leader takes it.
 
         Raises:
             LocalError: it is above the limits.
@@ -176,10 +177,10 @@ class ThreadDriver:
             self._drain_or_wake()
 
     def wait(self, is_ready: Callable[[], bool], deadline_s: float | None) -> bool:
-        """Work until ``is_ready``, or a monotonic second; return whether it came true.
+        """Work until ``is_ready``, or until a monotonic second; return whether it came true.
 
         Raises:
-            ClosedError: the session is or was closed meanwhile.
+            ClosedError: the session is closed, or was closed during the wait.
         """
         while True:
             if self._lock.acquire(blocking=False):
@@ -202,14 +203,14 @@ class ThreadDriver:
             follower.event.set()
         if threading.current_thread() is not self._thread:
             self._thread.join()
-        with self._lock:  # a thread that leads gives it back
+        with self._lock:  # waits until a leading thread releases it
             self._runtime.unwatch(self._wake)
             self._wake.close()
 
     # leading
 
     def _lead(self, is_ready: Callable[[], bool], deadline_s: float | None) -> bool:
-        """Work as the leader until ready; the lock is taken, and is given back here. Return whether it is ready."""
+        """Work as the leader until ready, and release the held lock; return whether it is ready."""
         self._is_led = True
         self._leads += 1
         try:
@@ -242,7 +243,7 @@ class ThreadDriver:
         if self._commands:
             self._run_commands()
         if core.has_services:
-            self._send(0)  # what servers and clients have to say must not wait for the next step
+            self._send(0)  # messages of servers and clients must not wait for the next step
         for follower in list(self._followers) if self._followers else ():
             if follower.is_ready():
                 follower.event.set()
@@ -256,20 +257,20 @@ class ThreadDriver:
     def _send(self, size_bytes: int) -> None:
         self._member.flush(time.monotonic())
         is_more = self._runtime.send()
-        while is_more and size_bytes > _SMALL_BYTES:  # what is confirmed meanwhile opens the window further
-            self._step(0.0)  # that second has passed: it does not wait
+        while is_more and size_bytes > _SMALL_BYTES:  # confirmations that arrive in the meantime open the window
+            self._step(0.0)  # that second has passed, so it does not wait
             is_more = self._runtime.send()
 
     # not leading
 
     def _follow(self, is_ready: Callable[[], bool], deadline_s: float | None) -> bool:
-        """Wait until the leader says that the condition came true, or that none leads; return whether it is true."""
+        """Wait until the leader reports the condition, or no thread leads; return whether it is true."""
         follower = _Follower(is_ready)
         self._followers.append(follower)
         try:
             if not (self._is_led or self._is_closed):
-                self._wake.set()  # the background thread makes place
-            if is_ready() or not self._lock.locked():  # it may have changed before the leader knew of us
+                self._wake.set()  # the background thread releases the lock
+            if is_ready() or not self._lock.locked():  # it may have changed before the leader saw this follower
                 return is_ready()
             follower.event.wait(None if deadline_s is None else max(deadline_s - time.monotonic(), 0.0))
             return is_ready()
@@ -277,7 +278,7 @@ class ThreadDriver:
             self._followers.remove(follower)
 
     def _drain_or_wake(self) -> None:
-        """Have the queued commands run: here if no thread leads, else by the leader."""
+        """Run the queued commands: here if no thread leads, else in the leader."""
         while self._commands:
             if not self._lock.acquire(blocking=False):
                 if not self._is_closed:
@@ -331,7 +332,7 @@ class ThreadDriver:
             self._unparked.wait(_GRACE_S)
             if self._leads == leads and not self._is_led and not self._followers:
                 return
-            if self._leads == leads and self._is_led:  # the same leader waits for long
+            if self._leads == leads and self._is_led:  # the same leader has waited for the whole time
                 self._unparked.clear()
                 self._is_pending = True
                 if self._is_led and not self._is_closed:
@@ -350,5 +351,5 @@ class ThreadDriver:
 def _publish_or_log(publisher: Publisher, message: bytes) -> None:
     try:
         publisher.publish(message)
-    except GdpError as error:  # its size was checked before
+    except GdpError as error:  # the size was checked before
         log.error("a message was not published reason=%s", error)

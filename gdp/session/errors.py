@@ -1,4 +1,4 @@
-"""Errors of sessions: each says what is wrong, where, and what to do.
+"""Errors of sessions; each text states what is wrong, where, and what to do.
 
 Sans-I/O.
 """
@@ -28,11 +28,11 @@ class SessionTimeoutError(SessionError, TimeoutError):
 
 
 class AttachError(SessionTimeoutError):
-    """No switch accepted the node in time; the text says what the node waits for."""
+    """No switch accepted the node in time; the text states what the node waits for."""
 
 
 class DelegationError(SessionError):
-    """The node holds no delegation, or several, for what a name and a right ask."""
+    """The node holds no delegation, or several, for a name and a right."""
 
 
 class ClosedError(SessionError):
@@ -40,11 +40,11 @@ class ClosedError(SessionError):
 
 
 class CallError(SessionError):
-    """Every server that was asked refused a request; the text is the last server's reason."""
+    """Every server refused a request; the text is the last server's reason."""
 
 
 class NoServerError(CallError, SessionTimeoutError):
-    """No server of the name was there."""
+    """No server of the name was available."""
 
 
 class CallTimeoutError(CallError, SessionTimeoutError):

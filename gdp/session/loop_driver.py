@@ -1,6 +1,6 @@
-"""Driver of a session for asyncio: the event loop of the program drives the node, without a thread.
+"""Loop driver of a session for asyncio: the event loop of the program drives the node, without a thread.
 
-Layer: I/O. The loop watches the plane's epoll descriptor and one timer; each step is short and does not wait.
+I/O. The loop watches the plane's epoll descriptor and one timer; each step is short and does not wait.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ __all__ = ["LoopDriver"]
 
 log = logging.getLogger(__name__)
 
-_STEPS_MAX: Final = 8  # before the program's other tasks have their turn
+_STEPS_MAX: Final = 8  # before the program's other tasks run
 
 
 class LoopDriver:
-    """Drives a core from the running event loop; only that loop's thread may use it."""
+    """Driver of a core in the running event loop; only that loop's thread may use it."""
 
     def __init__(self, core: SessionCore, runtime: Runtime, plane: NetdevPlane) -> None:
         self._core = core
@@ -55,10 +55,10 @@ class LoopDriver:
         self.schedule()
 
     async def wait(self, is_ready: Callable[[], bool], deadline_s: float | None) -> bool:
-        """Wait until ``is_ready``, or a monotonic second; return whether it came true.
+        """Wait until ``is_ready``, or until a monotonic second; return whether it came true.
 
         Raises:
-            ClosedError: the session is or was closed meanwhile.
+            ClosedError: the session is closed, or was closed during the wait.
         """
         if is_ready():
             return True
@@ -77,7 +77,7 @@ class LoopDriver:
         return True
 
     def schedule(self) -> None:
-        """Take a step soon: something was asked of the node."""
+        """Schedule a step soon, because the node has new work."""
         if not self._is_scheduled and not self._is_closed:
             self._is_scheduled = True
             self._loop.call_soon(self._scheduled)
@@ -109,11 +109,11 @@ class LoopDriver:
             self._work()
 
     def _work(self) -> None:
-        """Take steps while there is something to do, then set the timer."""
+        """Take steps while there is work, then set the timer."""
         try:
             for _ in range(_STEPS_MAX):
                 now_s = time.monotonic()
-                self._runtime.step(now_s)  # that second has come: it does not wait
+                self._runtime.step(now_s)  # that second has passed, so it does not wait
                 self._core.handle(time.monotonic())
                 if not self._runtime.send():
                     break

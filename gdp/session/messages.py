@@ -1,4 +1,4 @@
-"""What a session gives to a program: messages, requests, responses, and the names that its node may use.
+"""Messages, requests and responses of a session, and the names that its node may use.
 
 Sans-I/O.
 """
@@ -19,12 +19,12 @@ NameLike: TypeAlias = Union[str, Name, Metadata]  # noqa: UP007 (typing.get_type
 
 
 class Message(NamedTuple):
-    """A published message as a subscriber gets it.
+    """A published message as a subscriber receives it.
 
     Attributes:
-        payload: what was published.
+        payload: the published bytes.
         publisher: name of the node that published it, proven by its signature.
-        number: which message of the publisher's present life it is, from 1; a gap is a message that was lost.
+        number: its number within the publisher's present incarnation, from 1; a gap is a lost message.
         hops: links between switches that it crossed.
         stamp_ns: when it was published, by the publisher's clock, in nanoseconds since 1970.
     """
@@ -42,10 +42,10 @@ class Message(NamedTuple):
 
 
 class Request(NamedTuple):
-    """A request as a server's handler gets it.
+    """A request as a server's handler receives it.
 
     Attributes:
-        payload: what the client sent.
+        payload: the bytes that the client sent.
         client: name of the client's node, proven by its signature.
     """
 
@@ -57,7 +57,7 @@ class Response(NamedTuple):
     """The response to a call.
 
     Attributes:
-        payload: what the server's handler returned.
+        payload: the bytes that the server's handler returned.
         server: name of the server's node, proven by its signature.
     """
 
@@ -71,7 +71,7 @@ class DelegatedName(NamedTuple):
     Attributes:
         name: the 256-bit name.
         rights: what the node may do with it.
-        metadata: what the name stands for, if its owner added it.
+        metadata: the metadata of the name, if its owner added them.
     """
 
     name: Name

@@ -1,6 +1,6 @@
-"""The node under a session: a member of the overlay on one device, with its credentials and its log.
+"""Node of a session: a participant of the overlay on one device, with its credentials and its log.
 
-Layer: I/O.
+I/O.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _open_lock: Final = threading.Lock()
 
 @dataclass(slots=True)
 class SessionNode:
-    """What a driver runs; ``close`` gives everything back."""
+    """The node that a driver runs; ``close`` releases all its resources."""
 
     config: SessionConfig
     identity: Identity
@@ -52,12 +52,12 @@ class SessionNode:
     _stack: ExitStack
 
     def waiting_for(self) -> str:
-        """Return what keeps the node from being attached, as a sentence."""
+        """Return what prevents the node from being attached, as a sentence."""
         texts = self.node_log.waiting_for(time.monotonic())
         return "; ".join(texts) or "the switch has not answered yet"
 
     def refused(self, name: Name) -> str:
-        """Return why the overlay refused an advertisement of this node; empty where it did not."""
+        """Return why the overlay rejected an advertisement of this node; empty if it did not."""
         advertisements = (each for each in self.member.attachment.advertisements if each.subject.name == name)
         return next((each.refused.label for each in advertisements if each.refused is not None), "")
 
@@ -70,7 +70,7 @@ class SessionNode:
         self.core.renew(DelegationStore(self.config.delegation_directory, self.identity))
 
     def close(self) -> None:
-        """Close the device and give the identity free."""
+        """Close the device and release the identity."""
         self._stack.close()
 
 
@@ -78,7 +78,7 @@ def open_node(config: SessionConfig) -> SessionNode:
     """Open everything that a session needs.
 
     Raises:
-        LocalError: keys, delegations or the device are not as the settings say, or this node already runs.
+        LocalError: keys, delegations or the device differ from the settings, or this node already runs.
     """
     identity, policy = load_member(config.identity, config.domain, Role.PROXY)
     settings = NodeSettings(incarnation(), wall_clock_ms(), fresh_bytes, lease_s=config.lease_s)
@@ -109,7 +109,7 @@ def open_node(config: SessionConfig) -> SessionNode:
 
 
 def _own(name: Name) -> Callable[[], None]:
-    """Note that this process uses an identity; return what undoes that.
+    """Record that this process uses an identity; return the function that undoes that.
 
     Raises:
         SessionError: another session of this process uses it.
@@ -120,6 +120,7 @@ def _own(name: Name) -> Callable[[], None]:
         _open_names.add(name)
 
     def give_free() -> None:
+        """Release the identity."""
         with _open_lock:
             _open_names.discard(name)
 

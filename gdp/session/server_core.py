@@ -1,7 +1,7 @@
-"""One name served by a session: requests in order, responses to the clients that sent them.
+"""Server of one name in a session: requests in order, and responses to the clients that sent them.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). ``gdp/service/serving.py`` keeps the order, and repeats the
-response of a request that comes twice.
+response of a duplicate request.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from gdp.session.wire import LEAVING, PAYLOAD_MAX_BYTES, SERVING, RequestFrame, 
 
 __all__ = ["ServerCore"]
 
-_GRACE_S: Final = 0.5  # the client ends a call; a server only forgets it
+_GRACE_S: Final = 0.5  # the client ends a call; the server only drops it this much later
 _CALL_MAX_S: Final = 3_600.0
 _CHECK_CLIENTS_S: Final = 0.5
-_CLIENT_AWAY_S: Final = 30.0  # a client that is silent for so long waits no more
+_CLIENT_AWAY_S: Final = 30.0  # a client that is silent for so long has ended its wait
 _PART: Final = 0
 
 
 class ServerCore:
-    """One served name.
+    """Server of one name.
 
     Args:
         start: number of the first call here, random in 64 bits.
-        at_once: most requests that handlers work on at one time.
+        at_once: most requests that handlers process at the same time.
 
     Attributes:
-        turns: requests for handlers, in order; a driver takes them out.
-        unsent: responses that could not be sent, since their client had gone.
+        turns: requests for handlers, in order; a driver removes them.
+        best_effort_queue: number of responses that could not be sent, because their client had gone.
 
     Raises:
         LocalError: no delegation, or the name is in use in this session.
@@ -46,24 +46,24 @@ class ServerCore:
         self._name = topic.name
         self._serving: Serving[bytes] = Serving(start, at_once)
         self._publisher = member.serve(topic, SERVING, is_global=is_global, urgent=urgent)
-        self._seen_s: dict[Name, float] = {}  # when the clients of calls under way were last there
-        self._check_at_s: float | None = None  # when clients are checked next; None: no call is under way
+        self._seen_s: dict[Name, float] = {}  # when the clients of active calls were last alive
+        self._check_at_s: float | None = None  # when clients are checked next; None: no call is active
         self._is_leaving = False
         self.turns: deque[Turn[bytes]] = deque()
         self.best_effort_queue = 0
 
     @property
     def clients(self) -> int:
-        """Return how many clients are there."""
+        """Return the number of clients."""
         return len(self._member.peers(self._name))
 
     @property
     def is_idle(self) -> bool:
-        """Return whether no request is under way."""
+        """Return whether no request is active."""
         return not len(self._serving)
 
     def receive(self, message: Message, now_s: float) -> None:
-        """Take a client's request, or its word that calls have ended.
+        """Process a client's request, or its notice that calls have ended.
 
         Raises:
             RemoteError: MALFORMED or BAD_VERSION.
@@ -82,7 +82,7 @@ class ServerCore:
 
         Args:
             number: of the turn.
-            outcome: the payload, or as text the reason why there is none.
+            outcome: the payload, or as text the reason for the failure.
         """
         asked = self._serving.end(number)
         if asked is not None:
@@ -95,20 +95,20 @@ class ServerCore:
         self._give()
 
     def leave(self) -> None:
-        """Take no new requests: clients learn to ask other servers; what is under way is finished."""
+        """Accept no new requests: clients learn to use other servers, and active requests finish."""
         self._is_leaving = True
         self._publisher.describe(LEAVING)
 
     def close(self, now_s: float) -> None:
-        """Serve the name no more; calls under way fail."""
+        """Stop serving the name; active calls fail."""
         for asked in self._serving.fail_all():
             self._respond(asked, ResponseFrame.failed(asked.call, "the server was closed"))
         self.turns.clear()
-        self._member.flush(now_s)  # the responses must go before their stream ends
+        self._member.flush(now_s)  # the responses must leave before their stream ends
         self._member.withdraw(self._name)
 
     def handle_timer(self, now_s: float) -> None:
-        """Give up requests that no client waits for."""
+        """Drop requests that no client waits for."""
         for each in self._serving.expired(now_s):
             if each.asked is not None:
                 self._respond(each.asked, ResponseFrame.failed(each.asked.call, "the server did not respond in time"))
@@ -153,10 +153,10 @@ class ServerCore:
         try:
             self._member.respond(self._name, client, wire)
         except LocalError:
-            self.best_effort_queue += 1  # the client has gone; asked again, it gets the response that is remembered
+            self.best_effort_queue += 1  # the client has gone; if it repeats the request, it gets the stored response
 
     def _check_clients(self, now_s: float) -> None:
-        """Forget the calls of clients that have gone."""
+        """Drop the calls of clients that have gone."""
         here = set(self._member.heard(self._name))
         known = {writer_proxy.publisher for writer_proxy in self._member.writer_proxies_of(self._name)}
         clients = self._serving.clients

@@ -1,6 +1,6 @@
 """Sessions for programs with threads: publish, subscribe, serve and call.
 
-Layer: I/O, by its driver. Any thread may use a session and what it opens; ``aio.py`` has the same for asyncio.
+I/O, by its driver. Any thread may use a session and the objects that it opens; ``aio.py`` has the same for asyncio.
 """
 
 from __future__ import annotations
@@ -37,22 +37,22 @@ log = logging.getLogger(__name__)
 ATTACH_TIMEOUT_S: Final = 10.0
 CALL_TIMEOUT_S: Final = 10.0
 LINGER_S: Final = 1.0
-GOODBYE_S: Final = 0.2  # how long a node that leaves goes on, so that its goodbye is sent
+GOODBYE_S: Final = 0.2  # how long a leaving node continues, so that its goodbye is sent
 Priority = Literal["normal", "urgent"]
 
 
 class Node(Protocol):
-    """What a session needs of its node."""
+    """Interface of a node to its session."""
 
     @property
     def core(self) -> SessionCore:
-        """The core."""
+        """The core of the session."""
 
     def waiting_for(self) -> str:
-        """Return what keeps the node from being attached."""
+        """Return what prevents the node from being attached."""
 
     def refused(self, name: Name) -> str:
-        """Return why the overlay refused an advertisement; empty where it did not."""
+        """Return why the overlay rejected an advertisement; empty if it did not."""
 
     def reload(self) -> None:
         """Read the delegations again."""
@@ -62,7 +62,7 @@ class Node(Protocol):
 
 
 class Publisher:
-    """Publishes one name; made by ``Session.publisher``."""
+    """Publisher of one name; made by ``Session.publisher``."""
 
     def __init__(self, session: Session, topic: Topic, publisher: MemberPublisher, *, reliable: bool) -> None:
         self._session = session
@@ -79,7 +79,7 @@ class Publisher:
 
     @property
     def readers(self) -> int:
-        """Return how many readers are there."""
+        """Return the number of matched readers."""
         return self._publisher.readers
 
     @property
@@ -89,27 +89,27 @@ class Publisher:
 
     @property
     def lost(self) -> int:
-        """Return how many messages some reader did not get, as far as it is known here."""
+        """Return how many messages some reader did not get, as far as this node knows."""
         return self._publisher.losses.total
 
     @property
     def resent(self) -> int:
-        """Return how many parts were sent again because a reader lacked them."""
+        """Return how many fragments were retransmitted because a reader lacked them."""
         return self._publisher.repairs
 
     def put(self, payload: bytes, timeout_s: float | None = None) -> None:
         """Publish a message.
 
-        A reliable publisher waits while its window is full, so no reader loses a message to a fast publisher. What is
-        published without a reader is lost, unless the publisher is ``latched``; see ``wait_for_readers``.
+        A reliable publisher waits while its window is full, so no reader loses a message to a fast publisher. A message
+        without a reader is lost, unless the publisher is ``latched``; see ``wait_for_readers``.
 
         Args:
             payload: at most ``MESSAGE_MAX_BYTES`` less 14.
-            timeout_s: longest wait while the window is full; None: as long as it takes.
+            timeout_s: longest wait while the window is full; None: no limit.
 
         Raises:
             SessionTimeoutError: the window stayed full.
-            LocalError: the payload is too large, or no bytes.
+            LocalError: the payload is too large, or not bytes.
             ClosedError: the publisher or the session is closed.
         """
         if self._is_closed:
@@ -121,10 +121,10 @@ class Publisher:
         self._driver.publish(self._publisher, message_to_wire(time.time_ns(), payload))
 
     def wait_for_readers(self, count: int = 1, timeout_s: float | None = None) -> None:
-        """Wait until so many readers are there.
+        """Wait until at least ``count`` readers are matched.
 
         Raises:
-            SessionTimeoutError: they did not come in time; the text says why, where that is known.
+            SessionTimeoutError: the readers did not appear in time; the text gives the reason if it is known.
         """
         if not self._driver.wait(lambda: self._publisher.readers >= count, _deadline_s(self._driver, timeout_s)):
             raise SessionTimeoutError(
@@ -133,16 +133,16 @@ class Publisher:
             )
 
     def flush(self, timeout_s: float | None = None) -> None:
-        """Wait until every reader has confirmed every message; of a publisher without ``reliable``, until it is sent.
+        """Wait until every reader has confirmed every message; without ``reliable``, until every message is sent.
 
         Raises:
-            SessionTimeoutError: they did not in time.
+            SessionTimeoutError: that did not happen in time.
         """
         if not self._driver.wait(self._publisher.is_acknowledged, _deadline_s(self._driver, timeout_s)):
             raise SessionTimeoutError(f"{self._label}: not every reader has confirmed within {timeout_s:g} s")
 
     def close(self) -> None:
-        """Publish no more; what readers lack is lost, so ``flush`` first. Idempotent."""
+        """Stop publishing; unconfirmed messages are lost, so ``flush`` first. Idempotent."""
         if not self._is_closed:
             self._is_closed = True
             self._session.forget(self)
@@ -170,7 +170,7 @@ class Publisher:
 
 
 class Subscription:
-    """The messages of one name, an iterator that waits for the next; made by ``Session.subscribe``."""
+    """Messages of one name as an iterator that waits for the next; made by ``Session.subscribe``."""
 
     def __init__(self, session: Session, topic: Topic, inbox: Inbox) -> None:
         self._session = session
@@ -187,7 +187,7 @@ class Subscription:
 
     @property
     def publishers(self) -> int:
-        """Return how many publishers are there."""
+        """Return the number of matched publishers."""
         return len(self._session.core.member.writer_proxies_of(self.name))
 
     @property
@@ -197,14 +197,14 @@ class Subscription:
 
     @property
     def dropped(self) -> int:
-        """Return how many messages were dropped here because the program took too few."""
+        """Return how many messages this node dropped because the program received too few."""
         return self._inbox.dropped
 
     def receive(self, timeout_s: float | None = None) -> Message:
-        """Return the next message; from one publisher they come in order.
+        """Return the next message; messages of one publisher come in order.
 
         Args:
-            timeout_s: longest wait; None: as long as it takes.
+            timeout_s: longest wait; None: no limit.
 
         Raises:
             SessionTimeoutError: no message came in time.
@@ -223,7 +223,7 @@ class Subscription:
                 raise SessionTimeoutError(f"{label}: no message within {timeout_s:g} s{hint}")
             try:
                 return self._messages.popleft()
-            except IndexError:  # another thread took it, or the subscription was closed
+            except IndexError:  # another thread received it, or the subscription was closed
                 if self._is_closed:
                     label = self._session.core.label(self._topic)
                     raise ClosedError(f"the subscription to {label} is closed; subscribe again") from None
@@ -250,7 +250,7 @@ class Subscription:
             raise StopIteration from None
 
     def close(self) -> None:
-        """Subscribe no more; idempotent."""
+        """Unsubscribe. Idempotent."""
         if not self._is_closed:
             self._is_closed = True
             self._session.forget(self)
@@ -264,7 +264,7 @@ class Subscription:
 
 
 class Server:
-    """Serves one name with a handler; made by ``Session.serve``."""
+    """Server of one name with a handler; made by ``Session.serve``."""
 
     def __init__(
         self, session: Session, topic: Topic, server: ServerCore, handler: Callable[[Request], bytes], workers: int
@@ -289,14 +289,14 @@ class Server:
 
     @property
     def clients(self) -> int:
-        """Return how many clients are there."""
+        """Return the number of clients."""
         return self._core.clients
 
     def close(self, linger_s: float = LINGER_S) -> None:
-        """Serve no more: tell clients to ask other servers, finish what is under way, then withdraw. Idempotent.
+        """Stop serving: direct clients to other servers, finish active requests, then withdraw. Idempotent.
 
         Args:
-            linger_s: longest time for what is under way; the rest fails.
+            linger_s: longest time for active requests; the others fail.
         """
         if self._is_closed:
             return
@@ -307,7 +307,7 @@ class Server:
         self._driver.run(lambda: self._session.core.close_server(self._core, self._driver.now_s()))
 
     def serve_forever(self) -> None:
-        """Wait until the server or the session is closed, for a program that does nothing else."""
+        """Wait until the server or the session is closed, for a program that only serves."""
         try:
             self._driver.wait(lambda: self._is_closed, None)
         except ClosedError:
@@ -328,7 +328,7 @@ class Server:
                 try:
                     turn = turns.popleft()
                 except IndexError:
-                    continue  # another worker has it
+                    continue  # another worker handles it
                 outcome = outcome_of(self._handler, Request(turn.request, turn.asked.client))
                 self._driver.run(partial(self._core.finish, turn.number, outcome))
         except ClosedError:
@@ -338,8 +338,8 @@ class Server:
 class Session:
     """A node of the overlay in this process; made by ``gdp.open``.
 
-    Use it as a context manager, or call ``close``: then readers get what was published, and the overlay learns at once
-    that the node has left.
+    Use it as a context manager, or call ``close``: then readers get the published messages, and the overlay learns at
+    once that the node has left.
     """
 
     def __init__(self, node: Node, driver: Driver) -> None:
@@ -356,12 +356,12 @@ class Session:
 
     @property
     def delegations(self) -> list[DelegatedName]:
-        """Return the names that this node may use, and how."""
+        """Return the names that this node holds delegations for, with its rights."""
         return self.core.delegations
 
     @property
     def is_attached(self) -> bool:
-        """Return whether a switch has accepted the node and what it advertises."""
+        """Return whether a switch has accepted the node and its advertisements."""
         return self.core.member.attachment.is_attached
 
     def publisher(
@@ -378,11 +378,11 @@ class Session:
 
         Args:
             name: ``name`` of its metadata, such as ``"camera"``; 64 hex digits; a ``Name``; or the ``Metadata``.
-            reliable: whether readers get every message, in order; else what is lost on the way stays lost.
-            priority: ``"urgent"`` messages go before others wherever they queue.
+            reliable: whether readers get every message, in order; otherwise lost messages stay lost.
+            priority: ``"urgent"`` messages precede others in every queue.
             latched: how many of the last messages late readers get.
-            is_global: whether the name can be found from other domains.
-            description: what readers must know to understand the messages; travels sealed.
+            is_global: whether other domains can find the name.
+            description: information that readers need to decode the messages; it travels sealed.
 
         Raises:
             DelegationError: the node may not publish it.
@@ -400,7 +400,7 @@ class Session:
         return publisher
 
     def subscribe(self, name: NameLike, *, queue: int = QUEUE_MESSAGES) -> Subscription:
-        """Subscribe to a name; iterate what this returns.
+        """Subscribe to a name; iterate over the returned object.
 
         Args:
             name: as for ``publisher``.
@@ -420,7 +420,7 @@ class Session:
     def receive_any(
         self, subscriptions: Collection[Subscription], timeout_s: float | None = None
     ) -> tuple[Subscription, Message]:
-        """Return the next message of several subscriptions, and whose it is, for one thread that reads many names.
+        """Return the next message of several subscriptions, and its subscription, for a thread that reads many names.
 
         Raises:
             SessionTimeoutError: no message came in time.
@@ -449,9 +449,9 @@ class Session:
 
         Args:
             name: as for ``publisher``.
-            handler: called in a worker thread. Where it raises, the client gets the error's text, and may ask another
-                server.
-            workers: threads, so how many requests are handled at one time.
+            handler: called in a worker thread. If it raises, the client gets the error's text, and may call another
+            server.
+            workers: number of threads, and so of requests that are handled at the same time.
 
         Raises:
             DelegationError: the node may not serve it.
@@ -478,13 +478,13 @@ class Session:
 
         Args:
             name: as for ``publisher``.
-            timeout_s: longest wait, for a server to come and for its response; None: as long as it takes.
-            replication: ``"all"`` servers get the request; ``"hedged"``: one, and a second one where the first is slow;
-                a number: so many, the fastest ones; or a ``Replication``.
+            timeout_s: longest wait for a server and its response; None: no limit.
+            replication: ``"all"``: every server gets the request; ``"hedged"``: one server, and a second one if the
+                first is slow; a number: that many servers, the fastest ones; or a ``Replication``.
 
         Raises:
-            NoServerError: no server is there.
-            CallTimeoutError: none responded in time.
+            NoServerError: no server is available.
+            CallTimeoutError: no server responded in time.
             CallError: every server refused, or its handler raised.
             DelegationError: the node may not call it.
         """
@@ -507,10 +507,10 @@ class Session:
         self.driver.run(self._node.reload)
 
     def close(self, linger_s: float = LINGER_S) -> None:
-        """Close everything that was opened, and leave the overlay. Idempotent.
+        """Close all publishers, subscriptions and servers, and leave the overlay. Idempotent.
 
         Args:
-            linger_s: longest wait for readers to confirm what was published, and for requests under way.
+            linger_s: longest wait for the confirmation of published messages, and for active requests.
         """
         if self._is_closed:
             return
@@ -533,20 +533,20 @@ class Session:
         """Wait until a switch has accepted the node.
 
         Raises:
-            AttachError: none did in time; the text says what the node waits for.
+            AttachError: no switch accepted it in time; the text states what the node waits for.
         """
         if not self.driver.wait(lambda: self.is_attached, self.driver.now_s() + timeout_s):
             raise AttachError(f"not attached within {timeout_s:g} s: {self._node.waiting_for()}")
 
     def why_not(self, name: Name, otherwise: str) -> str:
-        """Return the end of an error's sentence: why nothing crosses on a name, as far as it is known here."""
+        """Return the end of an error's sentence: why no data flows on a name, as far as this node knows."""
         if not self.is_attached:
             return f"; the node is not attached: {self._node.waiting_for()}"
         refused = self._node.refused(name)
         return f"; the advertisement was refused: {refused}" if refused else f"; {otherwise}"
 
     def forget(self, opened: Publisher | Subscription | Server) -> None:
-        """Close this one no more: it has been closed by itself."""
+        """Remove an object from the session's list after it closed itself."""
         if opened in self._opened:
             self._opened.remove(opened)
 
@@ -581,7 +581,7 @@ def open_session(
     Args:
         node: the node's directory, as ``gdp keygen node`` and ``gdp cert issue`` made it, or a configuration file: a
             ``proxy.yaml``, of which a session uses ``identity``, ``domain``, ``iface``, ``delegations`` and ``state``.
-            For a directory ``robot/proxy`` it reads ``robot/proxy.yaml`` where there is one.
+            For a directory ``robot/proxy`` it reads ``robot/proxy.yaml`` if that exists.
         iface: device towards the switch. Default: the configuration's; else the directory's name and a 0 (``proxy0``),
             as ``attach`` of the switch makes it.
         root: certificate of the node's trust domain. Default: the configuration's; else ``root.crt`` of the directory.
@@ -594,7 +594,7 @@ def open_session(
         timeout_s: longest wait until a switch has accepted the node.
 
     Raises:
-        LocalError: keys, delegations or the device are not as the options say, or this node already runs.
+        LocalError: keys, delegations or the device differ from the options, or this node already runs.
         ConfigError: the configuration file is wrong.
         AttachError: no switch accepted the node in time.
     """
@@ -619,17 +619,17 @@ def open_session(
 
 
 def outcome_of(handler: Callable[[Request], bytes], request: Request) -> bytes | str:
-    """Return a handler's response, or as text why there is none."""
+    """Return a handler's response, or as text the reason for its failure."""
     try:
         response = handler(request)
-    except Exception as error:  # the program's own
+    except Exception as error:  # an error of the program's handler
         log.exception("a handler failed client=%s", request.client.short)
         return f"{type(error).__name__}: {error}"
     return checked_response(response)
 
 
 def checked_response(response: object) -> bytes | str:
-    """Return a response as bytes, or as text that it is none."""
+    """Return a response as bytes, or as text that it is not bytes."""
     if isinstance(response, bytes | bytearray | memoryview):
         return bytes(response)
     return f"the handler returned {type(response).__name__}, not bytes"

@@ -1,8 +1,8 @@
-"""Settings of a session: from a node's directory or a configuration file, and the options of ``gdp.open``.
+"""Settings of a session: a node's directory or a configuration file, and the options of ``gdp.open``.
 
-Layer: I/O; loading reads files and changes nothing. A directory is one that ``gdp keygen node`` made. What an option
-does not say comes from the file of the same name (``robot/proxy.yaml`` for ``robot/proxy``) where there is one. Else it
-comes from the directory: ``root.crt``, ``delegations/``, and its own name for the device (``proxy0`` for ``proxy``).
+I/O; loading reads files and changes nothing. ``gdp keygen node`` makes such a directory. A missing option comes from
+the file of the same name (``robot/proxy.yaml`` for ``robot/proxy``) if it exists. Otherwise it comes from the
+directory: ``root.crt``, ``delegations/``, and its own name for the device (``proxy0`` for ``proxy``).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class SessionConfig(Section):
     state: Directory | None = None
     lease_s: LeaseSeconds = ADVERTISEMENT_LEASE_S
     busy_poll_us: int = Field(default=SPIN_US, ge=0, le=SPIN_MAX_US)
-    # keys of proxy.yaml alone
+    # keys that only proxy.yaml uses
     ros: object = None
     expose: object = None
     imports: object = Field(default=None, alias="import")
@@ -49,7 +49,7 @@ class SessionConfig(Section):
 
     @property
     def delegation_directory(self) -> Path:
-        """Return where the delegations are."""
+        """Return the directory of the delegations."""
         return self.identity / DELEGATIONS if self.delegations is None else self.delegations
 
 
@@ -67,7 +67,7 @@ def settings_of(
     """Return the settings of a session; see ``gdp.open`` for the options.
 
     Raises:
-        LocalError: there is no such node, or an option is out of bounds.
+        LocalError: the node does not exist, or an option is out of bounds.
         ConfigError: the configuration file is wrong.
     """
     path = Path(node).expanduser()

@@ -34,7 +34,7 @@ __all__ = [
 
 VERSION: Final = 1
 SERVING: Final = b"gdp-session-1"  # description of a server, and of a client
-LEAVING: Final = b"gdp-session-1 leaving"  # ... of a server that finishes what it has, and takes nothing more
+LEAVING: Final = b"gdp-session-1 leaving"  # ... of a server that finishes its active requests, and accepts no more
 PATIENCE_MAX_MS: Final = (1 << 32) - 1
 _REASON_MAX_BYTES: Final = 1_024
 _KIND_REQUEST, _KIND_RESPONSE, _KIND_STOP = range(3)
@@ -50,7 +50,7 @@ class RequestFrame(NamedTuple):
     """A request under its client's number."""
 
     call: int
-    patience_ms: int  # 0: the client waits as long as it takes
+    patience_ms: int  # 0: the client waits without a limit
     payload: bytes
 
     def to_wire(self) -> bytes:
@@ -59,7 +59,7 @@ class RequestFrame(NamedTuple):
 
 
 class ResponseFrame(NamedTuple):
-    """What a server says to one request: a payload, or why there is none."""
+    """Response of a server to one request: a payload, or the reason for its failure."""
 
     call: int
     is_failure: bool
@@ -81,7 +81,7 @@ class ResponseFrame(NamedTuple):
 
 
 class StopFrame(NamedTuple):
-    """Calls of a client that have ended: a server that has not begun them drops them."""
+    """Calls of a client that have ended; a server that has not begun them drops them."""
 
     calls: Sequence[int]
 
@@ -110,7 +110,7 @@ def read_message(wire: bytes) -> tuple[int, bytes]:
 
 
 def read_request(wire: bytes) -> RequestFrame | StopFrame:
-    """Read what a client sends.
+    """Parse a frame of a client.
 
     Raises:
         RemoteError: MALFORMED or BAD_VERSION.
@@ -126,7 +126,7 @@ def read_request(wire: bytes) -> RequestFrame | StopFrame:
 
 
 def read_response(wire: bytes) -> ResponseFrame:
-    """Read what a server sends to one client.
+    """Parse a frame of a server to one client.
 
     Raises:
         RemoteError: MALFORMED or BAD_VERSION.

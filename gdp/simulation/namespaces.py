@@ -1,8 +1,8 @@
-"""A topology made real: one network namespace a switch, one veth pair a link, processes started inside.
+"""Kernel namespaces that realise a topology: one namespace per switch, one veth pair per link, processes inside.
 
-Place: shell; needs root of the machine or of a user namespace.
-Devices carry no addresses and speak no IPv6: what travels on them is ours alone. On every end the device is called like
-the neighbour it leads to, and its MAC says both (``02:67:64:70:AA:BB``, the AA-th switch towards the BB-th).
+I/O; needs root of the machine or of a user namespace.
+Devices have no addresses and no IPv6: all traffic on them is ours. On every end the device has the name of the
+neighbour that it leads to. Its MAC encodes both switches (``02:67:64:70:AA:BB``, the AA-th towards the BB-th).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Namespaces:
     """The namespaces of one run. ``run.end()`` removes exactly these, and with them every device inside.
 
     Raises:
-        LocalError: the kernel refuses; what was made until then is in the run's record.
+        LocalError: the kernel refuses; the run's record names what was made before.
     """
 
     def __init__(self, topology: Topology, run: Run) -> None:
@@ -60,7 +60,7 @@ class Namespaces:
         Args:
             node: the switch.
             argv: program and arguments.
-            dies_with_us: the kernel kills it when the thread that starts it ends, however that comes about.
+            dies_with_us: whether the kernel kills it when the thread that starts it ends in any way.
         """
         leash = ["setpriv", "--pdeathsig", "KILL", "--"] if dies_with_us else []
         return ["nsenter", f"--net={self._paths[node]}", "--", *leash, *argv]
@@ -70,11 +70,11 @@ class Namespaces:
         self._set_link(a, b, "down")
 
     def mend(self, a: str, b: str) -> None:
-        """Bring a cut link back."""
+        """Bring a cut link back up."""
         self._set_link(a, b, "up")
 
     def plug(self, home: str, ifname: str, switch: str) -> None:
-        """Join device ``ifname`` in one switch's namespace to a new ``ifname-s`` in that of another, or the same."""
+        """Connect device ``ifname`` in one switch's namespace to a new ``ifname-s`` in another's, or its own."""
         self._plugged += 1
         mtu = max(link.mtu for link in self.topology.links)
         far = os.open(self._paths[switch], os.O_RDONLY | os.O_CLOEXEC)
@@ -86,7 +86,7 @@ class Namespaces:
         self._inside(home, partial(_set_state, ifname, "up"))
 
     def unplug(self, home: str, ifname: str) -> None:
-        """Take away what ``plug`` made: both ends are gone."""
+        """Remove the pair that ``plug`` made."""
         self._inside(home, partial(_delete, ifname))
 
     def _set_link(self, a: str, b: str, state: str) -> None:
@@ -97,7 +97,7 @@ class Namespaces:
         number = {node: index for index, node in enumerate(self.topology.nodes, 1)}
         files = {node: os.open(path, os.O_RDONLY | os.O_CLOEXEC) for node, path in self._paths.items()}
         try:
-            # Any namespace will do to ask from; in one of ours, no name of the machine's can clash.
+            # The request may come from any namespace; in one of ours, no device name of the machine can clash.
             self._inside(self.topology.nodes[0], partial(_add, self.topology.links, number, files))
         finally:
             for descriptor in files.values():
@@ -105,20 +105,21 @@ class Namespaces:
 
     def _inside(self, node: str, work: Callable[[IPRoute], object]) -> None:
         def ask() -> None:
+            """Do the work with a netlink socket in the namespace."""
             with IPRoute() as ipr:
                 work(ipr)
 
         try:
             netns_files.inside(self._paths[node], ask)
-        except Exception as error:  # pyroute2 raises NetlinkError, which is no OSError
+        except Exception as error:  # pyroute2 raises NetlinkError, which is not an OSError
             raise LocalError(f"namespace of {node}: {error}") from error
 
 
 def _add(links: Sequence[Link], number: dict[str, int], files: dict[str, int], ipr: IPRoute) -> None:
-    """Make the veth pairs. Two ends must not share an index, or Linux may tell of a lost carrier a whole second late.
+    """Make the veth pairs, whose two ends must not share an index.
 
-    Source of that: Linux, net/core/link_watch.c, ``linkwatch_urgent_event``. The far end's index is the kernel's
-    choice, and it counts from 2.
+    With equal indices, Linux may report a lost carrier up to a second late. Source: Linux, net/core/link_watch.c,
+    ``linkwatch_urgent_event``. The kernel chooses the far end's index, and counts from 2.
     """
     for index, link in enumerate(links, _INDEX_FROM):
         a, b = number[link.a], number[link.b]

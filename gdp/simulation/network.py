@@ -1,11 +1,8 @@
-"""A network in memory: the same machines that run on real sockets, joined by links with delay, loss and reordering.
+"""Simulated network in memory: the protocol cores of real nodes, joined by links with delay, loss and reordering.
 
-Its clock jumps from event to event.
+No I/O; its virtual clock jumps from event to event, and a seed makes it deterministic.
 
-Place: shell, though without any I/O; deterministic for a seed.
-
-A switch's frames go through the reference decision first, like on any data plane; only what that hands up reaches its
-machine.
+The frames of a switch pass the reference decision first, as on any data plane; only punted frames reach its core.
 """
 
 from __future__ import annotations
@@ -25,8 +22,8 @@ from gdp.switch.table import Table
 
 __all__ = ["SimLink", "SimNetwork", "Tap"]
 
-_STALLED_MAX: Final = 8_192  # frames that wait for a frozen node, about what a socket holds
-_SAME_INSTANT_MAX: Final = 100  # timers of one node, before it counts as one that never moves on
+_STALLED_MAX: Final = 8_192  # frames that wait for a frozen node, about the capacity of a socket
+_SAME_INSTANT_MAX: Final = 100  # timers of one node in one instant; more is an endless loop
 EPOCH_UNIX_S: Final = 1_800_000_000.0
 
 Tap = Callable[[float, str, str, bytes], None]
@@ -34,11 +31,11 @@ Tap = Callable[[float, str, str, bytes], None]
 
 @dataclass(slots=True)
 class SimLink:
-    """What lies between two ports.
+    """A simulated link between two ports.
 
     Args:
         delay_s: one way.
-        jitter_s: up to so much more, at random; frames may then overtake each other.
+        jitter_s: largest random addition to the delay; frames may then overtake each other.
         loss: chance that a frame is lost, 0 to 1.
     """
 
@@ -60,24 +57,24 @@ class _End:
 class _Node:
     machine: ProtocolCore
     table: Table | None
-    ports: dict[int, tuple[SimLink, _End, _End]] = field(default_factory=dict)  # cable, own end, far end
+    ports: dict[int, tuple[SimLink, _End, _End]] = field(default_factory=dict)  # link, own end, far end
     costs: dict[int, int] = field(default_factory=dict)  # by port
     timer_s: float | None = None
     fired_s: float = float("-inf")
-    fired: int = 0  # times in the instant ``fired_s``
+    fired: int = 0  # number of timers in the instant ``fired_s``
     is_alive: bool = True
-    stalled: list[tuple[_End, bytes]] | None = None  # what came while it was frozen
+    stalled: list[tuple[_End, bytes]] | None = None  # frames that arrived while it was frozen
 
 
 class SimNetwork:
-    """Nodes, cables, and the events between them.
+    """Nodes, links, and the events between them.
 
     Args:
-        seed: of all chance.
+        seed: of all random choices.
 
     Attributes:
-        taps: called for each frame that enters a cable, with (second, from node, to node, frame with Ethernet header).
-        drops: what the simulated data planes dropped.
+        taps: called for each frame that enters a link, with (second, from node, to node, frame with Ethernet header).
+        drops: frames that the simulated data planes dropped, by reason.
     """
 
     def __init__(self, seed: int = 1) -> None:
@@ -92,11 +89,11 @@ class SimNetwork:
 
     @property
     def now(self) -> Timestamps:
-        """Return the present moment."""
+        """Return the present simulated time."""
         return Timestamps(self._now_s, EPOCH_UNIX_S + self._now_s)
 
     def random_bytes(self, size: int) -> bytes:
-        """Return reproducible bytes; only for what needs no secrecy."""
+        """Return reproducible bytes; never for secrets."""
         return self._random.randbytes(size)
 
     def add(self, name: str, machine: ProtocolCore, table: Table | None = None) -> None:
@@ -104,7 +101,7 @@ class SimNetwork:
         self._nodes[name] = _Node(machine, table)
 
     def connect(self, a: str, b: str, sim_link: SimLink | None = None, cost: int = 10) -> SimLink:
-        """Join two nodes by a cable; return it, to be changed while time goes on."""
+        """Join two nodes by a link; return the link, which may be changed while time runs."""
         sim_link = sim_link or SimLink()
         ends = [_End(name, len(self._nodes[name].ports), self._mac()) for name in (a, b)]
         for own, far in (ends, ends[::-1]):
@@ -116,34 +113,34 @@ class SimNetwork:
         return sim_link
 
     def set_link(self, sim_link: SimLink, up: bool) -> None:
-        """Pull a cable or put it back; both ends notice at once, as they do on a real port."""
+        """Cut or restore a link; both ends detect it at once, as on a real port."""
         sim_link.is_up = up
         self._tell(sim_link)
 
     def set_mtu(self, sim_link: SimLink, mtu: int) -> None:
-        """Let a cable take other sizes, in bytes after the Ethernet header; both ends notice at once.
+        """Change the MTU of a link, in bytes after the Ethernet header; both ends detect it at once.
 
-        What is under way on it still arrives.
+        Frames already on the link still arrive.
         """
         sim_link.mtu = mtu
         self._tell(sim_link)
 
     def set_cost(self, sim_link: SimLink, cost: int) -> None:
-        """Make a cable dearer or cheaper at both ends."""
+        """Change the cost of a link at both ends."""
         for node in self._nodes.values():
             node.costs |= {port: cost for port, (its, _, _) in node.ports.items() if its is sim_link}
         self._tell(sim_link)
 
     def stop(self, name: str) -> None:
-        """Kill a node: it says no goodbye."""
+        """Kill a node without a goodbye."""
         self._nodes[name].is_alive = False
 
     def freeze(self, name: str) -> None:
-        """Give a node no more time; what comes waits, as far as there is room."""
+        """Stop a node's time; arriving frames wait, up to a limit."""
         self._nodes[name].stalled = []
 
     def thaw(self, name: str) -> None:
-        """Let a frozen node go on."""
+        """Resume a frozen node."""
         node = self._nodes[name]
         stalled, node.stalled = node.stalled or [], None
         for end, frame in stalled:
@@ -151,7 +148,7 @@ class SimNetwork:
         self._arm(name)
 
     def replace(self, name: str, machine: ProtocolCore, table: Table | None = None) -> None:
-        """Start a node anew, with nothing remembered, on the same cables."""
+        """Restart a node without any state, on the same links."""
         before = self._nodes[name]
         node = self._nodes[name] = _Node(machine, table, before.ports, before.costs)
         for port, (sim_link, own, _) in node.ports.items():
@@ -161,18 +158,18 @@ class SimNetwork:
         self._arm(name)
 
     def call(self, delay_s: float, action: Callable[[], None]) -> None:
-        """Do something later."""
+        """Run an action after a delay."""
         self._push(self._now_s + delay_s, action)
 
     def touch(self, name: str) -> None:
-        """Carry away what a machine has to send after it was called from outside."""
+        """Send the frames of a core after a call from outside."""
         self._settle(name)
 
     def run(self, duration_s: float, until: Callable[[], bool] | None = None) -> bool:
-        """Let time go on; return whether ``until`` came true (True without one).
+        """Let time pass; return whether ``until`` came true (True without one).
 
         Raises:
-            LocalError: a machine's timer is due again and again in one instant: on a real clock it would spin.
+            LocalError: a core's timer is due repeatedly in one instant, which would be an endless loop on a real clock.
         """
         end_s = self._now_s + duration_s
         if until is not None and until():
@@ -187,12 +184,12 @@ class SimNetwork:
         return until is None
 
     def inject(self, name: str, port: int, frame: bytes, mac: bytes = b"\x02evil\x00") -> None:
-        """Let a frame (from its header on) come in at a node's port, as if a stranger on the link had sent it."""
+        """Deliver a frame (from its header on) to a node's port, as if a stranger on the link had sent it."""
         _, own, _ = self._nodes[name].ports[port]
         self._deliver(own, ethernet(BROADCAST, mac) + frame)
 
     def _tell(self, sim_link: SimLink) -> None:
-        """Tell both ends of a cable how it now is, as a node's shell does."""
+        """Report the state of a link to both ends, as a node's runtime does."""
         for name, node in self._nodes.items():
             for port, (its, own, _) in node.ports.items():
                 if its is not sim_link or not node.is_alive:
@@ -212,7 +209,7 @@ class SimNetwork:
         heapq.heappush(self._events, (at_s, self._count, action))
 
     def _arm(self, name: str) -> None:
-        """See that the machine is called when its next timer is due."""
+        """Schedule the call of a core for when its next timer is due."""
         node = self._nodes[name]
         due_s = node.machine.get_timer()
         if due_s is None or (node.timer_s is not None and node.timer_s <= due_s):

@@ -1,6 +1,6 @@
-"""A topology realised in memory: domains with keys, switches, RIBs and members, ready to run.
+"""Simulation of a topology in memory: domains with keys, switches, RIBs and members, ready to run.
 
-Place: shell, without I/O. ``namespaces`` realises the same topology with kernel namespaces and real processes.
+No I/O. ``namespaces`` realises the same topology with kernel namespaces and real processes.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ class Simulation:
     """A running network in memory.
 
     Args:
-        topology: what to build. Nodes are called by their switch's name, or ``switch/device`` for what is attached.
-        trusts: for each domain label, the labels it trusts; None: everyone trusts everyone.
-        transits: for a domain label, the labels through which its traffic may pass; all trusted ones if not given.
+        topology: what to build. A node has the name of its switch, or ``switch/device`` if it is attached to one.
+        trusts: for each domain label, the labels it trusts; None: all domains trust each other.
+        transits: for a domain label, the labels through which its traffic may pass; by default all trusted ones.
         delay_s: of every link between switches.
-        lease_s: of claims and watches.
+        lease_s: of advertisements and watches.
         lead_mtu: of the links to members and RIBs, in bytes after the Ethernet header.
-        keepalive_ms: as in ``NodeSettings``; slower ones where no link fails save most of the time.
-        leaves: switches whose certificate says ``leaf``.
+        keepalive_ms: as in ``NodeSettings``; longer ones save most of the time if no link fails.
+        leaves: switches whose certificate has the role ``leaf``.
     """
 
     topology: Topology
@@ -70,7 +70,7 @@ class Simulation:
     cables: dict[frozenset[str], SimLink] = field(default_factory=dict)
     leads: dict[str, SimLink] = field(default_factory=dict)  # of members and RIBs, by label
     owner: Owner = field(init=False)
-    settled_s: float = field(init=False)  # when ``settle`` last ended; before that, when the world began
+    settled_s: float = field(init=False)  # when ``settle`` last ended; before that, when the simulation began
     _incarnation: int = 0
 
     def __post_init__(self) -> None:
@@ -98,7 +98,7 @@ class Simulation:
     validity: Validity = field(init=False)
 
     def identity(self, role: Role, label: str, domain: str) -> Identity:
-        """Return (making it the first time) the identity of a node."""
+        """Return the identity of a node, made at the first call."""
         known = self.identities.get(label)
         if known is None:
             keys = NodeKeys.generate(role, label.replace("/", "-"))
@@ -125,7 +125,7 @@ class Simulation:
         return member
 
     def restart_member(self, label: str) -> Participant:
-        """Start a member anew with nothing remembered, no topic either."""
+        """Restart a member without any state or topic."""
         before = self.members[label]
         identity = next(each for each in self.identities.values() if each.name == before.name)
         domain = next(domain for domain, each in self.authorities.items() if each.root.domain == identity.root.domain)
@@ -134,12 +134,12 @@ class Simulation:
         return member
 
     def roam(self, label: str, switch: str) -> None:
-        """Pull a member's cable and put one in at another switch."""
+        """Move a member's link to another switch."""
         self.network.set_link(self.leads[label], up=False)
         self.leads[label] = self.network.connect(switch, label, SimLink(0.0001, mtu=self.lead_mtu))
 
     def topic(self, name: str, member: Participant, rights: Collection[Right], **metadata: str) -> Topic:
-        """Return a topic of the owner's, delegated to a member."""
+        """Return a topic of the owner, delegated to a member."""
         identity = next(each for each in self.identities.values() if each.name == member.name)
         described = Metadata({"kind": "topic", "name": name, **metadata})
         card = NodeDescriptor.from_wire(NodeDescriptor.make(identity))
@@ -148,13 +148,13 @@ class Simulation:
         return Topic(delegation, {epoch: grant.secret for epoch, grant in grants.items()})
 
     def restart_switch(self, name: str) -> SwitchCore:
-        """Start a switch anew with nothing remembered."""
+        """Restart a switch without any state."""
         switch, table = self._switch(name, self.topology.domain_of(name).label)
         self.network.replace(name, switch, table)
         return switch
 
     def restart_rib(self, label: str) -> RibHost:
-        """Start a RIB anew with nothing remembered; ``label`` as in ``ribs``."""
+        """Restart a RIB without any state; ``label`` as in ``ribs``."""
         host = self._rib(label)
         self.network.replace(self.rib_node(label), host)
         return host
@@ -164,12 +164,12 @@ class Simulation:
         self.network.stop(self.rib_node(label))
 
     def rib_node(self, label: str) -> str:
-        """Return what a RIB is called in ``network`` and ``leads``: ``switch/device``."""
+        """Return the name of a RIB in ``network`` and ``leads``: ``switch/device``."""
         at = self._rib_places()[label]
         return f"{at.switch}/{at.ifname}"
 
     def settle(self, duration_s: float = 10.0) -> bool:
-        """Let time go on until every member is attached; return whether that came true."""
+        """Let time pass until every member is attached; return whether that came true."""
         settled = self.network.run(duration_s, lambda: all(m.attachment.is_attached for m in self.members.values()))
         self.settled_s = self.network.now.mono_s
         return settled
@@ -184,7 +184,7 @@ class Simulation:
         return switch, table
 
     def _rib_places(self) -> dict[str, Attachment]:
-        """Return where the RIBs stand: a domain's first by its label, further ones as ``domain#2``, ``domain#3``."""
+        """Return the locations of the RIBs: a domain's first by its label, others as ``domain#2``, ``domain#3``."""
         places: dict[str, Attachment] = {}
         for domain in self.topology.domains:
             of_domain = [at for at in self.topology.attached("rib") if at.switch in domain.switches]

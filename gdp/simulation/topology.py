@@ -1,6 +1,6 @@
-"""A network as data: who stands where and who is joined to whom. Realising it is another file's work.
+"""Topology of a network as data: switches, links, domains and attached nodes.
 
-Sans-I/O. ``namespaces.py`` makes kernel namespaces of it, the in-memory network machines in one process.
+Sans-I/O. ``namespaces.py`` makes kernel namespaces of it; ``simulation.py`` makes protocol cores in one process.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _IFNAME_MAX: Final = 13
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """Two switches joined. On each end the device is called like the neighbour it leads to."""
+    """A link between two switches. On each end the device has the name of the neighbour that it leads to."""
 
     a: str
     b: str
@@ -34,7 +34,7 @@ class Link:
     mtu: int = MTU_BYTES
 
     def ends(self) -> frozenset[str]:
-        """Return both switches, so that ``a-b`` and ``b-a`` are one link."""
+        """Return both switches as a set, so that ``a-b`` and ``b-a`` are one link."""
         return frozenset((self.a, self.b))
 
     def other(self, node: str) -> str:
@@ -47,7 +47,10 @@ class Link:
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
-    """A RIB or a proxy beside a switch; ``ifname`` is its device, the first half of the pair that the switch makes."""
+    """A RIB or a proxy attached to a switch.
+
+    ``ifname`` is its device, the first half of the pair that the switch makes.
+    """
 
     switch: str
     role: Role
@@ -65,7 +68,7 @@ class DomainPlan:
 
 @dataclass(frozen=True, slots=True)
 class Topology:
-    """Switches, links, domains and what is attached; consistent once made.
+    """Switches, links, domains and attached nodes, validated on construction.
 
     Raises:
         LocalError: an unknown or repeated switch, a link twice or to itself, a domain that overlaps, a cost, MTU or
@@ -130,7 +133,7 @@ class Topology:
         return tuple(at for at in self.attachments if at.role == role)
 
     def rib_of(self, label: str) -> Attachment | None:
-        """Return the RIB that stands in this domain, if one does."""
+        """Return the RIB of this domain, None if it has none."""
         return next((at for at in self.attached("rib") if self.domain_of(at.switch).label == label), None)
 
 
@@ -140,12 +143,12 @@ def _require(holds: bool, otherwise: str) -> None:
 
 
 def ring5(mtu: int = MTU_BYTES) -> Topology:
-    """Return five switches in a ring over three domains; usual way nuc1-nuc2-nuc3-nuc4-nuc5, the short cut costs more.
+    r"""Return five switches in a ring over three domains.
 
-    ::
+    The usual path is nuc1-nuc2-nuc3-nuc4-nuc5; the short cut costs more::
 
         school: nuc1 (robot) -- nuc2 (border)            cloud: nuc4 (border) -- nuc5 (server)
-                  |                   \\                         /                   |
+                  |                   \                         /                   |
                   |                     backbone: nuc3 (upper RIB)                  |
                   +------------------------- cost 100 -----------------------------+
     """

@@ -1,12 +1,12 @@
 """Audit log: a folder with the chained lines of an audit trail, bounded, and its verification.
 
-Place: I/O, the file system; times come in as arguments. ::
+I/O; times come in as arguments. ::
 
-    audit.jsonl*                   what is written now
-    audit-<sequence>.jsonl*        what was written before, by the sequence of its first line; the oldest are deleted
+    audit.jsonl*                   the file in use
+    audit-<sequence>.jsonl*        earlier files, by the sequence of their first line; the oldest are deleted
 
-The chain goes on from file to file. A line without its end (a kill in the middle of a write) is dropped by the next
-append. Lines are handed to the system at once but not synced: a power failure may cost the last seconds.
+The chain continues from file to file. The next append drops a line without its end (a kill in the middle of a write).
+Lines are written at once but not synced: a power failure may cost the last seconds.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from gdp.trust.audit import BEGIN, Action, AuditLine, AuditTrail
 __all__ = ["FILES_MAX", "FILE_MAX_BYTES", "AuditLog", "Verified", "note_once", "verify_audit"]
 
 FILE_MAX_BYTES: Final = 4 << 20
-FILES_MAX: Final = 8  # 32 MiB: more than a day of the most that a flood may write
+FILES_MAX: Final = 8  # 32 MiB: more than a day at the highest rate of a flood
 _CURRENT: Final = "audit.jsonl"
 _OLDER: Final = "audit-*.jsonl"
 _LINE_MAX_BYTES: Final = 4_096
@@ -37,13 +37,13 @@ _FOLDER_MODE: Final = 0o700
 
 @dataclass(frozen=True, slots=True)
 class Verified:
-    """What a verification found.
+    """Result of a verification.
 
     Args:
-        lines: how many there are.
-        first: sequence of the first one; above 1: what came before was deleted by rotation.
-        last_hash: of the last line; kept elsewhere, it proves later that nothing was cut off.
-        events: how many of each action and kind, counts included.
+        lines: number of lines.
+        first: sequence of the first line; above 1: rotation deleted earlier ones.
+        last_hash: of the last line; a copy kept elsewhere proves later that no line was cut off.
+        events: number of events by action and kind, counts included.
     """
 
     lines: int
@@ -53,10 +53,10 @@ class Verified:
 
 
 class AuditLog:
-    """Where one node or one authority writes.
+    """Audit log of one node or one authority.
 
     Raises:
-        LocalError: the folder cannot be made, or is not this user's.
+        LocalError: the folder cannot be made, or does not belong to this user.
     """
 
     def __init__(self, folder: Path, *, file_max_bytes: int = FILE_MAX_BYTES, files_max: int = FILES_MAX) -> None:
@@ -70,10 +70,10 @@ class AuditLog:
             raise LocalError(f"{folder}: {error.strerror}") from error
 
     def write(self, trail: AuditTrail, mono_s: float, unix_s: float) -> None:
-        """Append what a trail has to say.
+        """Append the pending lines of a trail.
 
         Raises:
-            LocalError: the folder cannot be written; what was to be written is lost.
+            LocalError: the folder cannot be written; these lines are lost.
         """
         if not trail.is_due(mono_s):
             return
@@ -88,7 +88,7 @@ class AuditLog:
                 self._rotate(path, file)
 
     def _end_of(self, path: Path, file: BinaryIO) -> tuple[int, str]:
-        """Return sequence and hash of the last whole line, and leave the file's end behind it."""
+        """Return sequence and hash of the last whole line, and truncate the file after it."""
         end = file.seek(0, os.SEEK_END)
         begin = file.seek(max(end - 2 * _LINE_MAX_BYTES, 0))
         tail = file.read()

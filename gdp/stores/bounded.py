@@ -1,6 +1,6 @@
-"""Reading a file of at most so many bytes, without a buffer of that length for a short one.
+"""Bounded read of a file, without a buffer of the limit's length for a short file.
 
-Layer: I/O.
+I/O.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ _PIECE_BYTES: Final = 16 << 10
 
 
 def read_at_most(file: BinaryIO, limit: int) -> bytes:
-    """Return a file's bytes up to its end, or the first ``limit + 1`` where it is longer."""
+    """Return a file's bytes up to its end, or the first ``limit + 1`` bytes if it is longer."""
     pieces = []
     left = limit + 1
     while left and (piece := file.read(min(left, _PIECE_BYTES))):

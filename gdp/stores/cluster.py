@@ -1,9 +1,9 @@
-"""A RIB's routes in a Valkey or Redis Cluster, shared by any number of RIBs of one domain.
+"""Cluster store: a RIB's routes in a Valkey or Redis Cluster, shared by any number of RIBs of one domain.
 
-Layer: I/O; blocking, with short time limits (``cluster_link.py``). What the machine needs for one turn is fetched in
-one round trip for each primary, and what it wrote goes out in one. A function on the server decides whether a claim is
-newer, so RIBs that write at once agree. Leases are the expiry of keys; a change is published on the channel of its
-slot. What is read is verified like what a peer sends: the store is relied upon, not trusted.
+I/O; blocking, with short time limits (``cluster_link.py``). One round trip for each primary fetches the routes that the
+core needs for one turn, and one more sends what it wrote. A function on the server decides whether an advertisement is
+newer, so RIBs that write at the same time agree. Leases are the expiry of keys; a change is published on the channel of
+its slot. Data from the cluster is verified like data from a peer: the store must be available, but is not trusted.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ _KEPT, _NEWER, _NO_CONTEXT = 1, 0, 2
 
 
 def load_functions(link: ClusterLink) -> bool:
-    """Bring the functions to every primary; they replicate from there.
+    """Load the functions into every primary; the primaries replicate them.
 
     Returns:
-        Whether each primary has them; one that does not answer is to be asked again.
+        Whether each primary has them; one that does not respond must be tried again.
 
     Raises:
         LocalError: a server refuses them.
@@ -60,7 +60,7 @@ def load_functions(link: ClusterLink) -> bool:
 
 @dataclass(slots=True)
 class _Write:
-    """A route or a withdrawal on its way out."""
+    """A route or a withdrawal to send."""
 
     key: Key
     sequence: int
@@ -70,10 +70,10 @@ class _Write:
 
 
 class ClusterStore:
-    """The Store of RIBs that share a cluster.
+    """Store of RIBs that share a cluster.
 
     Args:
-        verifier: of the RIB: what is read is verified before it is used.
+        verifier: of the RIB: every route is verified when it is read, before it is used.
     """
 
     def __init__(self, link: ClusterLink, verifier: AdvertisementVerifier) -> None:
@@ -83,11 +83,11 @@ class ClusterStore:
         self._now = Timestamps(0.0, 0.0)
         self._cache: OrderedDict[Name, dict[Name, Route]] = OrderedDict()
         self._contexts: OrderedDict[bytes, bytes] = OrderedDict()  # by hash tag and id
-        self._floors: OrderedDict[Key, Withdrawn] = OrderedDict()  # what the cluster said is newer
+        self._floors: OrderedDict[Key, Withdrawn] = OrderedDict()  # newer sequence numbers that the cluster reported
         self._writes: list[_Write] = []
         self._ends: list[tuple[float, Name, Name]] = []
         self._owners: dict[Name, dict[int, float]] = {}  # ends of leases, by sender and by advertiser
-        self.refusals: Counter[DropReason] = Counter()  # of what was read and does not hold
+        self.refusals: Counter[DropReason] = Counter()  # invalid records that were read, by reason
         self.digests = None
 
     def __len__(self) -> int:
@@ -96,7 +96,7 @@ class ClusterStore:
     def prefetch(self, names: Collection[Name], now: Timestamps) -> None:
         """Read the names that are not in memory, in one round trip for each primary.
 
-        Names that could not be read raise when they are asked for.
+        Names that could not be read raise on their next use.
         """
         self._now = now
         wanted = [name for name in dict.fromkeys(names) if name not in self._cache]
@@ -110,12 +110,12 @@ class ClusterStore:
         return list(self._of(name).values())
 
     def get(self, name: Name, advertiser: Name) -> Route | Withdrawn | None:
-        """Return what is known of one advertiser of a name."""
+        """Return the route or withdrawal of one advertiser of a name, None if there is none."""
         route = self._of(name).get(advertiser)
         return route if route is not None else self._floors.get((name, advertiser))
 
     def put(self, route: Route) -> None:
-        """Add or replace a route; ``commit`` says whether the cluster took it."""
+        """Add or replace a route; ``commit`` reports whether the cluster accepted it."""
         self._of(route.name)[route.advertiser] = route
         self._floors.pop((route.name, route.advertiser), None)
         heapq.heappush(self._ends, (route.expires_s, route.name, route.advertiser))
@@ -125,7 +125,7 @@ class ClusterStore:
             self._writes.append(self._put_command(route))
 
     def withdraw(self, name: Name, advertiser: Name, withdrawn: Withdrawn | None = None) -> Route | None:
-        """Take a route away and return it."""
+        """Remove a route and return it."""
         route = self._of(name).pop(advertiser, None)
         if route is None and withdrawn is None:
             return None
@@ -145,7 +145,7 @@ class ClusterStore:
         return route
 
     def commit(self) -> list[Key]:
-        """Send what was written; return the keys that were not taken: another RIB's is newer, or the cluster failed."""
+        """Send the writes; return the rejected keys: another RIB's entry is newer, or the cluster failed."""
         writes, self._writes = self._writes, []
         if not writes:
             return []
@@ -168,7 +168,7 @@ class ClusterStore:
         return refused
 
     def expire(self, now_s: float, unix_s: float) -> list[Route]:
-        """Take away and return the routes in memory whose lease ended; the cluster does so by itself."""
+        """Remove and return the routes in memory whose lease ended; the cluster expires its own."""
         self._now = Timestamps(now_s, unix_s)
         gone = []
         while self._ends and self._ends[0][0] <= now_s:
@@ -181,30 +181,30 @@ class ClusterStore:
         return gone
 
     def next_expiry(self) -> float | None:
-        """Return a monotonic second that is no later than the next lease end in memory, or None."""
+        """Return a monotonic second no later than the next end of a lease in memory, or None."""
         return self._ends[0][0] if self._ends else None
 
     def count_of(self, owner: Name) -> int:
-        """Return how many routes of a sender or a node came through this RIB and hold still."""
+        """Return how many valid routes of a sender or a node came through this RIB."""
         held = self._owners.get(owner, {})
         if len(held) > 1_000 and min(held.values()) <= self._now.mono_s:
             held = self._owners[owner] = {key: end for key, end in held.items() if end > self._now.mono_s}
         return len(held)
 
     def resting_on(self, mark: bytes) -> list[Route]:
-        """Return the routes in memory that rest on a certificate, or a key; others are found out when read."""
+        """Return the routes in memory that depend on a certificate or a key; others are checked when read."""
         every = (route for routes in self._cache.values() for route in routes.values())
         return [route for route in every if mark in route.fingerprints or mark in route.issuers]
 
     def has_issuer(self, key: bytes) -> bool:
-        """Return whether a route in memory rests on a certificate that this key, 33 bytes, issued; looks at all."""
+        """Return whether a route in memory depends on a certificate that this key, 33 bytes, issued; scans all."""
         return any(key in route.issuers for routes in self._cache.values() for route in routes.values())
 
     def changed(self) -> list[tuple[Name, list[Route]]]:
         """Return the names that other RIBs changed since the last call, each with the routes that were in memory."""
         found: dict[Name, list[Route]] = {}
         if self._link.listen():
-            self._forget_all(found)  # what was changed while nobody listened is not known
+            self._forget_all(found)  # changes before the subscription are unknown
         for notification in self._link.notifications():
             if notification[:8] != self._me:
                 name = Name(notification[8:])
@@ -214,10 +214,10 @@ class ClusterStore:
     # -- memory
 
     def _of(self, name: Name) -> dict[Name, Route]:
-        """Return a name's routes in memory, read from the cluster where they are not.
+        """Return a name's routes in memory, read from the cluster if they are missing.
 
         Raises:
-            StoreError: the cluster did not answer.
+            StoreError: the cluster did not respond.
         """
         routes = self._cache.get(name)
         if routes is None:
@@ -247,7 +247,10 @@ class ClusterStore:
     # -- records
 
     def _put_command(self, route: Route) -> _Write:
-        """Return the call of the server's function; the claim is compressed against what its node's claims share."""
+        """Return the call of the server's function.
+
+        The context that a node's advertisements share is the dictionary of the compression.
+        """
         body = UnverifiedAdvertisement.from_statement(parse(route.advertisement))
         context = cbor_writer.encode(
             {
@@ -273,7 +276,7 @@ class ClusterStore:
         return _Write((route.name, route.advertiser), route.sequence, tag, command, context)
 
     def _decoded(self, name: Name, value: bytes) -> dict[Name, Route]:
-        """Return the routes in a value that hold; what does not is counted."""
+        """Return the valid routes in a value; invalid ones are counted."""
         routes: dict[Name, Route] = {}
         at = 0
         while at + _RECORD_BYTES <= len(value):
@@ -335,7 +338,7 @@ def _context_key(tag: bytes, context_id: bytes) -> bytes:
 
 
 def _with_context(write: _Write) -> Command:
-    """Return the call with the context that the server said it has not."""
+    """Return the call with the context, which the server reported as missing."""
     return (*write.command[:-3], write.context, *write.command[-2:])
 
 

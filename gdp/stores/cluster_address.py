@@ -1,6 +1,6 @@
-"""How a RIB reaches the cluster that keeps its routes.
+"""Address of the cluster that stores a RIB's routes.
 
-Layer: I/O, without any; the client library, an optional extra, is imported by ``cluster_link.py`` alone.
+It does no I/O; the client library, an optional extra, is imported by ``cluster_link.py`` alone.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ Address = tuple[str, int]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClusterAddress:
-    """How to reach a cluster.
+    """Address and credentials of a cluster.
 
     Args:
         nodes: some of its servers, as (host, port).
         username, password: of the RIBs' ACL user; empty without ACLs.
         ca: certificate authority of the servers, PEM; None: no TLS.
-        cert, key: what this RIB shows the servers, PEM, where they want it.
+        cert, key: certificate and key of this RIB, PEM, if the servers require them.
     """
 
     nodes: tuple[Address, ...]

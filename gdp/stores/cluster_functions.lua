@@ -7,14 +7,14 @@ local function now_ms()
   return time[1] * 1000 + math.floor(time[2] / 1000)
 end
 
--- numbers of 64 bits are compared in halves: Lua's are doubles
+-- 64-bit numbers are compared in halves, because numbers of Lua are doubles
 local function is_below(a, b)
   local a_high, a_low = struct.unpack('>I4I4', a)
   local b_high, b_low = struct.unpack('>I4I4', b)
   return a_high < b_high or (a_high == b_high and a_low < b_low)
 end
 
--- returns what other advertisers of the name hold, the latest end of their leases, and the own data and end
+-- returns the records of the other advertisers, the latest end of their leases, and this advertiser's data and end
 local function others(value, advertiser, now)
   local kept, latest, own, own_ends = {}, 0, nil, 0
   local at = 1
@@ -43,7 +43,7 @@ end
 
 -- KEYS: routes of the name, highest sequence, shared context.
 -- ARGV: advertiser, sequence, end of lease (ms), data, end of evidence (ms), context or empty, channel, message
--- Returns {1, sequence} when kept, {0, sequence} when what is held is newer, {2, sequence} when the context is missing.
+-- Returns {1, sequence} if stored, {0, sequence} if the stored route is newer, {2, sequence} if the context is missing.
 local function put(keys, argv)
   local advertiser, sequence, ends, data, until_ms = argv[1], argv[2], tonumber(argv[3]), argv[4], argv[5]
   local held = redis.call('GET', keys[2])

@@ -1,7 +1,7 @@
-"""Connections to the primaries of a Valkey or Redis Cluster: which one has a slot, commands in batches, notifications.
+"""Cluster link: connections to the primaries of a Valkey or Redis Cluster, the map of slots, batches, notifications.
 
-Layer: I/O; blocking, with short time limits. A primary that fails is left alone for a moment, and the map of slots is
-read again from the others, so that its replica is found once it was promoted.
+I/O; blocking, with short time limits. After a failure of a primary, the link does not use it for a moment. It reads the
+map of slots again from the other servers, and so finds the replica after its promotion.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ __all__ = ["CHANNELS", "ClusterLink", "Command", "tag_of"]
 
 _ALPHABET: Final = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_"
 CHANNELS: Final = tuple(b"{%c}" % char for char in _ALPHABET)  # hash tags: names share 64 slots, and one channel each
-_TIMEOUT_S: Final = 0.5  # a primary that does not answer for so long has failed
+_TIMEOUT_S: Final = 0.5  # a primary that does not respond within this time has failed
 _REFRESH_S: Final = 0.1  # between two readings of the map of slots while something fails
 _REPLICA_MS: Final = 100  # a replica confirms within about a millisecond
 _ALONE_S: Final = 1.0
-_PING_S: Final = 1.0  # between two signs of life on a connection that only listens
+_PING_S: Final = 1.0  # between two pings on a connection that only listens
 _ELSEWHERE: Final = (AskError, ClusterDownError, MasterDownError, MovedError, ReadOnlyError, TryAgainError)
 _NO_REPLICAS: Final = "NOREPLICAS"
 
-Command = tuple[bytes | str | int, ...]  # the second item of which decides: a key
+Command = tuple[bytes | str | int, ...]  # the second item is the key that decides the slot
 
 
 def tag_of(name: Name) -> bytes:
@@ -56,7 +56,7 @@ class ClusterLink:
     """Blocking access to the primaries.
 
     Raises:
-        LocalError: no server can be reached at the start, or they are no cluster.
+        LocalError: no server is reachable at the start, or the servers are no cluster.
     """
 
     def __init__(self, address: ClusterAddress) -> None:
@@ -88,7 +88,10 @@ class ClusterLink:
         return self._primaries[tag_of(name)]
 
     def ask_primaries(self, command: Command) -> list[object]:
-        """Send a command to each primary; where one did not answer, or is none any more, stands a ``StoreError``."""
+        """Send a command to each primary and return the replies.
+
+        A ``StoreError`` takes the place of the reply of a server that did not respond or is no longer a primary.
+        """
         replies = [reply for at in dict.fromkeys(self._primaries.values()) for reply in self._batch(at, [command])]
         if any(isinstance(reply, StoreError) for reply in replies):
             self._try_refresh()
@@ -98,10 +101,10 @@ class ClusterLink:
         """Send commands, each with the hash tag of its keys, in one batch for each primary.
 
         Args:
-            writes: wait until a replica of each primary has what they wrote, so that it outlives the primary. Where no
-                replica says so in time the primary has it alone; ``unreplicated`` counts that.
+            writes: wait until a replica of each primary has the writes, so that they outlive the primary. If no replica
+                confirms in time, the primary alone has them; ``unreplicated`` counts that.
 
-        Returns the replies in order; in the place of one that did not come stands a ``StoreError``.
+        Returns the replies in order; a ``StoreError`` takes the place of a missing one.
         """
         replies: list[object] = [StoreError("not sent")] * len(commands)
         batch = self._batch_of_writes if writes else self._batch
@@ -120,7 +123,7 @@ class ClusterLink:
         return replies
 
     def listen(self) -> bool:
-        """See that every channel is listened to; return whether that begins only now: changes may have been missed."""
+        """Subscribe to every channel; return whether the subscription is new, so that changes may have been missed."""
         wanted = set(self._primaries.values())
         if wanted == self._listening.keys():
             return False
@@ -139,7 +142,7 @@ class ClusterLink:
         return True
 
     def notifications(self) -> Iterator[bytes]:
-        """Yield what came on the channels; where a connection fails all are made again by the next ``listen``."""
+        """Yield the messages of the channels; if a connection fails, the next ``listen`` makes all of them again."""
         for subscription in list(self._listening.values()):
             try:
                 while (message := subscription.get_message(timeout=0)) is not None:
@@ -152,7 +155,7 @@ class ClusterLink:
                 return
 
     def keep_alive(self, now_s: float) -> None:
-        """Ask for a sign of life on the connections that only listen, now and then."""
+        """Send a ping, if it is due, on the connections that only listen."""
         if now_s - self._pinged_s < _PING_S:
             return
         self._pinged_s = now_s
@@ -189,7 +192,7 @@ class ClusterLink:
             return self._batch(at, commands)
         *replies, replicas = self._batch(at, [*commands, (b"WAIT", 1, _REPLICA_MS)])
         if replicas == 0:
-            self._alone_until_s[at] = time.monotonic() + _ALONE_S  # nobody waits for a replica that is away
+            self._alone_until_s[at] = time.monotonic() + _ALONE_S  # do not wait for a missing replica
             self.unreplicated += len(commands)
         return replies
 
@@ -223,7 +226,7 @@ class ClusterLink:
         """Read the map of slots from the first server that has one.
 
         Raises:
-            StoreError: none has.
+            StoreError: no server has one.
         """
         if time.monotonic() - self._refreshed_s < _REFRESH_S:
             raise StoreError("read the map of slots a moment ago")
@@ -265,9 +268,9 @@ def _primaries(shards: Sequence[Sequence[object]]) -> Iterator[tuple[bytes, Addr
 
 
 def _translated(reply: object) -> object:
-    """Return a reply; one that means "not here, not now" as a ``StoreError``.
+    """Return a reply; a reply that means "not here, not now" becomes a ``StoreError``.
 
-    The library gives most of these a class, and takes the server's word for it out of the text.
+    The library has classes for most of these, and removes the server's error word from the text.
     """
     is_temporary = isinstance(reply, _ELSEWHERE) or str(reply).startswith(_NO_REPLICAS)
     if isinstance(reply, ResponseError) and not is_temporary:

@@ -1,9 +1,9 @@
-"""Files that hold keys: whole or not there, and for their owner's eyes.
+"""Files that hold keys: written whole or not at all, and private to their owner.
 
-Place: I/O, the file system.
-A file appears under its name complete and synced, or not at all, so that a kill in the middle leaves nothing half
-written. A private file has mode 0600 from its first byte on. It is read, and written, only where no other user could
-have read or replaced it (``ownership``); a link in its place is not followed.
+I/O.
+A file appears under its name complete and synced, or not at all, so a kill in the middle leaves no partial file. A
+private file has mode 0600 from its first byte on. It is read and written only where no other user could have read or
+replaced it (``ownership``); a link in its place is not followed.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ __all__ += ["write_all"]
 
 FILE_MAX_BYTES: Final = 1 << 20
 _PRIVATE_MODE: Final = 0o600
-_PUBLIC_MODE: Final = 0o644  # less what the umask takes
+_PUBLIC_MODE: Final = 0o644  # minus the umask
 _DIRECTORY_MODE: Final = 0o700
 
 
 @dataclass(frozen=True, slots=True)
 class NewFile:
-    """What a file is to hold, and who may read it."""
+    """Content of a new file, and who may read it."""
 
     data: bytes
     mode: int
@@ -49,16 +49,15 @@ def public(data: bytes) -> NewFile:
 
 
 def write_all(directory: Path, files: Mapping[str, NewFile], *, force: bool = False) -> None:
-    """Write files into a directory, which is made (mode 0700) if it is not there.
+    """Write files into a directory, which is made (mode 0700) if it is missing.
 
     Args:
-        directory: where.
+        directory: target directory.
         files: file name to content.
-        force: replace what is there; otherwise nothing is written if one of them is.
+        force: replace existing files; otherwise nothing is written if one of them exists.
 
     Raises:
-        LocalError: a file is there already, one is private and others may write to the directory, or the system
-            refuses.
+        LocalError: a file exists already, one is private and others may write to the directory, or the system refuses.
     """
     try:
         directory.mkdir(mode=_DIRECTORY_MODE, parents=True, exist_ok=True)
@@ -74,20 +73,20 @@ def write_all(directory: Path, files: Mapping[str, NewFile], *, force: bool = Fa
 
 
 def read_public(path: Path) -> bytes:
-    """Return what a file holds.
+    """Return the content of a file.
 
     Raises:
-        LocalError: it is not there, too long, or the system refuses.
+        LocalError: it is missing or too long, or the system refuses.
     """
     return _read(path)
 
 
 def read_private(path: Path) -> bytes:
-    """Return what a private file holds.
+    """Return the content of a private file.
 
     Raises:
-        LocalError: it is a link, belongs to another user than this one and root, group or others may reach it or
-            write to its directory, or as for ``read_public``.
+        LocalError: it is a link, belongs to another user than this one and root, group or others may access it or write
+            to its directory, or as for ``read_public``.
     """
     return _read(path, is_private=True)
 
@@ -96,7 +95,7 @@ def refuse_existing(path: Path) -> None:
     """Refuse to replace a file, or a link of its name.
 
     Raises:
-        LocalError: it is there already.
+        LocalError: it exists already.
     """
     if os.path.lexists(path):
         raise LocalError(f"{path}: is there already; --force replaces it")
@@ -113,7 +112,7 @@ def _write(path: Path, new: NewFile, *, force: bool) -> None:
         if force:
             os.replace(draft, path)
         else:
-            os.link(draft, path)  # unlike a rename, refuses to replace
+            os.link(draft, path)  # unlike a rename, a link never replaces a file
     except FileExistsError as error:
         raise LocalError(f"{path}: is there already; --force replaces it") from error
     finally:
@@ -121,7 +120,7 @@ def _write(path: Path, new: NewFile, *, force: bool) -> None:
 
 
 def _read(path: Path, *, is_private: bool = False) -> bytes:
-    # O_NONBLOCK: a pipe in the file's place would hold up the open itself
+    # O_NONBLOCK: a pipe in the file's place would block the open itself
     guards = os.O_NOFOLLOW | os.O_NONBLOCK if is_private else 0
     try:
         with open(path, "rb", opener=lambda name, flags: os.open(name, flags | guards)) as file:

@@ -1,7 +1,7 @@
-"""Making domains, nodes, owners and delegations in one call each: what the ``gdp`` command and the testbed both do.
+"""Issuance of domains, nodes, owners and delegations, one call each, for the ``gdp`` command and for test networks.
 
-Place: I/O, through ``keyring``; reads the wall clock where no time is given. Every membership is in the domain's ledger
-before it is handed out.
+I/O, through ``keyring``; reads the wall clock if no time is given. The domain's ledger records every membership before
+it is handed out.
 """
 
 from __future__ import annotations
@@ -87,14 +87,14 @@ def make_domain(
     force: bool = False,
     unix_s: float | None = None,
 ) -> CertificateAuthority:
-    """Found a trust domain and keep its root in ``directory``.
+    """Create a trust domain and keep its root in ``directory``.
 
     Args:
-        key: the root's, if there is one already, as in a token.
+        key: the root's key, if it exists already, for example in a token.
         passphrase: guards the key's file.
 
     Raises:
-        LocalError: a wrong label, or there is one already.
+        LocalError: the label is invalid, or a domain exists there already.
     """
     validity = Validity.lasting(_now(unix_s), days * DAY_S)
     authority = CertificateAuthority.create(label, key or SigningKey.generate(), validity)
@@ -108,7 +108,7 @@ def make_owner(
     """Make an owner's keys and keep them in ``directory``; ``key`` and ``passphrase`` as for ``make_domain``.
 
     Raises:
-        LocalError: there are some already.
+        LocalError: an owner exists there already.
     """
     owner = Owner(key or SigningKey.generate(), secrets.token_bytes(SECRET_BYTES))
     save_owner(directory, owner, passphrase=passphrase, force=force)
@@ -125,17 +125,17 @@ def succeed_owner(
     passphrase: bytes | None = None,
     unix_s: float | None = None,
 ) -> Owner:
-    """Let a successor's key delegate names in an owner's place; it is made where there is none.
+    """Let a successor's key delegate names in place of an owner; the successor is made if it is missing.
 
-    The successor has the owner's master secret, so that the topics' secrets stay as they are.
+    The successor has the owner's master secret, so the topics' secrets do not change.
 
     Args:
-        names: to which it succeeds, in addition to those to which it did before.
-        days: how long; whatever the successor delegates ends then.
+        names: names that it may delegate, in addition to those of earlier calls.
+        days: duration; every delegation by the successor ends then.
         key, passphrase: of a new successor, as for ``make_domain``.
 
     Raises:
-        LocalError: no owner there, another owner's name, or a successor of another owner.
+        LocalError: no owner is there, a name is another owner's, or the successor is another owner's.
     """
     present = load_owner(owner)
     if not (successor / OWNER_KEY).exists():
@@ -168,7 +168,7 @@ def make_node_keys(
     ``key`` and ``passphrase`` as for ``make_domain``.
 
     Raises:
-        LocalError: wrong metadata, a library without the KEM, or there are some already.
+        LocalError: the metadata are invalid, the library lacks the KEM, or a node exists there already.
     """
     keys = NodeKeys.generate(role, label, more, key)
     save_node_keys(directory, keys, node_metadata(role, label, more), passphrase=passphrase, force=force)
@@ -186,7 +186,7 @@ def make_node(
     force: bool = False,
     unix_s: float | None = None,
 ) -> Identity:
-    """Make a node and admit it to the domain whose directory is at hand too.
+    """Make a node and admit it to a domain whose directory is accessible here.
 
     Raises:
         LocalError: as ``make_node_keys`` and ``admit_node``.
@@ -199,8 +199,8 @@ def admit(domain: Path, request: bytes, *, days: float = MEMBER_DAYS, unix_s: fl
     """Return the membership that a request asks for; it ends with the root at the latest.
 
     Raises:
-        StatementError: the request does not hold.
-        LocalError: no domain there, or its ledger cannot be written.
+        StatementError: the request is not valid.
+        LocalError: no domain is there, or its ledger cannot be written.
     """
     authority, now = load_domain(domain), _now(unix_s)
     member = authority.issue(request, _within(authority.root, now, days))
@@ -211,14 +211,14 @@ def admit(domain: Path, request: bytes, *, days: float = MEMBER_DAYS, unix_s: fl
 def admit_node(
     domain: Path, node: Path, *, days: float = MEMBER_DAYS, force: bool = False, unix_s: float | None = None
 ) -> Identity:
-    """Admit the node whose directory is at hand, and complete that directory.
+    """Admit a node whose directory is accessible here, and complete that directory.
 
     Raises:
-        LocalError: no domain or no keys there, it belongs to one already, or the ledger cannot be written.
+        LocalError: no domain or no keys are there, the node already belongs to one, or the ledger cannot be written.
     """
     authority, now = load_domain(domain), _now(unix_s)
     if not force:
-        refuse_existing(node / NODE_CERTIFICATE)  # before anything is signed
+        refuse_existing(node / NODE_CERTIFICATE)  # before the first signature
     identity = load_node_keys(node).join(authority, _within(authority.root, now, days))
     _issued(domain, identity.member, now)
     save_identity(node, identity, force=force)
@@ -226,11 +226,11 @@ def admit_node(
 
 
 def renew(domain: Path, certificate: bytes, *, days: float = MEMBER_DAYS, unix_s: float | None = None) -> Membership:
-    """Return a membership anew, for the same key, role and label; the one that it replaces may have run out.
+    """Return a new membership for the same key, role and label; the one that it replaces may have expired.
 
     Raises:
-        StatementError: it is not one that this domain issued.
-        LocalError: no domain there, or its ledger cannot be written.
+        StatementError: this domain did not issue the membership.
+        LocalError: no domain is there, or its ledger cannot be written.
     """
     authority, now = load_domain(domain), _now(unix_s)
     stranger = Unverified.from_wire(certificate)
@@ -248,19 +248,19 @@ def renew_node(
     before_days: float | None = None,
     unix_s: float | None = None,
 ) -> Membership | None:
-    """Renew the membership of a node whose directory is at hand; a running node takes it up.
+    """Renew the membership of a node whose directory is accessible here; a running node reloads it.
 
-    The node's key is needed for its card alone: a card stays as it was where the key is under a passphrase or in a
-    token.
+    Only the node descriptor needs the node's key: the descriptor does not change if the key is under a passphrase or in
+    a token.
 
     Args:
-        before_days: only if it ends within so many days; None: in any case.
+        before_days: renew only if it ends within this number of days; None: in any case.
 
     Returns:
-        The new membership, or None: the present one lasts longer.
+        The new membership, or None if the present one lasts longer.
 
     Raises:
-        StatementError: it is not one that this domain issued.
+        StatementError: this domain did not issue the membership.
         LocalError: as ``renew``.
     """
     now, path = _now(unix_s), node / NODE_CERTIFICATE
@@ -284,7 +284,7 @@ def install_membership(
     """Complete a node's directory with a membership that was issued elsewhere.
 
     Raises:
-        StatementError: it does not hold under this root.
+        StatementError: it is not valid under this root.
         LocalError: it is another node's, or the node has one already.
     """
     member = Membership.from_wire(certificate, root, _now(unix_s))
@@ -307,10 +307,10 @@ def delegate(
     """Let a node act on a name, and grant it the secrets of ``epochs``.
 
     Args:
-        recipient: the node, or its card's file.
+        recipient: the node, or the file of its descriptor.
 
     Raises:
-        LocalError: no owner there, no card, rights or epochs out of bounds.
+        LocalError: no owner or descriptor is there, or rights or epochs are out of bounds.
     """
     face = load_card(recipient) if isinstance(recipient, Path) else recipient
     validity = Validity.lasting(_now(unix_s), days * DAY_S)
@@ -321,11 +321,11 @@ def delegate(
 
 
 def install_delegation(node: Path, delegation: Delegation, *, force: bool = False, unix_s: float | None = None) -> Path:
-    """Put a delegation where the node finds it, after seeing that it holds and opens; return the file.
+    """Verify that a delegation is valid and opens, and write it into the node's directory; return the file.
 
     Raises:
-        StatementError: it is for another node, or does not hold.
-        LocalError: there is one for the name already.
+        StatementError: it is for another node, or not valid.
+        LocalError: a delegation of the name exists already.
     """
     now = _now(unix_s)
     identity = load_identity(node, now)
@@ -338,14 +338,14 @@ def delegate_route(node: Path, switch: Name, *, days: float, unix_s: float | Non
     """Return the RtCert by which a node lets a switch attract its traffic.
 
     Raises:
-        LocalError: no node there.
+        LocalError: no node is there.
     """
     now = _now(unix_s)
     return RtCert.make(load_identity(node, now), switch, Validity.lasting(now, days * DAY_S))
 
 
 def _issued(domain: Path, member: Membership, unix_s: float) -> None:
-    """Write a membership into the ledger, without which it is not handed out, and into the audit log."""
+    """Record a membership in the ledger, which must precede its use, and in the audit log."""
     append_issued(domain, member, unix_s)
     who, about = member.name.to_text(), member.fingerprint.hex()
     note_once(domain, Action.ACCEPTED, f"membership {member.role.value}", who=who, about=about, unix_s=unix_s)

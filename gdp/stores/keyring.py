@@ -1,11 +1,12 @@
-"""Where a domain, an owner and a node keep their keys and proofs: one directory each.
+"""Keyring: the keys and certificates of a domain, an owner and a node, in one directory each.
 
-Place: I/O, through ``files`` and ``private_keys``. ``*`` marks what is private (mode 0600); keys may also be under a
-passphrase, or in a token that the file names::
+I/O, through ``files`` and ``private_keys``. ``*`` marks private files (mode 0600); keys may also be under a passphrase,
+or in a token that the file names::
 
     domain/   root.key*  root.crt  issued.jsonl*                          the ledger: see ``ledger``
     owner/    owner.key*  owner.pub  master.key*
-              succession/<name>.delegation*                                of a successor: who let it delegate the name
+              succession/<name>.delegation*                                of a successor: its right to delegate the
+              name
     node/     node.key*  kem.key*  node.json  node.csr                      before it belongs to a domain
               node.crt  root.crt  node.card                                 once it does
               delegations/<name>.delegation*                                one for each name that it may act on
@@ -83,10 +84,10 @@ _T = TypeVar("_T")
 
 
 def parsed(path: Path, read: Callable[[bytes], _T], data: bytes) -> _T:
-    """Return what ``read`` makes of a file's bytes; an error names the file.
+    """Return the result of ``read`` on a file's bytes; an error names the file.
 
     Raises:
-        LocalError: the file does not hold what it should.
+        LocalError: the content is not valid.
     """
     try:
         return read(data)
@@ -98,7 +99,7 @@ def load_root(path: Path) -> Root:
     """Read a domain's root certificate, PEM or DER.
 
     Raises:
-        LocalError: not there, or not a root; the text names the file.
+        LocalError: it is missing, or not a root; the text names the file.
     """
     return parsed(path, Root.from_wire, read_public(path))
 
@@ -107,16 +108,16 @@ def load_public_key(path: Path) -> PublicKey:
     """Read an owner's public key, PEM.
 
     Raises:
-        LocalError: not there, or not a P-256 key; the text names the file.
+        LocalError: it is missing, or not a P-256 key; the text names the file.
     """
     return parsed(path, PublicKey.from_pem, read_public(path))
 
 
 def load_card(path: Path) -> NodeDescriptor:
-    """Read a node's card.
+    """Read a node descriptor (``node.card``).
 
     Raises:
-        LocalError: not there, or it does not hold; the text names the file.
+        LocalError: it is missing, or not valid; the text names the file.
     """
     return parsed(path, NodeDescriptor.from_wire, read_public(path))
 
@@ -124,10 +125,10 @@ def load_card(path: Path) -> NodeDescriptor:
 def save_domain(
     directory: Path, authority: CertificateAuthority, *, passphrase: bytes | None = None, force: bool = False
 ) -> None:
-    """Write a domain's root key and certificate; the key under a passphrase, if there is one.
+    """Write a domain's root key and certificate; the key under a passphrase, if one is given.
 
     Raises:
-        LocalError: they are there already, or the system refuses.
+        LocalError: they exist already, or the system refuses.
     """
     files = {
         ROOT_KEY: key_file(authority.key, passphrase),
@@ -140,7 +141,7 @@ def load_domain(directory: Path) -> CertificateAuthority:
     """Read a domain with its private key.
 
     Raises:
-        LocalError: something is missing, wrong, or readable for others.
+        LocalError: a file is missing, invalid, or readable for others.
     """
     key = read_signing_key(directory / ROOT_KEY)
     root = load_root(directory / ROOT_CERTIFICATE)
@@ -148,10 +149,10 @@ def load_domain(directory: Path) -> CertificateAuthority:
 
 
 def save_owner(directory: Path, owner: Owner, *, passphrase: bytes | None = None, force: bool = False) -> None:
-    """Write an owner's keys, under a passphrase, if there is one.
+    """Write an owner's keys, under a passphrase if one is given.
 
     Raises:
-        LocalError: they are there already, or the system refuses.
+        LocalError: they exist already, or the system refuses.
     """
     files = {
         OWNER_KEY: key_file(owner.key, passphrase),
@@ -165,7 +166,7 @@ def load_owner(directory: Path) -> Owner:
     """Read an owner.
 
     Raises:
-        LocalError: something is missing, wrong, or readable for others.
+        LocalError: a file is missing, invalid, or readable for others.
     """
     key = read_signing_key(directory / OWNER_KEY)
     public_path, path = directory / OWNER_PUBLIC, directory / OWNER_MASTER
@@ -179,10 +180,10 @@ def load_owner(directory: Path) -> Owner:
 def save_node_keys(
     directory: Path, keys: NodeKeys, metadata: Metadata, *, passphrase: bytes | None = None, force: bool = False
 ) -> None:
-    """Write a node's keys, its metadata and its request for a membership; keys under a passphrase, if there is one.
+    """Write a node's keys, its metadata and its membership request; keys under a passphrase, if one is given.
 
     Raises:
-        LocalError: they are there already, the metadata are of another node, or the system refuses.
+        LocalError: they exist already, the metadata are of another node, or the system refuses.
     """
     if metadata.digest() != keys.digest:
         raise LocalError("the metadata are not those of this node")
@@ -200,7 +201,7 @@ def load_node_keys(directory: Path) -> NodeKeys:
     """Read a node's keys, whether it belongs to a domain or not.
 
     Raises:
-        LocalError: something is missing, wrong, or readable for others.
+        LocalError: a file is missing, invalid, or readable for others.
     """
     path = directory / NODE_METADATA
     role, label, digest = parsed(path, _node_metadata, read_public(path))
@@ -210,10 +211,10 @@ def load_node_keys(directory: Path) -> NodeKeys:
 
 
 def save_identity(directory: Path, identity: Identity, *, force: bool = False) -> None:
-    """Add to a node's keys what makes it a member: certificate, root and card.
+    """Add the credentials of a member to a node's keys: certificate, root and node descriptor.
 
     Raises:
-        LocalError: they are there already, or the system refuses.
+        LocalError: they exist already, or the system refuses.
     """
     files = {
         ROOT_CERTIFICATE: public(identity.root.to_pem()),
@@ -224,7 +225,7 @@ def save_identity(directory: Path, identity: Identity, *, force: bool = False) -
 
 
 def save_membership(directory: Path, member: Membership, root: Root) -> None:
-    """Replace a node's membership and root; its card stays, which only its key could make anew.
+    """Replace a node's membership and root; the node descriptor stays, because only the node's key could renew it.
 
     Raises:
         LocalError: the system refuses.
@@ -238,10 +239,10 @@ def load_identity(directory: Path, unix_s: float) -> Identity:
 
     Args:
         directory: the node's.
-        unix_s: wall clock; a membership that has run out is refused here rather than by every neighbour.
+        unix_s: wall clock; an expired membership is refused here rather than by every neighbour.
 
     Raises:
-        LocalError: something is missing, wrong, run out, or readable for others.
+        LocalError: a file is missing, invalid, expired, or readable for others.
     """
     keys = load_node_keys(directory)
     root = load_root(directory / ROOT_CERTIFICATE)
@@ -254,12 +255,12 @@ def save_delegation(directory: Path, delegation: Delegation, *, force: bool = Fa
     """Write a delegation under its name's hash; return the file.
 
     Args:
-        directory: a node's ``delegations``, or wherever it waits to be carried there.
-        delegation: what an owner gave.
-        force: replace the one that is there.
+        directory: a node's ``delegations``, or another directory from which it is copied there.
+        delegation: the delegation of an owner.
+        force: replace an existing one.
 
     Raises:
-        LocalError: it is there already, or the system refuses.
+        LocalError: it exists already, or the system refuses.
     """
     name = delegation.name.to_text() + _DELEGATION_SUFFIX
     write_all(directory, {name: private(delegation.to_wire())}, force=force)
@@ -276,7 +277,7 @@ def load_delegation(path: Path) -> Delegation:
 
 
 def load_delegations(directory: Path) -> list[Delegation]:
-    """Read all delegations of a directory, in the order of their names; none where there is no directory.
+    """Read all delegations of a directory, in the order of their names; none if the directory is missing.
 
     Raises:
         LocalError: one is malformed or readable for others; the text names the file.
@@ -285,7 +286,7 @@ def load_delegations(directory: Path) -> list[Delegation]:
 
 
 def storage(directory: Path) -> dict[Path, Storage]:
-    """Return how each private key of a domain, an owner or a node is guarded, by file.
+    """Return by file how each private key of a domain, an owner or a node is guarded.
 
     Raises:
         LocalError: there is none, or one is readable for others.
@@ -297,10 +298,10 @@ def storage(directory: Path) -> dict[Path, Storage]:
 
 
 def store_again(directory: Path, passphrase: bytes | None) -> dict[Path, Storage]:
-    """Put the private keys of a directory under a passphrase, or take it away; return how each is guarded then.
+    """Put the private keys of a directory under a passphrase, or remove it; return how each is guarded then.
 
-    Each file is replaced as a whole, so that a kill in between leaves each one as it was or as it is to be. What
-    is in a token stays there.
+    Each file is replaced as a whole, so a kill in between leaves each one in its old or its new form. A key in a token
+    stays there.
 
     Raises:
         LocalError: one does not open with the present passphrase (then nothing is written), or the system refuses.

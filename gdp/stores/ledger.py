@@ -1,10 +1,10 @@
-"""Ledger of a trust domain: every membership that its root key signed, beside the key, in ``issued.jsonl``.
+"""Ledger of a trust domain: every membership that its root key signed, in ``issued.jsonl`` in the key's directory.
 
-Place: I/O, the file system; times come in as arguments.
-One JSON object a line, appended and synced before the certificate is handed out. Each line holds the SHA-256 of the
-line before it, so that a changed, removed or inserted line is found. A ledger whose last lines were cut off still holds
-together: keep a copy of the last hash elsewhere to notice that. A line without its end was never handed out and is
-dropped by the next append.
+I/O; times come in as arguments.
+The file has one JSON object per line, appended and synced before the certificate is handed out. Each line holds the
+SHA-256 of the line before it, which reveals a changed, removed or inserted line. A ledger whose last lines were cut off
+is still consistent: keep a copy of the last hash elsewhere to detect that. A line without its end was never handed out,
+and the next append drops it.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from gdp.stores.ownership import refuse_foreign_file, refuse_shared_folder
 __all__ = ["LEDGER", "Issued", "append_issued", "read_ledger"]
 
 LEDGER: Final = "issued.jsonl"
-_BEGIN: Final = "0" * 64  # what the first line has in place of a hash
+_BEGIN: Final = "0" * 64  # the previous hash of the first line
 _LINE_MAX_BYTES: Final = 16 * 1024
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Issued:
-    """One membership that was signed.
+    """One signed membership.
 
     Args:
         at_unix_s: when it was signed.
@@ -58,15 +58,15 @@ class Issued:
 
 
 def append_issued(directory: Path, member: Membership, unix_s: float) -> None:
-    """Write down a membership; it is on the disk when this returns.
+    """Record a membership; the record is on the disk when the call returns.
 
     Args:
         directory: of the domain.
         unix_s: when it was signed.
 
     Raises:
-        LocalError: the ledger is another user's, does not hold together at its end, or cannot be written. The
-            membership must not be handed out then.
+        LocalError: the ledger is another user's, is inconsistent at its end, or cannot be written. The membership must
+            not be handed out then.
     """
     path = directory / LEDGER
     validity = member.validity
@@ -95,7 +95,7 @@ def append_issued(directory: Path, member: Membership, unix_s: float) -> None:
 
 
 def read_ledger(directory: Path) -> list[Issued]:
-    """Return what a domain issued, the oldest first; empty: nothing was written down yet.
+    """Return the memberships of a domain, the oldest first; empty if none was recorded yet.
 
     Raises:
         LocalError: a line is malformed, or does not follow from the line before; the text names it.
@@ -109,7 +109,7 @@ def read_ledger(directory: Path) -> list[Issued]:
         fcntl.flock(file, fcntl.LOCK_SH)
         for number, line in enumerate(iter(lambda: file.readline(_LINE_MAX_BYTES), b""), 1):
             if not line.endswith(b"\n"):
-                break  # was never handed out
+                break  # it was never handed out
             issued = _parsed(f"{path}:{number}", line)
             if issued.previous != previous:
                 raise LocalError(f"{path}:{number}: does not follow from the line before: the ledger was changed")
@@ -131,7 +131,7 @@ def _opened(path: Path, flags: int) -> Iterator[BinaryIO]:
 
 
 def _last_hash(path: Path, file: BinaryIO) -> str:
-    """Return the hash of the last whole line, and leave the file's position and end behind it."""
+    """Return the hash of the last whole line, and truncate the file after it."""
     end = file.seek(0, os.SEEK_END)
     begin = file.seek(max(end - 2 * _LINE_MAX_BYTES, 0))
     tail = file.read()

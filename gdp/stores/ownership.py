@@ -1,9 +1,9 @@
-"""Owners of files and folders: whose bytes this process may act on.
+"""Ownership of files and folders: the checks whether this process may act on their content.
 
-Place: I/O, the file system; looks, and changes nothing.
-Trusted are this process's user and root. A command of root that sudo(8) started also trusts the user who called sudo,
-since that user can be root at will. A folder with the sticky bit (``/tmp``) may be writable for others: nobody but a
-file's owner can replace or remove it there. A group with the number of its user is that user's own (Debian's
+I/O; it only reads.
+This process's user and root are trusted. A command of root that sudo(8) started also trusts the user who called sudo,
+because that user can become root. A folder with the sticky bit (``/tmp``) may be writable for others: only a file's
+owner can replace or remove it there. A group with the number of its user belongs to that user alone (Debian's
 USERGROUPS).
 """
 
@@ -24,13 +24,13 @@ _OTHERS_WRITE: Final = stat.S_IWGRP | stat.S_IWOTH
 
 
 def refuse_foreign_file(path: Path, status: os.stat_result) -> None:
-    """Refuse a private file that another user wrote, or that others can reach.
+    """Refuse a private file that another user wrote, or that others can access.
 
     Args:
-        status: of the descriptor that is read, so that nothing changes in between.
+        status: of the open descriptor, so that the file cannot change in between.
 
     Raises:
-        LocalError: it is no regular file, belongs to an untrusted user, or group or others have any right to it.
+        LocalError: it is not a regular file, belongs to an untrusted user, or group or others have any right to it.
     """
     if not stat.S_ISREG(status.st_mode):
         raise LocalError(f"{path}: a regular file is expected")
@@ -49,7 +49,7 @@ def refuse_shared_folder(folder: Path) -> None:
 
     Raises:
         LocalError: the folder belongs to an untrusted user, or others may write to it.
-        OSError: there is no such folder.
+        OSError: the folder does not exist.
     """
     status = folder.stat()
     if status.st_uid not in _trusted():
@@ -62,14 +62,14 @@ def refuse_shared_folder(folder: Path) -> None:
 
 
 def refuse_foreign_folder(folder: Path, why: str) -> None:
-    """Refuse a folder that is not this user's alone.
+    """Refuse a folder that does not belong to this user alone.
 
     Args:
-        why: what the folder is for, as the end of a sentence.
+        why: purpose of the folder, as the end of a sentence.
 
     Raises:
         LocalError: it belongs to another user, or others may write to it.
-        OSError: there is no such folder.
+        OSError: the folder does not exist.
     """
     status = folder.stat()
     if status.st_uid != os.geteuid() or status.st_mode & _OTHERS_WRITE:

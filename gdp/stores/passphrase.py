@@ -1,7 +1,7 @@
 """Passphrases of private files: from a file, the environment, systemd's credentials or a prompt, never an argument.
 
-Place: I/O; reads the environment, files and the terminal. An argument stands in ``/proc/PID/cmdline`` for every user of
-the host, and in the shell's history. One process has one passphrase, but for prompts, which ask for each folder.
+I/O; reads the environment, files and the terminal. An argument is visible in ``/proc/PID/cmdline`` to every user of the
+host, and in the shell's history. One process has one passphrase, except for prompts, which ask for each folder.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ _SOURCES: Final = f"set {FILE_VARIABLE} to a private file, or {VARIABLE}, or giv
 def passphrase_for(path: Path) -> bytes:
     """Return the passphrase, or PIN, of a private file.
 
-    The first of these that is there: the file named by ``GDP_PASSPHRASE_FILE``, ``GDP_PASSPHRASE``, the credential, a
-    prompt at a terminal.
+    It is the first of these that exists: the file named by ``GDP_PASSPHRASE_FILE``, ``GDP_PASSPHRASE``, the credential,
+    a prompt at a terminal.
 
     Raises:
-        LocalError: none is there, the file is not private, or what it holds is empty.
+        LocalError: none exists, the file is not private, or its content is empty.
     """
     given = _given()
     if given is not None:
@@ -43,13 +43,13 @@ def passphrase_for(path: Path) -> bytes:
 
 
 def new_passphrase(file: Path | None = None) -> bytes:
-    """Return the passphrase under which files are to be put.
+    """Return the passphrase to put files under.
 
     Args:
         file: a private file with it; otherwise as for ``passphrase_for``, and a prompt asks twice.
 
     Raises:
-        LocalError: none is there, both answers differ, the file is not private, or what it holds is empty.
+        LocalError: none exists, the two inputs differ, the file is not private, or its content is empty.
     """
     if file is not None:
         return _first_line(str(file), read_private(file))

@@ -1,6 +1,6 @@
 """Private keys and secrets on disk: plain, under a passphrase, or in a token.
 
-Place: I/O, through ``files``. A file says by itself which it is::
+I/O, through ``files``. The content of a file shows its form::
 
     -----BEGIN PRIVATE KEY-----             a signing key, PKCS #8, guarded by the file's mode alone
     -----BEGIN ENCRYPTED PRIVATE KEY-----   the same under a passphrase (``gdp/crypto/pbes2``)
@@ -26,7 +26,7 @@ __all__ = ["Storage", "key_file", "read_secret", "read_signing_key", "secret_fil
 
 
 class Storage(str, Enum):
-    """Where a private key lies."""
+    """Form in which a private key is stored."""
 
     PLAIN = "plain"
     PASSPHRASE = "passphrase"
@@ -34,10 +34,10 @@ class Storage(str, Enum):
 
 
 def storage_of(path: Path) -> Storage:
-    """Return how a private file guards what it holds.
+    """Return how a private file guards its content.
 
     Raises:
-        LocalError: it is not there, or not private.
+        LocalError: it is missing, or not private.
     """
     return _storage(read_private(path))
 
@@ -46,7 +46,7 @@ def read_signing_key(path: Path) -> SigningKey:
     """Read a signing key.
 
     Raises:
-        LocalError: not there, not private, no key, or it does not open; the text names the file.
+        LocalError: it is missing, not private, not a key, or does not open; the text names the file.
     """
     data = read_private(path)
     storage = _storage(data)
@@ -63,7 +63,7 @@ def read_signing_key(path: Path) -> SigningKey:
 def _opened_key(plain: bytes) -> SigningKey:
     try:
         return SigningKey.from_der(plain)
-    except LocalError as error:  # one wrong passphrase in 256 leaves a padding that is none
+    except LocalError as error:  # one wrong passphrase in 256 yields a valid padding
         raise LocalError(WRONG_PASSPHRASE) from error
 
 
@@ -71,7 +71,7 @@ def read_secret(path: Path) -> bytes:
     """Read another secret: an owner's master secret, a node's KEM key.
 
     Raises:
-        LocalError: not there, not private, or it does not open; the text names the file.
+        LocalError: it is missing, not private, or does not open; the text names the file.
     """
     data = read_private(path)
     if _storage(data) is not Storage.PASSPHRASE:
@@ -83,7 +83,7 @@ def read_secret(path: Path) -> bytes:
 
 
 def key_file(key: SigningKey, passphrase: bytes | None = None) -> NewFile:
-    """Return the file that holds a signing key, or names the token that does.
+    """Return the file that holds a signing key, or names its token.
 
     Raises:
         LocalError: an empty passphrase.

@@ -1,9 +1,9 @@
-"""What a node was told of revocations, on disk: a node that starts again believes nobody who was revoked.
+"""Revocation file: a node's revocations on disk, so that it still rejects every revoked key after a restart.
 
-Layer: I/O. One SQLite file in WAL mode, synced with every slice, written by one thread, so that a slow disk holds up no
-frame. A killed process or machine leaves what was synced. The file is this user's alone; all the same each statement
-in it is verified when it is read. A file that is no database is put aside as ``revocations.broken``. A full disk is
-reported once, and tried again with the next slice.
+I/O. One SQLite file in WAL mode, synced with every slice, written by one thread, so that a slow disk delays no frame. A
+killed process or machine leaves the synced data. The file is private to this user; each statement in it is still
+verified when it is read. A file that is not a database is renamed to ``revocations.broken``. A full disk is reported
+once, and the next slice tries again.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ CREATE TABLE IF NOT EXISTS revocations (
 ) WITHOUT ROWID
 """
 
-Change = tuple[KeptKey, Kept | None]  # None: it is gone
+Change = tuple[KeptKey, Kept | None]  # None: it was removed
 
 
 class Row(NamedTuple):
@@ -49,7 +49,7 @@ class Row(NamedTuple):
 
 
 class RevocationFile:
-    """The file of one node.
+    """The revocation file of one node.
 
     Args:
         folder: the node's state folder.
@@ -71,7 +71,7 @@ class RevocationFile:
         self._thread = threading.Thread(target=self._work, name="revocations", daemon=True)
 
     def load(self, unix_s: float) -> Iterator[Row]:
-        """Yield what was written and has not run out, that of roots first."""
+        """Yield the stored revocations that have not expired, those of roots first."""
         try:
             with contextlib.closing(_opened(self._path)) as database:
                 with database:
@@ -86,20 +86,20 @@ class RevocationFile:
             self._put_aside(error)
 
     def start(self) -> None:
-        """Begin to write what ``write`` is given."""
+        """Start the thread that writes the changes of ``write``."""
         self._thread.start()
 
     @property
     def is_ready(self) -> bool:
-        """Return whether ``write`` takes another slice."""
+        """Return whether ``write`` accepts another slice."""
         return not self._slices.full()
 
     def write(self, changes: Sequence[Change]) -> None:
-        """Have changes written; the caller has asked ``is_ready``."""
+        """Queue changes to be written; the caller has checked ``is_ready``."""
         self._slices.put_nowait(changes)
 
     def close(self) -> None:
-        """Write what waits, each slice tried once, and end."""
+        """Write the queued slices, each tried once, and end."""
         self._is_closing.set()
         if self._thread.is_alive():
             self._slices.put(None)
@@ -154,7 +154,8 @@ def _opened(path: Path) -> sqlite3.Connection:
     try:
         database = sqlite3.connect(path, timeout=1.0)
         try:
-            database.execute("PRAGMA locking_mode=EXCLUSIVE")  # before WAL, or a file of shared memory is made
+            # before WAL; otherwise SQLite makes a file of shared memory
+            database.execute("PRAGMA locking_mode=EXCLUSIVE")
             database.execute("PRAGMA journal_mode=WAL")
             database.execute("PRAGMA synchronous=FULL")
             database.execute(_SCHEMA)

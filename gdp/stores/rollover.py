@@ -1,6 +1,6 @@
 """Rollover of a trust domain's root: another key takes over, and both are trusted for a while.
 
-Place: I/O, through ``keyring``. ::
+I/O, through ``keyring``. ::
 
     begin    domain/next/root.key*  next/root.crt     the successor, which the present root vouches for
              (next/root.crt goes to every node that has the domain's root; memberships are issued as before)
@@ -39,16 +39,16 @@ def begin_rollover(
     passphrase: bytes | None = None,
     unix_s: float | None = None,
 ) -> CertificateAuthority:
-    """Make a successor of a domain's root; the domain goes on issuing with the present one.
+    """Make a successor of a domain's root; the domain continues to issue with the present one.
 
     Args:
         days: how long the successor is valid.
-        overlap_days: how long the present root is trusted beside it.
-        key: the successor's, if there is one already, as in a token.
+        overlap_days: how long the present root is trusted together with it.
+        key: the successor's key, if it exists already, for example in a token.
         passphrase: guards the successor's key file.
 
     Raises:
-        LocalError: no domain there, or a rollover has begun already.
+        LocalError: no domain is there, or a rollover has begun already.
     """
     now = time.time() if unix_s is None else unix_s
     refuse_existing(domain / NEXT)
@@ -61,7 +61,7 @@ def begin_rollover(
 
 
 def finish_rollover(domain: Path) -> Root:
-    """Issue by the successor from now on; what a kill interrupted goes on with the next call.
+    """Issue with the successor from now on; the next call resumes after a kill.
 
     Raises:
         LocalError: no rollover has begun.
@@ -90,14 +90,14 @@ def _note(domain: Path, what: str, root: Root, unix_s: float) -> None:
 
 
 def trust_successor(file: Path, root: Path) -> Root:
-    """Replace a root that is trusted by one that descends from it.
+    """Replace a trusted root by one that descends from it.
 
     Args:
-        file: the domain's newer root, with those that it succeeded.
+        file: the domain's newer root, with its predecessors.
         root: the file that a node's configuration names.
 
     Raises:
-        LocalError: it does not descend from what is trusted, which then stays.
+        LocalError: it does not descend from the trusted root, which then stays.
     """
     newer, present = load_root(file), load_root(root)
     if newer.domain != present.domain or present.key not in [each.key for each in newer.lineage]:

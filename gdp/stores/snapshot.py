@@ -1,8 +1,8 @@
-"""What a RIB with its store in memory held, on disk: read at the start, kept up to date in the background.
+"""Snapshot of a RIB's in-memory store on disk: read at the start, updated in the background.
 
-Layer: I/O. SQLite in WAL mode, written by one thread in slices, each of which is one transaction. A full disk or a
-broken file is reported once, and the RIB goes on without. A slice that cannot be written is tried again, so that no
-withdrawal is missing from the file. Entries prove themselves: what is read is verified like what a peer sends.
+I/O. SQLite in WAL mode, written by one thread in slices, each of which is one transaction. A full disk or a broken file
+is reported once, and the RIB continues without it. A slice that cannot be written is tried again, so that no withdrawal
+is missing from the file. Entries carry their proof: they are verified like data from a peer when they are read.
 """
 
 from __future__ import annotations
@@ -27,26 +27,26 @@ __all__ = ["SLICE", "Snapshot"]
 log = logging.getLogger(__name__)
 
 SLICE: Final = 512  # entries at once
-RETRY_S: Final = 0.5  # between two tries of a slice that cannot be written
+RETRY_S: Final = 0.5  # between two attempts to write a slice
 _SLICES_WAITING_MAX: Final = 4
 _SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS entries (key BLOB PRIMARY KEY, entry BLOB NOT NULL, end_unix_s REAL NOT NULL) WITHOUT ROWID
 """
 
-Change = tuple[Key, Entry | None]  # None: it is gone
+Change = tuple[Key, Entry | None]  # None: it was removed
 
 
 class _Slice(NamedTuple):
     generation: int
     changes: Sequence[Change]
-    unix_s: float  # when the changes were looked up
+    unix_s: float  # when the changes were read
 
 
 class Snapshot:
-    """One file.
+    """One snapshot file.
 
     Args:
-        path: of the database; a file that is none is put aside as ``PATH.broken``.
+        path: of the database; a file that is not a database is renamed to ``PATH.broken``.
     """
 
     def __init__(self, path: Path) -> None:
@@ -55,13 +55,13 @@ class Snapshot:
         self.failures = 0
         self.unreadable = 0
         self._has_failed = False
-        self._generation = 0  # of the slices that count
-        self._generation_in_file = 0  # another one is deleted before a slice is written
+        self._generation = 0  # of the valid slices
+        self._generation_in_file = 0  # entries of another generation are deleted before a write
         self._is_closing = threading.Event()
         self._thread = threading.Thread(target=self._work, name="snapshot", daemon=True)
 
     def load(self, unix_s: float) -> Iterator[list[Entry]]:
-        """Yield what was held, in slices, without leases that ended."""
+        """Yield the stored entries in slices, without leases that ended."""
         try:
             with contextlib.closing(_opened(self._path)) as database:
                 rows = database.execute("SELECT entry, end_unix_s FROM entries WHERE end_unix_s > ?", (unix_s,))
@@ -69,30 +69,30 @@ class Snapshot:
                     yield [entry for row in slice_ if (entry := self._read(row[0], row[1] - unix_s)) is not None]
         except sqlite3.OperationalError as error:
             self.failures += 1
-            self.begin_again()  # the file may hold what this RIB will never hear of
+            self.begin_again()  # the file may hold entries that this RIB never receives
             log.warning("snapshot not read path=%s reason=%s; the RIB starts without it", self._path, error)
         except sqlite3.DatabaseError as error:
             self._put_aside(error)
 
     def start(self) -> None:
-        """Begin to write what ``write`` is given."""
+        """Start the thread that writes the changes of ``write``."""
         self._thread.start()
 
     @property
     def is_ready(self) -> bool:
-        """Return whether ``write`` takes another slice."""
+        """Return whether ``write`` accepts another slice."""
         return not self._slices.full()
 
     def write(self, changes: Sequence[Change], unix_s: float) -> None:
-        """Have changes written; the caller has asked ``is_ready``."""
+        """Queue changes to be written; the caller has checked ``is_ready``."""
         self._slices.put_nowait(_Slice(self._generation, changes, unix_s))
 
     def begin_again(self) -> None:
-        """Forget slices that are not written yet; the next one that is given replaces all that is in the file."""
+        """Drop slices that are not written yet; the next slice replaces the whole content of the file."""
         self._generation += 1
 
     def close(self) -> None:
-        """Write what waits, each slice tried once, and end."""
+        """Write the queued slices, each tried once, and end."""
         self._is_closing.set()
         if self._thread.is_alive():
             self._slices.put(None)
@@ -131,7 +131,7 @@ class Snapshot:
             database.close()
 
     def _write_failed(self, error: sqlite3.Error) -> None:
-        """Count each failure, report the first of a row."""
+        """Count each failure, and report the first of a series."""
         self.failures += 1
         if not self._has_failed:
             log.warning("snapshot not written path=%s reason=%s; the RIB goes on without it", self._path, error)
@@ -153,14 +153,14 @@ class Snapshot:
 
 
 def _opened(path: Path) -> sqlite3.Connection:
-    """Return the database, its lock held: SQLite then needs no further file to read what a killed RIB left.
+    """Return the locked database: SQLite then needs no other file to read the data of a killed RIB.
 
     Raises:
         sqlite3.Error: it cannot be opened, or is new and the disk is full.
     """
     database = sqlite3.connect(path, timeout=1.0)
     try:
-        database.execute("PRAGMA locking_mode=EXCLUSIVE")  # before WAL, or a file of shared memory is made
+        database.execute("PRAGMA locking_mode=EXCLUSIVE")  # before WAL; otherwise SQLite makes a file of shared memory
         database.execute("PRAGMA journal_mode=WAL")
         database.execute("PRAGMA synchronous=NORMAL")
         database.execute(_SCHEMA)

@@ -1,8 +1,8 @@
-"""Signing keys in tokens: an HSM, a TPM, a smart card or SoftHSM, spoken to by PKCS #11.
+"""Token keys: signing keys in an HSM, a TPM, a smart card or SoftHSM, used through PKCS #11.
 
-Place: I/O; loads the token's library into this process. Needs the extra ``pkcs11``.
+I/O; loads the token's library into this process. Needs the extra ``pkcs11``.
 Source: PKCS #11, version 2.40, sections 2.3.1 (EC keys) and 2.3.6 (``CKM_ECDSA``): the token gets a digest and returns
-r || s. The private key never enters this process. A token that was taken out and put back is opened once more.
+r || s. The private key never enters this process. A token that was removed and inserted again is reopened once.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ __all__ = ["SCHEME", "TokenKey", "generate_token_key", "open_token_key"]
 
 _DIGEST_BYTES: Final = 32
 _POINT_BYTES: Final = 65
-_TRIAL: Final = b"gdp-token-trial-1"  # no statement begins so
+_TRIAL: Final = b"gdp-token-trial-1"  # no statement begins with these bytes
 _MISSING: Final = "keys in tokens need the package python-pkcs11: pip install 'gdp-ros[pkcs11]'"
 
 
 class _PrivateKey(Protocol):
-    """What is used of the library's ``PrivateKey``."""
+    """The parts of the library's ``PrivateKey`` that are used here."""
 
     id: bytes
     label: str
@@ -46,11 +46,11 @@ class _PrivateKey(Protocol):
 
 @dataclass(slots=True)
 class TokenKey(SigningKey):
-    """A private key that its token uses for us; what a signature costs is the token's matter.
+    """A private key that its token uses for us; the token determines the cost of a signature.
 
     Args:
-        uri: where it is.
-        public: its other half, from the token.
+        uri: of the key.
+        public: its public key, from the token.
     """
 
     uri: str
@@ -70,7 +70,7 @@ class TokenKey(SigningKey):
         """Return r || s (64 bytes) over a SHA-256 digest (32 bytes).
 
         Raises:
-            LocalError: not 32 bytes, or the token does not sign.
+            LocalError: the digest is not 32 bytes, or the token does not sign.
         """
         if len(digest) != _DIGEST_BYTES:
             raise LocalError("a SHA-256 digest has 32 bytes")
@@ -88,8 +88,8 @@ class TokenKey(SigningKey):
         return signature
 
     def to_file(self, protect: Callable[[bytes], bytes] | None = None) -> bytes:
-        """Return the line of a key file: the URI of the key; ``protect`` is ignored, since it is no secret."""
-        del protect  # there is nothing to protect: the file names the key
+        """Return the line of a key file: the URI of the key; ``protect`` is ignored, because a URI is no secret."""
+        del protect  # nothing to protect: the file only names the key
         return self.uri.encode() + b"\n"
 
     def _ask(self, digest: bytes) -> bytes:
@@ -101,16 +101,18 @@ def open_token_key(text: str, file: Path) -> TokenKey:
 
     Args:
         text: its URI.
-        file: what named it, for messages and the prompt of the PIN.
+        file: file that names it, for messages and the prompt of the PIN.
 
     Raises:
-        LocalError: a wrong URI, no such library, token or key, a wrong PIN, or not a key on P-256.
+        LocalError: the URI is invalid, the library, token or key does not exist, the PIN is wrong, or the key is not on
+            P-256.
     """
     uri = TokenUri.from_text(text)
     pin = _pin(uri, file)
     library = _library()
 
     def opened() -> _PrivateKey:
+        """Return the private key in a new session."""
         session = _session(uri, pin)
         wanted = {**_attributes(uri), library.Attribute.CLASS: library.ObjectClass.PRIVATE_KEY}
         found = list(session.get_objects(wanted))
@@ -123,7 +125,7 @@ def open_token_key(text: str, file: Path) -> TokenKey:
         made = TokenKey(text, _public_key(uri, key), opened, key)
     except library.PKCS11Error as error:
         raise LocalError(f"the token does not open the key ({_said(error)}): {text}") from error
-    try:  # while all rights are there: a library may read files at its first signature
+    try:  # before the confinement of rights: a library may read files at its first signature
         made.public.verify(made.sign(_TRIAL), _TRIAL)
     except StatementError as error:
         raise LocalError(f"the public key beside the token's private key is another key's: {text}") from error
@@ -131,10 +133,10 @@ def open_token_key(text: str, file: Path) -> TokenKey:
 
 
 def generate_token_key(text: str) -> TokenKey:
-    """Make a P-256 key in a token, which never leaves it; return it opened.
+    """Make a P-256 key in a token, which it never leaves; return it opened.
 
     Raises:
-        LocalError: a wrong URI or one without ``object``, a key of this label is there already, or the token refuses.
+        LocalError: the URI is invalid or lacks ``object``, a key of this label exists already, or the token refuses.
     """
     uri = TokenUri.from_text(text)
     if not uri.label:
@@ -190,7 +192,7 @@ def _token(uri: TokenUri) -> pkcs11.Token:
 
 
 def _session(uri: TokenUri, pin: str, *, is_writing: bool = False) -> pkcs11.Session:
-    """Open a session; a process that has one already is logged in for all (PKCS #11, section 5.6)."""
+    """Open a session; one open session of a process logs in all others (PKCS #11, section 5.6)."""
     token = _token(uri)
     try:
         return token.open(rw=is_writing, user_pin=pin)
@@ -209,7 +211,7 @@ def _attributes(uri: TokenUri) -> dict[pkcs11.Attribute, object]:
 
 
 def _public_key(uri: TokenUri, key: _PrivateKey) -> PublicKey:
-    """Return the public key that lies beside the private one, under the same id or label."""
+    """Return the public key that the token stores with the private one, under the same id or label."""
     library = _library()
     names = library.Attribute
     beside = {names.ID: key.id} if key.id else {names.LABEL: key.label}
@@ -217,7 +219,7 @@ def _public_key(uri: TokenUri, key: _PrivateKey) -> PublicKey:
     if len(found) != 1:
         raise LocalError(f"{len(found)} public keys lie beside the private key in the token, not one: {uri.label!r}")
     encoded = bytes(found[0][names.EC_POINT])
-    try:  # some tokens wrap the point in an OCTET STRING, as they should, some do not
+    try:  # some tokens wrap the point in an OCTET STRING, as specified; others do not
         point = ec.EllipticCurvePublicKey.from_encoded_point(ec.SECP256R1(), encoded[-_POINT_BYTES:])
         return PublicKey.from_point(point)
     except (ValueError, GdpError) as error:

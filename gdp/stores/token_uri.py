@@ -1,9 +1,9 @@
-"""PKCS #11 URIs: which object of which token, by which library.
+"""PKCS #11 URIs: the object, its token, and the library.
 
-Place: pure text.
-Source: RFC 7512. Understood are ``token``, ``serial``, ``object``, ``id`` and ``type=private`` in the path, and
-``module-path`` and ``pin-source`` in the query. Another attribute is refused rather than passed over, since it would
-select less than it says. ``pin-value`` is refused: a PIN is no part of an address.
+Sans-I/O.
+Source: RFC 7512. Supported are ``token``, ``serial``, ``object``, ``id`` and ``type=private`` in the path, and
+``module-path`` and ``pin-source`` in the query. Another attribute is refused rather than ignored, because it would
+select less than the URI states. ``pin-value`` is refused: a PIN is not part of an address.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ _EXAMPLE: Final = "pkcs11:token=robot;object=node?module-path=/usr/lib/softhsm/l
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TokenUri:
-    """Where a key is.
+    """URI of a key.
 
     Args:
-        module: the library that speaks to the token, absolute.
+        module: the library of the token, absolute path.
         token, serial: of the token; empty: any, of which there must be one.
         label, key_id: of the key; empty: any, of which there must be one.
-        pin_file: a private file with the user's PIN; None: asked for as a passphrase is.
+        pin_file: a private file with the user's PIN; None: requested like a passphrase.
     """
 
     module: Path
@@ -44,7 +44,7 @@ class TokenUri:
         """Read a URI.
 
         Raises:
-            LocalError: not of this form; the text says what is wrong.
+            LocalError: the form is not supported; the text gives the reason.
         """
         if not text.startswith(SCHEME) or not text.isprintable():
             raise LocalError(f"not a PKCS #11 URI, such as {_EXAMPLE}")

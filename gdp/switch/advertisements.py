@@ -1,10 +1,11 @@
-"""What attached nodes bring to their switch: claims and withdrawals, checked before anything is done for them.
+"""Advertisements and withdrawals of attached nodes: a switch verifies each before it acts on it.
 
-Place: pure. The claim of whoever hears others on a name (``HEARS``) plants trees. A reader's is judged here; any other
-is kept, relayed, and judged by the RIB: those who hear it must find it.
+Sans-I/O. An advertisement with a right in ``HEARS`` starts multicast trees, so the switch verifies it here. Any other
+is stored, relayed, and verified by the RIB, because those who receive that traffic must find the node.
 
-A node numbers its claims in one count, and says all of them again in each session with a switch. So a claim of another
-life of the node, one below the first that came in its present session, and one that came before, are recordings.
+A node numbers all its advertisements in one sequence, and sends all of them again in each session with a switch. Three
+kinds of advertisements are therefore replays: of another incarnation of the node, below the first one of its present
+session, and received before.
 """
 
 from __future__ import annotations
@@ -39,24 +40,24 @@ from gdp.trust.verifier import AdvertisementVerifier
 
 __all__ = ["AdvertisementHandler"]
 
-_SESSIONS_MAX: Final = 4_096  # above the neighbours that a switch has
-_INCARNATION_BYTES: Final = 8  # at the end of a life
+_SESSIONS_MAX: Final = 4_096  # more than the neighbours that a switch has
+_INCARNATION_BYTES: Final = 8  # at the end of an instance id
 _TOLD_S: Final = 1.0
 
 
 class _Session:
-    """Which claims came in one session of a node."""
+    """The advertisements that came in one session of a node."""
 
     __slots__ = ("first", "told_s", "window")
 
     def __init__(self, first: int) -> None:
         self.first = first
-        self.told_s = float("-inf")  # when its node was last told that it is behind
+        self.told_s = float("-inf")  # when the node last received a report that it is behind
         self.window = ReplayWindow(ADVERTISEMENTS_WINDOW)
 
 
 class AdvertisementHandler:
-    """Takes the claims of attached nodes."""
+    """Handles the advertisements of attached nodes."""
 
     def __init__(
         self,
@@ -85,13 +86,13 @@ class AdvertisementHandler:
         self._relocations = relocations
         self._held = held
         self._outbox = outbox
-        self._sessions: OrderedDict[bytes, _Session] = OrderedDict()  # by the nonce of the node
+        self._sessions: OrderedDict[bytes, _Session] = OrderedDict()  # by the node's nonce
 
     def receive_advertisement(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
-        """Take a claim that an attached node brought; whether it is taken or refused, the node is told.
+        """Handle an advertisement of an attached node; the node receives an AdvertiseAck in either case.
 
         Raises:
-            StatementError: it does not hold, or is not the node's newest.
+            StatementError: it is not valid, or is not the node's newest.
         """
         if statement.signer != neighbour.name:
             raise StatementError(DropReason.UNKNOWN_SENDER, "a claim that its maker did not bring")
@@ -124,7 +125,7 @@ class AdvertisementHandler:
                 self._locations.send_to_reader(at, advertisement.right, place, now.mono_s)
         is_alone = (
             self._rib_client.rib is None and advertisement.previous != ZERO
-        )  # no RIB will judge a node that has moved
+        )  # no RIB sends an AdvertiseAck to a node that has moved
         if advertisement.right is Right.READ or is_alone:
             self._judge(neighbour, advertisement.name, None, advertisement.sequence)
         if advertisement.right is not Right.READ:
@@ -146,10 +147,10 @@ class AdvertisementHandler:
         self._rib_client.ask(now.mono_s)
 
     def _check_fresh(self, neighbour: Neighbour, advertisement: Advertisement, now_s: float) -> None:
-        """Note a verified claim of a neighbour; one that is far behind is told by how much, now and then.
+        """Record a verified advertisement; a neighbour that is far behind receives, now and then, by how much.
 
         Raises:
-            StatementError: REPLAYED, it is of another life or session of it, or came before.
+            StatementError: REPLAYED, it is of another incarnation or session of the node, or came before.
         """
         if advertisement.incarnation.to_bytes(_INCARNATION_BYTES, "big") != neighbour.life[-_INCARNATION_BYTES:]:
             raise StatementError(DropReason.REPLAYED, "a claim of another life of its maker")
@@ -163,25 +164,26 @@ class AdvertisementHandler:
                 advertisement.sequence <= session.window.top - ADVERTISEMENTS_WINDOW
                 and now_s >= session.told_s + _TOLD_S
             ):
-                session.told_s = now_s  # it may be the node's own, which says nothing newer unless it is told
+                # The advertisement may be the node's own; the node sends nothing newer unless it receives this report.
+                session.told_s = now_s
                 self._judge(neighbour, advertisement.name, DropReason.STALE, session.window.top)
             raise StatementError(DropReason.REPLAYED, "a claim")
         session.window.finish(advertisement.sequence)
         self._sessions.move_to_end(neighbour.nonce)
 
     def _sequence_of(self, name: Name, neighbour: Neighbour) -> int:
-        """Return the highest sequence number of what an attached node claims on a name here, or -1."""
+        """Return the highest sequence number among an attached node's advertisements of a name here, or -1."""
         attachment = self._attached.get(name, neighbour.name)
         reading = self._multicast.advertisement_of(name, (neighbour.port, neighbour.mac))
         known = [reading] if attachment is None else [reading, attachment.advertisement]
         return max((advertisement.sequence for advertisement in known if advertisement is not None), default=-1)
 
     def _refuse(self, neighbour: Neighbour, statement: Statement, error: StatementError) -> None:
-        """Tell an attached node why its claim was not taken."""
+        """Send an attached node an AdvertiseAck that rejects its advertisement."""
         try:
             body = UnverifiedAdvertisement.from_statement(statement)
         except StatementError:
-            return  # not even a claim: the caller counts it
+            return  # not even an advertisement: the caller counts it
         about, reason = body.subject.name.to_text(), error.reason.label
         self._audit.note(Action.REFUSED, "name", who=neighbour.name.to_text(), about=about, reason=reason)
         self._judge(neighbour, body.subject.name, error.reason, body.sequence)
@@ -192,10 +194,10 @@ class AdvertisementHandler:
         self._outbox.say(neighbour, Kind.ADVERTISE_ACK, wire)
 
     def withdraw(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
-        """Take a withdrawal.
+        """Handle a withdrawal.
 
         Raises:
-            StatementError: it does not hold, or is older than what is claimed now.
+            StatementError: it is not valid, or is older than the present advertisement.
         """
         fields = statement.expect(StatementType.WITHDRAW)
         if statement.signer != neighbour.name:

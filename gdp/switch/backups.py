@@ -1,9 +1,8 @@
-"""Where a tree finds another way: the backup asked for above, and the branches that backups protect.
+"""Backup branches of multicast trees: from which neighbour to request one, and which branches one protects.
 
-Place: pure.
-Source: RFC 5286 for the alternate above; RFC 7431 for the secondary join. There a secondary tree carries copies all the
-time; here it carries none until the switch that has both branches loses the protected one, so that no link carries a
-message twice.
+Sans-I/O. Source: RFC 5286 for the alternate upstream; RFC 7431 for the secondary join. In RFC 7431 a secondary tree
+carries copies all the time. Here it carries none until the switch that has both branches loses the protected one. So no
+link carries a message twice.
 """
 
 from __future__ import annotations
@@ -17,11 +16,11 @@ __all__ = ["Backups"]
 
 
 class Backups:
-    """The ways of trees that are not their best.
+    """Computes the backup paths of trees.
 
     Args:
         me: this switch.
-        own: its domain; a backup never leaves it, for how others choose their paths is theirs to know.
+        own: its domain; a backup never leaves it, because the path choice of other domains is unknown.
     """
 
     def __init__(self, me: Name, own: Name, paths: Paths, outbox: Outbox) -> None:
@@ -31,7 +30,7 @@ class Backups:
         self._outbox = outbox
 
     def above(self, tree: Tree) -> tuple[Downstream, Name] | None:
-        """Return whom a backup branch is to be asked of: the loop-free alternate towards the publisher, or None."""
+        """Return where to request a backup branch: the loop-free alternate towards the publisher, or None."""
         if tree.is_backup or tree.above is None or tree.switch == self._me:
             return None
         way = self._paths.to_switch(tree.switch, tree.domain, tree.allowed)
@@ -43,10 +42,11 @@ class Backups:
         return at, neighbour.name
 
     def protection(self, tree: Tree) -> dict[Downstream, Downstream]:
-        """Return, for each branch that a backup can take the place of, that backup.
+        """Return, for each branch that a backup can replace, that backup.
 
-        A backup protects the branch over which this switch would itself reach whoever asked for it, where messages
-        that fit that branch fit the backup, too. Of several the one asked for by the nearest switch is taken.
+        A backup protects the branch over which this switch would itself reach the switch that requested the backup.
+        Messages that fit that branch must also fit the backup. Of several backups, the one that the nearest switch
+        requested is taken.
         """
         found: dict[Downstream, tuple[int, Downstream]] = {}
         for at, branch in tree.branches.items():

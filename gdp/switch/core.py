@@ -1,12 +1,12 @@
-"""A switch's control plane: what it hears from neighbours, asks of its RIB, and writes into the forwarding table.
+"""Control plane of a switch: it handles neighbours' statements, queries its RIB, and writes the forwarding table.
 
-Place: pure; a shell or a simulated network feeds it the frames that its data plane hands up, and the time.
+Sans-I/O; an I/O layer or a simulated network passes in the frames that the data plane punts, and the time.
 
-The walk of a frame that was handed up::
+The path of a punted frame::
 
-    kind >= 0x80  -> joined to a statement -> hello | link state | claim, withdrawal | join, leave
-    addressed to us -> a RIB's answer, or an echo
-    anything else -> no entry yet: Unicast finds the way, or parks the frame and asks
+    kind >= 0x80    -> reassembled statement -> hello | link state | advertisement, withdrawal | join, leave
+    addressed to us -> a RIB's response, or an echo
+    anything else   -> no entry yet: Unicast finds the path, or buffers the frame and sends a query
 """
 
 from __future__ import annotations
@@ -57,13 +57,13 @@ from gdp.trust.verifier import AdvertisementVerifier
 
 __all__ = ["SwitchCore"]
 
-_PROTECT_S: Final = 0.1  # from new paths to their alternates, which nobody waits for
-_CONFLICTS_S: Final = 1.0  # between two looks at identities that are refused elsewhere
+_PROTECT_S: Final = 0.1  # from new paths to their alternates, which are not urgent
+_CONFLICTS_S: Final = 1.0  # between two checks of identities that other switches refuse
 _CONTROL = frozenset(kind.value for kind in Kind if kind >= CONTROL_FROM)
 
 
 class SwitchCore:
-    """The machine of one switch.
+    """Sans-I/O core of one switch.
 
     Args:
         table: the forwarding table that the data plane reads.
@@ -134,7 +134,8 @@ class SwitchCore:
         self._join_paces = Paces(JOINS_PER_S, JOINS_BURST)
         self._advertisement_paces = Paces(ADVERTISEMENTS_PER_S, ADVERTISEMENTS_BURST)
         self._drops: Counter[DropReason] = Counter()
-        self._rest_due_s: float | None = None  # when something other than the greeter is due; None: to be looked up
+        # when something other than the neighbour discovery is due; None: to be computed
+        self._rest_due_s: float | None = None
 
     @property
     def name(self) -> Name:
@@ -143,17 +144,17 @@ class SwitchCore:
 
     @property
     def rib(self) -> Name | None:
-        """Return the RIB that is asked, or None while none is known."""
+        """Return the RIB that receives the queries, or None while none is known."""
         return self.rib_client.rib
 
     @property
     def severed(self) -> frozenset[Name]:
-        """Return the switches of the domain that leaves alone join to this one, so that no way leads to them."""
+        """Return the switches of the domain that only leaves connect to this one, so that no path leads to them."""
         return self._paths.severed()
 
     @property
     def is_displaced(self) -> bool:
-        """Return whether an older switch with this identity is alive, so that this one has to end."""
+        """Return whether an older switch with this identity is alive, so that this one must end."""
         return self._flooding.is_displaced
 
     @property
@@ -162,10 +163,11 @@ class SwitchCore:
         return len(self._flooding.link_states)
 
     def waits(self, attachments: Collection[int], now_s: float) -> list[Wait]:
-        """Return what this switch waits for before it can serve; empty when nothing is missing.
+        """Return the conditions that are missing before this switch can serve; empty when none is.
 
         Args:
-            attachments: ports made for nodes of the same host, which may start at any time: an empty one is no reason.
+            attachments: ports made for nodes of the same host, which may start at any time: an empty one is no reason
+                to wait.
         """
         waits = list(stranger_waits(self.hello_protocol, now_s))
         refusing = {wait.port for wait in waits}
@@ -185,7 +187,7 @@ class SwitchCore:
         return own + self._flooding.drops + self.resolver.drops + self.multicast.drops + self.unicast.drops
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Timestamps) -> None:
-        """Begin to use a port, or learn that the MTU or cost of one that is up has changed."""
+        """Add a port, or update the MTU or cost of one that is up."""
         self._rest_due_s = None
         self._flooding.look_at_clock(now)
         changes = self.hello_protocol.add_port(index, mac, mtu, cost, now.mono_s)
@@ -195,15 +197,15 @@ class SwitchCore:
             self._follow_links(now.mono_s)
 
     def port_changed(self, port: int, up: bool, now: Timestamps) -> None:
-        """Learn that a port's link came or went."""
+        """Handle a change of a port's link."""
         self._rest_due_s = None
         self._flooding.look_at_clock(now)
         for change in self.hello_protocol.port_changed(port, up, now.mono_s):
             self._neighbour_changed(change, now.mono_s)
-        self._follow_links(now.mono_s)  # at once: these frames would be lost
+        self._follow_links(now.mono_s)  # at once: frames over this link would be lost
 
     def receive(self, arrivals: Sequence[ReceivedFrame], now: Timestamps) -> None:
-        """Take frames that the data plane handed up."""
+        """Handle frames that the data plane punted."""
         has_others = False
         self._flooding.look_at_clock(now)
         for arrival in arrivals:
@@ -216,7 +218,7 @@ class SwitchCore:
                     self._take(arrival, header, now)
             except RemoteError as error:
                 self._drops[error.reason] += 1
-            except Exception as error:  # one frame must not end the switch
+            except Exception as error:  # one frame must not stop the switch
                 self.boundary.note(error)
                 self._drops[DropReason.INTERNAL] += 1
         if has_others:
@@ -226,7 +228,7 @@ class SwitchCore:
             self._plan_follow(now.mono_s)
 
     def handle_timer(self, now: Timestamps) -> None:
-        """Do what is due."""
+        """Run the timers that are due."""
         now_s = now.mono_s
         self._flooding.look_at_clock(now)
         lost = self.hello_protocol.drop_silent(now_s)
@@ -235,7 +237,7 @@ class SwitchCore:
         for hello in self.hello_protocol.hellos_to_send(now_s):
             self._outbox.put(hello)
         if not lost and self._rest_due_s is not None and now_s < self._rest_due_s:
-            return  # keepalives are most of what is due
+            return  # most due timers are keepalives
         self._rest_due_s = None
         self._flooding.handle_timer(now_s)
         if lost or (self._spf_delay.due_s is not None and self._spf_delay.due_s <= now_s):
@@ -272,7 +274,7 @@ class SwitchCore:
         return self._rest_due_s if hello_protocol_s is None else min(hello_protocol_s, self._rest_due_s)
 
     def _next_of_rest(self) -> float:
-        """Return the monotonic second of the next timer that is not the greeter's."""
+        """Return the monotonic second of the next timer outside neighbour discovery."""
         times = [
             self._spf_delay.due_s,
             self._protect_at_s,
@@ -287,7 +289,7 @@ class SwitchCore:
         if self.rib_client.rib is not None:
             times.append(self._revoker.next_due_for_rib())
         if self.unicast.is_refreshing:
-            times.append(self._followed_s)  # past: at once
+            times.append(self._followed_s)  # in the past: due at once
         if self._paths.refused_elsewhere():
             times.append(self._conflicts_sought_s + _CONFLICTS_S)
         if self.rib_client.rib is None:
@@ -299,7 +301,7 @@ class SwitchCore:
         return self.hello_protocol.poll_addresses()
 
     def frames_to_send(self) -> list[OutgoingFrames]:
-        """Return, once, what is to be sent: nothing from a switch whose identity an older one has."""
+        """Return, once, the frames to send: none while an older switch has this identity."""
         return [] if self.is_displaced else self._outbox.poll_frames()
 
     def _unwatch(self, orphaned: Iterable[Name]) -> None:
@@ -314,7 +316,7 @@ class SwitchCore:
             self._sync.receive(neighbour, statement, now)
 
     def _tell_rib_of_revocations(self, now_s: float) -> None:
-        """Pass on to the RIB what the operator handed in."""
+        """Send the RIB the revocations that the operator submitted."""
         if self.rib_client.rib is not None:
             for wire in self._revoker.due_for_rib(self.rib_client.rib, now_s):
                 self.rib_client.relay(wire, now_s)
@@ -323,10 +325,10 @@ class SwitchCore:
         return self._flooding.digest_for(port)
 
     def revoke(self, wire: bytes, now: Timestamps) -> None:
-        """Take a revocation from this node's operator, and spread it.
+        """Handle a revocation from this node's operator, and distribute it.
 
         Raises:
-            StatementError: it does not hold.
+            StatementError: it is not valid.
         """
         self._rest_due_s = None
         self._unwatch(self._revoker.hand_in(parse(wire), now))
@@ -349,14 +351,14 @@ class SwitchCore:
             if header.kind == Kind.HELLO:
                 wire = self.hello_protocol.join(arrival, header, now.mono_s)
             else:
-                self._sender(arrival)  # for strangers no state is kept
+                self._sender(arrival)  # unknown senders get no state
                 wire = self._reassembler.add(header, arrival.frame, now.mono_s, arrival.via)
             if wire is not None:
                 statement = parse(wire)
                 with self.boundary.guard(arrival.via + statement.signer, now.mono_s):
                     self._take_control(arrival, header.kind, statement, now)
             return
-        neighbour = self._sender(arrival)  # nor is anything answered or looked for in their name
+        neighbour = self._sender(arrival)  # their frames cause no response and no query
         if header.destination == self.name:
             self._take_own(header, arrival, now)
         else:
@@ -382,7 +384,8 @@ class SwitchCore:
             self._flooding.receive(neighbour, statement, now)
         elif kind in (Kind.ADVERTISE, Kind.WITHDRAW):
             if not self._advertisement_paces.spend(neighbour.name, now.mono_s):
-                raise StatementError(DropReason.QUOTA, "claims of one neighbour")  # it is told nothing: that costs, too
+                # No response is sent: that would cost work, too.
+                raise StatementError(DropReason.QUOTA, "claims of one neighbour")
             take = (
                 self._advertisements.receive_advertisement if kind == Kind.ADVERTISE else self._advertisements.withdraw
             )
@@ -454,12 +457,12 @@ class SwitchCore:
         self.multicast.link_resized(neighbour.port)
 
     def _neighbour_moved(self, change: Change, now_s: float) -> None:
-        """Greet who came up, and let go of who is gone."""
+        """Send the present state to a neighbour that came up, and remove the state of one that is gone."""
         neighbour, before = change
         if neighbour.state is NeighbourState.UP:
             self._sync.neighbour_up(neighbour, now_s)
             self.multicast.neighbour_up((neighbour.port, neighbour.mac), now_s)
-            self._seen_version = -1  # it may have another address now: what leads to it is computed anew
+            self._seen_version = -1  # the neighbour may have another address now: the hops to it are computed again
             if neighbour.role.is_switch:
                 self._flooding.sync(neighbour, now_s)
         elif before is NeighbourState.UP:
@@ -474,7 +477,7 @@ class SwitchCore:
                     self.unicast.forget(attachment.advertisement.name)
 
     def _plan_follow(self, now_s: float) -> None:
-        """See that a change of the links is followed soon, together with those that come right behind it.
+        """Schedule the update after a link change, so that it covers the changes that follow closely.
 
         Link states come in bursts (``spf_delay.py``).
         """
@@ -482,12 +485,12 @@ class SwitchCore:
             self._spf_delay.news(now_s)
 
     def _follow_links(self, now_s: float) -> None:
-        """Let everything that depends on paths follow a change of the links."""
+        """Update everything that depends on paths after a link change."""
         self._spf_delay.computed()
         version = self._flooding.link_states.version
         if version == self._seen_version:
             return
-        self._flooding.neighbour_changed(now_s)  # what lies inside our domain may have moved
+        self._flooding.neighbour_changed(now_s)  # our domain's interior may have changed
         self._seen_version = self._flooding.link_states.version
         self._followed_s = now_s
         self._paths.has_alternates, self._protect_at_s = False, now_s + _PROTECT_S
@@ -501,7 +504,7 @@ class SwitchCore:
         return self._paths.life_of(name, role)
 
     def _look_for_conflicts(self, now_s: float) -> None:
-        """Let RIBs go that an older node with their identity outlives elsewhere; tell those that younger ones copy."""
+        """Drop RIBs with an older node's identity; notify nodes whose identity a younger node elsewhere copies."""
         self._conflicts_sought_s = now_s
         for neighbour in self.hello_protocol.all_up():
             elsewhere = self._life_elsewhere(neighbour.name) if neighbour.role is Role.RIB else None
@@ -518,7 +521,7 @@ class SwitchCore:
     # -- moved nodes
 
     def _relocated(self, statement: Statement, now: Timestamps) -> None:
-        """Take from the new switch of a node that was attached here where it is, and tell whom it hears."""
+        """Handle the new location of a node that was attached here; send its new switch the names that it reads."""
         place = self._evidence.from_relay(statement, now)
         if place.right in HEARS and self.multicast.reader_moved(place):
             self.resolver.unwatch(place.name)
@@ -527,7 +530,7 @@ class SwitchCore:
             self._locations.receive(place, statement.wire, now.mono_s)
 
     def _redirected(self, statement: Statement, now: Timestamps) -> None:
-        """Take from a neighbour, to whom our frames for a node went, where that node is now."""
+        """Handle a redirect: a neighbour that received our frames for a node reports where that node is now."""
         if statement.type is StatementType.RELAY:
             place = self._evidence.from_relay(statement, now)
         else:
@@ -540,7 +543,7 @@ class SwitchCore:
                 self.relocations.moved(place, statement.wire, now.mono_s)
 
     def _where(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
-        """Tell a neighbour, to whom our frames for a node go, where that node is."""
+        """Reply to a neighbour that receives our frames for a node with that node's location."""
         query = Query.from_fields(statement.expect(StatementType.QUERY))
         if not neighbour.role.is_switch or statement.signer != neighbour.name:
             raise StatementError(DropReason.UNKNOWN_SENDER, "a question that a neighbouring switch did not ask")

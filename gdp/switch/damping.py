@@ -1,7 +1,7 @@
-"""Damping of links that flap: one that keeps going serves, until it has stayed, only where there is no other.
+"""Damping of flapping links: a link that flaps is a last resort until it has been stable.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: the penalty with a half-life of RFC 2439, section 2.3.
-A link that goes is followed at once, and one that comes back once or twice is used at once.
+Paths follow a lost link at once, and use a link again at once that comes back once or twice.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from gdp.names import Name
 __all__ = ["Damping"]
 
 HALF_LIFE_S: Final = 5.0
-SUPPRESS_ABOVE: Final = 3.5  # times that the link went, those of long ago counting less
+SUPPRESS_ABOVE: Final = 3.5  # losses of the link; older ones count less
 REUSE_BELOW: Final = 1.5
 PENALTY_MAX: Final = 6.0  # so that no link waits longer than ten seconds
 _LINKS_MAX: Final = 1_024
@@ -37,13 +37,13 @@ class _Penalty:
 
 
 class Damping:
-    """Which links of this switch have flapped too often of late."""
+    """Links of this switch that flapped too often recently."""
 
     def __init__(self) -> None:
         self._penalties: dict[Link, _Penalty] = {}
 
     def went(self, link: Link, now_s: float) -> None:
-        """Note that a link went."""
+        """Record that a link was lost."""
         known = self._penalties.pop(link, None)
         value = min((0.0 if known is None else known.now(now_s)) + 1.0, PENALTY_MAX)
         is_suppressed = value > SUPPRESS_ABOVE or (known is not None and known.is_suppressed)
@@ -52,12 +52,12 @@ class Damping:
             del self._penalties[next(iter(self._penalties))]
 
     def suppresses(self, link: Link) -> bool:
-        """Return whether a link is to be a last resort."""
+        """Return whether a link is a last resort."""
         known = self._penalties.get(link)
         return known is not None and known.is_suppressed
 
     def expire(self, now_s: float) -> None:
-        """Let links be used again that have stayed, or stayed away, for long enough."""
+        """Release links whose penalty has decayed, whether they are up or down."""
         for each in self._penalties.values():
             if each.is_suppressed and now_s >= each.reused_at_s():
                 each.is_suppressed = False

@@ -1,6 +1,7 @@
-"""What a switch holds that rests on certificates: claims of attached nodes, places of names, branches of trees.
+"""Index of the certificate-dependent state of a switch: attached nodes' advertisements, locations, tree branches.
 
-Sans-I/O. The index finds what a revocation concerns; what has gone meanwhile is left out (``trust/evidence_index.py``).
+Sans-I/O. The index finds what a revocation concerns; entries that are gone meanwhile are left out
+(``trust/evidence_index.py``).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ __all__ = ["AttachedAdvertisement", "Dependents", "JoinedBranch", "KnownLocation
 
 
 class AttachedAdvertisement(NamedTuple):
-    """A claim that a node attached at ``at`` brought."""
+    """An advertisement of a node that is attached at ``at``."""
 
     name: Name
     node: Name
@@ -27,14 +28,14 @@ class AttachedAdvertisement(NamedTuple):
 
 
 class KnownLocation(NamedTuple):
-    """Where an advertiser of a name is."""
+    """The location of an advertiser of a name."""
 
     name: Name
     advertiser: Name
 
 
 class JoinedBranch(NamedTuple):
-    """A branch that a switch below asked for."""
+    """A branch that a downstream switch requested."""
 
     topic: Name
     publisher: Name
@@ -51,24 +52,24 @@ class Dependents:
         self._holdings = Holdings[AttachedAdvertisement | KnownLocation | JoinedBranch](self._is_held)
 
     def note_advertisement(self, advertisement: Advertisement, at: Downstream) -> None:
-        """Note the claim of an attached node."""
+        """Record the advertisement of an attached node."""
         self._holdings.note(AttachedAdvertisement(advertisement.name, advertisement.node, at), advertisement)
 
     def note_place(self, place: Location) -> None:
-        """Note what a RIB or a switch proved of an advertiser."""
+        """Record a location that a RIB or a switch proved."""
         if place.proof is not None:
             self._holdings.note(KnownLocation(place.name, place.advertiser), place.proof)
 
     def note_branch(self, topic: Name, publisher: Name, at: Downstream, evidence: Advertisement) -> None:
-        """Note the reader's claim that a join from below carried."""
+        """Record the reader's advertisement that a join from downstream carried."""
         self._holdings.note(JoinedBranch(topic, publisher, at), evidence)
 
     def resting_on(self, fingerprint: bytes) -> list[AttachedAdvertisement | KnownLocation | JoinedBranch]:
-        """Return what rests on a certificate."""
+        """Return what depends on a certificate."""
         return self._holdings.resting_on(fingerprint)
 
     def has_issuer(self, key: bytes) -> bool:
-        """Return whether something rests on a certificate that this key, 33 bytes, issued."""
+        """Return whether anything depends on a certificate that this key, 33 bytes, issued."""
         return self._holdings.has_issuer(key)
 
     def _is_held(self, holder: AttachedAdvertisement | KnownLocation | JoinedBranch) -> bool:

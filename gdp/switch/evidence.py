@@ -1,7 +1,7 @@
-"""From a signed statement to a place: what proves where a node is attached.
+"""Verification of locations: from a signed statement to the location of a node.
 
-Place: pure. A RIB's answer and a switch's relay both carry the node's own claim. It names the switch by an RtCert and
-is verified here like anywhere else. Only the domain and its transit are the word of the signer.
+Sans-I/O. A RIB's response and a switch's relay both carry the node's own advertisement. It names the switch by an
+RtCert and is verified here as everywhere. Only the domain and its transit rest on the signer alone.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Evidence:
     """Verifies where nodes are.
 
     Args:
-        verifier: shared with the switch's other rooms, so that a claim seen before is cheap.
+        verifier: shared with the other parts of the switch, so that a known advertisement is cheap.
     """
 
     def __init__(self, policy: Policy, verifier: AdvertisementVerifier) -> None:
@@ -34,10 +34,10 @@ class Evidence:
         self._verifier = verifier
 
     def from_answer(self, answer: Response, now: Timestamps) -> Location:
-        """Return the place that an answer, whose signature was verified, tells of.
+        """Return the location in a response whose signature was verified.
 
         Raises:
-            StatementError: the claim in it does not hold, or is about something else.
+            StatementError: the advertisement in it is not valid, or is about something else.
         """
         advertisement = self._verifier.verify(answer.advertisement, now.unix_s)
         if advertisement.name != answer.name or advertisement.node != answer.advertiser:
@@ -45,10 +45,10 @@ class Evidence:
         return _place(advertisement, answer.domain, frozenset(answer.transit), answer.lease_s, now)
 
     def from_relay(self, statement: Statement, now: Timestamps) -> Location:
-        """Return the place that a switch tells of a node that is attached to it.
+        """Return the location that a switch reports of a node that is attached to it.
 
         Raises:
-            StatementError: it does not hold, or the node lets another switch speak for it.
+            StatementError: it is not valid, or the node authorised another switch.
         """
         relay = Relay.from_fields(statement.expect(StatementType.RELAY))
         member = self._policy.verify_membership(relay.membership, now.unix_s)
@@ -61,10 +61,10 @@ class Evidence:
         return _place(advertisement, member.domain, frozenset(relay.transit), advertisement.lease_s, now)
 
     def of_join(self, join: Join, now: Timestamps) -> Advertisement:
-        """Return the reader's claim that a join with a lease shows; the publisher's proves where the join leads.
+        """Return the reader's advertisement of a join with a lease; the publisher's proves where the join leads.
 
         Raises:
-            StatementError: one of the two does not hold, or is about something else.
+            StatementError: one of the two is not valid, or is about something else.
         """
         reader = self._verifier.verify(join.evidence, now.unix_s)
         if reader.right not in HEARS or reader.name != join.topic:
@@ -76,7 +76,7 @@ class Evidence:
         return reader
 
     def still_holds(self, place: Location, now: Timestamps) -> bool:
-        """Return whether the proofs of a place hold; one made without proofs does."""
+        """Return whether the proofs of a location are valid; a location without proofs is."""
         if place.proof is None:
             return True
         try:

@@ -1,10 +1,10 @@
-"""One switch's part in keeping everybody's view of the links the same.
+"""Flooding of link states: one switch's part in keeping all link-state databases equal.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds).
-Source: after RFC 2328, section 13. What differs: neighbours compare digests in every hello and send each other all they
-have where these differ, so that a lost flood heals without acknowledgements. A switch that has restarted asks not to be
-passed through until it has learnt the network again (RFC 6987, stub router on start-up). A leaf passes link states on
-like any other switch: that keeps views the same and draws no traffic. Its own links stay within its domain.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: after RFC 2328, section 13, with these differences.
+Neighbours compare digests in every hello and send each other all link states where the digests differ. So a lost flood
+heals without acknowledgements. A switch that has restarted asks not to carry transit until it has learnt the network
+again (RFC 6987, stub router on start-up). A leaf passes link states on like any other switch: that keeps databases
+equal and attracts no traffic. Its own links stay within its domain.
 """
 
 from __future__ import annotations
@@ -37,27 +37,28 @@ __all__ = ["Flooding"]
 
 _LIVES_MAX: Final = 64
 _RTCERTS_REMEMBERED: Final = 1_024
-_ANSWERS: Final = 5  # of another life of ours to what we say; a few old link states may be left of a dead one
-_STUB_S: Final = 2.0  # after a restart, until the trees and ways through here are set up
-_STUB_COST: Final = 1 << 20  # above every real way, so only what has no other way passes
-_FLAPPING_COST: Final = 1 << 19  # a link that flaps is better than none, and worse than any other
-_EARLY_S: Final = 10.0  # when a link state of an earlier life comes this soon, we have restarted
-_SYNC_S: Final = 0.5  # a neighbour is not sent everything more often than this
-_OUT_OF_STEP_S: Final = 0.2  # a flood under way makes digests differ for less long
+# of another incarnation of ours to our link states; a few old ones of a dead incarnation may remain
+_ANSWERS: Final = 5
+_STUB_S: Final = 2.0  # after a restart, until the trees and paths through here are set up
+_STUB_COST: Final = 1 << 20  # above every real path, so only traffic without another path passes
+_FLAPPING_COST: Final = 1 << 19  # a flapping link is better than none, and worse than any other
+_EARLY_S: Final = 10.0  # when a link state of an earlier incarnation comes this soon, we have restarted
+_SYNC_S: Final = 0.5  # between two sends of everything to one neighbour
+_OUT_OF_STEP_S: Final = 0.2  # digests differ for less time while a flood is under way
 
 SendStatement = Callable[[Neighbour, bytes], None]
 
 
 class Flooding:
-    """Originates our link states, takes and passes on those of others.
+    """Originates our link states; receives and forwards those of others.
 
     Args:
         send: sends a link state to a neighbour.
-        first_sequence: above every sequence number of an earlier life; wall-clock milliseconds do.
-        life: mark of this life, ``LIFE_BYTES``.
+        first_sequence: above every sequence number of an earlier incarnation; wall-clock milliseconds suffice.
+        life: mark of this incarnation, ``LIFE_BYTES``.
 
     Attributes:
-        is_displaced: an older switch with our identity is alive. Then we say nothing any more.
+        is_displaced: an older switch with our identity is alive. This switch then originates nothing more.
     """
 
     def __init__(
@@ -76,10 +77,10 @@ class Flooding:
         self._send = send
         self._sequence = self._first_sequence = first_sequence
         self._life = life
-        self._answers: dict[tuple[bytes, Scope], int] = {}  # by life: how often it went above what we said
+        self._answers: dict[tuple[bytes, Scope], int] = {}  # by incarnation: how often it exceeded our sequence number
         self.is_displaced = False
         self._conflicts_seen = 0
-        self._unix_ahead_s = 0.0  # of the wall clock before the monotonic one
+        self._unix_ahead_s = 0.0  # wall clock minus monotonic clock
         self._begun_s: float | None = None
         self._stub_until_s: float | None = None
         self._was_stub = False
@@ -90,26 +91,26 @@ class Flooding:
         self.damping = Damping()
         self._rtcerts = RtCertCache(_RTCERTS_REMEMBERED)
         self._paces = Paces(LINK_STATES_PER_S, LINK_STATES_BURST)
-        self.drops: Counter[DropReason] = Counter()  # RIBs in link states that are not believed
+        self.drops: Counter[DropReason] = Counter()  # RIBs in link states that are rejected
         self._said: dict[Scope, tuple[object, ...]] = {}
-        self._refresh_at_s: dict[Scope, float] = {}  # each by itself: news in one scope renew nothing of the other
+        self._refresh_at_s: dict[Scope, float] = {}  # each by itself: news in one scope does not renew the other
         self._synced_s: dict[tuple[int, Name], float] = {}
-        self._differs_s: dict[tuple[int, Name], float] = {}  # since when keepalives show other ones
+        self._differs_s: dict[tuple[int, Name], float] = {}  # since when keepalives show other digests
 
     def look_at_clock(self, now: Timestamps) -> None:
-        """Learn what the wall clock says, before anything is said."""
+        """Take over the wall clock, before anything is originated."""
         self._unix_ahead_s = now.unix_s - now.mono_s
 
     def digest_for(self, port: HelloPort) -> bytes:
-        """Return what to say in a hello on a port: nothing where its switches are of several domains."""
+        """Return the digest for a hello on a port: nothing where its switches are of several domains."""
         domains = {each.domain for each in port.neighbours.values() if each.role.is_switch}
         return self.link_states.digest(domains.pop()) if len(domains) == 1 else bytes(DIGEST_BYTES)
 
     def receive(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> bool:
-        """Take a link state that a neighbour passed on; return whether it was news.
+        """Handle a link state that a neighbour passed on; return whether it was news.
 
         Raises:
-            StatementError: it does not hold, or does not belong here.
+            StatementError: it is not valid, or does not belong here.
         """
         fields = statement.fields
         if statement.signer != self._identity.name:
@@ -143,10 +144,10 @@ class Flooding:
         return True
 
     def _is_placed(self, rib: AttachedRib, state: LinkState, unix_s: float) -> bool:
-        """Return whether a RIB has proven that it is reached where a link state says so.
+        """Return whether a RIB has proven that it is reachable where a link state lists it.
 
-        A border speaks of the RIBs of its own domain, and of those that are attached to itself. A leaf speaks of those
-        that are both.
+        A border lists the RIBs of its own domain, and those that are attached to itself. A leaf lists those that are
+        both.
         """
         try:
             member = self._policy.verify_membership(rib.membership, unix_s)
@@ -164,16 +165,16 @@ class Flooding:
         return is_its and is_here
 
     def tell_of_conflicts(self, now_s: float) -> None:
-        """Say anew which identities are refused here, if that changed; cheap when it did not."""
+        """Advertise again which identities this switch refuses, if that changed; cheap otherwise."""
         if self._conflicts_seen != self._hello_protocol.conflicts.changes:
             self._originate(now_s)
 
     def neighbour_changed(self, now_s: float) -> None:
-        """Say anew what our links are, if that changed."""
+        """Advertise our links again, if they changed."""
         self._originate(now_s)
 
     def sync(self, neighbour: Neighbour, now_s: float) -> None:
-        """Send a neighbour everything it should have, but not too often."""
+        """Send a neighbour all its link states, but not too often."""
         key = (neighbour.port, neighbour.name)
         if now_s - self._synced_s.get(key, float("-inf")) < _SYNC_S:
             return
@@ -186,7 +187,7 @@ class Flooding:
         return neighbour.digest in (self.link_states.digest(neighbour.domain), bytes(DIGEST_BYTES))
 
     def compare(self, neighbour: Neighbour, now_s: float) -> None:
-        """Look at what a neighbour's keepalive says of its link states; send it ours where they differ for long."""
+        """Compare the digest of a neighbour's keepalive; send it our link states where they differ for long."""
         key = (neighbour.port, neighbour.name)
         if self.is_in_step(neighbour):
             self._differs_s.pop(key, None)
@@ -194,7 +195,7 @@ class Flooding:
             self.sync(neighbour, now_s)
 
     def handle_timer(self, now_s: float) -> None:
-        """Renew our link states, forget what others did not renew, and follow what moved inside our domain."""
+        """Renew our link states, expire those that were not renewed, and follow changes inside our domain."""
         self._begun_s = now_s if self._begun_s is None else self._begun_s
         if self._stub_until_s is not None and now_s >= self._stub_until_s:
             self._stub_until_s = None
@@ -242,7 +243,7 @@ class Flooding:
             self._say(Scope.BORDER, leaving, inside, tuple(sorted(self.paths.ribs_inside())), members, refused, now_s)
 
     def _had_border_state(self) -> bool:
-        """Return whether others may hold a border state of ours, of an earlier life perhaps."""
+        """Return whether others may have a border state of ours, perhaps of an earlier incarnation."""
         return self.link_states.sequence_of(self._identity.name, Scope.BORDER) > 0
 
     def _say(
@@ -280,9 +281,10 @@ class Flooding:
         self._flood(scope, wire)
 
     def _outdo(self, state: LinkState, now_s: float) -> None:
-        """Answer a link state of ours that we did not send: others still hold it, or another node has our identity.
+        """Answer a link state of ours that we did not send: others still have it, or another node has our identity.
 
-        What is left of an earlier life does not answer. So who goes above what we say, again and again, is alive.
+        An earlier incarnation's leftover state does not answer. So a sender that exceeds our sequence number repeatedly
+        is alive.
         """
         key = state.life, state.scope
         if state.life != self._life and state.sequence > self._sequence:

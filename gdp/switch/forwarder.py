@@ -1,15 +1,15 @@
-"""The forwarding decision, in the plainest words: every data plane must decide as this does.
+"""Forwarding decision: the reference that every data plane must match.
 
-Place: pure; the reference that the planes are tested against, and what they call for any frame out of the ordinary.
-Source: docs/explanation/design.md, sections 3 and 7. In this order:
+Sans-I/O. Data planes are tested against it, and call it for any unusual frame. Source: docs/explanation/design.md,
+sections 3 and 7. The order of the checks:
 
 1. shorter than an Ethernet and a GDP header: drop, truncated; another EtherType or version: drop;
-2. a kind from 0x80 on is for the neighbour itself: hand up;
-3. hops left 0 or 1: drop, for it may not leave again; a payload longer than what came: drop, truncated;
-4. look up destination and source, then destination alone; a miss: hand up; an entry whose frames come from other
-   sides: drop, wrong side; an entry without hops: drop, no route;
-5. one copy to every hop, or to its alternate while the hop's port is down, except to a port that is down or whose link
-   is too narrow: that copy alone is dropped.
+2. a kind from 0x80 on is for the neighbour itself: punt;
+3. hops left 0 or 1: drop, for it may not leave again; a payload longer than the received bytes: drop, truncated;
+4. look up destination and source, then destination alone; a miss: punt; an entry whose frames come from other sides:
+   drop, wrong side; an entry without hops: drop, no route;
+5. one copy to every hop, or to its alternate while the hop's port is down; a copy to a port that is down, or whose link
+   is too narrow, is dropped alone.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ _SOURCE: Final = ETHER_BYTES + SOURCE_AT
 
 
 class Drop(NamedTuple):
-    """The frame ends here."""
+    """The frame is dropped."""
 
     reason: DropReason
 
 
 class Punt(NamedTuple):
-    """The frame is for the switch's own machine: a neighbour's word, or a destination that it must look for."""
+    """The frame goes to the control plane: it is a neighbour's statement, or its destination has no entry."""
 
 
 class Forward(NamedTuple):
-    """Copies to send, and why some could not be."""
+    """Copies to send, and the reasons of those that are lost."""
 
     hops: tuple[Hop, ...]
     lost: tuple[DropReason, ...] = ()
@@ -60,14 +60,14 @@ def decide(
     sides: Mapping[bytes, int] = _NO_SIDES,
     port: int = 0,
 ) -> Verdict:
-    """Say what becomes of a frame. Any bytes get a verdict; nothing is raised.
+    """Return the decision for a frame. Any bytes get a decision; nothing is raised.
 
     Args:
         frame: from the Ethernet header on, padding included.
         entries: the forwarding table.
         mtus: port index to MTU (bytes after the Ethernet header) of the ports that are up.
         sides: the table's masks of ports that frames may come from.
-        port: index of the one that this frame came from.
+        port: index of the port that this frame came from.
     """
     if len(frame) < OVERHEAD_BYTES:
         return Drop(DropReason.TRUNCATED)
@@ -95,7 +95,7 @@ def decide(
 
 
 def _fit(hops: Hops, size: int, mtus: Mapping[int, int]) -> Forward:
-    """Part the hops whose link takes ``size`` bytes after the Ethernet header from the reasons of the others."""
+    """Return the hops whose link takes ``size`` bytes after the Ethernet header, and the reasons of the others."""
     good: list[Hop] = []
     lost: list[DropReason] = []
     for hop in hops:
@@ -114,10 +114,10 @@ def _fit(hops: Hops, size: int, mtus: Mapping[int, int]) -> Forward:
 
 
 def rewrite(frame: bytes | bytearray | memoryview, macs: bytes) -> bytes:
-    """Return the copy that leaves: new addresses, one hop fewer, every other byte (padding too) as it came.
+    """Return the copy that leaves: new addresses, one hop fewer, every other byte unchanged, padding included.
 
     Args:
-        frame: from the Ethernet header on, for which ``decide`` said ``Forward``.
+        frame: from the Ethernet header on, for which ``decide`` returned ``Forward``.
         macs: destination and source MAC, 12 bytes.
     """
     copy = bytearray(frame)

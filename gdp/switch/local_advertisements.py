@@ -1,6 +1,6 @@
-"""What attached nodes claim through this switch, and whether the RIB has taken it.
+"""Local advertisements: what attached nodes advertise through this switch, and whether the RIB has acknowledged it.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds).
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ RELAY_TRIES: Final = 20
 
 @dataclass(slots=True, kw_only=True)
 class LocalAdvertisement:
-    """One claim of one attached node."""
+    """One advertisement of one attached node."""
 
     advertisement: Advertisement
     port: int
@@ -32,11 +32,11 @@ class LocalAdvertisement:
     expires_s: float
     relay_at_s: float
     tries: int = 0
-    is_settled: bool = False  # the RIB has answered
+    is_settled: bool = False  # the RIB has sent an AdvertiseAck
 
 
 class LocalAdvertisements:
-    """The claims of all attached nodes, by (name, advertiser); bounded, and shared among the nodes."""
+    """The advertisements of all attached nodes, by (name, advertiser); bounded, and shared among the nodes."""
 
     def __init__(self) -> None:
         self._by_name: dict[Name, dict[Name, LocalAdvertisement]] = {}
@@ -51,18 +51,18 @@ class LocalAdvertisements:
         return len(self._shares)
 
     def get(self, name: Name, advertiser: Name) -> LocalAdvertisement | None:
-        """Return a claim, or None."""
+        """Return an advertisement, or None."""
         return self._by_name.get(name, {}).get(advertiser)
 
     def at(self, name: Name) -> LocalAdvertisement | None:
-        """Return an attachment that takes unicast frames for a name, or None."""
+        """Return an advertisement that takes unicast frames for a name, or None."""
         for attachment in self._by_name.get(name, {}).values():
             if attachment.advertisement.right in (Right.ATTACH, Right.SERVE):
                 return attachment
         return None
 
     def put(self, advertisement: Advertisement, port: int, mac: bytes, now_s: float) -> LocalAdvertisement:
-        """Note a verified claim; it is to be relayed at once.
+        """Store a verified advertisement; it is due to be relayed at once.
 
         Raises:
             StatementError: QUOTA, the node has too many.
@@ -78,7 +78,7 @@ class LocalAdvertisements:
         return attachment
 
     def remove(self, name: Name, advertiser: Name) -> LocalAdvertisement | None:
-        """Forget a claim; return it, if it was there."""
+        """Remove an advertisement and return it, or None."""
         advertisements = self._by_name.get(name, {})
         gone = advertisements.pop(advertiser, None)
         if gone is not None:
@@ -88,18 +88,18 @@ class LocalAdvertisements:
         return gone
 
     def all(self) -> list[LocalAdvertisement]:
-        """Return every claim."""
+        """Return every advertisement."""
         return [each for advertisements in self._by_name.values() for each in advertisements.values()]
 
     def of(self, advertiser: Name) -> list[LocalAdvertisement]:
-        """Return all claims of one node."""
+        """Return all advertisements of one node."""
         return [advertisements[advertiser] for advertisements in self._by_name.values() if advertiser in advertisements]
 
     def settle(self, name: Name, advertiser: Name, taken: int | None) -> LocalAdvertisement | None:
-        """Note that the RIB has answered; return the claim.
+        """Record the RIB's AdvertiseAck; return the advertisement.
 
         Args:
-            taken: the sequence number that it took, if it did: what was claimed anew since is not settled by that.
+            taken: the sequence number that the RIB accepted, if it did; it does not settle a newer advertisement.
         """
         attachment = self.get(name, advertiser)
         if attachment is None or (taken is not None and taken < attachment.advertisement.sequence):
@@ -108,13 +108,13 @@ class LocalAdvertisements:
         return attachment
 
     def relay_all(self, now_s: float) -> None:
-        """Have everything relayed again: there is a new RIB."""
+        """Make every advertisement due to be relayed: there is a new RIB."""
         for attachment in self.all():
             attachment.is_settled, attachment.relay_at_s, attachment.tries = False, now_s, 0
             self._push(self._relays, now_s, attachment)
 
     def due(self, now_s: float) -> list[LocalAdvertisement]:
-        """Return the claims to relay now."""
+        """Return the advertisements to relay now."""
         due = []
         while self._next_relay() <= now_s:
             each = heapq.heappop(self._relays)[2]
@@ -125,7 +125,7 @@ class LocalAdvertisements:
         return due
 
     def expire(self, now_s: float) -> list[LocalAdvertisement]:
-        """Forget and return what was not renewed."""
+        """Remove and return the advertisements that were not renewed."""
         late = []
         while self._next_end() <= now_s:
             late.append(heapq.heappop(self._ends)[2])

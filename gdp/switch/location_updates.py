@@ -1,4 +1,4 @@
-"""News of where advertisers are: verified statements in; name cache, routes, trees and attached readers follow.
+"""Location updates: verified statements come in; name cache, routes, trees and attached readers follow.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). The caller has verified every statement (``evidence.py``).
 """
@@ -33,7 +33,7 @@ PROOFS_MAX: Final = 8  # statements in one reply to a neighbour
 
 
 class LocationUpdates:
-    """Applies news of locations at one switch, and tells others what is known."""
+    """Applies location updates at one switch, and sends known locations to others."""
 
     def __init__(
         self,
@@ -59,11 +59,11 @@ class LocationUpdates:
         self._outbox = outbox
 
     def get(self, name: Name, advertiser: Name) -> Location | None:
-        """Return the known place of one advertiser of a name, or None."""
+        """Return the known location of one advertiser of a name, or None."""
         return self._resolver.cache.get(name, advertiser)
 
     def is_newer(self, place: Location) -> bool:
-        """Return whether a place is newer than what is known of its advertiser, here or elsewhere."""
+        """Return whether a location is newer than what is known of its advertiser, here or elsewhere."""
         attachment = self._attached.get(place.name, place.advertiser)
         known = self.get(place.name, place.advertiser)
         newest = max(
@@ -87,7 +87,8 @@ class LocationUpdates:
             was_here = True
         before = self.get(place.name, place.advertiser)
         if before is not None and before.sequence > place.sequence:
-            place = replace(before, expires_s=max(before.expires_s, place.expires_s))  # the sender lags behind
+            # the sender's information is older
+            place = replace(before, expires_s=max(before.expires_s, place.expires_s))
         self._held.note_place(place)
         self._resolver.receive_location(place, now_s, is_ours=is_ours, has_left=is_ours and attachment is None)
         if before is None or (before.switch, before.domain) != (place.switch, place.domain):
@@ -107,7 +108,7 @@ class LocationUpdates:
         """Remove an advertiser that has withdrawn.
 
         Raises:
-            StatementError: STALE, its claim that is known is newer.
+            StatementError: STALE, the known advertisement is newer.
         """
         known = self.get(answer.name, answer.advertiser)
         if known is not None and known.sequence > answer.sequence:
@@ -120,17 +121,17 @@ class LocationUpdates:
             self._outbox.say_at(*at, Kind.ADVERTISE_ACK, wire)
 
     def expire(self, now_s: float) -> None:
-        """Remove what no RIB has confirmed for a lease, and the frames that waited too long."""
+        """Remove locations that no RIB has confirmed for a lease, and frames that waited too long."""
         for place in self._resolver.expire(now_s):
             self._multicast.publisher_gone(place.name, place.advertiser)
 
     def send_to_reader(self, at: Downstream, right: Right, place: Location, now_s: float) -> None:
-        """Send the claim of an advertiser to an attached node that reads it by ``right``; the node verifies it."""
+        """Send an advertiser's advertisement to an attached node that reads it by ``right``; the node verifies it."""
         if HEARS[right] is place.right:
             self._outbox.say_at(*at, Kind.ADVERTISE_ACK, self._as_answer(place, now_s))
 
     def acknowledge_relocation(self, moved: Location, now_s: float) -> None:
-        """Send the new switch of a node an acknowledgement, and the locations of those advertisers that it reads."""
+        """Send a node's new switch an acknowledgement, and the locations of the advertisers that the node reads."""
         identity = self._identity
         ack = AdvertiseAck(moved.name, moved.advertiser, None, moved.sequence)
         statements = [ack.to_wire(identity.name, identity.key, identity.membership)]
@@ -142,7 +143,7 @@ class LocationUpdates:
             self._unicast.send(frames, moved.switch, identity.name, now_s)
 
     def proofs_of(self, name: Name, now_s: float) -> list[bytes]:
-        """Return statements that prove where a node, or an advertiser of a name, is; at most ``PROOFS_MAX``."""
+        """Return statements that prove the location of a node, or of a name's advertisers; at most ``PROOFS_MAX``."""
         attachment = self._attached.at(name)
         if attachment is not None:
             return [relayed(attachment.advertisement.wire, self._identity, self._policy.transit)]

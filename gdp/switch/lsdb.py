@@ -1,11 +1,10 @@
-"""What is known of everybody's links: the newest link state of each switch and scope.
+"""Link-state database of a switch: the newest link state of each switch and scope.
 
-Place: pure.
-Source: after RFC 2328, section 13.1 (which of two is newer) and 13.4 (one's own that comes back newer).
+Sans-I/O. Source: after RFC 2328, section 13.1 (which of two is newer) and 13.4 (a newer copy of one's own).
 
-What was forgotten stays known by its number for as long as anybody could believe its time (``PAST_S``): a recorded link
-state of a dead switch is refused. Numbers are kept for each life of an origin, so that one that has restarted is heard
-at once, whatever its clock says.
+The number of a removed link state stays known for as long as any clock could accept its time (``PAST_S``). So a
+recorded link state of a dead switch is rejected. Numbers are kept for each incarnation of an origin, so that a
+restarted origin is accepted at once, whatever its clock shows.
 """
 
 from __future__ import annotations
@@ -23,8 +22,8 @@ from gdp.names import Name
 __all__ = ["LINK_STATES_MAX", "PAST_S", "LinkStateDatabase"]
 
 LINK_STATES_MAX = 8_192
-PAST_S: Final = 2 * LINK_STATE_AGE_MAX_S  # what was signed by a clock ahead holds for so long at clocks behind
-_LIVES_MAX: Final = 8  # of one origin that are told apart; then the highest number of all counts
+PAST_S: Final = 2 * LINK_STATE_AGE_MAX_S  # a state signed by a fast clock stays valid this long at slow clocks
+_LIVES_MAX: Final = 8  # incarnations of one origin that are tracked; above that, the highest number of all counts
 
 
 @dataclass(slots=True)
@@ -36,11 +35,11 @@ class _Entry:
 
 @dataclass(slots=True)
 class _Past:
-    """Numbers of one origin and scope that are over."""
+    """Past sequence numbers of one origin and scope."""
 
     until_s: float
     lives: dict[bytes, int] = field(default_factory=dict)
-    floor: int = -1  # of all lives that are not listed
+    floor: int = -1  # minimum for all incarnations that are not listed
 
     def note(self, life: bytes, sequence: int, until_s: float) -> None:
         self.until_s = until_s
@@ -50,10 +49,10 @@ class _Past:
 
 
 class LinkStateDatabase:
-    """The link-state database of one switch.
+    """Link-state database of one switch.
 
     Attributes:
-        version: rises with every change that may move a path, or of whose identity is whose.
+        version: rises with every change that may change a path or an identity conflict.
     """
 
     def __init__(self, domain: Name) -> None:
@@ -72,7 +71,7 @@ class LinkStateDatabase:
         return known is None or sequence > known.state.sequence
 
     def is_past(self, origin: Name, scope: Scope, sequence: int, life: bytes) -> bool:
-        """Return whether a link state is of what was forgotten or replaced."""
+        """Return whether a link state was removed or replaced before."""
         past = self._past.get((origin, scope))
         return past is not None and sequence <= past.lives.get(life, past.floor)
 
@@ -82,7 +81,7 @@ class LinkStateDatabase:
         return 0 if known is None else known.state.sequence
 
     def put(self, state: LinkState, wire: bytes, now_s: float) -> bool:
-        """Take a verified link state; return whether it was news.
+        """Store a verified link state; return whether it was news.
 
         Raises:
             StatementError: QUOTA, the database is full.
@@ -102,7 +101,7 @@ class LinkStateDatabase:
         return True
 
     def expire(self, now_s: float) -> None:
-        """Forget what was not renewed."""
+        """Remove link states that were not renewed."""
         late = [key for key, entry in self._entries.items() if entry.expires_s <= now_s]
         for key in late:
             self._bury(self._entries.pop(key).state, now_s)
@@ -136,7 +135,7 @@ class LinkStateDatabase:
         return [entry.wire for key, entry in self._entries.items() if self._is_shared(key, domain)]
 
     def digest(self, domain: Name) -> bytes:
-        """Return a short digest of what is shared with a neighbour of this domain; equal at both ends when in step."""
+        """Return a short digest of the states shared with a neighbour of this domain; equal at both when in step."""
         is_home = domain == self._domain
         digest = self._digests.get(is_home)
         if digest is None:

@@ -1,20 +1,20 @@
-"""Growing and pruning trees: joins from below, joins upwards, and the table entries in between.
+"""Multicast trees of a switch: joins and prunes from downstream, joins upstream, and the table entries between.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds).
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: after PIM-SM (RFC 7761).
 
-A reader's claim and each known publisher of its topic make a tree; so do a server's with each client, and a client's
-with each server, which are called reader and publisher here. A switch asks the next switch towards the publisher,
-again and again while a branch stands, and asks another one at once when the way changes. A join is said several times
-at first, since one may be lost. A join says the smallest MTU below, so it is said anew at once when that changes: a
-reader came or left, or a link got narrower or wider.
+A reader's advertisement and each known publisher of its topic make a tree. So do a server with each client, and a
+client with each server; here they are called reader and publisher. While a branch stands, a switch repeats its join to
+the next switch towards the publisher. It joins another one at once when the path changes. A join is repeated several
+times at first, since one may be lost. A join carries the smallest MTU downstream, so it is sent again at once when that
+changes: a reader came or left, or a link became narrower or wider.
 
-Make before break: where the one above changes because a better way has come up, the former one is left only after
-``_OVERLAP_S``; readers drop what comes twice. Where the publisher has moved it is left at once, for the former one may
-now have to take its messages from here.
+Make before break: where the upstream neighbour changes because of a better path, the former one is left only after
+``_OVERLAP_S``; readers drop duplicates. Where the publisher has moved, the former one is left at once, for it may now
+have to take its messages from here.
 
-A tree that has settled asks its loop-free alternate for a backup branch (``backups.py``). Where both ways part, the
-data plane takes it as soon as the port of the protected branch is down; the branch itself is lost a moment later, and
-the backup then counts as one for ``_ACTIVE_S``, in which the switch below joins anew.
+A tree that has settled requests a backup branch from its loop-free alternate (``backups.py``). Where both paths part,
+the data plane uses the backup as soon as the port of the protected branch is down. The branch itself is lost a moment
+later. The backup then counts as a branch for ``_ACTIVE_S``, in which the downstream switch joins again.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ from gdp.trust.right import HEARS, Right
 
 __all__ = ["MulticastTrees"]
 
-_JOIN_AGAIN_S: Final = (0.1, 0.3)  # a new join is said again after so long, then every JOIN_REFRESH_S
-_OVERLAP_S: Final = 0.3  # the former one above is left so long after the new one was asked
-_ACTIVE_S: Final = 1.0  # for which a backup takes the place of a branch that was lost
+_JOIN_AGAIN_S: Final = (0.1, 0.3)  # a new join is repeated after so long, then every JOIN_REFRESH_S
+_OVERLAP_S: Final = 0.3  # the former upstream neighbour is left so long after the join to the new one
+_ACTIVE_S: Final = 1.0  # for which a backup replaces a branch that was lost
 
 
 @dataclass(slots=True)
@@ -60,7 +60,7 @@ class _Reader:
 
 
 class MulticastTrees:
-    """All trees of one switch.
+    """The multicast trees of one switch.
 
     Args:
         first_sequence: of our joins.
@@ -98,12 +98,12 @@ class MulticastTrees:
         return [(at, reader.advertisement.right) for at, reader in self._readers.get(topic, {}).items()]
 
     def advertisement_of(self, topic: Name, at: Downstream) -> Advertisement | None:
-        """Return the claim of a reader attached there, or None."""
+        """Return the advertisement of a reader attached there, or None."""
         reader = self._readers.get(topic, {}).get(at)
         return None if reader is None else reader.advertisement
 
     def add_reader(self, advertisement: Advertisement, at: Downstream, places: list[Location], now_s: float) -> bool:
-        """Take the verified claim of an attached node that hears others; return whether it is the name's first here.
+        """Add the verified advertisement of an attached reader; return whether it is the name's first here.
 
         Raises:
             StatementError: QUOTA, the node reads too many topics.
@@ -119,7 +119,7 @@ class MulticastTrees:
         return is_first
 
     def remove_reader(self, topic: Name, at: Downstream) -> bool:
-        """Let a reader go; return whether the topic has none left here."""
+        """Remove a reader; return whether the topic has none left here."""
         readers = self._readers.get(topic, {})
         if readers.pop(at, None) is not None:
             self._reader_shares.release(_owner(at))
@@ -131,10 +131,10 @@ class MulticastTrees:
         return True
 
     def publisher_found(self, place: Location, now_s: float) -> None:
-        """Join, or follow, a publisher of a topic that has readers here."""
+        """Join a publisher of a topic that has readers here, or follow it."""
         for at, reader in self._readers.get(place.name, {}).items():
             if reader.advertisement.node == place.advertiser or HEARS[reader.advertisement.right] is not place.right:
-                continue  # one's own messages do not come back
+                continue  # a publisher does not receive its own messages
             allowed = (self._policy.transit & place.transit) | {self._policy.own, place.domain}
             tree = self._tree(place.name, place.advertiser, allowed)
             if place.sequence >= tree.version:
@@ -151,7 +151,7 @@ class MulticastTrees:
             self._ask_above(tree, now_s)
 
     def publisher_attached(self, advertisement: Advertisement, now_s: float) -> None:
-        """Take in that a publisher claims its topic here: trees that pass here are asked of itself at once."""
+        """Handle a publisher's advertisement of its topic here: trees that pass here join it directly at once."""
         tree = self.trees.get(advertisement.name, advertisement.node)
         if tree is not None:
             version = max(advertisement.sequence, tree.version)
@@ -159,40 +159,40 @@ class MulticastTrees:
             tree.renew_at_s = now_s
 
     def publisher_moved(self, place: Location, now_s: float) -> None:
-        """Let the tree of a publisher follow it, if it passes here and its readers let it pass there."""
+        """Reroute a publisher's tree to its new location, if it passes here and its readers allow the path there."""
         tree = self.trees.get(place.name, place.advertiser)
         if tree is not None and place.sequence >= tree.version and place.domain in tree.allowed:
             self._place_at(tree, place.switch, place.domain, place.sequence, place.advertisement)
             self._follow(tree, now_s)
 
     def below(self, topic: Name, publisher: Name) -> list[Downstream]:
-        """Return the neighbouring switches that take a tree from here."""
+        """Return the neighbouring switches that receive a tree from here."""
         tree = self.trees.get(topic, publisher)
         readers = self._readers.get(topic, {})
         return [] if tree is None else [at for at in tree.branches if at not in readers]
 
     def publisher_gone(self, topic: Name, publisher: Name) -> None:
-        """Take the readers attached here off a tree whose publisher is gone."""
+        """Remove the readers attached here from a tree whose publisher is gone."""
         tree = self.trees.get(topic, publisher)
         if tree is not None:
             for at in self._readers.get(topic, {}):
                 self._cut(tree, at)
 
     def reader_moved(self, place: Location) -> bool:
-        """Let a reader go that is attached elsewhere now; return whether the topic has none left here."""
+        """Remove a reader that is attached elsewhere now; return whether the topic has none left here."""
         for at, reader in list(self._readers.get(place.name, {}).items()):
             if reader.advertisement.node == place.advertiser and reader.advertisement.sequence < place.sequence:
                 return self.remove_reader(place.name, at)
         return False
 
     def join(self, join: Join, neighbour: Neighbour, now_s: float) -> bool:
-        """Take a verified join (or, with no lease, a leave) from the switch below.
+        """Handle a verified join (or, with no lease, a leave) from a downstream switch.
 
         Returns:
-            Whether it looks for the publisher where that is no longer.
+            Whether it targets the publisher's former location.
 
         Raises:
-            StatementError: the way is not allowed to lead through here.
+            StatementError: the path may not lead through here.
         """
         at = (neighbour.port, neighbour.mac)
         if join.lease_s == 0:
@@ -242,13 +242,13 @@ class MulticastTrees:
         return is_behind and tree.switch != join.switch
 
     def neighbour_up(self, at: Downstream, now_s: float) -> None:
-        """Ask a neighbour again for what it was asked before its present session, of which it knows nothing."""
+        """Repeat to a neighbour the joins that it received before its present session, whose state it has lost."""
         for tree in self.trees.all():
             if tree.above == at:
                 self._ask_above(tree, now_s)
 
     def neighbour_lost(self, at: Downstream, now_s: float) -> None:
-        """Cut every branch to a neighbour that is gone; what backups they have take their place."""
+        """Remove every branch to a lost neighbour; backups of these branches replace them."""
         for topic in [topic for topic, readers in self._readers.items() if at in readers]:
             self.remove_reader(topic, at)
         for tree in self.trees.all():
@@ -258,7 +258,7 @@ class MulticastTrees:
             self._cut(tree, at)
 
     def link_resized(self, port: int) -> None:
-        """Tell the ones above of every tree to which the link on a port made a difference."""
+        """Send joins upstream for every tree whose MTU a changed link on a port affects."""
         for tree in self.trees.all():
             for (its, _), branch in tree.branches.items():
                 if its == port:
@@ -274,9 +274,9 @@ class MulticastTrees:
         until_s: float,
         now_s: float,
     ) -> None:
-        """Let a branch whose evidence holds no more end at ``until_s``, unless another reader's is shown by then.
+        """Let a branch whose evidence is invalid end at ``until_s``, unless another reader's evidence comes by then.
 
-        The next switch is shown another branch's evidence at once, or when one is shown here.
+        The upstream neighbour receives another branch's evidence at once, or when such evidence arrives here.
         """
         tree = self.trees.get(topic, publisher)
         if tree is None:
@@ -289,13 +289,13 @@ class MulticastTrees:
         self._plant(tree)
 
     def reroute(self, now_s: float) -> None:
-        """Ask anew where the way to a publisher has changed."""
+        """Join again where the path to a publisher has changed."""
         for tree in self.trees.all():
             if not self._follow(tree, now_s) and self._backups.protection(tree) != tree.protection:
                 self._plant(tree)
 
     def handle_timer(self, now_s: float) -> list[Name]:
-        """Prune, renew upwards; return the topics that lost their last reader here."""
+        """Prune and renew trees; return the topics that lost their last reader here."""
         orphaned = []
         if now_s >= self._readers_end_s:
             for topic in list(self._readers):
@@ -354,7 +354,7 @@ class MulticastTrees:
             self.drops[DropReason.QUOTA] += 1
 
     def _put_branch(self, tree: Tree, at: Downstream, branch: Branch) -> bool:
-        """Add or replace a branch; return False, and let go of a bare tree, where its neighbour has too many."""
+        """Add or replace a branch; return False, and remove a bare tree, where its neighbour has too many."""
         if at not in tree.branches and not self._branch_shares.reserve(_owner(at)):
             if not tree.branches:
                 self.trees.remove(tree)
@@ -379,7 +379,7 @@ class MulticastTrees:
         self.trees.remove(tree)
 
     def _above(self, tree: Tree) -> tuple[int, bytes, Name] | None:
-        """Return port, address and name of the next one towards the publisher; None when there is no way now."""
+        """Return port, address and name of the next hop towards the publisher; None when there is no path now."""
         if tree.switch == self._identity.name:
             attachment = self._attached.get(tree.topic, tree.publisher)
             return None if attachment is None else (attachment.port, attachment.mac, tree.publisher)
@@ -388,7 +388,7 @@ class MulticastTrees:
         return None if neighbour is None else (neighbour.port, neighbour.mac, neighbour.name)
 
     def _follow(self, tree: Tree, now_s: float) -> bool:
-        """Leave the one above and ask another where the way to the publisher has changed; return whether it has."""
+        """Join another upstream neighbour where the path to the publisher has changed; return whether it has."""
         above = self._above(tree)
         if (None if above is None else above[:2]) == tree.above:
             return False
@@ -403,7 +403,7 @@ class MulticastTrees:
             if above is not None:
                 tree.above, tree.above_name = above[:2], above[2]
                 if tree.backup is not None and tree.backup[0] == tree.above:
-                    tree.backup = None  # an ordinary join takes its place
+                    tree.backup = None  # an ordinary join replaces it
             self._plant(tree)
         if above is None and self._paths.leads_through_leaf(tree.switch, tree.domain):
             self.drops[DropReason.THROUGH_LEAF] += 1
@@ -422,7 +422,7 @@ class MulticastTrees:
             self._plant(tree)
 
     def _restate(self, tree: Tree) -> None:
-        """Say at once, to the one above, that what fits this tree, or whether anybody wants copies, has changed."""
+        """Send a join upstream at once: the tree's MTU, or whether it is only a backup, has changed."""
         if tree.above is None:
             return
         mtu = min(tree.mtu, self._outbox.mtu_of(tree.above[0]))
@@ -431,7 +431,7 @@ class MulticastTrees:
             self._show(tree)
 
     def _ask_for_backup(self, tree: Tree) -> None:
-        """Ask, or leave, the one above that could take the place of the best one."""
+        """Request a backup branch from the neighbour that could replace the best one, or leave it."""
         other = self._backups.above(tree)
         if other != tree.backup:
             self._leave_backup(tree)
@@ -451,7 +451,7 @@ class MulticastTrees:
                 self._say(tree, at, name, 1, 0.0, b"")
 
     def _show(self, tree: Tree) -> None:
-        """Join the one above, with the evidence of a reader below."""
+        """Send a join upstream, with the evidence of a downstream reader."""
         evidence = self._evidence(tree)
         tree.is_doubted = tree.is_doubted and evidence == tree.shown
         tree.shown = evidence
@@ -460,13 +460,14 @@ class MulticastTrees:
             return
         backup_for = tree.backup_for or ZERO
         if backup_for != ZERO and self._paths.domain_of(tree.above_name) != self._policy.own:
-            return  # what a domain does to survive is its own matter
+            return  # backups are internal to a domain
         self._say(tree, tree.above, tree.above_name, tree.asked_mtu, JOIN_LEASE_S, evidence, backup_for=backup_for)
 
     def _evidence(self, tree: Tree) -> bytes:
-        """Return the claim to show the one above; of a leaf that of a reader attached here, empty where none is.
+        """Return the advertisement to send upstream; of a leaf only an attached reader's, empty where none is.
 
-        A neighbour may still take a tree from a leaf that its publisher has just left. Nobody joins for that one.
+        A neighbour may still take a tree from a leaf that its publisher has just left. No join is sent for that
+        neighbour.
         """
         if not self._is_leaf or tree.switch == self._identity.name:
             return tree.evidence
@@ -474,14 +475,14 @@ class MulticastTrees:
         return max((tree.branches[at] for at in own), key=lambda each: each.expires_s).evidence if own else b""
 
     def _place_at(self, tree: Tree, switch: Name, domain: Name, version: int, proof: bytes) -> None:
-        """Take in where a tree's publisher is; where that is news, the one above is left before another is asked."""
+        """Update a tree's publisher location; if it is new, the upstream neighbour is left before another is joined."""
         if (tree.switch, tree.domain) != (switch, domain):
             self._leave_former(tree)
             tree.has_moved = True
         tree.switch, tree.domain, tree.version, tree.proof = switch, domain, version, proof
 
     def _part_from_above(self, tree: Tree, now_s: float, *, keep: bool) -> None:
-        """Leave the one above: at once, or where the way to the same place has changed, after a while."""
+        """Leave the upstream neighbour: at once, or after a while where only the path to the same location changed."""
         self._leave_former(tree)
         if keep and tree.above is not None and tree.above_name is not None and self._is_loop_free(tree):
             tree.former, tree.former_until_s = (tree.above, tree.above_name), now_s + _OVERLAP_S
@@ -491,10 +492,10 @@ class MulticastTrees:
         tree.joins, tree.has_moved = 0, False
 
     def _is_loop_free(self, tree: Tree) -> bool:
-        """Return whether the one above, which is not the best any more, cannot take the messages from here itself.
+        """Return whether the upstream neighbour, no longer the best, cannot take the messages from here itself.
 
-        Source: RFC 5286, inequality 3 (a downstream neighbour is nearer to the destination than we are). Nobody takes
-        messages of others from a leaf.
+        Source: RFC 5286, inequality 3 (a downstream neighbour is nearer to the destination than we are). No switch
+        takes other nodes' messages from a leaf.
         """
         if tree.has_moved or tree.above_name is None:
             return False
@@ -528,10 +529,10 @@ class MulticastTrees:
         *,
         backup_for: Name = ZERO,
     ) -> None:
-        """Send a join, or with no lease a leave, to one above."""
+        """Send a join, or with no lease a leave, to one upstream neighbour."""
         sessions = self._outbox.sessions_with(above[0], name)
         if sessions is None:
-            return  # it is gone, and with it what it knew of us
+            return  # it is gone, and so is its state of our joins
         own_session, its_echo = sessions
         self._sequence += 1
         join = Join(
@@ -555,10 +556,10 @@ class MulticastTrees:
 
 
 def _owner(at: Downstream) -> bytes:
-    """Return in whose name room is taken for something of a neighbour."""
+    """Return the owner whose quota the state of a neighbour uses."""
     return at[0].to_bytes(4, "big") + at[1]
 
 
 def _is_overtaken(join: Join, branch: Branch) -> bool:
-    """Return whether a newer join or leave of the same session of the neighbour came before."""
+    """Return whether a newer join or leave of the neighbour's same session came before."""
     return join.sender_session == branch.session and join.sequence <= branch.sequence

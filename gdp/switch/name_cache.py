@@ -1,7 +1,7 @@
-"""Cache of locations: where names are, as RIBs and neighbours proved it, and which names nobody advertises.
+"""Name cache: the locations of names that RIBs and neighbours proved, and negative entries.
 
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds). While no RIB answers, an entry is served beyond its lease,
-until the proofs of its claim end themselves (RFC 8767 in spirit).
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). While no RIB responds, an entry is served beyond its lease,
+until the proofs of its advertisement end themselves (RFC 8767 in spirit).
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ class Location:
     transit: frozenset[Name]  # domains through which that domain lets its traffic pass
     advertisement: bytes
     expires_s: float
-    proof: Advertisement | None = None  # what was verified; None where a test makes a place by hand
-    stale_until_s: float = 0.0  # the proofs hold so long: it is served until then while no RIB answers
+    proof: Advertisement | None = None  # what was verified; None in tests that build a location directly
+    stale_until_s: float = 0.0  # end of the proofs: it is served until then while no RIB responds
 
     @property
     def sequence(self) -> int:
-        """Return the sequence number of the claim, or 0."""
+        """Return the sequence number of the advertisement, or 0."""
         return 0 if self.proof is None else self.proof.sequence
 
 
@@ -41,10 +41,10 @@ class NameCache:
     """The locations that one switch knows, and negative entries.
 
     Args:
-        lease_s: of a claim; when a RIB answers again, it has half of that to confirm stale entries.
+        lease_s: of an advertisement; when a RIB responds again, it has half of that to confirm stale entries.
 
     Attributes:
-        serves_stale: no RIB answers, so entries outlive their leases.
+        serves_stale: no RIB responds, so entries outlive their leases.
     """
 
     def __init__(self, lease_s: float = ADVERTISEMENT_LEASE_S) -> None:
@@ -59,30 +59,30 @@ class NameCache:
         return len(self._places)
 
     def of(self, name: Name, now_s: float) -> list[Location]:
-        """Return the known places of a name."""
+        """Return the known locations of a name."""
         known = self._places.get(name)
         return [] if known is None else [place for place in known.values() if self._ends_s(place) > now_s]
 
     def get(self, name: Name, advertiser: Name) -> Location | None:
-        """Return the place of one advertiser of a name, or None."""
+        """Return the location of one advertiser of a name, or None."""
         return self._places.get(name, {}).get(advertiser)
 
     def of_node(self, node: Name, now_s: float) -> Location | None:
-        """Return the newest place of anything that a node advertises: it is attached there itself. None: not known."""
+        """Return the newest location of any name that a node advertises, where the node is attached, or None."""
         known = (self._places[name][node] for name in self._names_of.get(node, ()))
         held = [place for place in known if self._ends_s(place) > now_s]
         return max(held, key=lambda place: place.sequence, default=None)
 
     def all(self) -> list[Location]:
-        """Return every place."""
+        """Return every location."""
         return [place for known in self._places.values() for place in known.values()]
 
     def is_negative(self, name: Name, now_s: float) -> bool:
-        """Return whether the RIB said a moment ago that nobody advertises the name."""
+        """Return whether the RIB recently sent a negative response for the name."""
         return self._nobody.get(name, 0.0) > now_s
 
     def put(self, place: Location) -> Location | None:
-        """Store a place; return what was known of this advertiser before."""
+        """Store a location; return what was known of this advertiser before."""
         self._nobody.pop(place.name, None)
         known = self._places.setdefault(place.name, {})
         before = known.get(place.advertiser)
@@ -104,7 +104,7 @@ class NameCache:
             del self._names_of[advertiser]
 
     def put_negative(self, name: Name, now_s: float) -> None:
-        """Replace what is known of a name by a negative entry, for ``NEGATIVE_LEASE_S``."""
+        """Replace the entries of a name by a negative entry, for ``NEGATIVE_LEASE_S``."""
         for advertiser in list(self._places.get(name, ())):
             self.remove(name, advertiser)
         self._nobody[name] = now_s + NEGATIVE_LEASE_S
@@ -113,7 +113,7 @@ class NameCache:
     def serve_stale(self, stale: bool, now_s: float) -> None:
         """Begin or end to serve entries beyond their leases.
 
-        When a RIB answers again, entries that it does not confirm within half a lease expire.
+        When a RIB responds again, entries that it does not confirm within half a lease expire.
         """
         if stale == self.serves_stale:
             return
@@ -126,7 +126,7 @@ class NameCache:
         self._look_ahead()
 
     def expire(self, now_s: float) -> list[Location]:
-        """Remove entries whose leases have ended; return the places among them."""
+        """Remove entries whose leases have ended; return the locations among them."""
         if now_s < self._expire_at_s:
             return []
         gone = [place for place in self.all() if self._ends_s(place) <= now_s]
@@ -138,7 +138,7 @@ class NameCache:
         return gone
 
     def next_expiry(self) -> float | None:
-        """Return a monotonic second that is no later than the end of what is believed, or None."""
+        """Return a monotonic second that is no later than the next expiry, or None."""
         return None if self._expire_at_s == float("inf") else self._expire_at_s
 
     def _look_ahead(self) -> None:

@@ -1,10 +1,10 @@
-"""Queries for names: which names a switch asks its RIB for, and when each is due again.
+"""Queries for names: which names a switch queries at its RIB, and when each is due again.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
-A query is repeated until it is answered. A name that attached readers want, or that frames are sent to, is watched: its
-query is sent again before the watch ends, so that a RIB that restarted learns of the watch. Queries for new names pass
-the query window (``query_window.py``).
+A query is repeated until a response comes. A name that attached readers want, or that frames are sent to, is watched:
+its query is sent again before the watch ends, so that a RIB that restarted learns of the watch. Queries for new names
+pass the query window (``query_window.py``).
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class NameQueries:
         return name in self._queries
 
     def request(self, name: Name, now_s: float, owner: bytes = b"") -> None:
-        """Query a name unless a query is open; one that was answered is sent again at once.
+        """Query a name unless a query is open; a query with a response is sent again at once.
 
         Nothing happens where ``QUERIES_MAX`` are open: ``name in queries`` stays False.
 

@@ -1,15 +1,15 @@
-"""Name resolution at a switch: the cache of locations, the frames pending an answer, and the queries for the RIB.
+"""Name resolution at a switch: the name cache, the pending frames, and the queries to the RIB.
 
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds). It works like the neighbour cache of RFC 4861, sections
-5.1 and 7.2.2: a miss makes one query and keeps the frame; the answer releases the frame, or its end drops it::
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). It works like the neighbour cache of RFC 4861, sections 5.1
+and 7.2.2: a miss makes one query and keeps the frame; the response releases the frame, or its end drops it::
 
-    frame without an entry (machine.py)
+    frame without an entry (core.py)
       -> Unicast.miss -> resolve: a location, or a negative entry -> table entry, and the frame goes on
                       `-> resolve: unknown                        -> a query is open: buffer_frame
-    machine's timer   -> RibClient.ask -> queries_to_send           -> query to the RIB, again until it is answered
-    RIB's answer      -> RibClient.receive -> Locations.receive     -> receive_location -> Unicast.release: the frame
-                                          `-> receive_negative     -> the frame is dropped, counted
-    machine's timer   -> expire: leases, negative entries and pending frames end
+    timer of the core -> RibClient.ask -> queries_to_send            -> query to the RIB, repeated until a response
+    response of a RIB -> RibClient.receive -> LocationUpdates.receive -> receive_location -> Unicast.release: the frame
+                                           `-> receive_negative      -> the frame is dropped, counted
+    timer of the core -> expire: leases, negative entries and pending frames end
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _ACCEPTS_FRAMES: Final = (Right.ATTACH, Right.SERVE)
 
 
 class Resolution(NamedTuple):
-    """What is known of a name.
+    """The known locations of a name.
 
     Attributes:
         locations: where its advertisers are.
@@ -60,7 +60,7 @@ class NameResolver:
         lease_s: seconds for which the RIB keeps a watch; see ``NameQueries``.
 
     Attributes:
-        cache: the locations that are known; others only read it.
+        cache: the locations that are known; other classes only read it.
     """
 
     def __init__(self, me: Name, lease_s: float = ADVERTISEMENT_LEASE_S) -> None:
@@ -81,7 +81,7 @@ class NameResolver:
 
     @property
     def pending_frames(self) -> int:
-        """Return how many frames wait for an answer."""
+        """Return how many frames wait for a response."""
         return len(self._pending)
 
     @property
@@ -97,12 +97,12 @@ class NameResolver:
     # -- resolve
 
     def resolve(self, name: Name, now_s: float, owner: bytes = b"") -> Resolution | None:
-        """Return where frames to a name go, or None after the RIB was asked.
+        """Return where frames to a name go, or None after a query to the RIB.
 
         A name that resolves to another switch is watched from now on.
 
         Args:
-            owner: as ``owner_of``, at whose rate the RIB is asked; empty: this switch itself, without a limit.
+            owner: as ``owner_of``, whose query rate applies; empty: this switch itself, without a limit.
         """
         known = self.cache.of(name, now_s)
         accepting = [place for place in known if place.right in _ACCEPTS_FRAMES]
@@ -118,7 +118,7 @@ class NameResolver:
         return Resolution([], DropReason.NO_READER if known else DropReason.NO_ROUTE)
 
     def resolve_source(self, name: Name, now_s: float, owner: bytes = b"") -> Resolution | None:
-        """Return where the source of frames is attached, whatever its rights, or None after the RIB was asked.
+        """Return where the source of frames is attached, whatever its rights, or None after a query to the RIB.
 
         Args:
             owner: as in ``resolve``.
@@ -149,9 +149,9 @@ class NameResolver:
     # -- pending frames
 
     def buffer_frame(self, name: Name, frame: bytes, now_s: float, owner: bytes, until_s: float | None = None) -> None:
-        """Buffer a frame until its name is answered, or until ``until_s`` (default: for ``PARKED_S``).
+        """Buffer a frame until the response for its name, or until ``until_s`` (default: for ``PENDING_S``).
 
-        Where no query for the name is open, too many are, or its owner exceeds its rate: the frame is dropped.
+        The frame is dropped where no query for the name is open, too many are, or its owner exceeds its rate.
         """
         if name in self._queries:
             self._pending.park(name, frame, now_s, until_s, owner=owner)
@@ -162,16 +162,16 @@ class NameResolver:
         """Remove and return the frames that wait for a name, in order, each with its ``until_s`` and owner."""
         return self._pending.release(name)
 
-    # -- receive an answer
+    # -- receive a response
 
     def receive_location(self, place: Location, now_s: float, *, is_ours: bool = False, has_left: bool = False) -> None:
         """Store a verified location.
 
         Args:
-            is_ours: its advertiser is attached here. The RIB echoes a claim to the switch that relayed it; this echo
-                answers no query. The second time, it does.
-            has_left: its advertiser was attached here and is not any more. The RIB does not know that yet, so the
-                query stays open.
+            is_ours: its advertiser is attached here. The RIB echoes an advertisement to the switch that relayed it; the
+                first echo answers no query, the second one does.
+            has_left: its advertiser was attached here and is not any more. The RIB does not know that yet, so the query
+                stays open.
         """
         before = self.cache.put(place)
         is_repeated = before is not None and before.advertisement == place.advertisement
@@ -179,7 +179,7 @@ class NameResolver:
             self._queries.receive_answer(place.name, now_s)
 
     def receive_removal(self, name: Name, advertiser: Name, now_s: float) -> None:
-        """Remove one advertiser of a name: it has withdrawn, or its proofs do not hold any more."""
+        """Remove one advertiser of a name: it has withdrawn, or its proofs are no longer valid."""
         self._queries.receive_answer(name, now_s)
         self.cache.remove(name, advertiser)
 
@@ -187,7 +187,7 @@ class NameResolver:
         """Store that no node advertises a name, and drop the frames that wait for it.
 
         Args:
-            keep: known locations count more than this answer, of a RIB that has just started.
+            keep: known locations take precedence over this response of a RIB that has just started.
         """
         self._queries.receive_answer(name, now_s)
         if not (keep and self.cache.of(name, now_s)):
@@ -209,16 +209,16 @@ class NameResolver:
         self._queries.repeat_all(now_s)
 
     def serve_stale(self, now_s: float, *, stale: bool) -> None:
-        """Begin, or end, to serve entries beyond their leases: the RIB does not answer, or does again."""
+        """Begin, or end, to serve entries beyond their leases: the RIB does not respond, or responds again."""
         self.cache.serve_stale(stale, now_s)
 
     def expire(self, now_s: float) -> list[Location]:
-        """Drop the frames that waited too long and the entries whose leases ended; return the places among them."""
+        """Drop the frames that waited too long and the entries whose leases ended; return the locations among them."""
         self._pending.expire(now_s)
         return self.cache.expire(now_s)
 
     def next_expiry(self) -> float | None:
-        """Return a monotonic second that is no later than the next work of ``expire``, or None."""
+        """Return a monotonic second that is no later than the next expiry, or None."""
         times = (self._pending.next_expiry(), self.cache.next_expiry())
         return min((time for time in times if time is not None), default=None)
 

@@ -1,6 +1,6 @@
-"""What a switch has to send, gathered until its shell takes it.
+"""Outbox of a switch: the frames to send, collected until the I/O layer takes them.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ __all__ = ["Outbox"]
 
 
 class Outbox:
-    """Collects frames, and knows how neighbours are reached."""
+    """Collects frames, and maps neighbours to ports and addresses."""
 
     def __init__(self, hello_protocol: HelloProtocol, fragmenter: ControlFragmenter) -> None:
         self._hello_protocol = hello_protocol
@@ -28,22 +28,22 @@ class Outbox:
         self.say_at(neighbour.port, neighbour.mac, kind, statement)
 
     def say_at(self, port: int, mac: bytes, kind: int, statement: bytes) -> None:
-        """Send a statement to whoever has this address on a port."""
+        """Send a statement to the node with this address on a port."""
         if port in self._hello_protocol.ports:
             frames = self._fragmenter.split(kind, statement, self._hello_protocol.ports[port].mtu)
             self._waiting.append(OutgoingFrames(port, mac, frames))
 
     def far(self, kind: int, statement: bytes, destination: Name) -> list[bytes]:
-        """Return the frames of a statement that goes further than a neighbour."""
+        """Return the frames of a statement that goes beyond a neighbour."""
         mtu = min((port.mtu for port in self._hello_protocol.ports.values()), default=1_500)
         return self._fragmenter.split(kind, statement, mtu, destination)
 
     def frames(self, port: int, mac: bytes, frames: list[bytes]) -> None:
-        """Send frames that are ready."""
+        """Send frames that are encoded already."""
         self._waiting.append(OutgoingFrames(port, mac, frames))
 
     def put(self, transmit: OutgoingFrames) -> None:
-        """Send what is ready to go."""
+        """Add outgoing frames."""
         self._waiting.append(transmit)
 
     def neighbour(self, name: Name) -> Neighbour | None:
@@ -63,7 +63,7 @@ class Outbox:
         return neighbour.port, neighbour.mac + self._hello_protocol.ports[neighbour.port].mac
 
     def protected_hop(self, neighbour: Neighbour, alternate: Name | None) -> Hop | ProtectedHop:
-        """Return the hop to a neighbour with another way out: over a second link to it, or else to ``alternate``."""
+        """Return the hop to a neighbour with an alternate: over a second link to it, or else through ``alternate``."""
         hop = self.hop(neighbour)
         others = [port for port in self._hello_protocol.ports if port != hop[0]]
         for name in (neighbour.name, alternate or neighbour.name):
@@ -85,6 +85,6 @@ class Outbox:
         return self._hello_protocol.ports[port].mtu
 
     def poll_frames(self) -> list[OutgoingFrames]:
-        """Return, once, what waits."""
+        """Return, once, the frames to send."""
         waiting, self._waiting = self._waiting, []
         return waiting

@@ -1,13 +1,12 @@
-"""Shortest paths over what the link states say, and only through domains that are allowed.
+"""Shortest paths over the link states, restricted to the domains that are allowed.
 
-Place: pure.
-Source: Dijkstra, by networkx. Edges are directed; a link counts when both ends name it. Of another domain a switch sees
-the borders only, so the way to a switch behind them is the way to the nearest border that lists it. A part of the own
-domain that a failure has cut off is seen in the same way: through its borders, over other domains.
+Sans-I/O. Source: Dijkstra, by networkx. Edges are directed; a link counts when both ends list it. Of another domain a
+switch sees only the borders. So the path to a switch behind them is the path to the nearest border that lists it. A
+part of the own domain that a failure has cut off is reached in the same way: through its borders, over other domains.
 
-A leaf is an end and never on the way: no edge leads out of it, except for itself (RFC 6987; the overload bit of IS-IS,
-RFC 3277). That follows from the certificate in its link state, whatever costs it names. What only leaves join to this
-switch is ``severed``.
+A leaf is an end and never transit: no edge leads out of it, except for itself (RFC 6987; the overload bit of IS-IS, RFC
+3277). That follows from the certificate in its link state, whatever costs it lists. Switches that only leaves connect
+to this one are ``severed``.
 """
 
 from __future__ import annotations
@@ -27,23 +26,23 @@ __all__ = ["Path", "Paths"]
 
 _CACHE_MAX = 64
 _ALTERNATES_CACHE_MAX = 4_096
-_ALTERNATES_SWITCHES_MAX = 256  # among more, paths from every neighbour would keep a switch busy for too long
+_ALTERNATES_SWITCHES_MAX = 256  # above this, paths from every neighbour would keep a switch busy for too long
 
 
 class Path(NamedTuple):
-    """The way to a target."""
+    """The path to a target."""
 
-    first: Name  # the neighbour to go through
+    first: Name  # the neighbour that is the next hop
     distance: int
-    alternate: Name | None = None  # another neighbour, from which frames do not come back
+    alternate: Name | None = None  # another neighbour, from which frames do not return
 
 
 class Paths:
-    """Answers of shortest-path questions, computed when first asked after a change.
+    """Shortest paths, computed at the first request after a change.
 
     Attributes:
-        has_alternates: whether ways are given with their loop-free alternates (RFC 5286), which cost a computation for
-            each neighbour: nobody should wait for them.
+        has_alternates: whether paths include their loop-free alternates (RFC 5286). Alternates cost a computation for
+            each neighbour, so that no urgent work may wait for them.
     """
 
     def __init__(self, me: Name, domain: Name, link_states: LinkStateDatabase) -> None:
@@ -57,7 +56,7 @@ class Paths:
         self._severed: frozenset[Name] = frozenset()  # of our domain
         self._is_border_severed = False
         self._domains: dict[Name, Name] = {}  # of every switch that is known by name
-        # Of a switch that is not in the graph, and its domain: borders of that domain that list it.
+        # Borders that list a switch that is not in the graph, by that switch and its domain.
         self._borders_of: dict[tuple[Name, Name], list[Name]] = {}
         self._beyond: dict[Name, list[Name]] = {}  # by domain: borders that are reached over links between domains
         self._open_borders: dict[Name, list[Name]] = {}  # by domain: borders that could not list all their switches
@@ -70,10 +69,10 @@ class Paths:
         self.has_alternates = False
 
     def to_switch(self, switch: Name, domain: Name, allowed: frozenset[Name]) -> Path | None:
-        """Return the way to a switch of a domain; None when there is none through ``allowed`` domains.
+        """Return the path to a switch of a domain; None when there is none through ``allowed`` domains.
 
-        A way within our own domain goes first (RFC 2328, 16.2): those outside know only how far our borders
-        are, and would send back what left in order to come in again elsewhere.
+        A path within our own domain goes first (RFC 2328, 16.2). Switches outside know only the distance to our
+        borders, and would send back what left our domain in order to enter it elsewhere.
         """
         self._refresh()
         if switch in self._members:
@@ -91,8 +90,8 @@ class Paths:
     def _alternate(self, way: Path, switch: Name, domain: Name, allowed: frozenset[Name]) -> Name | None:
         """Return the best neighbour whose own shortest path does not lead back here: RFC 5286, inequality 1.
 
-        Only one of our domain: how others choose their paths is theirs to know. A leaf is none; for a leaf each
-        neighbour that knows a way is one, since no frame comes back through a leaf.
+        Only a neighbour of our domain qualifies, because the path choice of other domains is unknown. A leaf is none.
+        For a leaf each neighbour that has a path is one, since no frame returns through a leaf.
         """
         if self._graph is None or len(self._graph) > _ALTERNATES_SWITCHES_MAX:
             return None
@@ -111,7 +110,7 @@ class Paths:
         return min(found, default=(0, None))[1]
 
     def distance_from(self, start: Name, switch: Name, domain: Name, allowed: frozenset[Name]) -> int | None:
-        """Return how far a switch is from another one than this; None where there is no way."""
+        """Return the distance of a switch from another one than this; None where there is no path."""
         self._refresh()
         if start in self._leaves and start != switch:
             return None
@@ -129,16 +128,16 @@ class Paths:
         return min((ways[each] for each in borders if each in ways), key=lambda way: way.distance, default=None)
 
     def _fallback_borders(self, domain: Name) -> list[Name]:
-        """Return where to try a switch that no border lists: it may be new, or beyond what a border can list."""
+        """Return the borders to try for an unlisted switch: it may be new, or beyond a border's list limit."""
         if domain == self._domain:
             return self._open_borders.get(domain, [])
         return self._beyond.get(domain, [])
 
     def to_rib(self, rib: Name, allowed: frozenset[Name]) -> tuple[Path | None, Name | None]:
-        """Return the way to the nearest switch from which a RIB is reached, and that switch (self: no way needed).
+        """Return the path to the nearest switch that reaches a RIB, and that switch (self: no path needed).
 
         Args:
-            allowed: domains to pass through; the one that the RIB stands in may be another.
+            allowed: domains to pass through; the RIB's own domain may be another.
         """
         self._refresh()
         hosts = self._ribs.get(rib, {})
@@ -149,30 +148,30 @@ class Paths:
         return min(reachable, key=lambda each: each[0].distance, default=(None, None))
 
     def life_of(self, name: Name, role: Role) -> bytes | None:
-        """Return the mark of the oldest life in which a switch or a RIB is reached over other switches, or None."""
+        """Return the mark of the oldest incarnation in which other switches reach a switch or a RIB, or None."""
         self._refresh()
         if role is Role.RIB:
             hosts = {host: rib.life for host, rib in self._ribs.get(name, {}).items() if host != self._me}
         else:
             hosts = {} if (life := self._lives.get(name)) is None else {name: life}
         if not hosts:
-            return None  # a proxy, say: nothing is computed for its hellos
+            return None  # a proxy, for example: its hellos cause no computation
         everywhere = frozenset(self._domains.values())
         lives = [life for host, life in hosts.items() if host in self._to_all(everywhere)]
         return min(lives, default=None)
 
     def refused_elsewhere(self) -> frozenset[Name]:
-        """Return the identities that other switches refuse at present, for an older node has them."""
+        """Return the identities that other switches refuse at present because an older node has them."""
         self._refresh()
         return self._refused
 
     def is_switch(self, name: Name) -> bool:
-        """Return whether a link state names this switch."""
+        """Return whether a link state lists this switch."""
         self._refresh()
         return name in self._domains
 
     def is_rib(self, name: Name) -> bool:
-        """Return whether a link state names this RIB."""
+        """Return whether a link state lists this RIB."""
         self._refresh()
         return name in self._ribs
 
@@ -182,12 +181,12 @@ class Paths:
         return self._domains.get(switch)
 
     def ribs(self) -> dict[Name, AttachedRib]:
-        """Return every RIB that a link state names, our own domain's and others', by name."""
+        """Return every RIB that a link state lists, our own domain's and others', by name."""
         self._refresh()
         return {rib: min(hosts.values()) for rib, hosts in self._ribs.items()}
 
     def ribs_inside(self) -> frozenset[AttachedRib]:
-        """Return the RIBs that are attached to switches of our domain, as far as those are reachable within it."""
+        """Return the RIBs that are attached to switches of our domain that are reachable within it."""
         self._refresh()
         hosts = (state for state in self._link_states.states(Scope.DOMAIN) if state.origin in self._members)
         return frozenset(rib for state in hosts for rib in state.ribs)
@@ -198,17 +197,17 @@ class Paths:
         return self._members
 
     def carries_transit(self, switch: Name) -> bool:
-        """Return whether ways may lead through a switch: it is no leaf."""
+        """Return whether paths may lead through a switch: it is no leaf."""
         self._refresh()
         return switch not in self._leaves
 
     def severed(self) -> frozenset[Name]:
-        """Return the switches of our domain that leaves alone join to this one: no way leads to them."""
+        """Return the switches of our domain that only leaves connect to this one: no path leads to them."""
         self._refresh()
         return self._severed
 
     def leads_through_leaf(self, switch: Name, domain: Name) -> bool:
-        """Return whether there might be a way to a switch, to which there is none, if leaves carried transit."""
+        """Return whether an unreachable switch might be reachable if leaves carried transit."""
         self._refresh()
         return switch in self._severed if domain == self._domain else self._is_border_severed
 
@@ -220,14 +219,15 @@ class Paths:
         return {each: ways[each].distance for each in sorted(borders & self._members) if each in ways}
 
     def _to_all(self, allowed: frozenset[Name], start: Name | None = None) -> dict[Name, Path]:
-        """Return the ways from a switch, this one if not given, to all others."""
+        """Return the paths from a switch, this one if not given, to all others."""
         self._refresh()
-        key = start or self._me, allowed & self._known_domains  # a stranger's list may name others, each time anew
+        # an unknown sender's list may hold other domains, different ones each time
+        key = start or self._me, allowed & self._known_domains
         ways = self._ways.pop(key, None)
         if ways is None:
             ways = self._compute(*key)
             if len(self._ways) >= _CACHE_MAX:
-                del self._ways[next(iter(self._ways))]  # the least used
+                del self._ways[next(iter(self._ways))]  # the least recently used
         self._ways[key] = ways
         return ways
 
@@ -244,7 +244,7 @@ class Paths:
 
         before, distances = dijkstra_predecessor_and_distance(self._graph, start, weight=cost)
         ways: dict[Name, Path] = {}
-        for to, distance in distances.items():  # the nearest first: whoever comes before ``to`` is there already
+        for to, distance in distances.items():  # nearest first: the hop before ``to`` is already there
             if to != start:
                 last = before[to][0]
                 ways[to] = Path(to if last == start else ways[last].first, int(distance))
@@ -300,15 +300,15 @@ def _reachable(
 
 
 def _graph(edges: Iterable[tuple[Name, tuple[Adjacency, ...]]]) -> nx.DiGraph[Name]:
-    """Return the graph of all links that both ends name."""
+    """Return the graph of all links that both ends list."""
     cost: dict[tuple[Name, Name], int] = {}
     for origin, links in edges:
         for link in links:
             edge = (origin, link.name)
             cost[edge] = min(cost.get(edge, link.cost), link.cost)
-    from networkx import DiGraph  # large; nothing is asked before there is a neighbour
+    from networkx import DiGraph  # large; no path is requested before there is a neighbour
 
     graph: nx.DiGraph[Name] = DiGraph()
-    # sorted: among ways of one length every switch picks by the same order
+    # sorted: among ways of one length every switch picks in the same order
     graph.add_weighted_edges_from((a, b, cost[a, b]) for a, b in sorted(cost) if (b, a) in cost)
     return graph

@@ -1,7 +1,7 @@
-"""Frames that wait for the answer of a RIB.
+"""Frames that are pending a name resolution.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds). Bounded in frames, bytes and time, and shared among the
-neighbours that they came from; what does not fit is counted, never silently lost.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: the queue of RFC 4861, section 7.2.2. Bounded in
+frames, bytes and time, and shared among the neighbours that sent them; each frame that does not fit is counted.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class _PendingFrame(NamedTuple):
 
 
 class PendingFrames:
-    """Frames by the name whose place they wait for."""
+    """Pending frames, by the name whose location they wait for."""
 
     def __init__(self) -> None:
         self._by_name: OrderedDict[bytes, deque[_PendingFrame]] = OrderedDict()
@@ -37,7 +37,7 @@ class PendingFrames:
     def park(
         self, name: bytes, frame: bytes, now_s: float, until_s: float | None = None, *, owner: bytes = b""
     ) -> None:
-        """Keep a frame until ``release``, or until ``until_s``; if not given, until ``PARKED_S`` have gone.
+        """Store a frame until ``release``, or until ``until_s``; default: for ``PENDING_S``.
 
         Args:
             owner: the neighbour that it came from.
@@ -57,7 +57,7 @@ class PendingFrames:
         return name in self._by_name
 
     def release(self, name: bytes) -> list[tuple[bytes, float, bytes]]:
-        """Return, in order, what waited for a name, until when each frame would have waited, and its owner."""
+        """Remove and return, in order, the frames that wait for a name, each with its ``until_s`` and owner."""
         waiting = self._by_name.pop(name, deque())
         for each in waiting:
             self._give_back(each)
@@ -68,11 +68,11 @@ class PendingFrames:
         self._bytes.release(waiting.owner, size=len(waiting.frame))
 
     def refuse(self, name: bytes, reason: DropReason) -> None:
-        """Drop what waited for a name, under a reason."""
+        """Drop the frames that wait for a name, under a reason."""
         self.drops[reason] += len(self.release(name))
 
     def expire(self, now_s: float) -> None:
-        """Drop what waited too long."""
+        """Drop the frames that waited too long."""
         for name in list(self._by_name):
             waiting = self._by_name[name]
             while waiting and waiting[0].until_s <= now_s:

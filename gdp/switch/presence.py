@@ -1,7 +1,7 @@
-"""A switch's answers to the question whether an attached node is still there.
+"""Presence answers: a switch reports to RIBs whether an attached node is still there.
 
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds). A node is there when it has given a sign of life since the
-question came, and gone when it is no neighbour any more; one of the two comes within the time of a dead neighbour.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). A node is there when it has sent a sign of life since the
+question came, and gone when it is no neighbour any more. One of the two comes within the dead-neighbour interval.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ class PresenceAnswers:
         self._open: dict[Name, _Question] = {}
 
     def ask(self, presence: Presence, rib: Name, wire: bytes, now_s: float) -> None:
-        """Take a RIB's verified question; the node hears of it, too, if it is there."""
+        """Handle a RIB's verified question; the node receives it, too, if it is there."""
         if len(self._open) >= _OPEN_MAX and presence.node not in self._open:
-            return  # the RIB asks again
+            return  # the RIB repeats its question
         self._open[presence.node] = _Question(presence, rib, now_s)
         held = self._attached.get(presence.node, presence.node)
         if held is not None and held.advertisement.incarnation == presence.incarnation:
@@ -59,7 +59,7 @@ class PresenceAnswers:
         self.answer(now_s)
 
     def answer(self, now_s: float) -> None:
-        """Answer what can be answered; cheap when nothing is open."""
+        """Answer the questions that can be answered; cheap when none is open."""
         for question in list(self._open.values()):
             is_there = self._is_there(question)
             if is_there is not None:
@@ -70,7 +70,7 @@ class PresenceAnswers:
                 self._unicast.send(frames, question.rib, self._identity.name, now_s)
 
     def _is_there(self, question: _Question) -> bool | None:
-        """Return None while that is not known."""
+        """Return whether the node is there; None while that is not known."""
         node = question.presence.node
         held = self._attached.get(node, node)
         if held is None or held.advertisement.incarnation != question.presence.incarnation:

@@ -1,7 +1,7 @@
 """Query window: how many queries for new names a switch has in flight at its RIB.
 
-Sans-I/O. The window makes a switch query at the pace at which the RIB answers. Without it, repeated queries lengthen
-the queue at the RIB, and no query is answered in time. Names that wait for the window are served round robin by owner.
+Sans-I/O. The window makes a switch query at the pace at which the RIB responds. Without it, repeated queries lengthen
+the queue at the RIB, and no response comes in time. Names that wait for the window are served round robin by owner.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ WINDOW: Final = 128  # a tenth of a second's work of a RIB
 
 
 class QueryWindow:
-    """Names in flight, at most ``size``, and the names that wait for one of these places.
+    """Names in flight, at most ``size``, and the names that wait for a free slot.
 
     Args:
         size: most names in flight.

@@ -1,19 +1,18 @@
-"""Nodes that move from one switch to another: the former switch is told, forwards, and sends those who ask on.
+"""Relocation of nodes between switches: the former switch forwards frames and redirects senders to the new one.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds).
-Source: in spirit, the binding update of RFC 6275 (section 11.7), the fast neighbour advertisement and the context
-transfer of RFC 5568 and RFC 4067, and the ICMP redirect of RFC 1122 (section 3.2.2.2). No RIB takes part, so it works
-while none answers.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source, in spirit: the binding update of RFC 6275 (section
+11.7) and the fast neighbour advertisement of RFC 5568; the context transfer of RFC 4067; the ICMP redirect of RFC 1122
+(section 3.2.2.2). No RIB takes part, so it works while none responds.
 
 ::
 
-    node --claim (previous: old)--> new switch --RELOCATE (the claim, relayed)--> old switch
-    old switch --RIB_ANSWER (understood; whom the node hears)--> new switch
+    node --advertisement (previous: old)--> new switch --RELOCATE (the advertisement, relayed)--> old switch
+    old switch --RIB_ANSWER (received; the names that the node reads)--> new switch
     neighbour --frame for the node--> old switch --frame--> new switch
     neighbour <--REDIRECT (the same relay)-- old switch
-    neighbour <--WHERE, while no RIB answers-- switch that got its frame for a node it does not know
+    neighbour <--WHERE, while no RIB responds-- switch that got its frame for a node it does not know
 
-A claim proves itself and names the new switch, so neither the old switch nor a neighbour need believe anybody.
+An advertisement proves itself and names the new switch, so the old switch and its neighbours need not trust the sender.
 """
 
 from __future__ import annotations
@@ -37,12 +36,12 @@ from gdp.trust.domain import Policy
 
 __all__ = ["GRACE_S", "Relocations"]
 
-GRACE_S: Final = 4.0  # how long the former switch handles frames for a moved node itself, and sends others on
+GRACE_S: Final = 4.0  # how long the former switch handles frames for a moved node itself, and redirects senders
 _DEPARTED_S: Final = 30.0  # how long it is known that a node was attached here
 _REMEMBERED_MAX: Final = 4_096
 _NOTICE_AT_S: Final = (0.0, 0.1, 0.4, 1.2)  # one datagram may be lost
-_FORMER_S: Final = 3.0  # how long the answers of a former switch are taken
-_SAY_EVERY_S: Final = 0.1  # to one neighbour about one node
+_FORMER_S: Final = 3.0  # how long responses of a former switch are accepted
+_SAY_EVERY_S: Final = 0.1  # between two messages to one neighbour about one node
 
 _Key = tuple[Name, Name]  # name and advertiser
 
@@ -62,12 +61,12 @@ class _Notice:
 
 @dataclass(slots=True)
 class _Moved:
-    statement: bytes  # what proves the new place
+    statement: bytes  # proof of the new location
     until_s: float
 
 
 class Relocations:
-    """What one switch does for nodes that have come from, or gone to, another switch."""
+    """Handles the nodes of one switch that came from, or went to, another switch."""
 
     def __init__(
         self, identity: Identity, policy: Policy, multicast: MulticastTrees, unicast: Unicast, outbox: Outbox
@@ -78,14 +77,14 @@ class Relocations:
         self._unicast = unicast
         self._outbox = outbox
         self._notices: OrderedDict[_Key, _Notice] = OrderedDict()
-        self._former: OrderedDict[Name, float] = OrderedDict()  # switches whose answers are taken, until when
+        self._former: OrderedDict[Name, float] = OrderedDict()  # switches whose responses are accepted, until when
         self._departed: OrderedDict[_Key, float] = OrderedDict()
         self._moved: OrderedDict[_Key, _Moved] = OrderedDict()
         self._moved_names: dict[Name, float] = {}  # of ``_moved``, until when
         self._said: OrderedDict[tuple[Name, int, bytes], float] = OrderedDict()
 
     def arrived(self, advertisement: Advertisement, now_s: float) -> None:
-        """Tell the former switch of a node that claims a name here."""
+        """Notify the former switch of a node that advertises a name here."""
         if advertisement.previous in (ZERO, self._identity.name):
             return
         statement = relayed(advertisement.wire, self._identity, self._policy.transit)
@@ -98,25 +97,25 @@ class Relocations:
         self.handle_timer(now_s)
 
     def acknowledged(self, name: Name, advertiser: Name, sequence: int) -> None:
-        """Learn that the former switch knows; ``sequence``: of the claim that it was told."""
+        """Record that the former switch has the advertisement with this ``sequence``."""
         notice = self._notices.get((name, advertiser))
         if notice is not None and sequence >= notice.sequence:
             del self._notices[name, advertiser]
 
     def departed(self, advertisement: Advertisement, now_s: float) -> None:
-        """Note that a node is not attached here any more."""
+        """Record that a node is not attached here any more."""
         _remember(self._departed, (advertisement.name, advertisement.node), now_s + _DEPARTED_S)
 
     def was_here(self, name: Name, advertiser: Name, now_s: float) -> bool:
-        """Return whether an advertiser of a name was attached here a moment ago."""
+        """Return whether an advertiser of a name was attached here recently."""
         return self._departed.get((name, advertiser), 0.0) > now_s
 
     def is_former(self, switch: Name, now_s: float) -> bool:
-        """Return whether a switch was asked a moment ago what a node that came from it hears."""
+        """Return whether a switch was recently notified as a former one, so that its response counts."""
         return self._former.get(switch, 0.0) > now_s
 
     def moved(self, place: Location, statement: bytes, now_s: float) -> None:
-        """Note where a node is now that others may look for here; tell those who take its topic from here."""
+        """Record the new location of a node; redirect the switches that take its topic from here."""
         until_s = now_s + GRACE_S
         _remember(self._moved, (place.name, place.advertiser), _Moved(statement, until_s))
         if len(self._moved_names) > 2 * _REMEMBERED_MAX:
@@ -126,9 +125,9 @@ class Relocations:
             self._outbox.say_at(*at, Kind.REDIRECT, statement)
 
     def frame_came(self, destination: Name, neighbour: Neighbour, now_s: float) -> None:
-        """Send the neighbour on that sent a frame here for a node that has moved.
+        """Redirect the neighbour that sent a frame here for a node that has moved.
 
-        For ``GRACE_S`` no entry stands for such a node, so that each of its frames is seen here.
+        For ``GRACE_S`` no table entry exists for such a node, so that each of its frames is punted here.
         """
         if self._moved_names.get(destination, 0.0) <= now_s:
             return
@@ -140,13 +139,16 @@ class Relocations:
                 self._redirect(neighbour, name, moved.statement, now_s)
 
     def redirect_join(self, name: Name, advertiser: Name, neighbour: Neighbour, now_s: float) -> None:
-        """Send the neighbour on that joins a publisher at its former place."""
+        """Redirect the neighbour that joins a publisher at its former location."""
         moved = self._moved.get((name, advertiser))
         if moved is not None and moved.until_s > now_s:
             self._redirect(neighbour, name, moved.statement, now_s)
 
     def ask_neighbour(self, name: Name, neighbour: Neighbour, now_s: float) -> None:
-        """Ask the neighbour that sent a frame where its node is: no RIB answers, and it must have known."""
+        """Request a node's location from the neighbour that sent a frame for it.
+
+        No RIB responds, and the neighbour must have had the location to send the frame.
+        """
         if neighbour.role.is_switch and self._may_say(name, neighbour, now_s):
             identity = self._identity
             query = Query(name, 0.0).to_wire(identity.name, identity.key, identity.membership)
@@ -172,7 +174,7 @@ class Relocations:
             self._outbox.say(neighbour, Kind.REDIRECT, statement)
 
     def _may_say(self, name: Name, neighbour: Neighbour, now_s: float) -> bool:
-        """Return whether a neighbour was told or asked nothing about a name for a moment, and note that it is now."""
+        """Return whether a message to a neighbour about a name is allowed now, and record it as sent."""
         key = (name, neighbour.port, neighbour.mac)
         if now_s - self._said.get(key, float("-inf")) < _SAY_EVERY_S:
             return False
@@ -181,7 +183,7 @@ class Relocations:
 
 
 def _remember(memory: OrderedDict, key: object, value: object) -> None:  # type: ignore[type-arg]
-    """Put a value as the newest; the oldest gives way."""
+    """Store a value as the newest; the oldest is removed when the memory is full."""
     memory[key] = value
     memory.move_to_end(key)
     if len(memory) > _REMEMBERED_MAX:

@@ -1,14 +1,15 @@
-"""Revocations at a switch: take them, close what rested on them, pass them on to whom they concern.
+"""Revocations at a switch: it verifies them, closes what depends on them, and forwards them to affected nodes.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
-A revocation of a trusted domain's root goes to every neighbour, once; neighbours compare what they keep by digests
-(``control/revocation_sync.py``). One of an owner is taken where a certificate of that owner is held, goes on from there
-to the neighbours, and is dropped by those who hold none. What the operator hands in also goes to the RIB, which sends
-it to whoever brought, watches or heard of the name, in every tier.
+A revocation of a trusted domain's root goes to every neighbour, once; neighbours compare their sets by digests
+(``control/revocation_sync.py``). A revocation of an owner is accepted where a certificate of that owner is stored. It
+goes on from there to the neighbours, and is dropped by those that store none. A revocation that the operator submits
+also goes to the RIB. The RIB sends it to every node that advertised, watches or queried the name, in every tier.
 
-What a revoked certificate had opened ends at once: attachments, readers, and, unless the switch below shows another
-reader within ``GRACE_S``, the branches that rested on it. A revoked neighbour is let go.
+What a revoked certificate had opened ends at once: attachments, readers, and the branches that depend on it. A branch
+stays if the downstream switch sends another reader's evidence within ``GRACE_S``. The session with a revoked neighbour
+is closed.
 """
 
 from __future__ import annotations
@@ -40,14 +41,14 @@ from gdp.trust.verifier import AdvertisementVerifier
 __all__ = ["RevocationHandler"]
 
 GRACE_S: Final = 0.5
-_FIRST_S: Final = (0.3, 1.0, 3.0)  # from the first time that the RIB is sent a revocation to the next ones
+_FIRST_S: Final = (0.3, 1.0, 3.0)  # from the first send of a revocation to the RIB to the next ones
 _AGAIN_S: Final = 60.0
 _TICK_S: Final = 0.1
 _PER_TICK: Final = 4
 
 
 class RevocationHandler:
-    """Takes, applies and spreads revocations at one switch."""
+    """Handles, applies and distributes revocations at one switch."""
 
     def __init__(
         self,
@@ -75,22 +76,22 @@ class RevocationHandler:
         self._sync = sync
         self._outbox = outbox
         self._handed_in = _SubmittedRevocations()
-        self._sent_to: Name | None = None  # the RIB that revocations of the operator went to
+        self._sent_to: Name | None = None  # the RIB that received the operator's revocations
 
     def receive_revocation(self, statement: Statement, neighbour: Neighbour, now: Timestamps) -> list[Name]:
-        """Take a revocation from a neighbour; return the topics that lost all readers here.
+        """Handle a revocation from a neighbour; return the topics that lost all readers here.
 
         Raises:
-            StatementError: it does not hold, concerns nobody here, or there is no room for it.
+            StatementError: it is not valid, concerns nothing here, or exceeds a quota.
         """
         revocation = self._revoked.receive_revocation(statement, neighbour.name, now, self._held.has_issuer)
         return [] if revocation is None else self._spread(revocation, statement, neighbour, now)
 
     def receive_lacking(self, statement: Statement, neighbour: Neighbour, now: Timestamps) -> list[Name]:
-        """Take a revocation that was lacking here; the other neighbours hear of it by digests.
+        """Handle a revocation that was missing here; the other neighbours receive it by digests.
 
         Raises:
-            StatementError: as ``take``.
+            StatementError: as ``receive_revocation``.
         """
         revocation = self._revoked.receive_revocation(statement, neighbour.name, now, self._held.has_issuer)
         if revocation is None:
@@ -99,19 +100,19 @@ class RevocationHandler:
         return self._apply(revocation, now)
 
     def receive_from_rib(self, statement: Statement, rib: Name, now: Timestamps) -> list[Name]:
-        """Take a revocation that a RIB sent.
+        """Handle a revocation that a RIB sent.
 
         Raises:
-            StatementError: as ``take``.
+            StatementError: as ``receive_revocation``.
         """
         revocation = self._revoked.receive_revocation(statement, rib, now, self._held.has_issuer)
         return [] if revocation is None else self._spread(revocation, statement, None, now)
 
     def hand_in(self, statement: Statement, now: Timestamps) -> list[Name]:
-        """Take a revocation from this node's operator, whoever issued it.
+        """Handle a revocation from this node's operator, for any issuer.
 
         Raises:
-            StatementError: it does not hold.
+            StatementError: it is not valid.
         """
         revocation = self._revoked.receive_revocation(statement, OPERATOR, now, self._held.has_issuer)
         issued = revocation or Revocation.read(statement)
@@ -120,7 +121,7 @@ class RevocationHandler:
         return [] if revocation is None else self._spread(revocation, statement, None, now)
 
     def due_for_rib(self, rib: Name, now_s: float) -> list[bytes]:
-        """Return the revocations of the operator that are due at this RIB; those that have run out are removed."""
+        """Return the revocations of the operator that are due at this RIB; expired ones are removed."""
         if rib != self._sent_to:
             self._sent_to = rib
             self._handed_in.say_again(now_s)
@@ -202,25 +203,25 @@ class RevocationHandler:
 
 
 class _SubmittedRevocations:
-    """Revocations of owners that the operator handed in, by fingerprint, and when each is due at the RIB.
+    """Revocations of owners that the operator submitted, by fingerprint, and when each is due at the RIB.
 
     A RIB keeps one only while a name that it concerns is stored or watched there, and acknowledges none. So each is
-    sent four times at first, then once every ``_AGAIN_S``: a user of the name who comes later receives it.
+    sent four times at first, then once every ``_AGAIN_S``: a later user of the name receives it.
     """
 
     def __init__(self) -> None:
         self._wires: dict[bytes, bytes] = {}
-        self._due: list[tuple[float, int, bytes]] = []  # when, how often it was said, fingerprint
+        self._due: list[tuple[float, int, bytes]] = []  # when, how often it was sent, fingerprint
         self._tick_at_s = float("-inf")
 
     def add(self, fingerprint: bytes, wire: bytes, now_s: float) -> None:
-        """Send a statement from now on."""
+        """Add a statement to send from now on."""
         if fingerprint not in self._wires:
             heapq.heappush(self._due, (now_s, 0, fingerprint))
         self._wires[fingerprint] = wire
 
     def remove(self, fingerprint: bytes) -> None:
-        """Stop sending a statement: it has run out."""
+        """Stop sending a statement: it has expired."""
         self._wires.pop(fingerprint, None)
 
     def say_again(self, now_s: float) -> None:

@@ -1,11 +1,11 @@
-"""A switch's RIB client: it relays claims, sends queries, and verifies the answers.
+"""RIB client of a switch: it relays advertisements, sends queries, and verifies the responses.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
-The nearest RIB of the switch's own domain is asked, over other domains where its own is parted. Where the own domain
-has none, it is the nearest RIB of a domain through which traffic may pass. One that owes an answer for ``SILENT_S`` is
-left for the next one. While none answers, what is known is served on (``name_cache.py``). The name resolver says which
-queries are due; ``location_updates.py`` applies the answers.
+Queries go to the nearest RIB of the switch's own domain, over other domains where its own is partitioned. Where the own
+domain has none, they go to the nearest RIB of a domain through which traffic may pass. A RIB that owes a response for
+``SILENT_S`` is replaced by the next one. While none responds, known locations are still served (``name_cache.py``). The
+name resolver decides which queries are due; ``location_updates.py`` applies the responses.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ from gdp.trust.domain import Policy
 __all__ = ["SILENT_S", "RibClient"]
 
 SILENT_S: Final = 1.6  # longer than a RIB waits for the tier above
-_AVOID_S: Final = 10.0  # a RIB that owed an answer for too long is left for so long, if there is another
-_REFILL_S: Final = 10.0  # how long a RIB that is new here may say "nobody" of what is known
+_AVOID_S: Final = 10.0  # a RIB that owed a response for too long is avoided for so long, if there is another
+_REFILL_S: Final = 10.0  # how long negative responses of a RIB that is new here do not override known locations
 
 
 class RibClient:
-    """Speaks with the nearest RIB.
+    """Exchanges statements with the nearest RIB.
 
     Attributes:
-        rib: whom it asks, or None while none is known.
+        rib: the RIB in use, or None while none is known.
     """
 
     def __init__(
@@ -84,13 +84,13 @@ class RibClient:
         self.rib: Name | None = None
         self._session = b""  # of that RIB with its switch: another one means that it restarted or moved
         self._chosen_s = float("-inf")
-        self._owed_s: float | None = None  # since when it owes an answer
-        self._avoided: dict[Name, float] = {}  # RIBs that did not answer, until when
-        self._review_s = float("inf")  # when one of them may be asked again
-        self._asked: dict[Name, None] = {}  # RIBs whose answers are taken, the newest last
+        self._owed_s: float | None = None  # since when it owes a response
+        self._avoided: dict[Name, float] = {}  # RIBs that did not respond, until when
+        self._review_s = float("inf")  # when one of them may be used again
+        self._asked: dict[Name, None] = {}  # RIBs whose responses are accepted, the newest last
 
     def links_changed(self, now_s: float) -> None:
-        """Choose the RIB anew; a new one is told and asked everything."""
+        """Select the RIB again; a new one receives all advertisements and queries."""
         rib = self._nearest_rib(now_s)
         known = None if rib is None else self._paths.ribs().get(rib)
         session = b"" if known is None else known.session
@@ -115,7 +115,7 @@ class RibClient:
         return min(reached)[3] if reached else None
 
     def ask(self, now_s: float) -> None:
-        """Relay and ask what is due."""
+        """Send the relays and queries that are due."""
         self._channels.handle_timer(now_s)
         self._send(now_s)
         if self.rib is None:
@@ -133,7 +133,7 @@ class RibClient:
             self._to_rib(query.to_wire(self._identity.name, self._identity.key, self._identity.membership), now_s)
 
     def _leave_silent_rib(self, now_s: float) -> None:
-        """Ask another RIB; where there is none, serve what is known."""
+        """Switch to another RIB; where there is none, serve known locations."""
         assert self.rib is not None
         self._avoided = {rib: until_s for rib, until_s in self._avoided.items() if until_s > now_s}
         self._avoided[self.rib] = self._review_s = now_s + _AVOID_S
@@ -144,7 +144,7 @@ class RibClient:
             self.links_changed(now_s)
 
     def relay(self, statement: bytes, now_s: float) -> None:
-        """Pass an attached node's claim or withdrawal, or a revocation, on to the RIB."""
+        """Relay an attached node's advertisement or withdrawal, or a revocation, to the RIB."""
         self._to_rib(relayed(statement, self._identity, self._policy.transit), now_s)
 
     def _to_rib(self, statement: bytes, now_s: float) -> None:
@@ -165,25 +165,25 @@ class RibClient:
             self._unicast.send(frames, each.to, self._identity.name, now_s)
 
     def open(self, wire: bytes, sender: Name, now: Timestamps) -> Opened | None:
-        """Take what came for this switch; return the statement in it, if it is for more than the channel to a RIB.
+        """Handle a message for this switch; return its statement, if it is for more than the channel to a RIB.
 
         Raises:
-            RemoteError: it does not hold.
+            RemoteError: it is not valid.
         """
         opened = self._channels.receive(wire, sender, now)
         self._send(now.mono_s)
         return opened
 
     def receive(self, statement: Statement, now: Timestamps, *, is_fresh: bool) -> None:
-        """Take a RIB's answer, verdict or question, or what a node's former switch knows.
+        """Handle a RIB's response, AdvertiseAck or presence question, or the context of a node's former switch.
 
-        Whether a node is there any RIB of a trusted domain may ask: a tier above may know of another one.
+        Any RIB of a trusted domain may send a presence question: a tier above may know of another node.
 
         Args:
             is_fresh: it came in the channel to its signer.
 
         Raises:
-            StatementError: it does not hold, or is from nobody who was asked.
+            StatementError: it is not valid, or its sender received no query.
         """
         fields = statement.fields
         member = self._policy.verify_membership(fields.bytes_("c"), now.unix_s)
@@ -211,10 +211,10 @@ class RibClient:
             self._found(answer, statement.wire, now)
 
     def revocation_in(self, statement: Statement, now: Timestamps) -> tuple[Statement, Name]:
-        """Return the revocation, to be verified, that a RIB passed on, and the RIB.
+        """Return the revocation, to be verified, that a RIB forwarded, and the RIB.
 
         Raises:
-            StatementError: it is no RIB that was asked, or another statement.
+            StatementError: the sender is no RIB that received a query, or the statement is another one.
         """
         relay = Relay.from_fields(statement.expect(StatementType.RELAY))
         member = self._policy.verify_membership(relay.membership, now.unix_s)
@@ -229,10 +229,10 @@ class RibClient:
         statement.verify(member.key)
 
     def verify_answer(self, statement: Statement, now: Timestamps) -> Location:
-        """Return the place in an answer that was passed on; any RIB of a trusted domain may have given it.
+        """Return the location in a response that was forwarded; any RIB of a trusted domain may have issued it.
 
         Raises:
-            StatementError: it does not hold, or tells of no place.
+            StatementError: it is not valid, or contains no location.
         """
         fields = statement.expect(StatementType.ANSWER)
         member = self._policy.verify_membership(fields.bytes_("c"), now.unix_s)
@@ -259,7 +259,7 @@ class RibClient:
         try:
             place = self._evidence.from_answer(answer, now)
         except StatementError:
-            self._receive_negative(answer.name, now.mono_s)  # it is of no use here, and an answer all the same
+            self._receive_negative(answer.name, now.mono_s)  # it is of no use here, but still counts as a response
             raise
         self._locations.receive(place, wire, now.mono_s)
 
@@ -268,7 +268,7 @@ class RibClient:
         self._resolver.receive_negative(name, now_s, keep=now_s - self._chosen_s < _REFILL_S)
 
     def _take_context(self, statement: Statement, now: Timestamps) -> None:
-        """Take from a node's former switch whom the node hears; a RIB's word counts more."""
+        """Handle the names that a node reads, from the node's former switch; a RIB's information takes precedence."""
         if statement.type is StatementType.ADVERTISE_ACK:
             ack = AdvertiseAck.from_fields(statement.fields)
             self._relocations.acknowledged(ack.name, ack.advertiser, ack.sequence)
@@ -290,7 +290,7 @@ class RibClient:
                 self._unicast.forget(ack.name)
 
     def get_timer(self) -> float | None:
-        """Return the monotonic second of the next question, or of the moment to leave a silent RIB."""
+        """Return the monotonic second of the next query, or of the moment to leave a silent RIB."""
         owed_s = None if self._owed_s is None else self._owed_s + SILENT_S
         times = [
             self._attached.next_event(),

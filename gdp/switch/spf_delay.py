@@ -1,7 +1,7 @@
-"""When to compute paths after news of links: at once in quiet times, less often while news keep coming.
+"""SPF delay: when to compute paths after changes; at once in quiet times, less often while changes continue.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: RFC 8405, sections 5 and 6. The delays are shorter
-than its examples, for domains are small; what is lost at this switch's own ports waits for none of them::
+than its examples, for domains are small. Losses at this switch's own ports are handled without a delay::
 
     QUIET --news--> SHORT_WAIT --time to learn is over--> LONG_WAIT
       ^-- hold-down ----'    ^------- hold-down ----------' (to QUIET)
@@ -22,7 +22,7 @@ HOLD_DOWN_S: Final = 2.0
 
 
 class SpfState(Enum):
-    """How calm the network is."""
+    """State of the back-off."""
 
     QUIET = "quiet"
     SHORT_WAIT = "short-wait"
@@ -30,7 +30,7 @@ class SpfState(Enum):
 
 
 class SpfEvent(Enum):
-    """What moves the state."""
+    """Event that changes the state."""
 
     NEWS = "news"  # a link state that changes paths
     LEARNED = "learned"  # TIME_TO_LEARN_S after the first of them
@@ -53,10 +53,10 @@ _DELAYS_S: Final = {_S.QUIET: INITIAL_S, _S.SHORT_WAIT: SHORT_S, _S.LONG_WAIT: L
 
 
 class SpfDelay:
-    """The back-off of one switch.
+    """The SPF back-off of one switch.
 
     Attributes:
-        state: how calm it is.
+        state: of the back-off.
         due_s: monotonic second at which paths are to be computed, or None.
     """
 
@@ -67,7 +67,7 @@ class SpfDelay:
         self._held_down_s = float("inf")
 
     def news(self, now_s: float) -> None:
-        """Note that link states have changed paths."""
+        """Record that link states have changed paths."""
         self._settle(now_s)
         if self.state is SpfState.QUIET:
             self._learned_s = now_s + TIME_TO_LEARN_S
@@ -77,11 +77,11 @@ class SpfDelay:
         self.state = TRANSITIONS[self.state, SpfEvent.NEWS]
 
     def computed(self) -> None:
-        """Note that paths are as the link states say now."""
+        """Record that paths match the link states now."""
         self.due_s = None
 
     def _settle(self, now_s: float) -> None:
-        """Let the timers fire that were due since the last news; nothing else depends on them."""
+        """Run the timers that were due since the last change; nothing else depends on them."""
         if now_s >= self._learned_s:
             self.state, self._learned_s = TRANSITIONS[self.state, SpfEvent.LEARNED], float("inf")
         if now_s >= self._held_down_s:

@@ -1,21 +1,23 @@
-"""The forwarding table: where a frame goes, and until when that is known.
+"""Forwarding table: the hops of each destination, under leases.
 
-Place: pure; a data plane reads ``entries`` directly for every frame, the switch's machine alone writes.
-Source: docs/explanation/design.md, sections 6 and 7.
-A key is a destination (32 bytes) or destination and source (64 bytes, the order in
-which they stand in a frame), the longer one looked up first. A value is the tuple of hops that each get a copy; the
-empty tuple is a negative entry: known to lead nowhere. A hop may name an alternate, computed ahead (RFC 5286), which a
-data plane takes by itself while the first port is down.
+Sans-I/O; a data plane reads ``entries`` directly for every frame, and only the switch's core writes. Source:
+docs/explanation/design.md, sections 6 and 7.
 
-An entry may say from which sides its frames come (reverse path forwarding, RFC 5110, section 1.2): a mask of ports, for
-the trees of topics. A frame from another side is dropped, so that nobody below a publisher can speak in its name.
+A key is a destination (32 bytes), or destination and source (64 bytes, in the order of the frame); the longer one is
+looked up first. A value is the tuple of hops that each get a copy. The empty tuple is a negative entry: known to lead
+nowhere. A hop may have an alternate, computed ahead (RFC 5286), which a data plane uses by itself while the first port
+is down.
 
-Leases stand beside the entries, so that the hot dictionary holds nothing that forwarding does not need. A heap holds
-for every entry at least one item that is no later than the end of its lease; renewing a lease leaves the item alone,
-and it is put right when it comes to the top. So no operation looks at all entries, except a rebuild that as many
-changes have paid for.
+An entry may restrict the sides from which its frames come (reverse path forwarding, RFC 5110, section 1.2): a mask of
+ports, for the trees of topics. A frame from another side is dropped, so that no node downstream of a publisher can
+impersonate it.
 
-A data plane that keeps a copy elsewhere is told of every change before the call returns (``Observer``).
+Leases are stored apart from the entries, so that the hot dictionary holds only what forwarding needs. A heap holds for
+every entry at least one item that is no later than the end of its lease. Renewing a lease leaves the item unchanged; it
+is corrected when it reaches the top. So no operation visits all entries, except a rebuild that as many changes have
+paid for.
+
+A data plane with its own copy receives every change before the call returns (``Observer``).
 """
 
 from __future__ import annotations
@@ -56,18 +58,18 @@ SHARED_SIDE: Final = 63  # the bit of that port and all above
 _KEY_SIZES: Final = (NAME_BYTES, 2 * NAME_BYTES)
 _UNSEEN: Final[tuple[Hops, Hops | None]] = (NOWHERE, None)
 EXPIRE_MAX: Final = 4_096
-_SHARED_MAX: Final = 4_096  # hop tuples remembered for sharing; a switch has far fewer different ones
+_SHARED_MAX: Final = 4_096  # hop tuples that are cached for sharing; a switch has far fewer different ones
 _SLACK: Final = 1_024  # stale heap items that are not yet worth a rebuild
 
 
 class Observer(Protocol):
-    """Whoever keeps a copy of the entries. It may not change the table, and has nowhere to refuse to."""
+    """A holder of a copy of the entries. It must not change the table, and cannot refuse a change."""
 
     def put(self, items: Mapping[bytes, Hops]) -> None:
-        """Take entries that are new, or whose hops changed; a renewed lease alone is no news."""
+        """Add entries that are new, or whose hops changed; a renewed lease alone is no change."""
 
     def remove(self, keys: Sequence[bytes]) -> None:
-        """Take entries out."""
+        """Remove entries."""
 
 
 class Table:
@@ -97,13 +99,13 @@ class Table:
         return len(self.entries)
 
     def observe(self, observer: Observer | None) -> None:
-        """Tell one observer of all entries there are, and from now on of each change; None: nobody."""
+        """Send one observer all present entries, and from now on each change; None: no observer."""
         self._observer = observer
         if observer is not None and self.entries:
             observer.put(self.entries)
 
     def install(self, key: bytes, hops: Hops, expires_s: float, sides: int = EVERY_SIDE) -> bool:
-        """Put or replace an entry and its lease; False when the table is full and the key is new.
+        """Add or replace an entry and its lease; False when the table is full and the key is new.
 
         Args:
             key: 32 bytes (destination) or 64 (destination, source).
@@ -119,7 +121,7 @@ class Table:
         if known is None:
             if len(self.entries) >= self._max:
                 return False
-            key = bytes(key)  # a plain one: looked up faster than a subclass
+            key = bytes(key)  # plain bytes: looked up faster than a subclass
         hops = self._share(hops)
         is_news = self.entries.get(key) != hops or self.sides.get(key, EVERY_SIDE) != sides
         self.entries[key] = hops
@@ -137,15 +139,16 @@ class Table:
         return True
 
     def install_many(self, items: Iterable[tuple[bytes, Hops]], expires_s: float) -> int:
-        """Put or replace entries under one lease; return how many were taken: all, unless the table is full.
+        """Add or replace entries under one lease; return how many were taken: all, unless the table is full.
 
         Raises:
-            LocalError: as ``install``; the items before the wrong one are in.
+            LocalError: as ``install``; the items before the invalid one are stored.
         """
         entries, ends = self.entries, self._ends
         news: dict[bytes, Hops] = {}
         sooner: list[bytes] = []
-        seen: dict[int, tuple[Hops, Hops]] = {}  # by identity, which costs less than a hash; holding them keeps it true
+        # by identity, which costs less than a hash; the references keep the identities valid
+        seen: dict[int, tuple[Hops, Hops]] = {}
         taken = 0
         try:
             for key, hops in items:
@@ -177,7 +180,7 @@ class Table:
         return taken
 
     def remove(self, key: bytes) -> bool:
-        """Take an entry out; False when there was none."""
+        """Remove an entry; False when there was none."""
         if self.entries.pop(key, None) is None:
             return False
         del self._ends[key]
@@ -188,10 +191,10 @@ class Table:
         return True
 
     def expire(self, now_s: float) -> list[bytes]:
-        """Take out entries whose lease ended at or before ``now_s``, earliest first; return their keys.
+        """Remove entries whose lease ended at or before ``now_s``, earliest first; return their keys.
 
-        No more than ``EXPIRE_MAX`` go at once, so that a node is not busy with them for long; while more are due,
-        ``next_expiry`` says so.
+        At most ``EXPIRE_MAX`` are removed at once, so that a node is not busy with them for long; while more are due,
+        ``next_expiry`` returns a past time.
         """
         gone: list[bytes] = []
         while len(gone) < EXPIRE_MAX and self._settle() and self._heap[0][0] <= now_s:
@@ -209,7 +212,7 @@ class Table:
         return self._heap[0][0] if self._settle() else None
 
     def _settle(self) -> bool:
-        """Bring a true lease end to the top of the heap; False when there is none."""
+        """Move a valid lease end to the top of the heap; False when there is none."""
         heap, ends = self._heap, self._ends
         while heap:
             end, key = heap[0]
@@ -223,8 +226,8 @@ class Table:
         return False
 
     def _expect(self, keys: list[bytes], expires_s: float) -> None:
-        """Take in the end of one lease, and the entries that it is sooner for than what the heap says."""
-        if expires_s >= self._latest_s:  # none in the heap is later, so they may stand behind it
+        """Record the end of one lease, and the entries whose heap items it precedes."""
+        if expires_s >= self._latest_s:  # none in the heap is later, so they may be appended
             self._latest_s = expires_s
             self._heap += [(expires_s, key) for key in keys]
         else:
@@ -233,7 +236,7 @@ class Table:
         self._rebuild_if_stale()
 
     def _share(self, hops: Hops) -> Hops:
-        """Return the one remembered tuple that equals ``hops``."""
+        """Return the one cached tuple that equals ``hops``."""
         if len(self._shared) >= _SHARED_MAX:
             self._shared.clear()  # only sharing is lost
         return self._shared.setdefault(hops, hops)

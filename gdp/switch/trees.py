@@ -1,10 +1,10 @@
-"""Reverse-path trees: for each topic and publisher, who wants a copy below, and whom it is asked of above.
+"""Reverse-path trees: for each topic and publisher, the downstream branches and the upstream neighbour.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds). A branch is soft state: it stands for a lease and is
-renewed from below; a switch renews upwards for as long as a branch of its own stands.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). A branch is soft state: it stands for a lease and is renewed
+from downstream. A switch renews upstream for as long as a branch of its own stands.
 
-A *backup* branch was asked for by a switch that has the tree another way. It gets no copies while that way stands:
-in the forwarding table it is the alternate of the branch that it protects.
+A *backup* branch was requested by a switch that has the tree another way. It gets no copies while that path stands: in
+the forwarding table it is the alternate of the branch that it protects.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from gdp.switch.table import Hop, Hops, ProtectedHop, sides_of
 
 __all__ = ["Branch", "Tree", "Trees"]
 
-Downstream = tuple[int, bytes]  # port, MAC of the one below
+Downstream = tuple[int, bytes]  # port, MAC of the downstream neighbour
 _Key = tuple[Name, Name]  # topic and publisher
 _HEAP_SLACK: Final = 1_024
 
 
 @dataclass(slots=True, kw_only=True)
 class Branch:
-    """One neighbour below that wants a copy."""
+    """One downstream neighbour that wants a copy."""
 
     expires_s: float
-    mtu: int  # smallest on the way down, the link to that neighbour included
-    evidence: bytes  # the signed claim of a reader down there
-    said_mtu: int = FRAME_MAX_BYTES  # what the neighbour said of the way; a reader says nothing
+    mtu: int  # smallest on the path downstream, the link to that neighbour included
+    evidence: bytes  # the signed advertisement of a downstream reader
+    said_mtu: int = FRAME_MAX_BYTES  # the path MTU in the neighbour's join; a reader sends none
     sequence: int = 0  # of its last join
     session: bytes = b""  # of the neighbour that sent it, within which the sequence rises
-    backup_for: Name | None = None  # the switch that asked for a backup; None: an ordinary branch
+    backup_for: Name | None = None  # the switch that requested a backup; None: an ordinary branch
     active_until_s: float | None = None  # a backup whose protected branch was lost gets copies until then
 
     @property
@@ -43,13 +43,13 @@ class Branch:
         return self.backup_for is None or self.active_until_s is not None
 
     def fit(self, link_mtu: int) -> None:
-        """Take in what the link to the neighbour takes now."""
+        """Apply the link MTU to the neighbour."""
         self.mtu = min(self.said_mtu, link_mtu)
 
 
 @dataclass(slots=True, kw_only=True)
 class Tree:
-    """One topic from one publisher, as it passes this switch."""
+    """The tree of one topic and one publisher at this switch."""
 
     topic: Name
     publisher: Name
@@ -57,24 +57,22 @@ class Tree:
     domain: Name  # of that switch
     allowed: frozenset[Name]
     branches: dict[Downstream, Branch] = field(default_factory=dict)
-    above: Downstream | None = None  # whom the last join went to
+    above: Downstream | None = None  # the neighbour that received the last join
     above_name: Name | None = None
     renew_at_s: float = 0.0
-    asked_mtu: int = 0  # what the last join said
-    shown: bytes = b""  # the evidence that it carried
+    asked_mtu: int = 0  # MTU in the last join
+    shown: bytes = b""  # evidence in the last join
     version: int = 0  # sequence number of ``proof``
-    proof: bytes = b""  # the publisher's claim that ``switch`` was read from
-    joins: int = 0  # that the one above was sent since it was chosen
-    has_moved: bool = False  # the publisher has, since the one above was chosen
-    former: tuple[Downstream, Name] | None = (
-        None  # whom this tree took its messages from before, until ``former_until_s``
-    )
+    proof: bytes = b""  # the publisher's advertisement that ``switch`` was read from
+    joins: int = 0  # sent to the upstream neighbour since it was chosen
+    has_moved: bool = False  # the publisher has moved since the upstream neighbour was chosen
+    former: tuple[Downstream, Name] | None = None  # the former upstream neighbour, until ``former_until_s``
     former_until_s: float = 0.0
-    is_doubted: bool = False  # that proves nothing any more
-    asked_backup_for: Name | None = None  # what the last join said
-    backup: tuple[Downstream, Name] | None = None  # whom a backup branch was asked of
+    is_doubted: bool = False  # the evidence is invalid
+    asked_backup_for: Name | None = None  # backup owner in the last join
+    backup: tuple[Downstream, Name] | None = None  # the neighbour that received the request for a backup branch
     left: set[int] = field(default_factory=set)  # ports that copies may still come from, until the tree has settled
-    protection: dict[Downstream, Downstream] = field(default_factory=dict)  # branch to the backup that takes its place
+    protection: dict[Downstream, Downstream] = field(default_factory=dict)  # branch to the backup that replaces it
 
     @property
     def key(self) -> bytes:
@@ -83,26 +81,26 @@ class Tree:
 
     @property
     def mtu(self) -> int:
-        """Return the smallest MTU below here; a backup makes no messages smaller."""
+        """Return the smallest MTU downstream; a backup makes no messages smaller."""
         return min(branch.mtu for branch in self._wanted())
 
     @property
     def evidence(self) -> bytes:
-        """Return the claim of the reader whose branch stands longest."""
+        """Return the advertisement of the reader whose branch has the longest lease."""
         return max(self._wanted(), key=lambda branch: branch.expires_s).evidence
 
     @property
     def backup_for(self) -> Name | None:
-        """Return for which switch below this tree is only a backup; None: somebody wants copies."""
+        """Return for which downstream switch this tree is only a backup; None: a neighbour wants copies."""
         return max(self._wanted(), key=lambda branch: branch.expires_s).backup_for if self.is_backup else None
 
     @property
     def is_backup(self) -> bool:
-        """Return whether nobody below wants copies now."""
+        """Return whether no downstream neighbour wants copies now."""
         return not any(branch.is_active for branch in self.branches.values())
 
     def _wanted(self) -> list[Branch]:
-        """Return the branches that get copies; a tree of backups alone gives each what comes."""
+        """Return the branches that get copies; a tree of backups alone sends to each of them."""
         active = [branch for branch in self.branches.values() if branch.is_active]
         return active or list(self.branches.values())
 
@@ -112,16 +110,16 @@ class Tree:
 
     @property
     def sides(self) -> int:
-        """Return the ports that copies may come from: of whoever was asked for them, or was until a moment ago.
+        """Return the ports that copies may come from: of the present and the recent upstream neighbour.
 
-        Nobody was asked: the mask is empty.
+        Without either, the mask is empty.
         """
         asked = [self.above] if self.above is not None else []
         asked += [each[0] for each in (self.former, self.backup) if each is not None]
         return sides_of([*(port for port, _ in asked), *self.left])
 
     def next_s(self) -> float:
-        """Return when something is due: a renewal, the end of a lease, of an overlap, of a backup's turn."""
+        """Return when something is due: a renewal, or the end of a lease, an overlap or a backup's activity."""
         times = [self.renew_at_s]
         if self.former is not None:
             times.append(self.former_until_s)
@@ -133,13 +131,14 @@ class Tree:
 
     @property
     def is_wanted_below(self) -> bool:
-        """Return whether anybody but the one above wants a copy."""
+        """Return whether any neighbour except the upstream one wants a copy."""
         return any(at != self.above for at in self.branches)
 
     def hops(self, mac_of: dict[int, bytes]) -> Hops:
         """Return where copies go: one per active branch, in a stable order, with its backup as the alternate.
 
-        None goes back to the one above (split horizon): while links settle, two neighbours may each ask the other.
+        No copy goes back to the upstream neighbour (split horizon): while links settle, two neighbours may each join
+        the other.
         """
         only_backups = self.is_backup
         below = [
@@ -161,15 +160,15 @@ class Tree:
 class Trees:
     """All trees that pass one switch, and which is due next.
 
-    What is handed out may be changed by the caller. So its timers are read again before the next look at the time:
-    the cost is proportional to the trees that changed.
+    A caller may change the trees that it receives. So their timers are read again before the next check: the cost is
+    proportional to the trees that changed.
     """
 
     def __init__(self) -> None:
         self._by_topic: dict[Name, dict[Name, Tree]] = {}
         self._size = 0
         self._touched: dict[_Key, Tree] = {}
-        self._due_s: dict[_Key, float] = {}  # what the valid entry of the heap says
+        self._due_s: dict[_Key, float] = {}  # deadline of the valid heap entry
         self._heap: list[tuple[float, _Key]] = []
 
     def __len__(self) -> int:
@@ -200,7 +199,7 @@ class Trees:
         self._touched[tree.topic, tree.publisher] = tree
 
     def remove(self, tree: Tree) -> None:
-        """Take a tree away."""
+        """Remove a tree."""
         trees = self._by_topic.get(tree.topic, {})
         if trees.pop(tree.publisher, None) is not None:
             self._size -= 1
@@ -210,7 +209,7 @@ class Trees:
         self._due_s.pop((tree.topic, tree.publisher), None)
 
     def due(self, now_s: float) -> list[Tree]:
-        """Return the trees of which something is due; each is returned again while that is so."""
+        """Return the trees with a timer that is due; each is returned again while that is so."""
         self._schedule()
         due = []
         while self._heap and self._heap[0][0] <= now_s:

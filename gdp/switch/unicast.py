@@ -1,8 +1,8 @@
-"""Frames to one name: find its place, install the way, send on what was waiting.
+"""Unicast forwarding: resolve a name's location, install the path, release pending frames.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds).
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
-An entry is keyed by the destination alone where one domain is concerned, and by destination and source where the way
+An entry is keyed by the destination alone where one domain is concerned, and by destination and source where the path
 leaves it: then only domains that the policies of both ends trust may carry the frame.
 """
 
@@ -27,14 +27,14 @@ from gdp.switch.table import NOWHERE, Hop, ProtectedHop, Table
 __all__ = ["Unicast"]
 
 NODE_LEASE_S: Final = 30.0  # an entry for a switch or a RIB, which the link states renew
-STALE_S: Final = 5.0  # an entry for a place whose lease has ended, while no RIB answers
+STALE_S: Final = 5.0  # an entry for a location whose lease has ended, while no RIB responds
 NEGATIVE_S: Final = 0.5
-_REFRESH_AT_ONCE: Final = 4_096  # ways; about 50 ms
+_REFRESH_AT_ONCE: Final = 4_096  # paths; about 50 ms
 
 
 @dataclass(frozen=True, slots=True)
 class _Installed:
-    """Why an entry stands, to be looked at again when links change."""
+    """Why an entry stands, to be checked again when links change."""
 
     destination: Name
     source: Name
@@ -47,7 +47,7 @@ class _Installed:
 
 
 class Unicast:
-    """Resolves and installs the ways of frames to one name."""
+    """Resolves and installs the paths of frames to one name."""
 
     def __init__(
         self,
@@ -70,17 +70,17 @@ class Unicast:
         self._attached = attached
         self._outbox = outbox
         self._installed: dict[bytes, _Installed] = {}
-        self._stale = deque[bytes]()  # keys of ways to be computed anew
+        self._stale = deque[bytes]()  # keys of paths to compute again
         self._keys_of: dict[Name, set[bytes]] = {}  # of what is installed, by destination
         self.drops: Counter[DropReason] = Counter()
 
     def miss(self, header: Header, frame: bytes, neighbour: Neighbour, now_s: float) -> Name | None:
-        """Take a neighbour's frame that has no entry in the table; return the name whose place it waits for, if any."""
+        """Handle a neighbour's frame without a table entry; return the name whose location it waits for, if any."""
         destination, source = Name(header.destination), Name(header.source)
         return self._find(destination, source, frame, self._resolver.owner_of(neighbour), now_s)
 
     def send(self, frames: list[bytes], destination: Name, source: Name, now_s: float) -> None:
-        """Send frames of our own to a name, by the way that others' frames go."""
+        """Send frames of our own to a name, by the same path as forwarded frames."""
         if self._resolve(destination, source, b"", now_s) is None:
             hop = self._hop(destination, source)
             if hop is None:
@@ -89,40 +89,40 @@ class Unicast:
                 self._outbox.frames(hop[0], hop[1][:6], frames)
 
     def release(self, name: Name, now_s: float) -> None:
-        """Look again at what waited for a name."""
+        """Retry the frames that wait for a name."""
         for frame, until_s, owner in self._resolver.release_frames(name):
             source = Name(frame[SOURCE_AT:HEADER_BYTES])
             self._find(Name(frame[DESTINATION_AT:SOURCE_AT]), source, frame, owner, now_s, until_s)
 
     def refresh(self, now_s: float) -> None:
-        """Compute every installed way anew, for links have changed; ``refresh_more`` does the rest of very many."""
+        """Compute every installed path again after a link change; ``refresh_more`` does the rest of very many."""
         self._stale = deque(self._installed)
         self.refresh_more(now_s)
 
     def refresh_more(self, now_s: float) -> None:
-        """Go on with what ``refresh`` has begun, a slice at a time: a node must not be busy with it for long."""
+        """Continue ``refresh``, a slice at a time, so that a node is not busy with it for long."""
         for _ in range(min(len(self._stale), _REFRESH_AT_ONCE)):
             key = self._stale.popleft()
             why = self._installed.get(key)
             if why is None:
                 continue
-            if not why.is_negative:  # what led nowhere is looked for when the next frame comes
+            if not why.is_negative:  # a negative entry is resolved again when the next frame comes
                 self._resolve(why.destination, why.source, b"", now_s)
-            if self._installed.get(key) is why:  # it was not installed anew
+            if self._installed.get(key) is why:  # no other entry replaced it
                 self._uninstall(key)
 
     @property
     def is_refreshing(self) -> bool:
-        """Return whether ``refresh_more`` has something to do."""
+        """Return whether ``refresh_more`` has work left."""
         return bool(self._stale)
 
     def forget(self, name: Name) -> None:
-        """Take out the entries to a name whose place has changed, those too that say there is none."""
+        """Remove the entries to a name whose location has changed, negative ones included."""
         for key in list(self._keys_of.get(name, ())):
             self._uninstall(key)
 
     def expired(self, key: bytes) -> None:
-        """Learn that the table let an entry go."""
+        """Handle the expiry of a table entry."""
         self._let_go(key)
 
     def _let_go(self, key: bytes) -> _Installed | None:
@@ -135,7 +135,7 @@ class Unicast:
         return why
 
     def _uninstall(self, key: bytes) -> None:
-        """Take out an entry of ours, but not the tree that may have grown in a negative one's place."""
+        """Remove an entry of ours, but not a tree that may have replaced a negative one."""
         why = self._let_go(key)
         if why is not None and (not why.is_negative or self._table.entries.get(key) == NOWHERE):
             self._table.remove(key)
@@ -148,7 +148,7 @@ class Unicast:
     def _find(
         self, destination: Name, source: Name, frame: bytes, owner: bytes, now_s: float, until_s: float | None = None
     ) -> Name | None:
-        """Send a frame on, or have it wait for what is asked."""
+        """Forward a frame, or make it pending until its query is answered."""
         waits_for = self._resolve(destination, source, owner, now_s)
         if waits_for is None:
             self._forward(destination, source, frame)
@@ -176,17 +176,18 @@ class Unicast:
         return hops[0][:2] if hops else None
 
     def _resolve(self, destination: Name, source: Name, owner: bytes, now_s: float) -> Name | None:
-        """Install an entry, perhaps a negative one; or return the name whose place must be asked for first.
+        """Install an entry, perhaps a negative one; or return the name whose location must be queried first.
 
         Args:
-            owner: the neighbour at whose expense that is; empty: our own.
+            owner: the neighbour whose query rate applies; empty: our own.
         """
         at = self._attached.at(destination)
         if at is not None:
             self._install(destination, b"", self._outbox.hop_at(at.port, at.mac), source, at.expires_s)
             return None
         neighbour = self._outbox.neighbour(destination)
-        if neighbour is not None and neighbour.role is not Role.PROXY:  # a proxy is where its claim was taken
+        # a proxy is where its advertisement was accepted
+        if neighbour is not None and neighbour.role is not Role.PROXY:
             self._install(destination, b"", self._outbox.hop(neighbour), source, now_s + NODE_LEASE_S)
             return None
         if self._paths.is_switch(destination):
@@ -229,7 +230,7 @@ class Unicast:
         return None
 
     def _why(self, switch: Name, domain: Name) -> DropReason:
-        """Return the reason to give where there is no way to a switch."""
+        """Return the reason to report where there is no path to a switch."""
         return DropReason.THROUGH_LEAF if self._paths.leads_through_leaf(switch, domain) else DropReason.NO_ROUTE
 
     def _is_of_own_domain(self, source: Name, now_s: float) -> bool:
@@ -262,7 +263,7 @@ class Unicast:
 
     @staticmethod
     def _until_s(place: Location, now_s: float) -> float:
-        """Return how long an entry stands for a place; one that is served stale is looked at again soon."""
+        """Return how long an entry stands for a location; a stale one is checked again soon."""
         return max(place.expires_s, now_s + STALE_S)
 
     def _install_way(
@@ -275,7 +276,7 @@ class Unicast:
         now_s: float,
         otherwise: DropReason = DropReason.NO_ROUTE,
     ) -> None:
-        """Install a way; where there is none, a negative entry with the reason ``otherwise``."""
+        """Install a path; where there is none, a negative entry with the reason ``otherwise``."""
         neighbour = None if way is None else self._outbox.neighbour(way.first)
         if neighbour is None:
             self._install_nowhere(destination, source, otherwise, now_s)
@@ -289,12 +290,12 @@ class Unicast:
         key = destination + source_key
         negative = self._installed.get(destination + source)
         if negative is not None and negative.is_negative:
-            self._uninstall(destination + source)  # it would be found first
+            self._uninstall(destination + source)  # the longer key would match first
         if self._table.install(key, (hop,), expires_s):
             self._note(key, _Installed(destination, source))
 
     def _install_nowhere(self, destination: Name, source: Name, reason: DropReason, now_s: float) -> None:
-        """Have the data plane drop such frames for a moment, unless a tree stands there."""
+        """Make the data plane drop such frames briefly, unless a tree stands there."""
         key = destination + source
         if not self._table.entries.get(key) and self._table.install(key, NOWHERE, now_s + NEGATIVE_S):
             self._note(key, _Installed(destination, source, reason))

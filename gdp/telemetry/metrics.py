@@ -1,7 +1,7 @@
-"""A node's numbers as Prometheus text, on the loopback address only.
+"""Metrics of a node as Prometheus text, on the loopback address only.
 
-Place: I/O. Nodes count in plain attributes; this asks for them when somebody scrapes, so that a metric costs the hot
-path nothing. A node says which of its numbers there are; the names are the same for all.
+I/O. Nodes count in plain attributes, which a scrape reads, so a metric costs the hot path nothing. A node states which
+metrics it has; their names are the same for all nodes.
 Source: Prometheus text exposition format, version 0.0.4.
 """
 
@@ -26,7 +26,7 @@ _ANY: Final = "any"  # an entry for every source
 
 
 class Metrics(Collector):
-    """One node's metrics, in a registry of their own."""
+    """One node's metrics, in their own registry."""
 
     def __init__(self, sources: Sources) -> None:
         self._sources = sources
@@ -35,11 +35,11 @@ class Metrics(Collector):
         self._server: ScrapeServer | None = None
 
     def describe(self) -> list[Metric]:
-        """Return nothing, so that registering asks no source."""
+        """Return nothing, so that registration reads no source."""
         return []
 
     def collect(self) -> Iterator[Metric]:
-        """Ask every source."""
+        """Read every source."""
         of = self._sources
         yield from _counter("gdp_frames", "Frames by direction", "direction", of.frames)
         if of.drops:
@@ -70,14 +70,14 @@ class Metrics(Collector):
         return {reason.label: sum(counts[reason] for counts in lists) for reason in DropReason}
 
     def text(self) -> str:
-        """Return what a scrape would get."""
+        """Return the text of a scrape."""
         return generate_latest(self._registry).decode()
 
     def serve(self, port: int) -> int:
-        """Answer scrapes on 127.0.0.1, within the bounds of ``scraping``; return the port (0: the system chooses).
+        """Serve scrapes on 127.0.0.1, within the bounds of ``scraping``; return the port (0: the system chooses).
 
         Raises:
-            LocalError: it is served already, or the port is taken.
+            LocalError: it is served already, or the port is in use.
         """
         if self._server is not None:
             raise LocalError("metrics are served already")
@@ -88,7 +88,7 @@ class Metrics(Collector):
         return self._server.port
 
     def close(self) -> None:
-        """Stop answering, and return when the port is free again."""
+        """Stop serving, and return when the port is free again."""
         if self._server is None:
             return
         self._server.close()
@@ -98,13 +98,13 @@ class Metrics(Collector):
 def _counter(name: str, text: str, label: str, source: Counts | None) -> Iterator[Metric]:
     if source is not None:
         family = CounterMetricFamily(name, text, labels=[label])
-        for value, count in list(source().items()):  # at once: the node goes on counting
+        for value, count in list(source().items()):  # a copy, because the node continues to count
             family.add_metric([value], count)
         yield family
 
 
 def _entries(source: EntryCounts | None) -> Iterator[Metric]:
-    """Tell of entries by short names: a whole one would let whoever reads a graph ask for the topic."""
+    """Return entries under short names: a whole name would let every reader of a graph request the topic."""
     if source is None:
         return
     labels = ["destination", "source"]

@@ -1,9 +1,9 @@
-"""A small HTTP server for scrapes, on the loopback address, in one thread.
+"""HTTP server for scrapes, on the loopback address, in one thread.
 
-Place: I/O. Every local user may connect, so everything is bounded: connections at once, bytes of a request, seconds of
-a connection, and connections and answers per second. What is over a bound is closed at once. One thread serves all, so
-that neither threads nor descriptors of the node grow with the number of connections.
-Source: RFC 9112 (HTTP/1.1), sections 2 and 9.6: one answer, then the connection is closed.
+I/O. Every local user may connect, so everything is bounded: concurrent connections, bytes of a request, seconds of a
+connection, and connections and responses per second. A connection beyond a bound closes at once. One thread serves all,
+so neither threads nor descriptors of the node grow with the number of connections.
+Source: RFC 9112 (HTTP/1.1), sections 2 and 9.6: one response, then the connection closes.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ __all__ = ["CONNECTIONS_MAX", "CONNECTION_S", "REQUEST_MAX_BYTES", "ScrapeServer
 log = logging.getLogger(__name__)
 
 CONNECTIONS_MAX: Final = 4
-CONNECTION_S: Final = 5.0  # from its first byte to its end, however slowly the other side reads
+CONNECTION_S: Final = 5.0  # from its first byte to its end, even if the client reads slowly
 REQUEST_MAX_BYTES: Final = 8 * 1024
 _LOOPBACK: Final = "127.0.0.1"
 _BACKLOG: Final = 128
-_ACCEPTS_PER_S: Final = 500.0  # some 20 us each
-_ANSWERS_PER_S: Final = 20.0  # some ms each; a scraper asks every few seconds
+_ACCEPTS_PER_S: Final = 500.0  # about 20 us each
+_ANSWERS_PER_S: Final = 20.0  # a few ms each; a scraper polls every few seconds
 _TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 _END: Final = (b"\r\n\r\n", b"\n\n")
 
 
 class _Pace:
-    """A token bucket: ``per_s`` a second, and as many at once after a second of rest."""
+    """A token bucket: ``per_s`` tokens a second, and as many at once after a second of rest."""
 
     def __init__(self, per_s: float) -> None:
         self._per_s = per_s
@@ -42,7 +42,7 @@ class _Pace:
         self._seen_s = time.monotonic()
 
     def spend(self, now_s: float) -> bool:
-        """Return whether one more is within the pace, and count it then."""
+        """Return whether a token is left, and take it."""
         self._tokens = min(self._per_s, self._tokens + (now_s - self._seen_s) * self._per_s)
         self._seen_s = now_s
         if self._tokens < 1.0:
@@ -53,7 +53,7 @@ class _Pace:
 
 @dataclass(slots=True)
 class _Connection:
-    """One scrape under way; it ends at ``end_s`` at the latest."""
+    """One active scrape; it ends at ``end_s`` at the latest."""
 
     peer: socket.socket
     end_s: float
@@ -62,21 +62,21 @@ class _Connection:
 
 
 class ScrapeServer:
-    """Answers GET on any path with the present text.
+    """Server of GET on any path with the present text.
 
     Args:
         port: of 127.0.0.1; 0: the system chooses.
-        text: called in the server's thread, once for each answer.
+        text: called in the server's thread, once for each response.
 
     Raises:
-        OSError: the port is taken.
+        OSError: the port is in use.
     """
 
     def __init__(self, port: int, text: Callable[[], bytes]) -> None:
         self._text = text
         self._accepts, self._answers = _Pace(_ACCEPTS_PER_S), _Pace(_ANSWERS_PER_S)
         self._connections: dict[int, _Connection] = {}
-        self._resume_s: float | None = None  # when connections are accepted again
+        self._resume_s: float | None = None  # when the server accepts connections again
         self._is_closed = False
         self._listener = socket.create_server((_LOOPBACK, port), backlog=_BACKLOG)
         self._listener.setblocking(False)
@@ -89,7 +89,7 @@ class ScrapeServer:
 
     @property
     def port(self) -> int:
-        """Return the port that it listens on."""
+        """Return the port that the server listens on."""
         return int(self._listener.getsockname()[1])
 
     def close(self) -> None:
@@ -131,7 +131,7 @@ class ScrapeServer:
             peer, _ = self._listener.accept()
         except (BlockingIOError, ConnectionAbortedError):
             return
-        except OSError as error:  # no descriptors left, which this thread cannot mend
+        except OSError as error:  # no descriptors left, which this thread cannot repair
             log.warning("scrape not accepted reason=%s", error.strerror)
             self._pause(now_s)
             return
@@ -155,7 +155,7 @@ class ScrapeServer:
                 self._write(connection)
         except BlockingIOError:
             return
-        except OSError:  # the scraper has gone
+        except OSError:  # the scraper closed the connection
             self._end(connection)
 
     def _read(self, connection: _Connection) -> None:
@@ -183,7 +183,7 @@ class ScrapeServer:
             return _answer("503 Service Unavailable", b"")
         try:
             body = self._text()
-        except Exception:  # a source of the node failed; the node itself goes on
+        except Exception:  # a source of the node failed; the node itself continues
             log.exception("scrape failed")
             return _answer("500 Internal Server Error", b"")
         return _answer("200 OK", body, is_head=method == b"HEAD")

@@ -1,6 +1,6 @@
-"""What a node's metrics are made of: its numbers, and whom to ask for them.
+"""Sources of a node's metrics: its counts, and the functions that read them.
 
-Place: pure. Apart from the metrics themselves, because the library that writes these takes a tenth of a node's start.
+Sans-I/O. It is separate from the metrics, because their library takes a tenth of a node's start.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ LATENCY_BOUNDS_S: Final = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05
 
 
 class Histogram:
-    """How often which duration came.
+    """Histogram of durations.
 
     Attributes:
         bounds_s: upper ends of the buckets, ascending, each included.
-        counts: one a bucket, and one for what lies above them all.
+        counts: one per bucket, and one for the durations above all bounds.
         total_s: sum of all durations.
     """
 
@@ -32,6 +32,7 @@ class Histogram:
         self.total_s = 0.0
 
     def observe(self, duration_s: float) -> None:
+        """Count a duration in seconds."""
         self.counts[bisect_left(self.bounds_s, duration_s)] += 1
         self.total_s += duration_s
 
@@ -43,23 +44,23 @@ EntryCounts = Callable[[], Mapping[bytes, tuple[int, int]]]  # table key to fram
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sources:
-    """Whom to ask, on each scrape and from another thread, for what a node counts; None: it has no such number.
+    """Functions that return a node's counts, called in another thread on each scrape; None: there is no such count.
 
     Attributes:
         frames: by direction: in, out, forwarded, punted.
         drops: lists of counts by ``DropReason``, added up.
         table_entries: entries of the forwarding table.
         entries: frames and bytes forwarded by the busiest entries, by the table's key.
-        pending_frames: frames that wait for an answer.
-        rib_answers: a RIB's answers by what they said.
-        rib_refusals: a RIB's refusals by reason.
+        pending_frames: frames that wait for a name resolution.
+        rib_answers: a RIB's responses by result.
+        rib_refusals: a RIB's rejections by reason.
         messages: whole messages by direction.
         message_bytes: their bytes by direction, before sealing.
-        repairs: lost parts by what happened to them: asked, sent, given-up.
-        lost: messages that were lost on their way here, by reason.
-        unconfirmed: messages from here that some reader did not get, by reason.
-        faults: what a proxy could not carry, or not as it should be, by what was wrong.
-        calls: what several servers of one service bring with them: late and strange answers, hedged requests.
+        repairs: lost fragments by result: asked, sent, given-up.
+        lost: incoming messages that were lost, by reason.
+        unconfirmed: outgoing messages that some reader did not get, by reason.
+        faults: what a proxy could not carry, or not correctly, by fault.
+        calls: events of services with several servers: late and unexpected responses, hedged requests.
         waiting: 1 for each reason for which the node makes no progress, 0 for the others.
         clashes: signs of another node with this identity.
         latency: one-way, from the source's stamp to delivery.

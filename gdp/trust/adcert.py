@@ -1,9 +1,8 @@
-"""AdCert: an owner, or who has it from the owner, lets a node do something with a name.
+"""AdCert: an owner, or a delegate of the owner, permits a node to act on a name.
 
-Place: pure.
-Source: FogROS G, section on advertisements; docs/explanation/design.md, section 5.
-A chain leads from the owner's key to the node that acts:
-each link is signed by the key that the link before it names, may only narrow the rights, and needs its permission.
+Sans-I/O. Source: FogROS G, section on advertisements; docs/explanation/design.md, section 5. A chain leads from the
+owner's key to the acting node. Each link is signed by the key that the link before it names. A link may only narrow the
+rights, and needs the permission of the link before it.
 
 ::
 
@@ -36,12 +35,12 @@ class AdCert:
 
     Args:
         subject: the name that it is about.
-        issuer: who signed it: the name itself stands for its owner, else the node one link up.
-        delegate: the node that may.
+        issuer: its signer: the name itself stands for its owner, otherwise the node one link up.
+        delegate: the node that receives the rights.
         delegate_key: that node's key, 33 bytes.
-        rights: what it may.
-        validity: when it may.
-        may_delegate: whether it may pass them on.
+        rights: the rights of the node.
+        validity: when they are valid.
+        may_delegate: whether the node may delegate them further.
         fingerprint: SHA-256 of the signed part, for revocation.
     """
 
@@ -69,7 +68,7 @@ class AdCert:
 
         Args:
             key: the issuer's: the owner's key where ``issuer`` is the name itself.
-            issuer: the subject's own name, or the node that holds the link above.
+            issuer: the subject's own name, or the node that is valid the link above.
             subject: the name.
             delegate: the node.
             rights: of publish, serve, call and read.
@@ -92,7 +91,7 @@ class AdCert:
 
     @classmethod
     def from_statement(cls, statement: Statement) -> AdCert:
-        """Read a parsed statement; its signature is not looked at.
+        """Read a parsed statement; its signature is not checked.
 
         Raises:
             StatementError: MALFORMED or WRONG_NAME.
@@ -111,13 +110,13 @@ class AdCert:
 
 
 class AdCertCache:
-    """Remembers which AdCerts a key did sign, so that a refreshed claim costs no second look at them."""
+    """Cache of the AdCerts whose signatures were verified, so that a refreshed advertisement verifies none again."""
 
     def __init__(self, maximum: int) -> None:
         self._good: Lru[AdCert] = Lru(maximum)
 
     def verified(self, wire: bytes, issuer_key: bytes) -> AdCert:
-        """Return the AdCert if ``issuer_key`` (33 bytes) signed it. Time and rights are not looked at.
+        """Return the AdCert if ``issuer_key`` (33 bytes) signed it. Time and rights are not checked.
 
         Raises:
             StatementError: MALFORMED, WRONG_NAME or BAD_SIGNATURE.
@@ -134,7 +133,7 @@ class AdCertCache:
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """AdCerts from an owner to a node, each verified; empty where the node owns the name or nobody does."""
+    """AdCerts from an owner to a node, each verified; empty where the node owns the name or the name has no owner."""
 
     links: tuple[AdCert, ...]
 
@@ -173,9 +172,9 @@ class Chain:
         """Return if every link gives ``right`` at ``unix_s`` and none was revoked.
 
         Args:
-            right: what the node wants to do.
+            right: what the node intends to do.
             unix_s: wall clock.
-            revoked: what was taken back, by a link's issuer or by the owner; nothing if not given.
+            revoked: revocations by a link's issuer or by the owner; none if not given.
 
         Raises:
             StatementError: NOT_DELEGATED, EXPIRED or REVOKED.

@@ -1,14 +1,12 @@
-"""A claim: what a node says it does with a name, with all that proves that it may.
+"""Advertisement: a node's statement of what it does with a name, with all proofs that it may.
 
-Place: pure.
-Source: docs/explanation/design.md, section 5.
-The node signs it, its switch relays it to a RIB, RIBs relay it up the tiers and down in
-answers; each verifies it anew from the bytes and believes no relay.
+Sans-I/O. Source: docs/explanation/design.md, section 5. The node signs it, and its switch relays it to a RIB. RIBs
+relay it up the tiers, and down in responses. Each receiver verifies the bytes again and trusts no relay.
 
 ::
 
     owner's key ==AdCert(s)==> node ==RtCert==> switch
-    domain root ==membership=> node ==signs===> claim (name, right, sequence, incarnation, lease)
+    domain root ==membership=> node ==signs===> advertisement (name, right, sequence, incarnation, lease)
 """
 
 from __future__ import annotations
@@ -35,21 +33,21 @@ _MS = 1_000
 
 @dataclass(frozen=True, slots=True)
 class Advertisement:
-    """A verified claim; only ``AdvertisementVerifier`` makes one.
+    """A verified advertisement; only ``AdvertisementVerifier`` makes one.
 
     Args:
         subject: the name and what proves it.
         right: what the node does with it.
-        member: who the node is.
+        member: the membership of the node.
         chain: the delegations from the owner; empty links where the node owns the name.
         rtcert: which switch may attract the traffic.
-        sequence: a newer claim of the same node on the same name has a higher one.
+        sequence: a newer advertisement of the same node and name has a higher one.
         incarnation: of the node's present run; readers open nothing else (docs/explanation/design.md, section 4).
-        lease_s: how long it holds unless refreshed, within the bounds of ``limits``.
-        is_global: whether it climbs to the tier above.
-        wire: the bytes that were verified, to be relayed as they are.
+        lease_s: how long it is valid unless refreshed, within the bounds of ``limits``.
+        is_global: whether it is also advertised to the tier above.
+        wire: the bytes that were verified, to be relayed unchanged.
         previous: the switch that the node has come from, or ``ZERO``.
-        exchange: the node's X25519 key in this run, for notes to it; empty where it takes none.
+        exchange: the node's X25519 key in this run, for control messages to it; empty where it takes none.
     """
 
     subject: Subject
@@ -67,12 +65,12 @@ class Advertisement:
 
     @property
     def name(self) -> Name:
-        """Return the name that is claimed."""
+        """Return the advertised name."""
         return self.subject.name
 
     @property
     def node(self) -> Name:
-        """Return the name of the node that claims it."""
+        """Return the name of the node that advertises."""
         return self.member.name
 
     @property
@@ -87,26 +85,26 @@ class Advertisement:
 
     @property
     def valid_until_unix_s(self) -> int:
-        """Return when the first piece of evidence runs out; no lease should outlast it."""
+        """Return when the first piece of evidence expires; no lease should outlast it."""
         links = [link.validity.not_after_unix_s for link in self.chain.links]
         return min(self.member.not_after_unix_s, self.rtcert.validity.not_after_unix_s, *links)
 
     @property
     def issuers(self) -> frozenset[bytes]:
-        """Return the keys, 33 bytes each, that may revoke something of the evidence, the domain's root apart."""
+        """Return the keys, 33 bytes each, that may revoke part of the evidence, apart from the domain's root."""
         given = [key for link in self.chain.links for key in (link.subject.owner_key, link.delegate_key)]
         return frozenset((self.member.key.compressed, *given))
 
     @property
     def fingerprints(self) -> frozenset[bytes]:
-        """Return the fingerprints of all evidence: when one of them is revoked, ask the verifier to ``recheck``."""
+        """Return the fingerprints of all evidence: when one of them is revoked, call the verifier's ``recheck``."""
         links = [link.fingerprint for link in self.chain.links]
         return frozenset((self.member.fingerprint, self.rtcert.fingerprint, *links))
 
 
 @dataclass(frozen=True, slots=True)
 class UnverifiedAdvertisement:
-    """What stands in a claim, read but not believed."""
+    """The content of an advertisement, parsed but not verified."""
 
     subject: Subject
     right: Right
@@ -180,20 +178,20 @@ def sign_advertisement(
     previous: Name = ZERO,
     exchange: bytes = b"",
 ) -> bytes:
-    """Return a node's signed claim; costs about 50 us.
+    """Return a node's signed advertisement; costs about 50 us.
 
     Args:
         identity: the node.
         right: what it does with the name.
         subject: the name: a delegation's, or ``identity.subject`` for the node's own.
         rtcert: for the switch at which the node is attached; see ``RtCert.make``.
-        sequence: higher than that of any earlier claim on the name by this node.
+        sequence: higher than that of any earlier advertisement of the name by this node.
         incarnation: random at each start of the node, 64 bits.
         lease_s: within the bounds of ``limits``.
         is_global: whether other domains may find it.
         chain: the AdCerts of the delegation.
-        previous: the switch that the node was attached to a moment ago, to be told; ``ZERO``: it has not moved.
-        exchange: its X25519 key in this run, for notes to it; empty where it takes none.
+        previous: the node's former switch, which is to be notified; ``ZERO``: it has not moved.
+        exchange: its X25519 key in this run, for control messages to it; empty where it takes none.
 
     Raises:
         LocalError: a lease out of bounds, or more than one statement can carry.

@@ -1,10 +1,11 @@
-"""Audit trail of one node: what it accepted, refused and revoked, paced so that a flood is one line and a count.
+"""Audit trail of one node: what it accepted, refused and revoked, rate-limited so that a flood is one line and a count.
 
-Sans-I/O; time comes in with ``take``. Lines form a chain: each holds the SHA-256 of the line before it, so that a
-changed, removed or inserted line is found. Lines cut off at the end are noticed only with a later hash kept elsewhere.
+Sans-I/O; time comes in with ``poll_lines``. Lines form a chain: each holds the SHA-256 of the line before it, so that a
+changed, removed or inserted line is found. Lines cut off at the end are detected only with a later hash stored
+elsewhere.
 
-Single lines are written while the trail's allowance lasts, which grows by one line each ``_LINE_EACH_S``. What is above
-it is counted by kind (action, what, reason), and written each ``_COUNT_EACH_S`` in one line for each kind.
+Single lines are written within the trail's allowance, which grows by one line each ``_LINE_EACH_S``. Excess events are
+counted by kind (action, what, reason), and written each ``_COUNT_EACH_S`` in one line for each kind.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from gdp.errors import LocalError
 
 __all__ = ["BEGIN", "Action", "AuditLine", "AuditTrail"]
 
-BEGIN: Final = "0" * 64  # what the first line has in place of a hash
+BEGIN: Final = "0" * 64  # replaces the hash in the first line
 _LINES_MAX: Final = 200
 _LINE_EACH_S: Final = 10.0
 _COUNT_EACH_S: Final = 60.0
@@ -28,7 +29,7 @@ _OTHERS: Final = "others"
 
 
 class Action(str, Enum):
-    """What became of something."""
+    """Outcome of an event."""
 
     ACCEPTED = "accepted"
     REFUSED = "refused"
@@ -42,14 +43,13 @@ class AuditLine:
 
     Args:
         seq: 1, 2, ... without a gap.
-        at_unix_s: when it was noted, to half a second.
+        at_unix_s: when it was recorded, to half a second.
         action: of ``Action``.
-        what: what it was: neighbour, name, membership, delegation, enrolment, root, revocation,
-            statements.
-        who: the node or key that asked for it, 64 or 66 hex digits; empty: nobody who proved it.
+        what: the object: neighbour, name, membership, delegation, enrolment, root, revocation, statements.
+        who: the requesting node or key, 64 or 66 hex digits; empty: no identity was proven.
         about: the name that it is about, 64 hex digits, a fingerprint, or ``cluster/machine``; empty: none.
         reason: why it was refused, as ``DropReason.label``, or in a few words; empty: it was not.
-        count: how many there were; above 1 ``who`` and ``about`` are those of the last.
+        count: the number of events; above 1 ``who`` and ``about`` are those of the last.
         previous: SHA-256 of the line before, hex.
     """
 
@@ -68,7 +68,7 @@ class AuditLine:
         """Read a line, with or without its end.
 
         Raises:
-            LocalError: not a line as ``to_line`` writes it.
+            LocalError: not in the format of ``to_line``.
         """
         try:
             read = cls(**json.loads(line))
@@ -84,7 +84,7 @@ class AuditLine:
 
     @property
     def hash(self) -> str:
-        """Return what the next line holds."""
+        """Return the hash that the next line holds."""
         return hashlib.sha256(self.to_line()).hexdigest()
 
 
@@ -99,7 +99,7 @@ class _Event:
 
 
 class AuditTrail:
-    """Events that wait to be written; nothing is kept until somebody has called ``begin``."""
+    """Events that wait to be written; none is stored before the call of ``begin``."""
 
     def __init__(self) -> None:
         self._is_on = False
@@ -110,13 +110,13 @@ class AuditTrail:
         self._counted_s = 0.0
 
     def begin(self) -> None:
-        """Keep events from now on: somebody takes them."""
+        """Store events from now on: a writer polls them."""
         self._is_on = True
 
     def note(
         self, action: Action, what: str, *, who: str = "", about: str = "", reason: str = "", count: int = 1
     ) -> None:
-        """Note an event; costs about a microsecond.
+        """Record an event; costs about a microsecond.
 
         Args:
             action, what, who, about, reason, count: as in ``AuditLine``.
@@ -162,5 +162,5 @@ class AuditTrail:
         return lines
 
     def is_due(self, mono_s: float) -> bool:
-        """Return whether ``take`` would return a line."""
+        """Return whether ``poll_lines`` would return a line."""
         return bool(self._lines) or (bool(self._counts) and mono_s >= self._counted_s + _COUNT_EACH_S)

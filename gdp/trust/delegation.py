@@ -1,7 +1,7 @@
-"""A delegation: all that a node got from an owner for one name, in one file of its own.
+"""Delegation: all that a node received from an owner for one name, in one file.
 
-Place: pure; ``gdp/stores/files`` keeps it. It holds proofs and sealed secrets; only with the node's keys is it of use.
-The metadata may be added in plain, so that the node's operator sees what it is for: the file is private to the node.
+Sans-I/O; ``gdp/stores/files`` stores it. It holds proofs and sealed secrets, and is of use only with the node's keys.
+The metadata may be added in plain, so that the node's operator sees its purpose: the file is private to the node.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ _FORMAT: Final = "gdp-delegation-1"
 
 @dataclass(frozen=True, slots=True)
 class Delegation:
-    """What a node may do with a name, and the proofs.
+    """The rights of a node on a name, and their proofs.
 
     Args:
         subject: the name.
-        node: to whom it was given.
-        rights: what the node may.
+        node: the node that received it.
+        rights: the rights of the node.
         chain: AdCerts from the owner to the node, signed statements.
         grants: epoch to signed statement.
-        metadata: what the name means, if its giver added it; it is the name's own.
+        metadata: the meaning of the name, if the issuer added it; its hash belongs to the name.
     """
 
     subject: Subject
@@ -79,7 +79,7 @@ class Delegation:
 
     @classmethod
     def from_wire(cls, wire: bytes) -> Delegation:
-        """Read a file; signatures are not looked at, see ``verify``.
+        """Read a file; signatures are not checked, see ``verify``.
 
         Raises:
             StatementError: MALFORMED or WRONG_NAME.
@@ -101,7 +101,7 @@ class Delegation:
         )
 
     def verify(self, identity: Identity, unix_s: float) -> None:
-        """Return if the node may now do all that the file says. Revocations are for others to know.
+        """Return if the node now has all rights in the file. Revocations are checked elsewhere.
 
         Raises:
             StatementError: NOT_FOR_US, NOT_DELEGATED, EXPIRED, BAD_SIGNATURE, WRONG_NAME or MALFORMED.
@@ -118,7 +118,7 @@ class Delegation:
         """Return the topic's secrets by epoch.
 
         Raises:
-            StatementError: a grant does not hold, or is not for this node and name.
+            StatementError: a grant is not valid, or is not for this node and name.
             LocalError: a library without the KEM.
         """
         chain = Chain.walk(self.chain, self.subject, identity.subject, AdCertCache(CHAIN_MAX))

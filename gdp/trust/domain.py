@@ -1,9 +1,7 @@
-"""What this domain's policy says: which domains it trusts, and through which its traffic may pass.
+"""Trust policy of a domain: which domains it trusts, and through which its traffic may pass.
 
-Place: pure.
-Source: docs/explanation/design.md, section 5.
-Tiers are for finding names; trust is not inherited along them: a domain trusts the roots that
-its own operator put there, and no others.
+Sans-I/O. Source: docs/explanation/design.md, section 5. Tiers are for finding names; trust is not inherited along them.
+A domain trusts the roots that its own operator configured, and no others.
 """
 
 from __future__ import annotations
@@ -30,9 +28,9 @@ class Policy:
 
     Args:
         own: the root of the domain that this node belongs to.
-        trusted: roots of other domains whose members may claim, attach and carry here.
+        trusted: roots of other domains whose members may advertise, attach and carry traffic here.
         transit: domains through which this domain lets its traffic pass; all trusted ones if not given.
-        remembered: how many verified memberships to keep.
+        remembered: how many verified memberships to cache.
 
     Raises:
         LocalError: ``transit`` names a domain that is not trusted.
@@ -58,14 +56,14 @@ class Policy:
         self._members: Lru[Membership] = Lru(remembered)
 
     def trusts(self, domain: Name) -> bool:
-        """Return whether members of ``domain`` are believed here."""
+        """Return whether members of ``domain`` are trusted here."""
         return domain in self.roots
 
     def renew_roots(self, roots: Iterable[Root]) -> None:
-        """Take on newer roots of the domains that are trusted already, such as those with a successor.
+        """Replace roots of trusted domains by newer ones, such as those with a successor.
 
         Raises:
-            LocalError: a domain that is not trusted, or a root that does not descend from the one that is; nothing has
+            LocalError: a domain that is not trusted, or a root that does not descend from the trusted one; nothing has
                 changed then.
         """
         renewed = dict(self.roots)
@@ -81,7 +79,7 @@ class Policy:
         self._by_issuer = _by_issuer(renewed.values())
 
     def verify_membership(self, wire: bytes, unix_s: float) -> Membership:
-        """Return the membership if a trusted domain issued it and it holds now; costs 0.2 ms once, then 2 us.
+        """Return the membership if a trusted domain issued it and it is valid now; costs 0.2 ms once, then 2 us.
 
         Args:
             wire: X.509, DER.
@@ -99,7 +97,7 @@ class Policy:
         return member
 
     def check_member(self, member: Membership, unix_s: float) -> None:
-        """Return if a membership verified before holds still.
+        """Return if a membership verified before is still valid.
 
         Raises:
             StatementError: WRONG_DOMAIN, EXPIRED or REVOKED.
@@ -115,7 +113,7 @@ class Policy:
             raise StatementError(DropReason.REVOKED, "membership")
 
     def _predecessor(self, root: Root, member: Membership) -> Root:
-        """Return the root that issued a membership before ``root``; each one after it may take the membership back."""
+        """Return the root that issued a membership before ``root``; each later root may revoke the membership."""
         for each in reversed(root.lineage):
             if each.key.compressed == member.issuer_key:
                 return each
@@ -130,7 +128,7 @@ class Policy:
             if stranger.certificate.issuer_key_id in (b"", *(each.key_id for each in root.lineage))
         ]
         refusal = StatementError(DropReason.WRONG_DOMAIN, "a domain that is not trusted here")
-        for root in candidates:  # more than one only where labels are equal and a tool left the key id out
+        for root in candidates:  # more than one only where labels are equal and a tool omitted the key id
             try:
                 return stranger.verify(root, unix_s)
             except StatementError as error:

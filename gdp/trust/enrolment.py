@@ -1,21 +1,21 @@
-"""One-time enrolment: a machine with keys that it made itself asks for memberships and delegations.
+"""One-time enrolment: a machine with keys of its own requests memberships and delegations.
 
-Place: pure, but for the randomness that sealing draws.
-Source: HPKE (RFC 9180), HKDF (RFC 5869), HMAC (RFC 2104), AES-256-GCM (NIST SP 800-38D), PKCS #10 (RFC 2986).
-The machine knows a token of 32 random bytes and the responder's public key, both from its ticket. On the wire::
+Sans-I/O except for the randomness that sealing draws. Source: HPKE (RFC 9180), HKDF (RFC 5869), HMAC (RFC 2104),
+AES-256-GCM (NIST SP 800-38D), PKCS #10 (RFC 2986). The machine has a token of 32 random bytes and the responder's
+public key, both from its ticket. On the wire::
 
     request   "GDPE" || version (1) || length of the rest (3) || id (16) || HPKE (body) || tag (32)
-    answer    0, refused; or 1 || length of the rest (3) || AES-256-GCM (body)
+    response  0, refused; or 1 || length of the rest (3) || AES-256-GCM (body)
 
-    id        HKDF-SHA256(token, "gdp-enrol-id-1"): finds the ticket, and says nothing of the token
+    id        HKDF-SHA256(token, "gdp-enrol-id-1"): finds the ticket, and reveals nothing of the token
     tag       HMAC-SHA256(HKDF-SHA256(token, "gdp-enrol-tag-1"), all bytes before the tag)
     HPKE      to the responder's key, info "gdp-enrol-body-1" || id
-    answer    key HKDF-SHA256(answer secret || token, "gdp-enrol-answer-1" || SHA-256(request)), nonce 0
+    response  key HKDF-SHA256(answer secret || token, "gdp-enrol-answer-1" || SHA-256(request)), nonce 0
     proof     signature by a member's key over "gdp-enrol-proof-1" || id || SHA-256(PKCS #10) || KEM key
 
-The tag is verified before anything that costs more than a hash. The machine draws the answer secret for each request,
-so a key of an answer seals one answer only. Who has the token alone can ask, but neither read nor forge an answer to
-another; who has neither learns nothing.
+The tag is verified before any step that costs more than a hash. The machine draws the answer secret for each request,
+so a response key seals one response only. An attacker with the token alone can send requests, but can neither read nor
+forge the response to another request. An attacker with neither learns nothing.
 """
 
 from __future__ import annotations
@@ -84,15 +84,15 @@ ANSWER_HEAD_BYTES: Final = 1 + _LENGTH_BYTES
 _TAG_BYTES: Final = 32
 _SIGNATURE_BYTES: Final = 64
 _NONCE: Final = bytes(12)
-_DELEGATIONS_MAX: Final = 480  # of each of the members: all fit the items of one decode
+_DELEGATIONS_MAX: Final = 480  # of each of the members: all fit the item limit of one decode
 
 
 @dataclass(frozen=True, slots=True)
 class Seat:
-    """A member that a machine is to be: the launcher's plan, which no request changes.
+    """A planned member of a machine: the launcher's plan, which no request changes.
 
     Args:
-        folder: of its keys, below the machine's folder.
+        folder: with its keys, below the machine's folder.
     """
 
     folder: str
@@ -102,12 +102,12 @@ class Seat:
 
 @dataclass(frozen=True, slots=True)
 class Ticket:
-    """All that a machine is told about its enrolment.
+    """All that a machine receives about its enrolment.
 
     Args:
         addresses: of the responder, ``tcp:HOST:PORT`` or ``unix:PATH``, to be tried in this order.
         responder: the key that requests are sealed to.
-        token: valid once, for minutes; the launcher knows until when.
+        token: valid once, for minutes; the launcher stores its end.
     """
 
     addresses: tuple[str, ...]
@@ -116,7 +116,7 @@ class Ticket:
     seats: tuple[Seat, ...]
 
     def to_json(self) -> bytes:
-        """Return what ``from_json`` reads."""
+        """Return the JSON that ``from_json`` reads."""
         told = {
             "addresses": self.addresses,
             "responder": base64.b64encode(self.responder.wire).decode(),
@@ -130,7 +130,7 @@ class Ticket:
         """Read a ticket.
 
         Raises:
-            LocalError: it is none.
+            LocalError: not a ticket.
         """
         try:
             told = json.loads(data)
@@ -150,12 +150,12 @@ class Ticket:
 
 @dataclass(frozen=True, slots=True)
 class Application:
-    """What a machine sends of one member.
+    """A machine's application for one member.
 
     Args:
         request: PKCS #10, PEM or DER.
-        kem: to which secrets for it are sealed.
-        proof: that the member's key asks for this, with this token.
+        kem: the key to which secrets for it are sealed.
+        proof: that the member's key signs this, with this token.
     """
 
     request: bytes
@@ -163,7 +163,7 @@ class Application:
     proof: bytes
 
     def verify(self, key: PublicKey, identifier: bytes) -> None:
-        """Return if the key asks for this with the token of this id.
+        """Return if the key signed this with the token of this id.
 
         Raises:
             StatementError: BAD_SIGNATURE.
@@ -179,7 +179,7 @@ class Request:
     applications: tuple[Application, ...]
 
     def to_wire(self) -> bytes:
-        """Return what ``from_wire`` reads."""
+        """Return the bytes that ``from_wire`` reads."""
         asked = [{"request": each.request, "kem": each.kem.wire, "proof": each.proof} for each in self.applications]
         return encode({"answer": self.answer_secret, "members": asked})
 
@@ -204,7 +204,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Granted:
-    """What one member is given: its membership, and delegations as their files hold them."""
+    """What one member receives: its membership, and delegations as their files hold them."""
 
     member: bytes
     delegations: tuple[bytes, ...] = ()
@@ -212,24 +212,24 @@ class Granted:
 
 @dataclass(frozen=True, slots=True)
 class EnrolmentResponse:
-    """What a machine is given.
+    """What a machine receives.
 
     Args:
         root: the domain's, PEM.
-        granted: one a seat, in the order of the ticket.
+        granted: one for each seat, in the order of the ticket.
     """
 
     root: bytes
     granted: tuple[Granted, ...]
 
     def to_wire(self) -> bytes:
-        """Return what ``from_wire`` reads."""
+        """Return the bytes that ``from_wire`` reads."""
         members = [{"member": each.member, "delegations": list(each.delegations)} for each in self.granted]
         return encode({"root": self.root, "granted": members})
 
     @classmethod
     def from_wire(cls, wire: bytes) -> EnrolmentResponse:
-        """Read an answer.
+        """Read a response.
 
         Raises:
             StatementError: MALFORMED.
@@ -243,7 +243,7 @@ class EnrolmentResponse:
 
 
 def token_id(token: bytes) -> bytes:
-    """Return by what a ticket is found: ``ID_BYTES``."""
+    """Return the id that finds a ticket: ``ID_BYTES``."""
     return _derived(token, b"gdp-enrol-id-1", ID_BYTES)
 
 
@@ -253,13 +253,13 @@ def apply(token: bytes, key: SigningKey, request: bytes, kem: KemPublicKey) -> A
 
 
 def seal_request(ticket: Ticket, applications: Sequence[Application], answer_secret: bytes) -> bytes:
-    """Return what a machine sends.
+    """Return the request that a machine sends.
 
     Args:
         answer_secret: ``ANSWER_SECRET_BYTES``, drawn for this request.
 
     Raises:
-        StatementError: MALFORMED, the responder's key is none.
+        StatementError: MALFORMED, the responder's key is invalid.
         LocalError: it is too long, or the library has no such KEM.
     """
     identifier = token_id(ticket.token)
@@ -288,12 +288,12 @@ def request_head(data: bytes) -> tuple[bytes, int] | None:
 
 
 def has_tag(token: bytes, request: bytes) -> bool:
-    """Return whether whoever made the request knows the token; costs two hashes of it."""
+    """Return whether the sender of the request has the token; costs two hashes of it."""
     return hmac.compare_digest(_tag(token, request[:-_TAG_BYTES]), request[-_TAG_BYTES:])
 
 
 def open_request(key: KemPrivateKey, request: bytes) -> Request:
-    """Open a request whose tag holds.
+    """Open a request whose tag is valid.
 
     Raises:
         StatementError: BAD_TAG or MALFORMED.
@@ -304,7 +304,7 @@ def open_request(key: KemPrivateKey, request: bytes) -> Request:
 
 
 def seal_answer(token: bytes, request: bytes, answer_secret: bytes, answer: bytes) -> bytes:
-    """Return what the responder sends; of one request, always with the same answer.
+    """Return the responder's response; of one request, always with the same content.
 
     Raises:
         LocalError: it is too long.
@@ -316,7 +316,7 @@ def seal_answer(token: bytes, request: bytes, answer_secret: bytes, answer: byte
 
 
 def answer_bytes(head: bytes) -> int:
-    """Return how many bytes of an answer follow its head of ``ANSWER_HEAD_BYTES``.
+    """Return how many bytes of a response follow its head of ``ANSWER_HEAD_BYTES``.
 
     Raises:
         StatementError: MALFORMED, also a refusal.
@@ -328,7 +328,7 @@ def answer_bytes(head: bytes) -> int:
 
 
 def open_answer(token: bytes, request: bytes, answer_secret: bytes, sealed: bytes) -> EnrolmentResponse:
-    """Open what followed the head of an answer.
+    """Open the body of a response, without its head.
 
     Raises:
         StatementError: BAD_TAG, the responder did not make it, or MALFORMED.

@@ -1,7 +1,7 @@
-"""Holdings: which certificates what is held here rests on, and who issued them.
+"""Evidence index: which certificates stored state depends on, and which keys issued them.
 
-Sans-I/O. A revocation concerns a node that holds a certificate of its issuer, and changes only what carries the revoked
-fingerprint; both are found without a look at anything else.
+Sans-I/O. A revocation concerns a node that stores a certificate of its issuer, and changes only what carries the
+revoked fingerprint. Both are found without visiting anything else.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ class EvidenceIndex(Generic[_H]):
     """Holders by the fingerprints (32 bytes) of their evidence, and by the keys (33 bytes) that issued it."""
 
     def __init__(self) -> None:
-        self._holders: dict[bytes, list[_H] | dict[_H, None]] = {}  # a list of one where there is one
+        self._holders: dict[bytes, list[_H] | dict[_H, None]] = {}  # a list where there is only one
 
     def put(self, holder: _H, marks: Iterable[bytes]) -> None:
-        """Note what a holder rests on, fingerprints and keys; it must not be there."""
+        """Record what a holder depends on, fingerprints and keys; the holder must not be there."""
         for mark in marks:
             known = self._holders.get(mark)
             if known is None:
@@ -35,7 +35,7 @@ class EvidenceIndex(Generic[_H]):
                 known[holder] = None
 
     def remove(self, holder: _H, marks: Iterable[bytes]) -> None:
-        """Undo ``put`` of the same."""
+        """Remove a holder and its marks, the same as in ``put``."""
         for mark in marks:
             known = self._holders[mark]
             if isinstance(known, dict):
@@ -44,16 +44,16 @@ class EvidenceIndex(Generic[_H]):
                 del self._holders[mark]
 
     def resting_on(self, mark: bytes) -> list[_H]:
-        """Return who rests on a certificate, or on any that a key issued."""
+        """Return the holders that depend on a certificate, or on any that a key issued."""
         return list(self._holders.get(mark, ()))
 
     def has(self, mark: bytes) -> bool:
-        """Return whether anybody rests on a certificate, or on one that a key issued."""
+        """Return whether any holder depends on a certificate, or on one that a key issued."""
         return mark in self._holders
 
 
 class Holdings(Generic[_H]):
-    """An index of claims that are held in several places; what was let go is swept out now and then.
+    """Index of advertisements that are stored in several tables; removed ones are swept out periodically.
 
     Args:
         is_held: whether a holder is still there.
@@ -69,7 +69,7 @@ class Holdings(Generic[_H]):
         return len(self._of)
 
     def note(self, holder: _H, advertisement: Advertisement) -> None:
-        """Note the claim that a holder has now."""
+        """Record the present advertisement of a holder."""
         evidence = advertisement.fingerprints | advertisement.issuers
         before = self._of.get(holder)
         if before == evidence:
@@ -82,15 +82,15 @@ class Holdings(Generic[_H]):
         self._index.put(holder, evidence)
 
     def resting_on(self, fingerprint: bytes) -> list[_H]:
-        """Return the holders, still there, whose claim rests on a certificate."""
+        """Return the holders, still there, whose advertisement depends on a certificate."""
         return [holder for holder in self._index.resting_on(fingerprint) if self._is_held(holder)]
 
     def has_issuer(self, key: bytes) -> bool:
-        """Return whether a claim that is held, or was a while ago, rests on a certificate that this key issued."""
+        """Return whether a present or recently removed advertisement depends on a certificate that this key issued."""
         return self._index.has(key)
 
     def _sweep(self) -> None:
-        """Forget holders that are gone; each is looked at once in a while in which as many new ones came."""
+        """Remove holders that are gone; each is checked once per as many new holders as there are."""
         for holder in [each for each in self._of if not self._is_held(each)]:
             self._index.remove(holder, self._of.pop(holder))
         self._sweep_at = max(2 * len(self._of), _SWEEP_MIN)

@@ -1,8 +1,7 @@
-"""Grants: how the secret of a topic's epoch reaches a node, and only that node.
+"""Grant: the secret of a topic's epoch, sealed to one node.
 
-Place: pure, but for the randomness that sealing draws.
-Source: docs/explanation/design.md, section 4.
-HPKE (RFC 9180) to the node's key, signed by the owner. The owner keeps one master secret::
+Sans-I/O except for the randomness that sealing draws. Source: docs/explanation/design.md, section 4. HPKE (RFC 9180) to
+the node's key, signed by the owner. The owner stores one master secret::
 
     secret(name, epoch) = HKDF-SHA256(master, salt "", info "gdp-topic-secret-1" || name || epoch (2)), 32 bytes
     HPKE info           = "gdp-grant-1" || name || epoch (2) || the node's name
@@ -63,19 +62,19 @@ def topic_secret(owner_master: bytes, name: Name, epoch: int) -> bytes:
 def make_grant(
     key: SigningKey, owner_master: bytes, subject: Subject, epoch: int, node: Name, kem: KemPublicKey
 ) -> bytes:
-    """Return the signed statement that hands an epoch's secret to a node.
+    """Return the signed statement that grants an epoch's secret to a node.
 
     Args:
-        key: the owner's, or that of who may delegate the topic in its place.
+        key: the owner's, or that of a delegate that may delegate the topic in the owner's place.
         owner_master: the owner's.
         subject: the topic.
         epoch: 0 to ``EPOCH_MAX``.
-        node: whom it is for.
-        kem: that node's public key, from its card.
+        node: the recipient.
+        kem: that node's public key, from its node descriptor.
 
     Raises:
         LocalError: an epoch out of bounds, or a library without the KEM.
-        StatementError: MALFORMED, the node's public key is none.
+        StatementError: MALFORMED, the node's public key is invalid.
     """
     secret = topic_secret(owner_master, subject.name, epoch)
     body = {

@@ -1,6 +1,6 @@
-"""A bounded memory of what was found good, the least used forgotten first.
+"""LRU cache of verified statements, bounded in size.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ class Lru(Generic[_V]):
         self._maximum = maximum
 
     def get(self, key: bytes) -> _V | None:
-        """Return the value, now the last to be forgotten, or None."""
+        """Return the value, which is now the most recently used, or None."""
         value = self._items.get(key)
         if value is not None:
             self._items.move_to_end(key)
         return value
 
     def put(self, key: bytes, value: _V) -> None:
-        """Remember a value."""
+        """Store a value."""
         self._items[key] = value
         self._items.move_to_end(key)
         if len(self._items) > self._maximum:

@@ -1,7 +1,7 @@
-"""A node's card: what an owner needs to delegate to it, and nothing secret.
+"""Node descriptor: the public identity document that an owner needs to delegate to a node; it holds no secret.
 
-Place: pure. The card binds the key that receives secrets to the node's name. Whoever handed it over vouches that this
-is the node that the owner means; the name on it cannot be another's.
+Sans-I/O. The descriptor binds the key that receives secrets to the node's name. The person who supplies it vouches that
+this is the node that the owner means; the name in it cannot be another's.
 """
 
 from __future__ import annotations
@@ -21,23 +21,25 @@ __all__ = ["NodeDescriptor", "Recipient"]
 
 
 class Recipient(Protocol):
-    """Whom an owner delegates to: a node's name, and the key that secrets for it are sealed to."""
+    """Recipient of a delegation: a node's name, and the key that secrets for it are sealed to."""
 
     @property
-    def subject(self) -> Subject: ...
+    def subject(self) -> Subject:
+        """Return the node's name and what proves it."""
 
     @property
-    def kem(self) -> KemPublicKey: ...
+    def kem(self) -> KemPublicKey:
+        """Return the public key that secrets for the node are sealed to."""
 
 
 @dataclass(frozen=True, slots=True)
 class NodeDescriptor:
-    """A verified card.
+    """A verified node descriptor.
 
     Args:
         subject: the node's name and what proves it.
-        kem: what secrets for it are sealed to.
-        stranger: its certificate, whose issuer has not been asked for.
+        kem: the key that secrets for it are sealed to.
+        stranger: its certificate, whose issuer has not been verified.
         wire: the signed statement.
     """
 
@@ -53,7 +55,7 @@ class NodeDescriptor:
 
     @property
     def label(self) -> str:
-        """Return the node's name for people, as its domain wrote it."""
+        """Return the node's name for people, as in its certificate."""
         return self.stranger.label
 
     @staticmethod
@@ -64,7 +66,7 @@ class NodeDescriptor:
 
     @classmethod
     def from_wire(cls, wire: bytes) -> NodeDescriptor:
-        """Read a card and verify that the node itself made it.
+        """Read a node descriptor and verify that the node itself signed it.
 
         Raises:
             StatementError: MALFORMED, BAD_CERTIFICATE, WRONG_NAME or BAD_SIGNATURE.
@@ -79,7 +81,7 @@ class NodeDescriptor:
         return cls(stranger.subject, kem, stranger, wire)
 
     def member_of(self, root: Root, unix_s: float) -> Membership:
-        """Return the membership if ``root`` issued it and it holds now.
+        """Return the membership if ``root`` issued it and it is valid now.
 
         Raises:
             StatementError: WRONG_DOMAIN, BAD_CERTIFICATE or EXPIRED.

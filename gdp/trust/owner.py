@@ -1,6 +1,6 @@
-"""An owner: who may say what a name is for, and whom it serves.
+"""Owner of names: its key defines the names, and it delegates them to nodes.
 
-Place: pure, but for the randomness of signatures and seals. The owner's key and master secret never leave its machine:
+Sans-I/O except for the randomness of signatures and seals. The owner's key and master secret never leave its machine:
 nodes get delegations.
 """
 
@@ -33,15 +33,15 @@ _SUCCESSOR: Final = b"gdp-owner-successor-1"
 
 @dataclass(frozen=True, slots=True)
 class Owner:
-    """An owner's key, and the one secret from which those of all its topics come.
+    """An owner's key, and the one secret from which the secrets of all its topics are derived.
 
-    A name is made of its owner's key, so the key of a name never changes. What changes is who acts with it: the owner
-    may let a successor's key delegate its names, one link of a chain for each name.
+    A name contains its owner's key, so the key of a name never changes. Which node or key acts with it may change. The
+    owner may let a successor's key delegate its names, with one link of a chain for each name.
 
     Args:
-        key: owns names, or succeeded to those of the founder.
+        key: owns names, or is the successor for the founder's names.
         master: 32 random bytes.
-        founder: the key that the names are made of, where it is not ``key``.
+        founder: the key that the names contain, where it is not ``key``.
         successions: of a successor: by name, the links from the founder to ``key``.
 
     Raises:
@@ -59,12 +59,12 @@ class Owner:
 
     @property
     def public(self) -> PublicKey:
-        """Return the key that names are made of."""
+        """Return the key that the names contain."""
         return self.key.public if self.founder is None else self.founder
 
     @property
     def signer(self) -> Subject:
-        """Return as whom a successor signs."""
+        """Return the subject under which a successor signs."""
         return successor_subject(self.key.public)
 
     def subject(self, metadata: Metadata) -> Subject:
@@ -72,14 +72,14 @@ class Owner:
         return Subject.of(metadata, self.public.compressed)
 
     def succeed(self, successor: PublicKey, subject: Subject, validity: Validity) -> Delegation:
-        """Return what lets a successor's key delegate one name in this one's place.
+        """Return the delegation by which a successor's key may delegate one name in place of this key.
 
         Args:
             subject: the name.
-            validity: how long it may; whatever it delegates ends with it.
+            validity: how long it may; all its delegations end with it.
 
         Raises:
-            LocalError: another owner's name, or one that this key did not succeed to.
+            LocalError: another owner's name, or one for which this key is no successor.
         """
         chain, issuer = self._links(subject)
         to, rights = successor_subject(successor), frozenset(Right) - {Right.ATTACH}
@@ -87,7 +87,7 @@ class Owner:
         return Delegation(subject, to.name, rights, (*chain, link), MappingProxyType({}))
 
     def _links(self, subject: Subject) -> tuple[tuple[bytes, ...], Name]:
-        """Return the links from a name's key to this one, and as whom this one issues the next."""
+        """Return the links from a name's key to this one, and the issuer of the next link."""
         if subject.owner_key != self.public.compressed:
             raise LocalError("another owner's name")
         if self.founder is None:
@@ -109,19 +109,19 @@ class Owner:
         *,
         may_delegate: bool = False,
     ) -> Delegation:
-        """Return what lets a node act on a name.
+        """Return the delegation by which a node may act on a name.
 
         Args:
-            recipient: the node: its verified card, or what proved as much.
-            metadata: of the name; goes into the file in plain, for the node's operator.
+            recipient: the node: its verified node descriptor, or an equivalent proof.
+            metadata: of the name; the file holds it in plain, for the node's operator.
             rights: of publish, serve, call and read.
-            epochs: whose secrets the node gets.
+            epochs: the epochs whose secrets the node gets.
             validity: how long it may act; the secrets, once known, stay known.
-            may_delegate: whether the node may pass the rights on.
+            may_delegate: whether the node may delegate the rights further.
 
         Raises:
             LocalError: rights or epochs out of bounds, or a library without the KEM.
-            StatementError: MALFORMED, the recipient's key is none.
+            StatementError: MALFORMED, the recipient's key is invalid.
         """
         subject = self.subject(metadata)
         chain, issuer = self._links(subject)
@@ -136,7 +136,7 @@ class Owner:
         return Delegation(subject, to.name, frozenset(rights), (*chain, link), MappingProxyType(grants), metadata)
 
     def revoke(self, subject: Subject, fingerprint: bytes, until_unix_s: int) -> bytes:
-        """Return the statement that takes back an AdCert on one of this owner's names; a successor's: that it issued.
+        """Return the revocation of an AdCert on one of this owner's names; a successor may revoke what it issued.
 
         Raises:
             LocalError: another owner's name.
@@ -147,5 +147,5 @@ class Owner:
 
 
 def successor_subject(key: PublicKey) -> Subject:
-    """Return under which name a successor's key stands in a chain."""
+    """Return the name under which a successor's key stands in a chain."""
     return Subject(hashlib.sha256(_SUCCESSOR).digest(), key.compressed)

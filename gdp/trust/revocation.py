@@ -1,9 +1,9 @@
-"""Revocation: who issued a certificate says that it no longer counts.
+"""Revocation: the issuer of a certificate ends it early.
 
-Sans-I/O. A revocation names the SHA-256 of what was signed, not of the whole certificate: anybody can turn an ECDSA
-signature into a second valid one, and that must not bring a revoked certificate back. It counts only against what the
-same key issued (or against any link of a chain, when the name's owner says so), so a stranger can revoke nothing but
-his own. ``revocations.py`` keeps them.
+Sans-I/O. A revocation names the SHA-256 of the signed part, not of the whole certificate. Any observer can turn an
+ECDSA signature into a second valid one, and that must not restore a revoked certificate. It counts only against
+certificates of the same issuer (or against any link of a chain, when the name's owner signs it). So an outsider can
+revoke only its own certificates. ``revocations.py`` stores them.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ __all__ = ["Revocation"]
 
 @dataclass(frozen=True, slots=True)
 class Revocation:
-    """One certificate taken back.
+    """One revoked certificate.
 
     Args:
-        fingerprint: SHA-256 of what was signed: ``Membership.fingerprint``, ``AdCert.fingerprint``, ...
-        issuer: who takes it back: a domain, the name (for its owner) or the node that issued it.
-        until_unix_s: when the certificate would have run out.
+        fingerprint: SHA-256 of the signed part: ``Membership.fingerprint``, ``AdCert.fingerprint``, ...
+        issuer: the revoking issuer: a domain, the name (for its owner) or the node that issued it.
+        until_unix_s: when the certificate would have expired.
     """
 
     fingerprint: bytes
@@ -33,13 +33,13 @@ class Revocation:
 
     @staticmethod
     def make(key: SigningKey, issuer: Subject, fingerprint: bytes, until_unix_s: int) -> bytes:
-        """Return the signed statement; ``issuer`` must be of ``key``."""
+        """Return the signed statement; ``key`` must be the issuer's."""
         body = {**issuer.to_fields(), "cert": fingerprint, "until": until_unix_s}
         return sign(StatementType.REVOKE, body, issuer.name, key)
 
     @classmethod
     def read(cls, statement: Statement) -> Revocation:
-        """Read a parsed statement; its signature is not looked at, see ``verify``.
+        """Read a parsed statement; its signature is not checked, see ``verify``.
 
         Raises:
             StatementError: MALFORMED or WRONG_NAME.
@@ -52,13 +52,13 @@ class Revocation:
         """Return if the issuer signed the statement that this was read from.
 
         Raises:
-            StatementError: MALFORMED, the issuer's key is none, or BAD_SIGNATURE.
+            StatementError: MALFORMED, the issuer's key is invalid, or BAD_SIGNATURE.
         """
         statement.verify(PublicKey.from_compressed(self.issuer.owner_key))
 
     @classmethod
     def from_statement(cls, statement: Statement) -> Revocation:
-        """Read and verify a parsed statement; it carries what proves its signer.
+        """Read and verify a parsed statement; it carries its signer's proof.
 
         Raises:
             StatementError: MALFORMED, WRONG_NAME or BAD_SIGNATURE.

@@ -1,12 +1,12 @@
-"""Revocations that a node keeps: whose it takes, how many, and digests of them.
+"""Revocation store of a node: whose revocations it accepts, how many, and digests of them.
 
-Sans-I/O. Two kinds have room of their own. Those of *roots*, the trusted domains of the node's policy, are never given
-up for others, and neighbours compare them by digests. Those of *owners* (of names, or nodes that issued a certificate)
-are taken only while a certificate of that key is held here. Each giver, over whom they came, and each issuer has a
-rate and a share. Where a share or the whole is full, whoever holds most gives way to whoever holds less, so that one
-sender's junk takes the place of its own junk only.
+Sans-I/O. Two kinds have quotas of their own. Revocations by *roots*, the trusted domains of the node's policy, are
+never displaced by others, and neighbours compare them by digests. Revocations by *owners* (of names, or nodes that
+issued a certificate) are accepted only while a certificate of that key is stored here. Each origin, over which they
+came, and each issuer has a rate and a share. Where a share or the whole is full, the largest share gives way to a
+smaller one. So one sender's junk displaces only its own junk.
 
-A revocation is kept until the certificate would have run out by itself.
+A revocation is kept until the certificate would have expired by itself.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ __all__ = ["BUCKETS", "ID_BYTES", "OPERATOR", "Kept", "KeptKey", "Revocations", 
 
 BUCKETS: Final = 256  # of a root's revocations, by the first byte of the fingerprint
 ID_BYTES: Final = 8
-OPERATOR: Final = b""  # the giver of what this node's own operator hands in: without a rate, never given up
-_ROOTS_PER_S, _ROOTS_BURST = 1_500.0, 4_096.0  # of one giver; a verification costs about 80 us
-_OWNERS_PER_S, _OWNERS_BURST = 16.0, 512.0  # of one giver
+OPERATOR: Final = b""  # the origin of this node's own operator: without a rate, never displaced
+_ROOTS_PER_S, _ROOTS_BURST = 1_500.0, 4_096.0  # of one origin; a verification costs about 80 us
+_OWNERS_PER_S, _OWNERS_BURST = 16.0, 512.0  # of one origin
 _ISSUER_PER_S, _ISSUER_BURST = 4.0, 256.0  # of one owner
-_FORGED_COST: Final = 64.0  # tokens for a signature that does not hold
+_FORGED_COST: Final = 64.0  # tokens for an invalid signature
 _UNTIL_BYTES: Final = 8
 _SIGNATURE_BYTES: Final = 64
 
@@ -50,7 +50,7 @@ KeptKey = tuple[bytes, bytes]  # the issuer's key, the fingerprint
 
 
 class Kept(NamedTuple):
-    """One revocation as it is kept, for a file."""
+    """One stored revocation, for a file."""
 
     is_root: bool
     origin: bytes
@@ -60,7 +60,7 @@ class Kept(NamedTuple):
 
 @dataclass(slots=True)
 class _Root:
-    """What one root took back. A value: until when (8 bytes), and the signature, or the whole statement.
+    """The revocations of one root. A value: until when (8 bytes), and the signature, or the whole statement.
 
     Args:
         root: the hash of its key.
@@ -84,14 +84,14 @@ class _Owned:
 
 
 class Revocations:
-    """What has been taken back, as far as this node was told and it matters here.
+    """The revocations that this node has received and that concern it.
 
     Args:
         root_keys: the trusted domains' compressed keys, those of former roots too.
-        per_root, of_owners, per_issuer, per_giver: bounds, see ``limits``.
+        per_root, of_owners, per_issuer, per_origin: bounds, see ``limits``.
 
     Attributes:
-        changes: keys of what was added or dropped since they were last written down; None: nobody writes.
+        changes: keys that were added or dropped since they were last written down; None: there is no writer.
     """
 
     def __init__(
@@ -104,11 +104,11 @@ class Revocations:
         per_origin: int = REVOCATIONS_PER_ORIGIN,
     ) -> None:
         self._roots: dict[bytes, _Root] = {}
-        self._key_of: dict[Name, bytes] = {}  # by the hash by which neighbours speak of it
+        self._key_of: dict[Name, bytes] = {}  # by the hash by which neighbours identify it
         self.trust(root_keys)
         self._owners: dict[bytes, dict[bytes, _Owned]] = {}  # by the issuer's key and the fingerprint
         self._about: dict[Name, dict[KeptKey, None]] = {}  # of owners, by the name that signed
-        self._shares: dict[bytes, dict[bytes, int]] = {}  # how many of owners by giver and issuer's key
+        self._shares: dict[bytes, dict[bytes, int]] = {}  # number of owners' revocations by origin and issuer's key
         self._owned = 0
         self._per_root = per_root
         self._of_owners = of_owners
@@ -124,7 +124,7 @@ class Revocations:
         return self._owned + sum(root.count for root in self._roots.values())
 
     def trust(self, root_keys: Iterable[bytes]) -> None:
-        """Count these, too, as trusted domains' keys from now on; what is known stays."""
+        """Add trusted domains' keys; known revocations stay."""
         for key in root_keys:
             if key not in self._roots:
                 self._roots[key] = _Root(hash_of(key))
@@ -135,7 +135,7 @@ class Revocations:
         return issuer_key in self._roots
 
     def has(self, fingerprint: bytes, issuer_key: bytes) -> bool:
-        """Return whether the holder of ``issuer_key`` took this certificate back."""
+        """Return whether the holder of ``issuer_key`` revoked this certificate."""
         root = self._roots.get(issuer_key)
         if root is not None:
             return fingerprint in root.buckets[fingerprint[0]]
@@ -145,15 +145,15 @@ class Revocations:
     def receive_revocation(
         self, statement: Statement, origin: bytes, now: Timestamps, holds: Callable[[bytes], bool]
     ) -> Revocation | None:
-        """Take a parsed revocation; return it if it is news.
+        """Handle a parsed revocation; return it if it is news.
 
         Args:
-            giver: over whom it came, whose share it counts against: a node's name, or ``OPERATOR``.
-            holds: whether a certificate that a key (33 bytes) issued is held here.
+            origin: over which it came, and whose share it uses: a node's name, or ``OPERATOR``.
+            holds: whether a certificate that a key (33 bytes) issued is stored here.
 
         Raises:
-            StatementError: MALFORMED, WRONG_NAME, EXPIRED, BAD_SIGNATURE, UNCONCERNED (nothing of the issuer is held
-                here; the signature was not looked at) or QUOTA.
+            StatementError: MALFORMED, WRONG_NAME, EXPIRED, BAD_SIGNATURE, UNCONCERNED (nothing of the issuer is stored
+                here; the signature was not checked) or QUOTA.
         """
         revocation = Revocation.read(statement)
         self._check_end(revocation, now.unix_s)
@@ -179,13 +179,13 @@ class Revocations:
         return revocation
 
     def restore(self, statement: Statement, origin: bytes, now: Timestamps, *, of_root: bool) -> None:
-        """Take back what this node kept in an earlier life: verified, but without a rate.
+        """Restore what this node stored in an earlier incarnation: verified, but without a rate.
 
         Args:
-            of_root: it was kept as a trusted domain's, which the domain must be still.
+            of_root: it was stored as a trusted domain's, which the domain must still be.
 
         Raises:
-            StatementError: as ``take``.
+            StatementError: as ``receive_revocation``.
         """
         revocation = Revocation.read(statement)
         if of_root and not self.is_root(revocation.issuer.owner_key):
@@ -196,7 +196,7 @@ class Revocations:
             self._add(revocation, statement, origin, now.unix_s)
 
     def expire(self, unix_s: float) -> None:
-        """Forget what has run out."""
+        """Remove expired revocations."""
         if unix_s < self._next_end_s:
             return
         ended = [key for key in self.keys() if self._until(*key) + CLOCK_SKEW_S < unix_s]
@@ -206,14 +206,14 @@ class Revocations:
         self._next_end_s = min(ends, default=float("inf")) + CLOCK_SKEW_S
 
     def keys(self) -> Iterable[KeptKey]:
-        """Yield the key of everything that is kept, that of roots first."""
+        """Yield the key of every stored revocation, those of roots first."""
         for key, root in self._roots.items():
             yield from ((key, fingerprint) for bucket in root.buckets for fingerprint in bucket)
         for key, of_owner in self._owners.items():
             yield from ((key, fingerprint) for fingerprint in of_owner)
 
     def kept(self, key: KeptKey) -> Kept | None:
-        """Return what is kept under a key, or None."""
+        """Return the revocation stored under a key, or None."""
         issuer_key, fingerprint = key
         wire = self.wire(issuer_key, fingerprint)
         if wire is None:
@@ -224,7 +224,7 @@ class Revocations:
         return Kept(False, self._owners[issuer_key][fingerprint].origin, until_unix_s, wire)
 
     def wire(self, issuer_key: bytes, fingerprint: bytes) -> bytes | None:
-        """Return the signed statement by which a certificate was taken back, or None."""
+        """Return the signed statement that revoked a certificate, or None."""
         root = self._roots.get(issuer_key)
         if root is None:
             owned = self._owners.get(issuer_key, {}).get(fingerprint)
@@ -232,10 +232,10 @@ class Revocations:
         value = root.buckets[fingerprint[0]].get(fingerprint)
         return None if value is None else _unpacked(root, fingerprint, value)
 
-    # -- what owners took back, by name
+    # -- revocations by owners, by name
 
     def about(self, name: Name) -> list[bytes]:
-        """Return what the owner of a name, or the node of that name, took back in that name: signed statements."""
+        """Return the signed revocations by the owner of a name, or by the node of that name, in that name."""
         return [self._owners[key][fingerprint].wire for key, fingerprint in self._about.get(name, ())]
 
     def digest_about(self, name: Name) -> bytes:
@@ -244,10 +244,10 @@ class Revocations:
         ids = (_id(fingerprint, self._owners[key][fingerprint].until_unix_s) for key, fingerprint in entries)
         return reduce(xor, ids, 0).to_bytes(ID_BYTES, "big")
 
-    # -- what roots took back, for neighbours
+    # -- revocations by roots, for neighbours
 
     def summary(self) -> list[tuple[Name, int, bytes]]:
-        """Return for each root, by the hash of its key, how many it took back, and a digest."""
+        """Return for each root, by the hash of its key, its number of revocations, and a digest."""
         return [
             (root.root, root.count, reduce(xor, root.hashes).to_bytes(ID_BYTES, "big")) for root in self._roots.values()
         ]
@@ -264,7 +264,7 @@ class Revocations:
         return [_id(print_, _end_of(value)).to_bytes(ID_BYTES, "big") for print_, value in entries.items()]
 
     def lacking(self, of: Name, bucket: int, ids: frozenset[bytes]) -> list[KeptKey]:
-        """Return what of a root's bucket is not among these ids."""
+        """Return the keys of a root's bucket that are not among these ids."""
         root = self._root(of)
         if root is None:
             return []
@@ -279,7 +279,7 @@ class Revocations:
         key = self._key_of.get(of)
         return None if key is None else self._roots[key]
 
-    # -- room
+    # -- quotas
 
     @staticmethod
     def _check_end(revocation: Revocation, unix_s: float) -> None:
@@ -334,7 +334,7 @@ class Revocations:
         self._put_owned(issuer_key, fingerprint, owned)
 
     def _pin(self, issuer_key: bytes, fingerprint: bytes) -> None:
-        """Let the operator be the giver of what is kept: it never gives way."""
+        """Make the operator the origin of a stored revocation: it is never displaced."""
         owned = self._owners[issuer_key][fingerprint]
         if owned.origin != OPERATOR:
             self._remove(issuer_key, fingerprint)
@@ -348,10 +348,10 @@ class Revocations:
         self._owned += 1
 
     def _make_room(self, issuer_key: bytes, origin: bytes) -> None:
-        """See that one more of an owner fits.
+        """Make space for one more revocation of an owner.
 
         Raises:
-            StatementError: QUOTA: who would have to give way holds no more than this giver, or this owner.
+            StatementError: QUOTA: the share to displace is no larger than this origin's, or this owner's.
         """
         if len(self._owners.get(issuer_key, ())) >= self._per_issuer:
             raise StatementError(DropReason.QUOTA, "revocations of one owner")
@@ -368,7 +368,7 @@ class Revocations:
             raise StatementError(DropReason.QUOTA, "revocations of owners")
 
     def _give_way(self, origin: bytes, above: int) -> bool:
-        """Drop the oldest revocation of the owner that has most of a giver's share, if that is more than ``above``."""
+        """Drop the oldest revocation of the owner with most of an origin's share, if that is more than ``above``."""
         share = self._shares.get(origin, {})
         issuer_key = max(share, key=lambda key: share[key], default=None)
         if issuer_key is None or share[issuer_key] <= above:
@@ -402,7 +402,7 @@ class Revocations:
 
 
 def hash_of(root_key: bytes) -> Name:
-    """Return the hash by which neighbours speak of a root: a domain may have had several."""
+    """Return the hash by which neighbours identify a root: a domain may have had several."""
     return Name(sha256(root_key).digest())
 
 
@@ -416,7 +416,7 @@ def _end_of(value: bytes) -> int:
 
 
 def _packed(root: _Root, revocation: Revocation, statement: Statement) -> bytes:
-    """Return what is kept: a statement of the usual form can be put together again from little."""
+    """Return the stored form: a statement of the usual form can be rebuilt from few bytes."""
     until = revocation.until_unix_s.to_bytes(_UNTIL_BYTES, "big")
     short = until + statement.signature
     is_usual = _unpacked(root, revocation.fingerprint, short) == statement.wire

@@ -1,6 +1,6 @@
-"""What a node may do with a name.
+"""Rights of a node on a name.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ __all__ = ["DELEGABLE", "HEARS", "Right", "rights_from_fields", "rights_to_wire"
 
 
 class Right(str, Enum):
-    """One right. ``ATTACH`` is what a node has on its own name, and nobody can give it away."""
+    """One right. ``ATTACH`` is the right of a node on its own name, and cannot be delegated."""
 
     PUBLISH = "publish"
     SERVE = "serve"

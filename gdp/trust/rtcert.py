@@ -1,7 +1,6 @@
-"""RtCert: a node lets one switch attract traffic for it.
+"""RtCert: a node permits one switch to attract its traffic.
 
-Place: pure.
-Source: FogROS G, section on advertisements; docs/explanation/design.md, section 5.
+Sans-I/O. Source: FogROS G, section on advertisements; docs/explanation/design.md, section 5.
 """
 
 from __future__ import annotations
@@ -36,13 +35,13 @@ class RtCert:
 
 
 class RtCertCache:
-    """Remembers which RtCerts a node did sign: one serves all the claims that it makes through a switch."""
+    """Cache of verified RtCerts: one serves all advertisements of a node through a switch."""
 
     def __init__(self, maximum: int) -> None:
         self._good: Lru[RtCert] = Lru(maximum)
 
     def verified(self, wire: bytes, node: Name, node_key: PublicKey) -> RtCert:
-        """Return the RtCert if ``node``, whose key this is, signed it. Time is not looked at.
+        """Return the RtCert if ``node``, whose key this is, signed it. Time is not checked.
 
         Raises:
             StatementError: MALFORMED, NOT_DELEGATED (another node's) or BAD_SIGNATURE.

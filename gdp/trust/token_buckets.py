@@ -1,4 +1,4 @@
-"""Token buckets by key: how often something may happen on behalf of each sender.
+"""Token buckets by key: a rate limit for each sender.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: RFC 2697, the committed bucket alone.
 """
@@ -14,12 +14,12 @@ _KEYS_MAX: Final = 4_096
 
 
 class TokenBuckets:
-    """One bucket for each key; a key that is not known has a full one.
+    """One bucket for each key; an unknown key has a full one.
 
     Args:
         per_s: tokens that come back each second.
         burst: tokens of a full bucket.
-        maximum: buckets that are remembered; the one used longest ago is forgotten first.
+        maximum: buckets that are stored; the least recently used is removed first.
     """
 
     def __init__(self, per_s: float, burst: float, maximum: int = _KEYS_MAX) -> None:
@@ -37,7 +37,7 @@ class TokenBuckets:
         return min(tokens + max(now_s - at_s, 0.0) * self._per_s, self._burst)
 
     def spend(self, key: bytes, now_s: float, tokens: float = 1.0) -> bool:
-        """Take tokens of a key; False, and none taken, where there are fewer."""
+        """Take tokens of a key; False, and none taken, where it has fewer."""
         left = self.left(key, now_s)
         if left < tokens:
             return False

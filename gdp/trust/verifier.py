@@ -1,10 +1,9 @@
-"""Believing a claim: every proof that it carries, in the order that costs a stranger most and us least.
+"""Verification of advertisements: every proof, in the order that costs an attacker most and this node least.
 
-Place: pure; remembers what it verified, within bounds.
-Source: docs/explanation/design.md, section 5.
-First what is free (form, hash, lease), then who speaks (membership, signature), and only for
-a proved member the rest. A new claim costs two signature checks; a refreshed one costs one, since certificates seen
-before are remembered by digest. Time and revocation are asked every time.
+Sans-I/O; it caches what it verified, within bounds. Source: docs/explanation/design.md, section 5. Free checks come
+first (form, hash, lease), then the signer (membership, signature), and only for a proven member the rest. A new
+advertisement costs two signature checks. A refreshed one costs one, since known certificates are cached by digest. Time
+and revocation are checked every time.
 """
 
 from __future__ import annotations
@@ -31,13 +30,13 @@ _MS = 1_000
 
 
 class AdvertisementVerifier:
-    """Verifies claims under a policy.
+    """Verifies advertisements under a policy.
 
     Args:
-        policy: whom to trust; shared with whoever verifies memberships, so that a revocation reaches all.
-        allow_unowned: whether any member may claim a name without an owner.
-        adcerts_remembered: how many verified AdCerts to keep, about 1 kB each.
-        rtcerts_remembered: how many verified RtCerts to keep.
+        policy: the trusted domains; shared with every verifier of memberships, so that a revocation reaches all.
+        allow_unowned: whether any member may advertise a name without an owner.
+        adcerts_remembered: how many verified AdCerts to cache, about 1 kB each.
+        rtcerts_remembered: how many verified RtCerts to cache.
     """
 
     def __init__(
@@ -55,11 +54,11 @@ class AdvertisementVerifier:
 
     @property
     def revoked(self) -> Revocations:
-        """Return what has been taken back, as far as this node was told."""
+        """Return the revocations that this node has received."""
         return self.policy.revoked
 
     def verify(self, wire: bytes, unix_s: float) -> Advertisement:
-        """Return the claim if all of it holds now. Whether its sequence is news is for the RIB to say.
+        """Return the advertisement if all of it is valid now. The RIB decides whether its sequence is news.
 
         Args:
             wire: the signed statement.
@@ -71,7 +70,7 @@ class AdvertisementVerifier:
         return self.verify_statement(parse(wire), unix_s)
 
     def verify_statement(self, statement: Statement, unix_s: float) -> Advertisement:
-        """The same for a statement that was parsed already.
+        """Return the advertisement in a parsed statement if all of it is valid now.
 
         Raises:
             StatementError: with the reason.
@@ -104,7 +103,7 @@ class AdvertisementVerifier:
         return advertisement
 
     def recheck(self, advertisement: Advertisement, unix_s: float) -> None:
-        """Return if a claim verified before holds still; costs a few microseconds.
+        """Return if an advertisement verified before is still valid; costs a few microseconds.
 
         Raises:
             StatementError: EXPIRED, REVOKED or WRONG_DOMAIN.
@@ -125,7 +124,7 @@ class AdvertisementVerifier:
         return Chain(())
 
     def _check_evidence(self, advertisement: Advertisement, unix_s: float) -> None:
-        """Refuse what time or a revocation has taken away, the membership apart."""
+        """Reject evidence that has expired or is revoked, apart from the membership."""
         advertisement.rtcert.validity.check(unix_s, "RtCert")
         if self.revoked.has(advertisement.rtcert.fingerprint, advertisement.member.key.compressed):
             raise StatementError(DropReason.REVOKED, "RtCert")

@@ -1,4 +1,4 @@
-"""Between a live ROS graph and the overlay: which local things are global, and the flows that carry them.
+"""Bridge between a live ROS graph and the overlay: the flows, and the rules that select them.
 
-Place: shell; endpoints and the member do the I/O. ``wishes``, ``qos`` and ``rivals`` think.
+I/O through endpoints and the participant. ``desired_flows``, ``stream_qos`` and ``bridge_election`` are sans-I/O.
 """

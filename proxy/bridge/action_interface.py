@@ -1,6 +1,6 @@
-"""What a service or an action consists of in a ROS graph.
+"""Interface of a service or an action: the services and topics that it consists of in a ROS graph.
 
-Place: pure.
+Sans-I/O.
 Source: the ROS 2 design article on actions: an action is three services and two topics under ``<action>/_action/``.
 """
 
@@ -18,15 +18,16 @@ __all__ = ["CANCEL", "GOAL", "PROFILES", "RESULT", "ActionInterface", "action_of
 
 GOAL: Final = 0  # the parts of an action
 CANCEL: Final = 1
-RESULT: Final = 2  # answers when the goal has ended, however long that takes
-PROFILES: Final = (default(depth=100), default(latched=True, depth=1))  # of feedback and status, as rcl_action has them
+RESULT: Final = 2  # answers when the goal has ended, without a time limit
+# of feedback and status, as rcl_action sets them
+PROFILES: Final = (default(depth=100), default(latched=True, depth=1))
 _INFIX: Final = "/_action/"
 _SEND_GOAL: Final = "_SendGoal"
 
 
 @dataclass(frozen=True, slots=True)
 class ActionInterface:
-    """Local names and types of the services, then of the topics; their places are the part numbers."""
+    """Local names and types of the services, then of the topics; their indices are the part numbers."""
 
     services: tuple[tuple[str, str], ...]
     topics: tuple[tuple[str, str], ...] = ()
@@ -49,7 +50,7 @@ class ActionInterface:
         return cls(services, topics)
 
     def known(self, endpoint: Endpoint, encoding: Encoding) -> Exchange:
-        """Return how the endpoint's machine knows all parts.
+        """Return the descriptions of all parts, as the endpoint's machine has them.
 
         Raises:
             LocalError: it does not know one of them.
@@ -64,7 +65,7 @@ def is_part(name: str) -> bool:
 
 
 def action_of(end: GraphEntity) -> tuple[str, str] | None:
-    """Return name and type of the action that this end is the ``send_goal`` of, None for any other."""
+    """Return name and type of the action whose ``send_goal`` service this entity is; None for any other entity."""
     name, infix, part = end.name.partition(_INFIX)
     if not infix or part != "send_goal" or not end.type_name.endswith(_SEND_GOAL):
         return None

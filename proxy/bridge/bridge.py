@@ -1,10 +1,9 @@
-"""All flows of a proxy: begun, followed and ended as local nodes, rules and delegations come and go.
+"""Bridge: all flows of a proxy, which begin and end as local nodes, rules and delegations change.
 
-Place: shell; endpoints and the member do the I/O. The loop that drives it calls ``work`` after every step.
+I/O through endpoints and the participant. The loop that drives the bridge calls ``work`` after every step.
 
-A message's way out: endpoint -> ``EndpointDispatcher.deliver`` -> its flow -> ``Publisher.publish``. And in:
-``take_messages`` ->
-the flow of its name -> ``Endpoint.publish``, ``call`` or ``answer``.
+Outgoing path: endpoint -> ``EndpointDispatcher.deliver`` -> flow -> ``Publisher.publish``.
+Incoming path: ``poll_messages`` -> the flow of the name -> ``Endpoint.publish``, ``call`` or ``answer``.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ __all__ = ["Bridge", "BridgeRules"]
 log = logging.getLogger(__name__)
 
 _ENDED_MAX: Final = 256
-TICK_S: Final = 0.05  # how often services look whom they hear, and who may begin is looked at
+TICK_S: Final = 0.05  # interval at which services check their peers, and pending flows are checked
 
 Flow: TypeAlias = ExposedTopic | ImportedTopic | ExposedService | ImportedService
 
@@ -52,10 +51,10 @@ class BridgeRules(Protocol):
 
     @property
     def imports(self) -> Sequence[Rule]:
-        """Return the rules for what comes from elsewhere."""
+        """Return the rules for what comes from other machines."""
 
     def endpoint_of(self, rule: Rule) -> int:
-        """Return which of the bridge's endpoints a rule is about."""
+        """Return the number of the endpoint to which a rule applies."""
 
 
 class _Key(NamedTuple):
@@ -67,7 +66,7 @@ class _Key(NamedTuple):
 
 
 class _View:
-    """One look at a graph."""
+    """Snapshot of one graph."""
 
     def __init__(self, graph: Graph, me: str) -> None:
         self.graph = graph
@@ -78,26 +77,26 @@ class _View:
                 self._ends.setdefault((end.role, end.name, end.type_name), []).append(end)
 
     def ends(self, role: Role, flow_spec: FlowSpec) -> Sequence[GraphEntity]:
-        """Return what nodes other than proxies do with the wish's name."""
+        """Return the entities of this role, other than those of proxies, under the flow's local name."""
         return self._ends.get((role, flow_spec.local, flow_spec.type_name), ())
 
 
 class _Signboard:
-    """Owns the sign by which other proxies know this one."""
+    """Owner of the presence topic by which other proxies detect this one."""
 
     def handle_event(self, event: Event, now_s: float) -> None:
-        """Say what is wrong with it: without a sign two proxies of one graph may both carry a name for a moment."""
+        """Report a fault of the presence topic: without it two proxies may both carry a name for a moment."""
         del now_s
         if isinstance(event, EndpointError):
             log.warning("no sign for other proxies reason=%s", event.reason)
 
 
 class Bridge:
-    """Carries what the rules say between endpoints and the overlay.
+    """Carries the flows of the rules between endpoints and the overlay.
 
     Args:
-        endpoints: as the rules number them, in the order of the configuration's ``ros`` section.
-        look_s: seconds to look around before anything begins: what graphs take to show the other proxies in them.
+        endpoints: numbered as in the rules, in the order of the configuration's ``ros`` section.
+        look_s: seconds of observation before any flow begins: graphs need them to show the other proxies.
     """
 
     def __init__(
@@ -115,21 +114,21 @@ class Bridge:
         self._me = proxy_node_name(site.member.name.to_text())
         self._seats = [EndpointDispatcher(endpoint) for endpoint in endpoints]
         self._flows: dict[_Key, tuple[FlowSpec, Flow]] = {}
-        self._inbound: dict[Name, Flow] = {}  # who takes the overlay's messages of a name
+        self._inbound: dict[Name, Flow] = {}  # the flow that receives the overlay's messages of a name
         self._timed: list[ExposedService | ImportedService] = []
-        self._since: dict[_Key, float] = {}  # wished, and waiting for other proxies to begin
-        self._failed: dict[_Key, ConfigProblem] = {}  # could not begin in this graph as it is
+        self._since: dict[_Key, float] = {}  # desired flows that wait for other proxies to begin
+        self._failed: dict[_Key, ConfigProblem] = {}  # flows that this graph does not allow at present
         self._complaints: set[ConfigProblem] = set()
         self._ended = deque[TopicStats](maxlen=_ENDED_MAX)
         self._is_stale = True
         self._look_s = look_s
-        self._begun_s: float | None = None  # when the first look was
+        self._begun_s: float | None = None  # time of the first refresh
         self._tick_at_s = 0.0
         self._now_s = 0.0
         self.unknown_names = 0
         for seat in self._seats:
             if not seat.endpoint.is_live:
-                continue  # no other proxy looks into a recording
+                continue  # no other proxy takes part in a recording
             try:
                 seat.advertise(_Signboard(), sign(SIGN, seat.endpoint.ros))
             except LocalError as error:
@@ -137,17 +136,17 @@ class Bridge:
 
     @property
     def flows(self) -> list[tuple[FlowSpec, Flow]]:
-        """Return what is carried now."""
+        """Return the present flows."""
         return list(self._flows.values())
 
     @property
     def labels(self) -> list[str]:
-        """Return what people call the graphs."""
+        """Return the display names of the graphs."""
         return [seat.endpoint.label for seat in self._seats]
 
     @property
     def stats(self) -> list[TopicStats]:
-        """Return the figures of every topic that comes in, those that ended included."""
+        """Return the statistics of every incoming topic, including topics that ended."""
         imported = [flow for _, flow in self.flows if isinstance(flow, ImportedTopic)]
         for flow in imported:
             flow.count_losses()
@@ -155,11 +154,11 @@ class Bridge:
 
     @property
     def is_settled(self) -> bool:
-        """Return whether nothing waits to begin."""
+        """Return whether no flow waits to begin."""
         return not self._is_stale and not self._since
 
     def work(self, now_s: float) -> None:
-        """Take what endpoints and the overlay have, and do what is due."""
+        """Process events of endpoints and messages of the overlay, and run due timers."""
         self._now_s = now_s
         for seat in self._seats:
             if seat.deliver(now_s):
@@ -183,7 +182,7 @@ class Bridge:
             self._site.traffic.dropped = sum(seat.endpoint.dropped for seat in self._seats)
 
     def get_timer(self) -> float | None:
-        """Return the monotonic second at which there is something to do, or None."""
+        """Return the monotonic second of the next timer, or None."""
         if self._is_stale:
             return 0.0
         if not self._timed:
@@ -192,7 +191,7 @@ class Bridge:
         return min([self._tick_at_s, *(time for time in times if time is not None)])
 
     def reload(self, config: BridgeRules, held: DelegationStore) -> None:
-        """Take rules and delegations anew; flows whose rule is the same go on undisturbed while it is delegated."""
+        """Replace rules and delegations; flows with an unchanged rule continue undisturbed while they are delegated."""
         self._config, self._held = config, held
         for key, (flow_spec, flow) in list(self._flows.items()):
             topic = held.find(flow_spec.name, _right(flow_spec))
@@ -204,13 +203,13 @@ class Bridge:
         self._is_stale = True
 
     def drain(self, now_s: float) -> None:
-        """Let no client begin anything new with the servers here; what is under way is answered."""
+        """Refuse new requests of clients to the servers here; requests under way are answered."""
         for _, flow in self.flows:
             if isinstance(flow, ExposedService):
                 flow.drain(now_s)
 
     def is_drained(self, now_s: float) -> bool:
-        """Return whether every server here, after ``drain``, has answered everything."""
+        """Return whether every server here has answered everything since ``drain``."""
         return all(flow.is_drained(now_s) for _, flow in self.flows if isinstance(flow, ExposedService))
 
     def close(self) -> None:
@@ -221,12 +220,12 @@ class Bridge:
     def _receive(self, message: Message, now_s: float) -> None:
         flow = self._inbound.get(message.topic)
         if flow is None or isinstance(flow, ExposedTopic):
-            self.unknown_names += 1  # ended a moment ago
+            self.unknown_names += 1  # its flow ended a moment ago
             return
         flow.receive(message, now_s)
 
     def _refresh(self, now_s: float) -> None:
-        """Begin what is wished and not there, end what is there and not wished, tell the others who is there."""
+        """Begin desired flows, end flows that are no longer desired, and pass the graph to the others."""
         self._is_stale = False
         complaints = list[ConfigProblem]()
         wished = set[_Key]()
@@ -257,7 +256,7 @@ class Bridge:
         self._tell(complaints)
 
     def _is_our_turn(self, key: _Key, view: _View, now_s: float) -> bool:
-        """Return whether the proxies before us in this graph had time to show themselves, and to begin."""
+        """Return whether higher-ranked proxies of this graph had time to show themselves and to begin."""
         self._begun_s = now_s if self._begun_s is None else self._begun_s
         ours_s = self._since.setdefault(key, now_s) + view.conflicts.patience_s
         if now_s < max(ours_s, self._begun_s + self._look_s):
@@ -282,7 +281,7 @@ class Bridge:
         yield from imported(rules, graph, held, complaints)
 
     def _begin(self, key: _Key, flow_spec: FlowSpec, view: _View) -> None:
-        """Begin a flow, or note why it cannot be begun in this graph."""
+        """Begin a flow, or record why this graph does not allow it."""
         topic = self._held.find(flow_spec.name, _right(flow_spec))
         if topic is None:
             self._failed[key] = ConfigProblem(flow_spec.local, Fault.NO_DELEGATION, self._how_to_delegate(flow_spec))
@@ -328,7 +327,7 @@ class Bridge:
         )
 
     def _tell(self, complaints: Sequence[ConfigProblem]) -> None:
-        """Tell what is newly odd; what no longer is may be told again."""
+        """Report new configuration problems; a problem that ended may be reported again later."""
         now = set(complaints)
         for complaint in self._complaints - now:
             if complaint.fault is not Fault.UNKNOWN_TYPE and complaint.fault is not Fault.NO_DELEGATION:
@@ -339,7 +338,7 @@ class Bridge:
 
 
 def _shown_as(flow_spec: FlowSpec) -> str:
-    """Return the local name at which other proxies see that we carry this."""
+    """Return the local name at which other proxies see that this proxy carries the flow."""
     return presence_of(flow_spec.local) if flow_spec.is_exposed and flow_spec.rule.kind != "topic" else flow_spec.local
 
 

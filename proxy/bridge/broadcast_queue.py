@@ -1,6 +1,6 @@
-"""What is to be sent to far servers, and what of it waits for room on the stream that all of them hear.
+"""Broadcast queue: requests to all remote servers that wait for capacity of their common stream.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ Effect: TypeAlias = "DispatchEffect | ReplicaCommand"
 
 
 def wire_of(part: int, effect: Effect) -> bytes:
-    """Return what travels.
+    """Return the encoded form of an effect.
 
     Raises:
-        LocalError: it cannot.
+        LocalError: it cannot be encoded.
     """
     if isinstance(effect, Ask):
         return effect.request
@@ -31,7 +31,7 @@ def wire_of(part: int, effect: Effect) -> bytes:
 
 
 class BroadcastQueue:
-    """What waits, in its order; a request no longer than its call."""
+    """FIFO queue of effects; a request is removed when its call ends."""
 
     def __init__(self) -> None:
         self._waiting: OrderedDict[tuple[int, int], DispatchEffect] = OrderedDict()
@@ -40,18 +40,18 @@ class BroadcastQueue:
         return len(self._waiting)
 
     def add(self, part: int, effect: DispatchEffect) -> None:
-        """Let something wait; a call is asked, and is told to have ended, once."""
+        """Append an effect; each call is requested once, and its end is reported once."""
         self._waiting[part, effect.call if isinstance(effect, Ask) else ~effect.calls[0]] = effect
 
     def poll_effect(self) -> tuple[int, DispatchEffect]:
-        """Return, once, what is next, and about which part; there must be something."""
+        """Remove and return the next effect with its part number; the queue must not be empty."""
         (part, _), effect = self._waiting.popitem(last=False)
         return part, effect
 
     def end(self, part: int, call: int) -> None:
-        """Forget the request of a call that has ended."""
+        """Drop the request of a call that has ended."""
         self._waiting.pop((part, call), None)
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Drop everything."""
         self._waiting.clear()

@@ -1,6 +1,6 @@
-"""Cancellation of calls at one exposed service: what no client waits for any more is not worked on.
+"""Cancellation of calls at one exposed service, once no client waits for them any more.
 
-I/O: the local endpoint is called.
+I/O: it calls the local endpoint.
 """
 
 from __future__ import annotations
@@ -19,17 +19,18 @@ __all__ = ["TRIGGER", "Cancellation"]
 
 TRIGGER: Final = "std_srvs/srv/Trigger"
 
-_NO_FIELDS: Final = {1: b"", 2: b"\0\1\0\0\0"}  # a request of it; ROS 2 fills a message without fields with one byte
+# empty request of the stop service; ROS 2 fills a message without fields with one byte
+_NO_FIELDS: Final = {1: b"", 2: b"\0\1\0\0\0"}
 
 
 class Cancellation:
-    """Stops calls; an action's by cancelling the goal, a service's by calling the rule's ``stop``.
+    """Stops calls: of an action by cancelling the goal, of a service by calling the rule's ``stop``.
 
     Args:
         servers: handles of the local server, by part.
         stopper: handle of the rule's ``stop``; None: it has none.
-        is_concurrent: the local server works on several calls at once; else it finishes one before the next.
-        cancel_goal: asks the local server to cancel a goal, at a monotonic second.
+        is_concurrent: the local server processes several calls at once; else it finishes one before the next.
+        cancel_goal: sends the request that cancels a goal to the local server, at a monotonic second.
     """
 
     def __init__(
@@ -50,10 +51,10 @@ class Cancellation:
         self._stopper = stopper
         self._is_concurrent = is_concurrent
         self._cancel_goal = cancel_goal
-        self._stops = 0  # calls of the stopper; their numbers
+        self._stops = 0  # number of the last call of the stopper
 
     def handle_stop(self, client: Name, stop: Stop, now_s: float) -> None:
-        """Process that a client's calls have ended: what waits is dropped, what is worked on is stopped."""
+        """Process that a client's calls have ended: pending requests are dropped, running ones are stopped."""
         is_working = False
         for call in stop.calls:
             asked = Asked(client, stop.part, call)
@@ -68,7 +69,7 @@ class Cancellation:
             self._stop_work()
 
     def handle_client_gone(self, client: Name) -> None:
-        """Drop the calls of a client that left. Its goals go on: it may come back, and ask for their results."""
+        """Drop the calls of a client that left. Its goals continue: it may return and request their results."""
         is_working = False
         for number, part, asked, is_given in self._serving.gone(client):
             if asked is not None:
@@ -85,7 +86,7 @@ class Cancellation:
         self._stop_work()
 
     def _release(self, part: int, number: int) -> None:
-        """Await no more what the local server works on, unless the next one waits for that."""
+        """Forget a running call, unless the next call waits for its end."""
         if self._is_concurrent:
             self._endpoint.drop(self._servers[part], number)
 

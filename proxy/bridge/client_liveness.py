@@ -12,11 +12,11 @@ from gdp.names import Name
 
 __all__ = ["ClientLiveness"]
 
-_AWAY_S: Final = 30.0  # a client that is not heard for so long does not wait any more
+_AWAY_S: Final = 30.0  # a client that sends nothing for this long no longer waits
 
 
 class ClientLiveness:
-    """When each client was last heard."""
+    """Time of the last sign of life of each client."""
 
     def __init__(self) -> None:
         self._heard_s: dict[Name, float] = {}
@@ -28,8 +28,8 @@ class ClientLiveness:
 
         Args:
             clients: those whose calls are under way.
-            present: those that are heard now.
-            known: those that may be heard again.
+            present: those that are reachable now.
+            known: those that may become reachable again.
         """
         self._heard_s = {each: now_s if each in present else self._heard_s.get(each, now_s) for each in clients}
         return [

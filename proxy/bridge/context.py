@@ -1,6 +1,6 @@
-"""What every flow of a bridge works with.
+"""Bridge context: the objects that every flow of a bridge shares.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ __all__ = ["BridgeContext"]
 
 @dataclass(frozen=True, slots=True)
 class BridgeContext:
-    """One proxy: its hold on the overlay, what it has carried, and where its faults are told."""
+    """One proxy: its participant in the overlay, its counters, and its fault reports."""
 
     member: Participant
     traffic: Traffic
     faults: Faults
 
     def tell(self, what: str, event: EndpointError, fault: Fault) -> None:
-        """Tell what an endpoint says of a local name: ``fault``, unless it is the whole graph that cannot be had."""
+        """Report an endpoint's error about a local name as ``fault``, unless the whole graph is unavailable."""
         self.faults.report(what, Fault.NO_GRAPH if event.is_graph else fault, event.reason)

@@ -1,6 +1,6 @@
-"""What a proxy has carried, as its metrics show it.
+"""Counters of a proxy, as its metrics expose them.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ class Traffic:
     """Counts of one proxy.
 
     Attributes:
-        unread: messages that nobody was there to read.
+        unread: messages that had no reader.
         thinned: messages left out because their rule limits the rate.
-        dropped: messages that endpoints let go because somebody local did not keep up.
-        late: answers of servers that were not the first.
-        strange: answers of servers that were not asked.
+        dropped: messages that endpoints dropped because a local node did not keep up.
+        late: responses of servers that were not the first.
+        strange: responses of servers that had no request.
         hedged: second copies of requests.
-        latency: one-way, from the far proxy's stamp until handed over here.
+        latency: one-way, from the remote proxy's stamp until delivery to the endpoint here.
     """
 
     messages_out: int = 0
@@ -40,17 +40,17 @@ class Traffic:
     latency: Histogram = field(default_factory=Histogram)
 
     def sent(self, size: int) -> None:
-        """Count a message on its way out."""
+        """Count an outgoing message of this many bytes."""
         self.messages_out += 1
         self.bytes_out += size
 
     def received(self, size: int) -> None:
-        """Count a message that came in."""
+        """Count an incoming message of this many bytes."""
         self.messages_in += 1
         self.bytes_in += size
 
     def messages(self) -> Mapping[str, int]:
-        """Return the counts of messages by what became of them."""
+        """Return the counts of messages by outcome."""
         return {
             "in": self.messages_in,
             "out": self.messages_out,
@@ -60,7 +60,7 @@ class Traffic:
         }
 
     def calls(self) -> Mapping[str, int]:
-        """Return the counts of what several servers of one service bring with them."""
+        """Return the counts of calls that several servers of one service cause: late, unexpected, hedged."""
         return {"late": self.late, "strange": self.strange, "hedged": self.hedged}
 
     def message_bytes(self) -> Mapping[str, int]:

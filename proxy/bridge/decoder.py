@@ -1,6 +1,6 @@
-"""From a far side's body to a local message: decoded by its definition, converted into ours.
+"""Message decoder: from a remote body to a local message, by the remote definition, converted into the local one.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ __all__ = ["MessageDecoder"]
 
 
 class MessageDecoder:
-    """One kind of message, made ready.
+    """Decoder of one message type.
 
     Args:
-        source: as the far side describes it.
-        target: as it is here.
-        twin: converts; None where both sides have the same wire form.
+        source: description by the remote side.
+        target: description on this machine.
+        twin: converter; None where both sides have the same wire form.
     """
 
     __slots__ = ("_converter", "_serializer", "target")
@@ -35,14 +35,14 @@ class MessageDecoder:
 
     @classmethod
     def ready(cls, source: Channel, encoding: Encoding, known: Channel | None, ros: RosVersion) -> MessageDecoder:
-        """Return what turns ``source`` into something that this machine takes.
+        """Return the decoder that turns ``source`` into messages of this machine.
 
         Args:
-            known: how this machine knows the type; None where it does not.
-            ros: what is spoken here.
+            known: this machine's description of the type; None where it has none.
+            ros: ROS version of the local graph.
 
         Raises:
-            DefinitionError: the definitions differ, or there is no such type in this ROS.
+            DefinitionError: the definitions differ, or this ROS has no such type.
         """
         if source.ros != ros:
             target = translated_channel(source, ros) if known is None else known
@@ -59,7 +59,7 @@ class MessageDecoder:
         """Return the local message of a body.
 
         Raises:
-            RemoteError: it is not what its description says, or has no form here.
+            RemoteError: it does not fit its description, or has no local form.
         """
         raw = self._serializer.decode(body)
         return raw if self._converter is None else self._converter.convert(raw)

@@ -1,6 +1,6 @@
-"""Which local things are to cross, by the rules and by what is live.
+"""Desired flows: the local names that are to cross, from the rules and the live graph.
 
-Place: pure. What no rule names stays local. Concrete rules come before patterns; the first that matches holds.
+Sans-I/O. A name that no rule matches stays local. Concrete rules come before patterns; the first match applies.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _PLAIN: Final[tuple[Kind, ...]] = ("topic", "service")
 
 
 class FlowSpec(NamedTuple):
-    """One local name that is to cross, as which overlay name, by which rule."""
+    """One local name that is to cross, with its overlay name and its rule."""
 
     is_exposed: bool
     local: str
@@ -36,7 +36,7 @@ class FlowSpec(NamedTuple):
 
 
 class ConfigProblem(NamedTuple):
-    """Why something that a rule names cannot cross as it is."""
+    """Reason why something that a rule names cannot cross at present."""
 
     local: str
     fault: Fault
@@ -44,12 +44,12 @@ class ConfigProblem(NamedTuple):
 
 
 def exposed(rules: Sequence[Rule], graph: Graph, complaints: list[ConfigProblem]) -> Iterator[FlowSpec]:
-    """Yield what local nodes publish or serve, and a rule makes global; what is odd goes to ``complaints``."""
+    """Yield a flow for each local publisher or server that a rule exposes; problems are added to ``complaints``."""
     for (kind, local), types in _shown(graph, _SHOWS).items():
         first = choose(rules, kind, local)
         if first is None:
             continue
-        wanted: dict[int, tuple[str, Rule]] = {}  # of each rule the first type: topics of a recording may have several
+        wanted: dict[int, tuple[str, Rule]] = {}  # first type of each rule: topics of a recording may have several
         for type_name in sorted(types):
             rule = choose(rules, kind, local, type_name)
             if rule is not None:
@@ -66,7 +66,7 @@ def exposed(rules: Sequence[Rule], graph: Graph, complaints: list[ConfigProblem]
 def imported(
     rules: Sequence[Rule], graph: Graph, held: Iterable[tuple[Metadata, Name]], complaints: list[ConfigProblem]
 ) -> Iterator[FlowSpec]:
-    """Yield what is to be had from elsewhere: by concrete rules, by delegations held, by what local nodes ask for."""
+    """Yield a flow for each name to import: by concrete rules, by held delegations, by requests of local nodes."""
     seen: set[Name] = set()
     wanted = _shown(graph, _WANTS)
     had: dict[tuple[Kind, str], set[str]] = {}
@@ -100,7 +100,7 @@ def _imported(
 
 
 def _shown(graph: Graph, roles: Mapping[Kind, Role]) -> dict[tuple[Kind, str], set[str]]:
-    """Return the types of what nodes other than proxies show, by kind and local name."""
+    """Return the types that nodes other than proxies show, by kind and local name."""
     shown: dict[tuple[Kind, str], set[str]] = {}
     for end in sorted((end for end in graph if not end.is_proxy and end.type_name), key=lambda end: end.name):
         for kind, name, type_name in _things(end, roles):

@@ -1,6 +1,6 @@
-"""One endpoint at work in a bridge: who owns each of its handles.
+"""Endpoint dispatcher: delivers events of one endpoint to the owners of its handles.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ __all__ = ["EndpointDispatcher", "EventHandler"]
 
 
 class EventHandler(Protocol):
-    """Who is told what happens at a handle."""
+    """Receiver of the events of a handle."""
 
     def handle_event(self, event: Event, now_s: float) -> None:
-        """Take an event of one of its handles."""
+        """Process an event of one of its handles."""
 
 
 class EndpointDispatcher:
-    """An endpoint with the owners of its handles."""
+    """Endpoint with the owners of its handles."""
 
     def __init__(self, endpoint: Endpoint) -> None:
         self.endpoint = endpoint
@@ -30,7 +30,7 @@ class EndpointDispatcher:
         self._faulted: list[EndpointError] = []
 
     def deliver(self, now_s: float) -> bool:
-        """Hand out what happened, but for faults; return whether the graph changed."""
+        """Deliver all events except faults; return whether the graph changed."""
         is_changed = False
         for event in self.endpoint.poll_events():
             if isinstance(event, GraphChanged):
@@ -42,30 +42,30 @@ class EndpointDispatcher:
         return is_changed
 
     def deliver_faults(self, now_s: float) -> None:
-        """Hand out faults, once the graph in which they arose was seen: what gave way to another is nobody's now."""
+        """Deliver faults after the graph in which they arose was processed; handles that gave way have no owner."""
         faulted, self._faulted = self._faulted, []
         for event in faulted:
             if (owner := self._owners.get(event.handle)) is not None:
                 owner.handle_event(event, now_s)
 
     def subscribe(self, owner: EventHandler, topic: str, type_name: str, qos: Qos | None) -> int:
-        """Hear a topic; as ``Endpoint.subscribe``."""
+        """Subscribe to a topic, as ``Endpoint.subscribe``."""
         return self._own(self.endpoint.subscribe(topic, type_name, qos), owner)
 
     def advertise(self, owner: EventHandler, channel: Channel) -> int:
-        """Be a publisher; as ``Endpoint.advertise``."""
+        """Create a publisher, as ``Endpoint.advertise``."""
         return self._own(self.endpoint.advertise(channel), owner)
 
     def serve(self, owner: EventHandler, service: Service) -> int:
-        """Be a server; as ``Endpoint.serve``."""
+        """Create a server, as ``Endpoint.serve``."""
         return self._own(self.endpoint.serve(service), owner)
 
     def create_client(self, owner: EventHandler, name: str, type_name: str) -> int:
-        """Be a client; as ``Endpoint.dial``."""
+        """Create a client, as ``Endpoint.create_client``."""
         return self._own(self.endpoint.create_client(name, type_name), owner)
 
     def close(self, handle: int) -> None:
-        """End what a handle stands for."""
+        """Close a handle."""
         if self._owners.pop(handle, None) is not None:
             self.endpoint.close(handle)
 

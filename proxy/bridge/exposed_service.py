@@ -1,11 +1,14 @@
 """Local server exposed to remote clients: their requests are called here, and each gets its response.
 
-I/O: endpoint and member; ``gdp/service/serving.py`` keeps order. A service and an action differ in their parts.
+I/O: endpoint and participant; ``gdp/service/serving.py`` keeps order. A service and an action differ in their parts.
 
-It joins ``remote_clients.py`` (what requests mean), ``undescribed_requests.py`` (requests that wait for their
-description),
-``response_sender.py`` (what clients get), ``cancellation.py`` (what is stopped), ``client_liveness.py`` (who is there)
-and ``ordered_server.py`` (a server that keeps state).
+It combines these modules:
+- ``remote_clients.py``: decodes requests.
+- ``undescribed_requests.py``: holds requests that wait for their description.
+- ``response_sender.py``: sends responses to clients.
+- ``cancellation.py``: stops calls.
+- ``client_liveness.py``: detects clients that left.
+- ``ordered_server.py``: drives a server that keeps state.
 """
 
 from __future__ import annotations
@@ -50,13 +53,14 @@ from proxy.wire.service import Answer, Request, Stop
 
 __all__ = ["ExposedService"]
 
-_GRACE_S: Final = 0.5  # it is the client's side that ends a call; here it is only forgotten
+_GRACE_S: Final = 0.5  # the client's side ends a call; this side only forgets it
 _CANCEL_S: Final = 5.0
-_NOTICE_S: Final = 1.0  # a server that leaves still takes requests for so long: of clients that have not heard it yet
+# a leaving server accepts requests for this long, of clients that have not received its notice yet
+_NOTICE_S: Final = 1.0
 
 
 class ExposedService:
-    """Lets far clients call one local server.
+    """Lets remote clients call one local server.
 
     Args:
         random_start: the first number of a call here, random.
@@ -74,7 +78,7 @@ class ExposedService:
         self._topic = topic
         self._serving: Serving[bytes] = Serving(random_start, flow_spec.rule.at_once)
         self._goals = GoalCalls()
-        self._cancels = 0  # requests of our own that cancel a goal; their numbers
+        self._cancels = 0  # number of the last cancel request of the proxy itself
         self._refuses_from_s: float | None = None
         self._liveness = ClientLiveness()
         self._early = UndescribedRequests()
@@ -111,7 +115,7 @@ class ExposedService:
         )
 
     def receive(self, message: Message, now_s: float) -> None:
-        """Take a far client's request, or its word that some have ended; before its description both wait."""
+        """Process a remote client's request or its cancellations; both wait until the client's description arrives."""
         if not message.description:
             if not self._early.add(message):
                 self._drop_early("too many requests came before their client's description")
@@ -130,7 +134,7 @@ class ExposedService:
         self._give()
 
     def handle_event(self, event: Event, now_s: float) -> None:
-        """Take what the local server, or an action's topics, say."""
+        """Process an event of the local server or of an action's topics."""
         if (
             self._kept is not None
             and isinstance(event, ResponseReceived | CallFailed)
@@ -155,22 +159,22 @@ class ExposedService:
         elif isinstance(event, EndpointError):
             self._site.tell(self._flow_spec.local, event, Fault.REFUSED)
         else:
-            assert isinstance(event, TypeResolved)  # what an action's topics are was known before
+            assert isinstance(event, TypeResolved)  # the types of an action's topics are known beforehand
 
     def tick(self, now_s: float) -> None:
-        """Take what came before its description; look whose clients are still there."""
+        """Process requests that waited for their description, and check which clients are still present."""
         self._look_at_clients(now_s)
         if self._kept is not None:
             self._kept.look(self._site.member.peers(self._topic.name), now_s)
         self.handle_timer(now_s)
 
     def follow(self, ends: Sequence[GraphEntity], now_s: float) -> None:
-        """Take the local servers of the name: where state is kept it matters which one it is."""
+        """Update the local servers of the name: for a service with state their identity matters."""
         if self._kept is not None:
             self._kept.follow(ends, now_s)
 
     def handle_timer(self, now_s: float) -> None:
-        """Give up what its client no longer waits for."""
+        """Drop calls whose time has run out."""
         for number, part, asked, is_given in self._serving.expired(now_s):
             if is_given:
                 self._cancellation.handle_timeout(part, number)
@@ -184,20 +188,20 @@ class ExposedService:
         return self._serving.get_timer()
 
     def drain(self, now_s: float) -> None:
-        """Tell clients to ask others, and answer what is under way."""
+        """Redirect clients to other servers, and answer calls under way."""
         if self._refuses_from_s is None:
             self._refuses_from_s = now_s + _NOTICE_S
             self._publisher.describe(replace(self._exchange, is_leaving=True).to_wire())
 
     def is_drained(self, now_s: float) -> bool:
-        """Return whether nothing is under way any more, and nothing new will be."""
+        """Return whether no call is under way, and none will be accepted."""
         is_closed = self._refuses_from_s is not None and now_s >= self._refuses_from_s
         if is_closed and self._kept is not None:
             self._kept.close()
         return is_closed and not self._serving and (self._kept is None or self._kept.is_idle)
 
     def close(self, now_s: float) -> None:
-        """Serve nobody any more; calls under way fail."""
+        """Close the server; calls under way fail."""
         for asked in self._serving.fail_all():
             self._goals.end(asked)
             self._responses.fail(asked, Fault.NO_SERVER, "the server is gone")
@@ -207,16 +211,16 @@ class ExposedService:
         kept = [] if self._kept is None else self._kept.handles
         for handle in [self._mark, *self._servers, *stopper, *kept, *self._topics]:
             self._seat.close(handle)
-        self._site.member.flush(now_s)  # what was said last must not wait: it would go with its stream
+        self._site.member.flush(now_s)  # the last messages must not wait: they would be dropped with their stream
         self._site.member.withdraw(self._topic.name)
 
     def renew(self, topic: Topic) -> None:
-        """Take the delegation anew."""
+        """Replace the delegation."""
         self._topic = topic
         self._site.member.renew(topic)
 
     def _look_at_clients(self, now_s: float) -> None:
-        """Take what came before its description; let the calls of clients that left go."""
+        """Process requests that waited for their description; drop the calls of clients that left."""
         writer_proxies = self._site.member.writer_proxies_of(self._topic.name)
         known = {bytes(writer_proxy.publisher): writer_proxy.description for writer_proxy in writer_proxies}
         for _ in range(self._early.forget_all_but(known.keys())):
@@ -260,7 +264,7 @@ class ExposedService:
             self._responses.fail(asked, Fault.MALFORMED, str(error))
 
     def _patience_s(self, request: Request) -> float | None:
-        """Return how long a call may take; None: as long as a goal does."""
+        """Return the seconds that a call may take; None: as long as its goal."""
         if self._flow_spec.rule.kind == "action" and request.part == RESULT and not request.patience_ms:
             return None
         asked_s = request.patience_ms / 1e3 + _GRACE_S if request.patience_ms else CALL_MAX_S
@@ -293,7 +297,7 @@ class ExposedService:
             self._responses.fail(Asked(entry.client, 0, entry.call), Fault.REFUSED, event.reason)
 
     def _begin(self, now_s: float, patience_s: float | None, asked: Asked, raw: bytes) -> None:
-        """Take a request; what is about a goal waits until the local server knows whether it accepts that one."""
+        """Accept a request; one about a goal waits until the local server has accepted or rejected that goal."""
         goal = goal_of(raw) if self._flow_spec.rule.kind == "action" else b""
         after = None if asked.part == GOAL else self._goals.accepting(goal)
         self._serving.begin(now_s, patience_s, asked, raw, after)
@@ -301,7 +305,7 @@ class ExposedService:
             self._goals.add(asked, goal)
 
     def _give(self) -> None:
-        """Give the local server what it is the turn of."""
+        """Pass the next requests in order to the local server."""
         for turn in self._serving.poll_turns():
             self._seat.endpoint.call(self._servers[turn.asked.part], turn.number, turn.request)
 

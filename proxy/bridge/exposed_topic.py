@@ -1,6 +1,6 @@
-"""A topic of local publishers on its way out: heard, thinned, bounded, encoded, published.
+"""Exposed topic: messages of local publishers are received, rate-limited, bounded, encoded and published.
 
-Place: shell; endpoint and member do the I/O. The publishers are live nodes, or those of a recording.
+I/O through endpoint and participant. The publishers are live nodes, or those of a recording.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ __all__ = ["ExposedTopic"]
 
 
 class ExposedTopic:
-    """Carries one local topic out, for as long as somebody local publishes it.
+    """Carries one local topic to the overlay while a local publisher exists.
 
     Attributes:
         handle: of the endpoint's subscription.
         publisher: the overlay's publisher of the topic; None until the endpoint has described it.
-        published: messages published, by channel, those that nobody read included.
-        published_bytes: their bytes, as ROS wrote them.
+        published: messages published, by channel, including those without a reader.
+        published_bytes: their bytes in ROS's wire form.
 
     Raises:
         LocalError: this machine does not know the type.
@@ -60,13 +60,13 @@ class ExposedTopic:
         self._pace = RateLimiter(flow_spec.rule.max_hz)
         self.handle = self._subscribe()
         try:
-            # far readers may come before a message
+            # Remote readers may come before a message.
             self._describe((seat.endpoint.channel(flow_spec.local, flow_spec.type_name),))
         except LocalError:
             self.publisher = None  # the first message brings its definition
 
     def follow(self, ends: Sequence[GraphEntity]) -> None:
-        """Learn who publishes now."""
+        """Update the local publishers."""
         change = self._qos.receive_publishers(ends)
         if change is Change.NONE:
             return
@@ -77,11 +77,11 @@ class ExposedTopic:
             self._describe(self._channels)
 
     def has_room(self) -> bool:
-        """Return whether a message may be published without pushing out one that a reader still lacks."""
+        """Return whether a message may be published without dropping one that a reader still lacks."""
         return self.publisher is None or self.publisher.has_room()
 
     def handle_event(self, event: Event, now_s: float) -> None:
-        """Take what the endpoint says of the subscription."""
+        """Process an event of the subscription."""
         if isinstance(event, MessageReceived):
             self._publish(event, now_s)
         elif isinstance(event, TypeResolved):
@@ -90,14 +90,14 @@ class ExposedTopic:
             self._site.tell(self._flow_spec.local, event, Fault.QOS)
 
     def close(self, now_s: float) -> None:
-        """Carry nothing any more."""
+        """Close the subscription and the publisher."""
         self._seat.close(self.handle)
         if self.publisher is not None:
-            self._site.member.flush(now_s)  # what was said last must not wait: it would go with its stream
+            self._site.member.flush(now_s)  # the last messages must not wait: they would be dropped with their stream
             self._site.member.withdraw(self._topic.name)
 
     def renew(self, topic: Topic) -> None:
-        """Take the delegation anew."""
+        """Replace the delegation."""
         self._topic = topic
         if self.publisher is not None:
             self._site.member.renew(topic)
@@ -131,7 +131,7 @@ class ExposedTopic:
     def _publish(self, event: MessageReceived, now_s: float) -> None:
         rule, publisher, traffic = self._flow_spec.rule, self.publisher, self._site.traffic
         if publisher is None:
-            return  # described first, always: what comes before is of a subscription that was replaced
+            return  # the description always comes first: an earlier message belongs to a subscription that was replaced
         if not self._pace.may_pass(now_s):
             traffic.thinned += 1
             return

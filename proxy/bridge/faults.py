@@ -1,8 +1,8 @@
-"""What went wrong on this machine with something that a rule names: counted each time, told once.
+"""Local faults of the things that rules name: each occurrence is counted, only the first is logged.
 
-Place: shell; it logs. A warning names the topic as the robot calls it, on the machine that owns it and nowhere else.
-What goes on is told again by its count, at a thousand, ten thousand and so on. A detail may hold words of a far node:
-it is escaped and cut.
+I/O: it logs. A warning contains the local topic name, on the machine that owns the topic and nowhere else. A fault that
+persists is logged again with its count at a thousand, ten thousand and so on. A detail may contain text of a remote
+node: it is escaped and truncated.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ __all__ = ["Fault", "Faults"]
 log = logging.getLogger(__name__)
 
 _TOLD_MAX: Final = 4_096
-_COUNT_TOLD: Final = 1_000  # the first count that is told
+_COUNT_TOLD: Final = 1_000  # the first count that is logged
 
 
 class Fault(str, Enum):
-    """Why something is not carried, or not as it should be. The value is the metric's label."""
+    """Reason why something is not carried, or not as it should be. The value is the metric's label."""
 
     NO_DELEGATION = "no-delegation"
-    UNKNOWN_TYPE = "unknown-type"  # this machine, or this ROS, has no such type
-    OTHER_TYPE = "other-type"  # not the rule's, or definitions that differ
-    QOS = "qos"  # a local reader or publisher that cannot match
+    UNKNOWN_TYPE = "unknown-type"  # this machine, or this ROS version, has no such type
+    OTHER_TYPE = "other-type"  # differs from the rule's type, or definitions differ
+    QOS = "qos"  # a local reader or publisher whose QoS cannot match
     TOO_LARGE = "too-large"
     TOO_FAST = "too-fast"  # the path does not keep up
     MALFORMED = "malformed"  # bytes that do not fit their definition
-    NO_GRAPH = "no-graph"  # a master, a domain or a peer that cannot be had
+    NO_GRAPH = "no-graph"  # a master, a domain or a peer is unavailable
     NO_SERVER = "no-server"
     TIMED_OUT = "timed-out"
-    REFUSED = "refused"  # a service, or the overlay, said no
-    CONFLICT = "rival"  # another proxy of this graph does it already
+    REFUSED = "refused"  # a service or the overlay refused
+    CONFLICT = "rival"  # another proxy of this graph carries it already
 
 
 class Faults:
@@ -59,15 +59,15 @@ class Faults:
             log.warning("%s: %s: %d times by now", printable(what), fault.value, count)
 
     def clear(self, what: str, fault: Fault) -> None:
-        """Learn that a fault is over: another one will be told again."""
+        """Record that a fault is over: the next one is logged again."""
         self._told.pop((what, fault), None)
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Return how often each happened, by label."""
+        """Return the occurrences by label."""
         return {fault.value: self._counts[fault] for fault in Fault}
 
     @property
     def total(self) -> int:
-        """Return how many there were."""
+        """Return the number of all occurrences."""
         return sum(self._counts.values())

@@ -1,6 +1,6 @@
-"""Which calls under way at an action's server are about which goal.
+"""Index of the calls under way at an action's server, by goal.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ __all__ = ["GoalCalls"]
 
 
 class GoalCalls:
-    """Requests to accept goals, and for their results; each step costs the same, however many there are."""
+    """Requests to accept goals and requests for their results; each operation takes constant time."""
 
     def __init__(self) -> None:
         self._goals: dict[Asked, bytes] = {}
@@ -22,12 +22,12 @@ class GoalCalls:
         return len(self._goals)
 
     def add(self, asked: Asked, goal: bytes) -> None:
-        """Learn of a call."""
+        """Add a call."""
         self._goals[asked] = goal
         self._calls.setdefault((asked.part, goal), {})[asked] = None
 
     def end(self, asked: Asked) -> bytes | None:
-        """Learn that a call has ended; return its goal, None where it has none."""
+        """Remove a call that has ended; return its goal, None where it has none."""
         goal = self._goals.pop(asked, None)
         if goal is not None:
             calls = self._calls[asked.part, goal]
@@ -37,9 +37,9 @@ class GoalCalls:
         return goal
 
     def accepting(self, goal: bytes) -> Asked | None:
-        """Return the call by which the local server is to accept a goal."""
+        """Return the call by which the local server is asked to accept a goal."""
         return next(iter(self._calls.get((GOAL, goal), ())), None)
 
     def is_awaited(self, goal: bytes) -> bool:
-        """Return whether somebody waits for a goal's result."""
+        """Return whether a client waits for a goal's result."""
         return (RESULT, goal) in self._calls

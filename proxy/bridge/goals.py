@@ -1,14 +1,15 @@
-"""Goals of an action that has several servers: which of them speaks for each goal.
+"""Goals of an action with several servers: which server is the leader of each goal.
 
-Place: pure.
-Source: the interfaces of ``action_msgs`` and of the hidden services of an action, in CDR: a goal's id is the first 16
-bytes of its request, of its feedback, and of a request for its result; answers begin with one byte that says yes or no.
+Sans-I/O.
+Source: the interfaces of ``action_msgs`` and of the hidden services of an action, in CDR. A goal's id is the first 16
+bytes of its request, of its feedback, and of a request for its result. Responses begin with one byte: yes or no.
 
-Every server works on the goal. Its client hears of one at a time, its leader: the one whose acceptance it got, until
-that one goes; and at last the one whose result it got, even if others say later that they were cancelled.
+Every server executes the goal. Its client receives messages of one server at a time, the leader: the server whose
+acceptance it got, until that server leaves. At last the leader is the server whose result the client got, even if
+others report later that they were cancelled.
 
-Goals that only servers name, of other machines' clients or invented, have a room of their own and push out nobody
-else's: when it is full, the oldest of the server that named the most goes.
+Goals that only servers name, of other machines' clients or invented, have a separate quota and evict no other goals.
+When the quota is full, the oldest goal of the server that named the most is dropped.
 """
 
 from __future__ import annotations
@@ -24,10 +25,10 @@ from proxy.bridge.action_interface import CANCEL
 
 __all__ = ["Goals", "cancel_of", "goal_of", "says_yes"]
 
-GOALS_MAX: Final = 1_024  # that clients here asked for, and as many that only servers named
+GOALS_MAX: Final = 1_024  # requested by clients here, and as many that only servers named
 HEARTBEATS_MAX: Final = 16_384  # goals in one status message
-GOAL_KEPT_MAX_BYTES: Final = 64 << 10  # larger goals are not sent again to a server that arrives later
-_HEAD: Final = 4  # of CDR
+GOAL_KEPT_MAX_BYTES: Final = 64 << 10  # larger goals are not sent again to a server that joins later
+_HEAD: Final = 4  # bytes of the CDR encapsulation
 _ID: Final = 16
 _STAMP: Final = {order: struct.Struct(f"{order}iI") for order in "<>"}
 _COUNT: Final = {order: struct.Struct(f"{order}I") for order in "<>"}
@@ -48,7 +49,7 @@ def goal_of(raw: bytes) -> bytes:
 
 
 def says_yes(part: int, raw: bytes) -> bool:
-    """Return whether an answer is worth more than another server's: accepted, cancels, or knows the goal."""
+    """Return whether a response is worth more than another server's: accepted, cancels, or knows the goal."""
     if len(raw) <= _HEAD:
         return True
     return (raw[_HEAD] == 0) is (part == CANCEL)
@@ -63,15 +64,15 @@ def cancel_of(goal: bytes) -> bytes:
 class _Goal:
     leader: Name | None = None
     holders: set[Name] = field(default_factory=set)
-    request: bytes | None = None  # as it was sent; None: it is not to be sent again
+    request: bytes | None = None  # as it was sent; None: it must not be sent again
     result: int | None = None  # the status that its client got
-    status: tuple[int, int, int] | None = None  # stamp and status, as the client knows it
-    led_by: Name | None = None  # who said that
-    named_by: Name | None = None  # the server that named it first; None: a client here did
+    status: tuple[int, int, int] | None = None  # stamp and status, as the client has them
+    led_by: Name | None = None  # the server that reported it
+    named_by: Name | None = None  # the server that named it first; None: a client here requested it
 
 
 class Goals:
-    """What the clients here know of an action's goals."""
+    """State of an action's goals, as the clients here know it."""
 
     def __init__(self) -> None:
         self.clear()
@@ -85,11 +86,11 @@ class Goals:
         self._told = _write({})
 
     def sent(self, goal: bytes, request: bytes) -> None:
-        """Learn that a client here sends a goal; the request is kept for servers that come later."""
+        """Record that a client here sends a goal; the request is kept for servers that join later."""
         self._of(goal).request = request if len(request) <= GOAL_KEPT_MAX_BYTES else None
 
     def holds(self, goal: bytes, servers: set[Name]) -> None:
-        """Learn that servers were sent a goal."""
+        """Record that servers were sent a goal."""
         self._of(goal).holders |= servers
 
     def holders(self, goal: bytes) -> set[Name]:
@@ -98,21 +99,21 @@ class Goals:
         return set() if known is None else set(known.holders)
 
     def again(self, goal: bytes) -> bytes | None:
-        """Return the request of a goal, to send it to one more server; None where it is not to be sent."""
+        """Return the request of a goal, to send it to one more server; None where it must not be sent."""
         known = self._goals.get(goal)
         return None if known is None else known.request
 
     def accepted(self, goal: bytes, server: Name) -> None:
-        """Learn whose acceptance the client got."""
+        """Record the server whose acceptance the client got."""
         self._of(goal).leader = server
 
     def cancelled(self, goal: bytes) -> None:
-        """Learn that a client cancels a goal, or all: no more servers get it."""
+        """Record that a client cancels a goal, or all: no further servers get it."""
         for each in self._goals.values() if goal == _ALL else filter(None, [self._goals.get(goal)]):
             each.request = None
 
     def ended(self, goal: bytes, server: Name, raw: bytes) -> bytes | None:
-        """Learn whose result the client got; return the status message that goes with it, if clients need one."""
+        """Record the server whose result the client got; return the matching status message, if clients need one."""
         known = self._of(goal)
         known.request, known.leader = None, server
         known.result = raw[_HEAD] if len(raw) > _HEAD else None
@@ -121,23 +122,23 @@ class Goals:
         return self._news()
 
     def gone(self, server: Name) -> None:
-        """Learn that a server is no more: another one speaks for its goals."""
+        """Remove a server: another one becomes the leader of its goals."""
         for known in self._goals.values():
             known.holders.discard(server)
             known.led_by = None if known.led_by == server else known.led_by
             if known.leader == server and known.result is None:
                 known.leader = None
 
-    def may_writer_proxy(self, server: Name, raw: bytes) -> bool:
-        """Return whether feedback goes to the clients.
+    def may_feed(self, server: Name, raw: bytes) -> bool:
+        """Return whether feedback is passed on to the clients.
 
         Raises:
             RemoteError: MALFORMED.
         """
         return self._led(goal_of(raw), server) is not None
 
-    def heartbeats(self, server: Name, raw: bytes) -> bytes | None:
-        """Return the status message that clients get now that a server has sent this one; None: nothing new.
+    def statuses(self, server: Name, raw: bytes) -> bytes | None:
+        """Return the status message for the clients after a server has sent this one; None: nothing new.
 
         Raises:
             RemoteError: MALFORMED.
@@ -146,7 +147,7 @@ class Goals:
         for goal, known in self._goals.items():
             is_its = known.led_by == server or (known.led_by is None and known.result is None)
             if is_its and goal not in said:
-                known.status = known.led_by = None  # its server has forgotten it, or is gone
+                known.status = known.led_by = None  # its server has forgotten it, or has left
         for goal, status in said.items():
             led = self._led(goal, server)
             if led is not None:
@@ -155,14 +156,14 @@ class Goals:
         return self._news()
 
     def _led(self, goal: bytes, server: Name) -> _Goal | None:
-        """Return a goal if this server speaks for it; it does if nobody did."""
+        """Return a goal if this server is its leader; it becomes the leader if there was none."""
         known = self._goals.get(goal) or self._name(goal, server)
         if known.leader is None:
             known.leader = server
         return known if known.leader == server else None
 
     def _of(self, goal: bytes) -> _Goal:
-        """Return a goal that a client here asked for."""
+        """Return a goal that a client here requested."""
         known = self._goals.setdefault(goal, _Goal())
         if goal not in self._ours:
             self._unname(goal, known)
@@ -174,7 +175,7 @@ class Goals:
         return known
 
     def _name(self, goal: bytes, server: Name) -> _Goal:
-        """Return a goal that nobody here asked for, new."""
+        """Return a new goal that no client here requested."""
         known = self._goals[goal] = _Goal(named_by=server)
         self._named.setdefault(server, OrderedDict())[goal] = None
         self._named_count += 1
@@ -222,9 +223,9 @@ def _read(raw: bytes) -> dict[bytes, tuple[int, int, int]]:
     return said
 
 
-def _write(heartbeats: dict[bytes, tuple[int, int, int]]) -> bytes:
-    body = bytearray(_COUNT["<"].pack(len(heartbeats)))
-    for goal, (seconds, nanoseconds, status) in heartbeats.items():
+def _write(statuses: dict[bytes, tuple[int, int, int]]) -> bytes:
+    body = bytearray(_COUNT["<"].pack(len(statuses)))
+    for goal, (seconds, nanoseconds, status) in statuses.items():
         body += goal
         body += bytes(-len(body) % 4) + _STAMP["<"].pack(seconds, nanoseconds) + bytes([status])
     return b"\0\1\0\0" + bytes(body)

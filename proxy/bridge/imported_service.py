@@ -1,10 +1,11 @@
 """Virtual server on this machine for the remote servers of one service or action.
 
-I/O: endpoint and member; ``gdp/service/dispatch.py`` or ``gdp/service/sequencer.py`` decide. The virtual server exists
-while a remote one is heard, so that local clients see whether there is one. A call ends with the first response, with a
-reason, or when its time is up; a later response is counted, and servers that still work on it are told to stop.
+I/O: endpoint and participant; ``gdp/service/dispatch.py`` or ``gdp/service/sequencer.py`` decide. The virtual server
+exists while a remote one is reachable, so that local clients see whether there is one. A call ends with the first
+response, with a reason, or when its time is up. A later response is counted, and servers that still work on the call
+get a cancellation.
 
-It joins ``server_discovery.py`` (which servers there are) and ``request_sender.py`` (what is sent to which of them).
+It combines ``server_discovery.py`` (the servers) and ``request_sender.py`` (the requests to each of them).
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ _FAULTS: Final = {
 
 @dataclass(slots=True)
 class _Waiting:
-    """A local client's request; of an action, about which goal."""
+    """A local client's request, with its goal if it belongs to an action."""
 
     part: int
     ticket: int
@@ -55,7 +56,7 @@ class _Waiting:
 
 
 class ImportedService:
-    """Lets local clients call one far service or action.
+    """Lets local clients call one remote service or action.
 
     Args:
         random_start: the first number of a call, random.
@@ -71,7 +72,7 @@ class ImportedService:
         self._parts = ActionInterface.of(flow_spec.rule.kind, flow_spec.local, flow_spec.type_name)
         self._goals = Goals() if flow_spec.rule.kind == "action" else None
         self._sequencer: Sequencer[Response] | None = None
-        self._outside: dict[Name, str] = {}  # servers that cannot be kept in order, as told
+        self._outside: dict[Name, str] = {}  # servers that cannot be kept in order, with the reported reason
         if flow_spec.rule.is_ordered:
             self._sequencer = Sequencer(life=lambda: secrets.randbits(LIFE_BITS))
         self._calls: tuple[ServerCalls, ...] = tuple(
@@ -80,11 +81,11 @@ class ImportedService:
             else Dispatch[Response](
                 ALL if self._goals is not None and part == CANCEL else flow_spec.rule.spread,
                 start=random_start,
-                stops=self._goals is None or part == RESULT,  # a goal is every server's, until one has its result
+                stops=self._goals is None or part == RESULT,  # every server has the goal, until one has its result
             )
             for part in range(len(self._parts.services))
         )
-        self._counted: tuple[int, ...] = (0, 0, 0)  # late, strange and hedged, as told
+        self._counted: tuple[int, ...] = (0, 0, 0)  # late, unexpected and hedged, as reported last
         self._requests: tuple[Serializer, ...] = ()
         self._no_answers: tuple[NoAnswer | None, ...] = ()  # None: the dialect has errors
         self._handles: list[int] = []
@@ -108,7 +109,7 @@ class ImportedService:
         )
 
     def receive(self, message: Message, now_s: float) -> None:
-        """Take a far server's answer, or what its action's topics say."""
+        """Process a remote server's response, or a message of its action's topics."""
         self._site.traffic.received(len(message.delivered.message))
         try:
             if message.private and self._sequencer is not None and is_word(message.delivered.message):
@@ -124,7 +125,7 @@ class ImportedService:
         self._sender.flush(now_s)
 
     def handle_event(self, event: Event, now_s: float) -> None:
-        """Take a local client's request."""
+        """Process a local client's request."""
         if isinstance(event, RequestReceived):
             self._ask(event, now_s)
             self._sender.flush(now_s)
@@ -132,7 +133,7 @@ class ImportedService:
             self._site.tell(self._flow_spec.local, event, Fault.REFUSED)
 
     def tick(self, now_s: float) -> None:
-        """Open or close the virtual server as far ones come and go."""
+        """Open or close the virtual server as remote servers join and leave."""
         self._discovery.update(now_s)
         self.handle_timer(now_s)
         self._count()
@@ -143,7 +144,7 @@ class ImportedService:
             self._outside = outside
 
     def handle_timer(self, now_s: float) -> None:
-        """Do what is due, between looks at who is there."""
+        """Run due timers between checks of the servers."""
         for dispatch in self._calls:
             dispatch.handle_timer(now_s)
         self._sender.flush(now_s)
@@ -156,18 +157,18 @@ class ImportedService:
         return min((time for time in times if time is not None), default=None)
 
     def close(self, now_s: float) -> None:
-        """Call nobody any more; calls under way fail."""
+        """Close the virtual server; calls under way fail."""
         del now_s
         self._shut("the proxy no longer carries this service")
         self._site.member.withdraw(self._topic.name)
 
     def renew(self, topic: Topic) -> None:
-        """Take the delegation anew."""
+        """Replace the delegation."""
         self._topic = topic
         self._site.member.renew(topic)
 
     def _count(self) -> None:
-        """Add to the proxy's counts what is new since the last time."""
+        """Add the increments since the last call to the proxy's counters."""
         traffic = self._site.traffic
         now = tuple(sum(counts) for counts in zip(*((d.late, d.strange, d.hedged) for d in self._calls), strict=True))
         traffic.late += now[0] - self._counted[0]
@@ -176,7 +177,7 @@ class ImportedService:
         self._counted = now
 
     def _description(self) -> bytes:
-        """Return how this machine knows the service; empty where it must learn that from the far side."""
+        """Return this machine's description of the service; empty where only the remote side has one."""
         try:
             exchange = self._parts.known(self._seat.endpoint, self._flow_spec.rule.encoding)
         except LocalError:
@@ -239,7 +240,7 @@ class ImportedService:
         return wire
 
     def _holders(self, goal: bytes, goals: Goals) -> tuple[Name, ...]:
-        """Return whom to ask for a result, in place of what the rule says; nobody: as it says."""
+        """Return the servers to ask for a result, in place of the rule's choice; empty: the rule's choice applies."""
         servers = self._calls[RESULT].servers
         holders = goals.holders(goal) & set(servers)
         if self._flow_spec.rule.spread.mode is Mode.ALL:
@@ -250,7 +251,7 @@ class ImportedService:
         answer, name = Answer.from_wire(message.delivered.message), Name(message.delivered.publisher)
         server = self._discovery.find(name, now_s)
         if server is None or answer.part >= len(server.answers):
-            return  # of a server that is gone, or that cannot be understood here: that was reported
+            return  # of a server that left, or that has no valid description here: that was reported
         dispatch = self._calls[answer.part]
         if answer.outcome is Outcome.FAILED:
             dispatch.refused(answer.call, name, answer.reason, now_s)
@@ -291,7 +292,7 @@ class ImportedService:
         self._seat.endpoint.answer(self._handles[waiting.part], waiting.ticket, no_answer.to_raw(reason))
 
     def _forget(self, waiting: _Waiting) -> None:
-        is_cancelled = self._sequencer is None  # a log's entries go to all servers in any case
+        is_cancelled = self._sequencer is None  # entries of a log go to all servers in any case
         self._sender.forget(waiting.part, waiting.call, is_cancelled=is_cancelled)
 
     def _receive_news(self, message: Message) -> None:
@@ -302,8 +303,8 @@ class ImportedService:
             return
         raw = server.news[at].decode(news.body)
         if at > 0:
-            self._tell_status(self._goals.heartbeats(name, raw))
-        elif self._goals.may_writer_proxy(name, raw):
+            self._tell_status(self._goals.statuses(name, raw))
+        elif self._goals.may_feed(name, raw):
             self._seat.endpoint.publish(self._topics[at], raw)
 
     def _tell_status(self, raw: bytes | None) -> None:

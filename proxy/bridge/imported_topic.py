@@ -1,7 +1,7 @@
-"""A topic of far publishers on its way in: joined while somebody local reads it, decoded, converted, published here.
+"""Imported topic: joined while a local node reads it, then decoded, converted and published here.
 
-Place: shell; endpoint and member do the I/O. The local publisher (``local_output``) stands as long as the rule does, so
-that local tools see the topic; the overlay's tree stands while a local reader does. A recording reads always.
+I/O through endpoint and participant. The local publisher (``local_output``) exists as long as the rule does, so that
+local tools see the topic. The overlay's tree exists while a local reader does. A recording reads always.
 """
 
 from __future__ import annotations
@@ -34,27 +34,27 @@ _SAMPLES_MAX = 4_096  # latencies kept of a live topic
 
 
 class _Decoded(NamedTuple):
-    """One far channel, made ready."""
+    """Decoder and output of one remote channel."""
 
     incoming: MessageDecoder
     handle: int  # of the local output
 
 
 class ImportedTopic:
-    """Carries one far topic in.
+    """Carries one remote topic to the local graph.
 
     Raises:
-        LocalError: this graph does not take a publisher of it.
+        LocalError: this graph does not accept a publisher of it.
     """
 
     def __init__(self, site: BridgeContext, seat: EndpointDispatcher, flow_spec: FlowSpec, topic: Topic) -> None:
         self._site = site
         self._flow_spec = flow_spec
         self._topic = topic
-        self._unmatched: Set[str] = frozenset()  # keys of readers that want what cannot be had
+        self._unmatched: Set[str] = frozenset()  # keys of readers whose QoS cannot be met
         self._sources = Sources[tuple[_Decoded, ...]]()
         self._is_joined = False
-        self._past_losses = Losses()  # of when a local reader stood before
+        self._past_losses = Losses()  # losses of earlier subscriptions
         self._pace = RateLimiter(flow_spec.rule.max_hz)
         samples = _SAMPLES_MAX if seat.endpoint.is_live else SAMPLES_MAX
         self.stats = TopicStats(flow_spec.local, flow_spec.type_name, latencies_ms=deque(maxlen=samples))
@@ -62,7 +62,7 @@ class ImportedTopic:
         self._output: LocalOutput = kind(seat, self, flow_spec)
 
     def follow(self, ends: Sequence[GraphEntity]) -> None:
-        """Learn who reads here now."""
+        """Update the local readers."""
         self._tell_unmatched(ends)
         if ends and not self._is_joined:
             self._is_joined = True
@@ -71,10 +71,10 @@ class ImportedTopic:
             self._leave()
             self._output.drop_kept()
         self._output.receive_readers(ends)
-        self._sources.forget_refused()  # others may do now
+        self._sources.forget_refused()  # other types may fit now
 
     def receive(self, message: Message, now_s: float) -> None:
-        """Take a message from the overlay."""
+        """Process a message of the overlay."""
         try:
             self._receive(message, now_s)
         except RemoteError as error:
@@ -83,13 +83,13 @@ class ImportedTopic:
             self._refuse(Fault.REFUSED, str(error))
 
     def handle_event(self, event: Event, now_s: float) -> None:
-        """Take what the endpoint says of the local publisher."""
+        """Process an event of the local publisher."""
         del now_s
         if isinstance(event, EndpointError):
             self._site.tell(self._flow_spec.local, event, Fault.QOS)
 
     def close(self, now_s: float) -> None:
-        """Carry nothing any more."""
+        """Close the subscription and the local publisher."""
         del now_s
         if self._is_joined:
             self._leave()
@@ -97,13 +97,13 @@ class ImportedTopic:
         self._output.close()
 
     def renew(self, topic: Topic) -> None:
-        """Take the delegation anew."""
+        """Replace the delegation."""
         self._topic = topic
         if self._is_joined:
             self._site.member.renew(topic)
 
     def count_losses(self) -> None:
-        """Bring the tally's losses up to date."""
+        """Update the losses in the topic's statistics."""
         self.stats.losses = losses = Losses()
         losses.update(self._past_losses)
         if self._is_joined:
@@ -115,7 +115,7 @@ class ImportedTopic:
         self._site.member.unsubscribe(self._topic.name)
 
     def _tell_unmatched(self, ends: Sequence[GraphEntity]) -> None:
-        """Tell, once, of each reader that wants what cannot be had."""
+        """Report once each reader whose QoS cannot be met."""
         odd = {end.key: (end.node or "a node", policy) for end in ends if end.qos and (policy := unmatched(end.qos))}
         for key in odd.keys() - self._unmatched:
             detail = "{} will get nothing: {}, which no network can promise".format(*odd[key])
@@ -160,7 +160,7 @@ class ImportedTopic:
         traffic.received(len(delivered.message))
 
     def _describe(self, publisher: bytes, description: TopicDescription) -> tuple[_Decoded, ...] | None:
-        """Make ready for a publisher's messages; None if they cannot be had here."""
+        """Prepare the decoders of a publisher's channels; None if this graph cannot have them."""
         what, sources = self._flow_spec.local, description.channels
         other = next((each.type_name for each in sources if each.type_name != self._flow_spec.type_name), None)
         if other is not None:

@@ -1,8 +1,8 @@
-"""Local publishers of an imported topic: one that stands for all far publishers, or one for each of their channels.
+"""Local publishers of an imported topic: one for all remote publishers, or one for each of their channels.
 
-Place: shell; the endpoint does the I/O. A live graph gets one virtual publisher. Where another one must replace it, to
-promise more, the new one gets the messages that a latched topic keeps: readers get them again, as from any publisher
-that restarts. A recording gets every channel as its far publisher describes it.
+I/O through the endpoint. A live graph gets one virtual publisher. If a new one must replace it to promise more, the new
+one gets the messages that a latched topic keeps. Readers then get them again, as from any publisher that restarts. A
+recording gets every channel as its remote publisher describes it.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from proxy.wire.message import CHANNELS_MAX
 
 __all__ = ["ChannelPublishers", "LocalOutput", "MergedPublisher"]
 
-_FAR_MAX: Final = 1_024  # publishers whose QoS is kept; the oldest go
-_PUBLISHERS_MAX: Final = 4_096  # publishers whose channels are counted; the oldest go
+_FAR_MAX: Final = 1_024  # publishers whose QoS is kept; the oldest are dropped
+_PUBLISHERS_MAX: Final = 4_096  # publishers whose channels are counted; the oldest are dropped
 
 
 class LocalOutput(Protocol):
-    """Where the messages of one imported topic go."""
+    """Output of the messages of one imported topic."""
 
     refusal: Fault  # the fault of channels that cannot be added
 
@@ -39,21 +39,21 @@ class LocalOutput(Protocol):
         """Return whether messages can be published now."""
 
     def decoder(self, source: Channel, encoding: Encoding) -> MessageDecoder:
-        """Return what turns bodies of a far channel into local messages.
+        """Return the decoder that turns bodies of a remote channel into local messages.
 
         Raises:
             DefinitionError: the definitions differ, or there is no such type in this ROS.
         """
 
     def add(self, publisher: bytes, sources: Sequence[Channel], targets: Sequence[Channel]) -> list[int]:
-        """Make ready for the channels of a far publisher; return a handle for each.
+        """Add the channels of a remote publisher; return a handle for each.
 
         Args:
-            sources: as the far side describes them.
-            targets: as they are here.
+            sources: descriptions by the remote side.
+            targets: descriptions on this machine.
 
         Raises:
-            LocalError: the endpoint does not take one of them.
+            LocalError: the endpoint does not accept one of them.
         """
 
     def publish(self, handle: int, raw: bytes) -> None:
@@ -64,20 +64,20 @@ class LocalOutput(Protocol):
         """
 
     def receive_readers(self, ends: Sequence[GraphEntity]) -> None:
-        """Take the local readers of now."""
+        """Update the local readers."""
 
     def drop_kept(self) -> None:
         """Drop messages kept for late joiners, when the last local reader has left."""
 
     def close(self) -> None:
-        """End what was advertised."""
+        """Close the advertised publishers."""
 
 
 class MergedPublisher:
     """One virtual publisher in a live graph.
 
     Raises:
-        LocalError: this graph does not take a publisher of the topic.
+        LocalError: this graph does not accept a publisher of the topic.
     """
 
     refusal = Fault.UNKNOWN_TYPE
@@ -88,23 +88,23 @@ class MergedPublisher:
         self._flow_spec = flow_spec
         self._wants: tuple[Qos, ...] = ()
         self._handle: int | None = None
-        self._channel: Channel | None = None  # as it is offered here
-        self._far: dict[bytes, Qos] = {}  # what publishers offer, by name
-        self._kept = deque[bytes]()  # messages that late joiners get, for a publisher that replaces this one
-        if (known := self._known()) is not None:  # else the far side's own definition may do
+        self._channel: Channel | None = None  # as it is offered locally
+        self._far: dict[bytes, Qos] = {}  # offered QoS of the publishers, by name
+        self._kept = deque[bytes]()  # messages for late joiners, for a publisher that replaces this one
+        if (known := self._known()) is not None:  # else the remote definition may serve
             self._offer(known)
 
     @property
     def is_open(self) -> bool:
-        """Return whether the virtual publisher stands."""
+        """Return whether the virtual publisher exists."""
         return self._handle is not None
 
     def decoder(self, source: Channel, encoding: Encoding) -> MessageDecoder:
-        """Return what decodes by the far definition and converts into this machine's."""
+        """Return a decoder by the remote definition that converts into this machine's."""
         return MessageDecoder.ready(source, encoding, self._known(), self._seat.endpoint.ros)
 
     def add(self, publisher: bytes, sources: Sequence[Channel], targets: Sequence[Channel]) -> list[int]:
-        """Offer what a far publisher does; its channels share the virtual publisher."""
+        """Offer the QoS of a remote publisher; its channels share the virtual publisher."""
         source = sources[0]
         self._far[publisher] = source.qos[0] if source.qos else default(latched=source.latched)
         while len(self._far) > _FAR_MAX:
@@ -113,26 +113,26 @@ class MergedPublisher:
         return [0] * len(targets)
 
     def publish(self, handle: int, raw: bytes) -> None:
-        """Publish one message by the virtual publisher, if it stands."""
+        """Publish one message by the virtual publisher, if it exists."""
         del handle
         if self._handle is not None:
             self._seat.endpoint.publish(self._handle, raw)
             self._kept.append(raw)
 
     def receive_readers(self, ends: Sequence[GraphEntity]) -> None:
-        """Offer what local readers insist on."""
+        """Offer the QoS that local readers require."""
         self._wants = tuple(end.qos for end in sorted(ends, key=lambda end: end.key) if end.qos is not None)
         if self._channel is not None:
             self._offer(self._channel)
 
     def drop_kept(self) -> None:
-        """End a latched publisher: the messages that it keeps grow old, and come again with the next reader."""
+        """Close a latched publisher: its messages become outdated, and arrive again with the next reader."""
         if self._channel is not None and self._channel.latched:
             self._kept.clear()
             self.close()
 
     def close(self) -> None:
-        """End the virtual publisher."""
+        """Close the virtual publisher."""
         if self._handle is not None:
             self._seat.close(self._handle)
             self._handle = None
@@ -144,7 +144,7 @@ class MergedPublisher:
             return None
 
     def _offer(self, channel: Channel) -> None:
-        """Be the publisher that the far one is, as far as local readers allow; again where that has changed."""
+        """Create the publisher with the remote QoS, within what local readers allow; replace it where they change."""
         profile = offer(tuple(self._far.values()), self._wants, is_latched=self._flow_spec.rule.wants_latched)
         latched = profile.durability == "transient_local"
         offered = replace(channel, topic=self._flow_spec.local, qos=(profile,), latched=latched, callerid=None)
@@ -159,7 +159,7 @@ class MergedPublisher:
 
 
 class ChannelPublishers:
-    """A publisher for each far channel, under the rule's own name; nothing is converted."""
+    """Publishers for each remote channel, under the rule's own name; nothing is converted."""
 
     refusal = Fault.REFUSED
     is_open = True
@@ -168,14 +168,14 @@ class ChannelPublishers:
         self._seat = seat
         self._owner = owner
         self._flow_spec = flow_spec
-        self._handles: dict[bytes, set[int]] = {}  # of each far publisher
+        self._handles: dict[bytes, set[int]] = {}  # of each remote publisher
 
     def decoder(self, source: Channel, encoding: Encoding) -> MessageDecoder:
-        """Return what decodes by the far definition alone."""
+        """Return a decoder by the remote definition alone."""
         return MessageDecoder(source, encoding, source, None)
 
     def add(self, publisher: bytes, sources: Sequence[Channel], targets: Sequence[Channel]) -> list[int]:
-        """Return the handles of a far publisher's channels, whose number is bounded; equal channels share a handle."""
+        """Return the handles of a remote publisher's channels, of bounded number; equal channels share a handle."""
         del sources
         known = self._handles.setdefault(publisher, set())
         if len(self._handles) > _PUBLISHERS_MAX:
@@ -193,20 +193,20 @@ class ChannelPublishers:
         self._seat.endpoint.publish(handle, raw)
 
     def receive_readers(self, ends: Sequence[GraphEntity]) -> None:
-        """Take the readers: a recording reads everything."""
+        """Ignore the readers: a recording reads everything."""
 
     def drop_kept(self) -> None:
-        """Drop nothing: a recording keeps what it has."""
+        """Drop nothing: a recording keeps everything."""
 
     def close(self) -> None:
-        """End every channel's publisher."""
+        """Close every channel's publisher."""
         for handle in set().union(*self._handles.values()):
             self._seat.close(handle)
         self._handles.clear()
 
 
 def _is_served(standing: Channel, wanted: Channel) -> bool:
-    """Return whether a publisher that stands does for what is wanted: the same, or only with a smaller depth."""
+    """Return whether an existing publisher suffices for a wanted one: equal, or differing only by a smaller depth."""
     if replace(standing, qos=()) != replace(wanted, qos=()):
         return False
     before, after = standing.qos[0], wanted.qos[0]

@@ -1,7 +1,7 @@
-"""A local server that keeps state: given one log's entries in order, asked for its state, given another's.
+"""Ordered server: a local server with state, which executes one log's entries in order and exchanges snapshots.
 
-Place: shell; the endpoint does the I/O, ``gdp/service/follower.py`` decides. The state is a parameter of the server's
-node (``state_parameter.py``), where the rule names one.
+I/O through the endpoint; ``gdp/service/follower.py`` decides. The state is a parameter of the server's node
+(``state_parameter.py``), where the rule names one.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from proxy.wire.replication import STATE_MAX_BYTES
 
 __all__ = ["OrderedServer"]
 
-DOUBT_S: Final = 2.0  # a server that was exchanged may have had an entry for so long before the graph shows it
-AWAY_S: Final = 1.0  # a keeper that is not heard for so long is gone
+DOUBT_S: Final = 2.0  # a server that was replaced may have executed an entry for this long before the graph shows it
+AWAY_S: Final = 1.0  # a sequencer that sends nothing for this long is gone
 
 Give: TypeAlias = Callable[[int, bytes], None]  # an entry's number here, and its request
 Tell: TypeAlias = Callable[[Name, "FollowerMessage | Refuse"], None]
 
 
 class OrderedServer:
-    """One local server in its order.
+    """One local server as a replica of the log.
 
     Args:
-        node: whose parameter is the server's state; None: it tells none.
-        number: the first of ours for the local server, random.
-        give: gives the local server an entry.
-        tell: tells a client.
-        complain: says what is wrong with the node.
+        node: the node whose parameter is the server's state; None: it exports none.
+        number: the first request number for the local server, random.
+        give: passes an entry to the local server.
+        tell: sends a message to a client.
+        complain: reports a fault of the node.
     """
 
     def __init__(
@@ -53,27 +53,27 @@ class OrderedServer:
         self._give, self._tell, self._complain = give, tell, complain
         parts = () if node is None else tuple((f"{node}/{part}", type_name) for part, type_name in (GET, SET))
         self.handles = [seat.create_client(owner, *part) for part in parts]
-        self._number = number  # of what the server is at
+        self._number = number  # of the operation under way
         self._apply: Apply | None = None
         self._given_s = -DOUBT_S
-        self._heard_s = 0.0  # when the keeper was there last
+        self._heard_s = 0.0  # when the sequencer was last present
         self._keys: frozenset[str] | None = None
         self._is_closed = False
 
     @property
     def is_idle(self) -> bool:
-        """Return whether the server is at nothing."""
+        """Return whether no operation is under way."""
         return self._follower.doing is Doing.NOTHING
 
     def heard(self, client: Name, word: SequencerMessage, now_s: float) -> None:
-        """Take a keeper's word."""
+        """Process a sequencer's message."""
         self._follower.heard(client, word)
         if client == self._follower.sequencer:
             self._heard_s = now_s
         self._act(now_s)
 
     def entry(self, client: Name, call: int, request: bytes, now_s: float) -> None:
-        """Take a client's request."""
+        """Process a client's request."""
         if client == self._follower.sequencer:
             self._heard_s = now_s
         if not self._is_closed:
@@ -81,11 +81,11 @@ class OrderedServer:
             self._act(now_s)
 
     def close(self) -> None:
-        """Take no more entries."""
+        """Refuse further entries."""
         self._is_closed = True
 
     def done(self, event: ResponseReceived | CallFailed, now_s: float) -> Apply | None:
-        """Learn what became of what the server was at; return the entry, if it was one."""
+        """Process the end of the operation under way; return the entry, if it was one."""
         apply = None
         if event.call != self._number:
             return None
@@ -102,17 +102,17 @@ class OrderedServer:
         return apply
 
     def follow(self, ends: Sequence[GraphEntity], now_s: float) -> None:
-        """Look whether it is still the same server; another is as it started."""
+        """Check whether it is still the same server; a new one has its initial state."""
         keys = frozenset(end.key for end in ends)
         if self._keys is not None and keys - self._keys:
-            self._number += 1  # what the other was at is over
+            self._number += 1  # the previous server's operation is over
             self._apply = None
             self._follower.renewed(is_doubtful=now_s - self._given_s < DOUBT_S)
         self._keys = keys
         self._act(now_s)
 
     def look(self, clients: Sequence[Name], now_s: float) -> None:
-        """Let another client keep the order when the one that did is gone."""
+        """Accept another client as the sequencer when the present one is gone."""
         if self._follower.sequencer in clients:
             self._heard_s = now_s
         elif self._follower.sequencer is not None and now_s - self._heard_s >= AWAY_S:

@@ -1,6 +1,6 @@
-"""How often messages may cross, where a rule limits that.
+"""Rate limiter of messages, where a rule sets a maximum rate.
 
-Place: pure; time comes in as ``now_s`` (monotonic seconds).
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ __all__ = ["RateLimiter"]
 
 
 class RateLimiter:
-    """Lets so many messages a second pass, evenly; half a period early is in time, for no clock is exact.
+    """Passes so many messages a second, evenly; half a period early is in time, because no clock is exact.
 
     Args:
         max_hz: None: all.
@@ -22,7 +22,7 @@ class RateLimiter:
         self._next_s = float("-inf")
 
     def may_pass(self, now_s: float) -> bool:
-        """Return whether a message may go now; that counts as one that did."""
+        """Return whether a message may pass now; True counts it as passed."""
         if self._period_s is None:
             return True
         if now_s < self._next_s:

@@ -1,6 +1,6 @@
-"""Far clients as a server's side understands them: what their requests are, or why they are none.
+"""Remote clients of a local service: decoders of their requests, or the reason why there are none.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from proxy.wire.service import Exchange
 
 __all__ = ["RemoteClients"]
 
-REMOTE_CLIENTS_MAX: Final = 1_024  # clients kept ready; the oldest go
+REMOTE_CLIENTS_MAX: Final = 1_024  # clients whose decoders are kept; the oldest are dropped
 
 
 @dataclass(frozen=True, slots=True)
 class _Caller:
-    """One client as it describes itself; a refusal is kept as well, so that it costs once."""
+    """One client by its description; a refusal is kept as well, so that it is computed once."""
 
     description: bytes
     requests: tuple[MessageDecoder, ...] = ()
@@ -33,7 +33,7 @@ class RemoteClients:
     """All clients of one service.
 
     Args:
-        ours: the service as it is here.
+        ours: the service on this machine.
     """
 
     def __init__(self, ours: Exchange, ros: RosVersion) -> None:
@@ -42,10 +42,10 @@ class RemoteClients:
         self._known: dict[bytes, _Caller] = {}
 
     def incoming(self, client: bytes, description: bytes, part: int) -> MessageDecoder:
-        """Return what a client's requests for a part are.
+        """Return the decoder of a client's requests for a part.
 
         Raises:
-            DefinitionError: not what the service here takes.
+            DefinitionError: the service here does not accept them.
             RemoteError: the description cannot be read.
         """
         caller = self._known.get(client)

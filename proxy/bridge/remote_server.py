@@ -1,6 +1,6 @@
-"""A far server as this machine understands it: its answers and news made ready, and what its service is called here.
+"""Remote server: decoders of its responses and news, and the local description of its service.
 
-Place: pure, but for the local endpoint, which is asked what it knows.
+Sans-I/O, except that it queries the local endpoint for known types.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ __all__ = ["RemoteServer"]
 
 @dataclass(frozen=True, slots=True)
 class RemoteServer:
-    """One life of a far server.
+    """One incarnation of a remote server.
 
     Args:
-        description: what it says of itself.
-        exchange: the same, read; None where it cannot be understood here.
-        ours: the service as this machine knows it.
-        answers: by service.
-        news: by topic.
+        description: as the server sent it.
+        exchange: the same, decoded; None where it has no valid form here.
+        ours: the service as this machine describes it.
+        answers: decoders by service.
+        news: decoders by topic.
     """
 
     incarnation: int
@@ -44,7 +44,7 @@ class RemoteServer:
     def learn(
         cls, incarnation: int, description: bytes, parts: ActionInterface, endpoint: Endpoint, encoding: Encoding
     ) -> RemoteServer:
-        """Make ready for a server's answers.
+        """Prepare the decoders of a server's responses.
 
         Raises:
             LocalError: it serves something else, or this machine cannot know it.
@@ -66,11 +66,11 @@ class RemoteServer:
             tuple(MessageDecoder.ready(a, theirs.encoding, b, ros) for a, b in topics),
         )
         for our, their in zip(ours.services, theirs.services, strict=True):
-            MessageDecoder.ready(our.request, ours.encoding, their.request, their.ros)  # or it says why not
+            MessageDecoder.ready(our.request, ours.encoding, their.request, their.ros)  # raises with the reason
         return server
 
     def said_anew(self, description: bytes) -> RemoteServer | None:
-        """Return the same server after it said that it leaves, or stays; None where it says something else."""
+        """Return the same server with a new leaving flag; None where the description differs otherwise."""
         if self.exchange is None:
             return None
         exchange = replace(self.exchange, is_leaving=not self.exchange.is_leaving)
@@ -80,12 +80,12 @@ class RemoteServer:
 
     @property
     def is_leaving(self) -> bool:
-        """Return whether it goes soon."""
+        """Return whether the server leaves soon."""
         return self.exchange is not None and self.exchange.is_leaving
 
 
 def _ours(theirs: Exchange, parts: ActionInterface, endpoint: Endpoint, encoding: Encoding) -> Exchange:
-    """Return how this machine knows the service, from the far side's definitions where it does not by itself.
+    """Return this machine's description of the service, built from the remote definitions where it has none.
 
     Raises:
         LocalError: it cannot be known here.

@@ -1,6 +1,6 @@
 """Sender of the requests of one imported service, to all remote servers or to some.
 
-I/O: the overlay's member and publisher send.
+I/O through the overlay's participant and publisher.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ __all__ = ["RequestSender"]
 
 
 class RequestSender:
-    """Sends what the calls of each part decide; what is for all servers waits for room on their common stream.
+    """Sends the effects of the calls of each part; effects for all servers wait for capacity of their common stream.
 
     Args:
         service: name of the service.
         goals: of an action.
-        publisher: the stream that all servers hear.
+        publisher: the stream that all servers receive.
     """
 
     def __init__(
@@ -49,29 +49,29 @@ class RequestSender:
 
     @property
     def is_ready(self) -> bool:
-        """Return whether something that waited can be sent now."""
+        """Return whether a waiting effect can be sent now."""
         return bool(self._for_all) and self._publisher.has_room()
 
     def note_goal(self, part: int, call: int, goal: bytes) -> None:
-        """Note which goal a call is about."""
+        """Record the goal of a call."""
         self._goal_of[part, call] = goal
 
     def forget(self, part: int, call: int, *, is_cancelled: bool) -> None:
         """Forget a call that has ended.
 
         Args:
-            is_cancelled: its request is not sent any more.
+            is_cancelled: its request must not be sent any more.
         """
         self._goal_of.pop((part, call), None)
         if is_cancelled:
             self._for_all.end(part, call)
 
     def clear(self) -> None:
-        """Drop what waits."""
+        """Drop waiting effects."""
         self._for_all.clear()
 
     def flush(self, now_s: float) -> None:
-        """Send what was decided, as far as there is room."""
+        """Send decided effects, as far as the stream has capacity."""
         for part, dispatch in enumerate(self._calls):
             while effects := dispatch.poll_effects():
                 for effect in effects:
@@ -87,7 +87,7 @@ class RequestSender:
         servers = self._calls[part].servers
         if isinstance(effect, Ask):
             if effect.call not in self._calls[part]:
-                return  # of a log that is over
+                return  # of a log that has ended
             self._note_holders(part, effect.call, set(servers))
         try:
             wire = wire_of(part, effect)
@@ -101,7 +101,7 @@ class RequestSender:
         if isinstance(effect, Ask) and self._goals is not None:
             goal = self._goal_of.get((part, effect.call), b"")
             if part == RESULT and server not in self._goals.holders(goal):
-                again = self._goals.again(goal)  # a server that came later works on the goal as well
+                again = self._goals.again(goal)  # a server that joined later executes the goal as well
             self._note_holders(part, effect.call, {server})
         try:
             for wire in (*([] if again is None else [again]), wire_of(part, effect)):

@@ -1,6 +1,6 @@
 """Sender of the responses and news of one exposed service to remote clients.
 
-I/O: the overlay's member and publisher send.
+I/O through the overlay's participant and publisher.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ __all__ = ["ResponseSender"]
 
 
 class ResponseSender:
-    """Encodes what the local server says, and sends it.
+    """Encodes and sends the messages of the local server.
 
     Args:
         service: name of the service.
-        exchange: the service as it is here.
-        serving: remembers responses, for clients that ask again.
-        publisher: the stream that all clients hear.
+        exchange: the service on this machine.
+        serving: keeps responses for clients that repeat a request.
+        publisher: the stream that all clients receive.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class ResponseSender:
         self._send(asked, Answer.failed(asked.part, asked.call, reason))
 
     def send_wire(self, client: Name, wire: bytes) -> None:
-        """Send bytes to one client; to one that has gone nothing is sent."""
+        """Send bytes to one client; nothing is sent to a client that has gone."""
         try:
             self._site.member.respond(self._service, client, wire)
         except LocalError:
@@ -74,10 +74,10 @@ class ResponseSender:
         self._site.traffic.sent(len(wire))
 
     def publish_news(self, at: int, raw: bytes, stamp_ns: int) -> None:
-        """Send what an action's topic says to all clients.
+        """Send a message of an action's topic to all clients.
 
         Args:
-            at: which topic.
+            at: index of the topic.
             stamp_ns: when the local server sent it, in nanoseconds since 1970.
         """
         what, publisher, services = self._flow_spec.local, self._publisher, len(self._responses)
@@ -100,7 +100,7 @@ class ResponseSender:
 
     def _send(self, asked: Asked, answer: Answer) -> None:
         if asked.client == self._site.member.name:
-            return  # our own request that cancels a goal
+            return  # the proxy's own request that cancels a goal
         wire = answer.to_wire()
         self._serving.remember(asked, wire)
         self.send_wire(asked.client, wire)

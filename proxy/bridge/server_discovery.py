@@ -1,6 +1,6 @@
 """Discovery of the remote servers of one imported service or action.
 
-I/O: the overlay is asked who is there, the local endpoint what it knows.
+I/O: it queries the overlay for the servers, and the local endpoint for known types.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ __all__ = ["Response", "ServerCalls", "ServerDiscovery"]
 
 _SERVER_GONE: Final = "the far server is gone"
 
-Response: TypeAlias = "tuple[Name, bytes]"  # who sent it, and its body as the local endpoint has it
+Response: TypeAlias = "tuple[Name, bytes]"  # the sender, and its body in the local endpoint's wire form
 ServerCalls: TypeAlias = "Dispatch[Response] | Sequencer[Response]"
 
 
 class ServerDiscovery:
-    """The remote servers that can be heard, each as this machine understands it.
+    """Reachable remote servers, each as this machine decodes it.
 
     Args:
         service: name of the service.
-        calls: of each part; they learn which servers there are.
+        calls: of each part; they get every change of the servers.
         goals: of an action.
-        opened: called with the service as this machine knows it, when the first server is understood.
+        opened: called with this machine's description of the service, when the first server has a valid description.
         closed: called with the reason when the last server is gone.
 
     Attributes:
@@ -69,9 +69,9 @@ class ServerDiscovery:
         self._is_open = False
 
     def update(self, now_s: float) -> None:
-        """Compare the servers with those that are heard now, and report each change to the calls."""
+        """Compare the servers with those that are reachable now, and report each change to the calls."""
         member = self._site.member
-        # Where nobody keeps up, to wait for who may do so again is better than to give up.
+        # If no server keeps up, waiting for one that may recover is better than giving up.
         peers = set(member.peers(self._service) or member.heard(self._service))
         writer_proxies = member.writer_proxies_of(self._service) if peers else []
         heard = {
@@ -102,7 +102,7 @@ class ServerDiscovery:
             self._closed(_SERVER_GONE)
 
     def find(self, name: Name, now_s: float) -> RemoteServer | None:
-        """Return a server that may have come just now, or None."""
+        """Return a server, including one that joined just now, or None."""
         if name not in self.servers:
             self.update(now_s)
         return self.servers.get(name)
@@ -115,7 +115,7 @@ class ServerDiscovery:
             dispatch.gone(name, now_s, _SERVER_GONE)
 
     def _add(self, name: Name, incarnation: int, description: bytes, now_s: float) -> None:
-        """Prepare for a server's responses; one that cannot be understood is reported."""
+        """Prepare the decoders of a server's responses; an invalid description is reported."""
         rule = self._flow_spec.rule
         try:
             server = RemoteServer.learn(incarnation, description, self._parts, self._endpoint, rule.encoding)

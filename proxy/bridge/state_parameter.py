@@ -1,8 +1,8 @@
-"""A node's parameter ``state``, a byte array, read and written by the services that every ROS 2 node has.
+"""State parameter: the byte array ``state`` of a node, read and written by the services that every ROS 2 node has.
 
-Place: pure.
-Source: rcl_interfaces 2.0 (``GetParameters``, ``SetParameters``). Requests are written with rosbags' types; of answers
-only what stands at their beginning is read, for vendors pad their ends differently.
+Sans-I/O.
+Source: rcl_interfaces 2.0 (``GetParameters``, ``SetParameters``). Requests are written with rosbags' types. Of
+responses only the beginning is read, because vendors pad the ends differently.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ GET: Final = ("get_parameters", "rcl_interfaces/srv/GetParameters")
 SET: Final = ("set_parameters", "rcl_interfaces/srv/SetParameters")
 _NAME: Final = "state"
 _BYTES: Final = 5  # ParameterType.PARAMETER_BYTE_ARRAY
-_VALUE: Final = struct.Struct("<IB")  # how many values, and of which type the first is
+_VALUE: Final = struct.Struct("<IB")  # number of values, and type of the first
 _TEXT_AT: Final = 24  # after a bool, an integer and a double
 _LENGTH: Final = struct.Struct("<I")
-_RESULT: Final = struct.Struct("<I?3xI")  # how many, whether the first is good, and how long its reason is
+_RESULT: Final = struct.Struct("<I?3xI")  # number of results, success of the first, length of its reason
 _TYPES: Final = {
     "rcl_interfaces/msg/GetParameters_Request": "string[] names",
     "rcl_interfaces/msg/SetParameters_Request": "rcl_interfaces/Parameter[] parameters",
@@ -46,7 +46,7 @@ def read_request() -> bytes:
 
 
 def state_in(raw: bytes) -> bytes | None:
-    """Return the state that a response to that brings; None: there is no such parameter, or of another type."""
+    """Return the state in a response to ``read_request``; None: the parameter is missing or has another type."""
     body = memoryview(raw)[4:]
     try:
         count, kind = _VALUE.unpack_from(body)
@@ -80,7 +80,7 @@ def write_request(state: bytes) -> bytes:
 
 
 def was_set(raw: bytes) -> str:
-    """Return why the node did not take the state; nothing: it did."""
+    """Return why the node did not accept the state; empty: it did."""
     body = memoryview(raw)[4:]
     try:
         count, is_done, size = _RESULT.unpack_from(body)

@@ -19,15 +19,15 @@ __all__ = ["Change", "LiveQos", "RecordedQos", "StreamQos"]
 
 
 class Change(Enum):
-    """What a change among the local publishers makes necessary."""
+    """Consequence of a change among the local publishers."""
 
     NONE = "none"
-    DESCRIPTION = "description"  # far readers must learn it
+    DESCRIPTION = "description"  # remote readers must receive it
     SUBSCRIPTION = "subscription"  # and only a new subscription matches them
 
 
 class StreamQos(Protocol):
-    """What the overlay's publisher of one local topic promises."""
+    """QoS of the overlay's publisher of one local topic."""
 
     @property
     def request(self) -> Qos | None:
@@ -35,25 +35,25 @@ class StreamQos(Protocol):
 
     @property
     def is_reliable(self) -> bool:
-        """Return whether readers ask for messages that they miss."""
+        """Return whether readers request messages that they miss."""
 
     @property
     def depth(self) -> int:
-        """Return how many messages late joiners get."""
+        """Return the number of messages for late joiners."""
 
     def receive_publishers(self, ends: Sequence[GraphEntity]) -> Change:
-        """Take the local publishers of now; return what that makes necessary."""
+        """Update the local publishers; return the consequence."""
 
     def describe(self, channels: Sequence[Channel], topic: str) -> tuple[Channel, ...]:
-        """Take the channels that the endpoint describes; return them as far readers learn them.
+        """Set the channels that the endpoint describes; return them in the form for remote readers.
 
         Args:
-            topic: what all sides call it.
+            topic: the name that all sides use.
         """
 
 
 class LiveQos:
-    """Follows the publishers of a live graph, whose messages come as one channel."""
+    """QoS from the publishers of a live graph, whose messages come as one channel."""
 
     def __init__(self, rule: Rule, ends: Sequence[GraphEntity]) -> None:
         self._rule = rule
@@ -62,19 +62,19 @@ class LiveQos:
 
     @property
     def request(self) -> Qos | None:
-        """Return what matches every local publisher; None while their QoS is unknown."""
+        """Return a profile that matches every local publisher; None while their QoS is unknown."""
         return request(self._offers) if self._offers else None
 
     @property
     def is_reliable(self) -> bool:
-        """Return what the rule says, else whether every local publisher is reliable."""
+        """Return the rule's value, else whether every local publisher is reliable."""
         if self._rule.wants_reliable is not None:
             return self._rule.wants_reliable
         return not self._offers or request(self._offers).reliability == "reliable"
 
     @property
     def depth(self) -> int:
-        """Return how many messages late joiners get."""
+        """Return the number of messages for late joiners."""
         if self._rule.wants_latched is False:
             return 0
         if self._rule.latched or self._is_latched:
@@ -82,12 +82,12 @@ class LiveQos:
         return kept(self._offers)
 
     def receive_publishers(self, ends: Sequence[GraphEntity]) -> Change:
-        """Take the local publishers of now; return what that makes necessary."""
+        """Update the local publishers; return the consequence."""
         publishers, offers, depth = self._publishers, self._offers, self.depth
         self._publishers, self._offers = len(ends), _offers(ends)
         if (publishers, offers) == (self._publishers, self._offers):
             return Change.NONE
-        # A publisher that joins a latched topic may have pushed out what another latched before the graph showed it.
+        # A publisher that joins a latched topic may evict another's latched message before the graph shows it.
         if request(offers) != request(self._offers) or 0 < depth < self.depth:
             return Change.SUBSCRIPTION
         return Change.DESCRIPTION
@@ -105,7 +105,7 @@ class LiveQos:
 
 
 class RecordedQos:
-    """Keeps the channels of a recording as they are; only rules make a topic best-effort."""
+    """QoS of the channels of a recording, unchanged; only rules make a topic best-effort."""
 
     def __init__(self, rule: Rule) -> None:
         self._rule = rule
@@ -118,7 +118,7 @@ class RecordedQos:
 
     @property
     def is_reliable(self) -> bool:
-        """Return what the rule says, else True."""
+        """Return the rule's value, else True."""
         return self._rule.reliable
 
     @property
@@ -132,7 +132,7 @@ class RecordedQos:
         return Change.NONE
 
     def describe(self, channels: Sequence[Channel], topic: str) -> tuple[Channel, ...]:
-        """Return the channels under the topic that all sides know."""
+        """Return the channels under the topic name that all sides use."""
         self._recorded_depth = max(map(_recorded_depth, channels), default=0)
         return tuple(replace(channel, topic=topic) for channel in channels)
 

@@ -1,6 +1,6 @@
-"""What a proxy measured of the topics it received.
+"""Statistics of the topics that a proxy receives.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ SAMPLES_MAX: Final = 200_000  # latencies kept for percentiles; the oldest go
 
 @dataclass(slots=True)
 class TopicStats:
-    """One topic's figures."""
+    """Statistics of one topic."""
 
     topic: str
     type_name: str
     received: int = 0
-    losses: Losses = field(default_factory=Losses)  # on the way here
+    losses: Losses = field(default_factory=Losses)  # on the overlay
     duplicated: int = 0
-    refused: int = 0  # arrived, but could not be handed to the endpoint
-    parts: int = 0  # of the message that had most
+    refused: int = 0  # arrived, but could not be passed to the endpoint
+    parts: int = 0  # largest number of fragments of a message
     hops: Counter[int] = field(default_factory=Counter)
     latencies_ms: deque[float] = field(default_factory=lambda: deque(maxlen=SAMPLES_MAX))
     newest: dict[tuple[bytes, int], tuple[int, int]] = field(default_factory=dict)
-    # publisher, incarnation -> message number, place in its bundle
+    # publisher, incarnation -> message number, position in its bundle
 
     @property
     def lost(self) -> int:
-        """Return how many messages did not come to the endpoint: lost on the way, or refused here."""
+        """Return the number of messages that did not reach the endpoint: lost on the way, or refused here."""
         return self.losses.total + self.refused
 
     def count_number(self, publisher: bytes, incarnation: int, number: int, place: int = 0) -> None:
-        """Count a message that came again: numbers rise within an incarnation, places within a bundle."""
+        """Count a message that arrived again: numbers rise within an incarnation, positions within a bundle."""
         life, at = (publisher, incarnation), (number, place)
         newest = self.newest.get(life, (-1, 0))
         self.duplicated += at <= newest
@@ -52,7 +52,7 @@ class TopicStats:
         self.hops[hops] += 1
 
     def to_fields(self) -> dict[str, object]:
-        """Return the figures as one JSON object."""
+        """Return the statistics as one JSON object."""
         ordered = sorted(self.latencies_ms)
         latency = {"median": percentile(ordered, 0.5), "p99": percentile(ordered, 0.99), "max": percentile(ordered, 1)}
         return {
@@ -72,7 +72,7 @@ class TopicStats:
 
 
 def percentile(ordered: list[float], share: float) -> float | None:
-    """Return the value below which a share (0 to 1) of sorted values lies, by nearest rank; None of no values."""
+    """Return the value below which a share (0 to 1) of sorted values lies, by nearest rank; None if there are none."""
     if not ordered:
         return None
     return ordered[min(int(share * len(ordered)), len(ordered) - 1)]

@@ -1,6 +1,6 @@
-"""``--check``: what a configuration means here and now, without taking part in the overlay.
+"""Check command: ``--check`` reports what a configuration means here and now, without joining the overlay.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ __all__ = ["check_proxy"]
 
 
 def check_proxy(settings: ProxyConfig, *, json: bool) -> None:
-    """Say what each rule means.
+    """Print the meaning of each rule.
 
     Raises:
-        LocalError: without a live graph, a rule that has no delegation; with one, a graph that cannot be looked at.
+        LocalError: without a live graph, a rule has no delegation; with one, a graph cannot be queried.
     """
     identity, _ = load_member(settings.identity, settings.domain, Role.PROXY)
     held = DelegationStore(settings.delegations, identity)

@@ -1,6 +1,6 @@
-"""What every rule means here and now: what is live under it, whether the owner allows it, and what is wrong.
+"""Explanation of every rule: its live entities, its delegations, and its faults.
 
-Place: pure; from rules, a graph and the delegations held to findings.
+Sans-I/O; from rules, a graph and the held delegations to findings.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ _OPTIONS: Final = ("author", "maintainer", "description")  # metadata for which 
 
 
 class Delegated(Protocol):
-    """What an explanation asks of a delegation."""
+    """Properties of a delegation that an explanation needs."""
 
     @property
     def rights(self) -> frozenset[Right]:
-        """Return what this node may."""
+        """Return the rights of this node."""
 
     @property
     def metadata(self) -> Metadata | None:
-        """Return what the name means, if its giver said so."""
+        """Return the metadata of the name, if its giver stated them."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Side:
-    """What one direction and kind look for, and need."""
+    """Roles and rights that one direction and kind needs."""
 
     role: Role
     right: str
-    does: str  # of a local node
+    does: str  # role of a local node
     nobody: str
 
 
@@ -64,7 +64,7 @@ def explain(
     Args:
         expose: the rules about this graph.
         imports: the same.
-        graph: who is there; None: there is no live endpoint, and what is missing is not said to be.
+        graph: live entities; None: there is no live endpoint, and missing entities are not reported.
         held: by the name that each is about.
     """
     both: tuple[tuple[Direction, Sequence[Rule]], ...] = (("expose", expose), ("import", imports))
@@ -72,7 +72,7 @@ def explain(
 
 
 class _Look:
-    """At one rule among its equals."""
+    """Examination of one rule among the others of its direction."""
 
     def __init__(
         self,
@@ -98,7 +98,7 @@ class _Look:
         return Finding(self._direction, self._rule.kind, self._rule.name, matches, tuple(self._notes(matches)))
 
     def _candidates(self) -> set[tuple[str, str]]:
-        """Return local names and types: as the rule states them, as delegations do, and as they are live."""
+        """Return local names and types: from the rule, from delegations, and from the live graph."""
         rule = self._rule
         found = set()
         if not rule.is_pattern and rule.type_name:
@@ -136,11 +136,11 @@ class _Look:
         )
 
     def _concerns(self, local: str, type_name: str) -> bool:
-        """Return whether no other rule takes this type under this name."""
+        """Return whether no other rule applies to this type under this name."""
         return choose(self._rules, self._rule.kind, local, type_name) in (None, self._rule)
 
     def _type_faults(self, others: Sequence[str]) -> Iterator[str]:
-        """Yield what is wrong with the other types under the name."""
+        """Yield the faults of the other types under the name."""
         if others and self._rule.type_name:
             yield f"a node here {self._side.does} it as {', '.join(others)}; the rule says {self._rule.type_name}"
         elif others:
@@ -156,7 +156,7 @@ class _Look:
             yield f"no delegation; {_how_to_delegate(self._rule.metadata_of(local, type_name), self._side.right)}"
 
     def _qos_faults(self, ends: Sequence[GraphEntity]) -> Iterator[str]:
-        """Yield what local readers ask for beyond what the rule lets the proxy offer."""
+        """Yield the QoS that local readers request beyond what the rule lets the proxy offer."""
         if self._direction == "expose":
             return
         profiles = [(end.node, end.qos) for end in ends if end.qos is not None]
@@ -199,7 +199,7 @@ class _Look:
 
 
 def _of_kind(graph: Iterable[GraphEntity], kind: Kind) -> Iterator[GraphEntity]:
-    """Yield the ends of topics, of services, or of actions, these under their own names and types."""
+    """Yield the entities of topics, of services, or of actions; actions appear under their own names and types."""
     for end in graph:
         is_topic = end.role in (Role.PUBLISHES, Role.SUBSCRIBES)
         if kind != "action":
@@ -221,7 +221,7 @@ def _shown(metadata: Metadata) -> dict[str, str | int]:
 
 
 def _how_to_delegate(metadata: Metadata, right: str) -> str:
-    """Return how the owner makes the delegation: a command, as far as one can state these metadata."""
+    """Return how the owner creates the delegation: a command, as far as its options can state these metadata."""
     words = ["gdp", "delegate", "name", "--owner", "OWNER", "--card", "node.card", "--right", right]
     for key, value in metadata.items():
         if isinstance(value, int) and key != "pin":

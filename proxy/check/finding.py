@@ -1,6 +1,6 @@
-"""What there is to say about a rule of ``proxy.yaml``.
+"""Finding about a rule of ``proxy.yaml``.
 
-Place: pure. ``explain`` finds it, ``explain_table`` draws it.
+Sans-I/O. ``explain`` creates findings, ``table`` formats them.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ class Match:
     """One name under a rule.
 
     Args:
-        local: what this machine calls it.
+        local: the name on this machine.
         type_name: empty while unknown.
-        nodes: local nodes at its other end; empty: none is there.
-        qos: what they offer or ask for, such as ``reliable, transient local``; empty where there is no such thing.
-        overlay: the name everywhere; None while the type is unknown.
-        is_held: whether this node may do what the rule says.
-        faults: what keeps it from crossing.
-        notes: what may well be so.
+        nodes: local nodes of the opposite role; empty: there are none.
+        qos: what they offer or request, such as ``reliable, transient local``; empty where QoS does not apply.
+        overlay: the overlay name; None while the type is unknown.
+        is_held: whether this node has the delegation that the rule needs.
+        faults: reasons why it cannot cross.
+        notes: remarks that need no action.
     """
 
     local: str
@@ -56,7 +56,7 @@ class Match:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One rule: what is under it, and what concerns no single name of it."""
+    """One rule: its matches, and the faults that concern no single name of it."""
 
     direction: Direction
     kind: Kind
@@ -66,7 +66,7 @@ class Finding:
 
     @property
     def is_faulty(self) -> bool:
-        """Return whether something of it cannot cross."""
+        """Return whether any part of it cannot cross."""
         return any(match.faults for match in self.matches)
 
     def to_fields(self) -> dict[str, object]:

@@ -1,7 +1,8 @@
-"""Which delegations of one owner the rules of several machines need.
+"""Required delegations: those of one owner that the rules of several machines need.
 
-Place: pure. What a machine exposes it must be allowed to publish or serve, what it imports to read or call. A pattern,
-and a rule without a type, mean what is known: what rules of any machine state, what was delegated before, what is live.
+Sans-I/O. A machine needs the right to publish or serve for its exposed names, and the right to read or call for its
+imported names. A pattern, and a rule without a type, match known names: from rules of any machine, from earlier
+delegations, from live graphs.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ _GIVES = frozenset({Right.PUBLISH, Right.SERVE})
 
 
 class RequiredDelegation(NamedTuple):
-    """What one node is to be allowed with one name."""
+    """Right that one node needs for one name."""
 
     name: Name
     metadata: Metadata
@@ -34,11 +35,11 @@ class RequiredDelegation(NamedTuple):
 
 
 class Machine(NamedTuple):
-    """What is known of one machine.
+    """Known state of one machine.
 
     Args:
-        held: what its proxy was given before.
-        graphs: what is live there, in the order of the configuration's ``ros``; empty: nobody has looked.
+        held: delegations that its proxy already has.
+        graphs: live graphs, in the order of the configuration's ``ros``; empty: they were not observed.
     """
 
     config: ProxyConfig
@@ -47,7 +48,7 @@ class Machine(NamedTuple):
 
 
 def needs(machines: Sequence[Machine], owner: PublicKey) -> list[list[RequiredDelegation]]:
-    """Return what each machine needs, sorted by kind and ROS name."""
+    """Return the needs of each machine, sorted by kind and ROS name."""
     offers = [_offered(machine, owner) for machine in machines]
     everywhere = {name: metadata for each in offers for name, metadata in each.items()}
     return [
@@ -57,7 +58,7 @@ def needs(machines: Sequence[Machine], owner: PublicKey) -> list[list[RequiredDe
 
 
 def unmet(rules: Iterable[Rule], owner: PublicKey, found: Iterable[RequiredDelegation]) -> list[Rule]:
-    """Return the rules of this owner for which nothing was found."""
+    """Return the rules of this owner without any match."""
     known = [each.metadata for each in found]
     return [rule for rule in _of(rules, owner) if all(rule.local_of(metadata) is None for metadata in known)]
 
@@ -76,7 +77,7 @@ def _of_machine(
 
 
 def _offered(machine: Machine, owner: PublicKey) -> dict[Name, Metadata]:
-    """Return what a machine gives: as its rules state it, as it may already, as it is live there."""
+    """Return what a machine offers: from its rules, its delegations and its live graphs."""
     config = machine.config
     known = dict(_stated(config.expose, owner))
     for delegation in machine.held:
@@ -89,7 +90,7 @@ def _offered(machine: Machine, owner: PublicKey) -> dict[Name, Metadata]:
 
 
 def _asked(machine: Machine, owner: PublicKey) -> dict[Name, Metadata]:
-    """Return what a machine wants: as its rules state it, as it is live there."""
+    """Return what a machine requests: from its rules and its live graphs."""
     config = machine.config
     known = dict(_stated(config.imports, owner))
     for at, graph in enumerate(machine.graphs):

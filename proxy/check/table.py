@@ -1,6 +1,6 @@
-"""The findings of ``gdp-proxy --check`` for people: a table, and beneath it what there is to say, ready to copy.
+"""Table of the findings of ``gdp-proxy --check``, followed by faults and notes that are ready to copy.
 
-Place: shell; makes rich renderables, prints nothing.
+I/O layer; it builds rich renderables and prints nothing.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""The ``gdp-delegate`` command: an owner gives proxies what the rules of their files need.
+"""Command ``gdp-delegate``: an owner gives proxies the delegations that the rules of their files need.
 
-Place: command.
+I/O.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ def delegate_what_is_needed(
     json: Json = False,
     version: Version = False,
 ) -> None:
-    """Let each proxy publish, read, serve or call what its rules say; what it may already is left as it is."""
-    del version  # it ends the command by itself
+    """Give each proxy the delegations to publish, read, serve or call that its rules need; valid ones are kept."""
+    del version  # its callback ends the command
     with failing_clearly():
         key = load_owner(owner).public
         configs = [ProxyConfig.load(file) for file in files]
@@ -78,7 +78,7 @@ def main() -> None:
 
 
 def _refuse_other_owners(owner: Path, key: PublicKey, files: Sequence[Path], configs: Sequence[ProxyConfig]) -> None:
-    """Refuse to delegate where no rule is of this owner; warn of a single file where other files have such rules.
+    """Refuse to delegate if no rule is of this owner; warn of a single file if other files have such rules.
 
     Raises:
         LocalError: none of the files has a rule of this owner.
@@ -95,7 +95,7 @@ def _refuse_other_owners(owner: Path, key: PublicKey, files: Sequence[Path], con
 
 
 def _owners_named(file: Path) -> str:
-    """Return the owners that a file's rules name, as it writes them."""
+    """Return the owners that a file's rules name, as the file writes them."""
     data = read_yaml(file).data
     sides = [data.get(side) for side in ("expose", "import")] if isinstance(data, dict) else []
     rules = [rule for side in sides if isinstance(side, list) for rule in side if isinstance(rule, dict)]
@@ -108,7 +108,7 @@ def _graphs(config: ProxyConfig, card: NodeDescriptor) -> list[Graph]:
 
 
 def _held(delegations: Iterable[Delegation], card: NodeDescriptor, need: RequiredDelegation) -> Delegation | None:
-    """Return what the node has of a name, if it holds now."""
+    """Return the node's delegation of a name, if it is valid now."""
     for delegation in delegations:
         if delegation.name == need.name:
             try:
@@ -116,7 +116,7 @@ def _held(delegations: Iterable[Delegation], card: NodeDescriptor, need: Require
                 for right in delegation.rights:
                     chain.check(right, time.time())
             except StatementError:
-                return None  # run out, or of a node that was here before: a new one takes its place
+                return None  # expired, or of an earlier node here: a new one replaces it
             return delegation
     return None
 
@@ -124,7 +124,7 @@ def _held(delegations: Iterable[Delegation], card: NodeDescriptor, need: Require
 def _made(
     owner: Path, card: NodeDescriptor, need: RequiredDelegation, held: Delegation | None, days: float
 ) -> Delegation:
-    """Return a delegation of what is needed; what was given before is in it as well."""
+    """Return a delegation of the needed right; it includes the rights given before."""
     rights, epochs = (held.rights, held.grants.keys()) if held is not None else (frozenset(), (0,))
     return delegate(owner, card, need.metadata, need.rights | rights, epochs, days=days)
 

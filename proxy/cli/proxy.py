@@ -1,6 +1,6 @@
-"""The ``gdp-proxy`` command.
+"""Command ``gdp-proxy``.
 
-Place: command. Of what it can do only that is imported which is asked for: that is most of the time to its start.
+I/O. It imports only the modules of the requested function: imports take most of the start-up time.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def proxy(
 
     With a ros section it takes part in that graph; without one it records what it imports.
     """
-    del schema, version  # they end the command by themselves
+    del schema, version  # their callbacks end the command
     set_up_logging(verbose=verbose)
     with failing_clearly():
         settings = ProxyConfig.load(config)

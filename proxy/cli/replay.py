@@ -1,6 +1,6 @@
-"""The ``gdp-replay`` command.
+"""Command ``gdp-replay``.
 
-Place: command.
+I/O.
 """
 
 from __future__ import annotations
@@ -59,11 +59,11 @@ def replay(
 ) -> None:
     """Replay a recording's exposed topics onto the overlay with the recorded timing.
 
-    Exit 1: a message of a reliable topic was not confirmed by every reader of it, or had none, latched or not; or was
-    too large, or the overlay refused a topic; or the recording takes more memory or time than it may. Best effort is
-    sent, and confirmed by nobody.
+    Exit 1: a message of a reliable topic was too large, had no reader, or was not confirmed by each reader; this
+    includes latched topics. Also if the overlay refused a topic, or the recording exceeds its memory or time. Best
+    effort is sent without confirmation.
     """
-    del version  # it ends the command by itself
+    del version  # its callback ends the command
     set_up_logging(verbose=verbose)
     limits = BagLimits(None if memory is None else memory << 20, cpu)
     with failing_clearly(), _failing_decoder():
@@ -79,7 +79,7 @@ def replay(
 
 @contextlib.contextmanager
 def _failing_decoder() -> Iterator[None]:
-    """Turn the end of the process that decodes into one line on standard error and exit code 1."""
+    """Convert the end of the decoding process into one line on standard error and exit code 1."""
     try:
         yield
     except RecordingError as error:
@@ -133,7 +133,7 @@ def _report_progress(replay: Replay, total: int | None) -> None:
 
 
 def _exposed_total(reader: BagReader, endpoint: ReplayEndpoint) -> int | None:
-    """Return how many messages of the recording are exposed; None where its index does not say."""
+    """Return the number of exposed messages of the recording; None where its index does not state it."""
     if all(endpoint.is_subscribed(index) for index in range(len(reader.channels))):
         return reader.count
     if reader.counts is None:
@@ -166,7 +166,7 @@ def _report(reader: BagReader, replay: Replay, unconfirmed: Sequence[Unconfirmed
 
 
 def _topic_fields(replay: Replay) -> list[dict[str, object]]:
-    """Return the figures of each channel of which something was sent, in the recording's order."""
+    """Return the statistics of each channel that sent a message, in the recording's order."""
     channels = [(index, number, each) for each in replay.topics for number, index in enumerate(each.indexes)]
     return [
         {

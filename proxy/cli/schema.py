@@ -1,6 +1,6 @@
-"""The option that prints the schema of ``proxy.yaml``.
+"""Schema option of ``gdp-proxy``: prints the JSON schema of ``proxy.yaml``.
 
-Place: command.
+I/O.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ __all__ = ["Schema", "schema_text"]
 
 
 def schema_text() -> str:
-    """Return what ``docs/proxy.schema.json`` holds."""
+    """Return the content of ``docs/proxy.schema.json``."""
     return json.dumps(ProxyConfig.json_schema(), indent=2) + "\n"
 
 

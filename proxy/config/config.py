@@ -1,6 +1,6 @@
-"""The configuration of a proxy: what crosses (``proxy/rules``), and between which graphs and devices.
+"""Configuration of a proxy: rules (``proxy/config/rule.py``), graphs and devices.
 
-Place: shell; loading reads files and changes nothing. What no rule names stays local.
+I/O; loading reads files and changes nothing. A name that no rule matches stays local.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ __all__ = ["Encoding", "ProxyConfig", "Record", "RosGraphConfig", "Rule"]
 
 
 def _one_or_several(value: object, validate: ValidatorFunctionWrapHandler, info: ValidationInfo) -> object:
-    """Take a single mapping for a list of one; what is wrong in it is told at its own key."""
+    """Accept a single mapping for a list of one; its faults are reported at its own key."""
     if isinstance(value, dict):
         return (RosGraphConfig.model_validate(value, strict=True, context=info.context),)
     if not isinstance(value, list):
@@ -110,11 +110,11 @@ class ProxyConfig(Section):
 
     @classmethod
     def json_schema(cls) -> JsonSchema:
-        """Return the schema of the file, for editors."""
+        """Return the JSON schema of the file, for editors."""
         return editor_schema(cls, "proxy.yaml")
 
     def endpoint_of(self, rule: Rule) -> int:
-        """Return which of ``ros`` a rule is about; of a loaded file every rule has exactly one, if ``ros`` has any.
+        """Return the index in ``ros`` of a rule's graph; in a loaded file with any ``ros`` every rule has exactly one.
 
         Raises:
             LocalError: none, or more than one.
@@ -137,7 +137,7 @@ class ProxyConfig(Section):
         return self
 
     def _misplaced(self) -> Iterator[Fault]:
-        """Yield the keys that mean nothing on their side."""
+        """Yield the keys that have no meaning on their side."""
         for side, rules, only in (
             ("expose", self.expose, {"replication": "import"}),
             ("import", self.imports, dict.fromkeys(("stop", "at_once", "state_node"), "expose")),
@@ -169,7 +169,7 @@ class ProxyConfig(Section):
             for index, rule in enumerate(rules):
                 places[id(rule)] = None
                 if not self.ros and rule.kind == "topic" and rule.ros is None and rule.domain is None:
-                    continue  # recordings are enough for it
+                    continue  # recordings suffice for it
                 try:
                     places[id(rule)] = self.endpoint_of(rule)
                 except LocalError as error:

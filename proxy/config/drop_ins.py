@@ -37,7 +37,7 @@ class DropIn(Section):
 
 
 def drop_in_directory(path: Path) -> Path:
-    """Return the drop-in directory of a proxy's configuration, whether it is there or not."""
+    """Return the drop-in directory of a proxy's configuration, whether it exists or not."""
     return path.with_name(f"{path.name}.d")
 
 

@@ -1,6 +1,6 @@
-"""A ROS graph that the proxy takes part in: one of the ``ros`` entries of ``proxy.yaml``.
+"""ROS graph of the proxy: one of the ``ros`` entries of ``proxy.yaml``.
 
-Place: a section of a file; what is not stated is read from the environment, as every ROS program does.
+Section of a configuration file. Values that are not stated come from the environment, as in every ROS program.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class RosGraphConfig(Section):
 
     @property
     def ros(self) -> RosVersion:
-        """Return which ROS it is."""
+        """Return the ROS version."""
         return 1 if self.endpoint == "ros1" else 2
 
     @property
@@ -56,7 +56,7 @@ class RosGraphConfig(Section):
         """Return the ROS 2 domain.
 
         Raises:
-            LocalError: the environment states one that is none.
+            LocalError: the environment states an invalid one.
         """
         if self.domain is not None:
             return self.domain
@@ -67,16 +67,16 @@ class RosGraphConfig(Section):
 
     @property
     def master_uri(self) -> str:
-        """Return where the ROS 1 master is."""
+        """Return the URI of the ROS 1 master."""
         return self.master or os.environ.get("ROS_MASTER_URI") or DEFAULT_MASTER
 
     @property
     def where(self) -> tuple[RosVersion, int | str]:
-        """Return what tells one graph from another; raises as ``domain_id``."""
+        """Return the identity of the graph; raises as ``domain_id``."""
         return (1, self.master_uri) if self.ros == 1 else (2, self.domain_id)
 
     def fits(self, rule: Rule) -> bool:
-        """Return whether a rule may be about this graph; raises as ``domain_id``."""
+        """Return whether a rule may apply to this graph; raises as ``domain_id``."""
         return rule.ros in (None, self.ros) and (
             rule.domain is None or (self.ros == 2 and rule.domain == self.domain_id)
         )
@@ -104,5 +104,5 @@ def _is_master(text: str) -> bool:
     try:
         uri = urlsplit(text)
         return uri.scheme == "http" and bool(uri.hostname) and uri.port is not None and uri.path in ("", "/")
-    except ValueError:  # a port that is none
+    except ValueError:  # an invalid port
         return False

@@ -1,8 +1,8 @@
-"""The keys of a configuration file for editors: JSON Schema 2020-12, made from its model.
+"""JSON Schema (2020-12) of a configuration file for editors, generated from its model.
 
-Place: pure. An editor with a YAML language server completes and checks a file that begins with
-``# yaml-language-server: $schema=proxy.schema.json``. What JSON Schema cannot say (files that exist, rules that clash)
-is for ``gdp-proxy --check``.
+Sans-I/O. An editor with a YAML language server completes and checks a file that begins with
+``# yaml-language-server: $schema=proxy.schema.json``. JSON Schema cannot check that files exist or that rules clash;
+``gdp-proxy --check`` does that.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ JsonSchema: TypeAlias = "dict[str, object]"
 
 DIALECT: Final = "https://json-schema.org/draft/2020-12/schema"
 
-_SHARED: Final = {  # keys that every node's file has; docs/reference/configuration.md says more about them
+_SHARED: Final = {  # keys of every node's file; docs/reference/configuration.md describes them in full
     ("Domain", "root"): "Root certificate of the node's own trust domain.",
     ("Domain", "trusts"): "Root certificates of other domains whose members are believed.",
     ("Domain", "transit"): "Labels of the domains through which traffic may pass. `null`: every trusted one.",
@@ -36,5 +36,5 @@ def editor_schema(model: type[Section], title: str) -> JsonSchema:
         del each["title"]
         each["description"] = each["description"].replace("``", "`")
         for key in each["properties"].values():
-            key.pop("title", None)  # made of Python's names, and shown in place of the keys
+            key.pop("title", None)  # derived from Python's names, and displayed in place of the keys
     return {"$schema": DIALECT, "title": title, **schema}

@@ -1,6 +1,6 @@
-"""Which rule holds: a rule with a full name before every pattern, and among equals the first of the file.
+"""Rule matching: a rule with a full name precedes every pattern, and among equals the first of the file applies.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from proxy.config.rule import Kind, Rule
 
 __all__ = ["Fault", "choose", "clashes", "imported"]
 
-Fault: TypeAlias = "tuple[tuple[str | int, ...], str]"  # the key that is wrong, and what about it
+Fault: TypeAlias = "tuple[tuple[str | int, ...], str]"  # the wrong key, and its fault
 
 
 def choose(rules: Sequence[Rule], kind: Kind, local_name: str, type_name: str = "") -> Rule | None:
-    """Return the rule of one direction for what this machine calls so, None: it stays local.
+    """Return the rule of one direction for a local name; None: it stays local.
 
-    A rule with that full name settles it: where its type is another, no pattern takes its place.
+    A rule with that full name is final: if its type differs, no pattern replaces it.
 
     Args:
         type_name: empty while unknown.
@@ -31,7 +31,7 @@ def choose(rules: Sequence[Rule], kind: Kind, local_name: str, type_name: str = 
 
 
 def imported(rules: Sequence[Rule], name: Name, metadata: Metadata) -> tuple[Rule, str] | None:
-    """Return the rule about an overlay name, and what this machine calls it; None: no rule is about it."""
+    """Return the rule for an overlay name, and the local name; None: no rule applies to it."""
     for rule in sorted(rules, key=lambda rule: rule.is_pattern):
         local = rule.local_of(metadata)
         if local is not None and metadata.name(rule.owner.compressed) == name:
@@ -42,10 +42,10 @@ def imported(rules: Sequence[Rule], name: Name, metadata: Metadata) -> tuple[Rul
 def clashes(
     expose: Sequence[Rule], imports: Sequence[Rule], place_of: Callable[[Rule], Hashable | None]
 ) -> Iterator[Fault]:
-    """Yield what is wrong between rules: two of one direction, or a service on both sides, for one thing.
+    """Yield the conflicts between rules: two of one direction, or a service on both sides, for one name.
 
     Args:
-        place_of: which graph a rule is about.
+        place_of: returns the graph of a rule.
     """
     for side, rules in (("expose", expose), ("import", imports)):
         seen = _Seen(side, place_of)
@@ -64,7 +64,7 @@ def clashes(
 
 
 class _Seen:
-    """Rules of one direction by what only one of them may be about."""
+    """Rules of one direction, indexed by what only one of them may apply to."""
 
     def __init__(self, side: str, place_of: Callable[[Rule], Hashable | None]) -> None:
         self._side = side
@@ -76,7 +76,7 @@ class _Seen:
             self._rules.setdefault(key, []).append((index, rule))
 
     def find(self, rule: Rule) -> str | None:
-        """Return how an earlier rule is about the same thing."""
+        """Return how an earlier rule applies to the same name."""
         for key, what in self._keys(rule):
             for index, earlier in self._rules.get(key, ()):
                 if rule.fits_type(earlier.type_name):

@@ -1,9 +1,10 @@
-"""Full ROS names, and patterns of them.
+"""Patterns of full ROS names.
 
-Place: pure. In a pattern ``*`` stands for any characters of one segment, and ``**``, which is a segment of its own, for
-one or more segments. As in a shell, neither begins a hidden segment (``/fold/_action/status``): that is written out.
+Sans-I/O. In a pattern ``*`` matches any characters of one segment. ``**``, which is a segment of its own, matches one
+or more segments. As in a Unix shell, neither matches the start of a hidden segment (``/fold/_action/status``): a
+pattern spells it out.
 Source: https://design.ros2.org/articles/topic_and_service_names.html; http://wiki.ros.org/Names, by which a segment may
-begin with a digit, too.
+also begin with a digit.
 """
 
 from __future__ import annotations
@@ -16,23 +17,24 @@ __all__ = ["NAME_FORM", "NAME_MAX_CHARS", "PATTERN_FORM", "is_name", "is_pattern
 
 NAME_MAX_CHARS: Final = 512
 NAME_FORM: Final = r"(?:/[A-Za-z0-9_]+)+"
-PATTERN_FORM: Final = r"(?:/(?:\*\*|\*|\*?[A-Za-z0-9_]+(?:\*[A-Za-z0-9_]+)*\*?))+"  # names, too; as ECMAScript reads it
+# matches names, too; in ECMAScript's syntax
+PATTERN_FORM: Final = r"(?:/(?:\*\*|\*|\*?[A-Za-z0-9_]+(?:\*[A-Za-z0-9_]+)*\*?))+"
 
 _VISIBLE: Final = "(?!_)[A-Za-z0-9_]+"
 
 
 def is_name(text: str) -> bool:
-    """Return whether this is one full name, such as ``/camera/image``."""
+    """Return whether the text is one full name, such as ``/camera/image``."""
     return len(text) <= NAME_MAX_CHARS and re.fullmatch(NAME_FORM, text) is not None
 
 
 def is_pattern(text: str) -> bool:
-    """Return whether this is a pattern of full names, such as ``/camera/**``; a name is none."""
+    """Return whether the text is a pattern of full names, such as ``/camera/**``; a name is not."""
     return "*" in text and len(text) <= NAME_MAX_CHARS and re.fullmatch(PATTERN_FORM, text) is not None
 
 
 def matches(pattern: str, name: str) -> bool:
-    """Return whether a full name is one that the pattern means."""
+    """Return whether a full name matches the pattern."""
     return _compiled(pattern).fullmatch(name) is not None
 
 

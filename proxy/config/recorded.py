@@ -1,8 +1,9 @@
 """Rules of ``proxy.yaml`` as they apply to a recording.
 
-Sans-I/O. A recording has only topics, and it is exact: ``max_hz`` leaves none of its messages out, and each message
-that arrives is recorded, whatever its size. A replayed topic has the name that all machines know: ``remap``
-does not apply.
+Sans-I/O. A recording has topics only, and it is exact: ``max_hz`` omits none of its messages, and each message that
+arrives is recorded, whatever its size. A replayed topic has the name that all machines use: ``remap`` does not apply.
+QoS does not decide what is reliable or latched. Unless the rule states otherwise, a recording's topics are reliable,
+and a recorded latched topic stays latched.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ class RecordedRules:
     """Rules about the topics of one recording.
 
     Args:
-        expose: what of a replayed recording leaves this machine.
-        imports: what is recorded.
+        expose: topics of a replayed recording that leave this machine.
+        imports: topics that are recorded.
     """
 
     expose: tuple[Rule, ...] = ()

@@ -1,6 +1,6 @@
-"""One rule of ``proxy.yaml``: what crosses, under which name, in which form.
+"""Rule of ``proxy.yaml``: a name that crosses, with its overlay name and its options.
 
-Place: a section of a file; validating one reads the owner's public key and changes nothing.
+Section of a configuration file. Validation reads the owner's public key and changes nothing.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ CALL_MAX_S: Final = 86_400.0
 COPIES_MAX: Final = 1_024
 AT_ONCE_MAX: Final = 65_536
 RATE_MAX_HZ: Final = 1e6
-DOMAIN_MAX: Final = 232  # the ports of a higher one would lie above 65535; DDSI-RTPS 2.5, section 9.6.2
+DOMAIN_MAX: Final = 232  # ports of a higher domain would exceed 65535; DDSI-RTPS 2.5, section 9.6.2
 
 _WORD: Final = "[A-Za-z][A-Za-z0-9_]*"
 _TYPES: Final[dict[Kind, tuple[str, str]]] = {
@@ -72,7 +72,7 @@ def _extra_metadata(items: dict[str, str | int]) -> dict[str, str | int]:
 
 
 def _owner_key(value: object, info: ValidationInfo) -> object:
-    """Read the public key file that ``owner`` names; anything but a text goes on to be refused as such."""
+    """Read the public key file that ``owner`` names; a value that is not text is passed on and refused as such."""
     if not isinstance(value, str):
         return value
     path = relative(Path(value), info)
@@ -85,7 +85,7 @@ def _owner_key(value: object, info: ValidationInfo) -> object:
 
 
 def _salt(value: object, info: ValidationInfo) -> object:
-    """Read the private file that ``salt_file`` names; anything but a text goes on to be refused as such."""
+    """Read the private file that ``salt_file`` names; a value that is not text is passed on and refused as such."""
     if not isinstance(value, str):
         return value
     if SALT in info.data.get("metadata", {}):
@@ -107,7 +107,7 @@ CallSeconds = Annotated[float, Field(gt=0, le=CALL_MAX_S)]
 
 
 def _by_kind(kind: Kind) -> JsonValue:
-    """Return what a JSON schema says of the rules of one kind; without ``kind`` a rule is about a topic."""
+    """Return the JSON schema of the rules of one kind; a rule without ``kind`` is about a topic."""
     then: JsonDict = {"type": {"pattern": f"^(?:|{_TYPES[kind][0]})$"}, **dict.fromkeys(_FOREIGN[kind], False)}
     condition: JsonDict = {"properties": {"kind": {"const": kind}}, "required": [] if kind == "topic" else ["kind"]}
     return {"if": condition, "then": {"properties": then}}
@@ -247,12 +247,12 @@ class Rule(Section):
 
     @property
     def extra(self) -> dict[str, str | int]:
-        """Return what the name digests beside kind, name and type."""
+        """Return the metadata that the name digests in addition to kind, name and type."""
         return self.metadata if self.salt is None else {**self.metadata, SALT: self.salt}
 
     @property
     def is_pattern(self) -> bool:
-        """Return whether it is about all names of a pattern."""
+        """Return whether the rule is about all names of a pattern."""
         return "*" in self.name
 
     @property
@@ -262,12 +262,12 @@ class Rule(Section):
 
     @property
     def reliable(self) -> bool:
-        """Return ``wants_reliable`` for a source that says nothing about it."""
+        """Return ``wants_reliable`` for a source that does not state it."""
         return self.wants_reliable is not False
 
     @property
     def latched(self) -> bool:
-        """Return ``wants_latched`` for a source that says nothing about it."""
+        """Return ``wants_latched`` for a source that does not state it."""
         return self.wants_latched is True
 
     @property
@@ -275,7 +275,7 @@ class Rule(Section):
         """Return the flat map that the name digests.
 
         Raises:
-            LocalError: a pattern, or a rule without a type: what it means depends on what is found.
+            LocalError: a pattern, or a rule without a type: its names depend on the live graph.
         """
         if self.is_pattern or not self.type_name:
             what = "a pattern" if self.is_pattern else "a rule without a type"
@@ -284,7 +284,7 @@ class Rule(Section):
 
     @property
     def overlay_name(self) -> Name:
-        """Return the 256-bit name under which it is known everywhere.
+        """Return the 256-bit overlay name.
 
         Raises:
             LocalError: as ``overlay_metadata``.
@@ -293,39 +293,39 @@ class Rule(Section):
 
     @property
     def is_ordered(self) -> bool:
-        """Return whether it is about a service that keeps state."""
+        """Return whether the rule is about a service that keeps state."""
         return self.state == "ordered"
 
     @property
     def spread(self) -> Replication:
-        """Return how requests are spread over servers."""
+        """Return how requests are distributed over servers."""
         return Replication(Mode(self.replication.mode), self.replication.copies, self.replication.budget)
 
     def matches(self, local_name: str) -> bool:
-        """Return whether it is about what this machine calls so."""
+        """Return whether the rule applies to a local name."""
         return matches(self.name, local_name) if self.is_pattern else local_name == self.local
 
     def fits_type(self, type_name: str) -> bool:
-        """Return whether it takes this type; one of them may be empty: unknown."""
+        """Return whether the rule accepts this type; an empty type on either side is unknown and fits."""
         return not self.type_name or not type_name or self.type_name == type_name
 
     def global_name_of(self, local_name: str) -> str:
-        """Return what all sides call what ``matches``."""
+        """Return the name that all sides use for a local name that ``matches``."""
         return local_name if self.is_pattern else self.name
 
     def metadata_of(self, local_name: str, type_name: str) -> Metadata:
-        """Return what the overlay name of something that ``matches`` digests."""
+        """Return the metadata that the overlay name of a matching local name digests."""
         own = {"kind": self.kind, "name": self.global_name_of(local_name), "type": type_name}
         return Metadata({**own, **self.extra})
 
     def overlay_name_of(self, local_name: str, type_name: str) -> Name:
-        """Return the 256-bit name of something that ``matches``."""
+        """Return the 256-bit overlay name of a matching local name."""
         return self.metadata_of(local_name, type_name).name(self.owner.compressed)
 
     def local_of(self, metadata: Metadata) -> str | None:
-        """Return the local name of what this metadata describes, None if the rule is not about it.
+        """Return the local name that this metadata describes, None if the rule does not apply to it.
 
-        The owner is not in the metadata: compare ``overlay_name_of`` as well, or use ``choice.imported``.
+        The owner is not in the metadata: compare ``overlay_name_of`` as well, or use ``matching.imported``.
         """
         name, type_name = metadata.get("name"), metadata.get("type")
         if metadata["kind"] != self.kind or not isinstance(name, str) or not isinstance(type_name, str):
@@ -395,5 +395,5 @@ class Rule(Section):
 
 
 def fits_kind(type_name: str, kind: Kind) -> bool:
-    """Return whether a type, as ROS 2 writes it, is one that a topic, a service or an action can have."""
+    """Return whether a type, as ROS 2 writes it, is valid for a topic, a service or an action."""
     return re.fullmatch(_TYPES[kind][0], type_name) is not None

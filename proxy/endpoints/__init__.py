@@ -1,4 +1,4 @@
-"""Endpoints: each speaks one dialect of ROS and knows nothing of names.
+"""Endpoints: each implements one dialect of ROS and has no knowledge of overlay names.
 
-Place: I/O.
+I/O.
 """

@@ -1,11 +1,10 @@
-"""What every endpoint does: look at a ROS graph, take part in it as one virtual node, and move raw messages.
+"""Endpoint interface: observes a ROS graph, joins it as one virtual node, and transfers raw messages.
 
-Place: pure; ``ros2``, ``ros1``, ``dds``, ``fake`` and ``proxy/recordings/endpoint.py`` do the I/O. An endpoint speaks
-one dialect and knows nothing of names, rules or the overlay. All methods are called from one thread and none of them
-waits; whatever an endpoint runs beside that (a wait set, another process) is its own business.
+Sans-I/O; ``ros2``, ``ros1``, ``dds``, ``fake`` and ``proxy/recordings/endpoint.py`` do the I/O. An endpoint implements
+one dialect and has no knowledge of overlay names, rules or the overlay. All methods are called from one thread and none
+of them blocks. An endpoint may run a wait-set thread or another process internally.
 
-Handles are whole numbers of the endpoint's choosing, never used twice in its life. After ``close(handle)`` no event
-names it any more.
+Handles are integers that the endpoint chooses and never reuses. After ``close(handle)`` no event has that handle.
 """
 
 from __future__ import annotations
@@ -40,26 +39,26 @@ _PROXY_NODE: Final = re.compile(r"gdp_proxy_[0-9a-f]{12}(_[0-9a-z_]*)?\Z")
 
 
 class Role(Enum):
-    """What a node does with a name."""
+    """Relation of a node to a name."""
 
     PUBLISHES = "publishes"
     SUBSCRIBES = "subscribes"
     SERVES = "serves"
-    CALLS = "calls"  # ROS 1 masters do not know their clients
+    CALLS = "calls"  # never in ROS 1, whose masters do not know clients
 
 
 @dataclass(frozen=True, slots=True)
 class GraphEntity:
-    """One end in the graph: a node's publisher, subscription, server or client; never one of this endpoint's own.
+    """Graph entity: a node's publisher, subscription, server or client; never one of this endpoint's own.
 
     Args:
-        role: what the node does.
-        name: fully qualified, as the robot calls it (``/camera/image``); ROS 2 actions show as their hidden parts
+        role: the node's relation to the name.
+        name: fully qualified local name (``/camera/image``); ROS 2 actions appear as their hidden parts
             (``/fold/_action/send_goal``).
         type_name: as ROS 2 writes it (``sensor_msgs/msg/Image``, ``std_srvs/srv/SetBool``), for ROS 1 too; empty while
             unknown.
         node: fully qualified name of the node; empty while unknown.
-        key: tells the ends of one name apart: a GID in hex, or the node's name.
+        key: distinguishes the entities of one name: a GID in hex, or the node's name.
         hash: md5 sum or ``RIHS01_...``; empty where unknown.
         qos: offered or requested, ROS 2 topics only.
     """
@@ -74,7 +73,7 @@ class GraphEntity:
 
     @property
     def is_proxy(self) -> bool:
-        """Return whether the end belongs to the virtual node of another proxy."""
+        """Return whether the entity belongs to the virtual node of another proxy."""
         return is_proxy_node(self.node)
 
 
@@ -82,13 +81,13 @@ Graph: TypeAlias = frozenset[GraphEntity]
 
 
 class GraphChanged(NamedTuple):
-    """``graph()`` has news."""
+    """Event: ``graph()`` has changed."""
 
 
 class TypeResolved(NamedTuple):
-    """What the messages of a subscription are; comes before its first ``MessageReceived``, and again if that changes.
+    """Type of a subscription's messages; precedes its first ``MessageReceived``, and recurs if the type changes.
 
-    ``others`` are the channels of further publishers, where the endpoint tells publishers apart: a recording does.
+    ``others`` are the channels of further publishers, where the endpoint distinguishes publishers: a recording does.
     """
 
     handle: int
@@ -100,13 +99,13 @@ class MessageReceived(NamedTuple):
     """One message of a subscription; never one that this endpoint published itself."""
 
     handle: int
-    stamp_ns: int  # wall clock, when the endpoint took it
+    stamp_ns: int  # wall clock, when the endpoint received it
     raw: bytes  # the channel's wire form: CDR with its four bytes of encapsulation, or ROS 1
     channel: int = 0  # 0: ``TypeResolved.channel``; n: number n - 1 of ``TypeResolved.others``
 
 
 class RequestReceived(NamedTuple):
-    """A local client's request to a virtual server, to be answered or failed under this ticket."""
+    """A local client's request to a virtual server, to be answered or refused by its ticket."""
 
     handle: int
     ticket: int
@@ -122,7 +121,7 @@ class ResponseReceived(NamedTuple):
 
 
 class CallFailed(NamedTuple):
-    """A call that got no response, and why."""
+    """A call that got no response, with the reason."""
 
     handle: int
     call: int
@@ -130,11 +129,11 @@ class CallFailed(NamedTuple):
 
 
 class EndpointError(NamedTuple):
-    """Something about a handle's name is wrong and stays so until the graph changes; the handle stays open."""
+    """A persistent fault of a handle's name, until the graph changes; the handle stays open."""
 
     handle: int
     reason: str
-    is_graph: bool = False  # it is the whole graph that cannot be had
+    is_graph: bool = False  # the whole graph is unavailable
 
 
 Event: TypeAlias = (
@@ -147,11 +146,11 @@ class Endpoint(Protocol):
 
     @property
     def ros(self) -> RosVersion:
-        """Return which ROS it speaks."""
+        """Return the ROS version."""
 
     @property
     def label(self) -> str:
-        """Return what people call it, such as ``ros2 domain 0`` or ``ros1 http://localhost:11311``."""
+        """Return the display name, such as ``ros2 domain 0`` or ``ros1 http://localhost:11311``."""
 
     @property
     def is_live(self) -> bool:
@@ -159,33 +158,33 @@ class Endpoint(Protocol):
 
     @property
     def dropped(self) -> int:
-        """Return how many messages it let go for want of room; what a middleware drops by its QoS is not known."""
+        """Return the messages dropped because a queue was full; those that a middleware drops are unknown."""
 
     def fileno(self) -> int:
-        """Return a descriptor that is readable while ``take`` has something."""
+        """Return a descriptor that is readable while ``poll_events`` has events."""
 
     def poll_events(self) -> Sequence[Event]:
-        """Return, once, what happened, in order."""
+        """Remove and return the pending events, in order."""
 
     def graph(self) -> Graph:
-        """Return who is there, as far as known; at most a second old."""
+        """Return the known entities, at most a second old."""
 
     def channel(self, topic: str, type_name: str) -> Channel:
-        """Return how this machine knows a topic type: hash and full definition text.
+        """Return this machine's description of a topic type: hash and full definition text.
 
         Raises:
-            LocalError: it does not; the text says what to install.
+            LocalError: it has none; the text states what to install.
         """
 
     def service(self, name: str, type_name: str) -> Service:
-        """Return how this machine knows a service type.
+        """Return this machine's description of a service type.
 
         Raises:
-            LocalError: it does not.
+            LocalError: it has none.
         """
 
     def subscribe(self, topic: str, type_name: str, qos: Qos | None) -> int:
-        """Hear a topic from now on.
+        """Subscribe to a topic.
 
         Args:
             qos: to request; None: the default of a reliable topic. ROS 1 ignores it.
@@ -195,9 +194,9 @@ class Endpoint(Protocol):
         """
 
     def advertise(self, channel: Channel) -> int:
-        """Be a publisher of ``channel.topic``; offer ``channel.qos[0]``, or latch as ``channel.latched`` says.
+        """Create a publisher of ``channel.topic`` with ``channel.qos[0]``, or latched as ``channel.latched`` states.
 
-        What is published reaches late joiners of a latched or transient local channel, as many as its depth says.
+        Late joiners of a latched or transient local channel get its last messages, as many as its depth.
 
         Raises:
             LocalError: the type is not known here, or a local one of that name has another definition.
@@ -211,10 +210,10 @@ class Endpoint(Protocol):
         """
 
     def subscribers(self, handle: int) -> int:
-        """Return how many local subscriptions a publisher of ours has now."""
+        """Return the present number of local subscriptions of a publisher."""
 
     def serve(self, service: Service) -> int:
-        """Be the server of ``service.name``; requests come as ``RequestReceived``.
+        """Create the server of ``service.name``; requests arrive as ``RequestReceived``.
 
         Raises:
             LocalError: the type is not known here.
@@ -224,34 +223,33 @@ class Endpoint(Protocol):
         """Answer a request; an unknown ticket is ignored: its client is gone."""
 
     def refuse(self, handle: int, ticket: int, reason: str) -> None:
-        """Fail a request with a reason, as far as the dialect can say one; its client must not hang if it can."""
+        """Fail a request with a reason, as far as the dialect can express it; its client must not hang if possible."""
 
     def create_client(self, name: str, type_name: str) -> int:
-        """Be a client of a local service.
+        """Create a client of a local service.
 
         Raises:
             LocalError: the type is not known here.
         """
 
     def call(self, handle: int, call: int, raw: bytes) -> None:
-        """Send a request under a number of the caller's; ``ResponseReceived`` or ``CallFailed`` follows, unless it is
-        dropped.
+        """Send a request under the caller's number; ``ResponseReceived`` or ``CallFailed`` follows.
 
-        Any number of calls may be under way; the caller keeps the time.
+        Nothing follows after ``drop``. Any number of calls may be under way; the caller keeps the timeouts.
         """
 
     def drop(self, handle: int, call: int) -> None:
-        """Forget a call: its response, should it come, is nobody's."""
+        """Forget a call: a later response is discarded."""
 
     def close(self, handle: int) -> None:
-        """End a subscription, publisher, server or client."""
+        """Close a subscription, publisher, server or client."""
 
     def remove_entity(self) -> None:
         """Leave the graph and free everything; no method is called afterwards."""
 
 
 def proxy_node_name(name_hex: str, suffix: str = "") -> str:
-    """Return what the virtual node of the proxy with this GDP name (64 hex digits) is called."""
+    """Return the virtual node's name for the proxy with this GDP name (64 hex digits)."""
     return f"gdp_proxy_{name_hex[:12]}{'_' + suffix if suffix else ''}"
 
 

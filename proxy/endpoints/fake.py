@@ -1,7 +1,7 @@
-"""A ROS graph in memory, and an endpoint in it: for tests, without ROS.
+"""Fake ROS graph in memory, with an endpoint: for tests without ROS.
 
-Place: pure, but for the descriptor that an endpoint must have. Everything happens at once, in the caller's thread. As
-in ROS, a late joiner of a latched topic gets its publishers' last messages, and ends whose QoS cannot match do not.
+Sans-I/O, except for the descriptor that an endpoint must have. Everything happens immediately, in the caller's thread.
+As in ROS, a late joiner of a latched topic gets its publishers' last messages, and incompatible QoS does not match.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Publication:
     kept: deque[bytes]
 
     def publish(self, raw: bytes) -> None:
-        """Hand a message to all who match."""
+        """Deliver a message to all matching subscriptions."""
         if self.qos.durability == "transient_local":
             self.kept.append(raw)
         for subscription in self.graph.subscriptions(self.end.name, self.end.type_name):
@@ -63,7 +63,7 @@ class Subscription:
     end: GraphEntity
     qos: Qos
     hear: Callable[[bytes], None]
-    described: Callable[[], None]  # what the topic's messages are may have changed
+    described: Callable[[], None]  # called when the description of the topic's messages may have changed
 
     def close(self) -> None:
         """Leave the graph."""
@@ -73,7 +73,7 @@ class Subscription:
 
 @dataclass(slots=True, eq=False)
 class Server:
-    """A server in the graph; ``ask`` is given a request and what to call with the response or a reason."""
+    """A server in the graph; ``ask`` gets a request and a callback for the response or a reason."""
 
     graph: FakeGraph
     end: GraphEntity
@@ -89,9 +89,9 @@ class FakeGraph:
     """One ROS graph.
 
     Args:
-        ros: which dialect its messages have.
-        channels: what a machine in it knows of message types, by type name.
-        services: what it knows of service types.
+        ros: dialect of its messages.
+        channels: message types known to its machine, by type name.
+        services: service types known to its machine.
     """
 
     def __init__(
@@ -141,11 +141,11 @@ class FakeGraph:
         return subscription
 
     def match(self, offered: Qos, wanted: Qos) -> bool:
-        """Return whether a publisher and a subscription have to do with each other."""
+        """Return whether a publisher and a subscription match."""
         return self.ros == 1 or _match(offered, wanted)
 
     def is_latched(self, topic: str, type_name: str) -> bool:
-        """Return whether a ROS 1 subscription is told so by a publisher; ROS 2 has QoS instead."""
+        """Return whether a publisher declares a ROS 1 topic as latched; ROS 2 uses QoS instead."""
         return self.ros == 1 and any(
             (each.end.name, each.end.type_name, each.qos.durability) == (topic, type_name, "transient_local")
             for each in self.publications
@@ -161,7 +161,7 @@ class FakeGraph:
         return server
 
     def call(self, name: str, raw: bytes, done: Callable[[bytes | str], None]) -> None:
-        """Ask the first server of a name; ``done`` gets a response, or a reason at once if there is none."""
+        """Call the first server of a name; ``done`` gets a response, or a reason at once if there is none."""
         server = next((server for server in self.servers if server.end.name == name), None)
         if server is None:
             done("no server")
@@ -178,7 +178,7 @@ class FakeGraph:
         return [*topics, *(each.end for each in self.servers)]
 
     def changed(self) -> None:
-        """Tell the endpoints."""
+        """Notify the endpoints."""
         for endpoint in self.endpoints:
             endpoint.tell(GraphChanged())
 
@@ -210,7 +210,7 @@ class FakeEndpoint:
 
     @property
     def ros(self) -> RosVersion:
-        """Return which ROS it speaks."""
+        """Return the ROS version."""
         return self._graph.ros
 
     @property
@@ -220,31 +220,31 @@ class FakeEndpoint:
 
     @property
     def label(self) -> str:
-        """Return what people call it."""
+        """Return the display name."""
         return f"fake ros{self._graph.ros}"
 
     @property
     def dropped(self) -> int:
-        """Return 0: nothing waits here."""
+        """Return 0: there is no queue."""
         return 0
 
     @property
     def handles(self) -> int:
-        """Return how many handles are open."""
+        """Return the number of open handles."""
         return len(self._open)
 
     def fileno(self) -> int:
-        """Return a descriptor that is readable while ``take`` has something."""
+        """Return a descriptor that is readable while ``poll_events`` has events."""
         return self._wake
 
     def tell(self, event: Event) -> None:
-        """Let the proxy know."""
+        """Queue an event for the proxy."""
         if not self._events:
             os.eventfd_write(self._wake, 1)
         self._events.append(event)
 
     def poll_events(self) -> Sequence[Event]:
-        """Return, once, what happened."""
+        """Remove and return the pending events."""
         if not self._events:
             return ()
         os.eventfd_read(self._wake)
@@ -253,25 +253,25 @@ class FakeEndpoint:
         return [each for each in events if isinstance(each, GraphChanged) or each.handle in self._open]
 
     def graph(self) -> Graph:
-        """Return who is there but us."""
+        """Return the entities of other nodes."""
         return frozenset(end for end in self._graph.ends() if end.node != self._node)
 
     def channel(self, topic: str, type_name: str) -> Channel:
-        """Return how this machine knows a type."""
+        """Return this machine's description of a type."""
         known = self._graph.channels.get(type_name)
         if known is None:
             raise LocalError(f"{type_name}: not installed")
         return replace(known, topic=topic)
 
     def service(self, name: str, type_name: str) -> Service:
-        """Return how this machine knows a service type."""
+        """Return this machine's description of a service type."""
         known = self._graph.services.get(type_name)
         if known is None:
             raise LocalError(f"{type_name}: not installed")
         return replace(known, name=name)
 
     def subscribe(self, topic: str, type_name: str, qos: Qos | None) -> int:
-        """Hear a topic."""
+        """Subscribe to a topic."""
         channel, handle = self.channel(topic, type_name), next(self._numbers)
         self._open[handle] = _Open(lambda: None)
 
@@ -286,7 +286,7 @@ class FakeEndpoint:
         return handle
 
     def advertise(self, channel: Channel) -> int:
-        """Be a publisher."""
+        """Create a publisher."""
         qos = channel.qos[0] if channel.qos else default(latched=channel.latched, depth=1)
         publication = self._graph.publish(self._node, channel.topic, channel.type_name, qos)
         return self._add(_Open(publication.close, publication))
@@ -299,14 +299,14 @@ class FakeEndpoint:
         publication.publish(raw)
 
     def subscribers(self, handle: int) -> int:
-        """Return how many subscriptions a publisher of ours has."""
+        """Return the number of subscriptions of a publisher."""
         publication = self._open[handle].publication
         if publication is None:
             raise LocalError(f"handle {handle} is no publisher")
         return len(self._graph.subscriptions(publication.end.name, publication.end.type_name))
 
     def serve(self, service: Service) -> int:
-        """Be a server."""
+        """Create a server."""
         opened = _Open(lambda: None)
         handle = self._add(opened)
 
@@ -331,7 +331,7 @@ class FakeEndpoint:
             done(reason)
 
     def create_client(self, name: str, type_name: str) -> int:
-        """Be a client."""
+        """Create a client."""
         self.service(name, type_name)
         return self._add(_Open(lambda: None, name=name))
 
@@ -357,7 +357,7 @@ class FakeEndpoint:
         self._open[handle].calls.discard(call)
 
     def close(self, handle: int) -> None:
-        """End what a handle stands for."""
+        """Close a handle."""
         self._open.pop(handle).close()
 
     def remove_entity(self) -> None:

@@ -1,6 +1,6 @@
-"""Opening the endpoints that a configuration names.
+"""Live endpoints: opens those that a configuration names.
 
-Place: shell. Only what is named is imported: each endpoint brings packages of its own.
+I/O. Only the named ones are imported, because each endpoint needs packages of its own.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ def open_endpoint(end: RosGraphConfig, node: str) -> Endpoint:
     """Join a graph as a node of this name.
 
     Raises:
-        LocalError: what the endpoint needs is not installed; the text says how to get it.
+        LocalError: a package that the endpoint needs is not installed; the text states how to get it.
     """
     if end.endpoint == "ros1":
         from proxy.endpoints.ros1 import Ros1Endpoint

@@ -1,6 +1,6 @@
-"""Which QoS to ask of local publishers, and which to offer to local readers, so that all match.
+"""QoS to request from local publishers, and to offer to local readers, so that all match.
 
-Place: pure.
+Sans-I/O.
 Source: DDS 1.4, section 2.2.3: a reader and a writer match if what is offered is no less than what is requested.
 """
 
@@ -13,11 +13,11 @@ from proxy.serial.channel import Qos
 
 __all__ = ["DEPTH_MAX", "NEVER", "default", "depth_of", "kept", "offer", "request", "unmatched"]
 
-NEVER: Final = (9_223_372_036, 854_775_807)  # how ROS 2 writes an infinite duration
+NEVER: Final = (9_223_372_036, 854_775_807)  # ROS 2's form of an infinite duration
 DEPTH_MAX: Final = 64  # messages kept for late joiners of one topic
 _DEPTH: Final = 10  # where none is known; ROS 2's own default
-_OFFERED_MAX: Final = 1_000  # of our own publishers, whatever a far one says of itself
-_READER_DEPTH: Final = 1_000  # of our own subscriptions: a burst waits here, not at its publisher
+_OFFERED_MAX: Final = 1_000  # of the proxy's own publishers, whatever a remote one states
+_READER_DEPTH: Final = 1_000  # of the proxy's own subscriptions: a burst waits here, not at its publisher
 
 
 def default(*, reliable: bool = True, latched: bool = False, depth: int = _DEPTH) -> Qos:
@@ -28,14 +28,14 @@ def default(*, reliable: bool = True, latched: bool = False, depth: int = _DEPTH
 
 
 def depth_of(profile: Qos) -> int:
-    """Return how many messages a profile keeps, as far as it says so."""
+    """Return the number of messages that a profile keeps, as far as it states it."""
     if profile.history == "keep_all":
         return DEPTH_MAX
     return profile.depth or (1 if profile.durability == "transient_local" else _DEPTH)
 
 
 def request(offers: Sequence[Qos]) -> Qos:
-    """Return what to request so that every one of these publishers matches."""
+    """Return the profile to request so that every one of these publishers matches."""
     return default(
         reliable=all(each.reliability != "best_effort" for each in offers),
         latched=bool(offers) and all(each.durability == "transient_local" for each in offers),
@@ -44,10 +44,10 @@ def request(offers: Sequence[Qos]) -> Qos:
 
 
 def kept(offers: Sequence[Qos]) -> int:
-    """Return how many messages late joiners of these publishers' topic want; 0: none.
+    """Return the number of messages for late joiners of these publishers' topic; 0: none.
 
-    With several publishers, whose messages come without their sender, as many as may be are kept: one that publishes
-    often must not push out what another one latched.
+    With several publishers, whose messages come without their sender, the number is the maximum: one that publishes
+    often must not evict what another one latched.
     """
     latched = [each for each in offers if each.durability == "transient_local"]
     if not latched or len(latched) < len(offers):
@@ -56,10 +56,10 @@ def kept(offers: Sequence[Qos]) -> int:
 
 
 def offer(sources: Sequence[Qos], wants: Sequence[Qos], *, is_latched: bool | None) -> Qos:
-    """Return what to offer: what far publishers do, as far as they are known, and more where a local reader insists.
+    """Return the profile to offer: that of the known remote publishers, and more where a local reader requires it.
 
     Args:
-        is_latched: what a rule says about it; None: nothing.
+        is_latched: the rule's value; None: unset.
     """
     latched = [each for each in sources if each.durability == "transient_local"]
     insisting = [each for each in wants if each.durability == "transient_local"]
@@ -74,7 +74,7 @@ def offer(sources: Sequence[Qos], wants: Sequence[Qos], *, is_latched: bool | No
 
 
 def unmatched(want: Qos) -> str:
-    """Return which policy of a local reader nobody beyond a network can promise, empty where there is none."""
+    """Return the policy of a local reader that cannot be met across a network, empty where there is none."""
     if want.deadline not in (NEVER, (0, 0)):
         return "it requests a deadline"
     if want.liveliness not in ("automatic", "system_default", "unknown", "best_available"):

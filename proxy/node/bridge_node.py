@@ -1,6 +1,6 @@
-"""A proxy in live graphs: the loop that drives the overlay's member, the endpoints and the bridge between them.
+"""Bridge node: the loop that drives the overlay's participant, the endpoints and the bridge between them.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ __all__ = ["run"]
 log = logging.getLogger(__name__)
 
 TICK_S: Final = 0.5
-_LOOK_S: Final = 2.0  # who begins sooner may not see yet that another proxy of its graph carries the same
-DRAIN_MAX_S: Final = 10.0  # a server that leaves gives up then what it has not answered
-_TURN_S: Final = 0.0002  # what an endpoint's thread may have to wait for the interpreter; Python's own is 5 ms
+_LOOK_S: Final = 2.0  # with less, a new proxy may not detect yet that another proxy of its graph carries the same
+DRAIN_MAX_S: Final = 10.0  # after this time a leaving server abandons unanswered requests
+_TURN_S: Final = 0.0002  # longest wait of an endpoint's thread for the interpreter; Python's default is 5 ms
 
 
 def run(path: Path, settings: ProxyConfig, *, json: bool) -> None:
-    """Carry what the configuration names between its graphs and the overlay until stopped.
+    """Carry the configured names between the graphs and the overlay until stopped.
 
     Args:
         path: of the configuration, to read it again after a SIGHUP.
 
     Raises:
-        LocalError: keys, delegations or the device are not as the configuration says, or an endpoint cannot be had.
+        LocalError: keys, delegations or the device are not as configured, or an endpoint is unavailable.
     """
     sys.setswitchinterval(_TURN_S)
     with run_node(settings, emit_wait if json else None) as node:
@@ -78,7 +78,7 @@ def run(path: Path, settings: ProxyConfig, *, json: bool) -> None:
 
 
 def _work(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:
-    """Carry until stopped, telling of progress."""
+    """Run until stopped, and report progress."""
     is_ready = False
     tick_at_s = 0.0
     leave_at_s: float | None = None
@@ -87,12 +87,12 @@ def _work(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:
         node.runtime.step(tick_at_s if due_s is None else min(due_s, tick_at_s))
         now_s = time.monotonic()
         bridge.work(now_s)
-        node.member.flush(now_s)  # once for all that waited: small messages share a seal
+        node.member.flush(now_s)  # once for all pending messages: small ones share a seal
         if node.is_leaving:
             if leave_at_s is None:
                 log.info("leaving; what is under way is answered")
                 leave_at_s = now_s + DRAIN_MAX_S
-            bridge.drain(now_s)  # again and again: a local server may appear meanwhile
+            bridge.drain(now_s)  # repeatedly: a local server may appear meanwhile
             node.has_drained = bridge.is_drained(now_s)
             if now_s >= leave_at_s or node.has_drained:
                 return
@@ -138,7 +138,7 @@ def _tell_progress(node: ProxyNode, bridge: Bridge) -> None:
 
 
 def _reload(path: Path, first: ProxyConfig, node: ProxyNode, bridge: Bridge) -> None:
-    """Read the configuration and the delegations again; flows whose rule is the same go on.
+    """Read the configuration and the delegations again; flows with an unchanged rule continue.
 
     Raises:
         GdpError: the old configuration stays in use.

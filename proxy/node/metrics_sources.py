@@ -1,7 +1,7 @@
-"""What is made ready for far publishers' descriptions: bounded by number and bytes, and for each publisher alone.
+"""Cache of decoders for remote publishers' descriptions, bounded by number and bytes, also for each publisher.
 
-Layer: sans-I/O. The least recently used entry goes first. A publisher that changes its description again and again
-pushes out its own entries, not those of others.
+Sans-I/O. The least recently used entry is dropped first. A publisher that changes its description again and again
+evicts its own entries, not those of others.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ class Sources(Generic[_Ready]):
         return len(self._entries)
 
     def __contains__(self, key: tuple[bytes, bytes]) -> bool:
-        """Return whether something is known of (publisher, description)."""
+        """Return whether there is an entry for (publisher, description)."""
         return key in self._entries
 
     def get(self, publisher: bytes, description: bytes) -> _Ready | None:
-        """Return the entry, None for a refused or unknown description; it was used now."""
+        """Return the entry, None for a refused or unknown description; this counts as a use."""
         key = (publisher, description)
         if key not in self._entries:
             return None
@@ -52,7 +52,7 @@ class Sources(Generic[_Ready]):
         return self._entries[key]
 
     def put(self, publisher: bytes, description: bytes, ready: _Ready | None) -> None:
-        """Keep an entry; others go where that is one too many."""
+        """Add an entry, and drop others beyond the bounds."""
         key = (publisher, description)
         if key in self._entries:
             self._remove(key)
@@ -65,7 +65,7 @@ class Sources(Generic[_Ready]):
             self._remove(next(iter(self._entries)))
 
     def forget_refused(self) -> None:
-        """Drop what was refused, so that it is looked at again."""
+        """Drop the refused entries, so that they are checked again."""
         for key in [key for key, ready in self._entries.items() if ready is None]:
             self._remove(key)
 

@@ -1,6 +1,6 @@
-"""A proxy at work: a member of the overlay on one device, with what its configuration makes global.
+"""Proxy node: a participant of the overlay on one device, with the names that its configuration makes global.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -45,18 +45,18 @@ __all__ = ["GOODBYE_S", "ProxyNode", "open_topics", "run_node"]
 
 log = logging.getLogger(__name__)
 
-GOODBYE_S: Final = 0.2  # how long a node that leaves works on
+GOODBYE_S: Final = 0.2  # time in which a leaving node still sends
 
 
 @dataclass(slots=True)
 class ProxyNode:
-    """What runs, for the command that drives it.
+    """The running node, for the command that drives it.
 
     Attributes:
-        on_reload: reads the configuration again; raises ``GdpError`` where the old one stays. None: there is nothing.
-        is_leaving: a SIGUSR1 or a drain came: answer what is under way, then end.
+        on_reload: reads the configuration again; raises ``GdpError`` where the old one stays. None: not supported.
+        is_leaving: a SIGUSR1 or a drain arrived: answer what is under way, then end.
         has_drained: all that was under way was answered.
-        drains: whether the command looks at that; else a SIGUSR1 ends it at once.
+        drains: whether the command checks ``is_leaving``; else a SIGUSR1 ends it at once.
     """
 
     identity: Identity
@@ -74,10 +74,10 @@ class ProxyNode:
     faults: Faults = field(default_factory=Faults)
 
     def reload(self) -> None:
-        """Read again the certificates, the configuration and the delegations.
+        """Read the certificates, the configuration and the delegations again.
 
         Raises:
-            GdpError: the old configuration stays in use; the text says why.
+            GdpError: the old configuration stays in use; the text states why.
         """
         self.credentials.look(now())
         if self.on_reload is not None:
@@ -91,19 +91,19 @@ class ProxyNode:
             log.error("configuration not reloaded, the old one stays in use reason=%s", error)
 
     def drain(self) -> None:
-        """Answer what is under way, then end; a command that does not look at ``is_leaving`` ends after this step."""
+        """Answer what is under way, then end; a command that does not check ``is_leaving`` ends after this step."""
         self.is_leaving = True
         if not self.drains:
-            self.has_drained = True  # what arrived is written
+            self.has_drained = True  # received messages are written
             self.runtime.stop()
 
     def leave_soon(self, number: int, frame: FrameType | None) -> None:
-        """Take a SIGUSR1, which wakes the loop."""
+        """Handle a SIGUSR1, which wakes the loop."""
         del number, frame
         self.drain()
 
     def control_handlers(self) -> ControlHandlers:
-        """Return what the control socket does."""
+        """Return the handlers of the control socket."""
         sources = self.sources()
 
         def status() -> dict[str, object]:
@@ -113,18 +113,18 @@ class ProxyNode:
         return ControlHandlers(reload=self.reload, status=status, drain=self.drain, is_drained=lambda: self.has_drained)
 
     def linger(self, duration_s: float) -> None:
-        """Work on for a while, so that a goodbye is heard."""
+        """Run for this many seconds more, so that the goodbye is sent."""
         self.runtime.run(lambda: False, time.monotonic() + duration_s)
 
     def tell_refusals(self) -> None:
-        """Warn of each claim that the overlay has refused."""
+        """Log a warning for each advertisement that the overlay has rejected."""
         for each in self.member.attachment.advertisements:
             if each.refused is not None:
                 name, right, reason = each.subject.name.short, each.right.value, each.refused.label
                 log.warning("claim refused name=%s right=%s reason=%s", name, right, reason)
 
     def sources(self) -> Sources:
-        """Return what the metrics show."""
+        """Return the sources of the metrics."""
         counters, member = self.plane.counters, self.member
         return Sources(
             frames=lambda: {"in": counters.frames_in, "out": counters.frames_out},
@@ -147,10 +147,10 @@ def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[Pro
     """Open everything that a proxy needs; close it on leaving.
 
     Args:
-        on_wait: called with reason and text when the proxy reports what it waits for.
+        on_wait: called with reason and text when the proxy reports a wait.
 
     Raises:
-        LocalError: keys, delegations or the device are not as the configuration says, or this proxy already runs.
+        LocalError: keys, delegations or the device are not as configured, or this proxy already runs.
     """
     identity, policy = load_member(config.identity, config.domain, Role.PROXY)
     settings = NodeSettings(incarnation(), wall_clock_ms(), fresh_bytes, lease_s=config.lease_s)
@@ -196,17 +196,17 @@ def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[Pro
 
 
 def _local_names(config: ProxyConfig) -> Callable[[Name], str]:
-    """Return what the rules with a type call each overlay name; a pattern's names are shown short."""
+    """Return a function from overlay name to the local name of a rule with a type; a pattern's names are shortened."""
     rules = [rule for rule in (*config.expose, *config.imports) if rule.type_name and not rule.is_pattern]
     names = {rule.overlay_name: rule.name for rule in rules}
     return lambda name: names.get(name, name.short)
 
 
 def open_topics(config: ProxyConfig, held: DelegationStore) -> dict[Name, Topic]:
-    """Return, for every rule, what this node may do with its name and the topic's secrets.
+    """Return, for every rule, this node's rights to its name and the topic's secrets.
 
     Raises:
-        LocalError: a rule without a type, or without a delegation that holds.
+        LocalError: a rule without a type, or without a valid delegation.
     """
     topics: dict[Name, Topic] = {}
     for rule in [*config.expose, *config.imports]:

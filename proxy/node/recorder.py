@@ -1,6 +1,6 @@
-"""A proxy without a live graph: the bridge records what is imported, or only counts it.
+"""Recorder: a proxy without a live graph, whose bridge records or only counts what it imports.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ TICK_S: Final = 0.5
 
 
 def record(settings: ProxyConfig, *, json: bool) -> None:
-    """Receive what the configuration imports until stopped.
+    """Receive the configured imports until stopped.
 
     Raises:
-        LocalError: keys, delegations, the device or the file are not as the configuration says.
+        LocalError: keys, delegations, the device or the file are not as configured.
     """
     refuse_existing_file(settings)
     rules = RecordedRules.of(imports=settings.imports)
@@ -53,10 +53,10 @@ def record(settings: ProxyConfig, *, json: bool) -> None:
 
 
 def refuse_existing_file(settings: ProxyConfig) -> None:
-    """Refuse to record into a file that exists.
+    """Refuse to record into an existing file.
 
     Raises:
-        LocalError: it does.
+        LocalError: the file exists.
     """
     if settings.record is not None and settings.record.path.exists():
         raise LocalError(f"{settings.record.path} exists already; move or delete it, or change record.path")

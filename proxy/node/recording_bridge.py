@@ -1,6 +1,6 @@
 """Bridge between one recording and the overlay.
 
-Place: shell. ``gdp-replay`` and a ``gdp-proxy`` without a graph drive it.
+I/O. ``gdp-replay`` and a ``gdp-proxy`` without a graph drive it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def open_recording_bridge(
         rules: those of ``settings`` that apply.
 
     Raises:
-        LocalError: a rule of ``settings`` without a delegation that holds, or a topic that cannot be published.
+        LocalError: a rule of ``settings`` has no valid delegation, or a topic cannot be published.
     """
     held = DelegationStore(settings.delegations, node.identity)
     open_topics(settings, held)
@@ -41,7 +41,7 @@ def open_recording_bridge(
     node.on_reload = lambda: _renew(node, settings, rules, bridge)
     node.runtime.watch(endpoint)
     try:
-        while bridge.get_timer() is not None:  # the graph is read, then what it brings is described
+        while bridge.get_timer() is not None:  # the first pass reads the graph, later ones the descriptions
             work(node, bridge)
         work(node, bridge)
         yield bridge
@@ -52,17 +52,17 @@ def open_recording_bridge(
 
 
 def work(node: ProxyNode, bridge: Bridge) -> None:
-    """Take what the recording and the overlay have, and hand on what results."""
+    """Process the events of the recording and the messages of the overlay."""
     now_s = time.monotonic()
     bridge.work(now_s)
     node.member.flush(now_s)
 
 
 def _renew(node: ProxyNode, settings: ProxyConfig, rules: RecordedRules, bridge: Bridge) -> None:
-    """Read the delegations again: new epochs and longer validity take effect without a message lost.
+    """Read the delegations again: new epochs and longer validity take effect without losing a message.
 
     Raises:
-        GdpError: a delegation is missing or does not hold; the old ones stay in use.
+        GdpError: a delegation is missing or is invalid; the old ones stay in use.
     """
     held = DelegationStore(settings.delegations, node.identity)
     topics = open_topics(settings, held)

@@ -1,6 +1,6 @@
-"""Replay of a recording over the bridge, with its own timing, and the figures of its end.
+"""Replay of a recording over the bridge with its own timing, and its final statistics.
 
-Place: shell; drives the node's loop between messages.
+I/O; drives the node's loop between messages.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from proxy.recordings.endpoint import ReplayEndpoint
 
 __all__ = ["Replay", "ReplayedTopic", "Unconfirmed"]
 
-STALL_S: Final = 20.0  # without any acknowledgement, readers are given up
+STALL_S: Final = 20.0  # after this time without any acknowledgement, readers are given up
 TICK_S: Final = 0.5
 
 _WHY: Final = {
@@ -33,12 +33,12 @@ _WHY: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Unconfirmed:
-    """A reliable topic of which some message was not confirmed by each of its readers.
+    """A reliable topic with a message that some reader did not confirm.
 
     Attributes:
-        messages: how many were published, those above the rule's limit included.
-        why: in words, as far as it is known.
-        reasons: messages by reason, a message once for each reader; what is still waited for has none.
+        messages: how many were published, including those above the rule's limit.
+        why: the reason as text, as far as it is known.
+        reasons: messages by reason, a message once for each reader; pending ones have none.
     """
 
     topic: str
@@ -69,10 +69,10 @@ class ReplayedTopic:
 
 
 class Replay:
-    """One recording on its way out.
+    """One replay of a recording.
 
     Args:
-        bridge: its flows stand.
+        bridge: its flows exist.
         rate: 1: as recorded, 2: twice as fast, 0: as fast as readers confirm.
         report: called about twice a second while replaying.
     """
@@ -101,32 +101,32 @@ class Replay:
 
     @property
     def sent(self) -> int:
-        """Return how many messages were published, those that nobody read included."""
+        """Return the number of published messages, including those without a reader."""
         return sum(each.flow.published.total() for each in self.topics)
 
     @property
     def sent_bytes(self) -> int:
-        """Return their bytes, as recorded."""
+        """Return the bytes of the published messages, as recorded."""
         return sum(each.flow.published_bytes.total() for each in self.topics)
 
     @property
     def confirmed(self) -> int:
-        """Return how many messages of reliable topics every reader has confirmed."""
+        """Return the number of messages of reliable topics that every reader has confirmed."""
         return sum(each.publisher.acknowledged for each in self.topics if each.publisher.confirms)
 
     @property
     def sent_best_effort(self) -> int:
-        """Return how many messages of best-effort topics were sent: nobody confirms them."""
+        """Return the number of messages sent on best-effort topics, which have no confirmation."""
         publishers = [each.publisher for each in self.topics if not each.publisher.confirms]
         return sum(publisher.messages - publisher.losses.total for publisher in publishers)
 
     @property
     def too_large(self) -> int:
-        """Return how many messages were above a limit, and not sent."""
+        """Return the number of messages above a limit, which were not sent."""
         return sum(each.publisher.losses.counts.get(LossReason.TOO_LARGE, 0) for each in self.topics)
 
     def unconfirmed(self) -> list[Unconfirmed]:
-        """Return the reliable topics of which something was not confirmed."""
+        """Return the reliable topics with unconfirmed messages."""
         publishers = [(each.topic, each.publisher) for each in self.topics]
         return [
             Unconfirmed(topic, each.messages, each.acknowledged, _why(each), each.losses.by_label())
@@ -159,7 +159,7 @@ class Replay:
         return not runtime.is_stopped
 
     def finish(self) -> bool:
-        """Wait until readers have confirmed what they may get; return False when they stop to, or when stopped."""
+        """Wait until readers have confirmed all possible messages; return False when they stop, or when stopped."""
         progress, stalled_s = self.confirmed, time.monotonic()
         while any(each.publisher.is_wanted and not each.publisher.is_acknowledged() for each in self.topics):
             if self._node.runtime.is_stopped:
@@ -172,7 +172,7 @@ class Replay:
         return True
 
     def _continue(self) -> bool:
-        """Let the node work while the recording is waited for; return whether it was not stopped."""
+        """Run the node while waiting for the recording; return whether it was not stopped."""
         self._step(0.0)
         return not self._node.runtime.is_stopped
 
@@ -181,7 +181,7 @@ class Replay:
             self._step(due_s - time.monotonic())
 
     def _step(self, at_most_s: float | None) -> None:
-        """Let the node and the bridge work once, for no longer than so many seconds."""
+        """Run the node and the bridge once, for at most this many seconds."""
         now_s = time.monotonic()
         wait_s = TICK_S if at_most_s is None else min(max(at_most_s, 0.0), TICK_S)
         self._node.runtime.step(now_s + wait_s)
@@ -193,7 +193,7 @@ class Replay:
 
 
 def _why(publisher: Publisher) -> str:
-    """Return why not everything that a publisher has published was confirmed, as far as it is known."""
+    """Return why some of a publisher's messages were not confirmed, as far as it is known."""
     if not publisher.is_wanted and publisher.losses.counts.keys() <= {LossReason.NO_READER}:
         return "nobody reads it"
     known = [f"{count} {_WHY[reason]}" for reason, count in publisher.losses.counts.items() if reason in _WHY]

@@ -1,1 +1,1 @@
-"""Recordings: read by a process without rights, written, compared, and an endpoint of the bridge."""
+"""Recordings: reading in a process without rights, writing, comparison, and an endpoint of the bridge."""

@@ -1,6 +1,6 @@
-"""Between rosbags' connections and channels, in both directions.
+"""Channels of a recording: conversion from and to rosbags' connections.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def from_ros2(
 
 
 def offered_qos(profiles: object) -> list[RosbagsQos]:
-    """Return the QoS profiles that a recording says were offered: a YAML text, or a list of maps.
+    """Return the QoS profiles that a recording states as offered: a YAML text, or a list of maps.
 
     Raises:
         SalvageError: it is neither, or too long.
@@ -132,7 +132,7 @@ def _from_qos(profile: RosbagsQos) -> Qos:
 
 
 def to_qos(profile: Qos) -> RosbagsQos:
-    """Return rosbags' form of a profile; words it does not know become ``unknown``."""
+    """Return rosbags' form of a profile; values it does not know become ``unknown``."""
     return RosbagsQos(
         history=_policy(QosHistory, profile.history, QosHistory.UNKNOWN),
         depth=profile.depth,

@@ -1,9 +1,9 @@
-"""The process that decodes one recording, and can do nothing else.
+"""Child process that decodes one recording, without any other rights.
 
-Place: command, started by ``process``. It reads the recording and writes frames (``stream``) to a pipe. Limits
-of memory and time, Landlock and seccomp come before it opens the file. The kernel kills it when the other end of its
-lifeline is closed, even while it decodes. ``PR_SET_PDEATHSIG`` would not do: it follows the thread that started the
-process, and Landlock takes the right to signal it from a parent that is confined later.
+I/O; a command that ``process`` starts. It reads the recording and writes frames (``stream``) to a pipe. It sets limits
+of memory and time, Landlock and seccomp before it opens the file. The kernel kills it when the other side of its
+lifeline is closed, even while it decodes. ``PR_SET_PDEATHSIG`` would not suffice: it follows the thread that started
+the process. Landlock also removes the right to signal the process from a parent that is confined later.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ __all__ = ["confine_decoder", "main"]
 
 _ROOT: Final = Path(__file__).resolve().parents[2]
 _SYSTEM: Final = tuple(map(Path, ("/usr/lib", "/usr/share/zoneinfo", "/lib", "/lib64")))
-_JOURNALS: Final = ("-wal", "-shm")  # SQLite's, beside its database
+_JOURNALS: Final = ("-wal", "-shm")  # journal files of SQLite, in the same folder as the database
 _CPU_GRACE_S: Final = 5
 
 
 def main(words: Sequence[str]) -> None:
-    """Decode a recording, and give its messages each time that a byte is read from standard input.
+    """Decode a recording, and write its messages each time that a byte is read from standard input.
 
     Args:
         words: the recording; a folder that may be written to, or nothing; the descriptors of the output and of the
@@ -63,12 +63,12 @@ def _die_with(lifeline: int) -> None:
     fcntl.fcntl(lifeline, fcntl.F_SETSIG, signal.SIGKILL)
     fcntl.fcntl(lifeline, fcntl.F_SETOWN, os.getpid())
     fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | os.O_ASYNC)
-    if select.select([lifeline], [], [], 0)[0]:  # it was closed before
+    if select.select([lifeline], [], [], 0)[0]:  # the lifeline was closed before
         sys.exit(1)
 
 
 def confine_decoder(path: Path, scratch: Path | None, memory_bytes: int, cpu_s: int, file_bytes: int) -> None:
-    """Set the limits and give the rights away; there is no way back."""
+    """Set the limits and drop the rights irreversibly."""
     tempfile.tempdir = None if scratch is None else str(scratch)
     _limit(resource.RLIMIT_CORE, 0)
     _limit(resource.RLIMIT_FSIZE, file_bytes)
@@ -88,13 +88,13 @@ def confine_decoder(path: Path, scratch: Path | None, memory_bytes: int, cpu_s: 
 
 
 def _limit(what: int, amount: int, grace: int = 0) -> None:
-    """Set a limit, or leave one that is lower."""
+    """Set a limit, or keep one that is lower."""
     present = [each for each in resource.getrlimit(what) if each != resource.RLIM_INFINITY]
     resource.setrlimit(what, (min([amount, *present]), min([amount + grace, *present])))
 
 
 def _files(path: Path) -> list[Path]:
-    """Return what belongs to a recording; a folder's storage files may be links to elsewhere."""
+    """Return the files of a recording; a folder's storage files may be links to elsewhere."""
     if not path.is_dir():
         return [path, *(path.with_name(path.name + suffix) for suffix in _JOURNALS)]
     return [path, *(entry.resolve() for entry in path.iterdir() if entry.is_symlink())]
@@ -108,14 +108,14 @@ def _is_foreign(path: Path) -> bool:
 
 
 def _code() -> Iterable[Path]:
-    """Return where Python finds what it has not loaded yet."""
+    """Return the folders from which Python may still import."""
     folders = {*sys.path, sys.prefix, sys.base_prefix, sys.exec_prefix, *site.getsitepackages()}
-    folders -= {"", "/", "/usr", str(_ROOT), str(Path.cwd()), str(Path.home())}  # where other things are, too
+    folders -= {"", "/", "/usr", str(_ROOT), str(Path.cwd()), str(Path.home())}  # these contain other files, too
     return (*_SYSTEM, _ROOT / "gdp", _ROOT / "proxy", *map(Path, sorted(folders)))
 
 
 class _Output:
-    """Writes frames to a pipe; waits while that is full."""
+    """Writes frames to a pipe; blocks while it is full."""
 
     def __init__(self, output: int) -> None:
         self._output = output
@@ -182,7 +182,7 @@ def _write_opened(bag: BagDecoder, output: _Output) -> None:
 
 
 def _wire(channel: Channel) -> bytes:
-    """Return a description; without its definition and QoS where no reader would take these."""
+    """Return a description; without its definition and QoS where no reader would accept these."""
     try:
         return channel.to_wire()
     except (LocalError, UnicodeError):

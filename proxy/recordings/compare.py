@@ -1,7 +1,7 @@
-"""Whether a recording arrived as it was sent, topic by topic.
+"""Comparison of a received recording with the sent one, topic by topic.
 
-Place: I/O, reading only. A message is kept as a digest of 16 bytes, so memory does not grow with the recording's bytes.
-Order is promised per publisher: where several publish one topic, each publisher's messages are compared in their order.
+I/O, reading only. A message is kept as a digest of 16 bytes, so memory does not grow with the recording's bytes. Order
+is guaranteed per publisher: if several publish one topic, each publisher's messages are compared in their order.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ _Publisher: TypeAlias = "str | None"
 
 @dataclass(frozen=True, slots=True)
 class TopicComparison:
-    """One topic's fate.
+    """Result for one topic.
 
     Args:
         messages: sent.
-        bytes: sent, as ROS wrote them.
+        bytes: sent, in ROS's wire form.
         delivered: sent messages that arrived with the same bytes.
         lost: sent messages that did not.
         duplicated: arrivals beyond the first of a sent message.
@@ -52,7 +52,7 @@ class TopicComparison:
 
 @dataclass(slots=True)
 class _Side:
-    """What one recording holds of a topic."""
+    """Messages of a topic in one recording."""
 
     type_name: str = ""
     size: int = 0
@@ -72,9 +72,9 @@ def compare(sent: Path | str, received: Path | str, *, exact: bool) -> list[Topi
     """Compare two recordings; topics in the order of the first.
 
     Args:
-        sent: what was replayed.
-        received: what was recorded at the other end.
-        exact: the very bytes; otherwise topics whose bytes differ are compared in canonical form.
+        sent: the replayed recording.
+        received: the recording at the receiver.
+        exact: compare the exact bytes; otherwise topics whose bytes differ are compared in canonical form.
 
     Raises:
         ConfigError: one of them cannot be read at all.
@@ -93,7 +93,7 @@ def compare(sent: Path | str, received: Path | str, *, exact: bool) -> list[Topi
 def compare_digests(
     topic: str, type_name: str, size: int, sent: Iterable[bytes], arrived: Iterable[bytes]
 ) -> TopicComparison:
-    """Compare what one publisher sent, ``size`` bytes in all, with what arrived; each message is given by a digest."""
+    """Compare one publisher's messages, ``size`` bytes in all, with the arrivals; each message is given by a digest."""
     before = _Side(type_name, size, [(None, digest) for digest in sent])
     return _judge(topic, before, _Side(type_name, 0, [(None, digest) for digest in arrived]))
 
@@ -143,12 +143,12 @@ def _all_in_order(before: _Side, after: _Side) -> bool:
     publishers = after.publishers()
     if publishers <= before.publishers():
         return all(_in_order(before.stream(who), after.stream(who)) for who in publishers)
-    # the receiver did not record who published
+    # The receiver did not record the publisher.
     return _in_order([digest for _, digest in before.arrivals], [digest for _, digest in after.arrivals])
 
 
 def _in_order(sent: list[bytes], arrived: list[bytes]) -> bool:
-    """Whether the arrivals, without those never sent here, are a subsequence of what was sent; repeats may stand.
+    """Return whether the known arrivals are a subsequence of what was sent; repeats are allowed.
 
     A repeat of the newest arrival, or of an earlier one, is a duplicate and no disorder.
     """

@@ -1,9 +1,9 @@
-"""Decoder of a recording: ROS 1 bag, sqlite3, MCAP, alone or as a rosbag2 folder; also one that ends in the middle.
+"""Decoder of a recording: ROS 1 bag, sqlite3, MCAP, alone or as a rosbag2 folder; also a truncated one.
 
-Place: I/O, reading only. What is whole is read by rosbags; what is not, by a walk from its beginning (``salvage_*``).
-It runs in a process of its own (``child``), for what it decodes may come from anyone.
-Errors: a recording that cannot be read at all raises ``ConfigError`` naming the file and why; a loss is reported in
-``unread``.
+I/O, reading only. rosbags reads complete files; ``salvage_*`` scans incomplete ones from the beginning. It runs in a
+process of its own (``child``), because a recording may come from anyone.
+Errors: a recording that cannot be read at all raises ``ConfigError`` with the file and the reason; a loss is reported
+in ``unread``.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ else:
 
 __all__ = ["BagDecoder"]
 
-# What rosbags and the libraries under it raise for a file that is not as it should be.
+# These are raised by rosbags and the libraries under it for a malformed file.
 _FOREIGN: Final = (
     ReaderError1,
     ReaderError2,
@@ -93,22 +93,25 @@ class BagDecoder:
 
     @property
     def channels(self) -> list[Channel]:
-        """Every topic of every publisher, in the recording's order."""
+        """Return every topic of every publisher, in the recording's order."""
         return self._source.channels
 
     @property
     def count(self) -> int:
-        """Messages that ``messages`` will give, as far as known before."""
+        """Return the number of messages that ``messages`` will yield, as far as known in advance."""
         return self._source.count
 
     @property
     def counts(self) -> list[int] | None:
-        """Messages of each channel; None where the recording has no index that says it."""
+        """Return the messages of each channel; None where the recording has no index with them."""
         return self._source.counts if isinstance(self._source, _IndexedSource) else None
 
     @property
     def unread(self) -> str:
-        """Why some messages could not be read, and about how many; empty where all could. Final after ``messages``."""
+        """Return why some messages could not be read, and about how many; empty if all could.
+
+        The text is final after ``messages``.
+        """
         return self._source.unread
 
     def messages(self) -> Iterator[Message]:
@@ -136,7 +139,7 @@ class BagDecoder:
 
 
 def _check(path: Path, channel: Channel) -> None:
-    """Refuse a definition that cannot be read; one that is absent or unusual only makes its messages opaque."""
+    """Refuse a definition that cannot be read; an absent or unusual one only makes its messages opaque."""
     try:
         parse(channel.type_name, channel.definition, channel.definition_format, channel.ros)
     except UnparsedError as error:
@@ -173,7 +176,7 @@ def _open(path: Path) -> Source:
 def _open_folder(path: Path) -> Source:
     storage = sorted(file for pattern in _STORAGE for file in path.glob(pattern))
     compression = _compression(path / "metadata.yaml")
-    if compression == "message":  # each one is unpacked here, within bounds
+    if compression == "message":  # each message is unpacked here, within bounds
         return UnpackedSource(JoinedSource([_open(file) for file in storage]))
     if compression == "file":
         for file in path.glob("*.zstd"):
@@ -186,7 +189,7 @@ def _open_folder(path: Path) -> Source:
 
 
 def _compression(metadata: Path) -> str:
-    """Return what a folder says of its compression: ``message``, ``file``, or anything else for none."""
+    """Return the compression that a folder states: ``message``, ``file``, or anything else for none."""
     if not metadata.exists():
         return ""
     if metadata.stat().st_size > _METADATA_MAX_BYTES:
@@ -207,7 +210,7 @@ def _open_ros1(path: Path) -> Source:
     try:
         return _Rosbag1Source(path)
     except _FOREIGN:
-        return salvage_ros1.scan(path)  # no index, or one that the file ends in
+        return salvage_ros1.scan(path)  # no index, or a truncated one
 
 
 class _IndexedSource:

@@ -1,8 +1,8 @@
 """Endpoints of a recording: one plays its messages to a bridge, one records what a bridge publishes.
 
-Place: I/O, through ``reader`` and ``writer``. Both implement ``proxy/endpoints/endpoint.py``, and hold topics only. A
-recording tells publishers apart: each of its channels is one. Time belongs to the caller: a message becomes an event
-when ``deliver`` is called with it.
+I/O, through ``reader`` and ``writer``. Both implement ``proxy/endpoints/endpoint.py``, and hold topics only. A
+recording distinguishes publishers: each has a channel. The caller owns the time: a message becomes an event when
+``deliver`` is called with it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ __all__ = ["RecordedMessage", "RecordingEndpoint", "ReplayEndpoint"]
 
 
 class RecordedMessage(NamedTuple):
-    """One message of a topic that is subscribed to."""
+    """One message of a subscribed topic."""
 
     handle: int  # of the subscription
     channel: int  # number within the topic, in the recording's order
@@ -33,7 +33,7 @@ class RecordedMessage(NamedTuple):
 
 
 class _TopicsEndpoint:
-    """What both have in common: a queue of events, and no services."""
+    """Common part of both endpoints: a queue of events, and no services."""
 
     is_live: Final = False
     dropped: Final = 0
@@ -45,11 +45,11 @@ class _TopicsEndpoint:
         self._put(GraphChanged())
 
     def fileno(self) -> int:
-        """Return a descriptor that is readable while ``take`` has something."""
+        """Return a descriptor that is readable while ``poll_events`` has events."""
         return self._wake
 
     def poll_events(self) -> Sequence[Event]:
-        """Return, once, what happened, in order."""
+        """Remove and return the pending events, in order."""
         if not self._events:
             return ()
         os.eventfd_read(self._wake)
@@ -58,7 +58,7 @@ class _TopicsEndpoint:
         return events
 
     def channel(self, topic: str, type_name: str) -> Channel:
-        """Know no type: a recording brings its own definitions.
+        """Refuse: a recording has its own definitions and no installed types.
 
         Raises:
             LocalError: always.
@@ -75,10 +75,10 @@ class _TopicsEndpoint:
         self._refuse(service.name)
 
     def answer(self, handle: int, ticket: int, raw: bytes) -> None:
-        """Ignore the answer: no client asked."""
+        """Ignore the answer: no client sent a request."""
 
     def refuse(self, handle: int, ticket: int, reason: str) -> None:
-        """Ignore the refusal: no client asked."""
+        """Ignore the refusal: no client sent a request."""
 
     def create_client(self, name: str, type_name: str) -> int:
         """Refuse: a recording holds topics only; raises ``LocalError``."""
@@ -124,11 +124,11 @@ class ReplayEndpoint(_TopicsEndpoint):
 
     @property
     def ros(self) -> RosVersion:
-        """Return whose messages it has."""
+        """Return the ROS version of its messages."""
         return self._reader.channels[0].ros if self._reader.channels else 2
 
     def graph(self) -> Graph:
-        """Return one publisher for each channel; whose node it was says nothing about the nodes of now."""
+        """Return one publisher for each channel, without its node: the recorded node need not exist now."""
         channels = enumerate(self._reader.channels)
         return frozenset(
             GraphEntity(Role.PUBLISHES, each.topic, each.type_name, "", str(index), hash=each.hash)
@@ -136,15 +136,15 @@ class ReplayEndpoint(_TopicsEndpoint):
         )
 
     def channels_of(self, topic: str, type_name: str) -> list[int]:
-        """Return the indexes of a topic's channels; a channel's place here is its number within the topic."""
+        """Return the indexes of a topic's channels; a channel's position here is its number within the topic."""
         return self._indexes.get((topic, type_name), [])
 
     def is_subscribed(self, index: int) -> bool:
-        """Return whether a channel of the recording is subscribed to."""
+        """Return whether a channel of the recording has a subscription."""
         return index in self._subscribed
 
     def subscribe(self, topic: str, type_name: str, qos: Qos | None) -> int:
-        """Take a topic's messages from now on.
+        """Subscribe to a topic.
 
         Raises:
             LocalError: the recording does not have it.
@@ -175,7 +175,7 @@ class ReplayEndpoint(_TopicsEndpoint):
                 yield RecordedMessage(*subscribed, stamp_ns, raw)
 
     def deliver(self, message: RecordedMessage) -> None:
-        """Let a message be published now; its stamp is that of the present."""
+        """Publish a message now; its stamp is the present time."""
         self._put(MessageReceived(message.handle, time.time_ns(), message.raw, message.channel))
 
     def advertise(self, channel: Channel) -> int:
@@ -193,14 +193,14 @@ class ReplayEndpoint(_TopicsEndpoint):
         return 0
 
     def close(self, handle: int) -> None:
-        """End a subscription."""
+        """Close a subscription."""
         self._subscribed = {index: each for index, each in self._subscribed.items() if each[0] != handle}
 
 
 class RecordingEndpoint(_TopicsEndpoint):
     """The subscriber of everything that is recorded.
 
-    An equal channel has one handle, and keeps it: a recording knows channels, not publishers.
+    Equal channels share a handle, which stays valid: a recording has channels, not publishers.
 
     Args:
         writer: open; its owner closes it. None: messages are only counted.
@@ -217,7 +217,7 @@ class RecordingEndpoint(_TopicsEndpoint):
 
     @property
     def ros(self) -> RosVersion:
-        """Return whose messages it takes."""
+        """Return the ROS version of the messages that it accepts."""
         return 2 if self._writer is None else self._writer.ros
 
     def graph(self) -> Graph:
@@ -238,7 +238,7 @@ class RecordingEndpoint(_TopicsEndpoint):
         return 0 if self._writer is None else self._writer.add(channel)
 
     def publish(self, handle: int, raw: bytes) -> None:
-        """Record one message with the present as its stamp.
+        """Record one message with the present time as its stamp.
 
         Raises:
             LocalError: it cannot be written.
@@ -252,4 +252,4 @@ class RecordingEndpoint(_TopicsEndpoint):
         return 1
 
     def close(self, handle: int) -> None:
-        """End nothing: what is recorded stays."""
+        """Do nothing: recorded messages stay."""

@@ -1,6 +1,6 @@
-"""Bounds of the process that decodes a recording.
+"""Limits of the process that decodes a recording.
 
-Layer: sans-I/O.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _WAIT_PER_CPU: Final = 2.0
 
 @dataclass(frozen=True, slots=True)
 class BagLimits:
-    """What one recording may cost.
+    """Limits for one recording.
 
     Args:
         memory_bytes: address space of the process; None: 1 GiB and eight times the recording's bytes, at most 4 GiB.
@@ -42,5 +42,5 @@ class BagLimits:
         return _CPU_S + _CPU_S_PER_BYTE * size if self.cpu_s is None else self.cpu_s
 
     def wait_s_for(self, size: int) -> float:
-        """Return for how many seconds the process may give nothing while it is waited for."""
+        """Return the seconds for which the process may send nothing while the caller waits."""
         return max(_WAIT_S, _WAIT_PER_CPU * self.cpu_s_for(size))

@@ -1,7 +1,7 @@
-"""YAML of recordings, bounded: no deep nesting, no anchors, no tags.
+"""Parser of a recording's YAML with bounds: no deep nesting, no anchors, no tags.
 
-Place: pure. rosbags reads QoS profiles and ``metadata.yaml`` with a reader that takes seconds for 8 KiB of brackets;
-``BoundedYaml`` stands in its place. The events are looked at before anything is built.
+Sans-I/O. rosbags reads QoS profiles and ``metadata.yaml`` with a reader that takes seconds for 8 KiB of brackets;
+``BoundedYaml`` replaces it. The events are checked before any object is built.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ _BYTES_MAX: Final = 1 << 20
 _DEPTH_MAX: Final = 16
 
 
-@functools.lru_cache(maxsize=1)  # metadata is looked at for its compression, then read by rosbags
+@functools.lru_cache(maxsize=1)  # metadata is read for its compression, then by rosbags
 def load_plain(text: str) -> object:
-    """Return what a YAML text says.
+    """Return the value of a YAML text.
 
     Raises:
         SalvageError: it is too long, too deep, has anchors or tags, or is no YAML.
@@ -50,7 +50,7 @@ class BoundedYaml(YAML):
     """rosbags' reader of YAML, bounded."""
 
     def load(self, stream: Any) -> Any:
-        """Return what a text says.
+        """Return the value of a text.
 
         Raises:
             SalvageError: it is not within the bounds.

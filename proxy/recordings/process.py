@@ -1,7 +1,7 @@
-"""Process that decodes a recording, seen from outside: its start, its pipe, its end.
+"""Process that decodes a recording, as its parent handles it: start, pipe, end.
 
-Place: I/O, a process and pipes. It inherits little of the environment and no descriptors but its own. It ends when this
-object is closed, or when the process that started it ends, whichever way.
+I/O, a process and pipes. It inherits little of the environment and no descriptors but its own. It ends when this object
+is closed, or when the process that started it ends for any reason.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ main(sys.argv[1:])
 """
 _PASSED: Final = ("PATH", "LD_LIBRARY_PATH", "PYTHONHOME", "LANG", "LC_ALL", "LC_CTYPE")
 _PIPE_BYTES: Final = 1 << 20
-_LOOK_S: Final = 0.05  # between two calls of who waits
+_LOOK_S: Final = 0.05  # interval of the calls to ``waiting``
 _END_S: Final = 5.0
 
 
 class RecordingError(LocalError):
-    """The decoder of a recording ended before its work: it needed too much, crashed or was killed.
+    """The decoder of a recording ended early: it exceeded a limit, crashed or was killed.
 
     Attributes:
         limit: ``memory`` or ``cpu`` where it met that limit, else empty.
@@ -50,17 +50,17 @@ class RecordingError(LocalError):
 
 
 class StoppedError(Exception):
-    """Who waits for the process wants no more."""
+    """The caller that waits for the process has stopped."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """What the process may take.
+    """Limits of the process.
 
     Args:
         memory_bytes: address space.
         cpu_s: processor time.
-        wait_s: how long it may give nothing while it is waited for.
+        wait_s: how long it may send nothing while the caller waits.
         file_bytes: length of a file in its scratch folder.
     """
 
@@ -100,7 +100,7 @@ class BagProcess:
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
                 env=environment,
-                start_new_session=True,  # Ctrl-C is for who reads, who then closes this
+                start_new_session=True,  # Ctrl-C goes to the reading process, which then closes this one
             )
         except OSError as error:
             self._close_pipes()
@@ -109,21 +109,21 @@ class BagProcess:
             for each in (output, commands, lifeline):
                 os.close(each)
         os.set_blocking(self._output, False)
-        with contextlib.suppress(OSError):  # this user's pipes have taken their share
+        with contextlib.suppress(OSError):  # the user's pipes have used up their quota
             fcntl.fcntl(self._output, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
         self._poll = select.poll()
         self._poll.register(self._output, select.POLLIN)
 
     def ask(self) -> None:
-        """Ask for all messages."""
-        with contextlib.suppress(BrokenPipeError):  # it has ended; that is found when its answer is read
+        """Request all messages."""
+        with contextlib.suppress(BrokenPipeError):  # it has ended; reading its output detects that
             os.write(self._commands, b"m")
 
     def read(self, size: int, waiting: Callable[[], bool] | None = None) -> bytes:
         """Return the next ``size`` bytes.
 
         Raises:
-            RecordingError: it ended, or gave nothing for too long.
+            RecordingError: it ended, or sent nothing for too long.
             StoppedError: ``waiting`` returned False.
         """
         pieces = []
@@ -142,8 +142,8 @@ class BagProcess:
 
     def close(self) -> None:
         """End the process."""
-        self._close_pipes()  # the kernel kills it for that
-        with contextlib.suppress(PermissionError):  # of a process that was confined since it started this one
+        self._close_pipes()  # the kernel then kills the process
+        with contextlib.suppress(PermissionError):  # raised in a process that was confined after it started this one
             self._process.kill()
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(_END_S)

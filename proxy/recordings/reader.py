@@ -1,9 +1,9 @@
-"""Reader of a recording that anyone may have made: a process without rights decodes it, within limits.
+"""Reader of an untrusted recording: a process without rights decodes it, within limits.
 
-Place: I/O, through that process. What it says is checked like the recording: a decoder that was taken over can give
+I/O, through that process. Its output is checked like the recording: a decoder under an attacker's control can send
 wrong messages, as the recording could, and no more. The pipe bounds how far it works ahead.
-Errors: a recording that cannot be read raises ``ConfigError`` naming the file and why; a decoder that ends before its
-work, or falls silent, raises ``RecordingError``.
+Errors: a recording that cannot be read raises ``ConfigError`` with the file and the reason; a decoder that ends early,
+or falls silent, raises ``RecordingError``.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ class BagReader:
 
     Args:
         path: a ``.bag``, ``.mcap`` or ``.db3`` file, or a rosbag2 folder.
-        limits: what its decoder may take.
+        limits: of its decoder.
 
     Attributes:
-        count: messages that ``messages`` will give, as far as known before.
-        counts: messages of each channel; None where the recording has no index that says it.
+        count: messages that ``messages`` will yield, as far as known in advance.
+        counts: messages of each channel; None where the recording has no index with them.
         unread: why some messages could not be read, and about how many; empty where all could. Final after
             ``messages``.
 
@@ -68,17 +68,17 @@ class BagReader:
 
     @property
     def channels(self) -> list[Channel]:
-        """Every topic of every publisher, in the recording's order."""
+        """Return every topic of every publisher, in the recording's order."""
         return self._frames.channels
 
     def messages(self, waiting: _Waiting | None = None) -> Iterator[Message]:
         """Yield (channel index, stamp in ns, bytes) in time order; a file that ends early is no error.
 
-        One iterator at a time: the next one uses up what an earlier one left.
+        One iterator at a time: the next one consumes the rest of an earlier one.
 
         Args:
-            waiting: called some times a second while the decoder works; returns whether to go on. After a no, the
-                recording gives nothing more.
+            waiting: called some times a second while the decoder works; returns whether to continue. After False, the
+                recording yields nothing more.
 
         Raises:
             ConfigError, RecordingError: the decoder failed.
@@ -111,7 +111,7 @@ class BagReader:
 
     @contextlib.contextmanager
     def _checked(self) -> Iterator[None]:
-        """Turn what the decoder says of its end, and what it says wrongly, into errors that name the recording."""
+        """Translate the decoder's end, and invalid output, into errors that name the recording."""
         try:
             yield
         except RefusedError as error:
@@ -142,7 +142,7 @@ def _bytes_of(path: Path) -> int:
 
 
 def _scratch(path: Path, stack: contextlib.ExitStack) -> Path | None:
-    """Return a folder for copies, where the decoder may need some: of databases, and of compressed files."""
+    """Return a folder for copies of databases and of compressed files, where the decoder may need one."""
     if not path.is_dir():
         with path.open("rb") as file:
             if file.read(len(_SQLITE)) != _SQLITE:

@@ -1,6 +1,6 @@
-"""An MCAP file read record by record, without its summary: one that ends in the middle, or was never indexed.
+"""Salvage of an MCAP file: read record by record, without its summary, if it is truncated or was never indexed.
 
-Place: I/O, reading only.
+I/O, reading only.
 Source: MCAP format specification, https://mcap.dev/spec (opcodes 0x01 to 0x0F, little-endian).
 """
 
@@ -34,7 +34,7 @@ _FORMATS: Final[dict[str, DefinitionFormat]] = {"ros2msg": "msg", "ros2idl": "id
 
 
 def is_indexed(path: Path) -> bool:
-    """Whether the file has its end and a summary."""
+    """Return whether the file has its end and a summary."""
     with path.open("rb") as file:
         if file.seek(0, os.SEEK_END) < len(MAGIC) + _FOOTER_BYTES:
             return False
@@ -44,10 +44,10 @@ def is_indexed(path: Path) -> bool:
 
 
 def scan(path: Path) -> ScannedSource:
-    """Return what can be read.
+    """Return the readable part.
 
     Raises:
-        SalvageError: nothing can.
+        SalvageError: nothing can be read.
         OSError: the file cannot be opened.
     """
     found = _Found()
@@ -75,7 +75,7 @@ class _Found:
         self._index: dict[int, int] = {}  # channel id to index
 
     def walk(self, file: BinaryIO, size: int) -> str:
-        """Take every record; return why it ended early, empty where it did not."""
+        """Read every record; return why it ended early, empty where it did not."""
         while True:
             at = file.tell()
             head = file.read(_RECORD.size)

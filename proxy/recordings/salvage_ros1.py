@@ -1,6 +1,6 @@
-"""A ROS 1 bag read chunk by chunk, without its index: one that was never closed, or ends in the middle.
+"""Salvage of a ROS 1 bag: read chunk by chunk, without its index, if it was never closed or is truncated.
 
-Place: I/O, reading only.
+I/O, reading only.
 Source: ROS 1 bag format 2.0, http://wiki.ros.org/Bags/Format/2.0 (records of a header and data, little-endian).
 """
 
@@ -28,10 +28,10 @@ _TIME: Final = struct.Struct("<II")
 
 
 def scan(path: Path) -> ScannedSource:
-    """Return what can be read.
+    """Return the readable part.
 
     Raises:
-        SalvageError: nothing can.
+        SalvageError: nothing can be read.
         OSError: the file cannot be opened.
     """
     found = _Found()
@@ -57,7 +57,7 @@ class _Found:
         self._index: dict[int, int] = {}  # connection id to index
 
     def walk(self, file: BinaryIO, size: int) -> str:
-        """Take every record; return why it ended early, empty where it did not."""
+        """Read every record; return why it ended early, empty where it did not."""
         while True:
             at = file.tell()
             if at == size:

@@ -1,7 +1,7 @@
-"""A sqlite3 recording read row by row: one whose file ends in the middle, or whose journal was never folded in.
+"""Salvage of a sqlite3 recording: read row by row, if the file is truncated or its journal was never merged.
 
-Place: I/O, reading only.
-Source: SQLite file format, section 1.3 (the header says how many pages there should be); rosbag2 schemas 1 to 4.
+I/O, reading only.
+Source: SQLite file format, section 1.3 (the header states the number of pages); rosbag2 schemas 1 to 4.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _FORMATS: Final[dict[str, DefinitionFormat]] = {"ros2msg": "msg", "ros2idl": "id
 
 
 def _pages(path: Path) -> tuple[int, int]:
-    """Return the bytes of a page and how many pages there should be."""
+    """Return the bytes of a page and the number of pages in the header."""
     with path.open("rb") as file:
         head = file.read(100)
     page = int.from_bytes(head[16:18], "big")
@@ -46,7 +46,7 @@ _Copy: TypeAlias = "tempfile.TemporaryDirectory[str] | None"
 
 
 def _whole_pages(path: Path) -> tuple[_Copy, Path]:
-    """Return a copy without the last, broken page, which SQLite would fill up with zeros and take for data."""
+    """Return a copy without the last, broken page, which SQLite would pad with zeros and read as data."""
     size, _ = _pages(path)
     whole = path.stat().st_size // max(1, size) * size
     if whole == path.stat().st_size:
@@ -59,7 +59,7 @@ def _whole_pages(path: Path) -> tuple[_Copy, Path]:
 
 
 def _with_index(path: Path) -> tuple[_Copy, Path]:
-    """Return a copy of a database and its journal where the index of that is not there: SQLite would write it."""
+    """Return a copy of a database and its journal if the journal's index is missing: SQLite would write it."""
     if not _journal(path).exists() or path.with_name(path.name + "-shm").exists():
         return None, path
     folder = tempfile.TemporaryDirectory(prefix="journal-")
@@ -74,16 +74,16 @@ def _journal(path: Path) -> Path:
 
 
 def is_whole(path: Path) -> bool:
-    """Whether the file has all its pages and nothing waits in a journal."""
+    """Return whether the file has all its pages and no pending journal."""
     journal = _journal(path)
     return not _missing_bytes(path) and not (journal.exists() and journal.stat().st_size)
 
 
 class SqliteSource:
-    """What can be read of a database.
+    """The readable part of a database.
 
     Raises:
-        SalvageError: not even its topics.
+        SalvageError: not even its topics can be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -117,7 +117,7 @@ class SqliteSource:
 
     @property
     def count(self) -> int:
-        """Messages found."""
+        """Return the number of messages found."""
         return len(self._order)
 
     def messages(self) -> Iterator[Message]:
@@ -166,7 +166,7 @@ class SqliteSource:
     def _find_messages(self) -> None:
         reason = ""
         try:
-            # the data is asked for as well, so that a row whose pages are gone is found out here
+            # The data is queried as well, so that a row whose pages are missing is detected here.
             rows = self._db.execute("SELECT id, topic_id, timestamp, data FROM messages ORDER BY id")
             for row, topic, stamp_ns, _ in rows:
                 if topic in self._index and isinstance(stamp_ns, int):

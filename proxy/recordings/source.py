@@ -1,6 +1,6 @@
-"""What every way of reading a recording gives, and the places of messages found without an index.
+"""Source of a recording's messages: the interface of all decoders, and the positions found without an index.
 
-Place: I/O; files are opened for reading only.
+I/O; files are opened for reading only.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from proxy.serial.channel import Channel
 
 __all__ = ["Chunk", "Message", "Place", "ScannedSource", "Source", "Tally"]
 
-_CHUNKS_KEPT: Final = 4  # unpacked at a time; neighbours in time are neighbours in the file
+_CHUNKS_KEPT: Final = 4  # unpacked at a time; messages close in time are close in the file
 
 
 class Message(NamedTuple):
@@ -33,11 +33,11 @@ class Source(Protocol):
 
     @property
     def count(self) -> int:
-        """Messages that can be read, as far as known."""
+        """Return the number of readable messages, as far as known."""
 
     @property
     def unread(self) -> str:
-        """Why some could not be read, empty where all could."""
+        """Return why some could not be read, empty where all could."""
 
     def messages(self) -> Iterator[Message]:
         """Yield messages in time order; afterwards ``unread`` is final."""
@@ -47,16 +47,16 @@ class Source(Protocol):
 
 
 class Chunk(NamedTuple):
-    """A run of records, perhaps compressed."""
+    """A run of records, possibly compressed."""
 
     at: int  # file offset of its data
-    size: int  # bytes in the file, fewer than written where the file ends in it
+    size: int  # bytes in the file, fewer than written where the file is truncated
     compression: str
-    unpacked: int | None  # bytes, as its header says
+    unpacked: int | None  # bytes, as its header states
 
 
 class Place(NamedTuple):
-    """Where a message lies; sorts by time, then by order in the file."""
+    """Position of a message; sorts by time, then by order in the file."""
 
     stamp_ns: int
     order: int
@@ -67,15 +67,15 @@ class Place(NamedTuple):
 
 
 class Tally:
-    """How much of a file was found, to say how much is probably gone."""
+    """Amount of a file that was found, to estimate the amount that is missing."""
 
     def __init__(self) -> None:
         self.messages = 0
-        self.walked_bytes = 0  # what held them
-        self.missing_bytes = 0  # what should have followed, as far as the file says, measured alike
+        self.walked_bytes = 0  # bytes that held them
+        self.missing_bytes = 0  # bytes that should have followed, as far as the file states, in the same measure
 
     def text(self, reason: str) -> str:
-        """Return the reason with what was found and the estimate of what was not."""
+        """Return the reason with the number found and the estimate of the missing ones."""
         text = f"{reason}; {self.messages} messages were found"
         if self.missing_bytes and self.messages:
             lost = max(1, round(self.missing_bytes * self.messages / max(1, self.walked_bytes)))
@@ -84,7 +84,7 @@ class Tally:
 
 
 class ScannedSource:
-    """Messages found by walking a file from its beginning; read back in time order."""
+    """Messages found by scanning a file from its beginning; yielded in time order."""
 
     def __init__(self, path: Path, channels: list[Channel], chunks: list[Chunk], places: list[Place]) -> None:
         self.channels = channels
@@ -96,7 +96,7 @@ class ScannedSource:
 
     @property
     def count(self) -> int:
-        """Messages found."""
+        """Return the number of messages found."""
         return len(self._places)
 
     def messages(self) -> Iterator[Message]:

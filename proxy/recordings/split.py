@@ -1,6 +1,6 @@
-"""Several storage files as one recording, in time order.
+"""Split recording: several storage files as one recording, in time order.
 
-Place: I/O, reading only.
+I/O, reading only.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ class JoinedSource:
 
     @property
     def count(self) -> int:
-        """Messages of all parts."""
+        """Return the messages of all parts."""
         return sum(part.count for part in self._parts)
 
     @property
     def unread(self) -> str:
-        """What the parts report."""
+        """Return the reports of the parts."""
         return "; ".join(part.unread for part in self._parts if part.unread)
 
     def messages(self) -> Iterator[Message]:

@@ -1,7 +1,7 @@
-"""Limits for SQLite databases that anyone may have written: plain tables only, bounded work, bounded values.
+"""Guard for untrusted SQLite databases: plain tables only, bounded work, bounded values.
 
-Layer: I/O. A view or a virtual table may run any query, a tree of pages may lead in circles, and a value may be as
-long as its header says. Source: "Defense Against The Dark Arts", https://www.sqlite.org/security.html.
+I/O. A view or a virtual table may run any query. A tree of pages may be circular, and a value may be as long as its
+header states. Source: "Defense Against The Dark Arts", https://www.sqlite.org/security.html.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from proxy.recordings.unpacking import CHUNK_MAX_BYTES, SalvageError
 
 __all__ = ["check_schema", "guard", "guarded"]
 
-_STEPS_FREE: Final = 20_000_000  # of SQLite's machine for one statement, about a second
-_STEPS_PER_BYTE: Final = 16  # ... and so many for each byte of the file
-_STEPS_BETWEEN: Final = 50_000  # signals are handled, and steps counted, so often
+_STEPS_FREE: Final = 20_000_000  # steps of SQLite's virtual machine for one statement, about a second
+_STEPS_PER_BYTE: Final = 16  # ... and this many for each byte of the file
+_STEPS_BETWEEN: Final = 50_000  # interval, in steps, of signal handling and step counting
 _TABLES_MAX: Final = 256
 _PRAGMAS: Final = frozenset({"table_info", "writable_schema"})
 _FUNCTIONS: Final = frozenset({"count", "min", "max"})
 
 
 class _Steps:
-    """Counts the steps of the statement that runs."""
+    """Counts the steps of the running statement."""
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
@@ -44,7 +44,7 @@ class _Steps:
 
 
 def guard(connection: apsw.Connection) -> None:
-    """Bound what statements on a connection may do. Call before the first one."""
+    """Limit the statements on a connection. Call it before the first one."""
     try:
         size = os.stat(connection.filename).st_size
     except OSError:
@@ -60,7 +60,7 @@ def guard(connection: apsw.Connection) -> None:
 
 
 def check_schema(connection: apsw.Connection) -> None:
-    """Refuse a database in which a name may stand for more than a table.
+    """Refuse a database in which a name may denote anything but a table.
 
     Raises:
         SalvageError: there are views, triggers or virtual tables, or very many tables.
@@ -77,7 +77,7 @@ def check_schema(connection: apsw.Connection) -> None:
 
 @contextlib.contextmanager
 def guarded() -> Iterator[None]:
-    """Guard every connection that is opened meanwhile, by rosbags too."""
+    """Guard every connection that is opened meanwhile, including those of rosbags."""
 
     def hook(connection: apsw.Connection) -> None:
         guard(connection)

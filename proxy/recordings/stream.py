@@ -1,7 +1,7 @@
-"""Frames from the process that decodes a recording to the one that uses it.
+"""Stream of frames from the process that decodes a recording to the process that uses it.
 
-Layer: sans-I/O. A frame is a kind (1 byte), a length (4 bytes, little-endian) and so many bytes. The using side
-believes nothing of what comes: each length and number is checked.
+Sans-I/O. A frame is a kind (1 byte), a length (4 bytes, little-endian) and so many bytes. The using process trusts no
+input: it checks each length and number.
 
 ```
  CHANNEL   one description, as peers send it           one for each channel, before OPENED
@@ -9,7 +9,7 @@ believes nothing of what comes: each length and number is checked.
  BLOCK     {channel (4), stamp in ns (8), size (4), bytes} ...   above 128 KiB: exactly one message
  END       why some messages could not be read, UTF-8
  REFUSED   why it is no recording, UTF-8               the last frame
- FAILED    the decoder's error, UTF-8; empty: it lacks memory   the last frame
+ FAILED    the decoder's error, UTF-8; empty: out of memory   the last frame
 ```
 """
 
@@ -39,10 +39,11 @@ __all__ = [
     "text_to",
 ]
 
-BLOCK_BYTES: Final = 128 << 10  # small messages are collected up to so many
+BLOCK_BYTES: Final = 128 << 10  # small messages are collected up to this size
 CHANNELS_MAX: Final = 16_384
 CHANNELS_MAX_BYTES: Final = 32 << 20  # of all descriptions
-MESSAGE_MAX_BYTES: Final = 256 << 20  # eight times the largest that can travel; more is the memory of a small robot
+# eight times the largest that can be sent; more exceeds the memory of a small robot
+MESSAGE_MAX_BYTES: Final = 256 << 20
 _TEXT_MAX: Final = 4_096
 
 _HEAD: Final = struct.Struct("<BI")
@@ -52,7 +53,7 @@ _COUNT: Final = struct.Struct("<Q")
 
 
 class Kind(IntEnum):
-    """What a frame holds."""
+    """Content of a frame."""
 
     CHANNEL = 1
     OPENED = 2
@@ -72,15 +73,15 @@ _LONGEST: Final = {
 }
 
 
-Take: TypeAlias = Callable[[int], bytes]  # returns so many of the next bytes
+Take: TypeAlias = Callable[[int], bytes]  # returns this many of the next bytes
 
 
 class RefusedError(LocalError):
-    """The decoder says why the recording is none."""
+    """The decoder reports why the file is no recording."""
 
 
 class FailedError(LocalError):
-    """The decoder says why it failed; empty: it lacks memory."""
+    """The decoder reports why it failed; empty: out of memory."""
 
 
 def frame_head(kind: Kind, size: int) -> bytes:
@@ -89,7 +90,7 @@ def frame_head(kind: Kind, size: int) -> bytes:
 
 
 def message_head(message: Message) -> bytes:
-    """Return what stands before a message's bytes.
+    """Return the header of a message.
 
     Raises:
         LocalError: the message is too large, or its stamp has more than 64 bits.
@@ -123,11 +124,11 @@ def text_to(text: str) -> bytes:
 
 
 class FrameReader:
-    """What a decoder says, in the order in which it must.
+    """Parser of a decoder's frames, which enforces their order.
 
     Attributes:
         channels: of the recording; empty before ``open``.
-        is_giving: whether messages come, up to END.
+        is_giving: whether messages follow, up to END.
     """
 
     def __init__(self) -> None:
@@ -135,11 +136,11 @@ class FrameReader:
         self.is_giving = False
 
     def open(self, take: Take) -> tuple[int, list[int] | None]:
-        """Take the channels; return the number of messages, and that of each channel where it is known.
+        """Read the channels; return the number of messages, and that of each channel where it is known.
 
         Raises:
-            RefusedError, FailedError: the decoder says why it ends.
-            LocalError, RemoteError: it said something else.
+            RefusedError, FailedError: the decoder reports why it ends.
+            LocalError, RemoteError: an unexpected frame.
         """
         left = CHANNELS_MAX_BYTES
         while True:
@@ -152,7 +153,7 @@ class FrameReader:
             self.channels.append(Channel.from_wire(take(size)))
 
     def skip(self, take: Take) -> None:
-        """Take what is left of the messages."""
+        """Discard the remaining messages."""
         while self.is_giving:
             kind, size = self._head(take)
             take(size)
@@ -162,8 +163,8 @@ class FrameReader:
         """Yield messages up to END; return why some could not be read.
 
         Raises:
-            RefusedError, FailedError: the decoder says why it ends.
-            LocalError: it said something else.
+            RefusedError, FailedError: the decoder reports why it ends.
+            LocalError: an unexpected frame.
         """
         self.is_giving = True
         while True:

@@ -1,6 +1,6 @@
-"""A recording whose messages were compressed one by one.
+"""Unpacking source: a recording whose messages were compressed one by one.
 
-Place: I/O, reading only.
+I/O, reading only.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ __all__ = ["UnpackedSource"]
 
 
 class UnpackedSource:
-    """Messages unpacked as they are read; one that cannot be unpacked is left out and reported."""
+    """Messages unpacked as they are read; one that cannot be unpacked is omitted and reported."""
 
     def __init__(self, packed: Source) -> None:
         self.channels = packed.channels
@@ -23,12 +23,12 @@ class UnpackedSource:
 
     @property
     def count(self) -> int:
-        """Messages, packed or not."""
+        """Return the number of messages, compressed or not."""
         return self._packed.count
 
     @property
     def unread(self) -> str:
-        """What could not be read or unpacked."""
+        """Return why some could not be read or unpacked."""
         return "; ".join(text for text in (self._packed.unread, self._refused) if text)
 
     def messages(self) -> Iterator[Message]:

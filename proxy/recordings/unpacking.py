@@ -1,6 +1,6 @@
-"""Decompression of chunks that anyone may have written: never more bytes than their header says, or than the cap.
+"""Decompression of untrusted chunks: never more bytes than their header states, or than the cap.
 
-Layer: I/O, reading only. rosbags decompresses without a bound; ``bound_rosbags`` puts these into its tables.
+I/O, reading only. rosbags decompresses without a bound; ``bound_rosbags`` puts these functions into its tables.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ else:
 
 __all__ = ["CHUNK_MAX_BYTES", "SalvageError", "bound_rosbags", "check_file", "file_max_bytes", "unpack"]
 
-CHUNK_MAX_BYTES: Final = 64 << 20  # unpacked; more than twice the largest message that can travel
-_FILE_RATIO_MAX: Final = 100  # unpacked bytes for each byte of a compressed file, beside the first 64 MiB
-_ASKED_BYTES: Final = 4 << 10  # may be asked for without a look at the file's length
+CHUNK_MAX_BYTES: Final = 64 << 20  # unpacked; more than twice the largest message that can be sent
+_FILE_RATIO_MAX: Final = 100  # unpacked bytes for each byte of a compressed file, in addition to the first 64 MiB
+_ASKED_BYTES: Final = 4 << 10  # may be requested without checking the file's length
 _WINDOW_LOG_MAX: Final = 26  # memory of a zstd decoder: 64 MiB
 
 
 class SalvageError(LocalError):
-    """Not even the beginning of a file is a recording."""
+    """Not even the beginning of a file is a valid recording."""
 
 
 def unpack(compression: str, data: bytes, size: int | None = None) -> bytes:
-    """Return as much of a chunk as its bytes give; a chunk that ends early gives its beginning.
+    """Return the decompressed part of a chunk; a truncated chunk yields its beginning.
 
     Args:
-        size: unpacked bytes as its header says; None: unknown.
+        size: unpacked bytes as its header states; None: unknown.
 
     Raises:
         SalvageError: the compression is unknown, the bytes are not of it, or they unpack to more than ``size`` or than
@@ -71,12 +71,12 @@ def unpack(compression: str, data: bytes, size: int | None = None) -> bytes:
 
 
 def file_max_bytes(size: int) -> int:
-    """Return how long a file may become that is unpacked from ``size`` bytes."""
+    """Return the maximum length of a file that is unpacked from ``size`` bytes."""
     return CHUNK_MAX_BYTES + _FILE_RATIO_MAX * size
 
 
 def check_file(path: Path) -> None:
-    """Refuse a file of zstd that would fill the disk: one that unpacks to more than any recording does.
+    """Refuse a zstd file that would fill the disk: one that unpacks to more than any recording does.
 
     Raises:
         SalvageError: it does, or is no zstd.
@@ -95,7 +95,7 @@ def check_file(path: Path) -> None:
 
 
 def bound_rosbags() -> None:
-    """Have rosbags unpack within the same bounds, and read no record that is longer than its file."""
+    """Make rosbags unpack within the same bounds, and read no record that is longer than its file."""
     rosbag1_reader.read_bytes = _read_bytes
     storage_mcap.read_exact = _read_exact
     storage_mcap.DECOMPRESSORS["lz4"] = lambda data, size: unpack("lz4", data, size)
@@ -105,7 +105,7 @@ def bound_rosbags() -> None:
 
 
 def _read_bytes(src: BinaryIO, size: int) -> bytes:
-    """Read so many bytes of a ROS 1 bag, or of a chunk."""
+    """Read this many bytes of a ROS 1 bag, or of a chunk."""
     data = _read_there(src, size)
     if len(data) != size:
         raise ReaderError1(f"a record of {size} bytes is longer than what holds it")
@@ -113,7 +113,7 @@ def _read_bytes(src: BinaryIO, size: int) -> bytes:
 
 
 def _read_exact(bio: BinaryIO, size: int) -> bytes:
-    """Read so many bytes of an MCAP file, or of a chunk."""
+    """Read this many bytes of an MCAP file, or of a chunk."""
     data = _read_there(bio, size)
     if len(data) != size:
         raise ReaderError2(f"a record of {size} bytes is longer than what holds it")
@@ -121,7 +121,7 @@ def _read_exact(bio: BinaryIO, size: int) -> bytes:
 
 
 def _read_there(file: BinaryIO, size: int) -> bytes:
-    """Read at most so many bytes; a file reserves memory for what is asked for, also beyond its end."""
+    """Read at most this many bytes; a file reserves memory for the requested size, also beyond its end."""
     if size > _ASKED_BYTES and not isinstance(file, BytesIO):
         size = max(0, min(size, os.fstat(file.fileno()).st_size - file.tell()))
     return file.read(size)

@@ -1,7 +1,7 @@
-"""Record: ROS 2 messages as one MCAP file, ROS 1 messages as a bag.
+"""Writer of a recording: ROS 2 messages as one MCAP file, ROS 1 messages as a bag.
 
-Place: I/O. A recording appears under its name when it is closed; until then it is a hidden neighbour, so that a killed
-process leaves nothing that looks complete.
+I/O. A recording gets its name when it is closed; until then it is a hidden file in the same folder. So a killed process
+leaves nothing that looks complete.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ _UNKNOWN_HASH: Final = "RIHS01_" + "0" * 64
 _STAMPS_NS: Final = {1: (1 << 32) * 1_000_000_000, 2: 1 << 63}
 _CONNECTIONS_MAX: Final = 4_096  # rosbags keeps each, and its definition, until the file is finished
 _DEFINITIONS_MAX_BYTES: Final = 64 << 20
-_ANY_MD5: Final = "*"  # ROS 1's own word for an unknown one
+_ANY_MD5: Final = "*"  # ROS 1's own value for an unknown one
 
 
 class BagWriter:
-    """A recording being made. Close it, or use it as a context: an exception inside discards it.
+    """A recording in progress. Close it, or use it as a context: an exception inside discards it.
 
     Args:
-        path: the file that shall come into being, ``.mcap`` for ROS 2 or ``.bag`` for ROS 1.
-        ros: whose messages; one recording holds one kind.
+        path: the file to create, ``.mcap`` for ROS 2 or ``.bag`` for ROS 1.
+        ros: version of the messages; one recording holds one kind.
 
     Raises:
-        LocalError: the file exists, or cannot be made.
+        LocalError: the file exists, or cannot be created.
     """
 
     def __init__(self, path: Path | str, ros: RosVersion) -> None:
@@ -54,7 +54,7 @@ class BagWriter:
             self._folder = Path(tempfile.mkdtemp(prefix=f".{self.path.name}.", dir=self.path.parent))
         except OSError as error:
             raise LocalError(f"{self.path} cannot be made: {error.strerror}") from error
-        self._handles: dict[tuple[object, ...], int] = {}  # by what the format can tell
+        self._handles: dict[tuple[object, ...], int] = {}  # by the properties that the format can distinguish
         self._definitions_bytes = 0
         self._connections: list[Connection] = []
         self._writer1: Writer1 | None = None
@@ -68,7 +68,7 @@ class BagWriter:
 
     @property
     def ros(self) -> RosVersion:
-        """Return whose messages it takes."""
+        """Return the ROS version of the messages that it accepts."""
         return self._ros
 
     def add(self, channel: Channel) -> int:
@@ -117,7 +117,7 @@ class BagWriter:
             raise LocalError(f"{self.path} cannot be written: {error.strerror}") from error
 
     def close(self) -> None:
-        """Finish the file and give it its name; again: nothing happens.
+        """Finish the file and rename it; further calls have no effect.
 
         Raises:
             LocalError: it cannot be written.
@@ -132,7 +132,7 @@ class BagWriter:
             self.discard()
 
     def discard(self) -> None:
-        """Leave nothing behind."""
+        """Delete the unfinished file."""
         writer1, self._writer1 = self._writer1, None
         writer2, self._writer2 = self._writer2, None
         if writer1 is not None:

@@ -1,7 +1,7 @@
-"""Cache of results by a digest of their source, bounded in number; the least recently used one goes first.
+"""Cache of results by a digest of their source, bounded in number; the least recently used one is dropped first.
 
-Layer: sans-I/O. Keys are digests, so that a cache does not keep the long texts that peers send. What a computation
-refuses is kept too: the same text, sent again, costs no more time.
+Sans-I/O. Keys are digests, so that a cache does not keep the long texts that peers send. A refusal by a computation is
+kept too: the same text, sent again, costs no more time.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ def digest_of(*texts: str | int) -> bytes:
 
 
 class BoundedCache(Generic[_Result]):
-    """Remembers results, and errors of one kind.
+    """Keeps results, and errors of one kind.
 
     Args:
         count_max: results kept.
-        refusal: the error that is a result too.
+        refusal: the error that is kept as a result.
     """
 
     def __init__(self, count_max: int, refusal: type[Exception]) -> None:
@@ -42,7 +42,7 @@ class BoundedCache(Generic[_Result]):
         return len(self._known)
 
     def get(self, key: bytes, compute: Callable[[], _Result]) -> _Result:
-        """Return the result of a key, computed if need be.
+        """Return the result of a key, computed if necessary.
 
         Raises:
             refusal: what ``compute`` raised, now or before.

@@ -1,6 +1,6 @@
 """Bounds of a CBOR text before a library builds its values: items, depth, and lengths that the bytes cannot hold.
 
-Layer: sans-I/O. Source: RFC 8949, section 3. The walk costs time proportional to the items and stops at the bound.
+Sans-I/O. Source: RFC 8949, section 3. The check takes time proportional to the items and stops at the bound.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ _BREAK: Final = 0xFF
 
 
 def check_bounds(wire: bytes, items_max: int) -> None:
-    """Return where ``wire`` begins with one item within the bounds.
+    """Return if ``wire`` begins with one item within the bounds.
 
     Args:
         items_max: numbers, texts, arrays, maps and tags in all.
@@ -22,7 +22,7 @@ def check_bounds(wire: bytes, items_max: int) -> None:
     Raises:
         ValueError: too many items, too deep, or lengths beyond the end.
     """
-    open_counts: list[int] = [1]  # items still to come at each level; -1: until a break
+    open_counts: list[int] = [1]  # items that follow at each level; -1: until a break
     at, left, end = 0, items_max, len(wire)
     while open_counts:
         if open_counts[-1] == 0:

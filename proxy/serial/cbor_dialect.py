@@ -1,6 +1,6 @@
-"""How the leaves of a message look in CBOR: arrays of numbers are typed arrays, copied and never walked.
+"""CBOR form of the leaves of a message: arrays of numbers are typed arrays, which are copied as a whole.
 
-Place: pure.
+Sans-I/O.
 Source: RFC 8949; RFC 8746 (typed arrays, tags 64 to 86, little-endian).
 """
 
@@ -20,18 +20,18 @@ __all__ = ["CborDialect"]
 _TAGS: Final = {"B": 64, "H": 69, "I": 70, "Q": 71, "b": 72, "h": 77, "i": 78, "q": 79, "f": 85, "d": 86}
 _FLOATS: Final = {"f": struct.Struct("<f"), "d": struct.Struct("<d")}
 _PATTERNS: Final = {"f": struct.Struct("<I"), "d": struct.Struct("<Q")}
-_QUIET: Final = {"f": 0x7FC00000, "d": 0x7FF8000000000000}  # the one NaN that a CBOR float stands for here
+_QUIET: Final = {"f": 0x7FC00000, "d": 0x7FF8000000000000}  # the one NaN that a CBOR float represents here
 
 
 class CborDialect:
-    """Numbers and strings as CBOR has them; any other NaN as a typed array of one."""
+    """Numbers and strings as CBOR's own; any other NaN as a typed array of one."""
 
     as_bits = False
     inline_max = 0
     guarded = ""
 
     def plain(self, values: tuple[float, ...]) -> bool:
-        """Whether no value is NaN: one such makes the sum so too."""
+        """Return whether no value is NaN; the test is the sum, which a NaN makes NaN."""
         total = sum(values)
         return total == total  # noqa: PLR0124
 
@@ -42,7 +42,7 @@ class CborDialect:
         return CBORTag(_TAGS[code], _PATTERNS[code].pack(bits))
 
     def bits(self, code: str, value: object) -> int | bool:
-        """Return what to pack for a number of either form."""
+        """Return the value to pack for a number of either form."""
         if code == "?":
             if not isinstance(value, bool):
                 raise MisfitError("a bool is true or false")

@@ -1,7 +1,6 @@
-"""What a reader must know about a topic's messages; travels sealed, once per reader.
+"""Channel: description of a topic's messages for a reader; it travels sealed, once per reader.
 
-Place: pure. The wire form is a CBOR map with one-letter keys, bounded, refused whole when anything in it is not as it
-should be.
+Sans-I/O. The wire form is a bounded CBOR map with one-letter keys; a malformed one is refused as a whole.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ _TIME_MAX: Final = 1 << 63
 
 @dataclass(frozen=True, slots=True)
 class Qos:
-    """One offered QoS profile. Policies are ROS 2's words in lower case; durations are (seconds, nanoseconds)."""
+    """One offered QoS profile. Policies have ROS 2's names in lower case; durations are (seconds, nanoseconds)."""
 
     history: str
     depth: int
@@ -47,14 +46,14 @@ class Channel:
     """One publisher's topic, or one topic of a recording.
 
     Args:
-        topic: as the robot calls it.
+        topic: the local name.
         type_name: as ROS 2 writes it (``sensor_msgs/msg/Image``), for ROS 1 too.
-        ros: whose wire form the messages have.
+        ros: ROS version of the wire form.
         hash: md5 sum for ROS 1, ``RIHS01_...`` for ROS 2; empty where unknown.
         definition: full text, used types included; empty where unknown, or for a type without fields.
         definition_format: of ``definition``; empty: there is none.
         qos: offered profiles, ROS 2 only.
-        latched: late joiners want the last message.
+        latched: late joiners get the last message.
         callerid: the publishing node, ROS 1 only, where known.
     """
 
@@ -72,7 +71,7 @@ class Channel:
         """Return the bounded CBOR form.
 
         Raises:
-            LocalError: a part is longer than a peer would take.
+            LocalError: a part is longer than a peer would accept.
         """
         fields: dict[str, object] = {
             "t": self.topic,
@@ -96,10 +95,10 @@ class Channel:
 
     @classmethod
     def from_wire(cls, wire: bytes) -> Channel:
-        """Read what ``to_wire`` wrote.
+        """Parse the form that ``to_wire`` writes.
 
         Raises:
-            RemoteError: anything else, whatever the bytes.
+            RemoteError: any other bytes.
         """
         if len(wire) > CHANNEL_MAX_BYTES:
             raise RemoteError(DropReason.MALFORMED, f"a description of {len(wire)} bytes")

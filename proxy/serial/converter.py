@@ -1,7 +1,7 @@
-"""A topic's messages in the other ROS: how it would describe them, and the bytes there for the bytes here.
+"""Converter of a topic's messages between ROS 1 and ROS 2: the description and the bytes in the other ROS.
 
-Place: pure. A message is read with the one definition and written with the other; no type is known beforehand.
-What may differ is in ``match``; the table for people is in ``docs/reference/serialisation.md``.
+Sans-I/O. A message is read with one definition and written with the other; no type is known beforehand. The allowed
+differences are in ``type_match``; ``docs/reference/serialisation.md`` has them as a table.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ __all__ = ["MessageConverter", "translated_channel"]
 
 _NATIVE: Final = NativeDialect()
 _NEVER: Final = (9_223_372_036, 854_775_807)
-# What a ROS 1 publisher that latches promises: its last message, to whoever comes.
+# QoS equivalent of a latching ROS 1 publisher: every late joiner gets its last message.
 _LATCHED: Final = Qos("keep_last", 1, "reliable", "transient_local", _NEVER, _NEVER, "automatic", _NEVER, False)
 
 
 def translated_channel(channel: Channel, ros: RosVersion) -> Channel:
-    """Return how the channel looks in ROS ``ros``: the same topic and type name, its own definition, hash and QoS.
+    """Return the channel in ROS ``ros``: the same topic and type name, its own definition, hash and QoS.
 
     Raises:
         DefinitionError: there is no definition, or a field has no form there; the text names it.
@@ -59,9 +59,9 @@ def translated_channel(channel: Channel, ros: RosVersion) -> Channel:
 
 
 class MessageConverter:
-    """Messages of one channel as those of another, of either ROS.
+    """Converter from one channel to another, of either ROS.
 
-    Between channels of the same ROS and of equal definition every message is returned as it is, unread.
+    Between channels of the same ROS and of equal definition every message is returned unchanged and unread.
 
     Raises:
         DefinitionError: a definition is missing or cannot be read, or the two do not match field by field; the text
@@ -106,7 +106,7 @@ class MessageConverter:
 
 
 def _same_hash(source: Channel, target: Channel) -> bool:
-    """Whether two channels without a definition to compare are known to be of one type all the same."""
+    """Return whether the hashes of two channels without comparable definitions prove one type."""
     if source.definition_format and target.definition_format:
         return False
     return source.ros == target.ros and bool(source.hash) and source.hash == target.hash
@@ -121,7 +121,7 @@ def _side(channel: Channel) -> Side:
 
 
 def _wide_in(kind: Type, path: str, seen: set[int]) -> str:
-    """Return where the first wide string is, empty for nowhere."""
+    """Return the path of the first wide string, empty if there is none."""
     if isinstance(kind, Array | Sequence):
         return _wide_in(kind.item, f"{path}[]", seen)
     if isinstance(kind, Text):

@@ -1,7 +1,7 @@
-"""What a message of a type costs at the least: values that exist whatever its bytes say, and bytes of fixed fields.
+"""Cost of a message type: minimum number of values, whatever its bytes, and minimum bytes of fixed fields.
 
-Layer: sans-I/O. A fixed array counts with all its items, in nested types too, so that a short message or a short
-definition cannot stand for millions of values.
+Sans-I/O. A fixed array counts with all its items, in nested types too, so that a short message or a short definition
+cannot represent millions of values.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from proxy.serial.schema import Array, Number, Sequence, Text, Type
 
 __all__ = ["COST_MAX", "fixed_bytes", "items_of"]
 
-COST_MAX: Final = 1 << 40  # costs are counted up to here
+COST_MAX: Final = 1 << 40  # costs are counted up to this number
 
 
 def items_of(kind: Type, known: dict[int, int]) -> int:
-    """Return how many records, lists and texts one value holds, itself included; items of sequences are not counted.
+    """Return the number of records, lists and texts in one value, itself included; items of sequences are not counted.
 
     Args:
         kind: a field's type.
-        known: answers already found, by the record's identity; filled.
+        known: results so far, by the record's identity; extended.
     """
     if isinstance(kind, Number):
         return 0
@@ -34,7 +34,7 @@ def items_of(kind: Type, known: dict[int, int]) -> int:
 
 
 def fixed_bytes(kind: Type, known: dict[int, int]) -> int:
-    """Return how many bytes one value takes at the least, padding not counted; ``known`` as in ``items_of``."""
+    """Return the minimum number of bytes of one value, padding not counted; ``known`` as in ``items_of``."""
     if isinstance(kind, Number):
         return kind.size
     if isinstance(kind, Text | Sequence):

@@ -1,6 +1,6 @@
-"""What an encoding must say about the leaves of a message; the walk around them is the same for all.
+"""Dialect interface: an encoding's form of the leaves of a message; the traversal is common to all encodings.
 
-Place: pure. Implemented by ``json_dialect``, ``cbor_dialect`` and ``native_dialect``.
+Sans-I/O. ``json_dialect``, ``cbor_dialect`` and ``native_dialect`` implement it.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ from proxy.serial.schema import Number
 
 __all__ = ["BITS", "Dialect", "MisfitError", "Wide"]
 
-# The unsigned code of the same width, to take a float's bits apart exactly; others stand for themselves.
+# The unsigned code of the same width, for the exact bits of a float; other codes map to themselves.
 BITS: Final = {"f": "I", "d": "Q"}
 
 
 class MisfitError(ValueError):
-    """A value or a run of bytes that the type does not admit. Translated at the edge of this package."""
+    """A value or a run of bytes that the type does not allow. This package's public functions translate it."""
 
 
 class Wide(Enum):
-    """How a wide string lies in CDR; three generations of middlewares disagree.
+    """CDR layout of a wide string; three generations of middlewares differ.
 
     The value is the word used in an encoded message.
     """
@@ -32,24 +32,24 @@ class Wide(Enum):
 
 
 class Dialect(Protocol):
-    """Leaves to values and back. Values are what the encoding's own library writes and reads.
+    """Conversion of leaves to values and back. Values are those of the encoding's own library.
 
-    The ``un`` methods are given what a peer sent: they raise ``MisfitError``, ``TypeError``, ``ValueError``,
-    ``OverflowError`` or ``struct.error`` for what does not fit, and nothing else.
+    The ``un`` methods get untrusted values: for invalid ones they raise ``MisfitError``, ``TypeError``, ``ValueError``,
+    ``OverflowError`` or ``struct.error``, and nothing else.
     """
 
     as_bits: bool  # floats are carried as their bits, always exact; no ``plain``, no ``number``
-    inline_max: int  # fixed arrays of up to this many numbers are handled with their neighbours in one go
+    inline_max: int  # fixed arrays of up to this many numbers are processed together with their neighbours
     guarded: str  # codes whose every value must pass through ``number``
 
     def plain(self, values: tuple[float, ...]) -> bool:
-        """Whether a run of numbers may stand as it is; False asks for ``number`` on each."""
+        """Return whether a run of numbers needs no conversion; False requires ``number`` for each."""
 
     def number(self, code: str, value: float, bits: int) -> object:
         """Return the form of one number. ``bits``: its pattern where it is a float, else the value."""
 
     def bits(self, code: str, value: object) -> int | bool:
-        """Return what to pack for one number: a float's bits, an integer itself."""
+        """Return the value to pack for one number: a float's bits, an integer itself."""
 
     def text(self, raw: memoryview) -> object:
         """Return the form of a string (``raw``: without terminator, any bytes)."""
@@ -58,7 +58,7 @@ class Dialect(Protocol):
         """Return the bytes of a string."""
 
     def wide(self, units: bytes, layout: Wide) -> object:
-        """Return the form of a wide string (``units``: little-endian, as wide as the layout says)."""
+        """Return the form of a wide string (``units``: little-endian, of the layout's width)."""
 
     def unwide(self, value: object) -> tuple[Wide, bytes]:
         """Return layout and units."""

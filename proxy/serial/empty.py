@@ -1,7 +1,7 @@
-"""The empty message of a type: numbers are zero, texts and sequences have no length.
+"""Empty message of a type: numbers are zero, texts and sequences have no length.
 
-Sans-I/O. It is what a client gets where no answer came in time. A response with ``bool success`` and
-``string message``, as those of ``std_srvs``, says why instead.
+Sans-I/O. A client gets it if no answer arrives in time. A response with ``bool success`` and ``string message``, such
+as those of ``std_srvs``, contains the reason instead.
 Source: FogROS2-FT: "an empty response" after the timeout of a request.
 """
 
@@ -33,7 +33,7 @@ _LEAVES: Final = _Leaves()
 
 
 class NoAnswer:
-    """What a service of ROS 2 answers when it has no answer.
+    """Response of a ROS 2 service that has no answer.
 
     Args:
         response: the service's response.
@@ -55,7 +55,7 @@ class NoAnswer:
 
     @classmethod
     def of(cls, service: Service) -> NoAnswer | None:
-        """Return what a service answers; None: ROS 1 has errors, or nobody knows what its response looks like."""
+        """Return the empty response of a service; None: ROS 1 has errors, or the response's definition is unknown."""
         if service.ros == 1:
             return None
         try:
@@ -64,7 +64,7 @@ class NoAnswer:
             return None
 
     def to_raw(self, reason: str) -> bytes:
-        """Return the message; ``reason`` is in it where the type has a place for it."""
+        """Return the message; it contains ``reason`` where the type has a field for it."""
         tree = {name: _nothing(kind) for name, kind in self._fields}
         if self.says_reason:
             tree["message"] = memoryview(reason.encode())

@@ -1,8 +1,8 @@
 """Parser of the IDL texts that ROS 2 writes: one pass over the tokens, no backtracking.
 
-Layer: sans-I/O. A peer may send the text, so time and memory are proportional to its length, and tokens and nesting
-are bounded. Read are modules, structures, constants, typedefs and enumerations with their annotations. A constant is a
-literal or the name of another one; expressions with operators are refused, as rosidl refuses them.
+Sans-I/O. A peer may send the text, so time and memory are proportional to its length, and tokens and nesting are
+bounded. The parser accepts modules, structures, constants, typedefs and enumerations with their annotations. A constant
+is a literal or the name of another one; expressions with operators are refused, as rosidl refuses them.
 Source: OMG IDL 4.2, section 7.4; the ROS 2 article on IDL interfaces.
 """
 
@@ -63,7 +63,7 @@ _Item: TypeAlias = "BaseDesc | NameDesc"
 
 @dataclass(frozen=True, slots=True)
 class _Kind:
-    """A type as written: ``node`` 0 for one value, else ``Nodetype.ARRAY`` or ``Nodetype.SEQUENCE`` with its count."""
+    """A parsed type: ``node`` 0 for one value, else ``Nodetype.ARRAY`` or ``Nodetype.SEQUENCE`` with its count."""
 
     item: _Item
     node: int = _SCALAR
@@ -74,7 +74,7 @@ def parse_idl(text: str) -> Typesdict:
     """Return constants and fields of every structure in a text.
 
     Raises:
-        ValueError: the text is no IDL of the kind that ROS 2 writes, or is too long.
+        ValueError: the text is not IDL in the form of ROS 2, or is too long.
     """
     return _Parser(_tokens(text)).types()
 
@@ -116,7 +116,7 @@ def _token_end(text: str, at: int) -> int:
 
 
 def _comment_end(text: str, at: int) -> int:
-    """Return where a comment, or a line for the preprocessor, ends."""
+    """Return the end of a comment, or of a preprocessor line."""
     if text[at] == "#" or text[at + 1] == "/":
         stop = text.find("\n", at)
         return len(text) if stop < 0 else stop + 1
@@ -138,11 +138,11 @@ def _string_end(text: str, at: int) -> int:
 class _Parser:
     def __init__(self, tokens: Iterator[str]) -> None:
         self._tokens = tokens
-        self._token = next(tokens, "")  # the one that comes next; empty at the end
+        self._token = next(tokens, "")  # the next one; empty at the end
         self._statements = 0
         self._scope: list[str] = []
         self._types: Typesdict = {}
-        self._descs: dict[FieldDesc, FieldDesc] = {}  # equal ones are kept once
+        self._descs: dict[FieldDesc, FieldDesc] = {}  # equal ones are stored once
         self._aliases: dict[str, _Kind] = {}
         self._constants: dict[str, _Value] = {}
         self._by_scope: dict[str, Constdefs] = {}
@@ -229,7 +229,7 @@ class _Parser:
     def _struct(self) -> None:
         name = self._full(self._word())
         if self._token == ";":
-            return  # announced, and defined later
+            return  # forward declaration
         self._expect("{")
         fields: list[tuple[str, FieldDesc]] = []
         while True:
@@ -268,7 +268,7 @@ class _Parser:
         self._expect("}")
 
     def _declared(self, kind: _Kind) -> list[tuple[str, _Kind]]:
-        """Return the names that a declaration gives a type to."""
+        """Return the names that a declaration defines, with their types."""
         declared = []
         while True:
             name, of = self._word(), kind
@@ -330,7 +330,7 @@ class _Parser:
         return name
 
     def _found(self, name: str, known: Typesdict | dict[str, _Kind] | dict[str, _Value]) -> str:
-        """Return the full name of what is meant in this scope, the innermost first; empty where nothing is."""
+        """Return the full name that a name refers to in this scope, the innermost first; empty if there is none."""
         for depth in range(len(self._scope), -1, -1):
             full = "/".join((*self._scope[:depth], name))
             if full in known:
@@ -368,7 +368,7 @@ class _Parser:
                 self._skip_arguments()
 
     def _skip_arguments(self) -> None:
-        """Nothing in an annotation changes a message's bytes."""
+        """Skip the arguments of an annotation, which never change a message's bytes."""
         is_open = 1
         while is_open:
             token = self._next()

@@ -1,8 +1,8 @@
-"""How the leaves of a message look in JSON; readable first, exact always.
+"""JSON form of the leaves of a message: exact, and readable where possible.
 
-Place: pure.
+Sans-I/O.
 Source: rosbridge for base64; RFC 7493 (I-JSON) 2.2 for integers beyond 2^53.
-The rest: ``docs/reference/serialisation.md``.
+Other conventions: ``docs/reference/serialisation.md``.
 """
 
 from __future__ import annotations
@@ -33,31 +33,31 @@ _TOKENS: Final = {
     "d": {0x7FF0000000000000: "Infinity", 0xFFF0000000000000: "-Infinity", 0x7FF8000000000000: "NaN"},
 }
 _BITS: Final = {code: {token: bits for bits, token in tokens.items()} for code, tokens in _TOKENS.items()}
-# The one float32 (of either sign) whose shortest digits, read as a double and rounded, give its neighbour: found by
-# trying all 2^31. Its lists are written with the digits of doubles.
+# The one float32 (of either sign) whose shortest digits, read as a double and rounded, give its neighbour; found by a
+# test of all 2^31. Its lists are written with the digits of doubles.
 _TWICE_ROUNDED: Final = 0x15AE43FD
-_NAN_PREFIX: Final = "NaN:"  # and the bits in hex: any other NaN
+_NAN_PREFIX: Final = "NaN:"  # followed by the bits in hex: any other NaN
 
 
 class JsonDialect:
-    """Numbers, strings and base64; objects and tokens only for what JSON has no word for."""
+    """Numbers, strings and base64; objects and tokens only for values without a JSON form."""
 
     as_bits = False
     inline_max = 64
     guarded = "qQ"
 
     def plain(self, values: tuple[float, ...]) -> bool:
-        """Whether no value is infinite or NaN: one such makes the sum so too."""
+        """Return whether no value is infinite or NaN; the test is the sum, which such a value makes so too."""
         return isfinite(sum(values))
 
     def number(self, code: str, value: float, bits: int) -> object:
-        """Return a number, or a token for a float that is none, or text for an integer beyond 2^53."""
+        """Return a number, a token for an infinity or NaN, or text for an integer beyond 2^53."""
         if code in _TOKENS:
             return value if isfinite(value) else _token(code, bits)
         return value if -_SAFE <= value <= _SAFE else str(value)
 
     def bits(self, code: str, value: object) -> int | bool:
-        """Return what to pack for a number, a token or a text of digits."""
+        """Return the value to pack for a number, a token or a text of digits."""
         if code == "?":
             if not isinstance(value, bool):
                 raise MisfitError("a bool is true or false")
@@ -109,7 +109,7 @@ class JsonDialect:
         return layout, _unbase64(value["base64"])
 
     def array(self, item: Number, raw: memoryview) -> object:
-        """Return base64 for octets, else a list; an array of plain numbers stays one until it is written."""
+        """Return base64 for octets, else a list; an array of plain numbers remains an array until it is written."""
         if item.octet:
             return pybase64.b64encode_as_string(raw)
         if item.code == "?":
@@ -131,7 +131,7 @@ class JsonDialect:
             return bytes(self.bits("?", flag) for flag in value)
         try:
             return memoryview(array.array(item.code, value)).cast("B")
-        except TypeError:  # not only plain numbers
+        except TypeError:  # not all are plain numbers
             return self._unarray_with_texts(item.code, value)
 
     def _unarray_with_texts(self, code: str, values: list[object]) -> memoryview:
@@ -174,14 +174,14 @@ def _aligned(values: _Numbers) -> _Numbers:
 
 
 def _plain(code: str, values: _Numbers) -> _Numbers:
-    """Return the array as orjson may write it."""
+    """Return the array in a form that orjson can write."""
     if code == "f" and ((values.view("<u4") & 0x7FFFFFFF) == _TWICE_ROUNDED).any():
         return values.astype(np.float64)
     return _aligned(values)
 
 
 def _with_tokens(code: str, values: _Numbers) -> list[object]:
-    # the digits of float32 are those that orjson gives an array of them; what is no number comes back as None
+    # orjson writes an array of float32 with their own digits; a NaN or infinity is returned as None.
     items: list[object] = orjson.loads(orjson.dumps(_plain(code, values), option=orjson.OPT_SERIALIZE_NUMPY))
     patterns = values.view(f"<u{values.itemsize}")
     for index in np.flatnonzero(~np.isfinite(values)).tolist():
@@ -196,7 +196,7 @@ def _unbase64(value: object) -> bytes:
 
 
 def _wide_text(units: bytes, layout: Wide) -> str | None:
-    """Return the text that gives these very units again, None where there is none."""
+    """Return the text that encodes to exactly these units, None where there is none."""
     try:
         text = units.decode("utf-32-le" if layout is Wide.FOUR else "utf-16-le")
     except UnicodeDecodeError:

@@ -1,6 +1,6 @@
-"""Where numbers lie: a run of them, of fixed size, packed and unpacked in one call whatever its alignment.
+"""Layout of numbers on the wire: a run of fixed size is packed and unpacked in one call at any alignment.
 
-Place: pure.
+Sans-I/O.
 Source: CORBA CDR 15.3 (a primitive is aligned to its size, counted from the start of the body); ROS 1 packs tightly.
 """
 
@@ -15,12 +15,13 @@ from proxy.serial.schema import SIZES, Array, Number, Record, Type
 __all__ = ["RUN_MAX", "Phases", "Wire", "inline_codes", "structs_for"]
 
 _AS_BITS: Final = str.maketrans(BITS)
-RUN_MAX: Final = 4_096  # numbers of one record that are unpacked in runs; further arrays and records go one by one
-_INLINE_MAX: Final = 256  # numbers in one record that still count as one run
+# numbers of one record that are unpacked in runs; further arrays and records are unpacked one by one
+RUN_MAX: Final = 4_096
+_INLINE_MAX: Final = 256  # numbers in one record that still form one run
 
 
 class Phases(dict[int, struct.Struct]):
-    """The struct of a run for each place modulo 8 that it may start at, made when it is first needed."""
+    """Structs of a run, one for each start offset modulo 8, created when first needed."""
 
     __slots__ = ("_cdr", "_letters", "_order")
 
@@ -51,7 +52,7 @@ class Wire:
         self.order = order
 
     def structs(self, codes: str, *, as_bits: bool) -> Phases:
-        """Return the struct of a run for each place modulo 8 that it may start at."""
+        """Return the structs of a run, one for each start offset modulo 8."""
         letters = codes.translate(_AS_BITS) if as_bits else codes
         return Phases(letters, self.order, cdr=self.cdr)
 
@@ -73,12 +74,12 @@ def _padded(letters: str, phase: int) -> str:
 
 
 def inline_codes(kind: Type, inline_max: int, known: dict[int, str | None]) -> str | None:
-    """Return the codes of a type that is only numbers and of fixed size, None for any other.
+    """Return the codes of a type that consists of numbers only and has a fixed size, None for any other.
 
     Args:
         kind: a field's type.
         inline_max: longest fixed array that may count.
-        known: answers already found, by the record's identity; filled.
+        known: results so far, by the record's identity; extended.
     """
     if isinstance(kind, Number):
         return kind.code

@@ -1,8 +1,8 @@
 """Parser of ``msg`` definition texts: one pass over the lines, no backtracking.
 
-Layer: sans-I/O. A peer may send the text, so time and memory are proportional to its length, and the number of fields
-and constants is bounded. Constructs are those of ROS 1 and ROS 2: comments, constants, default values, bounds,
-annotations, used types after a rule of 80 ``=`` and a line ``MSG: name``.
+Sans-I/O. A peer may send the text, so time and memory are proportional to its length, and the number of fields and
+constants is bounded. It accepts the constructs of ROS 1 and ROS 2: comments, constants, default values, bounds,
+annotations, used types after a line of 80 ``=`` and a line ``MSG: name``.
 Source: ROS 1 ``msg`` wiki page; the ROS 2 interface definition article.
 """
 
@@ -162,7 +162,7 @@ class _Parser:
         if kind[2] and kind[1] not in ("string", "wstring"):
             raise ValueError(f"a bound of what is no string: {_short(line)}")
         item: _Item
-        if kind[1] in _BASES:  # the bound of a wide string does not show in any wire form or hash of ours
+        if kind[1] in _BASES:  # the bound of a wide string affects no wire form and no hash here
             item = (Nodetype.BASE, (_BASES[kind[1]], _number(kind[2]) if kind[2] and kind[1] == "string" else 0))
         else:
             item = (Nodetype.NAME, self._full(kind[1]))
@@ -189,7 +189,7 @@ def _with_msg(name: str) -> str:
 
 
 def _value(text: str, line: str) -> bool | float | int | str:
-    """Return what a constant is: a number or truth that ends the line, or the text itself."""
+    """Return the value of a constant: a number or bool that ends the line, or the text itself."""
     text = text.lstrip(" \t")
     for pattern, read in ((_FLOAT, float), (_INTEGER, _integer), (_TRUTH, _is_true)):
         found = pattern.match(text)
@@ -204,7 +204,7 @@ def _value(text: str, line: str) -> bool | float | int | str:
 
 
 def _closing_quote(text: str) -> int:
-    """Return where the string that begins a text ends, 0 where it does not."""
+    """Return the end of the string that begins a text, 0 if it is not closed."""
     at = 1
     while (found := _QUOTE_OR_ESCAPE.search(text, at)) is not None:
         if found[0] == text[0]:

@@ -1,6 +1,6 @@
-"""The leaves as their own bytes: nothing is interpreted, so a message read and written with it is only tidied.
+"""Native form of the leaves: their own bytes, uninterpreted, so that reading and writing only normalises a message.
 
-Place: pure. Used for the canonical form (padding zeroed, little-endian, bools 0 or 1), and to turn big-endian CDR.
+Sans-I/O. Used for the canonical form (padding zeroed, little-endian, bools 0 or 1), and to convert big-endian CDR.
 """
 
 from __future__ import annotations
@@ -12,22 +12,22 @@ __all__ = ["NativeDialect"]
 
 
 class NativeDialect:
-    """Floats as bits, everything longer as bytes."""
+    """Floats as bits, longer leaves as bytes."""
 
     as_bits = True
     inline_max = 64
     guarded = ""
 
     def plain(self, values: tuple[float, ...]) -> bool:  # noqa: ARG002
-        """Never asked: numbers are bits already."""
+        """Never called: numbers are bits already."""
         return True
 
     def number(self, code: str, value: float, bits: int) -> object:  # noqa: ARG002
-        """Never asked: numbers are bits already."""
+        """Never called: numbers are bits already."""
         return bits
 
     def bits(self, code: str, value: object) -> int:  # noqa: ARG002
-        """Return the pattern as it came."""
+        """Return the bits unchanged."""
         if not isinstance(value, int):
             raise MisfitError("bits are whole numbers")
         return value
@@ -52,7 +52,7 @@ class NativeDialect:
         raise MisfitError("a wide string is its layout and its units")
 
     def array(self, item: Number, raw: memoryview) -> object:
-        """Return the bytes; bools tidied to 0 or 1."""
+        """Return the bytes; bools are normalised to 0 or 1."""
         if item.code == "?":
             return memoryview(bytes(map(bool, raw)))
         return raw

@@ -1,9 +1,10 @@
-"""Bytes to a tree of values: a message type compiled once into steps that walk its wire form.
+"""Reader from bytes to a tree of values: a message type compiled once into steps that traverse its wire form.
 
-Place: pure. A step takes the body, a position and the tree so far, and returns the position after it. Numbers that lie
-side by side, in nested records too, are unpacked in one call.
+Sans-I/O. A step takes the body, a position and the tree so far, and returns the position after it. Adjacent numbers, in
+nested records too, are unpacked in one call.
 Errors: bytes that do not fit the type raise ``MisfitError`` or ``struct.error``. The values of a message, in nested and
-fixed arrays too, are counted against one budget before they are made. A reader keeps that budget: it is for one thread.
+fixed arrays too, are counted against one budget before they are created. A reader holds that budget, so it must be used
+by one thread only.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ _Values: TypeAlias = "tuple[object, ...] | list[object]"
 _Shape: TypeAlias = "Callable[[_Values, Tree], None]"
 
 ITEMS_MAX: Final = 1 << 19  # records, lists and texts of one message: some 150 MB
-_ITEMS_FREE: Final = 256  # ... of which a message may have so many whatever its length
-_ITEMS_PER_BYTE: Final = 4  # ... and so many for each of its bytes
+_ITEMS_FREE: Final = 256  # ... of which any message may have this many
+_ITEMS_PER_BYTE: Final = 4  # ... and this many for each of its bytes
 
 
 def read_with(record: Record, wire: Wire, dialect: Dialect, layout: Wide = Wide.FOUR) -> Reader:
@@ -47,7 +48,7 @@ class _Compiler:
         self._count = struct.Struct(wire.order + "I").unpack_from
         self._items_known: dict[int, int] = {}
         self._bytes_known: dict[int, int] = {}
-        self._items_left = [0]  # of the message that is being read
+        self._items_left = [0]  # of the present message
 
     def message(self, record: Record) -> Reader:
         """Return the reader of a whole message."""
@@ -139,7 +140,7 @@ class _Compiler:
         return fill
 
     def _shape(self, fields: list[tuple[str, Type]]) -> _Shape:
-        """Return what puts a run's flat values under their names."""
+        """Return the function that maps a run's flat values to their names."""
         if all(isinstance(kind, Number) for _, kind in fields):
             names = tuple(name for name, _ in fields)
 
@@ -147,7 +148,7 @@ class _Compiler:
                 tree.update(zip(names, values, strict=True))
 
             return put_all
-        parts: list[tuple[str, int, int, _Shape | None]] = []  # start, stop, shape; stop 0: a number alone
+        parts: list[tuple[str, int, int, _Shape | None]] = []  # start, stop, shape; stop 0: a single number
         at = 0
         for name, kind in fields:
             if isinstance(kind, Number):
@@ -268,7 +269,7 @@ class _Compiler:
                 number = fixed
             if number * least > len(body) - at:
                 raise MisfitError("more items than the message can hold")
-            if fixed is None:  # a fixed array was counted with what holds it
+            if fixed is None:  # a fixed array was counted with its container
                 left[0] -= number * each
                 if left[0] < 0:
                     raise MisfitError("more values than such a message may have")

@@ -1,7 +1,7 @@
-"""A message type as a tree of five nouns, read from the definition text that travels with a channel.
+"""Schema of a message type as a tree of five node kinds, parsed from the definition text of a channel.
 
-Place: pure. A definition may come from a peer: its text is bounded, parsed in time proportional to its length
-(``msg_text``, ``idl_text``), and nothing is generated or executed. Types are kept by the hash of their definition.
+Sans-I/O. A definition may come from a peer. Its text is bounded and parsed in time proportional to its length
+(``msg_text``, ``idl_text``), and nothing is generated or executed. Types are cached by the hash of their definition.
 Source: the ROS 2 interface definition article; ROS 1 ``msg`` wiki page.
 """
 
@@ -34,15 +34,15 @@ __all__ = [
     "parsed",
 ]
 
-DEFINITION_MAX_BYTES: Final = 64 << 10  # of a text in UTF-8; parsed in the loop that must also say hello
+DEFINITION_MAX_BYTES: Final = 64 << 10  # of a text in UTF-8; it is parsed in the loop that must also send hellos
 _KEPT_MAX: Final = 256  # parsed definitions
 _DEPTH_MAX: Final = 32  # records within records
-_FIELDS_MAX: Final = 4_096  # of a type with all that it contains: each record as often as it stands somewhere
+_FIELDS_MAX: Final = 4_096  # of a type with all nested ones: each record counts as often as it occurs
 _RULE: Final = "=" * 80 + "\n"
 
 
 class DefinitionError(LocalError):
-    """There is no definition, or it describes what this program has no form for."""
+    """The definition is missing, or describes a type without a form here."""
 
 
 class UnparsedError(DefinitionError):
@@ -58,7 +58,7 @@ class Number:
 
     @property
     def size(self) -> int:
-        """Bytes of one, which is its alignment in CDR too."""
+        """Return the bytes of one number, which is its alignment in CDR too."""
         return SIZES[self.code]
 
 
@@ -86,7 +86,7 @@ class Sequence:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Record:
-    """Named fields in wire order. Records are compared by identity: one parse makes one of each type."""
+    """Named fields in wire order. Records are compared by identity: one parse creates one of each type."""
 
     name: str
     fields: tuple[tuple[str, Type], ...]
@@ -111,10 +111,10 @@ _NUMBERS: Final = {
     "float32": Number("f"),
     "float64": Number("d"),
 }
-_ROS1_BYTE: Final = Number("b", octet=True)  # in ROS 1, byte is another word for int8
+_ROS1_BYTE: Final = Number("b", octet=True)  # in ROS 1, byte is a synonym of int8
 _DUMMY: Final = ("structure_needs_at_least_one_member", Number("B"))  # rosidl: no CDR structure is empty
 
-# Types that definitions use without bringing them.
+# Types that definitions use without including them.
 _BUILTIN: Final[dict[int, dict[str, tuple[tuple[str, Type], ...]]]] = {
     1: {
         "builtin_interfaces/msg/Time": (("sec", Number("I")), ("nanosec", Number("I"))),
@@ -132,7 +132,7 @@ def parse(type_name: str, definition: str, definition_format: str, ros: int) -> 
 
     Args:
         type_name: as ROS 2 writes it, such as ``sensor_msgs/msg/Image``.
-        definition: the full text, every used type after a rule of 80 ``=``.
+        definition: the full text, every used type after a line of 80 ``=``.
         definition_format: ``msg`` or ``idl``; empty means that there is no definition.
         ros: 1 or 2.
 
@@ -150,7 +150,7 @@ def parse(type_name: str, definition: str, definition_format: str, ros: int) -> 
 
 
 def msg_name(type_name: str, definition_format: str) -> str:
-    """Return the name under which a type stands in its parsed definition: ``msg`` text knows no services or actions."""
+    """Return a type's name in its parsed definition: ``msg`` text has no names for services or actions."""
     if definition_format != "msg":
         return type_name
     package, _, name = type_name.partition("/")
@@ -190,7 +190,7 @@ def _first_line(error: BaseException) -> str:
 
 
 class _Builder:
-    """Resolves names; remembers records, so that a type used twice is built once."""
+    """Resolves names and caches records, so that a type used twice is built once."""
 
     def __init__(self, types: Typesdict, ros: int) -> None:
         self._types = types

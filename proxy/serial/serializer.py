@@ -1,6 +1,6 @@
-"""One channel's messages in one encoding: bytes as ROS writes them to a body for the overlay, and back.
+"""Serializer of one channel's messages in one encoding: from ROS's bytes to a body for the overlay, and back.
 
-Place: pure. What is compiled for a channel is compiled once.
+Sans-I/O. Each channel is compiled once.
 Source: docs/explanation/design.md, section 8;
 OMG CDR encapsulation (RTPS 2.2, section 10): two bytes of scheme, two of options.
 """
@@ -34,14 +34,14 @@ _LITTLE: Final = b"\x00\x01"  # CDR_LE
 _BIG: Final = b"\x00\x00"  # CDR_BE
 _PREFIX: Final = b"\x00\x01\x00\x00"
 _PAD_MAX: Final = 3  # bytes that a writer may add to reach a multiple of four
-_RAW: Final = "$raw"  # no field can be called so
+_RAW: Final = "$raw"  # no field can have this name
 _NATIVE: Final = NativeDialect()
-_CONTAINERS_MAX: Final = 4 * ITEMS_MAX  # of JSON; texts may hold some of their signs
+_CONTAINERS_MAX: Final = 4 * ITEMS_MAX  # brackets in JSON; texts may contain some of them
 _CBOR_ITEMS_MAX: Final = 8 * ITEMS_MAX  # numbers count too
 _CODECS_MAX: Final = 256  # compiled types, of all encodings
 
 
-# How a body is written; ``cdr``: the bytes as they are, whichever ROS wrote them.
+# Encoding of a body; ``cdr``: the unchanged bytes of either ROS.
 Encoding: TypeAlias = Literal["json", "cbor", "cdr"]
 
 
@@ -52,8 +52,8 @@ class Serializer:
     ``{"$raw": bytes}``. Nothing is lost; only the readable form is.
 
     Args:
-        channel: what the messages are.
-        encoding: how bodies look.
+        channel: description of the messages.
+        encoding: of the bodies.
     """
 
     __slots__ = ("_codec", "_encoding", "channel", "opaque")
@@ -88,7 +88,7 @@ class Serializer:
         """Return the message of a body: little-endian CDR, padding zeroed, or ROS 1.
 
         Raises:
-            RemoteError: the body is not what the definition and the encoding say.
+            RemoteError: the body does not fit the definition and the encoding.
         """
         if self._encoding == "cdr":
             return body
@@ -115,7 +115,7 @@ class Serializer:
 def canonical(channel: Channel, raw: bytes) -> bytes:
     """Return the message read and written once: little-endian, padding zeroed, nothing after the last field.
 
-    A message that does not fit the definition comes back as it is.
+    A message that does not fit the definition is returned unchanged.
     """
     try:
         codec = _native(channel.type_name, channel.definition, channel.definition_format, channel.ros)
@@ -147,7 +147,7 @@ def _raw_of(value: object) -> bytes:
 
 
 class Codec:
-    """Readers for each way a message of the type may lie, and the one writer; each is compiled when it is needed."""
+    """Readers for each wire form of the type, and the one writer; each is compiled when it is needed."""
 
     __slots__ = ("_dialect", "_layouts", "_readers", "_record", "_ros", "_turned", "_writer")
 
@@ -155,7 +155,7 @@ class Codec:
         self._record = record
         self._ros = ros
         self._dialect = dialect
-        self._turned = turned  # reads what is big-endian; None where this one does itself
+        self._turned = turned  # reads big-endian messages; None where this one does itself
         self._layouts = tuple(Wide) if _has_wide(record, set()) else (Wide.FOUR,)
         self._readers: dict[tuple[bytes, Wide], Reader] = {}
         self._writer: Writer | None = None
@@ -175,7 +175,7 @@ class Codec:
         return self._first_fit(order, memoryview(raw)[len(_PREFIX) :], _PAD_MAX)
 
     def to_raw(self, tree: object) -> bytes:
-        """Return the message of a tree; raises what the writer raises."""
+        """Return the message of a tree; raises the writer's errors."""
         body = bytearray()
         if self._writer is None:
             self._writer = write_with(self._record, Wire(cdr=self._ros == 2), self._dialect)

@@ -1,6 +1,6 @@
-"""What a caller must know about a service: its request and its response, each described like a topic's messages.
+"""Service description for a caller: its request and its response, each described like a topic's messages.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Service:
     """A service.
 
     Args:
-        name: as the robot calls it.
+        name: the local name.
         type_name: as ROS 2 writes it (``std_srvs/srv/SetBool``), for ROS 1 too.
         hash: md5 sum of the ROS 1 service, ``RIHS01_...`` for ROS 2; empty where unknown.
         request: of type ``std_srvs/srv/SetBool_Request``, for ROS 1 too; its ``topic`` is the service's name.
@@ -40,14 +40,14 @@ class Service:
 
     @property
     def ros(self) -> RosVersion:
-        """Return whose wire form the messages have."""
+        """Return the ROS version of the messages' wire form."""
         return self.request.ros
 
     def to_wire(self) -> bytes:
         """Return the bounded CBOR form.
 
         Raises:
-            LocalError: a part is longer than a peer would take.
+            LocalError: a part is longer than a peer would accept.
         """
         fields = {
             "n": self.name,
@@ -60,10 +60,10 @@ class Service:
 
     @classmethod
     def from_wire(cls, wire: bytes) -> Service:
-        """Read what ``to_wire`` wrote.
+        """Parse the form that ``to_wire`` writes.
 
         Raises:
-            RemoteError: anything else, whatever the bytes.
+            RemoteError: any other bytes.
         """
         if len(wire) > _WIRE_MAX_BYTES:
             raise RemoteError(DropReason.MALFORMED, "a service description that is too long")

@@ -1,6 +1,6 @@
-"""A service in the other ROS: how it would describe it, and its requests and responses converted.
+"""Converter of a service between ROS 1 and ROS 2: its description in the other ROS, its requests and responses.
 
-Place: pure.
+Sans-I/O.
 Source: ``genmsg.gentools`` (md5 of a service: over the md5 texts of request and response, one after the other);
 ``rosidl_generator_type_description`` (RIHS01 of a service: a structure of request, response and event).
 """
@@ -25,10 +25,10 @@ _EVENT_INFO: Final = "service_msgs/msg/ServiceEventInfo"
 
 
 def translated_service(service: Service, ros: RosVersion) -> Service:
-    """Return how the service looks in ROS ``ros``.
+    """Return the service in ROS ``ros``.
 
     Raises:
-        DefinitionError: as ``twin_channel`` says, of either half.
+        DefinitionError: as ``translated_channel``, of either half.
     """
     if service.ros == ros:
         return service
@@ -44,7 +44,7 @@ def translated_service(service: Service, ros: RosVersion) -> Service:
 
 
 class ServiceConverter:
-    """Calls of a client that knows the service as ``source``, served by one that knows it as ``target``.
+    """Converter between a client's description ``source`` and a server's description ``target`` of a service.
 
     Raises:
         DefinitionError: the definitions do not match; see ``MessageConverter``.

@@ -1,7 +1,7 @@
-"""Definitions for recordings that bring none: rosbag2 stored them only from Iron on.
+"""Standard definitions for recordings without any: rosbag2 stored them only from Iron on.
 
-Place: pure. The types are those of Humble, the last distribution whose recordings lack them. A message that does not
-fit travels opaque (see ``serializer``).
+Sans-I/O. The types are those of Humble, the last distribution whose recordings lack them. A message that does not fit
+travels opaque (see ``serializer``).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def standard_definition(type_name: str) -> str | None:
 
 
 def type_hash(type_name: str, definition: str, definition_format: DefinitionFormat) -> str:
-    """Return the ROS 2 type hash (``RIHS01_...``) that a definition gives, empty where it gives none."""
+    """Return the ROS 2 type hash (``RIHS01_...``) of a definition, empty where it has none."""
     store = get_typestore(Stores.EMPTY)
     try:
         if definition_format == "msg":

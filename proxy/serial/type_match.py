@@ -1,7 +1,7 @@
-"""Whether two types say the same field by field, and how one tree of values serves both.
+"""Type match: whether two types are equal field by field, and how one tree of values serves both.
 
-Place: pure. What may differ between ROS 1 and ROS 2 without a difference in meaning is here and nowhere else:
-``Header.seq``, the signs in times and durations, ``byte``, the dummy of an empty type, upper case in field names.
+Sans-I/O. All differences between ROS 1 and ROS 2 without a difference in meaning are here: ``Header.seq``, the signs in
+times and durations, ``byte``, the dummy of an empty type, upper case in field names.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from proxy.serial.type_translation import DUMMY, Bounds
 
 __all__ = ["Amend", "Pair", "Side", "match"]
 
-Amend: TypeAlias = "Callable[[object], None]"  # finish the tree of a value for the other side, or refuse it
+Amend: TypeAlias = "Callable[[object], None]"  # completes the tree of a value for the other side, or refuses it
 
 _WORDS: Final = {"?": "bool", "b": "int8", "B": "uint8", "h": "int16", "H": "uint16", "i": "int32", "I": "uint32"}
 _WORDS64: Final = {"q": "int64", "Q": "uint64", "f": "float32", "d": "float64"}
 _SEQ: Final = ("seq", Number("I"))
-_HEADER: Final = ("stamp", "frame_id")  # what a ROS 2 header has
+_HEADER: Final = ("stamp", "frame_id")  # fields of a ROS 2 header
 _ROS1_CLOCKS: Final = {"builtin_interfaces/msg/Time": ("I", "I"), "builtin_interfaces/msg/Duration": ("i", "i")}
 _ROS2_CLOCK: Final = (("sec", Number("i")), ("nanosec", Number("I")))
 
 
 @dataclass(frozen=True, slots=True)
 class Side:
-    """A type on one side, the ROS it belongs to, and its bounds."""
+    """A type on one side, with its ROS version and its bounds."""
 
     record: Record
     ros: RosVersion
@@ -39,7 +39,7 @@ class Side:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
-    """What to read a message with, what to write its tree with, and what the tree needs in between (None: nothing)."""
+    """Types to read a message and to write its tree, and the amendment of the tree in between (None: none)."""
 
     read: Record
     write: Record
@@ -47,10 +47,10 @@ class Pair:
 
 
 def match(source: Side, target: Side) -> Pair:
-    """Return how messages of one type become those of the other. Names of types do not matter.
+    """Return how messages of one type become those of the other. Names of types are ignored.
 
     Raises:
-        DefinitionError: the types differ; the text names the first field that does, there (``source``) and here.
+        DefinitionError: the types differ; the text names the first differing field, there (``source``) and here.
     """
     return _Matcher(source, target).record(source.record, target.record, "")
 
@@ -81,7 +81,7 @@ class _Matcher:
 
     def _fields(self, there: Record, here: Record, path: str) -> Pair:
         unpaired = {DUMMY, "seq"} if self._crossing and _headers(there, here) else {DUMMY}
-        read: list[tuple[str, Type]] = [field for field in there.fields if field[0] in unpaired]  # both come first
+        read: list[tuple[str, Type]] = [field for field in there.fields if field[0] in unpaired]  # both are first
         write: list[tuple[str, Type]] = [field for field in here.fields if field[0] in unpaired]
         filled = tuple(name for name, _ in write if name not in dict(read))
         amends: list[tuple[str, Amend]] = []
@@ -104,7 +104,7 @@ class _Matcher:
         return Pair(Record(there.name, tuple(read)), Record(here.name, tuple(write)), amend)
 
     def _limits(self, there: tuple[str, str], here: tuple[str, str]) -> tuple[int, int]:
-        """Return the bounds here that are tighter than there, zero for none."""
+        """Return the bounds that are tighter here than there, zero for none."""
         wide = self._source.bounds.get(there, (0, 0))
         text, count = (
             tight if tight and not 0 < loose <= tight else 0
@@ -135,7 +135,7 @@ class _Matcher:
             return pair.read, pair.write, pair.amend
         if isinstance(there, Number) and isinstance(here, Number):
             if there.code == here.code or (there.octet and here.octet):
-                return here, here, None  # a byte is eight bits, whatever its sign
+                return here, here, None  # a byte has eight bits, whatever its sign
         elif there == here:
             return there, here, _bound_text(path, limit) if limit else None
         raise _difference(path, there, here)

@@ -1,7 +1,7 @@
-"""A type's definition as the other ROS would write it, and the hashes that its own ROS gives it.
+"""Type translation: a type's definition in the form of the other ROS, and its hashes there.
 
-Place: pure; works on the fields that rosbags parses. A type that both ROS ship and that matches is taken as the other
-ROS ships it (upper-case field names of ``CameraInfo``, constants, bounds), so that its hash is the published one.
+Sans-I/O; works on the fields that rosbags parses. A type that both ROS ship and that matches takes the other ROS's own
+form (upper-case field names of ``CameraInfo``, constants, bounds), so that its hash is the published one.
 Source: ``genmsg.gentools`` for the md5 text; REP 2016 for RIHS01; the ROS 2 interface definition article.
 """
 
@@ -59,7 +59,7 @@ def bounds_of(types: Typesdict) -> Bounds:
 
 
 def retyped(types: Typesdict, ros: RosVersion) -> Typesdict:
-    """Return the other ROS's types as ROS ``ros`` writes them, by the same names."""
+    """Return the other ROS's types in the form of ROS ``ros``, under the same names."""
     twins: Typesdict = {}
     if ros == 2:
         twins.update({name: _store(Stores.ROS2_JAZZY).fielddefs[name] for name in _CLOCKS})
@@ -67,7 +67,7 @@ def retyped(types: Typesdict, ros: RosVersion) -> Typesdict:
         shape = _shape(name, fields)
         standard = next((known for store in _STANDARD[ros] if (known := _known(store, name, shape))), None)
         if standard is not None and ros == 1:
-            twins[name] = standard  # as it is: md5 sums tell char from uint8
+            twins[name] = standard  # unchanged: md5 sums distinguish char from uint8
             continue
         if standard is not None:
             twins[name] = (standard[0], [(field, _plain(desc, bounded=True)) for field, desc in standard[1]])
@@ -85,7 +85,7 @@ def _known(store: Stores, name: str, shape: _Shape) -> tuple[Constdefs, Fielddef
 
 
 def _shape(name: str, fields: Fielddefs) -> _Shape:
-    """Return fields as both ROS could write them: no bounds, no ``seq`` of a header, no dummy, lower case."""
+    """Return fields in a form common to both ROS: no bounds, no ``seq`` of a header, no dummy, lower case."""
     unsaid = (DUMMY, "seq") if name == _HEADER else (DUMMY,)
     return tuple((field.lower(), _plain(desc, bounded=False)) for field, desc in fields if field not in unsaid)
 
@@ -101,12 +101,12 @@ def _plain(desc: FieldDesc, *, bounded: bool) -> FieldDesc:
 def _plain_item(desc: _Item, *, bounded: bool) -> _Item:
     if desc[0] == Nodetype.NAME:
         return desc
-    base, bound = desc[1]  # char is another word for uint8 in both ROS
+    base, bound = desc[1]  # char is a synonym of uint8 in both ROS
     return (Nodetype.BASE, ("uint8" if base == "char" else base, bound if bounded else 0))
 
 
 def text_of(name: str, types: Typesdict, ros: RosVersion) -> str:
-    """Return the full definition text of a type, every used type after a rule of 80 ``=``.
+    """Return the full definition text of a type, every used type after a line of 80 ``=``.
 
     Raises:
         DefinitionError: a used type is a part of an action, which has no name in a ``msg`` text.
@@ -132,7 +132,7 @@ def _filled(types: Typesdict) -> Typestore:
 
 
 def md5_text(name: str, types: Typesdict) -> str:
-    """Return what ROS 1 takes the md5 sum of."""
+    """Return the text from which ROS 1 computes the md5 sum."""
     return _md5_text(name, types, {})
 
 

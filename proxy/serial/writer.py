@@ -1,8 +1,8 @@
-"""A tree of values to bytes: the mirror of ``reader``, for trees that a peer sent.
+"""Writer from a tree of values to bytes: the inverse of ``reader``, for untrusted trees.
 
-Place: pure. Writes ROS 1 or little-endian CDR with zero padding, so that equal values give equal bytes.
+Sans-I/O. Writes ROS 1 or little-endian CDR with zero padding, so that equal values give equal bytes.
 Errors: a tree that does not fit the type raises ``MisfitError``, ``KeyError``, ``TypeError``, ``ValueError``,
-``OverflowError`` or ``struct.error``; the serialiser translates them.
+``OverflowError`` or ``struct.error``; the serializer translates them.
 """
 
 from __future__ import annotations
@@ -87,19 +87,19 @@ class _Compiler:
             flat: list[object] = []
             flatten(tree, flat)
             phase = len(body) & 7
-            if has_bools:  # struct would take anything for a bool
+            if has_bools:  # struct would accept any value for a bool
                 body += exactly(flat, phase)
                 return
             try:
                 packed = structs[phase].pack(*flat)
-            except struct.error:  # not only plain numbers: each is taken or refused by the dialect
+            except struct.error:  # not all are plain numbers: the dialect accepts or refuses each
                 packed = exactly(flat, phase)
             body += packed
 
         return write
 
     def _flatten(self, fields: list[tuple[str, Type]]) -> _Flatten:
-        """Return what lists a run's values in wire order."""
+        """Return the function that lists a run's values in wire order."""
         if len(fields) > 1 and all(isinstance(kind, Number) for _, kind in fields):
             get = itemgetter(*(name for name, _ in fields))
 

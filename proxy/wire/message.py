@@ -1,7 +1,7 @@
-"""How a ROS message travels inside a sealed message, and what describes it.
+"""Envelope of a ROS message inside a sealed message, and the description of a publisher's messages.
 
-Place: pure. Wire form of a parcel, big-endian: ``version (1) | channel (2) | stamp in ns (8) | body``. A description is
-a map in deterministic CBOR: ``e`` the encoding of all bodies, ``c`` the channels that the parcels' numbers mean.
+Sans-I/O. Wire form of a message, big-endian: ``version (1) | channel (2) | stamp in ns (8) | body``. A description is a
+map in deterministic CBOR: ``e`` the encoding of all bodies, ``c`` the channels to which the messages' numbers refer.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["RosMessage", "TopicDescription"]
 
 VERSION: Final = 1
 CHANNELS_MAX: Final = 256
-DESCRIPTION_MAX_BYTES: Final = 4 << 20  # many channels of one topic may bring the same definition
+DESCRIPTION_MAX_BYTES: Final = 4 << 20  # many channels of one topic may contain the same definition
 _HEAD: Final = struct.Struct("!BHQ")
 _ENCODINGS: Final[dict[object, Encoding]] = {"json": "json", "cbor": "cbor", "cdr": "cdr"}
 
@@ -28,8 +28,8 @@ _ENCODINGS: Final[dict[object, Encoding]] = {"json": "json", "cbor": "cbor", "cd
 class RosMessage(NamedTuple):
     """One ROS message.
 
-    ``channel`` numbers the description's channels; ``stamp_ns`` is the wall clock of the sending proxy when it took the
-    message in.
+    ``channel`` is an index into the description's channels; ``stamp_ns`` is the wall clock of the sending proxy when it
+    received the message.
     """
 
     channel: int
@@ -57,7 +57,7 @@ class RosMessage(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class TopicDescription:
-    """What the parcels of one publisher of one topic are."""
+    """Description of the messages of one publisher of one topic."""
 
     encoding: Encoding
     channels: tuple[Channel, ...]
@@ -66,7 +66,7 @@ class TopicDescription:
         """Return the wire form.
 
         Raises:
-            LocalError: too many channels, or too much to say of them.
+            LocalError: too many channels, or too long descriptions.
         """
         if len(self.channels) > CHANNELS_MAX:
             raise LocalError(f"{len(self.channels)} connections of one topic; at most {CHANNELS_MAX} are allowed")
@@ -88,7 +88,7 @@ class TopicDescription:
         """Read the wire form.
 
         Raises:
-            RemoteError: MALFORMED, whatever else these bytes are.
+            RemoteError: MALFORMED, for any invalid bytes.
         """
         match decode(wire, DESCRIPTION_MAX_BYTES):
             case {"e": str(encoding), "c": [*channels]} if encoding in _ENCODINGS and 0 < len(channels) <= CHANNELS_MAX:

@@ -1,6 +1,6 @@
-"""How words about a log travel between the proxies of a service that keeps state. Its entries travel as requests do.
+"""Replication messages between the proxies of a service with state. The log's entries travel as requests do.
 
-Place: pure. Wire form: version (1) | 0x40 in the place of a part (1) | deterministic CBOR.
+Sans-I/O. Wire form: version (1) | 0x40 in the position of a part (1) | deterministic CBOR.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from proxy.wire.service import VERSION
 
 __all__ = ["STATE_MAX_BYTES", "follower_message", "is_word", "sequencer_message", "to_wire"]
 
-_WORDS: Final = 0x40  # in the place of a part
+_WORDS: Final = 0x40  # in the position of a part
 _HEAD: Final = bytes([VERSION, _WORDS])
 STATE_MAX_BYTES: Final = MESSAGE_MAX_BYTES - 256
 
 
 def is_word(wire: bytes) -> bool:
-    """Return whether these bytes are meant as one, not as a request or an answer."""
+    """Return whether these bytes are a replication message, not a request or a response."""
     return wire[: len(_HEAD)] == _HEAD
 
 
@@ -53,10 +53,10 @@ def to_wire(word: SequencerMessage | FollowerMessage) -> bytes:
 
 
 def sequencer_message(wire: bytes) -> SequencerMessage:
-    """Read a keeper's word.
+    """Parse a sequencer's message.
 
     Raises:
-        RemoteError: MALFORMED, whatever else these bytes are.
+        RemoteError: MALFORMED, for any invalid bytes.
     """
     match _read(wire):
         case ["keep", int(life)]:
@@ -71,10 +71,10 @@ def sequencer_message(wire: bytes) -> SequencerMessage:
 
 
 def follower_message(wire: bytes) -> FollowerMessage:
-    """Read a replica's word.
+    """Parse a replica's message.
 
     Raises:
-        RemoteError: MALFORMED, whatever else these bytes are.
+        RemoteError: MALFORMED, for any invalid bytes.
     """
     match _read(wire):
         case ["position", int(g), int(life), int(at), int(held), bool(is_lost), bool(tells), None]:

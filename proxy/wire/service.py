@@ -1,7 +1,7 @@
-"""How calls of a service or an action travel inside sealed messages, and what describes them.
+"""Service protocol: wire forms of the calls of a service or an action inside sealed messages, and its description.
 
-Place: pure. A service has one part, itself. An action has five, in this order: the services ``send_goal``,
-``cancel_goal`` and ``get_result``, and the topics ``feedback`` and ``status``. Wire forms, big-endian::
+Sans-I/O. A service has one part, itself. An action has five, in this order: the services ``send_goal``, ``cancel_goal``
+and ``get_result``, and the topics ``feedback`` and ``status``. Wire forms, big-endian::
 
     request   version (1) | part (1) | call (8) | patience in ms, 0: none (4) | body
     answer    version (1) | part (1) | call (8) | outcome (1)                 | body, or a reason in UTF-8
@@ -28,7 +28,7 @@ __all__ = ["Answer", "Exchange", "News", "Outcome", "Request", "Stop", "too_larg
 
 VERSION: Final = 1
 PARTS_MAX: Final = 8
-_STOPS: Final = 0x80  # in the place of a part
+_STOPS: Final = 0x80  # in the position of a part
 PATIENCE_MAX_MS: Final = (1 << 32) - 1
 _REASON_MAX_BYTES: Final = 1_024
 _REQUEST: Final = struct.Struct("!BBQI")
@@ -41,7 +41,7 @@ _ENCODINGS: Final[dict[object, Encoding]] = {"json": "json", "cbor": "cbor", "cd
 
 
 class Outcome(IntEnum):
-    """What became of a call."""
+    """Outcome of a call."""
 
     ANSWERED = 0
     FAILED = 1  # at the server's side; the body is the reason
@@ -71,7 +71,7 @@ class Request(NamedTuple):
 
 
 class Stop(NamedTuple):
-    """Word from a client's proxy that calls have ended: whoever still works on one need not."""
+    """Cancellation from a client's proxy: calls that have ended, on which servers need not work any more."""
 
     part: int
     calls: tuple[int, ...]
@@ -82,7 +82,7 @@ class Stop(NamedTuple):
 
     @staticmethod
     def is_in(wire: bytes) -> bool:
-        """Return whether these bytes are meant as one, not as a request."""
+        """Return whether these bytes are a cancellation, not a request."""
         return len(wire) >= _STOP.size and bool(wire[1] & _STOPS)
 
     @classmethod
@@ -102,7 +102,7 @@ class Stop(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """What a call came to, back to the one client that made it."""
+    """Result of a call, for the one client that made it."""
 
     part: int
     call: int
@@ -116,7 +116,7 @@ class Answer(NamedTuple):
 
     @property
     def reason(self) -> str:
-        """Return why the call failed."""
+        """Return the reason of a failed call."""
         return self.body[:_REASON_MAX_BYTES].decode("utf-8", "replace")
 
     def to_wire(self) -> bytes:
@@ -159,7 +159,7 @@ class News(NamedTuple):
 
 
 def too_large(what: str, raw_bytes: int, max_bytes: int, body_bytes: int) -> str:
-    """Return why something cannot travel: above its rule's limit, or in its encoding above everyone's; else nothing."""
+    """Return why a message cannot be sent: above its rule's limit, or encoded above the general one; else empty."""
     if raw_bytes > max_bytes:
         return f"{what} of {raw_bytes} bytes; the rule's max_bytes is {max_bytes}"
     if body_bytes > MESSAGE_MAX_BYTES - _HEAD_MAX_BYTES:
@@ -178,13 +178,13 @@ def _head(form: struct.Struct, wire: bytes) -> tuple[int, ...]:
 
 @dataclass(frozen=True, slots=True)
 class Exchange:
-    """What one side of a service or an action knows of it, and in which form it writes.
+    """Description of a service or an action by one side, with its encoding.
 
     Args:
         services: by part.
         topics: of an action; their parts follow the services'.
-        is_leaving: a server that answers what is under way, and then goes: ask others.
-        is_ordered: it keeps state, and takes requests in one order only.
+        is_leaving: the server answers what is under way, and then leaves; clients use others.
+        is_ordered: it keeps state, and executes requests in one order only.
     """
 
     encoding: Encoding
@@ -197,7 +197,7 @@ class Exchange:
         """Return the wire form.
 
         Raises:
-            LocalError: a part is longer than a peer would take.
+            LocalError: a part is longer than a peer would accept.
         """
         services = [service.to_wire() for service in self.services]
         said = {"e": self.encoding, "s": services, "c": [channel.to_wire() for channel in self.topics]}
@@ -209,7 +209,7 @@ class Exchange:
         """Read the wire form.
 
         Raises:
-            RemoteError: MALFORMED, whatever else these bytes are.
+            RemoteError: MALFORMED, for any invalid bytes.
         """
         match decode(wire, 2 * PARTS_MAX * CHANNEL_MAX_BYTES):
             case {"e": str(encoding), "s": [*services], "c": [*topics], **more} if (

@@ -1,4 +1,4 @@
-"""The ring command: five switches in namespaces, a recording sent through them, compared byte for byte.
+"""Ring demonstration: five switches in namespaces, a recording sent through them and compared byte for byte.
 
-Place: shell, above everything; it starts the commands that stand alone and reads what they print.
+I/O; it starts the project's commands as processes and parses their output.
 """

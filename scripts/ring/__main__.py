@@ -1,6 +1,6 @@
-"""``python -m ring``.
+"""Module entry ``python -m ring``.
 
-Place: shell. Importing takes half a second, in which nothing has been made yet: Ctrl-C then simply ends the process.
+I/O. Importing takes half a second, in which nothing is created yet: Ctrl-C then simply ends the process.
 """
 
 import os

@@ -1,7 +1,7 @@
-"""A command of ours that runs as a process: started, listened to, ended.
+"""Child process of the ring: one of the project's commands, started, read and ended.
 
-Place: shell. Built on ``subprocess`` and a pidfd rather than on asyncio's own subprocesses, whose transports kill what
-still runs when they are forgotten; a kept ring must outlive us.
+I/O. Built on ``subprocess`` and a pidfd rather than on asyncio's own subprocesses, whose transports kill running
+processes when they are garbage-collected. A kept ring must outlive this process.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ _TAIL_LINES: Final = 12
 
 
 class ChildError(GdpError):
-    """A process ended too early, or did not say in time what was waited for; the text shows its last lines."""
+    """A process ended too early, or did not report the awaited event in time; the text shows its last lines."""
 
 
 class Child:
     """One process, leader of its own group. Its standard error goes to ``log``, its standard output is read as events.
 
     Args:
-        label: what people call it, such as ``switch nuc1``.
+        label: display name, such as ``switch nuc1``.
         argv: the command line; inherited by exec, so that the process id stays.
         log: a file to create.
-        heard: False: nobody reads its standard output, which goes to the log too.
+        heard: False: its standard output is not read, and goes to the log too.
     """
 
     def __init__(self, label: str, argv: Sequence[str], log: Path, *, heard: bool = True) -> None:
@@ -59,20 +59,20 @@ class Child:
         return self._process.pid
 
     async def events(self) -> AsyncGenerator[Event, None]:
-        """Yield what the process says, until it closes its output.
+        """Yield the events of the process, until it closes its output.
 
         Raises:
-            LocalError: it says something else than events.
+            LocalError: its output is not an event.
         """
         lines = await self._open()
         while line := await lines.readline():
             yield Event.from_line(line.decode("utf-8", "replace"))
 
     async def wait_for(self, name: str, patience_s: float) -> Event:
-        """Return the next event of this name; others on the way are passed over.
+        """Return the next event of this name; others on the way are skipped.
 
         Raises:
-            ChildError: the process ended, or its patience ran out.
+            ChildError: the process ended, or ``patience_s`` seconds passed.
         """
         try:
             return await asyncio.wait_for(self._next(name), patience_s)
@@ -91,28 +91,28 @@ class Child:
             raise self.failed(f"still runs after {patience_s:g} s") from None
 
     def interrupt(self) -> None:
-        """Ask the process to finish its work and end."""
+        """Request the process to finish its work and end."""
         if not self.ended.done():
             self._process.send_signal(signal.SIGINT)
 
     def kill(self) -> None:
-        """End the process at once; it says no goodbye."""
+        """Kill the process immediately."""
         if not self.ended.done():
             self._process.kill()
 
     def go(self) -> None:
-        """Tell a node of a live run to begin, or to go on after its report."""
+        """Signal a node of a live run to begin, or to continue after its report."""
         if not self.ended.done():
             self._process.send_signal(signal.SIGUSR1)
 
     def failed(self, how: str) -> ChildError:
-        """Return the error that says how this process failed, with the last lines of its log."""
+        """Return the error for this process's failure, with the last lines of its log."""
         with self.log.open(encoding="utf-8", errors="replace") as file:
             tail = deque((line.rstrip() for line in file), maxlen=_TAIL_LINES)
         return ChildError("\n".join([f"{self.label} {how}", *(f"    {line}" for line in tail if line)]))
 
     def forget(self) -> None:
-        """Close our ends; the process itself is left as it is."""
+        """Close the descriptors here; the process itself continues."""
         if self._pidfd >= 0:
             asyncio.get_running_loop().remove_reader(self._pidfd)
             os.close(self._pidfd)
@@ -146,7 +146,7 @@ class Child:
         return lines
 
     def _reap(self) -> None:
-        """Called by the loop when the process has ended."""
+        """Read the exit code; the loop calls it when the process has ended."""
         asyncio.get_running_loop().remove_reader(self._pidfd)
         if not self.ended.done():
             self.ended.set_result(self._process.wait())

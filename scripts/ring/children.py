@@ -1,6 +1,6 @@
-"""All processes of a run, watched together: while one thing is awaited, the end of any that must stand ends the wait.
+"""Children of a run, supervised together: the end of any required process also ends the present wait.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ class Children:
     """The processes of one run.
 
     Args:
-        run: notes each of them, so that whoever takes the run down ends it.
-        kept: they are to outlive us; otherwise the kernel kills them when we end, however that comes about.
+        run: records each of them, so that the clean-up of the run ends it.
+        kept: they outlive this process; otherwise the kernel kills them when it ends for any reason.
     """
 
     def __init__(self, run: Run, *, kept: bool) -> None:
@@ -35,10 +35,10 @@ class Children:
         self._kept = kept
         self._all: list[Child] = []
         self._standing: list[Child] = []
-        self._changed = asyncio.Event()  # what must stand is another set than before
+        self._changed = asyncio.Event()  # set when the set of required processes changes
 
     def start(self, label: str, argv: Sequence[str], *, heard: bool = True) -> Child:
-        """Start a process; its log is called like its label."""
+        """Start a process; its log is named after its label."""
         child = Child(label, argv, self._run.directory / f"{label.replace(' ', '-')}.log", heard=heard)
         self._run.note_process(child.pid)
         self._all.append(child)
@@ -54,16 +54,16 @@ class Children:
         heard: bool = True,
         environment: Mapping[str, str] | None = None,
     ) -> Child:
-        """Start Python with these arguments in the namespace of a switch; ``environment``: beside that of ours."""
+        """Start Python with these arguments in the namespace of a switch; ``environment`` extends the present one."""
         told = ["env", *(f"{name}={value}" for name, value in environment.items())] if environment else []
         argv = namespaces.command(node, [*told, sys.executable, *arguments], dies_with_us=not self._kept)
         return self.start(f"{role} {node}", argv, heard=heard)
 
     async def ready(self, children: Sequence[Child]) -> list[Event]:
-        """Wait until each has said ``ready``, and return how; from then on they must stand.
+        """Wait until each has reported ``ready``, and return these events; from then on they are required.
 
         Raises:
-            ChildError: one did not, or one that must stand ended.
+            ChildError: one did not, or a required one ended.
         """
         said = await self.guarded(_all(child.wait_for("ready", READY_S) for child in children))
         self._standing += children
@@ -76,13 +76,13 @@ class Children:
         self._changed.set()
 
     async def kill(self, child: Child) -> None:
-        """Kill a process that must stand; return when it has ended."""
+        """Kill a required process; return when it has ended."""
         self.may_end(child)
         child.kill()
         await child.ended
 
     async def guarded(self, work: Coroutine[None, None, T]) -> T:
-        """Do ``work``, but stop at once if a process that must stand ends.
+        """Run ``work``, but stop at once if a required process ends.
 
         Raises:
             ChildError: one ended.
@@ -99,7 +99,7 @@ class Children:
             await cancel(task, fallen)
 
     def forget(self) -> None:
-        """Close our ends; the processes are left as they are."""
+        """Close the descriptors here; the processes continue."""
         for child in self._all:
             child.forget()
 
@@ -122,7 +122,7 @@ class Children:
 
 
 async def cancel(*tasks: asyncio.Future[T] | asyncio.Future[Child]) -> None:
-    """Cancel what is still under way and wait until it has stopped; what it raises then, others have told already."""
+    """Cancel what is under way and wait until it has stopped; its errors were reported elsewhere already."""
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)

@@ -1,6 +1,6 @@
-"""``python -m ring``, which ``scripts/ring_topology.sh`` runs once everything is set up.
+"""Command ``python -m ring``, which ``scripts/ring_topology.sh`` runs once everything is set up.
 
-Place: shell. Exit codes: 0 passed, 1 failed, 2 wrong input, 130 and 143 for Ctrl-C and SIGTERM.
+I/O. Exit codes: 0 passed, 1 failed, 2 wrong input, 130 and 143 for Ctrl-C and SIGTERM.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ LIVES: Final[tuple[Live, ...]] = get_args(Live)
 _PASSED: Final = 0
 _FAILED: Final = 1
 _WRONG_INPUT: Final = 2
-_WIDE: Final = 200  # columns where no terminal says how many there are
+_WIDE: Final = 200  # columns where the terminal's width is unknown
 
 _EXAMPLES: Final = """\b
 Examples:
@@ -146,7 +146,7 @@ def main() -> None:
 
 
 def spelled_out(words: Sequence[str]) -> Iterator[str]:
-    """Yield the command line with ``ros2`` after each ``--live`` that stands without a word of its own."""
+    """Yield the command line with ``ros2`` after each ``--live`` without a value."""
     for word, following in zip_longest(words, words[1:], fillvalue="-"):
         yield word
         if word == "--live" and following.startswith("-"):
@@ -154,7 +154,7 @@ def spelled_out(words: Sequence[str]) -> Iterator[str]:
 
 
 def _run(options: Options, run: Run, errors: Console) -> int:
-    """Do one run, and take down what it made unless it is to be kept."""
+    """Execute one run, and remove what it created unless it is to be kept."""
     kept = False
     try:
         code = asyncio.run(interruptible(_go(options, run, errors)))
@@ -226,7 +226,7 @@ def _show(result: Result) -> None:
 
 
 def _write(options: Options, result: Result, recording: Path | None = None) -> None:
-    """Write the files that were asked for; under sudo they belong to the person who asked."""
+    """Write the requested files; under sudo they belong to the invoking user."""
     if options.json is not None:
         options.json.write_text(json.dumps(result.to_json(), indent=1) + "\n", encoding="utf-8")
     person = os.environ.get("SUDO_UID"), os.environ.get("SUDO_GID")

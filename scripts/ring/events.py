@@ -1,6 +1,6 @@
-"""The lines of JSON by which a command tells how far it is.
+"""Events: lines of JSON by which a command reports its progress.
 
-Place: pure. Every line is an object with the text key ``event``; what else it holds, the reader asks for by type.
+Sans-I/O. Every line is an object with the text key ``event``; the reader requests its other values by type.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ __all__ = ["Event"]
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One line. The readers return what is there in the wanted type, or raise ``LocalError``: the command is ours."""
+    """One line. The accessors return a value of the requested type, or raise ``LocalError``."""
 
     fields: Mapping[str, object]
 
@@ -37,7 +37,7 @@ class Event:
 
     @property
     def name(self) -> str:
-        """Return what happened, such as ``ready``."""
+        """Return the name of the event, such as ``ready``."""
         return self.text("event")
 
     def text(self, key: str) -> str:
@@ -48,7 +48,7 @@ class Event:
         return value
 
     def text_or_none(self, key: str) -> str | None:
-        """Return a text, or None for null and for a key that is not there."""
+        """Return a text, or None for null and for a missing key."""
         return None if self.fields.get(key) is None else self.text(key)
 
     def count(self, key: str) -> int:
@@ -59,7 +59,7 @@ class Event:
         return value
 
     def number_or_none(self, key: str) -> float | None:
-        """Return a number, or None for null and for a key that is not there."""
+        """Return a number, or None for null and for a missing key."""
         value = self.fields.get(key)
         if value is None:
             return None
@@ -68,7 +68,7 @@ class Event:
         return float(value)
 
     def counts(self, key: str) -> list[int]:
-        """Return a list of whole numbers; empty where the key is not there."""
+        """Return a list of whole numbers; empty for a missing key."""
         value = self.fields.get(key, [])
         if not isinstance(value, list) or not all(isinstance(item, int) for item in value):
             raise self._wrong(key, "a list of whole numbers")
@@ -89,7 +89,7 @@ class Event:
         return [Event(item) for item in value]
 
     def part(self, key: str) -> Event:
-        """Return an object; empty where the key is not there."""
+        """Return an object; empty for a missing key."""
         value = self.fields.get(key, {})
         if not isinstance(value, dict):
             raise self._wrong(key, "an object")

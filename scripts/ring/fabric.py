@@ -1,7 +1,7 @@
-"""What every run stands on: five namespaces, with a switch in each and a RIB in each domain; and what breaks in it.
+"""Overlay of a run: five namespaces with a switch in each and a RIB in each domain, and its faults.
 
-Place: shell. Nothing is waited for by the clock: every stage begins when the one before has said that it is ready, and
-every process is watched, so that one which dies ends the run at once.
+I/O. No stage waits by the clock: each begins when the one before has reported that it is ready. Every process is
+supervised, so that one which dies ends the run at once.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ _MIDDLE: Final = "nuc3"
 
 
 class Overlay:
-    """The overlay of one run, from its laying on; the ends are others' work.
+    """The overlay of one run, from its creation; other modules start the proxies.
 
     Args:
-        options: what was asked for.
-        run: takes down what is made here, whoever asks it to.
-        teller: hears of progress.
+        options: of the run.
+        run: removes what is created here.
+        teller: reports progress.
 
     Raises:
         LocalError: the kernel refuses namespaces.
@@ -54,11 +54,11 @@ class Overlay:
         self.switches: dict[str, Child] = {}
         self._ribs: dict[str, Child] = {}
         self._restarts = 0
-        self._planes: list[str] = []  # what the switches took
+        self._planes: list[str] = []  # the data planes that the switches selected
 
     @property
     def settings(self) -> dict[str, object]:
-        """Return the options as the JSON result states them, with the data plane that was taken."""
+        """Return the options for the JSON result, with the selected data plane."""
         return {**self.options.settings(), "data_plane": ", ".join(self._planes)}
 
     async def stand_up(self) -> None:
@@ -94,7 +94,7 @@ class Overlay:
         heard: bool = True,
         environment: Mapping[str, str] | None = None,
     ) -> Child:
-        """Start Python with these arguments in the namespace of a switch; ``environment``: beside that of ours."""
+        """Start Python with these arguments in the namespace of a switch; ``environment`` extends the present one."""
         return self.children.start_in(self.namespaces, node, role, arguments, heard=heard, environment=environment)
 
     async def cut(self, cut: Cut) -> None:
@@ -120,7 +120,7 @@ class Overlay:
             await self.children.kill(running[node])
 
     async def restart(self, kill: Kill) -> None:
-        """Start what was killed again; return when it is ready.
+        """Restart a killed process; return when it is ready.
 
         Raises:
             ChildError: it does not start.
@@ -132,7 +132,7 @@ class Overlay:
             await self.children.ready([child])
 
     async def roam(self, roam: Roam) -> None:
-        """Pull a proxy's cable and plug it in at another switch.
+        """Move a proxy's cable to another switch.
 
         Raises:
             LocalError: the kernel refuses.
@@ -149,5 +149,5 @@ class Overlay:
         return self.start(node, f"{prefix}rib", argv)
 
     def forget(self) -> None:
-        """Close our ends of the processes; they are left as they are."""
+        """Close the descriptors of the processes here; they continue."""
         self.children.forget()

@@ -1,6 +1,6 @@
-"""Faults of a run, as data: links cut, ends that roam, processes killed; and whether a way is left.
+"""Faults of a run, as data: links cut, proxies that roam, processes killed; and the check that a path remains.
 
-Sans-I/O. All seconds count from the moment at which the first message may leave.
+Sans-I/O. All seconds count from the time at which the first message may be sent.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _ROAM: Final = re.compile(rf"([^@:]+):([^@:]+)@({_SECONDS})\Z")
 
 @dataclass(frozen=True, slots=True)
 class Cut:
-    """A link that goes down after ``after_s`` and, unless ``until_s`` is None, comes back."""
+    """A link that goes down after ``after_s`` and, unless ``until_s`` is None, comes up again."""
 
     a: str
     b: str
@@ -35,10 +35,10 @@ class Cut:
 
     @classmethod
     def from_text(cls, text: str) -> Cut:
-        """Read ``nuc2-nuc3@5`` or ``nuc2-nuc3@5-20``.
+        """Parse ``nuc2-nuc3@5`` or ``nuc2-nuc3@5-20``.
 
         Raises:
-            LocalError: anything else, or a link that comes back before it goes.
+            LocalError: anything else, or a link that comes up before it goes down.
         """
         found = _CUT.match(text)
         if found is None:
@@ -49,7 +49,7 @@ class Cut:
 
     @property
     def target(self) -> frozenset[str]:
-        """Return what is hit, for comparison with other faults."""
+        """Return the affected components, for comparison with other faults."""
         return frozenset((self.a, self.b))
 
     def __str__(self) -> str:
@@ -58,11 +58,11 @@ class Cut:
 
 @dataclass(frozen=True, slots=True)
 class Kill:
-    """A process killed with SIGKILL after ``after_s`` and, unless ``until_s`` is None, started again.
+    """A process killed with SIGKILL after ``after_s`` and, unless ``until_s`` is None, restarted.
 
     Args:
-        role: what is killed.
-        of: a switch; for a RIB its domain, or the switch that it is attached to.
+        role: of the process.
+        of: a switch; for a RIB its domain, or the switch to which it is attached.
     """
 
     role: KillRole
@@ -72,10 +72,10 @@ class Kill:
 
     @classmethod
     def from_text(cls, text: str) -> Kill:
-        """Read ``rib:school@8``, ``switch:nuc3@10`` or ``switch:nuc3@10-20``.
+        """Parse ``rib:school@8``, ``switch:nuc3@10`` or ``switch:nuc3@10-20``.
 
         Raises:
-            LocalError: anything else, or a process that comes back before it goes.
+            LocalError: anything else, or a process that restarts before it is killed.
         """
         found = _KILL.match(text)
         if found is None:
@@ -87,7 +87,7 @@ class Kill:
 
     @property
     def target(self) -> frozenset[str]:
-        """Return what is hit, for comparison with other faults."""
+        """Return the affected components, for comparison with other faults."""
         return frozenset((f"{self.role}:{self.of}",))
 
     def victims(self, topology: Topology) -> tuple[str, ...]:
@@ -112,7 +112,7 @@ class Kill:
 
 @dataclass(frozen=True, slots=True)
 class Roam:
-    """A proxy whose cable is pulled after ``after_s`` and plugged into another switch.
+    """A proxy whose cable moves to another switch after ``after_s``.
 
     Args:
         who: the proxy's device, such as ``robot``.
@@ -124,7 +124,7 @@ class Roam:
 
     @classmethod
     def from_text(cls, text: str) -> Roam:
-        """Read ``robot:nuc3@10``.
+        """Parse ``robot:nuc3@10``.
 
         Raises:
             LocalError: anything else.
@@ -135,7 +135,7 @@ class Roam:
         return cls(found[1], found[2], float(found[3]))
 
     def proxy(self, topology: Topology) -> Attachment:
-        """Return who roams.
+        """Return the proxy that roams.
 
         Raises:
             LocalError: there is no such proxy.
@@ -163,16 +163,16 @@ def roamers(faults: Iterable[Fault], topology: Topology) -> tuple[Attachment, ..
 
 
 def check_faults(topology: Topology, faults: Sequence[Fault], duration_s: float | None) -> None:
-    """Refuse what cannot be done, and what leaves both ends parted for good.
+    """Refuse impossible faults, and faults that separate both proxies permanently.
 
     Args:
         topology: with two proxies.
         faults: in any order.
-        duration_s: of the traffic; None: not known beforehand.
+        duration_s: of the traffic; None: unknown in advance.
 
     Raises:
-        LocalError: an unknown link, process or proxy; two faults of one thing at once; one that comes after the
-            traffic; no way between the proxies once the last fault has come.
+        LocalError: an unknown link, process or proxy; two simultaneous faults of one component; one that comes after
+            the traffic; no path between the proxies after the last fault.
     """
     for fault in faults:
         if isinstance(fault, Cut):
@@ -229,7 +229,7 @@ def _refuse_parting(topology: Topology, faults: Sequence[Fault]) -> None:
 
 
 def _moments(faults: Iterable[Fault]) -> Iterator[tuple[Fault, bool]]:
-    """Yield what happens, in order of time, as (fault, whether it begins)."""
+    """Yield the fault events in order of time, as (fault, whether it begins)."""
     moments = [(fault.after_s, fault, True) for fault in faults]
     moments += [
         (fault.until_s, fault, False) for fault in faults if not isinstance(fault, Roam) and fault.until_s is not None

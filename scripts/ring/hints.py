@@ -1,6 +1,6 @@
-"""What to try with a ring that was left standing.
+"""Hints for experiments with a ring that was kept.
 
-Place: shell; makes text, prints nothing.
+I/O layer; it builds text, and prints nothing.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ __all__ = ["common", "hints", "inside", "live_hints"]
 
 
 def hints(ring: Ring, again: Path) -> list[tuple[str, str]]:
-    """Return (what it does, command line) in the order in which a person might try them.
+    """Return pairs of (effect, command line) in the recommended order.
 
     Args:
-        ring: still standing.
-        again: what its new receiver records into.
+        ring: still running.
+        again: the file of its new receiver.
     """
     replay = Path(sys.executable).with_name("gdp-replay")
     sender = f"{replay} {shlex.quote(str(ring.bag))} --config {ring.sender_config}"
@@ -31,7 +31,7 @@ def hints(ring: Ring, again: Path) -> list[tuple[str, str]]:
 
 
 def live_hints(ring: LiveRing) -> list[tuple[str, str]]:
-    """Return, likewise, what to try with a live ring."""
+    """Return such pairs for a live ring."""
     found = []
     for at, graph in zip(("nuc1", "nuc5"), ring.graphs, strict=True):
         if graph.ros == 1:
@@ -47,7 +47,7 @@ def live_hints(ring: LiveRing) -> list[tuple[str, str]]:
 
 
 def common(overlay: Overlay) -> list[tuple[str, str]]:
-    """Return what may be tried with every ring."""
+    """Return the pairs that apply to every ring."""
     script = Path(__file__).parents[2] / "scripts" / "ring_topology.sh"
     return [
         ("what the switch in the middle counts", inside(overlay, "nuc3", _metrics("switch"))),
@@ -58,7 +58,7 @@ def common(overlay: Overlay) -> list[tuple[str, str]]:
 
 
 def inside(overlay: Overlay, node: str, command: str) -> str:
-    """Return what a person types, from outside, to run a command in the namespace of a switch."""
+    """Return the shell command that runs a command in the namespace of a switch, from outside."""
     if in_first_user_namespace():
         return f"ip netns exec {overlay.namespaces.path(node).name} {command}"
     return f"nsenter --target {overlay.switches[node].pid} --user --mount --net --preserve-credentials {command}"

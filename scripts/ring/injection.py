@@ -1,6 +1,6 @@
-"""Injects the faults of a run: cuts links, moves cables, kills and restarts processes, each at its second.
+"""Injection of the faults of a run: cuts links, moves cables, kills and restarts processes, each at its second.
 
-Layer: I/O.
+I/O.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ __all__ = ["Injection", "Injector"]
 
 
 class Injector(Protocol):
-    """What a run's overlay lets be done to it."""
+    """Fault operations of a run's overlay."""
 
     async def cut(self, cut: Cut) -> None:
         """Take a link down."""
 
     async def heal(self, cut: Cut) -> None:
-        """Bring it back."""
+        """Bring a link up."""
 
     async def kill(self, kill: Kill) -> None:
         """Kill a process."""
 
     async def restart(self, kill: Kill) -> None:
-        """Start it again; return when it is ready."""
+        """Restart a process; return when it is ready."""
 
     async def roam(self, roam: Roam) -> None:
-        """Pull a proxy's cable and plug it in elsewhere."""
+        """Move a proxy's cable to another switch."""
 
 
 class Injection:
-    """The faults of one run under way. Their seconds count from now."""
+    """The faults of one run. Their seconds count from the creation of this object."""
 
     def __init__(self, injector: Injector, faults: Sequence[Fault], reporter: ProgressReporter) -> None:
         self._injector = injector
@@ -45,15 +45,15 @@ class Injection:
         self._tasks = {fault: asyncio.ensure_future(self._inject(fault)) for fault in faults}
 
     async def stop(self) -> None:
-        """Inject no more."""
+        """Stop the injection."""
         await cancel(*self._tasks.values())
 
     def complaints(self) -> list[str]:
-        """Return, once stopped, which faults came too late.
+        """Return, after the stop, the faults that came too late.
 
         Raises:
-            LocalError: the time of one came, and it could not be injected.
-            ChildError: a process did not start again.
+            LocalError: a fault was due, and could not be injected.
+            ChildError: a process did not restart.
         """
         for task in self._tasks.values():
             if not task.cancelled():

@@ -1,6 +1,6 @@
-"""What a live run consists of, as data: the graphs of both ends, what crosses, and how much of it.
+"""Plan of a live run, as data: the graphs of both sides, the names that cross, and the amount of traffic.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _RIGHTS: Final[dict[tuple[str, Side], Right]] = {
     ("service", "expose"): Right.SERVE,
     ("service", "import"): Right.CALL,
 }
-# A picture comes as fifteen datagrams at once: what Linux lets wait by default is less.
+# A picture arrives as fifteen datagrams at once, which exceeds Linux's default receive buffer.
 FAST_DDS_PROFILES: Final = """\
 <?xml version="1.0" encoding="UTF-8"?>
 <profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
@@ -59,7 +59,7 @@ FAST_DDS_PROFILES: Final = """\
   </participant>
 </profiles>
 """
-_DOMAINS: Final = 100  # above that, a domain's ports are among those that Linux gives to anyone
+_DOMAINS: Final = 100  # above that, a domain's ports are in Linux's ephemeral range
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,15 +72,15 @@ class Carried:
 
     @property
     def metadata(self) -> Metadata:
-        """Return what its name in the overlay digests."""
+        """Return the metadata that its overlay name digests."""
         return Metadata({"kind": self.kind, "name": self.name, "type": self.type_name, "author": AUTHOR})
 
     def right(self, side: Side) -> Right:
-        """Return what the proxy of one side must be allowed."""
+        """Return the right that the proxy of one side needs."""
         return _RIGHTS[self.kind, side]
 
     def rule(self, owner: Path, encoding: Encoding) -> Yaml:
-        """Return its rule in either ``proxy.yaml``; what kind of topic it is, the nodes' QoS says."""
+        """Return its rule in either ``proxy.yaml``; reliability and durability follow from the nodes' QoS."""
         return {
             "name": self.name,
             "kind": self.kind,
@@ -96,7 +96,7 @@ CARRIED: Final = (*(Carried(talk.topic, talk.type_name) for talk in TALKS), Carr
 
 @dataclass(frozen=True, slots=True)
 class Graph:
-    """The ROS graph of one end, alone in its network namespace. ``domain``: of ROS 2."""
+    """The ROS graph of one side, alone in its network namespace. ``domain``: of ROS 2."""
 
     ros: RosVersion
     domain: int
@@ -108,13 +108,13 @@ class Graph:
         return {"endpoint": "ros2", "domain": self.domain}
 
     def environment(self, logs: Path, profiles: Path) -> Mapping[str, str]:
-        """Return what its nodes and its proxy find in their environment.
+        """Return the environment of its nodes and its proxy.
 
-        Fast DDS's shared memory is left out: it crosses the network namespaces of a machine. So ROS 2 is not told to
-        keep to LOCALHOST, which would bring it back; there is no other network in the namespace anyway.
+        Fast DDS's shared memory is disabled: it crosses the network namespaces of a machine. So ROS 2 is not set to
+        LOCALHOST, which would enable it again; the namespace has no other network anyway.
 
         Args:
-            logs: directory for what ROS logs.
+            logs: directory for ROS's logs.
             profiles: file that holds ``FAST_DDS_PROFILES``.
         """
         if self.ros == 1:
@@ -136,7 +136,7 @@ class Graph:
 
 
 def graphs_of(live: Live, run: str) -> tuple[Graph, Graph]:
-    """Return the robot's graph and the server's; ``run`` is an id in hex, from which their domains follow."""
+    """Return the robot's graph and the server's; ``run`` is an id in hex, from which their domains are derived."""
     domain = 1 + int(run, 16) % _DOMAINS
     robot: RosVersion = 2 if live == "ros2" else 1
     server: RosVersion = 1 if live == "ros1" else 2
@@ -144,10 +144,10 @@ def graphs_of(live: Live, run: str) -> tuple[Graph, Graph]:
 
 
 def messages_in(seconds: float) -> dict[str, int]:
-    """Return how many messages each talking node publishes."""
+    """Return the number of messages that each talker publishes."""
     return {talk.node: max(round(talk.hz * seconds), 1) for talk in TALKS}
 
 
 def calls_in(seconds: float) -> int:
-    """Return how often the lamp is switched."""
+    """Return the number of calls of the lamp."""
     return max(round(LAMP_HZ * seconds), 1)

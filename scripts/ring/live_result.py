@@ -1,6 +1,6 @@
-"""What a live run showed: what was published and what was heard, one row a topic, and one for the service.
+"""Result of a live run: published and received messages, one row a topic, and one for the service.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ __all__ = ["Heard", "rows"]
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """What the nodes reported, each in its own way; see ``nodes/roles.py``."""
+    """Reports of the nodes, one form for each role; see ``nodes/roles.py``."""
 
     talkers: tuple[Event, ...]
     lamp: Event
@@ -31,8 +31,8 @@ def rows(heard: Heard, carried: Sequence[Event]) -> tuple[TopicResult, ...]:
     """Return the rows of the table.
 
     Args:
-        heard: what the nodes reported.
-        carried: what the server's proxy measured, one event a topic; latencies are the listener's.
+        heard: reports of the nodes.
+        carried: measurements of the server's proxy, one event a topic; latencies are the listener's.
     """
     reports = [_with_latency(each, _of(each.text("topic"), heard.listener.parts("topics"))) for each in carried]
     return (*put_together(_compared(heard), sorted(reports, key=lambda each: each.count("received"))), _lamp(heard))
@@ -47,7 +47,7 @@ def _compared(heard: Heard) -> Iterator[TopicComparison]:
 
 
 def _lamp(heard: Heard) -> TopicResult:
-    """Judge the calls: each answered, with what a lamp that is switched once a call must say."""
+    """Return the row of the calls: each must be answered, with the reply of a lamp that is switched once a call."""
     calls, answered = heard.caller.count("calls"), heard.caller.count("answered")
     wrong = answered - heard.caller.count("right")
     comparison = TopicComparison(

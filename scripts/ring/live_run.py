@@ -1,6 +1,6 @@
-"""One live run: real ROS nodes at both ends of the ring, and a proxy beside each in their graph.
+"""Live run: real ROS nodes on both sides of the ring, and a proxy in the graph of each.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ _SIDES: Final[tuple[Side, Side]] = ("expose", "import")
 
 
 class LiveRing:
-    """The ring of one live run, from its laying on.
+    """The ring of one live run, from its creation.
 
     Args:
-        options: what was asked for.
-        live: of which ROS the ends are.
-        run: takes down what is made here, whoever asks it to.
-        teller: hears of progress.
+        options: of the run.
+        live: ROS versions of the sides.
+        run: removes what is created here.
+        teller: reports progress.
 
     Raises:
         LocalError: a ROS is missing, or the kernel refuses namespaces.
@@ -60,7 +60,7 @@ class LiveRing:
         self._nodes: list[Child] = []
 
     async def result(self) -> Result:
-        """Let robot and server talk over the ring, and compare.
+        """Run the traffic between robot and server, and compare.
 
         Raises:
             ChildError: a process failed.
@@ -86,7 +86,7 @@ class LiveRing:
         return replace(result, traffic_s=traffic_s, silent_s=session.silent_s)
 
     def go_on(self) -> None:
-        """Start proxies that outlive us, in place of those that have reported, and let the nodes talk on."""
+        """Replace the proxies that have reported by ones that outlive this process, and continue the nodes' traffic."""
         for end in self._ends:
             self._start_proxy(*end, heard=False)
         for node in self._nodes:
@@ -94,15 +94,15 @@ class LiveRing:
 
     @property
     def directory(self) -> Path:
-        """Return where the processes' logs are."""
+        """Return the directory of the processes' logs."""
         return self._run.directory
 
     def environment(self, graph: Graph) -> Mapping[str, str]:
-        """Return what the processes in a graph find in their environment."""
+        """Return the environment of the processes in a graph."""
         return graph.environment(self._run.directory / "ros-logs", self._profiles)
 
     def forget(self) -> None:
-        """Close our ends of the processes; they are left as they are."""
+        """Close the descriptors of the processes here; they continue."""
         self.overlay.forget()
 
     async def _live_nodes(self) -> LiveNodes:
@@ -129,7 +129,7 @@ class LiveRing:
         return replace(result, complaints=(*complaints, *counted))
 
     async def _finish(self, proxy: Child) -> Event:
-        """Ask a proxy to end; return what it carried."""
+        """Request a proxy to end; return its final report."""
         children = self.overlay.children
         children.may_end(proxy)
         proxy.interrupt()
@@ -151,7 +151,7 @@ class LiveRing:
 
 
 def _require(versions: set[int]) -> None:
-    """Refuse, in one sentence, a ROS that is not here."""
+    """Refuse a missing ROS version, with one sentence."""
     if 1 in versions and not (Path(rospy_folder()) / "rosmaster").is_dir():
         raise LocalError("ROS 1 needs rosmaster, which is not installed here: run sudo scripts/setup_ros1.sh")
     missing = [name for name in _ROS2 if 2 in versions and importlib.util.find_spec(name) is None]
@@ -163,5 +163,5 @@ def _require(versions: set[int]) -> None:
 
 
 def _faults(done: Event) -> str:
-    """Return what a proxy counted that was not as wanted; empty: nothing."""
+    """Return the faults that a proxy counted; empty: none."""
     return ", ".join(f"{count} {label}" for label, count in done.part("faults").fields.items() if count)

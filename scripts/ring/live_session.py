@@ -1,6 +1,6 @@
-"""The time in which live nodes talk: all are listened to, until nothing is under way any more.
+"""Session of live traffic: reads the reports of all nodes until no message is under way.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ QUIET_S: Final = 5.0
 
 @dataclass(frozen=True, slots=True)
 class LiveNodes:
-    """The nodes of a live run; each has said that it is ready. ``talkers``: how many messages each will publish."""
+    """The nodes of a live run, all ready. ``talkers``: number of messages that each will publish."""
 
     talkers: Mapping[Child, int]
     lamp: Child
@@ -39,12 +39,12 @@ class LiveNodes:
 
     @property
     def messages(self) -> int:
-        """Return how many messages will be published in all."""
+        """Return the total number of messages to be published."""
         return sum(self.talkers.values())
 
 
 class LiveSession:
-    """One run's traffic. The nodes stand as long as ``children`` says."""
+    """One run's traffic. ``children`` owns the nodes."""
 
     def __init__(self, children: Children, live_nodes: LiveNodes, reporter: ProgressReporter) -> None:
         self._children = children
@@ -60,11 +60,11 @@ class LiveSession:
 
     @property
     def silent_s(self) -> float:
-        """Return the longest time that something was due and nothing came, to half a second."""
+        """Return the longest time in which something was due and nothing arrived, to half a second."""
         return self._silence.longest_s
 
     async def meet(self) -> None:
-        """Wait until the far end hears every topic and sees the service.
+        """Wait until the remote side receives every topic and discovers the service.
 
         Raises:
             ChildError: a process failed, or it took too long.
@@ -73,7 +73,7 @@ class LiveSession:
         await self._children.guarded(_all(*(child.wait_for("hears", MEET_S) for child in far)))
 
     async def talk(self, seconds: float) -> Heard:
-        """Let them talk for so long, wait for what is under way, and return what each has to report.
+        """Run the traffic for this long, wait for messages under way, and return each node's report.
 
         Raises:
             ChildError: a process failed, or did not report.
@@ -140,7 +140,7 @@ class LiveSession:
         )
 
     async def _until_quiet(self) -> None:
-        """Wait until all came, or nothing came for a while."""
+        """Wait until everything arrived, or nothing arrived for a while."""
         while sum(self._received.values()) < self._live_nodes.messages:
             self._moved.clear()
             try:

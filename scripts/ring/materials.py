@@ -1,6 +1,6 @@
-"""Keys, certificates, delegations and configuration files of a ring, made in the run's own directory.
+"""Credentials of a ring: keys, certificates, delegations and configuration files in the run's own directory.
 
-Place: shell. Every run has new keys; they go with the run::
+I/O. Every run has new keys, which are deleted with it::
 
     domains/<label>/      a root each
     owner/                the robot's owner
@@ -35,14 +35,14 @@ _SIDES: Final = {"expose": Right.PUBLISH, "import": Right.READ}
 
 
 class OverlayCredentials:
-    """The files of one run. Making it founds the domains and admits the switches and RIBs.
+    """The files of one run. Its creation creates the domains and admits the switches and RIBs.
 
     Args:
-        topology: who there is.
+        topology: of the ring.
         directory: the run's own.
         metrics: whether nodes serve metrics on their loopback.
-        roamers: proxies that will be plugged in at other switches, too.
-        lease_s: of claims and watches.
+        roamers: proxies that will also be attached to other switches.
+        lease_s: of advertisements and watches.
     """
 
     def __init__(
@@ -93,17 +93,17 @@ class OverlayCredentials:
         return self._write(Role.RIB, at.switch, content)
 
     def sender(self, at: Attachment, topics: Sequence[Topic], encoding: Encoding, ros: RosVersion) -> Path:
-        """Let a proxy publish these topics, and write its ``proxy.yaml``; return the file."""
+        """Give a proxy the right to publish these topics, and write its ``proxy.yaml``; return the file."""
         return self._proxy(at, "expose", topics, encoding, ros, None)
 
     def receiver(
         self, at: Attachment, topics: Sequence[Topic], encoding: Encoding, ros: RosVersion, record: Path
     ) -> Path:
-        """Let a proxy read these topics, and write the ``proxy.yaml`` by which it records them; return the file."""
+        """Give a proxy the right to read these topics, and write the ``proxy.yaml`` that records them; return it."""
         return self._proxy(at, "import", topics, encoding, ros, record)
 
     def live(self, at: Attachment, side: Side, carried: Sequence[Carried], encoding: Encoding, graph: Yaml) -> Path:
-        """Let a proxy carry its side of these, and write the ``proxy.yaml`` by which it does so in a graph."""
+        """Give a proxy the rights of its side, and write the ``proxy.yaml`` for its graph; return the file."""
         node = self._node(Role.PROXY, at.switch)
         for each in carried:
             self._delegate(node, each.metadata, each.right(side))
@@ -115,11 +115,11 @@ class OverlayCredentials:
         return self._write(Role.PROXY, at.switch, {**content, "ros": graph})
 
     def proxy_file(self, at: Attachment) -> Path:
-        """Return where ``proxy.yaml`` of a proxy is written."""
+        """Return the path of a proxy's ``proxy.yaml``."""
         return self.file("proxy", at.switch)
 
     def file(self, role: Literal["switch", "rib", "proxy"], switch: str) -> Path:
-        """Return where a node's configuration is written."""
+        """Return the path of a node's configuration."""
         return self._directory / f"{_title(Role(role), switch)}.yaml"
 
     def _proxy(

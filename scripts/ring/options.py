@@ -1,6 +1,6 @@
-"""What a person may ask of the ring.
+"""Options of a run of the ring.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ _LIVE_MAX_S: Final = 3_600.0
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """One run of the ring. Paths are absolute, for the processes that read them stand elsewhere.
+    """One run of the ring. Paths are absolute, because the processes that read them have other working directories.
 
     Args:
         bag: the recording; None: a generated robot drive.
-        rate: 1 is the recorded pace, 0 as fast as it goes.
+        rate: 1 is the recorded pace, 0 as fast as possible.
         keep: leave everything up afterwards.
-        out: directory, made if need be, where the received recording stays; None: it goes with the run.
-        pcap: where to write what passes through the middle of the ring.
-        live: real nodes instead of a recording; of which ROS. ``mixed``: ROS 1 at the robot, ROS 2 at the server.
-        seconds: of traffic; a recording is replayed slower or faster to last so long, a generated one is made so
-            long. None: ``LIVE_S`` live, else the recording's own time.
-        lease_s: of every node's claims and watches.
+        out: directory, created if necessary, for the received recording; None: it is deleted with the run.
+        pcap: file for a capture in the middle of the ring.
+        live: real nodes instead of a recording; their ROS version. ``mixed``: ROS 1 at the robot, ROS 2 at the server.
+        seconds: of traffic; a recording is replayed slower or faster to last this long, a generated one is created with
+            this length. None: ``LIVE_S`` live, else the recording's own time.
+        lease_s: of every node's advertisements and watches.
 
     Raises:
-        LocalError: a rate that is no pace, a fault that cannot be injected, a directory that is missing, a recording
-            for a live run.
+        LocalError: an invalid rate, a fault that cannot be injected, a directory that is missing, a recording for a
+            live run.
     """
 
     bag: Path | None = None
@@ -85,16 +85,16 @@ class Options:
 
     @property
     def faults(self) -> tuple[Fault, ...]:
-        """Return all that is to go wrong."""
+        """Return all requested faults."""
         return (*self.cuts, *self.roams, *self.kills)
 
     @property
     def live_s(self) -> float:
-        """Return how long live nodes talk."""
+        """Return the seconds of live traffic."""
         return LIVE_S if self.seconds is None else self.seconds
 
     def topology(self) -> Topology:
-        """Return the ring with the wanted MTU.
+        """Return the ring with the requested MTU.
 
         Raises:
             LocalError: no link can have that MTU.
@@ -102,7 +102,7 @@ class Options:
         return ring5(self.mtu)
 
     def settings(self) -> dict[str, object]:
-        """Return the options as the JSON result states them."""
+        """Return the options for the JSON result."""
         recorded = {"recording": str(self.bag) if self.bag else "demo", "rate": self.rate, "seconds": self.seconds}
         return {
             **({"live": self.live, "seconds": self.live_s} if self.live else recorded),

@@ -1,6 +1,6 @@
-"""The configuration files of a ring, as data.
+"""Plan of a ring: its configuration files, as data.
 
-Place: pure. What is written here is what the commands' own ``--check`` accepts.
+Sans-I/O. The commands' own ``--check`` accepts these files.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ __all__ = [
 
 Yaml: TypeAlias = "dict[str, object]"
 
-METRICS_PORTS: Final = {"switch": 9_101, "rib": 9_102, "proxy": 9_103}  # loopback of a namespace of its own
+METRICS_PORTS: Final = {"switch": 9_101, "rib": 9_102, "proxy": 9_103}  # on the loopback of each namespace
 AUTHOR: Final = "ring"
 
 
 @dataclass(frozen=True, slots=True)
 class Credentials:
-    """Where a node finds who it is and whom it believes."""
+    """Paths of a node's identity and trust anchors."""
 
     identity: Path
     root: Path
@@ -54,7 +54,7 @@ class Credentials:
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """A topic of the recording, as it is named in the overlay."""
+    """A topic of the recording, with its overlay name."""
 
     topic: str
     type_name: str
@@ -62,12 +62,12 @@ class Topic:
 
     @property
     def metadata(self) -> dict[str, str | int]:
-        """Return what the topic's name digests."""
+        """Return the metadata that the topic's name digests."""
         return {"kind": "topic", "name": self.topic, "type": self.type_name, "author": AUTHOR}
 
 
 def topics_of(channels: Iterable[Channel]) -> tuple[Topic, ...]:
-    """Return each topic once, though several nodes may have published it; latched if any of them latched."""
+    """Return each topic once, even if several nodes published it; latched if any of them latched."""
     latched: dict[tuple[str, str], bool] = {}
     for channel in channels:
         key = (channel.topic, channel.type_name)
@@ -88,7 +88,7 @@ def switch_yaml(
     """Return ``switch.yaml`` of one switch.
 
     Args:
-        roamers: proxies that may be plugged in here or elsewhere; the switch's end of their cable is made by others.
+        roamers: proxies that may be attached here or elsewhere; the switch's side of their cable is created elsewhere.
     """
     ports: list[Yaml] = [{"iface": link.other(node), "cost": link.cost} for link in topology.links_of(node)]
     return {
@@ -120,7 +120,7 @@ def rib_yaml(
 
 
 def rule_yaml(topic: Topic, owner: Path, encoding: Encoding) -> Yaml:
-    """Return the rule by which a topic crosses: complete, and known in every domain."""
+    """Return the rule for a topic: complete, and valid in every domain."""
     return {
         "name": topic.topic,
         "kind": "topic",
@@ -148,12 +148,12 @@ def proxy_yaml(
     """Return ``proxy.yaml`` of one proxy.
 
     Args:
-        at: where it is attached.
-        credentials: who it is.
-        delegations: directory of what owners gave it.
+        at: its attachment.
+        credentials: of the proxy.
+        delegations: directory of its delegations.
         ros: 1 or 2, the form of the recording.
         rules: by ``expose`` and ``import``.
-        record: the file to write what arrives into.
+        record: the file for received messages.
     """
     form = "ros1" if ros == 1 else "mcap"
     return {

@@ -1,6 +1,6 @@
-"""How a run is told on standard error: a moving bar in a terminal, plain lines elsewhere.
+"""Progress of a run on standard error: a moving bar in a terminal, plain lines elsewhere.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ _PLAIN_EVERY_S: Final = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Traffic:
-    """How far the replay is, put together from both ends.
+    """State of the replay, combined from both sides.
 
     Args:
-        total: messages and calls that are to come.
-        lost: what a reader says that it will never get.
-        behind: published, or asked, and not yet delivered.
-        silent: flows that stand still though they are behind, with seconds.
+        total: number of expected messages and calls.
+        lost: messages that a reader reports as permanently missing.
+        behind: published or requested, and not yet delivered.
+        silent: flows that stand still although they are behind, with seconds.
         latency_ms: one way, of the latest message; None before the first.
     """
 
@@ -51,7 +51,7 @@ class Traffic:
 
 
 class ProgressReporter:
-    """Tells steps and traffic as they come.
+    """Reports steps and traffic.
 
     Args:
         console: on standard error.
@@ -72,12 +72,12 @@ class ProgressReporter:
         self.end_traffic()
 
     def step(self, text: str) -> None:
-        """Tell what is being done now."""
+        """Report the present step."""
         at = f"[dim]{time.monotonic() - self._began_s:6.1f} s[/dim]"
         self._console.print(f"{at}  {text}", highlight=False, soft_wrap=True)
 
     def begin_traffic(self, total: int) -> None:
-        """Begin to tell traffic of ``total`` messages."""
+        """Begin the report of ``total`` messages."""
         self._told, self._told_s = Traffic(total), time.monotonic()
         if self._console.is_terminal:
             columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.fields[words]}"))
@@ -86,10 +86,10 @@ class ProgressReporter:
             self._bar.start()
 
     def traffic(self, now: Traffic) -> None:
-        """Tell the traffic so far; plain lines come at most every two seconds."""
+        """Report the traffic so far; plain lines come at most every two seconds."""
         elapsed_s = time.monotonic() - self._told_s
         if self._bar is not None:
-            if elapsed_s >= 0.4:  # both ends report twice a second; a rate over less would jump
+            if elapsed_s >= 0.4:  # both sides report twice a second; a rate over a shorter time would fluctuate
                 self._bar.update(self._task, completed=now.received, words=now.words(now.rate(self._told, elapsed_s)))
                 self._told, self._told_s = now, time.monotonic()
         elif elapsed_s >= _PLAIN_EVERY_S:
@@ -97,7 +97,7 @@ class ProgressReporter:
             self._told, self._told_s = now, time.monotonic()
 
     def end_traffic(self) -> None:
-        """Take the bar away."""
+        """Remove the bar."""
         if self._bar is not None:
             self._bar.stop()
             self._bar = None

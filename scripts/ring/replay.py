@@ -1,6 +1,6 @@
-"""The time between the first message and the last: both ends are listened to until both have finished.
+"""Replay through the ring: reads the reports of both sides until both have finished.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What the ends said last.
+    """Final reports of both sides.
 
     Args:
         topics: the receiver's measurements, one event a topic.
         unread: why some of the recording could not be read; None if all could.
-        complaints: what went otherwise than wanted.
+        complaints: deviations from the expected run.
         traffic_s: from the first message until all was confirmed or given up.
-        silent_s: the longest time that messages were due and none came, to half a second.
+        silent_s: the longest time in which messages were due and none came, to half a second.
     """
 
     topics: tuple[Event, ...]
@@ -47,14 +47,14 @@ class Report:
 
 
 class Replay:
-    """One replay under way.
+    """One replay in progress.
 
     Args:
-        children: watched all the while; the receiver among them is let go when it is asked to finish.
-        sender: has said that it is ready.
-        receiver: likewise.
+        children: supervised throughout; the receiver is released when it is requested to finish.
+        sender: ready.
+        receiver: ready.
         total: messages expected.
-        teller: hears of the traffic.
+        teller: reports the traffic.
     """
 
     def __init__(
@@ -66,14 +66,14 @@ class Replay:
         self._reporter = reporter
         self._traffic = Traffic(total)
         self._silence = Silence()
-        self._unconfirmed = ""  # topics
+        self._unconfirmed = ""  # names of topics
         self._moved = asyncio.Event()
 
     async def report(self, inject: Callable[[], Injection]) -> Report:
-        """Follow the traffic to its end, while ``inject`` lets faults happen.
+        """Follow the traffic to its end, while ``inject`` causes faults.
 
         Raises:
-            ChildError: a process failed, nothing moved for long, or an end did not finish.
+            ChildError: a process failed, nothing moved for long, or a side did not finish.
             LocalError: a fault cannot be injected.
         """
         self._reporter.begin_traffic(self._traffic.total)
@@ -99,7 +99,7 @@ class Replay:
         return Report(topics, unread, tuple(complaints), traffic_s, self._silence.longest_s)
 
     async def _finish(self, heard: asyncio.Future[Event | None]) -> tuple[Event, int]:
-        """Ask the receiver to close its recording; return its last word and its exit code."""
+        """Request the receiver to close its recording; return its last event and its exit code."""
         self._children.may_end(self._receiver)
         self._receiver.interrupt()
         try:
@@ -112,7 +112,7 @@ class Replay:
         return received, code
 
     async def _listen(self, child: Child) -> Event | None:
-        """Follow a child until it closes its output; return its last word, None if it did not say it."""
+        """Follow a child until it closes its output; return its last event, None if there was none."""
         done = None
         async for event in child.events():
             if event.name == "progress":
@@ -127,7 +127,7 @@ class Replay:
             self._silence.sent(_ALL, event.count("sent"), now_s)
             self._unconfirmed = ", ".join(event.part("unconfirmed").fields)
             self._traffic = replace(before, sent=event.count("sent"))
-            waiting = before.sent < before.total  # for a moment of the recording, which may be silent for long
+            waiting = before.sent < before.total  # for the next stamp of the recording, which may have long pauses
         else:
             received, lost = event.count("received"), event.count("lost")
             latency_ms = event.number_or_none("latency_ms")
@@ -140,7 +140,7 @@ class Replay:
         self._reporter.traffic(replace(self._traffic, behind=self._silence.behind, silent=silent))
 
     async def _unstalled(self, work: Coroutine[None, None, T]) -> T:
-        """Do ``work`` as long as traffic moves."""
+        """Run ``work`` as long as traffic moves."""
         task = asyncio.ensure_future(work)
         try:
             while not task.done():

@@ -1,6 +1,6 @@
-"""What a run showed, topic by topic, and whether that is what was wanted.
+"""Result of a run, topic by topic, and whether it passed.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ __all__ = ["Journey", "Result", "TopicResult", "put_together"]
 
 @dataclass(frozen=True, slots=True)
 class Journey:
-    """What the receiver measured on one topic.
+    """Measurements of the receiver on one topic.
 
     Args:
-        parts: of the largest message.
+        parts: fragments of the largest message.
         hops: switches that most messages passed.
         hops_seen: every number of switches that some message passed.
         silent_ms: the longest time between two messages, or between two answers; None: not measured.
@@ -52,7 +52,7 @@ class Journey:
 
 @dataclass(frozen=True, slots=True)
 class TopicResult:
-    """One row of the table. Of a service the messages are calls, and those lost are without an answer."""
+    """One row of the table. Of a service the messages are calls, and lost ones have no answer."""
 
     comparison: TopicComparison
     journey: Journey
@@ -60,12 +60,12 @@ class TopicResult:
 
     @property
     def duplicated(self) -> int:
-        """Return messages that came out twice: by what was recorded, and by what the receiver saw."""
+        """Return the number of duplicates: the larger of the recording's and the receiver's."""
         return max(self.comparison.duplicated, self.journey.duplicated)
 
     @property
     def faults(self) -> list[str]:
-        """Return what is wrong with this topic, in words."""
+        """Return the faults of this topic, as text."""
         of = self.comparison
         found = []
         if of.lost:
@@ -79,7 +79,7 @@ class TopicResult:
         return found
 
     def to_json(self) -> dict[str, object]:
-        """Return the row as ``--json`` states it."""
+        """Return the row for ``--json``."""
         of, way = self.comparison, self.journey
         return {
             "topic": of.topic,
@@ -106,9 +106,9 @@ class Result:
 
     Args:
         unread: why the end of the recording could not be read; None if all of it was.
-        complaints: what else went wrong, such as an end that did not finish.
-        traffic_s: how long the traffic took.
-        silent_s: the longest time that something was due and nothing came, to half a second.
+        complaints: other faults, such as a side that did not finish.
+        traffic_s: duration of the traffic.
+        silent_s: the longest time in which something was due and nothing came, to half a second.
     """
 
     topics: tuple[TopicResult, ...]
@@ -120,18 +120,18 @@ class Result:
 
     @property
     def faults(self) -> list[str]:
-        """Return everything that keeps the run from having passed."""
+        """Return all reasons why the run did not pass."""
         per_topic = [f"{row.comparison.topic}: {', '.join(row.faults)}" for row in self.topics if row.faults]
         nothing = [] if any(row.comparison.messages for row in self.topics) else ["no message was sent"]
         return [*self.complaints, *nothing, *per_topic]
 
     @property
     def passed(self) -> bool:
-        """Tell whether every message came out identical and in order."""
+        """Return whether every message arrived identical and in order."""
         return not self.faults
 
     def to_json(self) -> dict[str, object]:
-        """Return the result as ``--json`` states it."""
+        """Return the result for ``--json``."""
         return {
             "passed": self.passed,
             "topics": [row.to_json() for row in self.topics],
@@ -144,7 +144,7 @@ class Result:
 
 
 def put_together(comparisons: Iterable[TopicComparison], reports: Sequence[Event]) -> tuple[TopicResult, ...]:
-    """Return one row per compared topic, with what the receiver measured on it where it did."""
+    """Return one row per compared topic, with the receiver's measurements where there are any."""
     journeys = {(report.text("topic"), report.text("type")): Journey.from_event(report) for report in reports}
     return tuple(
         TopicResult(comparison, journeys.get((comparison.topic, comparison.type_name), Journey()))

@@ -1,6 +1,6 @@
-"""One run of the ring, from the recording to the result.
+"""Run of the ring, from the recording to the result.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from ring.result import Result, put_together
 __all__ = ["DEMO_S", "Ring", "make_demo"]
 
 DEMO_S: Final = 10.0
-_MAKING_S: Final = 240.0  # patience with the making of the demonstration recording
+_MAKING_S: Final = 240.0  # timeout for the generation of the demonstration recording
 _DEMO_SCRIPT: Final = Path(__file__).parents[2] / "scripts" / "make_demo_bag.py"
 
 
 class Ring:
-    """The ring of one run, from its laying on.
+    """The ring of one run, from its creation.
 
     Args:
-        options: what was asked for.
-        run: takes down what is made here, whoever asks it to.
-        teller: hears of progress.
+        options: of the run.
+        run: removes what is created here.
+        teller: reports progress.
         bag: the recording.
 
     Raises:
@@ -65,7 +65,7 @@ class Ring:
 
     @property
     def recording(self) -> Path:
-        """Return where the receiver writes."""
+        """Return the path of the receiver's recording."""
         name = "recording.bag" if self._ros == 1 else "recording.mcap"
         return (self.options.out or self._run.directory) / name
 
@@ -93,7 +93,7 @@ class Ring:
         )
 
     def start_again(self) -> Path:
-        """Start a receiver that outlives us, in place of the one that has ended; return the file it records into."""
+        """Start a receiver that outlives this process, in place of the ended one; return the path of its recording."""
         path = self.recording.with_name(f"again-{self.recording.name}")
         self._start_receiver(path, heard=False)
         return path
@@ -104,7 +104,7 @@ class Ring:
         return self.overlay.materials.proxy_file(self.overlay.robot)
 
     def forget(self) -> None:
-        """Close our ends of the processes; they are left as they are."""
+        """Close the descriptors of the processes here; they continue."""
         self.overlay.forget()
 
     def _start_receiver(self, record: Path, *, heard: bool = True) -> Child:
@@ -126,7 +126,7 @@ def _recorded_s(reader: BagReader) -> float:
 
 
 async def make_demo(run: Run, seconds: float) -> Path:
-    """Make a demonstration recording of this length in the run's directory; return the file.
+    """Generate a demonstration recording of this length in the run's directory; return the file.
 
     Raises:
         ChildError: the script fails.

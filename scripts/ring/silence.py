@@ -1,4 +1,4 @@
-"""Which reliable flows stand still, and for how long.
+"""Silence detection: which reliable flows stand still, and for how long.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 """
@@ -17,7 +17,7 @@ TOLD_FROM_S: Final = 1.5  # both ends report twice a second
 class _Flow:
     sent: int = 0
     received: int = 0
-    since_s: float = 0.0  # nothing has come since, though something was sent
+    since_s: float = 0.0  # nothing was received since, although something was sent
 
     @property
     def is_behind(self) -> bool:
@@ -25,7 +25,7 @@ class _Flow:
 
 
 class Silence:
-    """A flow is silent while something was sent that has not been received, and nothing is received."""
+    """A flow is silent while a sent message is outstanding and nothing is received."""
 
     def __init__(self) -> None:
         self._flows: dict[str, _Flow] = {}
@@ -33,18 +33,18 @@ class Silence:
 
     @property
     def behind(self) -> int:
-        """Return how many messages were sent and not received, over all flows."""
+        """Return the number of sent and not received messages, over all flows."""
         return sum(max(flow.sent - flow.received, 0) for flow in self._flows.values())
 
     def sent(self, name: str, count: int, now_s: float) -> None:
-        """Note how many messages of a flow were sent in all."""
+        """Set the total of sent messages of a flow."""
         flow = self._flows.setdefault(name, _Flow())
         if not flow.is_behind:
             flow.since_s = now_s
         flow.sent = count
 
     def received(self, name: str, count: int, now_s: float) -> None:
-        """Note how many messages of a flow were received in all."""
+        """Set the total of received messages of a flow."""
         flow = self._flows.setdefault(name, _Flow())
         if flow.is_behind:
             self.longest_s = max(self.longest_s, now_s - flow.since_s)

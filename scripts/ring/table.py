@@ -1,6 +1,6 @@
-"""The table at the end of a run.
+"""Table at the end of a run.
 
-Place: shell; makes rich renderables, prints nothing.
+I/O layer; it builds rich renderables, and prints nothing.
 """
 
 from __future__ import annotations

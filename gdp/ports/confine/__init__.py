@@ -1,1 +1,1 @@
-"""Rights of this process: given away after its sockets are open, by capabilities, Landlock and seccomp."""
+"""Confinement of this process after its sockets are open: capabilities, Landlock and seccomp."""

@@ -1,6 +1,6 @@
-"""Capabilities of the calling thread, and of what it starts.
+"""Capabilities of the calling thread and of the programs that it starts.
 
-Place: I/O. Source: capabilities(7), capget(2); include/uapi/linux/capability.h.
+I/O. Source: capabilities(7), capget(2); include/uapi/linux/capability.h.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _HIGHEST: Final = 63
 
 
 class Capability(IntEnum):
-    """Those that a node may need; the values are the kernel's."""
+    """Capabilities that a node may need; the values are the kernel's."""
 
     DAC_OVERRIDE = 1
     DAC_READ_SEARCH = 2
@@ -40,10 +40,10 @@ class _Words(ctypes.Structure):
 
 
 def drop_bounding() -> None:
-    """Empty the bounding set: no program that is started from now on gets a capability, root's included.
+    """Empty the bounding set: no program started from now on gets a capability, not even one of root.
 
     Raises:
-        OSError: EPERM, without CAP_SETPCAP.
+        OSError: EPERM without CAP_SETPCAP.
     """
     for number in range(_HIGHEST + 1):
         try:
@@ -51,11 +51,11 @@ def drop_bounding() -> None:
         except OSError:
             if number <= Capability.BPF:
                 raise
-            return  # beyond the last one that this kernel knows
+            return  # beyond the last capability that this kernel knows
 
 
 def keep_only(wanted: Collection[Capability]) -> None:
-    """Give all capabilities of this thread away but those wanted; none is gained.
+    """Drop all capabilities of this thread except the wanted ones; the call adds none.
 
     Raises:
         OSError: the system refuses.

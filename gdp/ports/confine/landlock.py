@@ -1,7 +1,7 @@
-"""Landlock: which files, TCP ports and processes this thread may still reach.
+"""Landlock rules: the files, TCP ports and processes that this thread may still reach.
 
-Place: I/O. Source: https://docs.kernel.org/userspace-api/landlock.html; include/uapi/linux/landlock.h. What an older
-kernel does not know is left out; what is open already stays usable.
+I/O. Source: https://docs.kernel.org/userspace-api/landlock.html; include/uapi/linux/landlock.h. A right that an older
+kernel does not know is left out. Files that are already open stay usable.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _SCOPE_ABSTRACT_SOCKET, _SCOPE_SIGNAL = 1 << 0, 1 << 1
 
 
 def abi() -> int:
-    """Return the kernel's Landlock version; 0: it has none, or it is off."""
+    """Return the kernel's Landlock version; 0 if the kernel has no Landlock or it is off."""
     try:
         return call(_CREATE, None, 0, _VERSION)
     except OSError:
@@ -40,14 +40,14 @@ def abi() -> int:
 def restrict(
     writes: Iterable[Path], reads: Iterable[Path] | None, tcp_ports: Iterable[int] | None, *, may_execute: bool
 ) -> int:
-    """Restrict this thread, and those that it starts; return the version that was used, 0: there is none.
+    """Restrict this thread and the threads that it starts; return the version used, 0 if there is no Landlock.
 
     The thread must have ``no_new_privs``, or CAP_SYS_ADMIN.
 
     Args:
-        writes: files and folders to change, with all below; what is not there is passed over.
-        reads: those to read beside them; None: everything.
-        tcp_ports: to listen on, and nothing is connected to by TCP; None: any.
+        writes: files and folders to change, with everything below them; missing ones are skipped.
+        reads: files and folders to read in addition; None: everything.
+        tcp_ports: ports to listen on, and no TCP connection may be opened; None: any.
         may_execute: whether programs may be started.
 
     Raises:
@@ -60,7 +60,7 @@ def restrict(
     views = 0 if reads is None else _READ_FILE | _READ_DIR
     execution = 0 if may_execute else _EXECUTE
     net = _BIND_TCP | _CONNECT_TCP if version >= 4 and tcp_ports is not None else 0
-    # a node that starts programs also ends them, and those are within; abstract sockets are X11's and D-Bus's
+    # A node that starts programs also ends them, and those share its domain. X11 and D-Bus use abstract sockets.
     scopes = (_SCOPE_SIGNAL | (0 if may_execute else _SCOPE_ABSTRACT_SOCKET)) if version >= 6 else 0
     size = 24 if version >= 6 else 16 if version >= 4 else 8
     attributes = struct.pack("=QQQ", changes | views | execution, net, scopes)[:size]

@@ -1,7 +1,7 @@
-"""seccomp: system calls that no node makes once it is up, or that a mere reader of files does not, refused with EPERM.
+"""seccomp filter that refuses, with EPERM, system calls that a running node or a mere reader of files does not need.
 
-Place: I/O. Source: seccomp(2); include/uapi/linux/seccomp.h, filter.h, audit.h. A deny list, for ROS middleware and
-Python's libraries differ in what they call. Calls of another architecture (32 bit, x32) are refused altogether.
+I/O. Source: seccomp(2); include/uapi/linux/seccomp.h, filter.h, audit.h. It is a deny list, because ROS middleware and
+Python libraries differ in the calls that they make. Calls of another architecture (32 bit, x32) are always refused.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _X32: Final = 0x40000000
 _NUMBER_AT, _ARCHITECTURE_AT = 0, 4
 _STEP: Final = struct.Struct("=HBBI")
 _MACHINES: Final = {"x86_64": (0xC000003E, 317), "aarch64": (0xC00000B7, 277)}  # AUDIT_ARCH, number of seccomp(2)
-_NUMBERS: Final = {  # of x86_64, of aarch64
+_NUMBERS: Final = {  # numbers on x86_64 and aarch64
     "acct": (163, 89),
     "add_key": (248, 217),
     "bpf": (321, 280),
@@ -72,7 +72,7 @@ _NUMBERS: Final = {  # of x86_64, of aarch64
     "unshare": (272, 97),
     "userfaultfd": (323, 282),
 }
-_READER: Final = {  # network, processes, signals, memory beyond its limit, marks of files, which Landlock leaves open
+_READER: Final = {  # network, processes, signals, memory beyond its limit, file marks: Landlock leaves them open
     "chmod": (90, None),
     "chown": (92, None),
     "clone": (56, 220),
@@ -117,16 +117,16 @@ _READER: Final = {  # network, processes, signals, memory beyond its limit, mark
     "utimes": (235, None),
     "vfork": (58, None),
 }
-READER: Final = frozenset(_READER)  # calls that are refused to a process that only reads files and writes to a pipe
+READER: Final = frozenset(_READER)  # refused to a process that only reads files and writes to a pipe
 
 
 def denied(machine: str, spared: Iterable[str] = (), *, is_reader: bool = False) -> dict[str, int]:
-    """Return the calls that are refused, by name, with their numbers on a machine; empty: it is not known here.
+    """Return the refused calls by name, with their numbers on a machine; empty if the machine is unknown.
 
     Args:
-        machine: as ``uname -m`` says.
-        spared: names of calls that are needed after all.
-        is_reader: those of ``READER``, too.
+        machine: as ``uname -m`` prints it.
+        spared: names of calls that are needed and therefore allowed.
+        is_reader: whether to add the calls of ``READER``.
     """
     if machine not in _MACHINES:
         return {}
@@ -138,7 +138,7 @@ def denied(machine: str, spared: Iterable[str] = (), *, is_reader: bool = False)
 
 
 def refuse(spared: Iterable[str] = (), *, is_reader: bool = False) -> bool:
-    """Refuse the calls of ``denied`` to all threads of this process; return False: the machine is not known.
+    """Refuse the calls of ``denied`` to all threads of this process; return False if the machine is unknown.
 
     The thread must have ``no_new_privs``, or CAP_SYS_ADMIN.
 

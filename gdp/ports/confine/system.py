@@ -1,6 +1,6 @@
-"""System calls without a wrapper in the standard library, through ctypes.
+"""System calls without a wrapper in the standard library, called through ctypes.
 
-Place: I/O, the kernel's interface.
+I/O.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ LIBC.syscall.restype = ctypes.c_long
 
 
 def call(number: int, *arguments: object) -> int:
-    """Return what a system call returns; integers are passed as 64 bits.
+    """Return the result of a system call; integers are passed as 64 bits.
 
     Raises:
-        OSError: it failed.
+        OSError: the call failed.
     """
     given = [ctypes.c_long(each) if isinstance(each, int) else each for each in arguments]
     return checked(LIBC.syscall(ctypes.c_long(number), *given))
 
 
 def prctl(option: int, second: int = 0, third: int = 0) -> int:
-    """Return what prctl(2) returns.
+    """Return the result of prctl(2).
 
     Raises:
-        OSError: it failed.
+        OSError: the call failed.
     """
     zero = ctypes.c_ulong(0)
     return checked(LIBC.prctl(option, ctypes.c_ulong(second), ctypes.c_ulong(third), zero, zero))
@@ -39,7 +39,7 @@ def checked(result: int) -> int:
     """Return a result that is not negative.
 
     Raises:
-        OSError: it is, and why.
+        OSError: the result is negative; the error carries the errno.
     """
     if result < 0:
         number = ctypes.get_errno()

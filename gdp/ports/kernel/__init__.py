@@ -1,1 +1,1 @@
-"""The data plane whose decision is an eBPF program in the kernel; what it is unsure of, Python decides."""
+"""Kernel data plane: an eBPF program decides in the kernel, and Python decides the frames that it is unsure of."""

@@ -1,6 +1,6 @@
-"""What the kernel program and its control plane must agree on: the bytes of keys, values and counters.
+"""Binary interface between the kernel program and its control plane: the bytes of keys, values and counters.
 
-Place: pure; numbers only. In this machine's byte order, but for names and addresses, which are bytes as in a frame::
+Sans-I/O; numbers only. Numbers are in host byte order; names and addresses are bytes as in a frame::
 
     key      destination (32)  source, or zero for every source (32)
     entry    port, or GROUP or NOWHERE (4)  addresses (12)  alternate port or NOWHERE (4)  its addresses (12)
@@ -53,7 +53,7 @@ INDEX_BYTES: Final = 4
 KEY_BYTES: Final = 2 * NAME_BYTES
 EVERY_SOURCE: Final = bytes(NAME_BYTES)
 ENTRIES_DEFAULT: Final = 1 << 17  # 2 MiB of counters on every CPU
-PORTS_MAX: Final = 1_024  # a port above that is served by Python alone
+PORTS_MAX: Final = 1_024  # Python alone serves a port above that
 GROUPS_MAX: Final = 4_096  # different sets of branches; entries with equal hops share one
 BRANCHES_MAX: Final = 64
 
@@ -66,7 +66,7 @@ class EntryAt(IntEnum):
 
     PORT = 0
     MACS = 4
-    ALTERNATE = 4 + MACS_BYTES  # as port and addresses
+    ALTERNATE = 4 + MACS_BYTES  # port and addresses of the alternate
     GROUP = 2 * (4 + MACS_BYTES)
     COUNTER = GROUP + 4
     SIDES = COUNTER + INDEX_BYTES
@@ -81,15 +81,15 @@ class PortAt(IntEnum):
 
 
 class PortFlag(IntEnum):
-    """How a port is served."""
+    """Flags of a port for the kernel program."""
 
-    PEER = 1  # straight to the other end of a veth pair
+    PEER = 1  # redirect to the other end of a veth pair
 
 
 class Total(IntEnum):
     """Indices of the counters behind those of the drop reasons."""
 
-    TAKEN = DROP_COUNTERS  # frames that were not handed up
+    TAKEN = DROP_COUNTERS  # frames that were not punted
     COPIES = TAKEN + 1  # forwarded
     BYTES = TAKEN + 2  # of those copies, Ethernet header included
 
@@ -118,17 +118,17 @@ def entry_head(
     *,
     group: int = 0,
 ) -> bytes:
-    """Return an entry up to its counter."""
+    """Return the bytes of an entry before its counter."""
     return _HEAD.pack(port, macs, alternate_port, alternate_macs, group)
 
 
 def entry_tail(counter: int, sides: int) -> bytes:
-    """Return the rest of an entry."""
+    """Return the bytes of an entry after its counter."""
     return _TAIL.pack(counter, sides)
 
 
 def port(ifindex: int, mtu: int, flags: int) -> bytes:
-    """Return a port; ``ifindex`` 0 is one that is down."""
+    """Return a port; ``ifindex`` 0 marks a port that is down."""
     return _PORT.pack(ifindex, mtu, flags, 0)
 
 

@@ -1,8 +1,8 @@
-"""A small assembler for eBPF: named registers, named labels, one method an instruction.
+"""Assembler for eBPF: named registers, named labels, one method per instruction.
 
-Place: pure; numbers in, bytes out.
-Source: RFC 9669 (BPF Instruction Set Architecture). One instruction is 8 bytes, and a jump counts instructions from the
-one behind it::
+Sans-I/O; numbers in, bytes out.
+Source: RFC 9669 (BPF Instruction Set Architecture). One instruction is 8 bytes. A jump counts instructions from the one
+after it::
 
     opcode (1)  source and destination register (1)  offset (2, signed)  immediate (4, signed)
 """
@@ -21,7 +21,7 @@ __all__ = ["Assembler", "Reg"]
 
 
 class Reg(IntEnum):
-    """R0: results; R1 to R5: arguments, lost in a call; R6 to R9: kept; R10: the top of the stack, read only."""
+    """R0: results; R1 to R5: arguments, lost in a call; R6 to R9: preserved; R10: the top of the stack, read only."""
 
     R0 = 0
     R1 = 1
@@ -56,7 +56,7 @@ class _Step:
 
 
 class Assembler:
-    """Steps in the order in which they are written. Values are signed 32-bit, comparisons unsigned 64-bit."""
+    """A program as instructions in order. Values are signed 32-bit, comparisons unsigned 64-bit."""
 
     def __init__(self) -> None:
         self._steps: list[_Step] = []
@@ -66,7 +66,7 @@ class Assembler:
         """Name the next instruction.
 
         Raises:
-            LocalError: the name is taken.
+            LocalError: the label exists already.
         """
         if name in self._labels:
             raise LocalError(f"label {name} stands twice")
@@ -89,7 +89,7 @@ class Assembler:
         self._compute(_SHIFT_LEFT, to, bits)
 
     def from_big_endian(self, to: Reg, bits: int) -> None:
-        """Turn what was loaded from a frame into a number."""
+        """Convert a big-endian value that was loaded from a frame into a number."""
         self._steps.append(_Step(_BIG_ENDIAN, to, value=bits))
 
     def load(self, to: Reg, base: Reg, offset: int, size: int) -> None:
@@ -104,15 +104,15 @@ class Assembler:
             self._steps.append(_Step(_STORE_VALUE | _IN_MEMORY | _SIZES[size], base, 0, offset, value))
 
     def load_map(self, to: Reg, descriptor: int) -> None:
-        """Name a map to the next call."""
+        """Load a map as an argument of the next call."""
         self._steps += [_Step(_WIDE, to, _MAP, value=descriptor), _Step(0)]
 
     def jump(self, label: str) -> None:
-        """Jump to a label further on."""
+        """Jump forward to a label."""
         self._steps.append(_Step(_JUMP, label=label))
 
     def jump_if(self, left: Reg, condition: str, right: Reg | int, label: str) -> None:
-        """Jump where ``left condition right``; ``&`` asks for a common bit."""
+        """Jump to a label if ``left condition right``; ``&`` tests for a common bit."""
         opcode = _JUMP | _CONDITIONS[condition]
         if isinstance(right, Reg):
             self._steps.append(_Step(opcode | _FROM_REGISTER, left, right, label=label))
@@ -124,16 +124,16 @@ class Assembler:
         self._steps.append(_Step(_CALL, value=helper))
 
     def leave(self, result: int | None = None) -> None:
-        """End the program with a result, or with what is in R0."""
+        """End the program with a result, or with the value of R0."""
         if result is not None:
             self.move(Reg.R0, result)
         self._steps.append(_Step(_EXIT))
 
     def assemble(self) -> bytes:
-        """Return the program in this machine's byte order.
+        """Return the program in host byte order.
 
         Raises:
-            LocalError: a jump to nowhere, or a number that does not fit.
+            LocalError: a jump has no target, or a number does not fit.
         """
         return b"".join(self._encoded(at, step) for at, step in enumerate(self._steps))
 

@@ -1,12 +1,12 @@
-"""Where the program is attached: a TCX link on Linux 6.6 and later, else a filter of a clsact qdisc.
+"""Attachment of the kernel program to a device: a TCX link on Linux 6.6 and later, else a filter of a clsact qdisc.
 
-Place: I/O; one attachment a device, and one live switch: where a second one is seen, either way, it is refused. Whoever
-else stands at the same hook stays there.
+I/O. Each device has one attachment and one live switch; a second one is refused, attached by link or by filter.
+Programs of other owners at the same hook stay there.
 Source: Linux, include/uapi/linux/bpf.h (``BPF_TCX_INGRESS``); tc-bpf(8).
 
-A TCX link is a descriptor: it ends with its process, whatever ends that. A filter does not, so it carries the process
-it belongs to in its name, and the next run on that device takes a dead one's away; until then the program itself
-forwards nothing, since nobody renews its lease (see ``program.py``).
+A TCX link is a descriptor: it ends with its process, however that ends. A filter outlives its process, so its name
+carries the process that it belongs to. The next run on that device removes the filter of a dead process. Until then the
+program forwards nothing, because its lease is not renewed (see ``program.py``).
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ __all__ = ["Attachment", "FilterAttachment", "LinkAttachment", "has_links"]
 _TCX_INGRESS: Final = 46
 _LOOPBACK: Final = 1  # the index of lo in every namespace
 _NAME: Final = re.compile(rf"{PROGRAM}:(?P<pid>\d+):(?P<started>\d+)", re.ASCII)
-_START_TIME: Final = 19  # field 22 of proc_pid_stat(5), counted from behind the command
+_START_TIME: Final = 19  # field 22 of proc_pid_stat(5), counted after the command
 
 
 def has_links() -> bool:
-    """Whether this kernel has TCX links.
+    """Return whether this kernel has TCX links.
 
     Raises:
-        BpfError: not allowed to ask.
+        BpfError: the process may not query the kernel.
     """
     try:
         attached(_LOOPBACK, _TCX_INGRESS)
@@ -56,15 +56,15 @@ class Attachment(Protocol):
     """A program at the ingress of one device."""
 
     def close(self) -> None:
-        """Take it away; the device may be gone."""
+        """Detach the program; the device may be gone."""
 
 
 class LinkAttachment:
     """A TCX link.
 
     Raises:
-        BpfError: refused.
-        LocalError: a live switch has the device.
+        BpfError: the kernel refuses it.
+        LocalError: a live switch uses the device.
     """
 
     def __init__(self, program: int, ifindex: int, ask: NetlinkSocket) -> None:
@@ -88,7 +88,7 @@ class FilterAttachment:
     """A bpf filter of a clsact qdisc.
 
     Raises:
-        LocalError: refused, or a live switch has the device.
+        LocalError: the kernel refuses it, or a live switch uses the device.
     """
 
     def __init__(self, program: int, ifindex: int, ask_briefly: NetlinkSocket) -> None:
@@ -119,30 +119,31 @@ class FilterAttachment:
         except LocalError:
             if self._ask_briefly.link(self._ifindex):
                 raise
-            # the device is gone, and all that stood there with it
+            # the device is gone with all its filters
 
     def _remove_dead(self, ask: IPRoute) -> bool:
-        """Take away what dead runs left; return whether there was any."""
+        """Remove the filters that dead runs left; return whether there were any."""
         removed = False
         for each in _filters(ask, self._ifindex, CLSACT_INGRESS):
-            if _NAME.fullmatch(each.name):  # those of the living were refused before
+            if _NAME.fullmatch(each.name):  # filters of live processes were refused before
                 _remove(ask, self._ifindex, each)
                 removed = True
         return removed
 
     def _is_bare(self, ask: IPRoute) -> bool:
-        """Whether no filter stands at the qdisc, either way."""
+        """Return whether the qdisc has no filter in either direction."""
         return not any(_filters(ask, self._ifindex, parent) for parent in (CLSACT_INGRESS, CLSACT_EGRESS))
 
 
 def _refuse_second(ask: NetlinkSocket, ifindex: int) -> None:
-    """Two switches on one device would each forward by half of what they are told.
+    """Refuse a second switch on one device: each would receive half of the control frames and forward by those.
 
-    A link stands only while its process holds it, so its program is a live one's. Where others' programs may not be
-    opened (that takes CAP_SYS_ADMIN, which forwarding does not), a second one by a link goes unseen.
+    A link exists only while its process holds it, so its program belongs to a live process. Opening the programs of
+    other owners takes CAP_SYS_ADMIN, which forwarding does not need. Without it, a second switch on a link stays
+    undetected.
 
     Raises:
-        LocalError: a live switch has the device.
+        LocalError: a live switch uses the device.
     """
     for name in ask.filters(ifindex, CLSACT_INGRESS):
         of_ours = _NAME.fullmatch(name)
@@ -153,17 +154,17 @@ def _refuse_second(ask: NetlinkSocket, ifindex: int) -> None:
 
 
 def _linked(ifindex: int) -> list[str | None]:
-    """Return the names of the programs at the links' hook, as far as they may be known."""
+    """Return the names of the programs at the hook of links, as far as this process may read them."""
     try:
         return [name_of(program) for program in attached(ifindex, _TCX_INGRESS)]
     except BpfError as error:
-        if error.number in (errno.EINVAL, errno.EPERM):  # no links before Linux 6.6; not ours to open
+        if error.number in (errno.EINVAL, errno.EPERM):  # no links before Linux 6.6; no right to open the program
             return []
         raise
 
 
 def _started(pid: int) -> str:
-    """Return when a process began, in ticks since boot; empty when it is not there."""
+    """Return when a process began, in ticks since boot; empty if it does not exist."""
     try:
         text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -173,7 +174,7 @@ def _started(pid: int) -> str:
 
 @contextlib.contextmanager
 def _asking(ifindex: int) -> Iterator[IPRoute]:
-    from pyroute2 import IPRoute  # large, and needed for this alone
+    from pyroute2 import IPRoute  # a large import, needed for this alone
     from pyroute2.netlink.exceptions import NetlinkError
 
     try:
@@ -186,7 +187,7 @@ def _asking(ifindex: int) -> Iterator[IPRoute]:
 def _filters(ask: IPRoute, ifindex: int, parent: int) -> list[_Filter]:
     found: list[_Filter] = []
     for each in ask.get_filters(index=ifindex, parent=parent):
-        if each["handle"]:  # a chain's head has none
+        if each["handle"]:  # the head of a chain has no handle
             name = each.get_nested("TCA_OPTIONS", "TCA_BPF_NAME") if each.get_attr("TCA_KIND") == "bpf" else None
             found.append(_Filter(each["handle"], each["info"] >> 16, socket.ntohs(each["info"] & 0xFFFF), name or ""))
     return found

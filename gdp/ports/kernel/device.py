@@ -1,9 +1,12 @@
-"""What stands between a port's device and its far end: whether frames may pass it by, and how many it refused.
+"""Checks of a port's device: whether redirected frames may bypass its egress path, and how many frames it refused.
 
-Place: I/O. ``bpf_redirect_peer`` passes by everything on the way out of the device and into the other end: so it is
-right only where nothing stands there. The device must be one end of a veth pair whose other end is in another
-namespace (the kernel drops the frame otherwise), without a queue, and without programs or filters on its way out; and
-the other end without an XDP program in its driver (a generic one is run all the same, and so is whatever comes later).
+I/O. ``bpf_redirect_peer`` bypasses everything between the egress of the device and the other end of its pair. It is
+correct only if nothing is attached there:
+
+- The device is one end of a veth pair whose other end is in another namespace; otherwise the kernel drops the frame.
+- The device has no queue, and no programs or filters at its egress.
+- The other end has no XDP program in its driver. A generic one runs all the same, and so does everything after it.
+
 Source: Linux, net/core/filter.c, ``skb_do_redirect``; if_link.h, ``rtnl_link_stats64``; gen_stats.h.
 """
 
@@ -31,10 +34,10 @@ _READ_BYTES: Final = 1 << 16
 
 
 def peer_is_bare(ask: NetlinkSocket, ifindex: int) -> bool:
-    """Say whether nothing stands between this device and the other end of its pair, in another namespace.
+    """Return whether nothing is attached between this device and the other end of its pair, in another namespace.
 
     Raises:
-        LocalError: a question was refused; about the other end, that takes CAP_NET_ADMIN there.
+        LocalError: the kernel refused a query; a query about the other end takes CAP_NET_ADMIN there.
     """
     facts = ask.link(ifindex)
     kind = nested(facts.get(LinkAttribute.LINKINFO, b"")).get(_INFO_KIND, b"")
@@ -52,13 +55,13 @@ def _has_programs(ifindex: int) -> bool:
     try:
         return bool(attached(ifindex, _TCX_EGRESS))
     except BpfError as error:
-        if error.number == errno.EINVAL:  # before Linux 6.6 there are none
+        if error.number == errno.EINVAL:  # before Linux 6.6 there are no links
             return False
         raise
 
 
 def _has_driver_xdp(ask: NetlinkSocket, facts: dict[int, bytes]) -> bool:
-    """Whether the other end, or what cannot be found there, is not to be passed by."""
+    """Return whether the other end has XDP in its driver; True if it cannot be found."""
     if LinkAttribute.LINK not in facts:
         return True
     there, namespace = (_NUMBER.unpack(facts[each])[0] for each in (LinkAttribute.LINK, LinkAttribute.LINK_NETNSID))
@@ -68,23 +71,23 @@ def _has_driver_xdp(ask: NetlinkSocket, facts: dict[int, bytes]) -> bool:
 
 
 class QueueWatch:
-    """Becomes readable when queues or filters of this namespace's devices change."""
+    """Monitor of queues and filters; readable when those of this namespace's devices change."""
 
     def __init__(self) -> None:
         self._socket = listen(TRAFFIC_GROUP)
 
     def fileno(self) -> int:
-        """Return the descriptor to wait on; it is readable when there is news."""
+        """Return the descriptor to wait on; it is readable when there are notifications."""
         return self._socket.fileno()
 
     def drain(self) -> None:
-        """Forget the news; what is now is asked anew."""
+        """Discard the notifications; the caller queries the present state."""
         while True:
             try:
                 self._socket.recv(_READ_BYTES)
             except BlockingIOError:
                 return
-            except OSError:  # ENOBUFS: more news than fits, which is news all the same
+            except OSError:  # ENOBUFS: notifications were lost, which is a change too
                 continue
 
     def close(self) -> None:
@@ -93,9 +96,9 @@ class QueueWatch:
 
 
 class TxDrops:
-    """Frames that devices and their queues would not send, which nobody tells a program that redirects.
+    """Frames that devices and their queues refused to send; the kernel does not report them to a redirecting program.
 
-    A device counts what anybody sends: where others use it too, theirs are among them.
+    A device counts all senders: if others use it too, their frames are included.
     """
 
     def __init__(self) -> None:
@@ -104,14 +107,14 @@ class TxDrops:
 
     @property
     def total(self) -> int:
-        """Frames refused since each device was first looked at."""
+        """Frames refused since the first query of each device."""
         return self._total
 
     def look(self, ask: NetlinkSocket, ifindexes: Iterable[int]) -> None:
-        """Ask about these devices, and forget the others. Costs a dump of all queues: 4 ms where there are 32 ports.
+        """Query these devices, and forget the others. Costs a dump of all queues: 4 ms with 32 ports.
 
         Raises:
-            LocalError: a question was refused; what was known stays.
+            LocalError: the kernel refused a query; the known counts stay.
         """
         asked = {ifindex: ask.link(ifindex) for ifindex in ifindexes}
         now = {ifindex: _dropped(facts) for ifindex, facts in asked.items() if facts}

@@ -1,7 +1,7 @@
-"""The program in the kernel, with its maps: what a plane writes into and reads its counts from.
+"""Program loaded into the kernel, with its maps, which a plane writes and whose counters it reads.
 
-Place: I/O. Nothing is pinned: what is loaded here lasts as long as its descriptors, and what attaches it. Each port has
-a program of its own, since an entry says which ports its frames come from.
+I/O. Nothing is pinned: the program and maps last as long as their descriptors and attachments. Each port has a program
+of its own, because an entry states which ports its frames may come from.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ class LoadedProgram:
     """One program and its maps.
 
     Args:
-        entries_max: most entries that the kernel holds. Each may cost 16 bytes on every CPU and 16 of a hash bucket
-            at once, and about 130 when it is there.
-        leased: forward only until ``renew`` says; for a program that outlives its process.
+        entries_max: most entries that the kernel holds. Each may cost 16 bytes on every CPU and 16 bytes of a hash
+            bucket at once, and about 130 bytes once it exists.
+        leased: whether forwarding needs ``renew``; for a program that outlives its process.
 
     Raises:
-        LocalError: not allowed here, a kernel that is too old, or a machine that is unknown.
+        LocalError: the process lacks the right, the kernel is too old, or the machine is unknown.
         LoadRefusedError: with the verifier's log.
     """
 
@@ -92,11 +92,11 @@ class LoadedProgram:
 
     @property
     def of_entries(self) -> tuple[KernelMap, KernelMap, KernelMap]:
-        """The maps of entries, groups and counts, which a mirror writes."""
+        """The maps of entries, groups and counts, which a ``MapSync`` writes."""
         return self.entries, self.groups, self.counts
 
     def close(self) -> None:
-        """Let go of all; what is attached still holds what it needs."""
+        """Close all descriptors; an attached program keeps what it needs."""
         if self._programs:
             self._last = self.counters()
         for program in self._programs.values():
@@ -112,12 +112,12 @@ class LoadedProgram:
             self._lease.put(_FIRST, until_ns.to_bytes(8, sys.byteorder))
 
     def set_port(self, index: int, ifindex: int, mtu: int, flags: int) -> None:
-        """Say what a port is now; ``ifindex`` 0: it is down."""
+        """Set the state of a port; ``ifindex`` 0 means down."""
         if index < PORTS_MAX:
             self.ports.put(index.to_bytes(INDEX_BYTES, sys.byteorder), abi.port(ifindex, mtu, flags))
 
     def counters(self) -> Counters:
-        """Return what the program did, until it was let go of. Safe in any thread."""
+        """Return the counts of the program up to its release. Safe in any thread."""
         if not self._programs:
             return self._last
         words = memoryview(self.totals.get(_FIRST) or b"").cast("Q")

@@ -1,12 +1,13 @@
-"""Keeps the kernel's map in step with the forwarding table, before the table's call returns.
+"""Map synchronisation: the kernel's map equals the forwarding table before the table's call returns.
 
-Place: I/O; an ``Observer`` of ``gdp.switch.table.Table``.
-What the kernel cannot hold (a full map, more than 64 branches, a port number out of range) is left out of it: those
-frames go up, and Python forwards them by the table itself. So nothing here fails; ``left_out`` says how many there are.
+I/O; an ``Observer`` of ``gdp.switch.table.Table``.
+The map leaves out what the kernel cannot hold: a full map, more than 64 branches, a port number out of range. Those
+frames are punted, and Python forwards them with the table itself. Therefore nothing here fails; ``left_out`` counts
+those entries.
 
-An entry names its counter, so that replacing an entry keeps its counts. Entries with equal branches share one group. A
-group is never changed while an entry names it, and numbers that came free are used again as late as can be, for a frame
-on its way may still hold them.
+An entry names its counter, so replacing an entry keeps its counts. Entries with equal branches share one group. A group
+never changes while an entry names it. Free numbers are reused as late as possible, because a frame in progress may
+still use them.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ __all__ = ["EntryCounts", "MapSync"]
 EntryCounts = dict[bytes, tuple[int, int]]  # by the table's key: frames, and their bytes
 
 _GROUP_FROM: Final = 2  # branches
-_UNCOUNTED: Final = 0  # the counter shared by all that find none of their own
+_UNCOUNTED: Final = 0  # counter shared by all entries without one of their own
 
 
 @dataclass(slots=True)
@@ -60,26 +61,26 @@ def _kernel_key(key: bytes) -> bytes:
 
 
 class MapSync:
-    """The table, as the kernel sees it.
+    """The table as the kernel sees it.
 
     Args:
-        table: what is mirrored, read only.
+        table: the table to copy; it is only read.
         entries: hash of entries.
         groups: hash of groups, by number.
-        counts: per-CPU array of counters, one more than there may be entries.
+        counts: per-CPU array of counters, one more than the maximum number of entries.
     """
 
     def __init__(self, table: Table | None, entries: KernelMap, groups: KernelMap, counts: KernelMap) -> None:
         self._table: Mapping[bytes, Hops] = {} if table is None else table.entries
         self._sides: Mapping[bytes, int] = {} if table is None else table.sides
         self._entries, self._groups, self._counts = entries, groups, counts
-        self._counter_of: dict[bytes, int] = {}  # by the table's key: what is in the kernel
+        self._counter_of: dict[bytes, int] = {}  # by the table's key: entries in the kernel
         self._key_of: list[bytes] = [b""]  # by counter
         self._free_counters: deque[int] = deque()
-        self._group_of: dict[bytes, _Group] = {}  # by key, of the entries that have one
+        self._group_of: dict[bytes, _Group] = {}  # by key, of the entries that have a group
         self._group_by: dict[Hops, _Group] = {}
         self._free_groups: deque[int] = deque(range(groups.max_entries))
-        self._waiting: dict[bytes, None] = {}  # for room
+        self._waiting: dict[bytes, None] = {}  # entries that wait for space in the map
         self._unfit: set[bytes] = set()
         self._zero_sources: set[bytes] = set()  # destinations that have an entry for the source zero
 
@@ -88,18 +89,18 @@ class MapSync:
 
     @property
     def left_out(self) -> int:
-        """How many of the table's entries only Python knows."""
+        """Number of the table's entries that only Python knows."""
         return len(self._waiting) + len(self._unfit)
 
     def put(self, items: Mapping[bytes, Hops]) -> None:
-        """Write entries of the table to the kernel's maps; what does not fit stays in Python alone."""
+        """Write entries of the table to the kernel's maps; an entry that does not fit stays in Python alone."""
         keys: list[bytes] = []
         kernel_keys: list[bytes] = []
         values: list[bytes] = []
         left: list[_Group] = []
         used: list[int] = []
-        fresh: set[bytes] = set()  # those that the kernel did not have
-        headers: dict[int, bytes] = {}  # by identity, since the table shares equal hops; those of groups are not here
+        fresh: set[bytes] = set()  # keys that the kernel did not have
+        headers: dict[int, bytes] = {}  # by identity, because the table shares equal hops; without groups
         counter_of, group_of, sides = self._counter_of, self._group_of, self._sides
         for key, hops in items.items():
             if group_of and key in group_of:
@@ -117,12 +118,12 @@ class MapSync:
                 counter = counter_of[key] = self._new_counter(key, used)
                 fresh.add(key)
             keys.append(key)
-            # ``_kernel_key`` and ``_index``, written out: a table may bring a hundred thousand names at once
+            # ``_kernel_key`` and ``_index`` inlined: a table may hold a hundred thousand names
             kernel_keys.append(key if len(key) > NAME_BYTES else key + EVERY_SOURCE)
             values.append(head + entry_tail(counter, sides.get(key, EVERY_SIDE)))
         self._counts.put_many([*map(_index, used)], [bytes(self._counts.value_bytes)] * len(used))
         self._write(keys, kernel_keys, values, fresh)
-        for name in self._zero_sources:  # empty, but for a strange peer
+        for name in self._zero_sources:  # empty, unless a peer misbehaves
             if name in counter_of:
                 self._leave_out(name)
         for each in left:
@@ -158,7 +159,7 @@ class MapSync:
     # entries
 
     def _write(self, keys: list[bytes], kernel_keys: list[bytes], values: list[bytes], fresh: set[bytes]) -> None:
-        """Give entries to the kernel; those that it has no room for wait."""
+        """Write entries to the kernel; those that do not fit wait."""
         is_full = False
         at = self._entries.put_many(kernel_keys, values)
         if self._waiting or self._unfit:
@@ -170,11 +171,11 @@ class MapSync:
                 self._give_back([key])
                 self._wait(key)
                 continue
-            try:  # what replaces another still finds room
+            try:  # an entry that replaces another still fits
                 self._entries.put(kernel_key, value)
             except BpfError as error:
                 is_full = is_full or error.number == errno.E2BIG
-                self._take_out([key])  # an older one there would be wrong now
+                self._take_out([key])  # an older entry there would be wrong now
                 self._wait(key)
 
     def _wait(self, key: bytes) -> None:
@@ -182,7 +183,7 @@ class MapSync:
         self._waiting[key] = None
 
     def _take_out(self, keys: Sequence[bytes]) -> None:
-        """Take what is in the kernel out of it, then give back what it used."""
+        """Remove entries from the kernel, then free the counters and groups that they used."""
         self._entries.remove_many([*map(_kernel_key, keys)])
         self._give_back(keys)
 
@@ -207,7 +208,7 @@ class MapSync:
             self.put(again)
 
     def _is_ambiguous(self, key: bytes) -> bool:
-        """Whether the kernel cannot tell an entry for every source from one for the source zero."""
+        """Return whether the kernel cannot tell an entry for every source from one for the source zero."""
         if len(key) == NAME_BYTES:
             return key in self._zero_sources
         if not key.endswith(EVERY_SOURCE):
@@ -216,7 +217,7 @@ class MapSync:
         return True
 
     def _new_counter(self, key: bytes, used: list[int]) -> int:
-        """Return a counter that stands at zero, or will: ``used`` are those to be cleared."""
+        """Return a counter that is zero or is cleared later: ``used`` are those to clear."""
         if len(self._key_of) < self._counts.max_entries:
             self._key_of.append(key)
             return len(self._key_of) - 1
@@ -227,10 +228,10 @@ class MapSync:
         used.append(counter)
         return counter
 
-    # where to
+    # heads of entries
 
     def _head(self, key: bytes, hops: Hops) -> bytes:
-        """Return the beginning of an entry; empty where the kernel cannot do it."""
+        """Return the beginning of an entry; empty if the kernel cannot forward by it."""
         if len(hops) > BRANCHES_MAX or any(port >= PORTS_MAX for hop in hops for port in hop[::2]):
             return b""
         if len(hops) >= _GROUP_FROM:

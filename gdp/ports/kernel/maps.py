@@ -1,6 +1,6 @@
-"""Maps of the kernel, as bytes to bytes.
+"""BPF maps of the kernel as mappings from bytes to bytes.
 
-Place: I/O; one file descriptor each.
+I/O; one file descriptor per map.
 Source: bpf(2); Linux, Documentation/bpf/map_hash.rst and map_array.rst. A per-CPU value is as many values as there may
 be CPUs, each padded to 8 bytes.
 """
@@ -21,20 +21,21 @@ from gdp.ports.kernel.syscall import NAME_MAX, BpfError, Command, address, bpf
 
 __all__ = ["KernelMap", "MapKind", "possible_cpus"]
 
-# BPF_F_NO_PREALLOC: an entry costs memory when it is there. From Linux 6.1 on, what is removed or replaced may be used
-# again at once, while a frame on its way still reads it: for some nanoseconds that frame may see the port of one entry
-# and the addresses of another, and one sealed frame goes astray, which nobody but its reader can open. To allocate
-# before is no cure, for such elements have always been used again at once; and it costs 18 MB for the usual table.
+# BPF_F_NO_PREALLOC: an entry costs memory only while it exists. From Linux 6.1 on, the kernel may reuse a removed or
+# replaced element at once, while a frame in progress still reads it. For some nanoseconds that frame may see the port
+# of one entry and the addresses of another. Then one sealed frame is misdelivered, and only its reader can open it.
+# Preallocation does not help: the kernel has always reused preallocated elements at once, and the usual table would
+# cost 18 MB.
 _NO_PREALLOC: Final = 1
 _POSSIBLE: Final = Path("/sys/devices/system/cpu/possible")
 _BATCH: Final = struct.Struct("=QQQQIIQQ")
 _STOPPED: Final = (errno.E2BIG, errno.ENOENT)
 _NO_BATCH: Final = (errno.EINVAL, 524)  # ENOTSUPP: arrays, before Linux 5.13
-_CHUNK: Final = 1 << 14  # entries a call: the kernel holds a copy of each only while it works on it
+_CHUNK: Final = 1 << 14  # entries per call: the kernel copies each one during the call
 
 
 class MapKind(IntEnum):
-    """``enum bpf_map_type``, as far as it is used."""
+    """``enum bpf_map_type``, as far as it is used here."""
 
     HASH = 1
     ARRAY = 2
@@ -42,7 +43,7 @@ class MapKind(IntEnum):
 
 
 def possible_cpus() -> int:
-    """Return how many CPUs this kernel is ready for, there or not."""
+    """Return how many CPUs this kernel is prepared for, present or not."""
     ranges = (part.partition("-") for part in _POSSIBLE.read_text(encoding="ascii").strip().split(","))
     return sum(int(last or first) - int(first) + 1 for first, _, last in ranges)
 
@@ -51,13 +52,13 @@ class KernelMap:
     """One map.
 
     Args:
-        kind: a hash is empty at first and takes memory as it grows; arrays are all zero, and whole, at once.
-        key_bytes: of one key.
-        value_bytes: of one value; on one CPU, where there is one for each.
+        kind: a hash starts empty and takes memory as it grows; an array is complete at once, and all zero.
+        key_bytes: size of one key.
+        value_bytes: size of one value; for a per-CPU map, on one CPU.
         name: shown by diagnostic tools.
 
     Raises:
-        BpfError: refused.
+        BpfError: the kernel refuses it.
     """
 
     def __init__(self, kind: MapKind, key_bytes: int, value_bytes: int, max_entries: int, name: str) -> None:
@@ -72,16 +73,16 @@ class KernelMap:
         self.fd = _create(attributes, f"make the map {name} of {max_entries} entries")
         self._key, self._value = bytearray(key_bytes), bytearray(self._value_bytes)
         self._one = bytearray(struct.pack("=IxxxxQQQ", self.fd, address(self._key), address(self._value), 0))
-        self._one_key = self._one[:16]  # what takes no value may be given none
+        self._one_key = self._one[:16]  # an operation without a value must get none
         self._tried = f"map {name}"
 
     @property
     def value_bytes(self) -> int:
-        """Bytes of one value as user space sees it: of all CPUs."""
+        """Bytes of one value as user space sees it: the values of all CPUs."""
         return self._value_bytes
 
     def close(self) -> None:
-        """Let go of it; a program that uses it keeps it."""
+        """Close the descriptor; a program that uses the map keeps it."""
         if self.fd >= 0:
             os.close(self.fd)
             self.fd = -1
@@ -90,13 +91,13 @@ class KernelMap:
         """Put or replace one entry.
 
         Raises:
-            BpfError: E2BIG when it is full.
+            BpfError: E2BIG if the map is full.
         """
         self._key[:], self._value[:] = key, value
         bpf(Command.MAP_UPDATE_ELEM, self._one, self._tried)
 
     def get(self, key: bytes) -> bytes | None:
-        """Return one entry's value, None where there is none. Safe in any thread."""
+        """Return one entry's value, None if there is none. Safe in any thread."""
         given, value = bytearray(key), bytearray(self._value_bytes)
         try:
             attributes = bytearray(struct.pack("=IxxxxQQQ", self.fd, address(given), address(value), 0))
@@ -108,7 +109,7 @@ class KernelMap:
         return bytes(value)
 
     def remove(self, key: bytes) -> bool:
-        """Take one entry out; False when there was none."""
+        """Remove one entry; return False if there was none."""
         self._key[:] = key
         try:
             bpf(Command.MAP_DELETE_ELEM, self._one_key, self._tried)
@@ -119,12 +120,12 @@ class KernelMap:
         return True
 
     def put_many(self, keys: Sequence[bytes], values: Sequence[bytes]) -> int:
-        """Put entries in order until one is refused; return how many are in."""
+        """Put entries in order until one is refused; return how many were put."""
         for at in range(0, len(keys), _CHUNK):
             some, theirs = keys[at : at + _CHUNK], values[at : at + _CHUNK]
             done = self._batch(Command.MAP_UPDATE_BATCH, b"".join(some), b"".join(theirs), len(some))
             while done < len(some):
-                try:  # what a batch refuses, and what it is too old for
+                try:  # the batch refused one, or the kernel has no batches
                     self.put(some[done], theirs[done])
                 except BpfError:
                     return at + done
@@ -132,14 +133,14 @@ class KernelMap:
         return len(keys)
 
     def remove_many(self, keys: Sequence[bytes]) -> None:
-        """Take entries out; some may not be there."""
+        """Remove entries; missing ones are ignored."""
         for at in range(0, len(keys), _CHUNK):
             some = keys[at : at + _CHUNK]
             for key in some[self._batch(Command.MAP_DELETE_BATCH, b"".join(some), b"", len(some)) :]:
                 self.remove(key)
 
     def read_array(self, count: int) -> bytes:
-        """Return the first ``count`` values of an array, one behind the other. Safe in any thread."""
+        """Return the first ``count`` values of an array, concatenated. Safe in any thread."""
         keys, values, following = bytearray(4 * count), bytearray(self._value_bytes * count), bytearray(8)
         places = (0, address(following), address(keys), address(values), count, self.fd, 0, 0)
         try:
@@ -148,12 +149,12 @@ class KernelMap:
         except BpfError as error:
             if error.number in _NO_BATCH:
                 return b"".join(self.get(index.to_bytes(4, sys.byteorder)) or b"" for index in range(count))
-            if error.number != errno.ENOENT:  # which only says that this was the end
+            if error.number != errno.ENOENT:  # ENOENT only marks the end of the map
                 raise
         return bytes(values)
 
     def _batch(self, command: Command, keys: bytes, values: bytes, count: int) -> int:
-        """Return for how many, from the first on, it is done; the kernel says so only where one of them was refused."""
+        """Return how many were done, from the first on; the kernel reports it only if it refused one."""
         attributes = bytearray(_BATCH.pack(0, 0, address(keys), address(values), count, self.fd, 0, 0))
         try:
             bpf(command, attributes, self._tried)
@@ -168,7 +169,7 @@ def _create(attributes: bytearray, tried: str) -> int:
     except BpfError as error:
         if error.number != errno.EPERM:
             raise
-        try:  # before Linux 5.11 maps count as locked memory
+        try:  # before Linux 5.11, maps count as locked memory
             resource.setrlimit(resource.RLIMIT_MEMLOCK, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
         except (OSError, ValueError):
             raise error from None

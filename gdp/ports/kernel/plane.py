@@ -1,12 +1,11 @@
-"""The data plane whose decision is a program in the kernel; what that is unsure of comes up to the raw plane's code.
+"""Kernel data plane: a program in the kernel decides, and punts the frames that it is unsure of to the raw plane.
 
-Place: I/O; the raw plane beneath, with the same table, so that nothing is lost that the kernel cannot take.
+I/O. The raw plane below uses the same table, so a frame or entry that the kernel cannot take is not lost.
 Source: docs/explanation/design.md, section 7.
-A frame that the kernel takes wakes nobody; one that comes up costs what it costs the raw
-plane::
+A frame that the kernel takes wakes no process. A frame that the kernel punts costs as much as in the raw plane::
 
     device -> program -> redirected | dropped and counted
-                 `-> up: packet socket -> decide() -> sent | dropped and counted | handed up
+                 `-> up: packet socket -> decide() -> sent | dropped and counted | punted
 """
 
 from __future__ import annotations
@@ -30,24 +29,24 @@ from gdp.switch.table import Table
 
 __all__ = ["KernelPlane"]
 
-_LEASE_S: Final = 3.0  # how long a dead process's filter goes on forwarding
+_LEASE_S: Final = 3.0  # how long the filter of a dead process continues to forward
 _UPKEEP_S: Final = 1.0
 _COUNTED_MAX: Final = 100
 
 
 class KernelPlane(RawPlane):
-    """``Plane`` by a program on the ingress of every port.
+    """``Plane`` with a program on the ingress of every port.
 
     Args:
         ifnames: devices to open at once.
-        table: what to forward by; None hands every frame up.
+        table: entries to forward by; None punts every frame.
         entries_max: most entries that the kernel holds; Python forwards by the others.
-        peer: go straight to the other end of a veth pair where that is right.
-        clsact: attach by filters even where there are links.
-        bypass_qdisc: send what is sent from here past traffic control.
+        peer: redirect to the other end of a veth pair where that is correct.
+        clsact: attach by filters even if the kernel has links.
+        bypass_qdisc: send frames of this process past traffic control.
 
     Raises:
-        LocalError: as ``add_port``; or the kernel does not take the program, and why.
+        LocalError: as ``add_port``; or the kernel refuses the program, with the reason.
     """
 
     def __init__(
@@ -65,14 +64,14 @@ class KernelPlane(RawPlane):
         self._table = table
         self._next_upkeep_s = 0.0
         self._refusals = TxDrops()
-        self._unread = 0  # frames that came up to a full socket
+        self._unread = 0  # punted frames that the kernel dropped at a full socket
         with ExitStack() as opened:
             self._loaded = opened.enter_context(closing(LoadedProgram(entries_max, leased=clsact or not has_links())))
             self._questions = opened.enter_context(closing(NetlinkSocket()))
             self._queues = opened.enter_context(closing(QueueWatch()))
             self._mirror = MapSync(table, *self._loaded.of_entries)
             super().__init__(ifnames, table, bypass_qdisc=bypass_qdisc)
-            opened.pop_all()  # from now on ``close`` does it
+            opened.pop_all()  # from now on ``close`` closes them
         self.watch(self._queues, self._review_queues)
         if table is not None:
             table.observe(self._mirror)
@@ -80,10 +79,10 @@ class KernelPlane(RawPlane):
 
     @property
     def counters(self) -> Counters:
-        """The counts of the kernel and of this process together, as they are now.
+        """The present counts of the kernel and of this process together.
 
-        A device tells nobody when it refuses what the kernel sent on: such a frame counts as forwarded, and as
-        ``PORT_FULL`` from the next time that devices are asked on, which ``poll`` does twice a second.
+        A device does not report that it refused a redirected frame. Such a frame counts as forwarded, and as
+        ``PORT_FULL`` after the next query of the devices, which ``poll`` makes twice a second.
         """
         here, there = self._counters, self._loaded.counters()
         drops = [a + b for a, b in zip(here.drops, there.drops, strict=True)]
@@ -99,7 +98,7 @@ class KernelPlane(RawPlane):
 
     @property
     def left_out(self) -> int:
-        """How many of the table's entries are forwarded by Python alone."""
+        """Number of the table's entries that Python alone forwards by."""
         return self._mirror.left_out
 
     def entry_counts(self, most: int = _COUNTED_MAX) -> EntryCounts:
@@ -107,7 +106,7 @@ class KernelPlane(RawPlane):
         return self._mirror.counts(most)
 
     def poll(self, timeout_s: float | None) -> list[ReceivedFrame]:
-        """Renew the lease of the program and read its counts when due, then as ``Plane.poll``."""
+        """Renew the lease of the program and read its counts when due; then as ``Plane.poll``."""
         if self._loaded.is_leased:
             timeout_s = _UPKEEP_S if timeout_s is None else min(timeout_s, _UPKEEP_S)
         if time.monotonic() >= self._next_upkeep_s:
@@ -125,7 +124,7 @@ class KernelPlane(RawPlane):
 
     def remove_port(self, index: int) -> None:
         """Detach the program from a port and close it, as ``Plane.remove_port``."""
-        self._look_at_devices()  # while what the port's device refused can still be asked
+        self._look_at_devices()  # while the drop count of the port's device can still be read
         super().remove_port(index)
 
     # ports
@@ -149,7 +148,7 @@ class KernelPlane(RawPlane):
 
     def _know(self, port: Port) -> None:
         self._tell_kernel(port)
-        self._look_at_devices()  # what it refuses from now on is counted
+        self._look_at_devices()  # drops are counted from now on
         super()._know(port)
 
     def _kernel_drops(self) -> int:
@@ -168,23 +167,23 @@ class KernelPlane(RawPlane):
     def _has_free_peer(self, ifindex: int) -> bool:
         try:
             return peer_is_bare(self._questions, ifindex)
-        except LocalError:  # who cannot know takes the way that is always right; the next upkeep asks again
+        except LocalError:  # unknown: redirect is always correct; the next upkeep queries again
             return False
 
     def _look_at_devices(self) -> None:
         try:
             self._refusals.look(self._questions, self._devices)
-        except LocalError:  # nothing is lost: devices go on counting, and the next upkeep asks again
+        except LocalError:  # nothing is lost: devices continue to count, and the next upkeep queries again
             return
 
     def _review_queues(self) -> None:
-        """See anew where frames may pass by what stands on the way out."""
+        """Check again on which ports redirected frames may bypass the egress path."""
         self._queues.drain()
         for port in self._ports.values():
             self._tell_kernel(port)
 
     def _keep_up(self) -> None:
-        """Do what nobody gives news of: the lease, programs that came to stand on a port's way out, and refusals."""
+        """Do what no notification triggers: renew the lease, check each port's egress, and read refusals."""
         self._loaded.renew(_LEASE_S)
         self._review_queues()
         self._look_at_devices()

@@ -1,20 +1,20 @@
-"""The forwarding decision as an eBPF program on the ingress of every port, written as a story.
+"""Forwarding decision as an eBPF program on the ingress of every port, written in the order of its steps.
 
-Place: pure; map descriptors in, instructions out.
-Source: ``gdp.switch.forwarder.decide``, which it must never differ from; Linux, include/uapi/linux/bpf.h, for the
-helpers and ``struct __sk_buff``; linux/pkt_sched.h for the priority. The header's offsets are read from the
-codec, which tests hold to the normative Scapy layer: Scapy takes longer to load than all else that a switch loads.
+Sans-I/O; map descriptors in, instructions out.
+Source: ``gdp.switch.forwarder.decide``, from which the program must never differ; Linux, include/uapi/linux/bpf.h, for
+the helpers and ``struct __sk_buff``; linux/pkt_sched.h for the priority. The codec has the header's offsets, which
+tests compare with the normative Scapy layer, because Scapy takes longer to load than everything else in a switch.
 
-A frame is taken (forwarded, or dropped and counted) where the program is sure; any other goes *up*: it continues to
-the port's packet socket, where Python decides by the same table and counts. So the program needs no word for what is
-rare::
+The program *takes* a frame (forwards it, or drops and counts it) if it is sure. Any other frame goes *up*: it continues
+to the port's packet socket, where Python decides with the same table and counts. So the program does not handle rare
+cases::
 
     to our station? -> leased, and over? -> whole header? -> version, kind, hops, length good? -> known?
           no: up            yes: up             no: up                 no: up                     no: up
                                                       known -> another side's: drop | nowhere | one hop | a group
 
-While a hop's port is down its alternate is taken. A port goes down by one write into the map of ports, however many
-entries name it.
+While a hop's port is down, the program uses its alternate. One write into the map of ports takes a port down, however
+many entries name it.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ from gdp.switch.table import MACS_BYTES
 
 __all__ = ["DROP", "LICENCE", "REDIRECT", "UP", "Descriptors", "forwarder"]
 
-LICENCE: Final = b"Apache-2.0"  # no helper used here asks for another
-UP: Final = -1  # TC_ACT_UNSPEC, TCX_NEXT: whoever else stands at this hook sees it next
+LICENCE: Final = b"Apache-2.0"  # the helpers used here require no other licence
+UP: Final = -1  # TC_ACT_UNSPEC, TCX_NEXT: the next program at this hook gets the frame
 DROP: Final = 2  # TC_ACT_SHOT, TCX_DROP
 REDIRECT: Final = 7  # TC_ACT_REDIRECT, TCX_REDIRECT
 
 _SKB: Final = Reg.R6
-_UNTIL, _FRAME, _PORT, _BRANCH = (Reg.R7,) * 4  # in turn; a frame's bytes may not be kept over what a group does
+_UNTIL, _FRAME, _PORT, _BRANCH = (Reg.R7,) * 4  # one at a time; pointers into the frame become invalid in a group
 _TOTALS: Final = Reg.R8
 _ENTRY, _TURN = Reg.R9, Reg.R9
 
@@ -66,7 +66,7 @@ _CONGESTION_NOTED: Final = 2  # NET_XMIT_CN: sent, though the queue is getting f
 #
 #     -64  key: destination (32)  every source (32)
 #     -72  index of a map (4)  unused (4)
-#     -80  where the group is (8)
+#     -80  pointer to the group (8)
 #     -88  ifindex of a branch (8)
 _KEY: Final = -2 * NAME_BYTES
 _INDEX: Final = _KEY - 8
@@ -76,7 +76,10 @@ _IFINDEX: Final = _GROUP - 8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Descriptors:
-    """The maps that the program reads, by file descriptor; without ``lease`` it forwards for as long as it is there."""
+    """File descriptors of the maps that the program reads.
+
+    Without ``lease`` the program forwards for as long as it is loaded.
+    """
 
     entries: int
     ports: int
@@ -87,7 +90,7 @@ class Descriptors:
 
 
 class ForwarderProgram(Assembler):
-    """The program, one method a step."""
+    """Assembler of the forwarding program, one method per step."""
 
     def __init__(self, maps: Descriptors, side: int) -> None:
         super().__init__()
@@ -97,6 +100,7 @@ class ForwarderProgram(Assembler):
         self._at = {name: ETHER_BYTES + offset for name, (offset, _) in places.items()}
 
     def tell(self) -> bytes:
+        """Return the instructions of the whole program; call it once."""
         self._only_ours()
         if self._maps.lease is not None:
             self._only_while_valid(self._maps.lease)
@@ -112,7 +116,7 @@ class ForwarderProgram(Assembler):
         return self.assemble()
 
     def _only_ours(self) -> None:
-        """To this station, by our EtherType, and in no VLAN."""
+        """Accept frames to this station, of our EtherType, and in no VLAN."""
         self.move(_SKB, Reg.R1)
         self.load(Reg.R2, _SKB, _PROTOCOL, 4)
         self.jump_if(Reg.R2, "!=", socket.htons(ETHERTYPE), "up")
@@ -122,7 +126,7 @@ class ForwarderProgram(Assembler):
         self.jump_if(Reg.R2, "!=", 0, "up")
 
     def _only_while_valid(self, lease: int) -> None:
-        """A program that may outlive its switch forwards only while that says so."""
+        """Forward only while the lease is valid, because the program may outlive its switch."""
         self._find(lease, 0)
         self.jump_if(Reg.R0, "==", 0, "up")
         self.load(_UNTIL, Reg.R0, 0, 8)
@@ -130,7 +134,7 @@ class ForwarderProgram(Assembler):
         self.jump_if(Reg.R0, ">", _UNTIL, "up")
 
     def _whole_header(self) -> None:
-        """Make the header readable, then prove it to the verifier."""
+        """Make the header readable, then prove its length to the verifier."""
         self.load(Reg.R2, _SKB, _DATA, 4)
         self.load(Reg.R3, _SKB, _DATA_END, 4)
         self.add(Reg.R2, OVERHEAD_BYTES)
@@ -160,7 +164,7 @@ class ForwarderProgram(Assembler):
         self.jump_if(Reg.R2, ">", Reg.R3, "up")
 
     def _look_up(self) -> None:
-        """By destination and source, which stand in the frame as they do in a key; then by destination alone."""
+        """Look up destination and source, contiguous in the frame as in a key; then the destination alone."""
         self.load_map(Reg.R1, self._maps.entries)
         self.move(Reg.R2, _FRAME)
         self.add(Reg.R2, self._at["destination"])
@@ -182,7 +186,7 @@ class ForwarderProgram(Assembler):
         self.move(_TOTALS, Reg.R0)
 
     def _from_its_side(self) -> None:
-        """Reverse path: what a publisher sends comes from where it is."""
+        """Check the reverse path: frames of a publisher must come from its direction."""
         self.load(Reg.R2, _ENTRY, EntryAt.SIDES, 8)
         self.move(Reg.R3, 1)
         self.shift_left(Reg.R3, self._side)
@@ -193,7 +197,7 @@ class ForwarderProgram(Assembler):
         self.label("from its side")
 
     def _urgency(self) -> None:
-        """Where a device queues, urgent frames go first."""
+        """Set the priority of urgent frames, so that the queue of a device sends them first."""
         self.load(Reg.R2, _FRAME, self._at["flags"], 1)
         self.jump_if(Reg.R2, "&", Flag.URGENT, "urgent")
         self.label("any urgency")
@@ -202,10 +206,10 @@ class ForwarderProgram(Assembler):
         self.load(Reg.R2, _ENTRY, EntryAt.PORT, 4)
         self.jump_if(Reg.R2, "==", GROUP, "group")
         self.jump_if(Reg.R2, "==", NOWHERE_PORT, "nowhere")
-        # any other falls into ``_one_hop``, its port in R2
+        # any other value falls into ``_one_hop`` with the port in R2
 
     def _one_hop(self) -> None:
-        """R2: the port. R4 becomes where the entry names the port that is taken, and its addresses behind it."""
+        """Forward to one hop. R2: the port; R4 points to the chosen port in the entry, then its addresses."""
         self._find(self._maps.ports, Reg.R2)
         self.jump_if(Reg.R0, "==", 0, "up")
         self.move(Reg.R4, _ENTRY)
@@ -227,7 +231,7 @@ class ForwarderProgram(Assembler):
         for at in range(0, MACS_BYTES, 4):
             self.load(Reg.R2, Reg.R4, EntryAt.MACS + at, 4)
             self.store(_FRAME, at, Reg.R2, 4)
-        self.move(_PORT, Reg.R0)  # the frame is done with
+        self.move(_PORT, Reg.R0)  # the frame is not read after this
         self._count(Total.TAKEN)
         self._count_copy()
         self._count_entry("one hop")
@@ -242,7 +246,7 @@ class ForwarderProgram(Assembler):
         self.leave()
 
     def _group(self) -> None:
-        """A copy to every branch that can take it; from the first copy on nothing may go up."""
+        """Send a copy to every branch that can take it; after the first copy nothing may go up."""
         self.label("group")
         self.load(Reg.R2, _ENTRY, EntryAt.GROUP, 4)
         self._find(self._maps.groups, Reg.R2)
@@ -295,7 +299,7 @@ class ForwarderProgram(Assembler):
             self.jump("next branch")
 
     def _send_copy(self) -> None:
-        """Put the branch's addresses into the frame and send a clone; R0: 0, or why not."""
+        """Write the branch's addresses into the frame and send a clone; R0: 0, or an error."""
         self.move(Reg.R1, _SKB)
         self.move(Reg.R2, 0)
         self.move(Reg.R3, _BRANCH)
@@ -317,7 +321,7 @@ class ForwarderProgram(Assembler):
         self.label("down")
         self._count(Total.TAKEN)
         self._count(DropReason.PORT_DOWN)
-        # falls into "drop"; a group, which has counted already, ends there too
+        # falls into "drop"; a group, which has already counted, also ends there
         self.label("drop")
         self.leave(DROP)
         self.label("urgent")
@@ -327,10 +331,10 @@ class ForwarderProgram(Assembler):
         self.label("up")
         self.leave(UP)
 
-    # phrases
+    # building blocks
 
     def _find(self, descriptor: int, index: Reg | int) -> None:
-        """R0: the value at an index of a map, or 0."""
+        """Set R0 to the value at an index of a map, or 0."""
         self.store(Reg.R10, _INDEX, index, 4)
         self.load_map(Reg.R1, descriptor)
         self.move(Reg.R2, Reg.R10)
@@ -338,7 +342,7 @@ class ForwarderProgram(Assembler):
         self.call(_LOOKUP)
 
     def _frame_bytes(self, to: Reg) -> None:
-        """What counts against an MTU: all behind the Ethernet header, padding too."""
+        """Load the bytes that count against an MTU: all after the Ethernet header, padding too."""
         self.load(to, _SKB, _LEN, 4)
         self.subtract(to, ETHER_BYTES)
 
@@ -348,7 +352,7 @@ class ForwarderProgram(Assembler):
         self.store(_FRAME, self._at["hops_left"], Reg.R2, 1)
 
     def _count(self, index: int, amount: Reg | int = 1) -> None:
-        """Not atomically: on one CPU, receiving is never interrupted by receiving."""
+        """Add to a counter, not atomically: receiving never interrupts receiving on one CPU."""
         self.load(Reg.R1, _TOTALS, 8 * index, 8)
         self.add(Reg.R1, amount)
         self.store(_TOTALS, 8 * index, Reg.R1, 8)

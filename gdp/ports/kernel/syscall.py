@@ -1,7 +1,7 @@
-"""bpf(2) through ctypes: the one place that speaks to the kernel about programs, maps and links.
+"""bpf(2) system call through ctypes: the only module that calls the kernel for programs, maps and links.
 
-Place: I/O; keeps nothing. File descriptors come and go as plain numbers, opened close-on-exec by the kernel.
-Source: bpf(2); Linux, include/uapi/linux/bpf.h, ``union bpf_attr``. What is left out of an attribute is zero.
+I/O; it keeps no state. File descriptors are plain numbers, which the kernel opens close-on-exec.
+Source: bpf(2); Linux, include/uapi/linux/bpf.h, ``union bpf_attr``. Omitted fields of an attribute are zero.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ NAME_MAX: Final = 15  # BPF_OBJ_NAME_LEN - 1
 _LOG_BYTES: Final = 1 << 20
 _SCHED_CLS: Final = 3  # BPF_PROG_TYPE_SCHED_CLS
 _INFO_BYTES: Final = 256
-_ATTACHED_MAX: Final = 64  # BPF_MPROG_MAX: more are never at one hook
-_SKB_BYTES: Final = 512  # more than struct __sk_buff has
+_ATTACHED_MAX: Final = 64  # BPF_MPROG_MAX: the most programs at one hook
+_SKB_BYTES: Final = 512  # more than the size of struct __sk_buff
 _PRIORITY_AT: Final = 32
-_NUMBERS: Final = {  # of the call itself; where Python is 32-bit, under the machine that it was built for
+_NUMBERS: Final = {  # of the call itself; a 32-bit Python looks up the machine that it was built for
     "x86_64": 321,
     "aarch64": 280,
     "riscv64": 280,
@@ -59,7 +59,7 @@ _NARROW: Final = {"x86_64": "i686", "aarch64": "armv7l", "armv8l": "armv7l"}
 
 
 class Command(IntEnum):
-    """``enum bpf_cmd``, as far as it is used."""
+    """``enum bpf_cmd``, as far as it is used here."""
 
     MAP_CREATE = 0
     MAP_LOOKUP_ELEM = 1
@@ -80,7 +80,7 @@ class Command(IntEnum):
 
 
 class BpfError(LocalError):
-    """The kernel refused.
+    """The kernel refused a call.
 
     Attributes:
         number: its errno.
@@ -94,10 +94,10 @@ class BpfError(LocalError):
 
 
 class LoadRefusedError(BpfError):
-    """The verifier does not let a program in; its log is part of the text.
+    """The verifier rejected a program; its log is part of the text.
 
     Attributes:
-        log: what the verifier said; empty when it was not even asked.
+        log: the verifier's log; empty if the kernel refused before verification.
     """
 
     def __init__(self, number: int, tried: str, log: str) -> None:
@@ -110,11 +110,11 @@ class LoadRefusedError(BpfError):
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """What a program made of one frame.
+    """The result of a program on one frame.
 
     Attributes:
-        each_ns: mean of the repeats; each is given the frame that the one before it left.
-        priority: that the frame leaves with.
+        each_ns: mean time of the repeats; each repeat gets the frame that the previous one left.
+        priority: priority of the frame after the program.
     """
 
     ack: int
@@ -139,7 +139,7 @@ def _number() -> int:
 
 
 def address(buffer: bytes | bytearray) -> int:
-    """Return where a buffer lies; valid for as long as the caller keeps the buffer and its size."""
+    """Return the address of a buffer; valid while the caller keeps the buffer and its size."""
     if isinstance(buffer, bytearray):
         return ctypes.addressof(ctypes.c_char.from_buffer(buffer))
     return ctypes.cast(ctypes.c_char_p(buffer), ctypes.c_void_p).value or 0
@@ -149,11 +149,11 @@ def bpf(command: Command, attributes: bytearray, tried: str) -> int:
     """Make the call. The kernel may write into ``attributes``.
 
     Args:
-        tried: what for, in words, for the error.
+        tried: purpose of the call, in words, for the error.
 
     Raises:
-        BpfError: refused.
-        LocalError: this machine is unknown.
+        BpfError: the kernel refuses it.
+        LocalError: the machine type is unknown.
     """
     result = _libc.syscall(_number(), command, address(attributes), len(attributes))
     if result < 0:
@@ -165,12 +165,13 @@ def load_program(code: bytes, name: str, licence: bytes) -> int:
     """Load a traffic-control program; return its file descriptor.
 
     Raises:
-        LoadRefusedError: with the verifier's log, if it got that far.
+        LoadRefusedError: with the verifier's log if the verifier ran.
     """
     text = licence + b"\0"
     log = bytearray(_LOG_BYTES)
 
     def attributes(level: int) -> bytearray:
+        """Return the attribute bytes of the call; ``level``: log level, 0 for no log."""
         place = (len(log), address(log)) if level else (0, 0)
         head = struct.pack("=IIQQIIQ", _SCHED_CLS, len(code) // 8, address(code), address(text), level, *place)
         return bytearray(head + struct.pack("=II16s16x", 0, 0, name.encode()[:NAME_MAX]))
@@ -179,27 +180,27 @@ def load_program(code: bytes, name: str, licence: bytes) -> int:
     try:
         return bpf(Command.PROG_LOAD, attributes(0), tried)
     except BpfError as refused:
-        try:  # once more, now for its reasons: a log costs time, so it is not kept for what succeeds
+        try:  # again, with a log, which costs time and is not needed on success
             return bpf(Command.PROG_LOAD, attributes(1), tried)
         except BpfError:
             raise LoadRefusedError(refused.number, tried, log.partition(b"\0")[0].decode(errors="replace")) from refused
 
 
 def create_link(program: int, ifindex: int, attach_type: int) -> int:
-    """Attach a program to a device, behind those that are there; closing the returned descriptor detaches it.
+    """Attach a program to a device after the present ones; closing the returned descriptor detaches it.
 
     Raises:
-        BpfError: refused.
+        BpfError: the kernel refuses it.
     """
     attributes = bytearray(struct.pack("=IIII32x", program, ifindex, attach_type, 0))
     return bpf(Command.LINK_CREATE, attributes, f"attach to device {ifindex}")
 
 
 def attached(ifindex: int, attach_type: int) -> list[int]:
-    """Return the programs that stand at one hook of a device, by id.
+    """Return the ids of the programs at one hook of a device.
 
     Raises:
-        BpfError: EINVAL: this kernel does not know that hook.
+        BpfError: EINVAL if this kernel does not know the hook.
     """
     ids = bytearray(4 * _ATTACHED_MAX)
     attributes = bytearray(struct.pack("=IIIIQI36x", ifindex, attach_type, 0, 0, address(ids), _ATTACHED_MAX))
@@ -209,10 +210,10 @@ def attached(ifindex: int, attach_type: int) -> list[int]:
 
 
 def name_of(program: int) -> str | None:
-    """Return the name of a program by id; None where it is gone.
+    """Return the name of a program by id; None if it is gone.
 
     Raises:
-        BpfError: EPERM: it takes CAP_SYS_ADMIN to open what others loaded.
+        BpfError: EPERM, because opening a program of another owner takes CAP_SYS_ADMIN.
     """
     try:
         opened = bpf(Command.PROG_GET_FD_BY_ID, bytearray(struct.pack("=I12x", program)), "open what is loaded")
@@ -227,10 +228,10 @@ def name_of(program: int) -> str | None:
 
 
 def run(program: int, frame: bytes, repeat: int = 1) -> Run:
-    """Give a frame to a program as if the loopback device had received it.
+    """Run a program on a frame as if the loopback device had received it.
 
     Raises:
-        BpfError: shorter than an Ethernet header, longer than a page takes, or not allowed.
+        BpfError: the frame is shorter than an Ethernet header or larger than a page holds, or the right is missing.
     """
     out, data, skb = bytearray(len(frame) + 256), bytearray(frame), bytearray(_SKB_BYTES)
     frames = struct.pack("=IIIIQQI", program, 0, len(data), len(out), address(data), address(out), repeat)
@@ -241,10 +242,10 @@ def run(program: int, frame: bytes, repeat: int = 1) -> Run:
 
 
 def objects(next_id: Command, open_by_id: Command) -> Iterator[int]:
-    """Open every program (or link) that there is, one after the other; each is closed before the next.
+    """Open every program (or link) of the system in turn; each is closed before the next one opens.
 
     Raises:
-        BpfError: not allowed.
+        BpfError: the process lacks the right.
     """
     at = 0
     while True:
@@ -259,7 +260,7 @@ def objects(next_id: Command, open_by_id: Command) -> Iterator[int]:
         try:
             opened = bpf(open_by_id, bytearray(struct.pack("=I12x", at)), "open what is loaded")
         except BpfError as error:
-            if error.number == errno.ENOENT:  # gone meanwhile
+            if error.number == errno.ENOENT:  # removed in the meantime
                 continue
             raise
         try:
@@ -272,16 +273,16 @@ def program_name(program: int) -> str:
     """Return the name that a program was loaded under.
 
     Raises:
-        BpfError: not a program.
+        BpfError: the descriptor is not a program.
     """
     return _info(program)[64:80].partition(b"\0")[0].decode(errors="replace")
 
 
 def program_id(program: int) -> int:
-    """Return the number that a program has for as long as it is there.
+    """Return the id of a program, constant while it is loaded.
 
     Raises:
-        BpfError: not a program.
+        BpfError: the descriptor is not a program.
     """
     return int(struct.unpack_from("=II", _info(program))[1])
 
@@ -290,7 +291,7 @@ def link_program(link: int) -> int:
     """Return the id of a link's program.
 
     Raises:
-        BpfError: not a link.
+        BpfError: the descriptor is not a link.
     """
     return int(struct.unpack_from("=III", _info(link))[2])
 

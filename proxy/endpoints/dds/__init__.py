@@ -1,9 +1,9 @@
-"""A live ROS 2 graph through Cyclone DDS's Python binding: for machines without ROS.
+"""DDS endpoint: a live ROS 2 graph through Cyclone DDS's Python binding, for machines without ROS.
 
-``endpoint`` is what the proxy calls; ``watch`` is the thread that hears; ``node`` is our place in the graph; ``survey``
-knows who else is there, ``discovery`` tells it; ``topics`` and ``services`` are the things that are opened;
-``library``, ``opaque``, ``policies`` and ``profile`` are what they need of Cyclone; ``naming`` and ``node_info`` say
-how ROS writes itself in DDS.
+``endpoint`` is the interface for the proxy. ``wait_thread`` receives. ``node`` is the proxy's DDS participant.
+``discovery`` fills ``graph_cache`` with the other participants. ``topics`` and ``services`` are the entities that can
+be opened. ``library``, ``opaque``, ``policies`` and ``profile`` wrap parts of Cyclone. ``naming`` and ``node_info``
+implement ROS's conventions in DDS.
 """
 
 from gdp.errors import LocalError

@@ -1,6 +1,6 @@
-"""What Cyclone DDS discovers of other participants, made into news for a survey.
+"""Discovery of other participants by Cyclone DDS, passed on to a graph cache.
 
-Place: I/O. Cyclone's built-in topics tell of participants, readers and writers; ``ros_discovery_info`` of their nodes.
+I/O. Cyclone's built-in topics report participants, readers and writers; ``ros_discovery_info`` reports their nodes.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from proxy.endpoints.qos import default
 __all__ = ["Discovery"]
 
 _BATCH: Final = 64
-_INFO_DEPTH: Final = 1_000  # as many participants may be there before we are
+_INFO_DEPTH: Final = 1_000  # so many participants may exist before this one joins
 _HANDLES: Final = 1 << 64
 
 
 class Discovery:
-    """Feeds a survey.
+    """Source of a graph cache's updates.
 
     Args:
-        changed: is called in the caller's thread after each batch of news.
+        changed: called in the caller's thread after each batch of updates.
     """
 
     def __init__(self, node: Node, survey: GraphCache, changed: News) -> None:
@@ -54,7 +54,7 @@ class Discovery:
         node.read(INFO_TOPIC, INFO_TYPE, profile, self._told)
 
     def close(self) -> None:
-        """Learn no more."""
+        """Stop discovery."""
         for _, condition, number in self._readers:
             self._node.watch.remove(condition._ref, number)
         self._readers.clear()

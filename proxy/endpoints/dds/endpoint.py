@@ -1,6 +1,6 @@
-"""The endpoint ``dds``: a ROS 2 graph through Cyclone DDS, with no ROS installed.
+"""Endpoint ``dds``: a ROS 2 graph through Cyclone DDS, without a ROS installation.
 
-Place: I/O, through its parts.
+I/O, through its parts.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ _T = TypeVar("_T", Subscription, Publication, Server, Client)
 class DdsEndpoint:
     """One node in a DDS domain, as peers see it.
 
-    CYCLONEDDS_URI configures the network, as it does for every user of Cyclone DDS.
+    CYCLONEDDS_URI configures the network, as for every program with Cyclone DDS.
 
     Args:
         domain: the domain id.
-        node: what it is called.
+        node: the name of the virtual node.
 
     Raises:
         LocalError: the domain cannot be joined.
@@ -55,7 +55,7 @@ class DdsEndpoint:
 
     @property
     def ros(self) -> RosVersion:
-        """Return which ROS it speaks."""
+        """Return the ROS version."""
         return 2
 
     @property
@@ -65,19 +65,20 @@ class DdsEndpoint:
 
     @property
     def label(self) -> str:
-        """Return what people call it."""
+        """Return the display name."""
         return f"dds domain {self._domain}"
 
     @property
     def dropped(self) -> int:
-        return 0  # what waits too long waits in the middleware, by its QoS
+        """Return 0: only the middleware drops messages."""
+        return 0  # messages wait in the middleware, which drops them by its QoS
 
     def fileno(self) -> int:
-        """Return a descriptor that is readable while ``take`` has something."""
+        """Return a descriptor that is readable while ``poll_events`` has events."""
         return self._node.watch.fileno()
 
     def poll_events(self) -> Sequence[Event]:
-        """Return, once, what happened, in order."""
+        """Remove and return the pending events, in order."""
         self._is_taking = True
         self._node.watch.catch_up()
         self._is_taking = False
@@ -86,7 +87,7 @@ class DdsEndpoint:
         return [each for each in events if isinstance(each, GraphChanged) or each.handle in self._open]
 
     def graph(self) -> Graph:
-        """Return who is there, as of the last ``take``."""
+        """Return the graph as of the last ``poll_events``."""
         return self._survey.graph()
 
     def channel(self, topic: str, type_name: str) -> Channel:
@@ -107,10 +108,10 @@ class DdsEndpoint:
         )
 
     def service(self, name: str, type_name: str) -> Service:
-        """Return a service that is served here; its messages are known as bytes.
+        """Return a service that a local node serves; its messages are opaque bytes.
 
         Raises:
-            LocalError: nobody serves it here.
+            LocalError: no node serves it here.
         """
         for peer in self._survey.peers(Role.SERVES, name, type_name):
             request, response = (Channel(name, f"{type_name}_{part}", 2) for part in ("Request", "Response"))
@@ -118,15 +119,15 @@ class DdsEndpoint:
         raise LocalError(f"{type_name} is not known here: endpoint dds knows a service while a local node serves it")
 
     def subscribe(self, topic: str, type_name: str, qos: Qos | None) -> int:
-        """Hear a topic from now on, whatever its type."""
+        """Subscribe to a topic of any type."""
         handle = next(self._numbers)
         return self._keep(handle, Subscription(self._node, self._survey, handle, self._tell, topic, type_name, qos))
 
     def advertise(self, channel: Channel) -> int:
-        """Be a publisher of a topic.
+        """Create a publisher of a topic.
 
         Raises:
-            LocalError: it is not ROS 2's, or local nodes know another type of that name.
+            LocalError: it is not ROS 2's, or local nodes have another type of that name.
         """
         if channel.ros != 2:
             raise LocalError(f"{channel.topic}: messages of ROS {channel.ros} cannot be published in DDS")
@@ -139,11 +140,11 @@ class DdsEndpoint:
         self._find(handle, Publication).publish(raw)
 
     def subscribers(self, handle: int) -> int:
-        """Return how many local subscriptions a publisher of ours has now."""
+        """Return the present number of local subscriptions of a publisher."""
         return self._find(handle, Publication).subscribers
 
     def serve(self, service: Service) -> int:
-        """Be a server for clients that speak Cyclone DDS; others are told of as ``EndpointError``.
+        """Create a server for clients on Cyclone DDS; clients on other vendors raise ``EndpointError`` events.
 
         Raises:
             LocalError: it is not ROS 2's.
@@ -161,11 +162,11 @@ class DdsEndpoint:
         self._find(handle, Server).answer(ticket, raw)
 
     def refuse(self, handle: int, ticket: int, reason: str) -> None:
-        """Answer {success: false, message: reason} where the response has these; ROS 2 knows no other way."""
+        """Answer {success: false, message: reason} where the response has these fields; ROS 2 has no other way."""
         self._find(handle, Server).refuse(ticket, reason)
 
     def create_client(self, name: str, type_name: str) -> int:
-        """Be a client of a service of servers that speak Cyclone DDS; others are told of as ``EndpointError``."""
+        """Create a client for servers on Cyclone DDS; servers on other vendors raise ``EndpointError`` events."""
         handle = next(self._numbers)
         hashed = next((peer.hash for peer in self._survey.peers(Role.SERVES, name, type_name)), "")
         client = Client(self._node, self._survey, handle, self._tell, name, type_name, hashed)
@@ -180,7 +181,7 @@ class DdsEndpoint:
         self._find(handle, Client).drop(call)
 
     def close(self, handle: int) -> None:
-        """End a subscription, publisher, server or client."""
+        """Close a subscription, publisher, server or client."""
         self._open.pop(handle).close()
 
     def remove_entity(self) -> None:
@@ -205,7 +206,7 @@ class DdsEndpoint:
         self._events.append(event)
 
     def _follow(self) -> None:
-        """Tell all who need to know that others have come or gone."""
+        """Pass changes of the graph on to all entities."""
         for opened in self._open.values():
             if not isinstance(opened, Publication):
                 opened.follow()

@@ -1,7 +1,7 @@
-"""Who is there: the readers and writers that peers announced, and whose node each is.
+"""Graph cache: the readers and writers that peers announced, and their nodes.
 
-Place: pure; discovery is fed in. The ends of a ROS participant are shown only once it has said which node they belong
-to: for a moment the ends of another proxy would look like those of a robot's node.
+Sans-I/O; discovery supplies the input. The entities of a ROS participant are shown only after it has announced their
+nodes. Until then the entities of another proxy would look like those of a robot's node.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from proxy.serial.channel import Qos
 
 __all__ = ["GraphCache", "Peer"]
 
-_PREFIX: Final = 12  # bytes of a GID that name its participant
+_PREFIX: Final = 12  # bytes of a GID that identify its participant
 
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """One reader or writer of somebody else.
+    """One reader or writer of another participant.
 
     Args:
-        named: what it is in ROS; None for the reply half of a client or server.
-        identity: of the client or server that it is a half of, empty where it is none.
+        named: its ROS name, type and role; None for the reply half of a client or server.
+        identity: of the client or server to which it belongs, empty where there is none.
     """
 
     gid: bytes
@@ -47,7 +47,7 @@ class GraphCache:
         self._graph: Graph | None = None
 
     def found(self, handle: int, peer: Peer) -> None:
-        """Learn of a reader or writer, by its instance handle."""
+        """Add a reader or writer, by its instance handle."""
         self.lost(handle)
         self._peers[handle] = peer
         if peer.named is not None:
@@ -55,7 +55,7 @@ class GraphCache:
         self._graph = None
 
     def lost(self, handle: int) -> None:
-        """Learn that it is gone."""
+        """Remove a reader or writer."""
         peer = self._peers.pop(handle, None)
         if peer is None:
             return
@@ -67,19 +67,19 @@ class GraphCache:
                 del self._named[peer.named[:2]]
 
     def joined(self, handle: int, gid: bytes) -> None:
-        """Learn of a participant that is ROS."""
+        """Add a ROS participant."""
         self._participants[handle] = gid[:_PREFIX]
         self._graph = None
 
     def left(self, handle: int) -> None:
-        """Learn that it is gone."""
+        """Remove a participant."""
         prefix = self._participants.pop(handle, None)
         if prefix is not None:
             self._nodes.pop(prefix, None)
             self._graph = None
 
     def told(self, info: NodeInfo) -> None:
-        """Learn whose the ends of a participant are."""
+        """Record the nodes of a participant's entities."""
         self._nodes[info.participant[:_PREFIX]] = dict(info.nodes)
         self._graph = None
 
@@ -88,14 +88,14 @@ class GraphCache:
         return self._peers.get(handle)
 
     def graph(self) -> Graph:
-        """Return who is there."""
+        """Return the present entities."""
         if self._graph is None:
             ros = set(self._participants.values())
             self._graph = frozenset(self._ends(ros))
         return self._graph
 
     def peers(self, role: Role, name: str, type_name: str = "") -> Iterator[Peer]:
-        """Yield those that do this with a name, whether they have told their node or not.
+        """Yield the peers of this role under a name, including those without an announced node.
 
         Args:
             type_name: those of this type only; empty: of any.

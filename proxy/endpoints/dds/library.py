@@ -1,6 +1,7 @@
-"""The few functions of Cyclone DDS that the binding does not have, or has in a way that does not serve.
+"""Library bindings for a few functions of Cyclone DDS that the Python binding lacks, or offers in an unsuitable form.
 
-Place: I/O. ``ddspy_write`` keeps all of Python waiting while it writes; ``WaitSet.wait`` does not say what it woke for.
+I/O. ``ddspy_write`` of the binding blocks all of Python while it writes; its ``WaitSet.wait`` does not report which
+condition holds.
 """
 
 from __future__ import annotations
@@ -28,12 +29,12 @@ TIMED_OUT: Final = -10  # DDS_RETCODE_TIMEOUT
 _TRIGGERED_MAX: Final = 256
 _FOREVER: Final = (1 << 63) - 1
 
-# an own handle: argument types set here must not change those of the binding
+# a separate handle: argument types set here must not change those of the binding
 _library = ct.CDLL(str(library_path))
 
 
 class _Sample(ct.Structure):
-    """What the binding's serialiser takes for a sample."""
+    """Input structure of the binding's serialiser."""
 
     _fields_ = (("raw", ct.c_char_p), ("size", ct.c_size_t))
 
@@ -69,24 +70,24 @@ def write(writer: int, raw: bytes) -> int:
 
 
 def count_readers(writer: int) -> int:
-    """Return how many readers a writer of ours has."""
+    """Return the number of matched readers of a writer."""
     return max(int(_readers(writer, None, 0)), 0)
 
 
 def count_writers(reader: int) -> int:
-    """Return how many writers a reader of ours has."""
+    """Return the number of matched writers of a reader."""
     return max(int(_writers(reader, None, 0)), 0)
 
 
 def matched_readers(writer: int) -> Sequence[int]:
-    """Return the instance handles of the readers that a writer of ours has."""
+    """Return the instance handles of a writer's matched readers."""
     room = count_readers(writer)
     found = (ct.c_uint64 * room)()
     return found[: min(max(int(_readers(writer, found, room)), 0), room)] if room else ()
 
 
 def matches(entity: int, status: int) -> None:
-    """Reset the status by which a reader or writer says that its matches have changed."""
+    """Reset the status that signals a change of a reader's or writer's matches."""
     _take_status(entity, ct.byref(ct.c_uint32()), status)
 
 
@@ -103,7 +104,7 @@ def sertype_of(topic: int) -> int:
 
 
 class WaitSet:
-    """Conditions, each with a number that says which it is."""
+    """Conditions, each with an identifying number."""
 
     def __init__(self, participant: int) -> None:
         self._ref = int(_create(participant))
@@ -112,20 +113,20 @@ class WaitSet:
             raise LocalError(f"Cyclone DDS gives no wait set (code {self._ref})")
 
     def attach(self, entity: int, number: int) -> None:
-        """Wait for this too."""
+        """Add a condition."""
         code = _attach(self._ref, entity, number)
         if code < 0:
             raise LocalError(f"Cyclone DDS cannot wait for an entity (code {code})")
 
     def detach(self, entity: int) -> None:
-        """Wait for it no more."""
+        """Remove a condition."""
         _detach(self._ref, entity)
 
     def wait(self) -> list[int]:
-        """Return the numbers of the conditions that hold, smallest first, as soon as there are any."""
+        """Block until a condition holds; return the numbers of all that hold, smallest first."""
         found = int(_wait(self._ref, self._triggered, _TRIGGERED_MAX, _FOREVER))
         return sorted(self._triggered[: min(max(found, 0), _TRIGGERED_MAX)])
 
     def delete(self) -> None:
-        """Give it back; nobody waits any more."""
+        """Free the wait set; no thread may wait on it any more."""
         _delete(self._ref)

@@ -1,6 +1,6 @@
-"""How ROS 2 writes names, types and hashes in DDS.
+"""Naming conventions of ROS 2 in DDS: names, types and hashes.
 
-Place: pure.
+Sans-I/O.
 Source: the ROS 2 design article on topic and service names; REP-2016 for ``typehash=`` in user data; rmw_cyclonedds for
 ``clientid=`` and ``serviceid=``.
 """
@@ -22,7 +22,7 @@ _REQUEST, _REPLY = "Request", "Reply"
 
 
 class Named(NamedTuple):
-    """What a DDS reader or writer is in ROS."""
+    """ROS name, type and role of a DDS reader or writer."""
 
     role: Role
     name: str
@@ -30,7 +30,7 @@ class Named(NamedTuple):
 
 
 def named(topic: str, type_name: str, *, is_writer: bool) -> Named | None:
-    """Return what a reader or writer is in ROS, None where ROS does not show it (replies, what is not ROS)."""
+    """Return the ROS identity of a reader or writer, None where ROS does not show it (replies, what is not ROS)."""
     ros_type = _ros_type(type_name)
     prefix, slash, rest = topic.partition("/")
     if not slash or not ros_type:
@@ -55,7 +55,7 @@ def _ros_type(type_name: str) -> str:
 
 
 def vendor(gid: bytes) -> str:
-    """Return whose DDS an end speaks; the first two bytes of every GUID say so."""
+    """Return the DDS vendor of an entity, from the first two bytes of its GUID."""
     return _VENDORS.get(gid[:2], f"vendor {gid[:2].hex()}")
 
 
@@ -66,7 +66,7 @@ def user_data(type_hash: str, *identities: bytes) -> bytes:
 
 
 def identity(kind: str, gid: bytes, number: int) -> bytes:
-    """Return ``clientid=1.16.…;``: how the two halves of a client or server find each other."""
+    """Return ``clientid=1.16.…;``, by which the two halves of a client or server find each other."""
     of = gid[:12] + number.to_bytes(4, "big")
     return f"{kind}={'.'.join(str(byte) for byte in of)};".encode()
 

@@ -1,7 +1,7 @@
-"""Our place in a DDS domain: one participant that looks like one ROS 2 node, and the readers and writers it has.
+"""Node: one DDS participant that appears as one ROS 2 node, with its readers and writers.
 
-Place: I/O.
-Source: rmw_dds_common for how a participant tells its nodes; the binding's own samples of built-in topics.
+I/O.
+Source: rmw_dds_common for the announcement of nodes; the binding's own samples of built-in topics.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from proxy.endpoints.qos import default
 __all__ = ["ANY_STATE", "Node", "Reader", "Sample", "Writer"]
 
 ANY_STATE: Final = SampleState.Any | ViewState.Any | InstanceState.Any
-_BATCH: Final = 64  # samples taken at once
+_BATCH: Final = 64  # samples read at once
 
 
 class Sample(NamedTuple):
@@ -37,11 +37,11 @@ class Sample(NamedTuple):
 
     raw: bytes
     writer: int  # instance handle
-    stamp_ns: int  # wall clock, when it was taken
+    stamp_ns: int  # wall clock, when it was read
 
 
 class Reader:
-    """A reader of ours; what it hears goes to ``hear`` in the caller's thread."""
+    """A reader of this node; its samples are passed to ``hear`` in the caller's thread."""
 
     def __init__(
         self, node: Node, topic: str, type_name: str, qos: DdsQos, hear: Callable[[list[Sample]], None]
@@ -57,7 +57,7 @@ class Reader:
         self._number = self._watch.add(self._source, self._drain)
 
     def close(self) -> None:
-        """Hear no more."""
+        """Stop reading."""
         self._hear = _nothing
         self._watch.remove(self._source, self._number)
         del self._condition, self._entity
@@ -66,14 +66,14 @@ class Reader:
     def _drain(self) -> News | None:
         taken = ddspy_take(self._source, ANY_STATE, _BATCH)
         if not isinstance(taken, list):
-            return None  # closed meanwhile
+            return None  # closed in the meantime
         now_ns = time.time_ns()
         samples = [Sample(raw, info.publication_handle, now_ns) for raw, info in taken if info.valid_data]
         return (lambda: self._hear(samples)) if samples else None
 
 
 class Writer:
-    """A writer of ours."""
+    """A writer of this node."""
 
     def __init__(self, node: Node, topic: str, type_name: str, qos: DdsQos) -> None:
         self._topic = OpaqueTopic(node.participant, topic, type_name)
@@ -85,7 +85,7 @@ class Writer:
         self._number: int | None = None
 
     def tell_matches(self, matched: News) -> None:
-        """Call this, in the caller's thread, when readers have come or gone."""
+        """Register a callback for joined or departed readers; it runs in the caller's thread."""
 
         def drain() -> News:
             library.matches(self.ref, DDSStatus.PublicationMatched)
@@ -100,7 +100,7 @@ class Writer:
         return library.write(self.ref, raw + bytes(4 - odd) if odd else raw)
 
     def close(self) -> None:
-        """Write no more."""
+        """Close the writer."""
         if self._number is not None:
             self._watch.remove(self.ref, self._number)
         del self._entity
@@ -132,10 +132,10 @@ class Node:
         self.announce()
 
     def read(self, topic: str, type_name: str, qos: DdsQos, hear: Callable[[list[Sample]], None]) -> Reader:
-        """Open a reader that is the node's.
+        """Open a reader of the node.
 
         Raises:
-            LocalError: DDS does not take such a reader.
+            LocalError: DDS does not accept such a reader.
         """
         try:
             reader = Reader(self, topic, type_name, qos, hear)
@@ -146,10 +146,10 @@ class Node:
         return reader
 
     def write(self, topic: str, type_name: str, qos: DdsQos) -> Writer:
-        """Open a writer that is the node's.
+        """Open a writer of the node.
 
         Raises:
-            LocalError: DDS does not take such a writer.
+            LocalError: DDS does not accept such a writer.
         """
         try:
             writer = Writer(self, topic, type_name, qos)
@@ -167,13 +167,13 @@ class Node:
         self.announce()
 
     def write_gids(self, wide: int) -> None:
-        """Write GIDs as long as peers here do."""
+        """Write GIDs of the same length as local peers do, in bytes."""
         if wide != self._wide:
             self._wide = wide
             self.announce()
 
     def announce(self) -> None:
-        """Say which readers and writers are the node's."""
+        """Announce the node's readers and writers."""
         self._info.write(write_info(self.gid, self._name, [*self._readers], [*self._writers], self._wide))
 
     def leave(self) -> None:
@@ -188,5 +188,5 @@ class Node:
 
 
 def _nothing(samples: list[Sample]) -> None:
-    """Hear what came after the end."""
+    """Ignore samples that arrive after the end."""
     del samples

@@ -1,6 +1,6 @@
-"""``ros_discovery_info``: by which a DDS participant says which nodes it holds and which ends are whose.
+"""Node information ``ros_discovery_info``: a DDS participant's announcement of its nodes and their entities.
 
-Place: pure. Up to Humble a GID has 24 bytes here, from Iron on 16.
+Sans-I/O. Up to Humble a GID has 24 bytes here, from Iron on 16.
 Source: rmw_dds_common/msg/ParticipantEntitiesInfo.
 """
 
@@ -16,7 +16,7 @@ __all__ = ["GID_BYTES", "INFO_HASH", "INFO_TOPIC", "INFO_TYPE", "NodeInfo", "rea
 INFO_TOPIC: Final = "ros_discovery_info"
 INFO_TYPE: Final = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_"
 INFO_HASH: Final = "RIHS01_91a0593bacdcc50ea9bdcf849a938b128412cc1ea821245c663bcd26f83c295e"
-GID_BYTES: Final = (16, 24)  # as Iron and later write them, as Humble did
+GID_BYTES: Final = (16, 24)  # in Iron and later, and in Humble
 _GID: Final = 16
 _LITTLE: Final = b"\x00\x01\x00\x00"
 _PAD_MAX: Final = 3
@@ -24,10 +24,10 @@ _PAD_MAX: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class NodeInfo:
-    """What one participant says of itself: whose each of its ends is.
+    """Announcement of one participant: the node of each of its entities.
 
     Args:
-        gid_bytes: how long a GID was in the message.
+        gid_bytes: length of a GID in the message.
     """
 
     participant: bytes
@@ -54,7 +54,7 @@ def write_info(participant: bytes, name: str, readers: Sequence[bytes], writers:
 
 
 def read_info(raw: bytes) -> NodeInfo | None:
-    """Return what a message says; None if it is none."""
+    """Return the content of a message; None if it is malformed."""
     for wide in GID_BYTES:
         try:
             info, end = _read(_Reader(raw[4:], "<" if raw[1:2] == b"\x01" else ">"), wide)

@@ -1,9 +1,9 @@
-"""DDS topics of types that are known by name only: any bytes go in and come out.
+"""Opaque DDS topics: only the type's name is known, and any bytes can be written and read.
 
-Place: I/O. A type of one octet is the shortest that a ROS message can be (ROS gives empty ones a dummy octet); Cyclone
-checks that the octet is there and lets the rest pass. What the type looks like must not be announced, for peers that
-know the real one would not match: ROS announces the name alone. Cyclone has no switch for that, so that the length of
-the announcement is set to zero while readers and writers of the topic exist.
+I/O. A type of one octet is the shortest possible ROS message (ROS gives empty ones a dummy octet). Cyclone checks that
+the octet exists and accepts any further bytes. The structure of the type must not be announced, because peers that know
+the real one would not match: ROS announces the name alone. Cyclone has no option for that, so the length of the
+announcement is set to zero while readers and writers of the topic exist.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from proxy.endpoints.dds.library import sertype_of
 
 __all__ = ["OpaqueTopic"]
 
-_WORDS: Final = 64  # of the C description that are searched for the type's Python object
+_WORDS: Final = 64  # of the C description, searched for the type's Python object
 _LENGTH_AT: Final = 3  # words after it: the object, flags, the announcement's address, its length
 _WORD: Final = 8
 
 
 class OpaqueTopic:
-    """One topic for one reader or writer: equal types would be merged, and the first one's would be closed with it.
+    """One topic for one reader or writer: equal types would be merged, and closed together with the first one.
 
     Raises:
-        LocalError: this is not the binding that is known here.
+        LocalError: the binding's version is unknown.
     """
 
     def __init__(self, participant: DomainParticipant, name: str, type_name: str) -> None:
-        # a class of its own that shares what the binding worked out, and never forgets, for the first one of this type
+        # A separate class that shares what the binding computed, and never frees, for the first one of this type.
         own = type("Opaque", (), {"__idl__": _model(type_name).__idl__})
         self.topic = Topic(participant, name, own)
         self._length = _announcement_length(self.topic)
@@ -45,8 +45,8 @@ class OpaqueTopic:
         self._length.value = 0
 
     def close(self) -> None:
-        """Let go; its reader or writer is closed already."""
-        self._length.value = self._full  # or what was announced is never freed
+        """Free the topic; its reader or writer is closed already."""
+        self._length.value = self._full  # otherwise the announcement is never freed
         del self.topic, self._length
 
 

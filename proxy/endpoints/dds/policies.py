@@ -1,7 +1,7 @@
-"""What a peer announces about one of its ends: its QoS profile and its user data.
+"""Policies that a peer announces for one of its entities: its QoS profile and its user data.
 
-Place: I/O. The binding reads policies into variables that all threads share, and never frees user data; these few are
-read here instead, from the C structure.
+I/O. The binding reads policies into variables that all threads share, and never frees user data. So these few are read
+from the C structure directly.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ _free.restype = None
 
 
 class Announced(NamedTuple):
-    """A profile and the user data beside it."""
+    """A profile and its user data."""
 
     qos: Qos
     user_data: bytes
 
 
 def announced(policies: int) -> Announced:
-    """Return what a peer's policies say; what they do not is as DDS has it by default.
+    """Return the announced policies of a peer; missing ones have DDS's defaults.
 
     Args:
         policies: the address of the C structure.

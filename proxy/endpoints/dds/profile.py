@@ -1,6 +1,6 @@
-"""QoS profiles of our own readers and writers, as Cyclone DDS has them.
+"""Profiles: QoS of the proxy's own readers and writers, in Cyclone DDS's form.
 
-Place: imports the binding; no other I/O.
+Imports the binding; no other I/O.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ __all__ = ["offered", "requested"]
 
 _SECOND: Final = 1_000_000_000
 _FOREVER: Final = (1 << 63) - 1
-_PATIENCE: Final = _SECOND // 10  # a writer whose readers do not keep up gives up so soon: nobody waits for long
+# a writer whose readers do not keep up gives up after this time, so that it blocks only briefly
+_PATIENCE: Final = _SECOND // 10
 _LIVELINESS: Final = {
     "automatic": Policy.Liveliness.Automatic,
     "manual_by_participant": Policy.Liveliness.ManualByParticipant,
@@ -26,12 +27,12 @@ _LIVELINESS: Final = {
 
 
 def requested(qos: Qos, user_data: bytes) -> DdsQos:
-    """Return what a reader of ours requests."""
+    """Return the QoS that a local reader requests."""
     return DdsQos(*_common(qos, user_data))
 
 
 def offered(qos: Qos, user_data: bytes) -> DdsQos:
-    """Return what a writer of ours offers."""
+    """Return the QoS that a local writer offers."""
     kept = Policy.History.KeepLast(max(qos.depth, 1))
     return DdsQos(
         *_common(qos, user_data),
@@ -48,7 +49,7 @@ def _common(qos: Qos, user_data: bytes) -> list[object]:
     return [
         Policy.Reliability.Reliable(_PATIENCE) if is_reliable else Policy.Reliability.BestEffort,
         Policy.Durability.TransientLocal if is_kept else Policy.Durability.Volatile,
-        # never KeepAll: with a reader that stalls it would hold up the writer, and all that the process does
+        # Never KeepAll: a stalled reader would block the writer, and with it the whole process.
         Policy.History.KeepLast(max(qos.depth, 1)),
         Policy.Deadline(_nanoseconds(qos.deadline)),
         liveliness(_nanoseconds(qos.lease)),

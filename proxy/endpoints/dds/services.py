@@ -1,8 +1,8 @@
-"""A server and a client of the virtual node, as Cyclone DDS's peers have them.
+"""Services of the virtual node: servers and clients that interoperate with Cyclone DDS's peers.
 
-Place: I/O, through the node. rmw_cyclonedds puts the client (8 bytes) and a call's number (8 bytes) before the message.
-Fast DDS and others put them into the header of the RTPS sample, which the binding can neither write nor read: services
-with such peers are refused with a reason.
+I/O, through the node. rmw_cyclonedds puts the client (8 bytes) and a call's number (8 bytes) before the message. Fast
+DDS and others put them into the header of the RTPS sample, which the binding can neither write nor read. Services with
+such peers are refused with a reason.
 Source: rmw_cyclonedds_cpp, ``cdds_request_header_t`` and ``clientid``/``serviceid`` in user data.
 """
 
@@ -25,12 +25,12 @@ __all__ = ["Client", "Server"]
 
 _PREFIX: Final = 4  # CDR encapsulation
 _HEADER: Final = 16
-_QOS: Final = default(depth=1_000)  # a thousand calls at once, and none pushes out another
+_QOS: Final = default(depth=1_000)  # a thousand calls at once without eviction
 _WAITING_MAX: Final = 1_000
 
 
 class _Halves:
-    """The request and the reply of one service, on our side of it."""
+    """The local halves of a service's request and reply topics."""
 
     def __init__(self, node: Node, name: str, type_name: str, role: Role, number: int, type_hash: str) -> None:
         self._node = node
@@ -45,21 +45,21 @@ class _Halves:
         self.reader = node.read(heard[0], dds_type(heard[1]), requested(_QOS, data), self.heard)
 
     def matched(self) -> None:
-        """Learn that readers of our half have come or gone."""
+        """Process a change of the matched readers."""
         raise NotImplementedError
 
     def heard(self, samples: list[Sample]) -> None:
-        """Take what came."""
+        """Process received samples."""
         raise NotImplementedError
 
     def close(self) -> None:
-        """Take part no more."""
+        """Close both halves."""
         self._node.close(self.reader, self.writer)
 
 
 class _Ask(NamedTuple):
     header: bytes
-    client: int  # instance handle of the writer that it came from
+    client: int  # instance handle of the request's writer
 
 
 class Server(_Halves):
@@ -84,15 +84,15 @@ class Server(_Halves):
         self._no_answer = no_answer
         self._tickets = tickets
         self._asks: dict[int, _Ask] = {}
-        self._early = deque[Sample](maxlen=_WAITING_MAX)  # of clients that are not known yet
-        self._late = deque[tuple[_Ask, bytes]](maxlen=_WAITING_MAX)  # whose clients cannot hear us yet
+        self._early = deque[Sample](maxlen=_WAITING_MAX)  # of clients that are not discovered yet
+        self._late = deque[tuple[_Ask, bytes]](maxlen=_WAITING_MAX)  # whose clients do not match the reply writer yet
         self._matched: frozenset[bytes] = frozenset()
         self._fault = ""
         super().__init__(node, name, type_name, Role.SERVES, handle, type_hash)
         self.follow()
 
     def follow(self) -> None:
-        """Learn who calls now."""
+        """Update the clients."""
         self._fault = _tell_fault(self._survey, Role.CALLS, self._name, self._fault, self._handle, self._tell)
         gone = [ticket for ticket, ask in self._asks.items() if self._survey.peer(ask.client) is None]
         for ticket in gone:
@@ -102,12 +102,12 @@ class Server(_Halves):
         self.matched()
 
     def heard(self, samples: list[Sample]) -> None:
-        """Take requests."""
+        """Process requests."""
         for sample in samples:
             self._ask(sample)
 
     def answer(self, ticket: int, raw: bytes) -> None:
-        """Answer a request, as soon as its client can hear that."""
+        """Answer a request, as soon as its client matches the reply writer."""
         ask = self._asks.pop(ticket, None)
         if ask is None:
             return
@@ -117,14 +117,14 @@ class Server(_Halves):
             self._late.append((ask, raw))
 
     def refuse(self, ticket: int, reason: str) -> None:
-        """Answer with the reason, if the response can say one; else the client's own patience must end it."""
+        """Answer with the reason, if the response has a field for it; else the client's own timeout ends the call."""
         if self._no_answer is not None and self._no_answer.says_reason:
             self.answer(ticket, self._no_answer.to_raw(reason))
         else:
             self._asks.pop(ticket, None)
 
     def matched(self) -> None:
-        """Answer those whose replies found nobody yet."""
+        """Answer the clients that had no matching reader yet."""
         peers = [self._survey.peer(handle) for handle in library.matched_readers(self.writer.ref)]
         self._matched = frozenset(peer.identity for peer in peers if peer is not None)
         for _ in range(len(self._late)):
@@ -138,7 +138,8 @@ class Server(_Halves):
         raw, client = sample.raw, self._survey.peer(sample.writer)
         if client is None:
             self._early.append(sample)
-        elif client.gid.startswith(CYCLONE) and len(raw) >= _PREFIX + _HEADER:  # of others ``follow`` has told
+        # for other vendors ``follow`` has reported the fault
+        elif client.gid.startswith(CYCLONE) and len(raw) >= _PREFIX + _HEADER:
             ticket = self._tickets()
             self._asks[ticket] = _Ask(raw[_PREFIX : _PREFIX + _HEADER], sample.writer)
             self._tell(RequestReceived(self._handle, ticket, raw[:_PREFIX] + raw[_PREFIX + _HEADER :]))
@@ -185,7 +186,7 @@ class Client(_Halves):
         self.follow()
 
     def follow(self) -> None:
-        """Learn who serves now; calls whose servers are all gone have failed."""
+        """Update the servers; calls fail when all their servers have left."""
         self._fault = _tell_fault(self._survey, Role.SERVES, self._name, self._fault, self._handle, self._tell)
         servers = self._servers()
         for sequence, call in list(self._calls.items()):
@@ -197,7 +198,7 @@ class Client(_Halves):
     def call(self, number: int, raw: bytes) -> None:
         """Send a request, as soon as there is a server that can answer it.
 
-        Every server of a name gets every request: one of another vendor would take ours for something else.
+        Every server of a name receives every request: one of another vendor would misread it.
         """
         servers = self._servers()
         if self._fault or not servers:
@@ -219,13 +220,13 @@ class Client(_Halves):
             self._forget(sequence)
 
     def matched(self) -> None:
-        """Send what waited for a server."""
+        """Send the requests that waited for a server."""
         if self._early and self._is_matched():
             while self._early:
                 self._send(*self._early.popleft())
 
     def heard(self, samples: list[Sample]) -> None:
-        """Take responses; those of other clients come too."""
+        """Process responses; those for other clients arrive too."""
         for raw, _, _ in samples:
             if raw[_PREFIX : _PREFIX + 8] != self._me or len(raw) < _PREFIX + _HEADER:
                 continue
@@ -260,7 +261,7 @@ class Client(_Halves):
 def _tell_fault(
     survey: GraphCache, role: Role, name: str, before: str, handle: int, tell: Callable[[Event], None]
 ) -> str:
-    """Say once that a peer of another vendor is there; return what is wrong now."""
+    """Report once that a peer of another vendor is present; return the present fault."""
     others = {vendor(peer.gid) for peer in survey.peers(role, name) if not peer.gid.startswith(CYCLONE)}
     if not others:
         return ""

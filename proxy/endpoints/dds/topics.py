@@ -1,6 +1,6 @@
-"""A subscription and a publisher of the virtual node.
+"""Topics of the virtual node: a subscription and a publisher.
 
-Place: I/O, through the node.
+I/O, through the node.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ __all__ = ["Publication", "Subscription"]
 
 
 class Subscription:
-    """Hears a topic; its type need not be known here."""
+    """Subscribes to a topic; its type need not be known here."""
 
     def __init__(
         self,
@@ -48,10 +48,10 @@ class Subscription:
         self._reader = node.read(f"rt{topic}", dds_type(type_name), profile, self._hear)
 
     def follow(self) -> None:
-        """Learn who publishes now, and so what the messages are."""
+        """Update the publishers, and with them the description of the messages."""
         topic, type_name = self._bare.topic, self._bare.type_name
         hashes = sorted({peer.hash for peer in self._survey.peers(Role.PUBLISHES, topic, type_name)} - {""})
-        # what was described stays so while there are publishers of that hash
+        # A description remains valid while there are publishers of its hash.
         if self._channel is None or (hashes and self._channel.hash not in hashes):
             self._describe(hashes[0] if hashes else "")
         fault = f"publishers disagree about {type_name}: {', '.join(hashes)}" if len(hashes) > 1 else ""
@@ -60,7 +60,7 @@ class Subscription:
         self._fault = fault
 
     def close(self) -> None:
-        """Hear no more."""
+        """Close the subscription."""
         self._node.close(self._reader)
 
     def _describe(self, peers_hash: str) -> None:
@@ -80,7 +80,7 @@ class Publication:
     """Publishes a topic.
 
     Raises:
-        LocalError: it is of another type here, or not ROS 2's.
+        LocalError: it has another type here, or is not ROS 2's.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class Publication:
 
     @property
     def subscribers(self) -> int:
-        """Return how many readers it has now."""
+        """Return the present number of readers."""
         return library.count_readers(self._writer.ref)
 
     def publish(self, raw: bytes) -> None:
@@ -119,5 +119,5 @@ class Publication:
         self._is_late = code < 0
 
     def close(self) -> None:
-        """Publish no more."""
+        """Close the publisher."""
         self._node.close(self._writer)

@@ -1,6 +1,6 @@
-"""What a machine without ROS knows of types: those that every ROS 2 has.
+"""Types of a machine without ROS: those that every ROS 2 has.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def known_channel(topic: str, type_name: str) -> Channel | None:
 
 
 def hash_of(channel: Channel) -> str:
-    """Return the ROS 2 type hash of a channel: its own, or what its definition gives; empty where that says nothing."""
+    """Return the ROS 2 type hash of a channel: its own, or that of its definition; empty where it cannot be derived."""
     if channel.hash.startswith("RIHS01_"):
         return channel.hash
     if channel.definition:

@@ -1,7 +1,7 @@
-"""The thread that waits for Cyclone DDS and takes what it has; what that means is worked out in the caller's thread.
+"""Wait-set thread: waits for Cyclone DDS and reads its samples; the caller's thread processes them.
 
-Place: I/O. Listeners of the binding run Python in Cyclone's own threads, with its locks held; this one holds none. The
-queue is short: while the caller does not come, samples wait in their readers, which keep the newest.
+I/O. Listeners of the binding run Python in Cyclone's own threads, with its locks held; this thread holds none. The
+queue is short: while the caller does not poll, samples wait in their readers, which keep the newest.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ log = logging.getLogger(__name__)
 
 _QUEUE_MAX: Final = 64
 
-News: TypeAlias = Callable[[], None]  # what to do about it, in the caller's thread
-Drain: TypeAlias = Callable[[], News | None]  # takes what is there, in the watch's own thread
+News: TypeAlias = Callable[[], None]  # processing of the samples, in the caller's thread
+Drain: TypeAlias = Callable[[], News | None]  # reads the samples, in the wait-set thread
 
 
 class WaitThread:
@@ -46,10 +46,10 @@ class WaitThread:
         self._thread.start()
 
     def add(self, entity: int, drain: Drain) -> int:
-        """Watch a condition, or the status of a reader or writer; return a number to end that with.
+        """Watch a condition, or the status of a reader or writer; return a number for ``remove``.
 
         Args:
-            drain: is called until the condition no longer holds.
+            drain: called until the condition no longer holds.
         """
         number = next(self._numbers)
         self._drains[number] = drain
@@ -57,12 +57,12 @@ class WaitThread:
         return number
 
     def remove(self, entity: int, number: int) -> None:
-        """Watch it no more; ``drain`` may be under way once more."""
+        """Stop watching; ``drain`` may run once more."""
         self._set.detach(entity)
         del self._drains[number]
 
     def fileno(self) -> int:
-        """Return a descriptor that is readable while ``catch_up`` has something."""
+        """Return a descriptor that is readable while ``catch_up`` has work."""
         return self._wake
 
     def tell(self) -> None:
@@ -70,7 +70,7 @@ class WaitThread:
         os.eventfd_write(self._wake, 1)
 
     def catch_up(self) -> None:
-        """Do what is to be done about what came."""
+        """Process what was read."""
         try:
             os.eventfd_read(self._wake)
         except BlockingIOError:
@@ -103,7 +103,7 @@ class WaitThread:
     def _take(self, drain: Drain) -> None:
         try:
             news = drain()
-        except Exception as error:  # what a peer announces, the binding may fail to read in any way
+        except Exception as error:  # the binding may fail in any way on a peer's announcement
             log.warning("something in DDS could not be read reason=%s", error)
             return
         if news is not None:

@@ -1,7 +1,7 @@
-"""One ROS 1 graph: rospy in a process of its own per master (``child``), its twin in the proxy (``endpoint``), and the
-wire between the two (``link``).
+"""ROS 1 endpoint of one graph: a rospy process per master (``child``), its counterpart in the proxy (``endpoint``), and
+the IPC between them (``ipc``).
 
-Place: I/O. Only the process of ``child`` imports rospy, genpy and genmsg.
+I/O. Only the process of ``child`` imports rospy, genpy and genmsg.
 """
 
 from __future__ import annotations

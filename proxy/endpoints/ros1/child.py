@@ -1,7 +1,7 @@
-"""The process that speaks rospy: ``python -m proxy.endpoints.ros1.child FD MASTER NODE LIFE DELAY_S``.
+"""Child process that runs rospy: ``python -m proxy.endpoints.ros1.child FD MASTER NODE INCARNATION DELAY_S``.
 
-Place: a shell. FD is its end of the link; it ends when that does. LIFE counts such processes of one endpoint; DELAY_S
-is how long this one stays off the graph, because an earlier one has failed.
+I/O. FD is its side of the IPC link; the process ends when the link does. INCARNATION counts such processes of one
+endpoint; DELAY_S is how long this one stays off the graph, because an earlier one has failed.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from proxy.endpoints.ros1.ipc import IpcLink, Kind
 
 
 def main() -> None:
-    """Serve the link, until it ends."""
+    """Serve the IPC link until it ends."""
     descriptor, master, node, life, delay_s = sys.argv[1:]
     woken = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
     link = IpcLink(socket.socket(fileno=int(descriptor)), lambda: os.eventfd_write(woken, 1))
     try:
-        # First: a ROS 2 of this interpreter has packages of the same names.
+        # This comes first: a ROS 2 of this interpreter has packages of the same names.
         sys.path.insert(0, rospy_folder())
         from proxy.endpoints.ros1.node import Node
     except (ImportError, LocalError) as error:

@@ -1,7 +1,7 @@
-"""One ROS 1 graph, as the proxy sees it: every word goes to a rospy process, and comes from it.
+"""ROS 1 endpoint in the proxy: forwards every operation to a rospy process, and returns its events.
 
-Place: I/O; a process and a socket pair. When the process ends, or its master is started anew, another one is started
-and everything is established again; until then the handles are faulted.
+I/O; a process and a socket pair. When the process ends, or its master restarts, another process is started and all
+handles are established again; until then the handles are faulted.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ _ANSWER_S: Final = 1.0
 _START_S: Final = 4.0  # a process that has just been started answers later
 _FAREWELL_S: Final = 2.0
 _DELAY_MAX_S: Final = 5.0
-_SOUND_S: Final = 10.0  # a process that lasted that long had not failed at once
+_SOUND_S: Final = 10.0  # a process that ran this long did not fail at its start
 _ROOT: Final = Path(__file__).resolve().parents[3]
 
 
 @dataclass(slots=True)
 class _Held:
-    """What a handle is, enough to establish it anew.
+    """Definition of a handle, sufficient to establish it again.
 
     Args:
         kind: of the frame that establishes it, with ``payload``.
@@ -74,7 +74,7 @@ class Ros1Endpoint:
         """Start the rospy process; it joins the graph as soon as the master answers.
 
         Raises:
-            LocalError: there is no rospy.
+            LocalError: rospy is not installed.
         """
         rospy_folder()
         self._master_uri = master_uri
@@ -83,8 +83,8 @@ class Ros1Endpoint:
         self._held: dict[int, _Held] = {}
         self._events: list[Event] = []
         self._graph: Graph = frozenset()
-        self._is_graph_old = True  # the next one is news, whatever it shows
-        self._trouble = ""  # why nothing works now; told to handles made meanwhile
+        self._is_graph_old = True  # the next snapshot counts as a change, whatever it shows
+        self._trouble = ""  # the present fault; also reported to handles created while it lasts
         self._answers: dict[int, bytes | None] = {}
         self._known: dict[tuple[Kind, str, str], bytes] = {}
         self._life = 0
@@ -114,15 +114,15 @@ class Ros1Endpoint:
 
     @property
     def dropped(self) -> int:
-        """Return how many messages were dropped on the way between the two processes, oldest of a topic first."""
+        """Return the number of messages dropped between the two processes, oldest of a topic first."""
         return self._lost_before + self._link.dropped + self._lost
 
     def fileno(self) -> int:
-        """Return a descriptor that is readable while ``take`` has something."""
+        """Return a descriptor that is readable while ``poll_events`` has events."""
         return self._epoll.fileno()
 
     def poll_events(self) -> Sequence[Event]:
-        """Return, once, what happened, in order."""
+        """Remove and return the pending events, in order."""
         self._pump()
         if self._events:
             self._drain_woken()
@@ -130,29 +130,29 @@ class Ros1Endpoint:
         return events
 
     def graph(self) -> Graph:
-        """Return who is there."""
+        """Return the present entities."""
         return self._graph
 
     def channel(self, topic: str, type_name: str) -> Channel:
-        """Return what an installed ROS 1 package says of a type; may wait, up to a second."""
+        """Return an installed ROS 1 package's description of a type; may block up to a second."""
         wire = self._ask(Kind.ASK_CHANNEL, topic, type_name)
         if wire is None:
             raise LocalError(f"{type_name} is not known here as a ROS 1 type: install its ROS 1 package")
         return Channel.from_wire(wire)
 
     def service(self, name: str, type_name: str) -> Service:
-        """Return what an installed package says of a type, or, without definitions, what a live server does."""
+        """Return an installed package's description of a type, or, without definitions, that of a live server."""
         wire = self._ask(Kind.ASK_SERVICE, name, type_name)
         if wire is None:
             raise LocalError(f"{type_name} is not known here as a ROS 1 service type: install its ROS 1 package")
         return Service.from_wire(wire)
 
     def subscribe(self, topic: str, type_name: str, qos: Qos | None) -> int:  # noqa: ARG002  # of any type and QoS
-        """Hear a topic from now on, whatever its publishers' type."""
+        """Subscribe to a topic, whatever its publishers' type."""
         return self._hold(_Held(Kind.SUBSCRIBE, topic.encode()))
 
     def advertise(self, channel: Channel) -> int:
-        """Be a publisher; if something local contradicts, ``EndpointError`` follows."""
+        """Create a publisher; if a local node contradicts, ``EndpointError`` follows."""
         if channel.ros != 1 or not (channel.hash or channel.definition):
             here = self.channel(channel.topic, channel.type_name)
             channel = Channel(
@@ -171,11 +171,11 @@ class Ros1Endpoint:
         self._link.send(Kind.PUBLISH, handle, 0, raw)
 
     def subscribers(self, handle: int) -> int:
-        """Return how many local subscriptions a publisher of ours has now."""
+        """Return the present number of local subscriptions of a publisher."""
         return self._held[handle].subscribers
 
     def serve(self, service: Service) -> int:
-        """Be a server; if something local contradicts, ``EndpointError`` follows."""
+        """Create a server; if a local node contradicts, ``EndpointError`` follows."""
         if service.ros != 1:
             service = self.service(service.name, service.type_name)
         return self._hold(_Held(Kind.SERVE, service.to_wire()))
@@ -189,7 +189,7 @@ class Ros1Endpoint:
         self._link.send(Kind.REFUSE, handle, ticket, reason.encode())
 
     def create_client(self, name: str, type_name: str) -> int:
-        """Be a client of a local service; nothing but its type's name need be known."""
+        """Create a client of a local service; only its type's name need be known."""
         return self._hold(_Held(Kind.DIAL, cbor2.dumps([name, type_name])))
 
     def call(self, handle: int, call: int, raw: bytes) -> None:
@@ -206,13 +206,13 @@ class Ros1Endpoint:
             self._link.send(Kind.DROP, handle, call)
 
     def close(self, handle: int) -> None:
-        """End a subscription, publisher, server or client."""
+        """Close a subscription, publisher, server or client."""
         if self._held.pop(handle, None) is not None:
             self._link.send(Kind.CLOSE, handle)
             self._events = [event for event in self._events if getattr(event, "handle", None) != handle]
 
     def remove_entity(self) -> None:
-        """Leave the graph; may wait two seconds for the process to say farewell to the master."""
+        """Leave the graph; may block two seconds while the process unregisters from the master."""
         self._link.close()
         self._ended.append(self._process)
         until_s = time.monotonic() + _FAREWELL_S
@@ -244,7 +244,7 @@ class Ros1Endpoint:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,  # rospy prints there
                 env=environment,
-                start_new_session=True,  # Ctrl-C is for the proxy, which then closes the link
+                start_new_session=True,  # Ctrl-C goes to the proxy, which then closes the link
             )
         self._link = IpcLink(ours, self._watch_room)
         self._epoll.register(ours, select.EPOLLIN)
@@ -257,7 +257,7 @@ class Ros1Endpoint:
             self._link.send(Kind.PUBLISH, handle, 0, raw)
 
     def _restart(self) -> None:
-        """The process has ended: fail what was under way, and start another, later each time."""
+        """Fail the calls under way after the process has ended, and start another, with a growing delay."""
         self._process.kill()
         self._ended = [process for process in (*self._ended, self._process) if process.poll() is None]
         self._lost_before += self._link.dropped + self._lost
@@ -278,7 +278,7 @@ class Ros1Endpoint:
         self._epoll.modify(self._link, select.EPOLLIN | select.EPOLLOUT)
 
     def _pump(self) -> None:
-        """Move what can be moved on the link, without waiting."""
+        """Transfer frames on the link without blocking."""
         if self._link.is_behind:
             self._link.flush()
             if not self._link.is_behind:
@@ -365,10 +365,10 @@ class Ros1Endpoint:
         try:
             os.eventfd_read(self._woken)
         except BlockingIOError:
-            return  # nobody had to wake
+            return  # no wake-up was needed
 
     def _ask(self, kind: Kind, name: str, type_name: str) -> bytes | None:
-        """Ask the process, wait for its answer, and keep what happens meanwhile for ``take``.
+        """Query the process, wait for its response, and keep events that arrive meanwhile for ``poll_events``.
 
         Raises:
             LocalError: it does not answer in time.

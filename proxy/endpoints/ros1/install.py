@@ -1,6 +1,6 @@
-"""Where ROS 1's Python lies.
+"""Installation folder of ROS 1's Python packages.
 
-Place: I/O; the import system. Imports nothing of ROS.
+I/O; the import system. Imports nothing of ROS.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def rospy_folder() -> str:
     """Return the folder to import rospy from: of a sourced ROS 1, or Debian's.
 
     Raises:
-        LocalError: there is none; the text says what to install.
+        LocalError: there is none; the text states what to install.
     """
     spec = importlib.util.find_spec("rospy")
     if spec is not None and spec.origin is not None:

@@ -1,13 +1,13 @@
-"""The wire between the proxy and its rospy process: frames with a short head on a socket pair, never waiting.
+"""IPC between the proxy and its rospy process: frames with a short header on a non-blocking socket pair.
 
-Place: I/O; a socket that is given. Both ends are the same program, so nothing here defends against the peer.
+I/O; on a given socket. Both sides are the same program, so nothing here defends against the peer.
 
     0        4      5        13       21
     | length | kind | handle | number | payload, ``length`` bytes
-    little-endian; handle: the endpoint's; number: a call, a ticket, a stamp, a question or a count, as the kind says.
+    little-endian; handle: the endpoint's; number: a call, a ticket, a stamp, a question or a count, by kind.
 
-A message goes out in one gathering write, uncopied, while the peer keeps up. What it does not take waits, bounded: when
-the budget is spent, the oldest waiting message of the same topic is dropped and counted.
+A message is sent in one gathering write, uncopied, while the peer keeps up. The rest waits in a bounded queue: when the
+budget is spent, the oldest waiting message of the same topic is dropped and counted.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ __all__ = ["Frame", "IpcLink", "Kind", "LinkEndedError"]
 _HEAD: Final = struct.Struct("<IBqq")
 _CHUNK_BYTES: Final = 65_536
 _BUDGET_BYTES: Final = 64 << 20
-_TURN_BYTES: Final = 4 << 20  # taken in one go, lest the caller's other work waits
+_TURN_BYTES: Final = 4 << 20  # received in one go, so that the caller's other work does not wait
 _GATHER: Final = 64  # waiting frames in one write
 
 
 class Kind(IntEnum):
-    """What a frame says. Down: to rospy; up: from it."""
+    """Kind of a frame. Down: to rospy; up: from it."""
 
-    # down: each makes the handle
+    # down: each creates the handle
     SUBSCRIBE = 1
     ADVERTISE = 2
     SERVE = 3
@@ -58,8 +58,8 @@ class Kind(IntEnum):
     COUNTED = 39  # number: subscribers
     KNOWN = 40  # number: the question
     UNKNOWN = 41
-    LOST = 42  # number: messages dropped for want of room, in all
-    ENDING = 43  # why the process ends
+    LOST = 42  # total of messages dropped because the queue was full
+    ENDING = 43  # reason why the process ends
 
 
 _MESSAGES: Final = frozenset({Kind.PUBLISH, Kind.HEARD})
@@ -80,7 +80,7 @@ class Frame(NamedTuple):
 
 
 class _Waiting:
-    """A frame that the socket has not taken; of size 0 once it was sent or dropped. ``topic``: it may be dropped."""
+    """A frame that the socket has not accepted; of size 0 once it was sent or dropped. ``topic``: it may be dropped."""
 
     __slots__ = ("size", "topic", "views")
 
@@ -91,10 +91,10 @@ class _Waiting:
 
 
 class IpcLink:
-    """One end. ``send`` may be called from any thread; the rest from one."""
+    """One side of the link. ``send`` may be called from any thread; the rest from one."""
 
     def __init__(self, sock: socket.socket, behind: Callable[[], None], *, budget_bytes: int = _BUDGET_BYTES) -> None:
-        """Take a stream socket over; ``behind`` is called, from any thread, when something begins to wait."""
+        """Own a stream socket; ``behind`` is called, from any thread, when a frame begins to wait."""
         sock.setblocking(False)
         self.dropped = 0
         self._sock = sock
@@ -114,13 +114,13 @@ class IpcLink:
 
     @property
     def is_behind(self) -> bool:
-        """Return whether something waits: call ``flush`` when the socket takes more."""
+        """Return whether frames wait: call ``flush`` when the socket is writable."""
         return bool(self._queue)
 
     def send(self, kind: Kind, handle: int = 0, number: int = 0, payload: bytes = b"") -> bool:
-        """Send a frame, or let it wait; return False if it was not taken, which only happens to messages and requests.
+        """Send or queue a frame; return False if it was not accepted, which only happens to messages and requests.
 
-        A frame for a process that is gone counts as sent: ``receive`` tells.
+        A frame for a process that is gone counts as sent: ``receive`` reports the end.
         """
         views = [memoryview(_HEAD.pack(len(payload), kind, handle, number)), memoryview(payload)]
         with self._lock:
@@ -141,7 +141,7 @@ class IpcLink:
             return True
 
     def flush(self) -> None:
-        """Write what waits, as far as the socket takes it."""
+        """Write waiting frames, as far as the socket accepts them."""
         with self._lock:
             while self._queue:
                 batch = list(itertools.islice(self._queue, _GATHER))
@@ -159,10 +159,10 @@ class IpcLink:
                     self._queue.popleft()
 
     def receive(self) -> list[Frame]:
-        """Return the frames that have come, up to some megabytes of them.
+        """Return the received frames, up to some megabytes of them.
 
         Raises:
-            LinkEndedError: nothing more will come; frames read before were returned before.
+            LinkEndedError: the link has ended; frames read earlier were returned earlier.
         """
         frames: list[Frame] = []
         taken = 0
@@ -175,7 +175,7 @@ class IpcLink:
                 count = 0
             if not count:
                 if frames:
-                    break  # the end is read again
+                    break  # the next call reads the end again
                 raise LinkEndedError
             taken += count
         return frames
@@ -214,7 +214,7 @@ class IpcLink:
         return len(chunk)
 
     def _write(self, views: list[memoryview]) -> list[memoryview]:
-        """Return what the socket does not take now."""
+        """Return the part that the socket does not accept now."""
         views = [view for view in views if len(view)]
         while views:
             try:
@@ -248,7 +248,7 @@ class IpcLink:
         return False
 
     def _undroppable(self, waiting: _Waiting) -> None:
-        """It is the oldest of its topic: they are sent in order."""
+        """Protect the oldest frame of its topic from being dropped: frames of a topic are sent in order."""
         if waiting.topic is not None:
             older = self._topics[waiting.topic]
             older.popleft()
@@ -257,7 +257,7 @@ class IpcLink:
             waiting.topic = None
 
     def _begin(self, waiting: _Waiting, sent: int) -> None:
-        """Its first ``sent`` bytes are gone, so the rest must follow."""
+        """Mark a frame whose first ``sent`` bytes are written, so that the rest must follow."""
         self._undroppable(waiting)
         left = []
         for view in waiting.views:

@@ -1,9 +1,10 @@
-"""Looking at a ROS 1 graph: a master tells nobody what is new, so it is asked twice a second.
+"""Master poller of a ROS 1 graph: a master does not push changes, so it is queried twice a second.
 
-Place: I/O; XML-RPC to the master, TCP to nodes and servers. Runs in the rospy process, on its own thread, yet needs
-nothing of rospy.
-Source: ROS wiki, Master API and TCPROS header. A master keeps nodes that died without a farewell, and knows no service
-types: a node whose port refuses is left out until it answers again, and a server is asked for its type with a probe.
+I/O; XML-RPC to the master, TCP to nodes and servers. Runs in the rospy process, on its own thread, but does not use
+rospy.
+Source: ROS wiki, Master API and TCPROS header. A master keeps nodes that died without unregistering, and does not know
+service types. So a node whose port refuses is omitted until it answers again, and a probe asks each server for its
+type.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ _PIECE_BYTES: Final = 64 << 10
 _REASON_MAX: Final = 300
 
 
-# What xmlrpc.client raises for an answer that is no XML-RPC; the parser's handlers fail in many ways.
+# These are raised by xmlrpc.client for an answer that is not XML-RPC; the parser's handlers fail in many ways.
 _FOREIGN: Final = (
     OSError,
     xmlrpc.client.Error,
@@ -54,11 +55,11 @@ _FOREIGN: Final = (
 
 
 class MasterError(Exception):
-    """The master, a node or a server does not answer, or not as it should."""
+    """The master, a node or a server does not answer, or answers wrongly."""
 
 
 class LocalEnd(NamedTuple):
-    """One end, in the words of ROS 1; ``role`` is a value of ``Role``."""
+    """One graph entity in the terms of ROS 1; ``role`` is a value of ``Role``."""
 
     role: str
     name: str
@@ -69,12 +70,12 @@ class LocalEnd(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class GraphSnapshot:
-    """What one look at the master showed.
+    """Result of one poll of the master.
 
     Args:
-        ends: of all nodes but ours that are alive, with a known type.
-        servers: of all services but ours, service to node.
-        is_ours_known: the master knows our node.
+        ends: of all other nodes that are alive, with a known type.
+        servers: of all other services, service to node.
+        is_ours_known: the master knows this node.
     """
 
     ends: frozenset[LocalEnd]
@@ -91,7 +92,7 @@ class _Transport(xmlrpc.client.Transport):
         return connection
 
     def parse_response(self, response: http.client.HTTPResponse) -> tuple[Any, ...]:
-        """Read an answer as it is, unpacked and at most ``_ANSWER_MAX_BYTES`` long."""
+        """Read a response uninterpreted, unpacked and at most ``_ANSWER_MAX_BYTES`` long."""
         if response.getheader("Content-Encoding", ""):
             raise MasterError("an answer in an encoding that nobody asked for")
         parser, target = self.getparser()
@@ -106,17 +107,17 @@ class _Transport(xmlrpc.client.Transport):
 
 
 class Master:
-    """A master's slow, careful caller. Used from one thread."""
+    """XML-RPC client of a master with timeouts. Used from one thread."""
 
     def __init__(self, uri: str, node: str) -> None:
         self._proxy = xmlrpc.client.ServerProxy(uri, transport=_Transport())
         self._node = node
 
     def ask(self, *calls: tuple[str, ...]) -> list[object]:
-        """Return the answers to several calls, each (method, argument...), asked in one go; None where one is refused.
+        """Return the responses to a batch of calls, each (method, argument...); None for a refused call.
 
         Raises:
-            MasterError: no answer at all.
+            MasterError: no response at all.
         """
         several = xmlrpc.client.MultiCall(self._proxy)
         for method, *arguments in calls:
@@ -133,7 +134,7 @@ class Master:
 
 
 class MasterWatch:
-    """The graph, looked at again and again."""
+    """Periodic polling of the graph."""
 
     def __init__(self, uri: str, node: str) -> None:
         self._master = Master(uri, node)
@@ -144,7 +145,7 @@ class MasterWatch:
         self._next_liveness_s = 0.0
 
     def look(self) -> GraphSnapshot:
-        """Ask the master, and new servers for their types.
+        """Query the master, and probe new servers for their types.
 
         Raises:
             MasterError: the master does not answer.
@@ -177,7 +178,7 @@ class MasterWatch:
     def run(
         self, stopped: threading.Event, seen: Callable[[GraphSnapshot], None], failed: Callable[[str], None]
     ) -> None:
-        """Look until ``stopped``; ``failed`` is told once of every silence."""
+        """Poll until ``stopped``; ``failed`` is called once for every outage."""
         is_silent = False
         while not stopped.is_set():
             try:
@@ -195,7 +196,7 @@ class MasterWatch:
         return node != self._node and node not in self._dead
 
     def _check_alive(self, nodes: set[str]) -> None:
-        """Knock at every node now and then, and at the dead each time: a node that was started anew has a new door."""
+        """Probe every node periodically, and dead ones at each poll: a restarted node has a new port."""
         dead = self._dead & nodes
         doubtful = dead
         if time.monotonic() >= self._next_liveness_s:
@@ -226,7 +227,7 @@ class _Server:
 
 
 def _probed(service: str, uri: object) -> _Server:
-    """Ask a server what it serves; what does not answer is asked again at the next look, what does in ten seconds."""
+    """Probe a server for its type, again at the next poll if it does not respond, else after ten seconds."""
     now_s = time.monotonic()
     fields = {"probe": "1", "md5sum": "*", "callerid": "/gdp_probe", "service": service}
     try:
@@ -245,7 +246,7 @@ def _refuses(uri: object) -> bool:
     except ConnectionRefusedError:
         return True
     except (OSError, MasterError):
-        return False  # far away, or busy: not known to be dead
+        return False  # unreachable or busy: not known to be dead
 
 
 def _connected(uri: object) -> socket.socket:
@@ -293,7 +294,7 @@ def _exactly(sock: socket.socket, count: int) -> bytes:
 
 
 def _value(answer: object) -> object:
-    """Return what a call gave: an answer is (code, text, value)."""
+    """Return the value of a call's response, which is (code, text, value)."""
     if not isinstance(answer, list) or len(answer) != 3:
         raise MasterError("an answer that is none")
     return answer[2] if answer[0] == 1 else None

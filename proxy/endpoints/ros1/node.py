@@ -1,7 +1,9 @@
-"""The rospy node: does what the link says, and tells what happens.
+"""Node of rospy: executes the commands of the IPC link, and reports events.
 
-Place: imports rospy. Three threads: the main one serves the link and never waits for ROS; the registrar puts things on
-the graph and takes them off, which waits for the master; the watch looks at the graph. rospy adds its own.
+I/O; imports rospy. It has three threads, and rospy adds its own:
+- The main thread serves the link and never waits for ROS.
+- The registrar adds entities to the graph and removes them, which waits for the master.
+- The watch polls the graph.
 """
 
 from __future__ import annotations
@@ -61,7 +63,7 @@ class Node:
         self._servers: dict[int, Server] = {}
         self._dials: dict[int, Client] = {}
         self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._refused: dict[int, str] = {}  # not on the graph, and why; the registrar's
+        self._refused: dict[int, str] = {}  # not on the graph, with the reason; owned by the registrar
         self._look: GraphSnapshot | None = None
         self._stopped = threading.Event()
         self._lost = 0
@@ -69,7 +71,7 @@ class Node:
     def run(self) -> None:
         """Serve the link until it ends; does not return."""
         logging.getLogger().addHandler(logging.NullHandler())
-        rospy.core.configure_logging = lambda *_: None  # no log files of ours in ~/.ros
+        rospy.core.configure_logging = lambda *_: None  # write no log files to ~/.ros
         threading.excepthook = self._broke
         threading.Thread(target=self._register, name="registrar", daemon=True).start()
         poller = select.poll()
@@ -138,7 +140,7 @@ class Node:
             self._todo.put(lambda: self._forget(handle))
 
     def _tell(self, kind: Kind, question: int, payload: bytes) -> None:
-        """Answer what is known of a type here."""
+        """Report the known description of a type."""
         name, type_name = cbor2.loads(payload)
         known = self._channel(name, type_name) if kind is Kind.ASK_CHANNEL else self._service(name, type_name)
         if known is None:
@@ -174,7 +176,7 @@ class Node:
             return
         masterslave.ROSHandler._connect_topic = _to_others(masterslave.ROSHandler._connect_topic)
         rospy.init_node(self._name, argv=["gdp"], disable_rosout=True, disable_rostime=True, disable_signals=True)
-        # 50 clients may come at once, and rospy lets five queue.
+        # 50 clients may connect at once, and rospy's backlog is five.
         tcpros_base._tcpros_server.tcp_ros_server.server_sock.listen(_BACKLOG)
         watch = MasterWatch(self._master, self._id)
         threading.Thread(
@@ -197,7 +199,7 @@ class Node:
             self._stopped.wait(_RETRY_S)
 
     def _join(self, handle: int) -> None:
-        """Put a publisher or server on the graph, unless something there speaks against it."""
+        """Add a publisher or server to the graph, unless an entity there contradicts it."""
         subject = self._outlets.get(handle) or self._servers.get(handle)
         if subject is None:
             return
@@ -257,17 +259,17 @@ class Node:
     # the end
 
     def _broke(self, broken: threading.ExceptHookArgs) -> None:
-        """A thread of ours must not end; one of rospy's ends like this when a peer goes at a bad moment."""
+        """End the process if a thread of its own fails; rospy's threads fail when a peer leaves at a bad moment."""
         name = "" if broken.thread is None else broken.thread.name
         if name in ("registrar", "watch", "call") and not self._stopped.is_set():
             self._end(f"{name}: {broken.exc_type.__name__}: {broken.exc_value}")
 
     def _end(self, reason: str) -> None:
         self._link.send(Kind.ENDING, payload=reason.encode())
-        os._exit(1)  # rospy's threads would keep it alive
+        os._exit(1)  # rospy's threads would keep the process alive
 
     def _leave(self) -> None:
-        """Tell the master, if it listens, and end."""
+        """Unregister from the master, if it responds, and end."""
         self._stopped.set()
         farewell = threading.Thread(target=rospy.signal_shutdown, args=("the proxy has ended",), daemon=True)
         farewell.start()
@@ -276,7 +278,7 @@ class Node:
 
 
 def _to_others(connect: Callable[[object, str, str], _Connected]) -> Callable[[object, str, str], _Connected]:
-    """rospy would send what this node publishes to itself, over TCP, if it also subscribes."""
+    """Prevent rospy from sending this node's publications to its own subscriptions over TCP."""
 
     def connect_topic(handler: object, topic: str, publisher: str) -> _Connected:
         return (1, "ours", 0) if publisher == rospy.core.get_node_uri() else connect(handler, topic, publisher)

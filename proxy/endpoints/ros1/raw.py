@@ -1,6 +1,6 @@
-"""Raw ROS 1 classes: the right names and md5 sums, with the bytes as they are. Only the rospy process imports this.
+"""Raw ROS 1 classes: the right names and md5 sums, with uninterpreted bytes. Only the rospy process imports this.
 
-Place: imports genpy and genmsg. Definitions from afar are parsed, never generated into code and never executed.
+Imports genpy and genmsg. Remote definitions are parsed, never generated into code and never executed.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Raw(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class KnownMessage:
-    """A message type. ``name``: as ROS 1 writes it (``sensor_msgs/Image``)."""
+    """A message type. ``name``: in ROS 1's form (``sensor_msgs/Image``)."""
 
     name: str
     md5: str
@@ -64,7 +64,7 @@ class KnownService:
 
 
 def ros1_name(type_name: str) -> str:
-    """Return ``sensor_msgs/Image`` for ``sensor_msgs/msg/Image``, and the like for services."""
+    """Return ``sensor_msgs/Image`` for ``sensor_msgs/msg/Image``, and likewise for services."""
     return type_name.replace("/msg/", "/").replace("/srv/", "/")
 
 
@@ -75,7 +75,7 @@ def ros2_name(type_name: str, kind: str) -> str:
 
 
 def installed_message(type_name: str) -> KnownMessage | None:
-    """Return what an installed ROS 1 package says of a type."""
+    """Return an installed ROS 1 package's description of a type."""
     name = ros1_name(type_name)
     try:
         known = roslib.message.get_message_class(name)
@@ -85,7 +85,7 @@ def installed_message(type_name: str) -> KnownMessage | None:
 
 
 def installed_service(type_name: str) -> KnownService | None:
-    """Return what an installed ROS 1 package says of a service type."""
+    """Return an installed ROS 1 package's description of a service type."""
     name = ros1_name(type_name)
     try:
         known = roslib.message.get_service_class(name)
@@ -103,7 +103,7 @@ def installed_service(type_name: str) -> KnownService | None:
 
 
 def known_message(channel: Channel) -> KnownMessage:
-    """Return the type of a channel, from what it says or what is installed.
+    """Return the type of a channel, from its description or an installed package.
 
     Raises:
         LocalError: neither suffices, or they contradict each other.
@@ -127,7 +127,7 @@ def known_message(channel: Channel) -> KnownMessage:
 
 
 def known_service(service: Service) -> KnownService:
-    """Return the type of a service, from what it says or what is installed.
+    """Return the type of a service, from its description or an installed package.
 
     Raises:
         LocalError: neither suffices, or they contradict each other.
@@ -169,7 +169,7 @@ def raw_class(known: KnownMessage) -> type:
         "_type": known.name,
         "_md5sum": known.md5,
         "_full_text": known.text,
-        "_has_header": False,  # or rospy would write a sequence number into it
+        "_has_header": False,  # otherwise rospy would write a sequence number into it
         "serialize": serialize,
         "deserialize": deserialize,
     }

@@ -1,6 +1,6 @@
-"""Servers and clients of the rospy process.
+"""Services of the rospy process: servers and clients.
 
-Place: imports rospy. rospy runs a thread for each client's connection; a thread of ours runs each call, over a
+I/O; imports rospy. rospy runs a thread for each client's connection. A separate thread runs each call, over a
 connection of its own that it keeps for a while.
 """
 
@@ -24,10 +24,10 @@ from proxy.endpoints.ros1.raw import KnownMessage, KnownService, Raw, raw_servic
 
 __all__ = ["Client", "Server", "tickets"]
 
-_WORKERS: Final = 64  # calls of one service under way at once; more wait their turn
+_WORKERS: Final = 64  # calls of one service under way at once; further calls wait
 _CONNECT_S: Final = 5.0
 _IDLE_S: Final = 10.0  # a connection costs the server a thread
-_SAID_MAX: Final = 4_096  # characters of a server's words
+_SAID_MAX: Final = 4_096  # characters of a server's error text
 _RESPONDED: Final = " responded with an error: "
 _CANNOT: Final = "service cannot process request: "
 
@@ -51,7 +51,7 @@ class Server:
         self._service = rospy.Service(self.name, self._class, self._serve)
 
     def close(self) -> None:
-        """Withdraw it, and fail who waits."""
+        """Unregister the service, and fail waiting requests."""
         self._is_closed = True
         if self._service is not None:
             self._service.shutdown("closed")
@@ -109,14 +109,14 @@ class Client:
             threading.Thread(target=self._run, name="call", daemon=True).start()
 
     def drop(self, call: int) -> None:
-        """Forget a call; its connection is cut, for the response could not be told from the next one's."""
+        """Forget a call and close its connection: its response could not be distinguished from the next one's."""
         with self._lock:
             proxy = self._calls.pop(call, None)
         if proxy is not None:
             proxy.close()
 
     def close(self) -> None:
-        """Forget all calls, end all threads."""
+        """Forget all calls and end all threads."""
         self._is_closed = True
         for call in list(self._calls):
             self.drop(call)
@@ -182,11 +182,11 @@ class Client:
         except TransportInitError as error:
             return b"", f"its server cannot be reached: {error}", False
         except (rospy.ROSException, ROSInternalException, OSError, AttributeError) as error:
-            return b"", f"the call broke off: {error}", False  # AttributeError: rospy, closed in mid-call
+            return b"", f"the call broke off: {error}", False  # AttributeError: rospy, closed during the call
         return response, "", True
 
     def _connect(self, proxy: ServiceProxy, request: Raw) -> TCPROSTransport:
-        """As rospy does on a first call, but apart: what serves now may be of another type, and would read nonsense."""
+        """Connect like rospy's first call, but separately: the present server may have another type."""
         uri = proxy._get_service_uri(request)
         host, port = rospy.core.parse_rosrpc_uri(uri)
         transport = TCPROSTransport(proxy.protocol, proxy.resolved_name)
@@ -200,7 +200,7 @@ def tickets(life: int) -> Iterator[int]:
 
 
 def _has_ended(proxy: ServiceProxy) -> bool:
-    """Return whether an idle connection has something to read, which can only be its end."""
+    """Return whether an idle connection is readable, which can only mean its end."""
     transport = proxy.transport
     if transport is None or transport.done or transport.socket is None:
         return True
@@ -210,7 +210,7 @@ def _has_ended(proxy: ServiceProxy) -> bool:
 
 
 def _reason(error: Exception) -> str:
-    """Return what the server said, out of rospy's wrapping, or rospy's own words."""
+    """Return the server's error text without rospy's wrapping, or rospy's own text."""
     _, found, tail = str(error).partition(_RESPONDED)
     if not found:
         return str(error)

@@ -1,8 +1,7 @@
-"""Subscriptions and publishers of the rospy process.
+"""Topics of the rospy process: subscriptions and publishers.
 
-Place: imports rospy. rospy calls ``Subscriber`` from a thread for each connection; ``Publisher`` is fed by the main
-thread and
-put on the graph by the registering one.
+I/O; imports rospy. rospy calls ``Subscriber`` from a thread for each connection. The main thread calls
+``Publisher.publish``, and the registrar adds publishers to the graph.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from proxy.serial.channel import Channel
 
 __all__ = ["Publisher", "Subscriber"]
 
-_QUEUE: Final = 100  # messages that wait for one slow subscriber
+_QUEUE: Final = 100  # messages in the queue of one slow subscriber
 
 
 class _Connection(Protocol):
@@ -33,15 +32,16 @@ class _Connection(Protocol):
 
 
 class Subscriber:
-    """One subscription: says what the messages are, then hands them up."""
+    """One subscription: reports the type of the messages, then forwards them."""
 
     def __init__(self, link: IpcLink, handle: int, topic: str, node: str) -> None:
         self._link = link
         self._handle = handle
         self._topic = topic
         self._node = node
-        self._lock = threading.Lock()  # one connection's description must not pass another's message
-        self._headers: dict[int, tuple[dict[str, str], bool]] = {}  # by identity, which holding them keeps
+        self._lock = threading.Lock()  # one connection's description must not overtake another's message
+        # by identity; the reference keeps the identity valid
+        self._headers: dict[int, tuple[dict[str, str], bool]] = {}
         self._type: tuple[str, str] | None = None
         self._described: Channel | None = None
         self._subscriber: rospy.Subscriber | None = None
@@ -112,7 +112,7 @@ class Subscriber:
 
 
 class Publisher(rospy.SubscribeListener):  # type: ignore[misc]  # rospy is untyped
-    """One publisher. A latched one keeps its last messages for every newcomer, which rospy itself does for one only."""
+    """One publisher. A latched one keeps its last messages for every late joiner; rospy itself keeps only one."""
 
     def __init__(self, link: IpcLink, handle: int, channel: Channel, known: KnownMessage, node: str) -> None:
         self.topic = channel.topic
@@ -124,7 +124,7 @@ class Publisher(rospy.SubscribeListener):  # type: ignore[misc]  # rospy is unty
         self._kept: deque[bytes] = deque(maxlen=_depth(channel) if channel.latched else 0)
         self._is_latched = channel.latched
         self._lock = threading.Lock()
-        self._publisher: rospy.Publisher | None = None  # set once it is on the graph
+        self._publisher: rospy.Publisher | None = None  # set once it is registered
         self._counted = 0
 
     def register(self) -> None:
@@ -146,7 +146,7 @@ class Publisher(rospy.SubscribeListener):  # type: ignore[misc]  # rospy is unty
             self._count()
 
     def publish(self, raw: bytes) -> None:
-        """Publish to all, and keep it if latched."""
+        """Publish to all subscribers, and keep the message if latched."""
         with self._lock:
             publisher = self._publisher
             if publisher is None:
@@ -168,14 +168,14 @@ class Publisher(rospy.SubscribeListener):  # type: ignore[misc]  # rospy is unty
     def peer_subscribe(
         self, _topic_name: str, _topic_publish: Callable[[Raw], None], peer_publish: Callable[[Raw], None]
     ) -> None:
-        """Give a newcomer what is kept; rospy calls it under the lock of ``_one_at_a_time``."""
+        """Send the kept messages to a late joiner; rospy calls it under the lock of ``_one_at_a_time``."""
         if self._publisher is not None:
             for raw in self._kept:
                 peer_publish(self._class(raw))
             self._count()
 
     def peer_unsubscribe(self, _topic_name: str, _num_peers: int) -> None:
-        """One has gone; rospy still has it in its list."""
+        """Report that a subscriber has left; rospy still has it in its list."""
         self._count()
 
     def _count(self) -> None:
@@ -199,7 +199,7 @@ class _Impl(Protocol):
 
 
 def _one_at_a_time(impl: _Impl) -> Callable[[object], bool]:
-    """A newcomer must not get a message twice because it was published while the kept ones were handed over."""
+    """Serialise joins with publications, so that a late joiner does not get a kept message twice."""
 
     def add_connection(connection: object) -> bool:
         with impl.publock:
@@ -209,7 +209,7 @@ def _one_at_a_time(impl: _Impl) -> Callable[[object], bool]:
 
 
 def _free(impl: _Impl) -> None:
-    """rospy leaves its descriptor to the garbage collector, which may come a thousand topics later."""
+    """Close the descriptor that rospy leaves to the garbage collector, which may run a thousand topics later."""
     if impl.closed:
         impl.connection_poll.poller.close()
 

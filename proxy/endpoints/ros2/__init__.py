@@ -1,7 +1,7 @@
-"""A live ROS 2 graph through rclpy, whatever DDS vendor or RMW the robot runs.
+"""ROS 2 endpoint: a live graph through rclpy, with any DDS vendor or RMW of the robot.
 
-``endpoint`` is what the proxy calls; ``waiting`` is the thread that hears; ``ends`` are the things it hears with;
-``survey`` looks at the graph; ``session`` is the part of rclpy that all of them use.
+``endpoint`` is the interface for the proxy. ``wait_thread`` receives through the ``entities``. ``graph_cache`` polls
+the graph. ``session`` is the part of rclpy that all of them use.
 """
 
 from proxy.endpoints.ros2.endpoint import Ros2Endpoint

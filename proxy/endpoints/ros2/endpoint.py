@@ -1,6 +1,6 @@
-"""The ``ros2`` endpoint: one virtual node in one domain, spoken through rclpy.
+"""Endpoint ``ros2``: one virtual node in one domain, through rclpy.
 
-Place: I/O; what the proxy's thread calls. A thread of its own hears (``waiting``).
+I/O; called by the proxy's thread. A separate thread receives (``wait_thread``).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Ros2Endpoint:
         node: name of the virtual node (``proxy_node_name``).
 
     Raises:
-        LocalError: ROS 2 is not installed, or does not start; the text says what to do.
+        LocalError: ROS 2 is not installed, or does not start; the text states what to do.
     """
 
     ros: Final[RosVersion] = 2
@@ -60,24 +60,31 @@ class Ros2Endpoint:
 
     @property
     def dropped(self) -> int:
-        return 0  # what waits too long waits in the middleware, by its QoS
+        """Return 0: only the middleware drops messages."""
+        return 0  # messages wait in the middleware, which drops them by its QoS
 
     def fileno(self) -> int:
+        """Return a descriptor that is readable while ``poll_events`` has events."""
         return self._waiting.fileno()
 
     def poll_events(self) -> Sequence[Event]:
+        """Remove and return the pending events, in order."""
         return self._waiting.poll_events()
 
     def graph(self) -> Graph:
+        """Return the last known graph."""
         return self._waiting.graph
 
     def channel(self, topic: str, type_name: str) -> Channel:
+        """Return the installed description of a topic type; raises ``LocalError`` if there is none."""
         return channel_of(topic, type_name)
 
     def service(self, name: str, type_name: str) -> Service:
+        """Return the installed description of a service type; raises ``LocalError`` if there is none."""
         return service_of(name, type_name)
 
     def subscribe(self, topic: str, type_name: str, qos: Qos | None) -> int:
+        """Subscribe to a topic; raises ``LocalError`` for an unknown type or a refused name."""
         message = class_of(type_name)
         requested = filled(qos)
         channel = channel_of(topic, type_name)
@@ -99,6 +106,7 @@ class Ros2Endpoint:
         return subscription_entity.number
 
     def advertise(self, channel: Channel) -> int:
+        """Create a publisher; raises ``LocalError`` for an unknown or different type or a refused name."""
         known = self._checked(channel)
         offered = filled(channel.qos[0] if channel.qos else None, latched=channel.latched)
         with translated(f"{channel.topic}: cannot be advertised"):
@@ -118,9 +126,11 @@ class Ros2Endpoint:
         return publisher_entity.number
 
     def publish(self, handle: int, raw: bytes) -> None:
+        """Publish one CDR message."""
         self._publisher_entity[handle].publish(raw)
 
     def subscribers(self, handle: int) -> int:
+        """Return the present number of local subscriptions of a publisher, without the endpoint's own."""
         publisher_entity = self._publisher_entity[handle]
         ours = sum(
             subscription_entity.topic == publisher_entity.topic
@@ -130,6 +140,7 @@ class Ros2Endpoint:
         return max(0, publisher_entity.handle.get_subscription_count() - ours)
 
     def serve(self, service: Service) -> int:
+        """Create a server; raises ``LocalError`` for an unknown or different type or a refused name."""
         known = service_of(service.name, service.type_name)
         if service.hash and known.hash and service.ros == 2 and service.hash != known.hash:
             raise LocalError(f"{service.name}: this machine has another definition of {service.type_name}")
@@ -144,6 +155,7 @@ class Ros2Endpoint:
         return serving.number
 
     def answer(self, handle: int, ticket: int, raw: bytes) -> None:
+        """Answer a request; a response that cannot be read is replaced by a refusal."""
         from rclpy.serialization import deserialize_message
 
         serving = self._serving[handle]
@@ -155,7 +167,7 @@ class Ros2Endpoint:
         serving.send(ticket, response)
 
     def refuse(self, handle: int, ticket: int, reason: str) -> None:
-        """Answer {success: false, message: reason} where the response has these; ROS 2 knows no other way."""
+        """Answer {success: false, message: reason} where the response has these fields; ROS 2 has no other way."""
         serving = self._serving[handle]
         refusal = _refusal(serving.response, reason)
         if refusal is None:
@@ -164,6 +176,7 @@ class Ros2Endpoint:
             serving.send(ticket, refusal)
 
     def create_client(self, name: str, type_name: str) -> int:
+        """Create a client; raises ``LocalError`` for an unknown type or a refused name."""
         service_of(name, type_name)
         kind = class_of(type_name)
         with translated(f"{name}: cannot be dialled"):
@@ -177,6 +190,7 @@ class Ros2Endpoint:
         return client_entity.number
 
     def call(self, handle: int, call: int, raw: bytes) -> None:
+        """Send a request, or hold it until a server that the graph shows matches."""
         from rclpy.serialization import deserialize_message
 
         client_entity = self._client_entity[handle]
@@ -193,9 +207,11 @@ class Ros2Endpoint:
             self._waiting.wake()
 
     def drop(self, handle: int, call: int) -> None:
+        """Forget a call."""
         self._client_entity[handle].drop(call)
 
     def close(self, handle: int) -> None:
+        """Close a subscription, publisher, server or client."""
         self._waiting.remove(handle)
         if subscription_entity := self._subscription_entity.pop(handle, None):
             self._node.destroy_subscription(subscription_entity.entity)
@@ -208,6 +224,7 @@ class Ros2Endpoint:
             self._node.destroy_client(client_entity.entity)
 
     def remove_entity(self) -> None:
+        """Leave the graph and free everything."""
         self._waiting.close()
         self._session.close()
 
@@ -216,7 +233,7 @@ class Ros2Endpoint:
         return self._numbers
 
     def _checked(self, channel: Channel) -> Channel:
-        """Return how this machine knows the channel's type, after making sure that it means the same."""
+        """Return this machine's description of the channel's type, after verifying that it is equivalent."""
         known = channel_of(channel.topic, channel.type_name)
         if channel.ros != 2:
             raise LocalError(f"{channel.topic}: its messages are in ROS 1's form")
@@ -229,7 +246,7 @@ class Ros2Endpoint:
         return known
 
     def _tell_apart(self, topic: str) -> None:
-        """Have our publishers of a topic leave word with our subscriptions to it, so that these skip what they hear."""
+        """Connect the endpoint's publishers of a topic to the loopback filters of its own subscriptions."""
         publisher_entity = [end for end in self._publisher_entity.values() if end.topic == topic]
         subscription_entity = [end for end in self._subscription_entity.values() if end.topic == topic]
         for ear in subscription_entity if publisher_entity else ():
@@ -243,7 +260,7 @@ class Ros2Endpoint:
 
 
 def _ignore(*_: object) -> None:
-    """rclpy wants a callback; the waiting thread takes what comes before any could be called."""
+    """Ignore a callback that rclpy requires; the wait-set thread reads data before any callback could run."""
 
 
 def _refusal(response: type, reason: str) -> object | None:

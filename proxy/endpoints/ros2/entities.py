@@ -1,7 +1,7 @@
-"""What the endpoint has in the graph: things to hear with, to serve with, to call with and to publish with.
+"""Entities of the endpoint in the graph: subscriptions, publishers, servers and clients.
 
-Place: I/O through rclpy's handles. ``drain`` is called by the waiting thread; everything else by the endpoint's caller.
-A drain takes a bounded number, so that one busy topic does not keep the others waiting.
+I/O through rclpy's handles. The wait-set thread calls ``drain``; the endpoint's caller calls everything else. A drain
+reads a bounded number, so that one busy topic does not delay the others.
 """
 
 from __future__ import annotations
@@ -35,31 +35,35 @@ Kind: TypeAlias = Literal["subscription", "service", "client"]
 
 _AT_ONCE: Final = 64
 _TICKETS_MAX: Final = 10_000
-_WINDOW: Final = 8  # below the ten places of a server's queue
+_WINDOW: Final = 8  # less than the ten slots of a server's queue
 _WINDOW_S: Final = 0.1
-_PATIENCE_S: Final = 1.0  # for a server that the graph shows, to match a new client
+_PATIENCE_S: Final = 1.0  # time for a server that the graph shows to match a new client
 
 
 class Source(Protocol):
-    """What the waiting thread waits for."""
+    """An entity on which the wait-set thread waits."""
 
     @property
-    def number(self) -> int: ...
+    def number(self) -> int:
+        """Return the handle of the entity at the endpoint."""
 
     @property
-    def entity(self) -> Entity: ...
+    def entity(self) -> Entity:
+        """Return rclpy's object."""
 
     @property
-    def kind(self) -> Kind: ...
+    def kind(self) -> Kind:
+        """Return the kind of entity in a wait set."""
 
     @property
-    def handle(self) -> Handle: ...
+    def handle(self) -> Handle:
+        """Return rcl's object."""
 
     def join(self, wait_set: WaitSet) -> Callable[[], object]:
-        """Return what has a wait set wait for this once."""
+        """Return the callable that adds this entity to a wait set for one wait."""
 
     def drain(self) -> list[Event]:
-        """Take what has come."""
+        """Read the available data."""
 
 
 @dataclass(slots=True)
@@ -70,18 +74,20 @@ class SubscriptionEntity:
     topic: str
     message: type
     qos: Qos
-    channel: Channel  # as far as the graph tells
+    channel: Channel  # as far as the graph shows it
     entity: Entity
     handle: SubscriptionHandle
-    own: LoopbackFilter | None = None  # where this endpoint publishes the topic too
+    own: LoopbackFilter | None = None  # set where this endpoint publishes the topic too
     described: Channel | None = None
 
     kind: Kind = "subscription"
 
     def join(self, wait_set: WaitSet) -> Callable[[], object]:
+        """Return the callable that adds the subscription to a wait set."""
         return partial(wait_set.add_subscription, self.handle)
 
     def drain(self) -> list[Event]:
+        """Read a bounded number of messages; the endpoint's own are left out."""
         events: list[Event] = []
         stamp_ns = time.time_ns()
         for _ in range(_AT_ONCE):
@@ -93,7 +99,7 @@ class SubscriptionEntity:
         return events
 
     def describe(self, graph: Graph) -> Channel:
-        """Return the channel with what the publishers now there offer."""
+        """Return the channel with the QoS that its present publishers offer."""
         offers = {end.qos for end in graph if end.role is Role.PUBLISHES and end.qos is not None}
         ordered = tuple(sorted(offers, key=repr))
         latched = any(qos.durability == "transient_local" for qos in ordered)
@@ -105,7 +111,10 @@ class SubscriptionEntity:
 
 @dataclass(slots=True)
 class PublisherEntity:
-    """A publisher. ``kept``: of a transient local one, what its late joiners get; one of them may be our own."""
+    """A publisher; ``kept`` are messages for late joiners of a transient local one.
+
+    A late joiner may be a subscription of the endpoint itself.
+    """
 
     number: int
     topic: str
@@ -114,10 +123,10 @@ class PublisherEntity:
     entity: Entity
     handle: PublisherHandle
     kept: deque[bytes] = field(default_factory=lambda: deque(maxlen=0))
-    echoes: tuple[LoopbackFilter, ...] = ()  # of our own subscriptions to the topic
+    echoes: tuple[LoopbackFilter, ...] = ()  # of the endpoint's own subscriptions to the topic
 
     def publish(self, raw: bytes) -> None:
-        """Publish, unheard by our own subscriptions."""
+        """Publish; the endpoint's own subscriptions filter the message out."""
         for own in self.echoes:
             own.add(raw, time.monotonic())
         self.kept.append(raw)
@@ -125,7 +134,7 @@ class PublisherEntity:
 
 
 class ServiceEntity:
-    """A virtual server; a request waits under its ticket, the oldest is forgotten when there are too many."""
+    """A virtual server; requests wait by ticket, and the oldest is dropped when there are too many."""
 
     kind: Final[Kind] = "service"
 
@@ -140,9 +149,11 @@ class ServiceEntity:
         self._lock = Lock()
 
     def join(self, wait_set: WaitSet) -> Callable[[], object]:
+        """Return the callable that adds the server to a wait set."""
         return partial(wait_set.add_service, self.handle)
 
     def drain(self) -> list[Event]:
+        """Read a bounded number of requests."""
         from rclpy.serialization import serialize_message
 
         events: list[Event] = []
@@ -159,7 +170,7 @@ class ServiceEntity:
         return events
 
     def send(self, ticket: int, response: object) -> None:
-        """Answer; an unknown ticket is ignored."""
+        """Answer a request; an unknown ticket is ignored."""
         with self._lock:
             request = self._tickets.pop(ticket, None)
         if request is not None:
@@ -173,17 +184,17 @@ class ServiceEntity:
 
 @dataclass(frozen=True, slots=True)
 class _Held:
-    """A call that was not sent yet."""
+    """A call that is not sent yet."""
 
     request: object
-    until_s: float  # how long it waits for a server that the graph shows, to match our client
+    until_s: float  # deadline for a server that the graph shows to match this client
 
 
 class ClientEntity:
     """A client; any number of its calls may be under way.
 
-    A server's queue has ten places by default, and drops the oldest request beyond that: only so many unanswered
-    requests go out in a short time, the others are held.
+    A server's queue has ten slots by default, and drops the oldest request beyond that. So only a few unanswered
+    requests are sent in a short time; the others are held.
     """
 
     kind: Final[Kind] = "client"
@@ -195,15 +206,17 @@ class ClientEntity:
         self.handle = handle
         self.request = service.Request
         self._response = service.Response
-        self._lock = Lock()  # over sending too: a response may be here before send_request returns
+        self._lock = Lock()  # it covers sending too: a response may arrive before send_request returns
         self._calls: dict[int, int] = {}  # rcl's sequence number -> the caller's number
-        self._recent: dict[int, float] = {}  # rcl's sequence number -> when its request may be taken for taken
+        self._recent: dict[int, float] = {}  # rcl's sequence number -> when the server has presumably read its request
         self._held: dict[int, _Held] = {}
 
     def join(self, wait_set: WaitSet) -> Callable[[], object]:
+        """Return the callable that adds the client to a wait set."""
         return partial(wait_set.add_client, self.handle)
 
     def drain(self) -> list[Event]:
+        """Read a bounded number of responses."""
         from rclpy.serialization import serialize_message
 
         events: list[Event] = []
@@ -220,10 +233,10 @@ class ClientEntity:
         return events
 
     def begin(self, call: int, request: object, *, is_there: bool, now_s: float) -> CallFailed | None:
-        """Send a request, or hold it a moment.
+        """Send a request, or hold it briefly.
 
         Args:
-            is_there: the graph shows a server, so that it is worth while to wait until it matches our client.
+            is_there: the graph shows a server, so that waiting for it to match this client is useful.
         """
         is_matched = self.handle.service_server_is_available()
         if not is_matched and not is_there:
@@ -245,11 +258,11 @@ class ClientEntity:
 
     @property
     def is_holding(self) -> bool:
-        """Return whether a call was not sent yet."""
+        """Return whether a call is not sent yet."""
         return bool(self._held)
 
     def tend(self, now_s: float) -> list[Event]:
-        """Send what was held, fail what cannot be answered any more."""
+        """Send held requests, and fail calls that cannot be answered any more."""
         if not self._held and not self._calls:
             return []
         if self.handle.service_server_is_available():

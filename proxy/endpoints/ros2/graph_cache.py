@@ -1,8 +1,8 @@
-"""Who is in the graph: what is new is asked about at once, the rest in turns.
+"""Graph cache of the endpoint: changes are queried at once, the rest in rotation.
 
-Place: asks rclpy's graph cache, from the waiting thread. A look compares names, types and counts, which is cheap;
-the costly questions (who, with which QoS) follow for topics whose counts changed, and for a quarter of the others, so
-that an end that took another's place between two looks is seen four looks later.
+I/O; queries rclpy's graph cache, from the wait-set thread. A refresh compares names, types and counts, which is cheap.
+The costly queries (node and QoS) follow for topics whose counts changed, and for a quarter of the others. So an entity
+that replaced another one between two refreshes is detected four refreshes later.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ __all__ = ["LOOK_EVERY_S", "GraphCache"]
 
 LOOK_EVERY_S: Final = 0.2
 _TURNS: Final = 4
-_UNKNOWN: Final = "_NODE_NAME_UNKNOWN_"  # its discovery is still under way
+_UNKNOWN: Final = "_NODE_NAME_UNKNOWN_"  # its discovery is incomplete
 _TOPICS_OF_NODES: Final = frozenset({"/rosout", "/parameter_events"})
 _SERVICES_OF_NODES: Final = frozenset(
     {
@@ -34,7 +34,7 @@ _SERVICES_OF_NODES: Final = frozenset(
 
 
 class GraphCache:
-    """The graph as last seen, without our own node and without what every node has."""
+    """The last known graph, without the endpoint's own node and without the entities that every node has."""
 
     def __init__(self, session: Session) -> None:
         self._node = session.node
@@ -53,7 +53,7 @@ class GraphCache:
         self.graph: Graph = frozenset()
 
     def look(self) -> bool:
-        """Look again; return whether ``graph`` changed."""
+        """Refresh the cache; return whether ``graph`` changed."""
         self._turn = (self._turn + 1) % _TURNS
         changed = self._look_at_topics()
         changed |= self._look_at_nodes()
@@ -66,7 +66,7 @@ class GraphCache:
         return self._by_topic.get(topic, frozenset())
 
     def ask(self, topic: str) -> Graph:
-        """Ask about one topic now, ends of nodes that are not known yet included."""
+        """Query one topic now, including entities of nodes that are not known yet."""
         return frozenset(self._asked(topic))
 
     def _look_at_topics(self) -> bool:
@@ -126,7 +126,7 @@ class GraphCache:
         try:
             served = self._node.get_service_names_and_types_by_node(name, space)
             called = self._node.get_client_names_and_types_by_node(name, space)
-        except self._missing:  # it left in this moment
+        except self._missing:  # the entity left at this moment
             return frozenset()
         node = _full_name(name, space)
         return frozenset(

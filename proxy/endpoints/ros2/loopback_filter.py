@@ -1,7 +1,8 @@
-"""What this endpoint published on a topic that it hears too, so that it does not hear itself.
+"""Loopback filter: removes the endpoint's own messages from a topic to which it also subscribes.
 
-Place: pure; the clock is an argument. rclpy neither ignores local publications nor says who sent a message, so its own
-are known by their bytes: as many copies as were published are taken out, within a short time, whoever sent them.
+Sans-I/O; the clock is an argument. rclpy neither ignores local publications nor identifies the sender of a message. So
+own messages are recognised by their bytes: as many copies as were published are removed within a short time, from any
+sender.
 """
 
 from __future__ import annotations
@@ -14,15 +15,15 @@ __all__ = ["LoopbackFilter"]
 
 _MEMORY_S: Final = 2.0
 _COUNT_MAX: Final = 4_096
-_HEADER: Final = 4  # of encapsulation: an RMW may write its padding there
+_HEADER: Final = 4  # bytes of encapsulation: an RMW may write its padding there
 
 
 class LoopbackFilter:
-    """A bounded multiset of message hashes; one thread adds, another takes out."""
+    """A bounded multiset of message hashes; one thread adds, another removes."""
 
     def __init__(self) -> None:
         self._lock = Lock()
-        self._until: dict[int, deque[float]] = {}  # by hash: when each copy is forgotten
+        self._until: dict[int, deque[float]] = {}  # by hash: expiry of each copy
         self._order: deque[tuple[float, int]] = deque()
 
     def add(self, raw: bytes, now_s: float) -> None:
@@ -34,7 +35,7 @@ class LoopbackFilter:
             self._forget(now_s)
 
     def is_loopback(self, raw: bytes, now_s: float) -> bool:
-        """Return whether a message that came is one of ours; that copy of it is then spent."""
+        """Return whether a received message is the endpoint's own; that copy is then removed."""
         with self._lock:
             self._forget(now_s)
             if not self._until:
@@ -52,7 +53,7 @@ class LoopbackFilter:
         while self._order and (self._order[0][0] <= now_s or len(self._order) > _COUNT_MAX):
             until_s, key = self._order.popleft()
             copies = self._until.get(key)
-            if copies is not None and copies[0] <= until_s:  # else it was taken out before
+            if copies is not None and copies[0] <= until_s:  # else it was removed before
                 copies.popleft()
                 if not copies:
                     del self._until[key]

@@ -1,7 +1,7 @@
-"""QoS profiles: ours filled in, rclpy's translated, and which offer cannot meet which request.
+"""QoS profiles in rclpy's form and in the proxy's, and the compatibility of an offer with a request.
 
-Place: pure; the enumerations of rclpy are imported where they are used.
-Source: DDS 1.4, section 2.2.3 (request against offer); rmw/types.h (the words).
+Sans-I/O; the enumerations of rclpy are imported where they are used.
+Source: DDS 1.4, section 2.2.3 (request against offer); rmw/types.h (the names of policies).
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ __all__ = ["conflict", "filled", "from_profile", "service_profile", "to_profile"
 _INFINITE: Final = (9_223_372_036, 854_775_807)  # RMW_DURATION_INFINITE
 _DEPTH: Final = 10
 _DEPTH_OF_ALL: Final = 1_000
-_INFINITE_FROM_S: Final = 2_147_483_647  # what DDS itself calls infinite
+_INFINITE_FROM_S: Final = 2_147_483_647  # DDS's own infinite value
 _LIVELINESS: Final = ("automatic", "manual_by_topic")
 
 
 def filled(qos: Qos | None, *, latched: bool = False) -> Qos:
-    """Return a profile that an endpoint can have: every policy a definite word, the depth finite.
+    """Return a profile that an endpoint accepts: every policy has a definite value, the depth is finite.
 
-    "Keep all" becomes a depth of 1,000: one stalled reader must not block the publisher that serves all others.
+    "Keep all" becomes a depth of 1,000: one stalled reader must not block the publisher for all others.
 
     Args:
         qos: None: reliable, and transient local with a depth of one if ``latched``.
@@ -64,7 +64,7 @@ def conflict(offered: Qos, requested: Qos) -> str:
 
 
 def from_profile(profile: QoSProfile) -> Qos:
-    """Return rclpy's profile in our words."""
+    """Return the proxy's form of rclpy's profile."""
     return Qos(
         history=profile.history.name.lower(),
         depth=profile.depth,
@@ -97,7 +97,7 @@ def to_profile(qos: Qos) -> QoSProfile:
 
 
 def service_profile() -> QoSProfile:
-    """Return the default profile of services, but deep: a burst of calls must find room."""
+    """Return the default profile of services with a larger depth, because a burst of calls must fit."""
     return to_profile(replace(filled(None), depth=_DEPTH_OF_ALL))
 
 
@@ -106,7 +106,7 @@ def _duration(duration: tuple[int, int]) -> tuple[int, int]:
 
 
 def _limit(duration: tuple[int, int]) -> tuple[int, int]:
-    """Zero is "not said", which is infinite."""
+    """Return the duration; zero means unspecified, which is infinite."""
     return _INFINITE if duration == (0, 0) or duration[0] >= _INFINITE_FROM_S else duration
 
 

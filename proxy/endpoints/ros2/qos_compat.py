@@ -1,6 +1,6 @@
-"""What is wrong between an end of ours and the others of its topic, in one sentence.
+"""QoS compatibility of one of the endpoint's entities with the others of its topic, as one sentence.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ __all__ = ["incompatibility"]
 
 
 def incompatibility(role: Role, channel: Channel, qos: Qos, ends: Graph) -> str:
-    """Return why some end on the other side of the topic cannot be reached or read, empty where all can.
+    """Return why some entity of the opposite role cannot be matched, empty where all can.
 
     Args:
-        role: ours, PUBLISHES or SUBSCRIBES.
-        channel: ours.
-        qos: what we offer or request.
-        ends: the others in the topic; those of our own role do not matter.
+        role: the endpoint's own, PUBLISHES or SUBSCRIBES.
+        channel: the endpoint's own.
+        qos: the offered or requested profile.
+        ends: the other entities of the topic; those of the same role are ignored.
     """
     for end in sorted((end for end in ends if end.role is not role), key=lambda end: (end.node, end.key)):
         reason = _type_conflict(channel, end) or _qos_conflict(role, qos, end)

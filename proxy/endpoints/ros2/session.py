@@ -1,8 +1,8 @@
-"""One node of ours in one ROS 2 domain, and the part of rclpy that we use, with types.
+"""Session: one node in one ROS 2 domain, and typed protocols of the used part of rclpy.
 
-Place: the only module here that starts rclpy. rclpy's executors take 100 µs and more a callback, and its experimental
-``EventsExecutor`` delivered nothing to raw subscriptions when tried (7.1.6); so the handles beneath its publishers and
-subscriptions are used directly, as its executors do.
+I/O; the only module here that starts rclpy. rclpy's executors take 100 µs and more a callback, and its experimental
+``EventsExecutor`` delivered nothing to raw subscriptions when tried (7.1.6). So this package uses the handles of its
+publishers and subscriptions directly, as its executors do.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ __all__ = [
 
 
 class Handle(Protocol):
-    """An rcl object; alive at least while entered."""
+    """An rcl object; it is valid at least while entered."""
 
     pointer: int
 
@@ -51,33 +51,40 @@ class Handle(Protocol):
 
 
 class GuardCondition(Handle, Protocol):
-    """What wakes a wait set."""
+    """Wake-up source of a wait set."""
 
-    def trigger_guard_condition(self) -> None: ...
-    def destroy_when_not_in_use(self) -> None: ...
+    def trigger_guard_condition(self) -> None:
+        """Wake the wait set."""
+
+    def destroy_when_not_in_use(self) -> None:
+        """Free the object after its last use."""
 
 
 class SubscriptionHandle(Handle, Protocol):
     """A subscription of rcl."""
 
-    def take_message(self, kind: type, raw: bool, /) -> tuple[bytes, object] | None: ...
+    def take_message(self, kind: type, raw: bool, /) -> tuple[bytes, object] | None:
+        """Return a message and its metadata; None: there is none."""
 
 
 class PublisherHandle(Handle, Protocol):
     """A publisher of rcl."""
 
-    def publish_raw(self, raw: bytes, /) -> None: ...
-    def get_subscription_count(self) -> int: ...
+    def publish_raw(self, raw: bytes, /) -> None:
+        """Publish CDR bytes."""
+
+    def get_subscription_count(self) -> int:
+        """Return the number of matched subscriptions."""
 
 
 class RequestId(Protocol):
-    """Which request of its client."""
+    """Identity of a request within its client."""
 
     sequence_number: int
 
 
 class RequestInfo(Protocol):
-    """What comes with a request or a response."""
+    """Metadata of a request or a response."""
 
     request_id: RequestId
 
@@ -85,16 +92,24 @@ class RequestInfo(Protocol):
 class ServiceHandle(Handle, Protocol):
     """A server of rcl."""
 
-    def service_take_request(self, kind: type, /) -> tuple[object, RequestInfo] | tuple[None, None]: ...
-    def service_send_response(self, response: object, request: RequestId, /) -> None: ...
+    def service_take_request(self, kind: type, /) -> tuple[object, RequestInfo] | tuple[None, None]:
+        """Return a request and its metadata; None, None: there is none."""
+
+    def service_send_response(self, response: object, request: RequestId, /) -> None:
+        """Send a response."""
 
 
 class ClientHandle(Handle, Protocol):
     """A client of rcl."""
 
-    def send_request(self, request: object, /) -> int: ...
-    def take_response(self, kind: type, /) -> tuple[RequestInfo | None, object]: ...
-    def service_server_is_available(self) -> bool: ...
+    def send_request(self, request: object, /) -> int:
+        """Send a request; return its sequence number."""
+
+    def take_response(self, kind: type, /) -> tuple[RequestInfo | None, object]:
+        """Return metadata and response; metadata None: there is none."""
+
+    def service_server_is_available(self) -> bool:
+        """Return whether a server matches the client."""
 
 
 class ServiceType(Protocol):
@@ -105,16 +120,31 @@ class ServiceType(Protocol):
 
 
 class WaitSet(Handle, Protocol):
-    """What waits; emptied by every wait."""
+    """Wait set of rcl; every wait empties it."""
 
-    def clear_entities(self) -> None: ...
-    def add_guard_condition(self, guard: GuardCondition, /) -> int: ...
-    def add_subscription(self, subscription: SubscriptionHandle, /) -> int: ...
-    def add_service(self, service: ServiceHandle, /) -> int: ...
-    def add_client(self, client: ClientHandle, /) -> int: ...
-    def wait(self, timeout_ns: int, /) -> None: ...
-    def get_ready_entities(self, kind: str, /) -> list[int]: ...
-    def destroy_when_not_in_use(self) -> None: ...
+    def clear_entities(self) -> None:
+        """Remove all entities."""
+
+    def add_guard_condition(self, guard: GuardCondition, /) -> int:
+        """Add a guard condition; return its index."""
+
+    def add_subscription(self, subscription: SubscriptionHandle, /) -> int:
+        """Add a subscription; return its index."""
+
+    def add_service(self, service: ServiceHandle, /) -> int:
+        """Add a server; return its index."""
+
+    def add_client(self, client: ClientHandle, /) -> int:
+        """Add a client; return its index."""
+
+    def wait(self, timeout_ns: int, /) -> None:
+        """Block until an entity is ready, at most ``timeout_ns`` nanoseconds."""
+
+    def get_ready_entities(self, kind: str, /) -> list[int]:
+        """Return the pointers of the ready entities of one kind."""
+
+    def destroy_when_not_in_use(self) -> None:
+        """Free the object after its last use."""
 
 
 class Entity(Protocol):
@@ -136,8 +166,11 @@ class TopicEnd(Protocol):
 class NodeHandle(Handle, Protocol):
     """A node of rcl."""
 
-    def get_count_publishers(self, topic: str, /) -> int: ...
-    def get_count_subscribers(self, topic: str, /) -> int: ...
+    def get_count_publishers(self, topic: str, /) -> int:
+        """Return the number of a topic's publishers."""
+
+    def get_count_subscribers(self, topic: str, /) -> int:
+        """Return the number of a topic's subscriptions."""
 
 
 class Node(Protocol):
@@ -145,28 +178,61 @@ class Node(Protocol):
 
     handle: NodeHandle
 
-    def get_name(self) -> str: ...
-    def get_topic_names_and_types(self, no_demangle: bool = ...) -> list[tuple[str, list[str]]]: ...
-    def get_service_names_and_types(self) -> list[tuple[str, list[str]]]: ...
-    def get_node_names_and_namespaces(self) -> list[tuple[str, str]]: ...
-    def get_publishers_info_by_topic(self, topic: str) -> list[TopicEnd]: ...
-    def get_subscriptions_info_by_topic(self, topic: str) -> list[TopicEnd]: ...
-    def get_service_names_and_types_by_node(self, node: str, space: str) -> list[tuple[str, list[str]]]: ...
-    def get_client_names_and_types_by_node(self, node: str, space: str) -> list[tuple[str, list[str]]]: ...
-    def create_publisher(self, kind: type, topic: str, qos: object, *, event_callbacks: object) -> Entity: ...
+    def get_name(self) -> str:
+        """Return the name without its namespace."""
+
+    def get_topic_names_and_types(self, no_demangle: bool = ...) -> list[tuple[str, list[str]]]:
+        """Return the graph's topics, each with its types."""
+
+    def get_service_names_and_types(self) -> list[tuple[str, list[str]]]:
+        """Return the graph's services, each with its types."""
+
+    def get_node_names_and_namespaces(self) -> list[tuple[str, str]]:
+        """Return the graph's nodes."""
+
+    def get_publishers_info_by_topic(self, topic: str) -> list[TopicEnd]:
+        """Return a topic's publishers."""
+
+    def get_subscriptions_info_by_topic(self, topic: str) -> list[TopicEnd]:
+        """Return a topic's subscriptions."""
+
+    def get_service_names_and_types_by_node(self, node: str, space: str) -> list[tuple[str, list[str]]]:
+        """Return a node's services, each with its types."""
+
+    def get_client_names_and_types_by_node(self, node: str, space: str) -> list[tuple[str, list[str]]]:
+        """Return the services of a node's clients, each with its types."""
+
+    def create_publisher(self, kind: type, topic: str, qos: object, *, event_callbacks: object) -> Entity:
+        """Create a publisher."""
+
     def create_subscription(
         self, kind: type, topic: str, callback: object, qos: object, *, callback_group: object, raw: bool,
         event_callbacks: object,
-    ) -> Entity: ...  # fmt: skip
+    ) -> Entity:  # fmt: skip
+        """Create a subscription; ``raw``: its messages are CDR bytes."""
+
     def create_service(
         self, kind: type, name: str, callback: object, *, qos_profile: object, callback_group: object
-    ) -> Entity: ...
-    def create_client(self, kind: type, name: str, *, qos_profile: object, callback_group: object) -> Entity: ...
-    def destroy_publisher(self, entity: Entity) -> bool: ...
-    def destroy_subscription(self, entity: Entity) -> bool: ...
-    def destroy_service(self, entity: Entity) -> bool: ...
-    def destroy_client(self, entity: Entity) -> bool: ...
-    def destroy_node(self) -> None: ...
+    ) -> Entity:
+        """Create a server."""
+
+    def create_client(self, kind: type, name: str, *, qos_profile: object, callback_group: object) -> Entity:
+        """Create a client."""
+
+    def destroy_publisher(self, entity: Entity) -> bool:
+        """Free a publisher."""
+
+    def destroy_subscription(self, entity: Entity) -> bool:
+        """Free a subscription."""
+
+    def destroy_service(self, entity: Entity) -> bool:
+        """Free a server."""
+
+    def destroy_client(self, entity: Entity) -> bool:
+        """Free a client."""
+
+    def destroy_node(self) -> None:
+        """Leave the graph and free the node."""
 
 
 class _Context(Protocol):
@@ -178,7 +244,7 @@ class _Context(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """A node in a context of its own."""
+    """A node in a separate context."""
 
     node: Node
     context: _Context
@@ -190,18 +256,18 @@ class Session:
             return cast("GuardCondition", self.rcl.GuardCondition(self.context.handle))
 
     def wait_set(self, subscriptions: int, services: int, clients: int) -> WaitSet:
-        """Return a wait set with room for one guard condition and these."""
+        """Return a wait set for one guard condition and these numbers of entities."""
         with self.context.handle:
             return cast("WaitSet", self.rcl.WaitSet(subscriptions, 1, 0, clients, services, 0, self.context.handle))
 
     def group(self) -> object:
-        """Return a callback group for one entity: a node's default group would remember every entity for ever."""
+        """Return a callback group for one entity: a node's default group would keep every entity for ever."""
         from rclpy.callback_groups import ReentrantCallbackGroup
 
         return ReentrantCallbackGroup()
 
     def silence(self, *, publisher: bool) -> object:
-        """Return event callbacks that do nothing; what does not fit is seen in the graph instead."""
+        """Return event callbacks that do nothing; incompatible QoS is detected in the graph instead."""
         try:
             from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
         except ImportError:  # before Iron
@@ -220,7 +286,7 @@ def open_session(domain: int, name: str) -> Session:
     """Join a domain as a node without parameters, log topic or type service.
 
     Raises:
-        LocalError: ROS 2 is not installed, or does not start; the text says what to do.
+        LocalError: ROS 2 is not installed, or does not start; the text states what to do.
     """
     _check_rmw()
     try:
@@ -254,7 +320,7 @@ def open_session(domain: int, name: str) -> Session:
 
 
 def _check_rmw() -> None:
-    """Refuse an RMW that is not installed: rcl would end the process over it, with exit status 102."""
+    """Refuse an RMW that is not installed: rcl would end the process with exit status 102."""
     wanted = os.environ.get("RMW_IMPLEMENTATION", "")
     prefixes = [*os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix]
     folders = [*os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep), *(f"{prefix}/lib" for prefix in prefixes)]
@@ -269,7 +335,7 @@ def _check_rmw() -> None:
 
 @contextmanager
 def translated(what: str) -> Iterator[None]:
-    """Turn what rclpy raises for a name, a type or a profile that it refuses into a LocalError."""
+    """Translate rclpy's error for a refused name, type or profile into a LocalError."""
     from rclpy.exceptions import NameValidationException, NoTypeSupportImportedException
 
     try:

@@ -1,6 +1,6 @@
-"""The generated Python class of an interface name, and what it says of itself as channels and services.
+"""Types: generated Python classes of interface names, and their descriptions as channels and services.
 
-Place: imports what the robot's ROS 2 has installed; no other I/O.
+Imports the packages of the robot's ROS 2; no other I/O.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ def class_of(type_name: str) -> type:
     ``test_msgs/action/Fibonacci_SendGoal`` of an action, which is a service).
 
     Raises:
-        LocalError: it is not installed; the text says what to install.
+        LocalError: it is not installed; the text states what to install.
     """
     match = _NAME.match(type_name)
     if match is None:
         raise LocalError(f"{type_name!r} is not the name of a ROS 2 interface (package/msg/Name)")
     package, room, name, outer = match.groups()
     try:
-        # the generated module of the outer interface holds the classes of its parts, under their full names
+        # The generated module of the outer interface holds the classes of its parts, under their full names.
         module = sys.modules[getattr(importlib.import_module(f"{package}.{room}"), outer).__module__]
         found = getattr(module, name)
     except (ImportError, AttributeError) as error:
@@ -48,7 +48,7 @@ def class_of(type_name: str) -> type:
 
 @lru_cache(maxsize=1024)
 def channel_of(topic: str, type_name: str) -> Channel:
-    """Return what is known here of a topic's type, without any QoS.
+    """Return the local description of a topic's type, without any QoS.
 
     Raises:
         LocalError: the type is not installed.
@@ -60,7 +60,7 @@ def channel_of(topic: str, type_name: str) -> Channel:
 
 @lru_cache(maxsize=1024)
 def service_of(name: str, type_name: str) -> Service:
-    """Return what is known here of a service's type.
+    """Return the local description of a service's type.
 
     Raises:
         LocalError: the type is not installed, or is not a service.
@@ -68,7 +68,7 @@ def service_of(name: str, type_name: str) -> Service:
     found = class_of(type_name)
     if not hasattr(found, "Request"):
         raise LocalError(f"{type_name} is not a service")
-    # before Iron services had no events, and interfaces no hashes
+    # Before Iron services had no events, and interfaces no hashes.
     digest = type_hash_of(interface_of(type_name, class_of)) if hasattr(found, "Event") else ""
     request, response = (channel_of(name, f"{type_name}_{part}") for part in ("Request", "Response"))
     return Service(name, type_name, digest, request, response)

@@ -1,8 +1,8 @@
-"""The thread that hears: one wait set over everything, one wake of the caller for a batch of events.
+"""Wait-set thread: one wait set over all sources, one wake-up of the caller for a batch of events.
 
-Place: a thread; rclpy gives up the interpreter's lock while it waits. The caller adds and removes sources; what it
-removes is alive until the thread has let go of it. Where the caller does not keep up, subscriptions are left alone,
-and their queues drop what their QoS says.
+I/O; a thread. rclpy releases the interpreter's lock while it waits. The caller adds and removes sources; a removed
+source stays valid until the thread has released it. If the caller does not keep up, subscriptions are not read, and
+their queues drop messages by their QoS.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _HOLD_S: Final = 0.005  # rcl has no event for "this client has its server"
 
 
 class WaitThread:
-    """Sources in, events out."""
+    """Reads sources and queues their events."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
@@ -51,15 +51,15 @@ class WaitThread:
 
     @property
     def graph(self) -> Graph:
-        """Return the graph as last seen."""
+        """Return the last known graph."""
         return self._survey.graph
 
     def fileno(self) -> int:
-        """Return what is readable while there are events."""
+        """Return a descriptor that is readable while there are events."""
         return self._fd
 
     def add(self, end: Source | PublisherEntity) -> None:
-        """Hear with ``end``, or watch whether a publisher's QoS suits its subscribers."""
+        """Wait on a source, or check whether a publisher's QoS matches its subscribers."""
         with self._lock:
             if isinstance(end, PublisherEntity):
                 self._publishers[end.number] = end
@@ -70,7 +70,7 @@ class WaitThread:
         self._guard.trigger_guard_condition()
 
     def remove(self, number: int) -> None:
-        """Let go of an end; no event names it any more."""
+        """Remove an entity; no event names it any more."""
         with self._lock:
             self._publishers.pop(number, None)
             if self._sources.pop(number, None) is not None:
@@ -84,15 +84,15 @@ class WaitThread:
         self._guard.trigger_guard_condition()
 
     def tell(self, event: Event) -> None:
-        """Add an event of the caller's own making."""
+        """Add an event of the caller."""
         self._post([event])
 
     def wake(self) -> None:
-        """Have the thread look at its sources again."""
+        """Make the thread check its sources."""
         self._guard.trigger_guard_condition()
 
     def poll_events(self) -> list[Event]:
-        """Return, once, what happened."""
+        """Remove and return the pending events."""
         with self._lock:
             events, self._events = self._events, []
             was_full = self._backlog_bytes >= _BACKLOG_MAX_BYTES
@@ -130,9 +130,9 @@ class WaitThread:
                     return
 
     def _wait_on(self, sources: list[Source], due_s: float) -> float:
-        """Hear until the sources change; return when the graph is to be looked at next.
+        """Wait and read until the sources change; return the time of the next refresh of the graph.
 
-        It goes round once a message where messages are rare, so that what can be found out before is.
+        If messages are rare, it wakes once a message, so that work can be done in advance.
         """
         tables: dict[Kind, dict[int, Source]] = {"subscription": {}, "service": {}, "client": {}}
         for source in sources:

@@ -1,5 +1,5 @@
-"""The robot and the server of a live ring: ordinary ROS nodes, which know nothing of the overlay.
+"""Nodes of a live ring: ordinary ROS nodes for robot and server, which do not use the overlay.
 
-Place: processes of their own, ``python -m ring.nodes``. ``content`` is pure; ``ros1`` and ``ros2`` alone import
-their ROS.
+I/O; processes of their own, ``python -m ring.nodes``. ``content`` is sans-I/O; only ``ros1`` and ``ros2`` import their
+ROS.
 """

@@ -1,6 +1,6 @@
-"""``python -m ring.nodes ROS NODE COUNT``: ROS is 1 or 2; COUNT messages or calls, where the node has any.
+"""Module entry ``python -m ring.nodes ROS NODE COUNT``: ROS is 1 or 2; COUNT messages or calls, where the node has any.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ def _node(ros: str, name: str) -> Node:
         return Ros2Node(name)
     from proxy.endpoints.ros1.install import rospy_folder
 
-    sys.path.insert(0, rospy_folder())  # first: a ROS 2 of this interpreter has packages of the same names
+    sys.path.insert(0, rospy_folder())  # comes first: a ROS 2 of this interpreter has packages of the same names
     from ring.nodes.ros1 import Ros1Node
 
     return Ros1Node(name)
 
 
 def main() -> None:
-    """Be one of the nodes until killed."""
+    """Run one of the nodes until killed."""
     ros, name, count = sys.argv[1], sys.argv[2], int(sys.argv[3])
     orders = Orders()
     node = _node(ros, name)

@@ -1,8 +1,9 @@
-"""What the nodes of a live ring say: messages that are never the same twice, and what is compared of them.
+"""Content of the live ring's messages: each is unique, and reduced to a mark for comparison.
 
-Place: pure. A message is seen through its fields, so that ROS 1 and ROS 2 are one here.
+Sans-I/O. Messages are accessed by their fields, so that the same code serves ROS 1 and ROS 2.
 
-A talker's messages are numbered from 1. Number 0 is a greeting, said until the other end hears; it does not count.
+A talker's messages are numbered from 1. Number 0 is a greeting, sent until the other side receives it; it does not
+count.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import Final, NamedTuple, TypeAlias
 
 __all__ = ["LAMP", "LAMP_HZ", "LAMP_TYPE", "TALKS", "Fit", "Mark", "Talk", "digest", "lamp_says", "talk_of"]
 
-Fit: TypeAlias = Callable[["array[int]"], object]  # makes an array what a ROS takes
+Fit: TypeAlias = Callable[["array[int]"], object]  # converts an array to the form of a ROS version
 
 LAMP: Final = "/lamp"
 LAMP_TYPE: Final = "std_srvs/srv/SetBool"
@@ -32,7 +33,7 @@ _SECOND_NS: Final = 1_000_000_000
 
 
 class Mark(NamedTuple):
-    """What a listener reads off a message."""
+    """Properties that a listener reads from a message."""
 
     number: int
     stamp_ns: int
@@ -40,7 +41,7 @@ class Mark(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Talk:
-    """A topic of the robot, and the node that publishes it. ``latched``: the newest message stays for late joiners."""
+    """A topic of the robot, and the node that publishes it. ``latched``: late joiners get the newest message."""
 
     node: str
     topic: str
@@ -52,9 +53,9 @@ class Talk:
 
 
 def digest(message: object) -> str:
-    """Return 32 hex digits that tell messages of different content apart.
+    """Return 32 hex digits that distinguish messages of different content.
 
-    Both ROS give the same, save for the sequence number in a ROS 1 header, which does not cross.
+    Both ROS versions give the same, except for the sequence number in a ROS 1 header, which does not cross.
     """
     sha = sha256()
     for leaf in _leaves(message):
@@ -64,12 +65,12 @@ def digest(message: object) -> str:
 
 
 def lamp_says(number: int, *, on: bool) -> str:
-    """Return what the lamp answers when it is switched for the ``number``-th time."""
+    """Return the lamp's reply to its ``number``-th switching."""
     return f"{'on' if on else 'off'}, switched {number} times"
 
 
 def talk_of(topic: str) -> Talk:
-    """Return what is said on a topic."""
+    """Return the talk of a topic."""
     return next(talk for talk in TALKS if talk.topic == topic)
 
 
@@ -109,7 +110,7 @@ def _look_at_picture(message: object) -> Mark:
 
 def _draw_map(message: object, number: int, now_ns: int, fit: Fit) -> None:
     cells = array("b", [-1]) * (_CELLS_X * _CELLS_Y)  # unknown
-    for at in range(min(number * _CELLS_X, len(cells))):  # each map knows one row more
+    for at in range(min(number * _CELLS_X, len(cells))):  # each map adds one known row
         cells[at] = 100 if at % 7 == number % 7 else 0
     _put_time(_get(message, "header.stamp"), now_ns)
     _put_time(_get(message, "info.map_load_time"), now_ns)
@@ -128,7 +129,7 @@ def _draw_map(message: object, number: int, now_ns: int, fit: Fit) -> None:
 
 
 def _look_at_map(message: object) -> Mark:
-    return Mark(1, _time_ns(_get(message, "header.stamp")))  # there are no greetings among them
+    return Mark(1, _time_ns(_get(message, "header.stamp")))  # this topic has no greetings
 
 
 TALKS: Final = (
@@ -170,7 +171,7 @@ def _time_ns(stamp: object) -> int:
 
 
 def _leaves(value: object) -> Iterator[bytes]:
-    """Yield what a message holds, in the order of its definition."""
+    """Yield the values of a message, in the order of its definition."""
     if isinstance(value, array) and value.typecode == "B":
         yield value.tobytes()
     elif isinstance(value, bytes):

@@ -1,6 +1,6 @@
-"""``python -m ring.nodes.master PORT``: the master of a ROS 1 graph, until killed.
+"""Master of a ROS 1 graph: ``python -m ring.nodes.master PORT``, until killed.
 
-Place: shell; imports rosmaster, which brings no types.
+I/O; imports rosmaster, which has no types.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from ring.nodes.orders import say
 
 
 def main() -> None:
-    """Serve, and say when."""
+    """Serve, and report when ready."""
     sys.path.insert(0, rospy_folder())
     import_module("rosmaster.master").Master(int(sys.argv[1])).start()
     say("ready")

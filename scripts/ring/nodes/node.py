@@ -1,6 +1,6 @@
-"""What the roles of a live ring want of a ROS node, whichever ROS it is.
+"""Node interface that the roles of a live ring need, for either ROS.
 
-Place: pure; ``ros1`` and ``ros2`` do the I/O.
+Sans-I/O; ``ros1`` and ``ros2`` do the I/O.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ __all__ = ["Call", "Caller", "Lamp", "Node", "Publisher"]
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """A lamp's answer. ``size``: bytes of request and response, as this ROS writes them."""
+    """A lamp's reply. ``size``: bytes of request and response in this ROS's wire form."""
 
     success: bool
     message: str
@@ -29,39 +29,39 @@ class Publisher(Protocol):
         """Return a new, empty message."""
 
     def publish(self, message: object) -> None:
-        """Send it."""
+        """Publish a message."""
 
 
 class Caller(Protocol):
     """A client of a lamp."""
 
     def wait(self, seconds: float) -> bool:
-        """Return whether the service is there by then."""
+        """Return whether the service is available within this many seconds."""
 
     def call(self, *, on: bool, patience_s: float) -> Call | None:
-        """Switch it; return the answer, None if none came."""
+        """Call the lamp; return the reply, None if none came within ``patience_s`` seconds."""
 
 
 Lamp = Callable[[bool], tuple[bool, str]]  # on -> success, message
 
 
 class Node(Protocol):
-    """A node at work: callbacks come from threads of its own."""
+    """A running node: its callbacks come from threads of its own."""
 
     def publisher(self, topic: str, type_name: str, *, latched: bool) -> Publisher:
-        """Publish a topic."""
+        """Create a publisher of a topic."""
 
     def subscribe(self, topic: str, type_name: str, take: Callable[[object], None], *, latched: bool) -> None:
-        """Hear a topic."""
+        """Subscribe to a topic."""
 
     def serve(self, name: str, type_name: str, lamp: Lamp) -> None:
-        """Serve a ``SetBool``."""
+        """Create a ``SetBool`` server."""
 
     def caller(self, name: str, type_name: str) -> Caller:
-        """Be a client of a ``SetBool``."""
+        """Create a ``SetBool`` client."""
 
     def fit(self, values: array[int]) -> object:
-        """Return an array as this ROS takes it in a message."""
+        """Return an array in the form of this ROS's messages."""
 
     def size(self, message: object) -> int:
-        """Return the bytes of a message as this ROS writes it."""
+        """Return the bytes of a message in this ROS's wire form."""

@@ -1,6 +1,6 @@
-"""The roles of a live ring: who talks, listens, serves and calls, written for either ROS.
+"""Roles of a live ring: talkers, listeners, the server and the caller, for either ROS.
 
-Place: shell. Nobody ends by itself: what was said must stay to be had, and a kept ring lives on.
+I/O. No role ends by itself: latched messages must stay available, and a kept ring continues.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ __all__ = ["call", "listen", "serve", "talk"]
 
 _GREETING_S: Final = 0.2
 _LOOK_S: Final = 0.25
-_CALL_S: Final = 8.0  # longer than proxies let a client wait
+_CALL_S: Final = 8.0  # longer than the proxies' timeout for a client
 
 
 class _Pace:
@@ -31,7 +31,7 @@ class _Pace:
         self._tell_at_s = self._next_s
 
     def step(self, **progress: object) -> None:
-        """Wait for the next step; twice a second, tell how far we are, if anything is given to tell."""
+        """Wait for the next step; twice a second, report the progress, if any is given."""
         self._next_s += self._period_s
         self._orders.wait_until(self._next_s)
         if progress and time.monotonic() >= self._tell_at_s:
@@ -40,7 +40,7 @@ class _Pace:
 
 
 def talk(node: Node, orders: Orders, of: Talk, count: int) -> NoReturn:
-    """Greet until told to go, publish ``count`` messages, report, and after that talk on when told to."""
+    """Send greetings until GO, publish ``count`` messages, report, and continue after another GO."""
     out = node.publisher(of.topic, of.type_name, latched=of.latched)
     size = 0
     sent = list[str]()
@@ -59,7 +59,7 @@ def talk(node: Node, orders: Orders, of: Talk, count: int) -> NoReturn:
 
     say("ready")
     if of.latched:
-        publish_counted(1)  # for those who are not there yet
+        publish_counted(1)  # for late joiners
     while orders.wait(_GREETING_S) is not Order.GO:
         if not of.latched:
             publish(0)
@@ -76,21 +76,21 @@ def talk(node: Node, orders: Orders, of: Talk, count: int) -> NoReturn:
 
 
 class Gap:
-    """The longest time between two of a series of moments."""
+    """The longest interval in a series of times."""
 
     def __init__(self) -> None:
         self._newest_ns: int | None = None
         self.longest_ms: float | None = None
 
     def note(self, now_ns: int) -> None:
-        """Note a moment."""
+        """Add a time, in nanoseconds."""
         if self._newest_ns is not None:
             self.longest_ms = max(self.longest_ms or 0.0, (now_ns - self._newest_ns) / 1e6)
         self._newest_ns = now_ns
 
 
 class _Ear:
-    """What came on one topic. The first message is not timed: it may have waited for us."""
+    """Messages of one topic. The first one is not timed: it may have waited for the subscription."""
 
     def __init__(self, of: Talk) -> None:
         self._of = of
@@ -123,7 +123,7 @@ class _Ear:
 
 
 def listen(node: Node, orders: Orders, talks: Sequence[Talk]) -> NoReturn:
-    """Hear all topics; tell when each was heard, how many messages came, and at the end which."""
+    """Receive all topics; report the first message of each, the counts, and at the end the content."""
     ears = [_Ear(of) for of in talks]
     for of, ear in zip(talks, ears, strict=True):
         node.subscribe(of.topic, of.type_name, ear.take, latched=of.latched)
@@ -139,7 +139,7 @@ def listen(node: Node, orders: Orders, talks: Sequence[Talk]) -> NoReturn:
 
 
 def serve(node: Node, orders: Orders) -> NoReturn:
-    """Be a lamp; report how often it was switched."""
+    """Serve the lamp; report how often it was switched."""
     switched = 0
 
     def lamp(on: bool) -> tuple[bool, str]:
@@ -155,7 +155,7 @@ def serve(node: Node, orders: Orders) -> NoReturn:
 
 
 def call(node: Node, orders: Orders, count: int) -> NoReturn:
-    """Switch the lamp ``count`` times at a steady pace, one call after the other; report which answers were right."""
+    """Call the lamp ``count`` times at a steady pace, one call after the other; report the correct replies."""
     client = node.caller(LAMP, LAMP_TYPE)
     say("ready")
     _until(lambda: client.wait(_LOOK_S), orders)
@@ -169,7 +169,7 @@ def call(node: Node, orders: Orders, count: int) -> NoReturn:
     for number in range(1, count + 1):
         pace.step()
         if time.monotonic() > give_up_s:
-            break  # calls that wait for nothing take long
+            break  # failing calls take long
         say("progress", asked=number, answered=len(latencies_ms))
         on = bool(number % 2)
         began_ns = time.perf_counter_ns()
@@ -199,7 +199,7 @@ def call(node: Node, orders: Orders, count: int) -> NoReturn:
 
 
 def _switched(answer: Call, *, on: bool) -> int:
-    """Return how often the lamp was switched, as a right answer says; 0: a wrong one."""
+    """Return how often the lamp was switched, from a correct reply; 0: an incorrect one."""
     words = answer.message.split()
     number = int(words[2]) if len(words) == 4 and words[2].isdigit() else 0
     return number if answer.success and answer.message == lamp_says(number, on=on) else 0

@@ -1,6 +1,6 @@
-"""A node of ROS 1.
+"""Node of ROS 1 for the roles of a live ring.
 
-Place: imports rospy; I/O.
+I/O; imports rospy.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class _Caller:
         return True
 
     def call(self, *, on: bool, patience_s: float) -> Call | None:
-        del patience_s  # rospy has none; who serves must answer or refuse
+        del patience_s  # rospy has no timeout; the server must answer or refuse
         try:
             response = self._call(on)
         except rospy.ServiceException:
@@ -54,26 +54,26 @@ class _Caller:
 
 
 class Ros1Node:
-    """A node; rospy brings the threads. The environment says where its master is."""
+    """A node; rospy supplies the threads. The environment states the master's URI."""
 
     def __init__(self, name: str) -> None:
         rospy.init_node(name, disable_signals=True)
 
     def publisher(self, topic: str, type_name: str, *, latched: bool) -> Publisher:
-        """Publish a topic."""
+        """Create a publisher of a topic."""
         return _Publisher(topic, type_name, latched=latched)
 
     def subscribe(self, topic: str, type_name: str, take: Callable[[object], None], *, latched: bool) -> None:
-        """Hear a topic."""
-        del latched  # the publisher's business
+        """Subscribe to a topic."""
+        del latched  # the publisher decides it
         rospy.Subscriber(topic, _load(type_name), take, buff_size=1 << 22, tcp_nodelay=True)
 
     def serve(self, name: str, type_name: str, lamp: Lamp) -> None:
-        """Serve a ``SetBool``."""
+        """Create a ``SetBool`` server."""
         rospy.Service(name, _load(type_name), lambda request: lamp(request.data))
 
     def caller(self, name: str, type_name: str) -> Caller:
-        """Be a client of a ``SetBool``."""
+        """Create a ``SetBool`` client."""
         return _Caller(name, type_name)
 
     def fit(self, values: array[int]) -> object:

@@ -1,6 +1,6 @@
-"""A node of ROS 2.
+"""Node of ROS 2 for the roles of a live ring.
 
-Place: imports rclpy; I/O.
+I/O; imports rclpy.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ring.nodes.node import Call, Caller, Lamp, Publisher
 
 __all__ = ["Ros2Node"]
 
-_DEPTH: Final = 50  # some seconds of pictures: Fast DDS may take three until it asks for what it lost
+_DEPTH: Final = 50  # some seconds of pictures: Fast DDS may need three to request a lost sample
 
 
 class _SetBool(Protocol):
@@ -64,7 +64,7 @@ class _Caller:
 
 
 class Ros2Node:
-    """A node that is spun in a thread of its own. The environment says in which domain, through which middleware."""
+    """A node that is spun in a thread of its own. The environment states the domain and the middleware."""
 
     def __init__(self, name: str) -> None:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
@@ -74,15 +74,15 @@ class Ros2Node:
         threading.Thread(target=executor.spin, name="spin", daemon=True).start()
 
     def publisher(self, topic: str, type_name: str, *, latched: bool) -> Publisher:
-        """Publish a topic, reliably."""
+        """Create a reliable publisher of a topic."""
         return _Publisher(self._node, topic, type_name, _profile(latched=latched))
 
     def subscribe(self, topic: str, type_name: str, take: Callable[[object], None], *, latched: bool) -> None:
-        """Hear a topic."""
+        """Subscribe to a topic."""
         self._node.create_subscription(_load(type_name), topic, take, _profile(latched=latched))
 
     def serve(self, name: str, type_name: str, lamp: Lamp) -> None:
-        """Serve a ``SetBool``."""
+        """Create a ``SetBool`` server."""
         kind = _load(type_name)
         make = cast("_SetBool", kind).Response
 
@@ -94,7 +94,7 @@ class Ros2Node:
         self._node.create_service(kind, name, answer)
 
     def caller(self, name: str, type_name: str) -> Caller:
-        """Be a client of a ``SetBool``."""
+        """Create a ``SetBool`` client."""
         return _Caller(self._node, name, type_name)
 
     def fit(self, values: array[int]) -> object:

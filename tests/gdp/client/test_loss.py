@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gdp.client.writer_proxy import WriterProxyState
@@ -256,6 +256,7 @@ OUTAGES = st.lists(
 
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(OUTAGES, st.booleans(), st.integers(0, 1_000))
+@example([("deaf", 8.0, 1, 20)], True, 0)
 def test_through_any_outages_published_is_delivered_or_lost(
     outages: list[tuple[str, float, int, int]], reliable: bool, seed: int
 ) -> None:

@@ -20,7 +20,7 @@ ONE, TWO = (bytes([number]) * 16 for number in (1, 2))
 EXECUTING, SUCCEEDED, CANCELED = 2, 4, 5
 
 
-def heartbeats(*goals: tuple[bytes, int], order: str = "<") -> bytes:
+def statuses(*goals: tuple[bytes, int], order: str = "<") -> bytes:
     """Return an ``action_msgs/GoalStatusArray``, the first goal's stamp being 1 s, the next one's 2 s, ..."""
     body = struct.pack(f"{order}I", len(goals))
     for number, (goal, status) in enumerate(goals, 1):
@@ -37,49 +37,49 @@ def test_feedback_comes_from_the_one_whose_acceptance_the_client_got() -> None:
     goals = Goals()
     goals.sent(ONE, b"goal")
     goals.accepted(ONE, B)
-    assert [goals.may_writer_proxy(server, feedback(ONE)) for server in (A, B, A)] == [False, True, False]
+    assert [goals.may_feed(server, feedback(ONE)) for server in (A, B, A)] == [False, True, False]
 
 
 def test_when_that_one_goes_the_next_who_speaks_takes_over() -> None:
     goals = Goals()
     goals.accepted(ONE, A)
     goals.gone(A)
-    assert [goals.may_writer_proxy(server, feedback(ONE)) for server in (B, A)] == [True, False]
+    assert [goals.may_feed(server, feedback(ONE)) for server in (B, A)] == [True, False]
 
 
 def test_a_goal_of_another_machines_client_has_one_speaker_too() -> None:
     goals = Goals()
-    assert [goals.may_writer_proxy(server, feedback(ONE)) for server in (B, A, B)] == [True, False, True]
+    assert [goals.may_feed(server, feedback(ONE)) for server in (B, A, B)] == [True, False, True]
 
 
 def test_goal_statuses_of_several_servers_come_as_one_message_each_goal_by_its_speaker() -> None:
     goals = Goals()
     goals.accepted(ONE, A)
     goals.accepted(TWO, B)
-    assert goals.heartbeats(A, heartbeats((ONE, 1), (TWO, 1))) == heartbeats((ONE, 1))
-    assert goals.heartbeats(B, heartbeats((ONE, EXECUTING))) is None
-    said = goals.heartbeats(B, heartbeats((ONE, EXECUTING), (TWO, EXECUTING), order=">"))
-    assert said == heartbeats((ONE, 1), (TWO, EXECUTING))
+    assert goals.statuses(A, statuses((ONE, 1), (TWO, 1))) == statuses((ONE, 1))
+    assert goals.statuses(B, statuses((ONE, EXECUTING))) is None
+    said = goals.statuses(B, statuses((ONE, EXECUTING), (TWO, EXECUTING), order=">"))
+    assert said == statuses((ONE, 1), (TWO, EXECUTING))
     stamp_and_status = struct.pack("<iIB", 2, 0, EXECUTING)
-    assert goals.heartbeats(A, heartbeats()) == heartbeats((TWO, 0))[:24] + stamp_and_status
+    assert goals.statuses(A, statuses()) == statuses((TWO, 0))[:24] + stamp_and_status
 
 
 def test_what_a_server_said_that_is_gone_ends_when_another_speaks_and_does_not_know_the_goal() -> None:
     goals = Goals()
-    goals.heartbeats(A, heartbeats((ONE, EXECUTING)))
+    goals.statuses(A, statuses((ONE, EXECUTING)))
     goals.gone(A)
-    assert goals.heartbeats(B, heartbeats()) == heartbeats()
+    assert goals.statuses(B, statuses()) == statuses()
 
 
 def test_nothing_contradicts_the_result_that_the_client_got() -> None:
     goals = Goals()
     goals.accepted(ONE, A)
-    goals.heartbeats(A, heartbeats((ONE, EXECUTING)))
-    assert goals.ended(ONE, B, CDR + bytes([SUCCEEDED])) == heartbeats((ONE, SUCCEEDED))
-    assert goals.heartbeats(A, heartbeats((ONE, CANCELED))) is None
-    assert goals.heartbeats(B, heartbeats((ONE, EXECUTING))) is None
+    goals.statuses(A, statuses((ONE, EXECUTING)))
+    assert goals.ended(ONE, B, CDR + bytes([SUCCEEDED])) == statuses((ONE, SUCCEEDED))
+    assert goals.statuses(A, statuses((ONE, CANCELED))) is None
+    assert goals.statuses(B, statuses((ONE, EXECUTING))) is None
     goals.gone(B)
-    assert goals.heartbeats(A, heartbeats((ONE, CANCELED))) is None
+    assert goals.statuses(A, statuses((ONE, CANCELED))) is None
 
 
 def test_a_goal_is_sent_again_until_it_ends_or_is_cancelled() -> None:
@@ -106,20 +106,20 @@ def test_goals_are_forgotten_the_oldest_first() -> None:
 def test_goals_that_one_server_names_push_out_no_goal_of_a_client_here_nor_another_servers() -> None:
     goals = Goals()
     goals.sent(ONE, b"goal")
-    goals.may_writer_proxy(B, feedback(TWO))
+    goals.may_feed(B, feedback(TWO))
     for first in range(0, 3_000, 1_000):
         many = [(number.to_bytes(16, "big"), EXECUTING) for number in range(1 << 40, (1 << 40) + 1_000)]
-        goals.heartbeats(A, heartbeats(*((bytes([first // 1_000]) + goal[1:], status) for goal, status in many)))
+        goals.statuses(A, statuses(*((bytes([first // 1_000]) + goal[1:], status) for goal, status in many)))
     assert goals.again(ONE) == b"goal"
-    assert [goals.may_writer_proxy(server, feedback(TWO)) for server in (A, B)] == [False, True]
-    assert len(goals.heartbeats(B, heartbeats((TWO, EXECUTING))) or b"") < 40 * 1_100
+    assert [goals.may_feed(server, feedback(TWO)) for server in (A, B)] == [False, True]
+    assert len(goals.statuses(B, statuses((TWO, EXECUTING))) or b"") < 40 * 1_100
 
 
 def test_a_goal_that_a_server_named_first_is_kept_like_any_other_when_a_client_here_sends_it() -> None:
     goals = Goals()
-    goals.may_writer_proxy(A, feedback(ONE))
+    goals.may_feed(A, feedback(ONE))
     goals.sent(ONE, b"goal")
-    goals.heartbeats(A, heartbeats(*((number.to_bytes(16, "big"), EXECUTING) for number in range(1_100))))
+    goals.statuses(A, statuses(*((number.to_bytes(16, "big"), EXECUTING) for number in range(1_100))))
     assert goals.again(ONE) == b"goal"
 
 
@@ -135,9 +135,9 @@ def test_of_too_many_goals_of_clients_here_one_that_has_ended_goes_first() -> No
 
 
 def test_a_status_message_of_too_many_goals_is_refused() -> None:
-    raw = heartbeats(*((number.to_bytes(16, "big"), EXECUTING) for number in range(HEARTBEATS_MAX + 1)))
+    raw = statuses(*((number.to_bytes(16, "big"), EXECUTING) for number in range(HEARTBEATS_MAX + 1)))
     with pytest.raises(RemoteError, match="at most"):
-        Goals().heartbeats(A, raw)
+        Goals().statuses(A, raw)
 
 
 @pytest.mark.parametrize(
@@ -157,8 +157,8 @@ def test_the_request_that_cancels_one_goal_has_its_id_and_no_time() -> None:
 def test_any_bytes_are_read_or_refused(raw: bytes) -> None:
     goals = Goals()
     for read in (
-        lambda: goals.heartbeats(A, raw),
-        lambda: goals.may_writer_proxy(A, raw),
+        lambda: goals.statuses(A, raw),
+        lambda: goals.may_feed(A, raw),
         lambda: goals.ended(ONE, A, raw),
     ):
         with contextlib.suppress(RemoteError):
