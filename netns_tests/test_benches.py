@@ -1,4 +1,4 @@
-"""Every bench runs: a short round of each, whose figures nobody looks at."""
+"""Every bench in a short round; the figures are not checked."""
 
 from __future__ import annotations
 

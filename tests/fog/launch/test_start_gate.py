@@ -1,3 +1,5 @@
+"""Start gate, which holds commands back until the cluster serves."""
+
 import subprocess
 from pathlib import Path
 
@@ -20,7 +22,7 @@ def test_a_command_begins_when_the_gate_opens_and_at_once_afterwards(tmp_path: P
         assert late.communicate()[0] == "begun\n"
 
 
-def test_nobody_waits_for_a_launch_that_is_gone(tmp_path: Path) -> None:
+def test_no_node_waits_for_a_launch_that_is_gone(tmp_path: Path) -> None:
     gate = StartGate.remove_entity(tmp_path / "gate")
     with held(gate) as waiting:
         gate.open(serving=False)

@@ -1,4 +1,4 @@
-"""Which machine of a group is the gateway, as tables of records."""
+"""Gateway election of a group, as tables of records."""
 
 from __future__ import annotations
 
