@@ -21,4 +21,4 @@ if __name__ == "__main__":
         for event in endpoint.poll_events() if ready else ():
             if isinstance(event, MessageReceived):
                 endpoint.publish(back, event.raw)
-    endpoint.remove_entity()
+    endpoint.shut_down()

@@ -68,7 +68,7 @@ def _seen(domain: int, nodes: Sequence[_Start], folder: Path) -> list[tuple[str,
             ends = dict(stack.enter_context(_started(each, folder / f"{n}.log")) for n, each in enumerate(nodes))
             return _settled(endpoint, ends)
     finally:
-        endpoint.remove_entity()
+        endpoint.shut_down()
 
 
 def _settled(endpoint: Ros2Endpoint, ends: Mapping[int, Path]) -> list[tuple[str, str, str]]:

@@ -61,7 +61,7 @@ class FogCluster(entity.FogCluster, Action):  # type: ignore[misc]  # launch has
         for note in self.cluster_spec.notes:
             log.warning("cluster %s: %s", name, note)
         run = RunRegistry().start()
-        gate = StartGate.remove_entity(run.directory / "gate")
+        gate = StartGate.closed(run.directory / "gate")
         _hold(context, shlex.join(gate.prefix()))
         context.register_event_handler(_Fails(lambda event: isinstance(event, _Failed) and event.cluster is self))
         self._starting = context.asyncio_loop.create_task(self._start(context, nodes, run.directory, gate))

@@ -31,7 +31,7 @@ class StartGate:
     descriptor: int
 
     @classmethod
-    def remove_entity(cls, path: Path) -> StartGate:
+    def closed(cls, path: Path) -> StartGate:
         """Create a closed gate."""
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
         fcntl.flock(descriptor, fcntl.LOCK_EX)

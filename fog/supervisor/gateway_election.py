@@ -74,7 +74,7 @@ def _is_suspect(gateway: Record, there: Sequence[Record], now_s: float, patience
     """Return whether a running gateway seems not to forward: no replica of the group is reachable."""
     if gateway.unreachable_unix_s is None or any(each.is_serving for each in there):
         return False
-    since_s = max(gateway.unreachable_unix_s + patience.unreachable_s, _last_s(gateway) + patience.gateway_s)
+    since_s = max(gateway.unreachable_unix_s + patience.unreachable_timeout_s, _last_s(gateway) + patience.gateway_s)
     return now_s >= since_s
 
 

@@ -22,7 +22,7 @@ class Timeouts:
 
     Args:
         boot_s: from the request of a machine until its replica serves.
-        unreachable_s: limit for an unreachable replica while another replica is reachable.
+        unreachable_timeout_s: limit for an unreachable replica while another replica is reachable.
         partition_timeout_s: the same while no replica is reachable; the cause is then probably a network partition.
         drain_s: from the drain request to a machine until its release.
         release_s: until the release of a machine that still exists is repeated.
@@ -31,7 +31,7 @@ class Timeouts:
     """
 
     boot_s: float = 90.0
-    unreachable_s: float = 1.0
+    unreachable_timeout_s: float = 1.0
     partition_timeout_s: float = 10.0
     drain_s: float = 12.0
     release_s: float = 5.0
@@ -160,7 +160,7 @@ class _View:
             is_late = now_s - record.asked_unix_s >= limit.boot_s
             return Release(record.name, "did not serve in time", Outcome.FAILED) if is_late else None
         since_s = record.unreachable_unix_s
-        patience_s = limit.unreachable_s if self.is_any_serving else limit.partition_timeout_s
+        patience_s = limit.unreachable_timeout_s if self.is_any_serving else limit.partition_timeout_s
         if since_s is not None and now_s - since_s >= patience_s and record.name not in self.excused:
             return Release(record.name, "its replica is not heard any more", Outcome.TAKEN)
         return None

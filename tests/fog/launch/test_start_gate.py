@@ -13,7 +13,7 @@ def held(gate: StartGate) -> subprocess.Popen[str]:
 
 
 def test_a_command_begins_when_the_gate_opens_and_at_once_afterwards(tmp_path: Path) -> None:
-    gate = StartGate.remove_entity(tmp_path / "gate")
+    gate = StartGate.closed(tmp_path / "gate")
     with held(gate) as waiting:
         gate.open(serving=True)
         gate.open(serving=False)
@@ -23,7 +23,7 @@ def test_a_command_begins_when_the_gate_opens_and_at_once_afterwards(tmp_path: P
 
 
 def test_no_node_waits_for_a_launch_that_is_gone(tmp_path: Path) -> None:
-    gate = StartGate.remove_entity(tmp_path / "gate")
+    gate = StartGate.closed(tmp_path / "gate")
     with held(gate) as waiting:
         gate.open(serving=False)
         assert waiting.communicate() == ("", "not started: the cluster does not serve\n")

@@ -190,13 +190,13 @@ class Sites:
         machine.member.leave()
         self.world.network.touch(machine.label)
         for endpoint in machine.endpoints:
-            endpoint.remove_entity()
+            endpoint.shut_down()
         self.machines.remove(machine)
 
     def kill(self, machine: Machine) -> None:
         """End a proxy without a goodbye to the overlay."""
         for endpoint in machine.endpoints:
-            endpoint.remove_entity()
+            endpoint.shut_down()
         self.machines.remove(machine)
         self.world.network.stop(machine.label)
 

@@ -277,7 +277,7 @@ def _dds_peer(domain: int) -> None:
             endpoint.close(handles.pop(name))
         elif do == "graph":
             _say(answer="graph", ends=[[end.name, end.role.value, end.node] for end in endpoint.graph()])
-    endpoint.remove_entity()
+    endpoint.shut_down()
 
 
 if __name__ == "__main__":

@@ -189,7 +189,7 @@ class Net:
     def leave(self) -> None:
         """End the peers and endpoints."""
         for endpoint in self.endpoints:
-            endpoint.remove_entity()
+            endpoint.shut_down()
         self.endpoints.clear()
         self.end_peers()
 

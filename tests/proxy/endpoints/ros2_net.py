@@ -147,7 +147,7 @@ def endpoint_of_ours(node: str = NODE) -> Iterator[Ears]:
         try:
             yield Ears(endpoint)
         finally:
-            endpoint.remove_entity()
+            endpoint.shut_down()
 
 
 @contextmanager

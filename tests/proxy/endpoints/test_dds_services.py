@@ -33,7 +33,7 @@ def ears(domain: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Ears]:
     monkeypatch.setenv("CYCLONEDDS_URI", CYCLONE)
     endpoint = DdsEndpoint(domain, "gdp_proxy_0123456789ab")
     yield Ears(endpoint)
-    endpoint.remove_entity()
+    endpoint.shut_down()
 
 
 @pytest.fixture

@@ -43,7 +43,7 @@ def ears(domain: int) -> Iterator[Ears]:
         patch.setenv("CYCLONEDDS_URI", CYCLONE)
         endpoint = DdsEndpoint(domain, "gdp_proxy_0123456789ab")
     yield Ears(endpoint)
-    endpoint.remove_entity()
+    endpoint.shut_down()
 
 
 @pytest.fixture(scope="module")

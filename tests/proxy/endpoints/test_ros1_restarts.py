@@ -121,6 +121,6 @@ def test_the_rospy_process_ends_with_the_proxy(net: Net) -> None:
     other.wait_end("/out")
     net.endpoints.remove(ear.endpoint)
     process = ear.endpoint._process
-    ear.endpoint.remove_entity()
+    ear.endpoint.shut_down()
     assert process.returncode == 0
     other.wait_end("/out", gone=True)
