@@ -1,4 +1,8 @@
-"""Send 30 images a second, or show how they arrive: ``camera.py send robot/proxy``, ``camera.py show server/proxy``."""
+"""Publisher of 30 images a second, and a subscriber that shows their arrival.
+
+python examples/camera.py send robot/proxy
+python examples/camera.py show server/proxy
+"""
 
 import asyncio
 import os
@@ -12,7 +16,7 @@ async def main(role: str, node: str, count: int = 30) -> None:
     """Send or show ``count`` images of 640 x 480 pixels."""
     async with gdp.open_async(node) as session:
         if role == "send":
-            camera = session.publisher("camera", reliable=False)  # a late image is worth nothing
+            camera = session.publisher("camera", reliable=False)  # a late image has no value
             await camera.wait_for_readers()
             for _ in range(count):
                 await camera.put(os.urandom(640 * 480))

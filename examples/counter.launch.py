@@ -1,4 +1,4 @@
-"""A counter that two spot machines keep in step: if one fails, the other has the same count (docs/how-to/state.md)."""
+"""Counter replicated on two spot machines: if one fails, the other has the same count (docs/how-to/state.md)."""
 
 from fog import FogCluster, LaunchDescription, Node, SpotMachine
 

@@ -1,4 +1,4 @@
-"""A service on two spot machines and a robot that calls it; all nodes come with this package.
+"""Service on two spot machines and a robot that calls it; this package contains all nodes.
 
 ``fog launch examples/echo.launch.py rate:=50``
 """

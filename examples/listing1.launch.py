@@ -1,6 +1,6 @@
-"""The first listing of the FogROS2-FT paper: a detector on two machines, the robot's client on the robot.
+"""First listing of the FogROS2-FT paper: a detector on two machines, its client on the robot.
 
-``fog launch examples/listing1.launch.py --dry-run``; the packages are the reader's own.
+``fog launch examples/listing1.launch.py --dry-run``; supply the packages yourself.
 """
 
 from fog import CloudMachine, FogCluster, LaunchDescription, Node, SpotMachine

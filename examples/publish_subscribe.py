@@ -1,4 +1,4 @@
-"""Publish a greeting ten times a second, or print what arrives.
+"""Publisher of ten greetings a second, and a subscriber that prints them.
 
 python examples/publish_subscribe.py publish robot/proxy
 python examples/publish_subscribe.py subscribe server/proxy

@@ -1,4 +1,4 @@
-"""Serve a name on two nodes, and call both: the first response counts, and one of them may stop.
+"""Service of one name on two nodes: a call uses the first response, so one node may stop.
 
 python examples/request_response.py serve edge/proxy
 python examples/request_response.py serve cloud/proxy

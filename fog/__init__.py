@@ -1,4 +1,4 @@
-"""Replicated ROS services on machines in the cloud: launch descriptions, providers, the supervisor, prices.
+"""Replicated ROS services on cloud machines: launch descriptions, providers, the supervisor and prices.
 
 ``from fog import FogCluster, SpotMachine`` loads a name when it is first used (docs/reference/launch-files.md).
 """

@@ -1,8 +1,9 @@
-"""Environment variables that programs of others inherit: ROS nodes, probes, and the programs of a machine.
+"""Environment variables that child processes inherit: ROS nodes, probes, and the programs of a machine.
 
-Place: pure. A node needs where ROS is installed and how it communicates. It does not need the operator's cloud
-credentials or agents (``AWS_SECRET_ACCESS_KEY``, ``SSH_AUTH_SOCK``), so only what is listed here is passed on.
-``FOG_PASS_ENVIRONMENT`` lists further names, separated by blanks or commas; ``PREFIX_*`` stands for all that begin so.
+Sans-I/O. A node needs the location of ROS and its communication settings. It does not need the operator's cloud
+credentials or agents (``AWS_SECRET_ACCESS_KEY``, ``SSH_AUTH_SOCK``), so only the names listed here are passed on.
+``FOG_PASS_ENVIRONMENT`` lists further names, separated by blanks or commas; ``PREFIX_*`` means all names with that
+prefix.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ def child_environment(environment: Mapping[str, str], *, has_desktop: bool = Fal
 
     Args:
         environment: of this process.
-        has_desktop: also what a window needs, for nodes beside the robot such as RViz.
+        has_desktop: also the variables that a window needs, for nodes on the robot's side such as RViz.
     """
     more = re.split(r"[\s,]+", environment.get(PASS_MORE, ""))
     wanted = {*_NAMES, *(_DESKTOP if has_desktop else ()), *(name for name in more if name.strip("*"))}

@@ -1,6 +1,6 @@
-"""What is wanted of a cluster: which nodes, on which machines, known by which names; the supervisor's desired state.
+"""Desired state of a cluster: its nodes, its machines and its exported interfaces.
 
-Place: pure. It is what a launch description comes to, and what the journal keeps as JSON.
+Sans-I/O. A launch description is resolved into this plan, and the journal stores it as JSON.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ __all__ = ["CloudNode", "ClusterPlan", "ExportedInterface", "MachineRequest"]
 
 @dataclass(frozen=True, slots=True)
 class CloudNode:
-    """A ROS node that runs on every machine of the cluster.
+    """ROS node that runs on every machine of the cluster.
 
     Args:
         package, executable: as ``ros2 run`` takes them; without such an installed package, the Python module
             ``package.executable``.
-        arguments: after the executable; ``--ros-args`` (name, namespace, parameters, remappings) included.
+        arguments: after the executable, including ``--ros-args`` (name, namespace, parameters, remappings).
     """
 
     package: str
@@ -34,10 +34,10 @@ class CloudNode:
 
 @dataclass(frozen=True, slots=True)
 class ExportedInterface:
-    """A service, action or topic that the cluster's nodes offer to the robot.
+    """Service, action or topic that the cluster's nodes offer to the robot.
 
     Args:
-        type_name: as ROS 2 writes it.
+        type_name: in the notation of ROS 2.
         options: further keys of the rule on the robot's side, such as ``replication`` and ``timeout_s``.
         served: further keys of the rule on the machines' side, such as ``stop`` and ``at_once``.
     """
@@ -51,10 +51,10 @@ class ExportedInterface:
 
 @dataclass(frozen=True, slots=True)
 class MachineRequest:
-    """One replica's machine.
+    """Request for the machine of one replica.
 
     Args:
-        region: empty: chosen, a different one for each where that can be had.
+        region: empty: chosen by the supervisor, a different one for each machine if possible.
     """
 
     hardware: Hardware
@@ -64,13 +64,13 @@ class MachineRequest:
 
 @dataclass(frozen=True, slots=True)
 class ClusterPlan:
-    """A cluster.
+    """Plan of a cluster.
 
     Args:
-        idle_s: without a call for this long all machines are given back; None: never.
-        budget_usd: when its machines have cost this much, they are given back; None: no limit.
-        availability: share of time for which a machine is to serve; ``fog launch`` adds to ``machines`` as many as
-            that takes. None: ``machines`` says how many there are.
+        idle_s: after this long without a call all machines are released; None: never.
+        budget_usd: when its machines have cost this much, they are released; None: no limit.
+        availability: share of time for which at least one machine is to serve; ``fog launch`` adds as many machines as
+            that needs. None: ``machines`` is the full list.
     """
 
     name: str
@@ -83,7 +83,7 @@ class ClusterPlan:
     availability: float | None = None
 
     def to_json(self) -> str:
-        """Return what ``from_json`` reads."""
+        """Return the text that ``from_json`` reads."""
         return json.dumps(asdict(self), sort_keys=True)
 
     @classmethod
@@ -91,7 +91,7 @@ class ClusterPlan:
         """Read a plan.
 
         Raises:
-            LocalError: it is none.
+            LocalError: the text is not a plan.
         """
         try:
             items = json.loads(text)

@@ -1,6 +1,6 @@
-"""What a machine must have, in no provider's words: ``cpu:16``, ``mem:64``, ``T4``, ``gpu:A100:2``, ``cpu:4,mem:16``.
+"""Hardware requirements, independent of providers: ``cpu:16``, ``mem:64``, ``T4``, ``gpu:A100:2``, ``cpu:4,mem:16``.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ _FORM: Final = "cpu:N, mem:GiB, a GPU such as T4, or gpu:T4:2; several with comm
 
 @dataclass(frozen=True, slots=True)
 class Hardware:
-    """At least this much.
+    """Minimum hardware.
 
     Args:
-        cpus: virtual ones; 0: any number.
+        cpus: virtual CPUs; 0: any number.
         memory_gib: 0: any amount.
-        gpu: its model as in ``GPUS``; empty: none wanted.
-        gpus: how many of that.
+        gpu: model as in ``GPUS``; empty: none required.
+            gpus: number of GPUs.
     """
 
     cpus: int = 0
@@ -35,10 +35,10 @@ class Hardware:
 
     @classmethod
     def from_text(cls, text: str) -> Hardware:
-        """Read the form people write.
+        """Parse the textual form.
 
         Raises:
-            LocalError: it is not of that form, or says a thing twice; the text says what is expected.
+            LocalError: the form is wrong, or a key occurs twice; the text states the expected form.
         """
         found: dict[str, float] = {}
         gpu = ""
@@ -57,14 +57,14 @@ class Hardware:
         return cls(int(found.get("cpu", 0)), found.get("mem", 0.0), gpu, int(found.get("gpus", 0)))
 
     def to_text(self) -> str:
-        """Return the form that ``from_text`` reads; ``cpu:1`` for no wish at all."""
+        """Return the form that ``from_text`` reads; ``cpu:1`` without any requirement."""
         words = [f"cpu:{self.cpus}"] if self.cpus else []
         words += [f"mem:{self.memory_gib:g}"] if self.memory_gib else []
         words += [f"gpu:{self.gpu}:{self.gpus}"] if self.gpu else []
         return ",".join(words) or "cpu:1"
 
     def fits(self, other: Hardware) -> bool:
-        """Return whether what ``other`` has is enough."""
+        """Return whether ``other`` has enough hardware."""
         return (
             other.cpus >= self.cpus
             and other.memory_gib >= self.memory_gib

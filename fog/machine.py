@@ -1,6 +1,6 @@
-"""A machine of a cluster: what is asked of a provider, what it is to run, and what the provider says of it.
+"""Machine of a cluster: the request to a provider, the bootstrap bundle, and the provider's description.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ __all__ = ["Machine", "MachineBundle", "MachineSpec", "MachineState", "Program"]
 
 
 class MachineState(Enum):
-    """Where a machine is in its life."""
+    """State of a machine."""
 
-    BOOTING = "booting"  # asked for; its programs may not be up
-    RUNNING = "running"  # its programs said that they are ready
+    BOOTING = "booting"  # requested; its programs may not be up
+    RUNNING = "running"  # its programs reported that they are ready
     LEAVING = "leaving"  # the provider gave notice, or it is being drained
     GONE = "gone"
 
 
 @dataclass(frozen=True, slots=True)
 class MachineSpec:
-    """What a provider is asked for.
+    """Request for one machine.
 
     Args:
-        cluster: whose it is; providers tag machines with it, so that ``describe`` finds them without a journal.
+        cluster: its cluster; providers tag machines with it, so ``describe`` finds them without a journal.
         name: unique within the cluster and never used again, such as ``m3``.
         offer: which line of the price list: provider, region, type, spot or not.
     """
@@ -40,16 +40,16 @@ class MachineSpec:
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """A process of a machine.
+    """Process of a machine.
 
     Args:
         name: of its log, such as ``switch``.
         argv: ``{home}`` in a word stands for the machine's folder, ``{python}`` for its Python.
-        ready: what a line of its output contains when it is up; empty: it is up when it runs.
-        environment: beside the machine's own; ``{home}`` as in ``argv``.
-        restarts: whether it is started again when it ends; else its end ends the machine.
-        is_users: it runs the user's code: where the machine has a user for that, as this one, without a capability and
-            without a way to the machine's keys.
+        ready: text in a line of its output that reports it is up; empty: it is up when it runs.
+        environment: added to the machine's environment; ``{home}`` as in ``argv``.
+        restarts: whether it is restarted when it ends; otherwise its end ends the machine.
+        is_users: it runs the user's code. If the machine has a user account for that, it runs as that user, without
+            capabilities and without access to the machine's keys.
     """
 
     name: str
@@ -63,11 +63,11 @@ class Program:
 
 @dataclass(frozen=True, slots=True)
 class MachineBundle:
-    """All that a machine needs to become what it is to be.
+    """Bootstrap bundle of a machine.
 
     Args:
-        files: path below the machine's folder -> content. They hold private keys: mode 0600, folders 0700.
-        programs: started all at once, the first first; what one needs of another it waits for. Ended in the reverse
+        files: path below the machine's folder -> content. They may contain secrets: mode 0600, folders 0700.
+        programs: all start at once, in this order; a program waits for what it needs of others. They end in reverse
             order.
     """
 
@@ -77,14 +77,14 @@ class MachineBundle:
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """What a provider says of a machine.
+    """Provider's description of a machine.
 
     Args:
-        id: the provider's own name for it.
-        address: where people reach it; empty while there is none.
-        leaves_at_unix_s: when the provider will take it, once it has given notice.
+        id: the provider's identifier.
+        address: address for users; empty while there is none.
+        leaves_at_unix_s: time of the preemption, after the provider gave notice.
         reason: why it is leaving or gone, in a few words.
-        since_unix_s: when it came into this state; None: the provider does not say.
+        since_unix_s: start of this state; None: the provider does not report it.
         is_gateway: it has the uplink of its replica gateway.
     """
 

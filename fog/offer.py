@@ -1,6 +1,6 @@
-"""What a provider sells: a type of machine, somewhere, at a price.
+"""Offer of a provider: a machine type in a region at a price.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ class Offer:
     """One line of a price list.
 
     Args:
-        region: as the provider calls it.
-        type_name: of machine, as the provider calls it.
-        hardware: what it has.
-        is_spot: cheaper, and may be taken away.
+        region: in the provider's notation.
+        type_name: machine type in the provider's notation.
+        hardware: hardware of the type.
+        is_spot: cheaper, and may be preempted.
     """
 
     provider: str

@@ -1,11 +1,11 @@
-"""A site: whose domain and owner clusters are of, which robot uses them, and which provider has the machines.
+"""Site: domain and owner of its clusters, the robots that use them, and the provider of the machines.
 
-Place: shell. ``fog.yaml`` states it; without one a site of its own is made in the state folder::
+I/O. ``fog.yaml`` describes it; without this file a self-contained site is created in the state folder::
 
-    state/  site.json                 its id: devices and runs carry it
-            domain/ owner/            keys, as gdp lab makes them
-            robot/                    what the robot's side boots: switch, RIB, proxy; keys of the supervisor's watch
-            enrolment/                tickets of machines that are to enrol, and the responder's key
+    state/  site.json                 its id, which devices and runs carry
+            domain/ owner/            keys, as of ``gdp lab``
+            robot/                    bundle of the robot's side: switch, RIB, proxy; keys of the supervisor's watch
+            enrolment/                enrolment tickets of machines, and the responder's key
             journal.sqlite3  supervisor.*  site.lock
 """
 
@@ -113,12 +113,12 @@ class SiteConfig(Section):
 
     @property
     def device(self) -> str:
-        """Return a machine's device towards the overlay; empty: nobody said which."""
+        """Return a machine's device towards the overlay; empty: not configured."""
         return self.machine_iface or ("eth0" if self.provider == "local" else self._tunnel)
 
     @property
     def enrolment_address(self) -> str:
-        """Return where a rented machine reaches the supervisor, ``HOST:PORT``; empty: machines are of this host."""
+        """Return where a rented machine reaches the supervisor, ``HOST:PORT``; empty: machines run on this host."""
         if self.provider == "local":
             return ""
         if self.enrolment.address is not None or self._vxlan is None:
@@ -137,7 +137,7 @@ class SiteConfig(Section):
 
     @model_validator(mode="after")
     def _meets_the_overlay(self) -> SiteConfig:
-        """A machine whose switch has no device to the robot boots, costs, and never serves."""
+        """Reject a machine without a device to the robot: it would cost money and never serve."""
         if not self.device:
             raise ValueError(
                 f"machines of {self.provider} have no way to the robot: set {self.provider}.setup.vxlan, or name in"
@@ -152,7 +152,7 @@ class SiteConfig(Section):
 
     @model_validator(mode="after")
     def _can_enrol(self) -> SiteConfig:
-        """A machine that finds nobody who admits it boots, costs, and never serves."""
+        """Reject a machine that cannot reach a responder: it would cost money and never serve."""
         if self.provider != "local" and not self.enrolment_address:
             raise ValueError(
                 f"machines of {self.provider} do not know where to enrol: set enrolment.address to HOST:PORT at which"
@@ -162,7 +162,7 @@ class SiteConfig(Section):
 
     @model_validator(mode="after")
     def _has_something_to_install(self) -> SiteConfig:
-        """A machine that installs nothing boots, costs, and never serves."""
+        """Reject a machine that installs nothing: it would cost money and never serve."""
         setups = {"aws": self.aws.setup, "skypilot": self.skypilot.setup}
         has_image = bool(self.aws.images) if self.provider == "aws" else False
         if self.provider in setups and not setups[self.provider].has_requirements and not has_image:
@@ -186,7 +186,7 @@ class SiteConfig(Section):
         """Read ``fog.yaml``.
 
         Raises:
-            ConfigError: every error of the file, each with line and column.
+            ConfigError: all errors of the file, each with line and column.
         """
         return load(cls, path)
 
@@ -209,15 +209,15 @@ class _Settings(TypedDict):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Site:
-    """A site as the commands and the supervisor use it.
+    """Site for the commands and the supervisor.
 
     Args:
         id: six hex digits.
-        file: its ``fog.yaml``; None: it is its own.
+        file: its ``fog.yaml``; None: self-contained.
         robots: configuration files of proxies.
-        revocations: folder, and the switch's file that names it; None: nobody is told.
-        watch: directory of keys, and device; None: the provider's word is all there is.
-        devices: of the robot's side that the site runs itself.
+        revocations: folder, and the switch's file that names it; None: revocations are not published.
+        watch: directory of keys, and device; None: only the provider reports on machines.
+        devices: of the robot's side of a self-contained site.
     """
 
     id: str
@@ -250,7 +250,7 @@ class Site:
 
     @property
     def enrolment_url(self) -> str:
-        """Return where machines enrol, as their tickets say it."""
+        """Return the address of enrolment that tickets contain."""
         return f"tcp://{self.enrolment_address}" if self.enrolment_address else f"unix:{self.enrolment_socket}"
 
     @property
@@ -260,36 +260,36 @@ class Site:
 
     @property
     def enrolment_listens(self) -> tuple[str, int]:
-        """Return host and port on which the supervisor listens for rented machines; an empty host: every one."""
+        """Return host and port on which the supervisor listens for rented machines; an empty host: every address."""
         if self.enrolment.listen is not None:
             return host_and_port(self.enrolment.listen)
         return "", host_and_port(self.enrolment_address)[1]
 
     @property
     def latencies(self) -> Latencies:
-        """Return what is known of how far regions are."""
+        """Return the known latencies of regions."""
         return Latencies(self.state, self.latency, self.latency_ms)
 
     @property
     def robot(self) -> Path | None:
-        """Return the folder of the robot's side that the site runs itself."""
+        """Return the folder of the robot's side; None: the site is not self-contained."""
         return None if self.file is not None else self.state / "robot"
 
     @property
     def journal(self) -> Path:
-        """Return the journal's file."""
+        """Return the path of the journal."""
         return self.state / "journal.sqlite3"
 
     @contextmanager
     def locked(self, what: str = "site") -> Iterator[None]:
-        """Hold what only one process may do at a time; others wait."""
+        """Hold an exclusive lock of the site; other processes wait."""
         with (self.state / f"{what}.lock").open("a") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
             yield
 
 
 def state_folder() -> Path:
-    """Return where a site is kept if nothing else is said."""
+    """Return the default state folder."""
     if given := os.environ.get("FOG_STATE"):
         return Path(given).expanduser().absolute()
     base = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
@@ -297,10 +297,10 @@ def state_folder() -> Path:
 
 
 def open_site(file: Path | None, state: Path | None = None) -> Site:
-    """Return the site that a file states, or ``fog.yaml`` here, or else the one of its own; that is made if need be.
+    """Return the site of a file or of ``./fog.yaml``; otherwise the self-contained site, created if needed.
 
     Raises:
-        ConfigError, LocalError: the file, keys or folders are not as they should be.
+        ConfigError, LocalError: the file, the keys or the folders are invalid.
     """
     file, config, folder = _stands_where(file, state)
     try:
@@ -320,7 +320,7 @@ def open_site(file: Path | None, state: Path | None = None) -> Site:
 
 @contextmanager
 def peek_site(file: Path | None, state: Path | None = None) -> Iterator[Site]:
-    """Yield the same for those who only look: nothing is made, and no key drawn. One that is not there yet is empty.
+    """Yield the same site read-only: no file or key is created. A site that does not exist yet is empty.
 
     Raises:
         ConfigError, LocalError: as ``open_site``.
@@ -347,7 +347,7 @@ def peek_site(file: Path | None, state: Path | None = None) -> Iterator[Site]:
 
 
 def _stands_where(file: Path | None, state: Path | None) -> tuple[Path | None, SiteConfig | None, Path]:
-    """Return the site's file, what it says, and its folder."""
+    """Return the site's file, its configuration, and its folder."""
     if file is None and state is None and Path(_FILE).is_file():
         file = Path(_FILE)
     config = SiteConfig.load(file) if file is not None else None
@@ -355,10 +355,10 @@ def _stands_where(file: Path | None, state: Path | None) -> tuple[Path | None, S
 
 
 def with_gateway(site: Site, *, is_replica: bool) -> Site:
-    """Return a site of its own with another kind of gateway; ``save_topology`` makes it last.
+    """Return a self-contained site with another kind of gateway; ``save_topology`` stores it.
 
     Raises:
-        LocalError: a file states the site.
+        LocalError: the site has a ``fog.yaml``.
     """
     if site.file is not None:
         raise LocalError(f"{site.file} states the site: set 'topology' there instead of --gateway")
@@ -366,7 +366,7 @@ def with_gateway(site: Site, *, is_replica: bool) -> Site:
 
 
 def topology_now(site: Site) -> Gateway:
-    """Return a site's topology as the last launch left it.
+    """Return a site's topology of the last launch.
 
     Raises:
         LocalError: the site's file cannot be read.
@@ -377,7 +377,7 @@ def topology_now(site: Site) -> Gateway:
 
 
 def save_topology(site: Site) -> None:
-    """Keep the topology of a site of its own for later commands; of another site it is in its file."""
+    """Store the topology of a self-contained site for later commands; other sites have it in their file."""
     if site.file is None:
         with site.locked():
             said = {"id": site.id, "replica_gateway": site.topology.replica}
@@ -385,7 +385,7 @@ def save_topology(site: Site) -> None:
 
 
 def _identifier(folder: Path) -> tuple[str, bool]:
-    """Return a site's id, and whether its own gateway is a replica."""
+    """Return a site's id, and whether the gateway of a self-contained site is a replica."""
     path = folder / _SITE
     if not path.exists():
         write_all(folder, {_SITE: private(json.dumps({"id": secrets.token_hex(_ID_BYTES)}).encode())})
@@ -405,7 +405,7 @@ def _own(folder: Path, identifier: str) -> Site:
     if not authority.owner.exists():
         make_owner(authority.owner)
     robot = folder / "robot"
-    if not (robot / "boot.json").exists():  # the last file to be written
+    if not (robot / "boot.json").exists():  # this file is written last
         _install_anew(robot, authority, devices)
     return Site(
         id=identifier,
@@ -421,7 +421,7 @@ def _own(folder: Path, identifier: str) -> Site:
 
 
 def _install_anew(robot: Path, authority: Authority, devices: RobotDevices) -> None:
-    """Write the files of the robot's side, over what a killed attempt left."""
+    """Write the files of the robot's side, and overwrite those of an interrupted attempt."""
     shutil.rmtree(robot, ignore_errors=True)
     for folder in ("proxy/delegations", "watch/delegations", "revocations"):
         (robot / folder).mkdir(mode=0o700, parents=True)
@@ -455,7 +455,7 @@ def _stated(config: SiteConfig, file: Path, folder: Path, identifier: str) -> Si
 
 
 def _settings(config: SiteConfig) -> _Settings:
-    """Return what a site takes from its file as it is."""
+    """Return the settings that a site takes unchanged from its file."""
     return {
         "provider": config.provider,
         "aws": config.aws,

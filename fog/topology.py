@@ -1,7 +1,7 @@
-"""Tree of gateways between a robot and its machines: ``topology:`` in ``fog.yaml``.
+"""Tree of gateways between a robot and its machines: section ``topology:`` of ``fog.yaml``.
 
-Sans-I/O. Source: FogROS2-FT, Figure 4. A request travels once over each link, however many machines lie behind: copies
-are made where branches part.
+Sans-I/O. Source: FogROS2-FT, Figure 4. A request crosses each link once, for any number of machines behind it;
+gateways copy it where branches separate.
 ::
 
     topology:
@@ -10,8 +10,8 @@ are made where branches part.
         - {gateway: west, regions: [us-west-1, us-west-2]}
         - {gateway: east, replica: true, regions: [us-east-1]}    # one of its machines (Figure 4, right)
 
-The first gateway serves every region that no gateway names. Without ``topology`` one dedicated gateway serves all;
-with ``topology: replica`` one of the machines does.
+The first gateway serves every region that no gateway lists. Without ``topology``, one dedicated gateway serves all
+regions; with ``topology: replica``, one of the machines does.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from gdp.nodes.schema import Section, Unique
 
 __all__ = ["AUTOMATIC", "AUTOMATIC_REPLICA", "Gateway", "Topology"]
 
-_LABEL: Final = r"^[a-z0-9][a-z0-9-]{0,10}$"  # ``to-LABEL`` is a device's name
+_LABEL: Final = r"^[a-z0-9][a-z0-9-]{0,10}$"  # ``to-LABEL`` is the name of a device
 _GATEWAYS_MAX: Final = 64
 _AUTOMATIC_LABEL: Final = "gateway"
 _REPLICA: Final = "replica"
 
 
 class Gateway(Section):
-    """A gateway, the regions whose machines are its neighbours, and the gateways behind it.
+    """Gateway, the regions whose machines are its neighbours, and the gateways behind it.
 
     Attributes:
-        replica: one of the machines of these regions is the gateway. Otherwise it is dedicated: a switch of its own.
+        replica: one of the machines of these regions is the gateway. Otherwise it is dedicated: a separate switch.
     """
 
     gateway: str = Field(pattern=_LABEL)
@@ -44,13 +44,13 @@ class Gateway(Section):
     children: tuple[Gateway, ...] = ()
 
     def walk(self) -> Iterator[Gateway]:
-        """Yield this one and all behind it, each before its children."""
+        """Yield this gateway and all gateways behind it, each before its children."""
         yield self
         for child in self.children:
             yield from child.walk()
 
     def serving(self, region: str) -> Gateway:
-        """Return the gateway next to the machines of a region."""
+        """Return the gateway of the machines of a region."""
         return next((each for each in self.walk() if region in each.regions), self)
 
     @model_validator(mode="after")
@@ -67,7 +67,7 @@ class Gateway(Section):
 
     @model_validator(mode="after")
     def _replicas_are_leaves(self) -> Gateway:
-        """A machine that may be preempted carries only machines that are its equals."""
+        """Reject gateways behind a replica gateway: a machine that may be preempted carries only peer machines."""
         if self.replica and self.children:
             raise ValueError(
                 f"gateway {self.gateway} is a replica and has children: only a dedicated gateway may have gateways"
@@ -87,9 +87,9 @@ AUTOMATIC_REPLICA: Final = Gateway(gateway=_AUTOMATIC_LABEL, replica=True)
 
 
 def _read(value: object) -> object:
-    """Return the gateway for which the word ``replica`` stands; anything else stays as it is, but lists as tuples.
+    """Return the gateway of the word ``replica``; other values are unchanged, except that lists become tuples.
 
-    What a validator of this kind returns is not JSON any more to pydantic, so that its strict mode refuses lists.
+    Pydantic does not treat the result of such a validator as JSON, so its strict mode refuses lists.
     """
     if value == _REPLICA:
         return AUTOMATIC_REPLICA

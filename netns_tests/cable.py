@@ -1,4 +1,4 @@
-"""Two machines joined by a cable on ``eth0``, and the terminals in which the commands of a page run there."""
+"""Cable ``eth0`` between two machines, and the terminals in which the commands of a page run there."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _READY = (" is up", " is attached", "started core service")
 
 
 class Terminals:
-    """The commands that run on, each in a terminal of its own."""
+    """Long-running commands, each in a terminal of its own."""
 
     def __init__(self, machines: Machines, into_server: list[str]) -> None:
         self._machines = machines
@@ -25,11 +25,11 @@ class Terminals:
         self._running: list[tuple[str, subprocess.Popen[bytes]]] = []
 
     def words(self, home: Path) -> list[str]:
-        """Return what runs a command on the machine whose folder this is."""
+        """Return a function that runs a command on the machine with this folder."""
         return self._into_server if home == self._machines.server else []
 
     def start(self, line: str, home: Path) -> None:
-        """Start a command and return when it says that it is ready."""
+        """Start a command and return when it reports that it is ready."""
         process = subprocess.Popen(
             [*self.words(home), "bash", "-c", f"exec {line.removesuffix('&')}"],
             cwd=home,
@@ -44,12 +44,12 @@ class Terminals:
         assert heard[-1], f"{line}: ended after {heard}"
 
     def signal(self, part: str, number: signal.Signals) -> None:
-        """Send a signal to the one command in whose line this is."""
+        """Send a signal to the only command whose line contains this text."""
         (process,) = (process for line, process in self._running if part in line)
         process.send_signal(number)
 
     def end(self, part: str = "") -> dict[str, str]:
-        """Press Ctrl-C in each with ``part`` in its line, the last started first; return what they said, by program."""
+        """Press Ctrl-C in each command with ``part`` in its line, last started first; return the output by program."""
         said = {}
         for line, process in reversed([each for each in self._running if part in each[0]]):
             self._running.remove((line, process))
@@ -59,7 +59,7 @@ class Terminals:
         return said
 
     def close(self) -> None:
-        """End what still runs; kindly first, for roscore has children of its own."""
+        """End all running commands, with a signal first: roscore has children of its own."""
         while self._running:
             _, process = self._running.pop()
             process.send_signal(signal.SIGINT)
@@ -75,12 +75,12 @@ def _line_of(process: subprocess.Popen[bytes]) -> str:
     with selectors.DefaultSelector() as selector:
         selector.register(process.stdout, selectors.EVENT_READ)
         assert selector.select(_PATIENCE_S), "nothing said"
-    return process.stdout.readline().decode()  # byte by byte: what follows is left for select to see
+    return process.stdout.readline().decode()  # byte by byte, so that select sees what remains
 
 
 @contextlib.contextmanager
 def sim_link(space: Space) -> Iterator[list[str]]:
-    """Join this namespace with another by ``eth0``; yield what runs a command in the other."""
+    """Join this namespace to another by ``eth0``; yield a function that runs a command in the other one."""
     with Space() as other:
         other.ip("set", "lo", "up")
         anchor = subprocess.Popen(["cat"], stdin=subprocess.PIPE)

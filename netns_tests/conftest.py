@@ -1,4 +1,4 @@
-"""Where real namespaces are allowed, and a fresh one for each test that wants it."""
+"""Fixtures for network namespaces: the reason to skip, and a fresh namespace for each test."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
 
 
 def _why_not() -> str:
-    """Return why tests with real namespaces cannot run here; empty where they can."""
+    """Return why tests with real namespaces cannot run here; empty if they can."""
     try:
         with Space(), socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0):
             return ""
@@ -51,14 +51,14 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.fixture
 def space() -> Iterator[Space]:
-    """A network namespace of its own, in which the test runs."""
+    """Network namespace of its own, in which the test runs."""
     with Space() as entered:
         yield entered
 
 
 @pytest.fixture
 def make_kernel(space: Space) -> Iterator[MakeKernel]:
-    """Makes kernel planes on p0 to p2, whose links are there; they are closed at the end."""
+    """Factory of kernel planes on p0 to p2, whose links exist; the planes are closed at the end."""
     for port, mac in PORT_MACS.items():
         space.veth(f"p{port}", f"q{port}", mac, PEER_MACS[port], MTUS[port])
     made: list[KernelPlane] = []

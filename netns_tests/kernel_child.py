@@ -1,4 +1,4 @@
-"""A kernel plane in a process of its own, for tests that end it badly; it names its programs and polls until killed.
+"""Kernel plane in a child process, for tests that kill it; it prints its programs and polls until killed.
 
 python -m netns_tests.kernel_child link|filter p0 p1 ...
 """

@@ -1,6 +1,6 @@
-"""How long topologies of real processes carried traffic, compared with the leases of their names.
+"""Running time of real topologies, compared with the leases of their names.
 
-A test that ends within the first lease shows nothing about renewal: what it saw may die a moment later.
+A test that ends within the first lease proves nothing about renewal: its result may change a moment later.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ import pytest
 __all__ = ["LEASES", "LEASE_S", "Lifetime", "noted", "too_short"]
 
 LEASES = 3
-LEASE_S = 2.0  # what tests with real processes ask for, so that three leases are soon over
+LEASE_S = 2.0  # requested by tests with real processes, so that three leases pass quickly
 
 
 @dataclass(frozen=True, slots=True)
 class Lifetime:
-    """One topology: the lease of its names, and for how many seconds it carried traffic."""
+    """Topology with the lease of its names and the seconds for which it carried traffic."""
 
     what: str
     lease_s: float
@@ -25,7 +25,7 @@ class Lifetime:
 
     @property
     def short_s(self) -> float:
-        """Return how many seconds are missing to three leases."""
+        """Return how many seconds three leases still need."""
         return LEASES * self.lease_s - self.lasted_s
 
 
@@ -33,7 +33,7 @@ noted: list[Lifetime] = []  # of the test that runs
 
 
 def too_short(lifetimes: list[Lifetime], marker: pytest.Mark | None) -> str:
-    """Return why a test does not outlive its leases; empty: it does, or need not."""
+    """Return why a test does not outlive its leases; empty if it does, or does not have to."""
     if marker is not None:
         reasons = [reason for reason in marker.args if isinstance(reason, str) and reason.strip()]
         return "" if reasons else "momentary needs a reason: why does no lease matter here?"

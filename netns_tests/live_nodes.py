@@ -1,4 +1,4 @@
-"""A real rospy node, told what to do line by line as ``ros2_peer`` is; and what a message of either ROS holds.
+"""Real rospy node, controlled line by line like ``ros2_peer``, and the values of a message of either ROS.
 
 python netns_tests/live_nodes.py NODE
 
@@ -17,7 +17,7 @@ _PLAIN = (bool, int, float, str)
 
 
 def values(message: object) -> object:
-    """Return the values of all fields in their order, without the one that ROS 2 has not: a header's ``seq``."""
+    """Return the values of all fields in order, without a header's ``seq``, which ROS 2 lacks."""
     if isinstance(message, _PLAIN):
         return message
     if isinstance(message, bytes):
@@ -48,7 +48,7 @@ def main() -> None:
         return rospy.Service(name, kind, work)
 
     def call(kind: type, name: str, *request: object) -> object:
-        """Call once; a refusal is answered as its text."""
+        """Call once; return the text of a refusal."""
         try:
             rospy.wait_for_service(name, timeout=10)
             return values(rospy.ServiceProxy(name, kind)(*request))
@@ -63,7 +63,7 @@ def main() -> None:
             is_statement = line.startswith("!")
             code = compile(line[is_statement:].replace("\\n", "\n"), "told", "exec" if is_statement else "eval")
             print(json.dumps(eval(code, names), default=list), flush=True)
-        except Exception as error:  # whatever it is, the test is told
+        except Exception as error:  # the test gets every error, whatever its type
             print(json.dumps(f"ERROR {error!r}"), flush=True)
     rospy.signal_shutdown("told to")
 

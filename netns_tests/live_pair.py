@@ -1,4 +1,4 @@
-"""Two machines joined by a cable, with switches, a RIB, real ROS graphs and a proxy for each graph; and their nodes.
+"""Two machines joined by a cable: switches, a RIB, real ROS graphs, a proxy for each graph, and their nodes.
 
 ::
 
@@ -78,7 +78,7 @@ _TOPOLOGY: Final = Topology(
 
 
 def until(is_met: Callable[[], object], what: str, patience_s: float = PATIENCE_S) -> None:
-    """Look until something holds that tells nobody when it does."""
+    """Poll until a condition holds that causes no event."""
     end_s = time.monotonic() + patience_s
     while not is_met():
         assert time.monotonic() < end_s, f"{what}: not within {patience_s:g} s"
@@ -87,7 +87,7 @@ def until(is_met: Callable[[], object], what: str, patience_s: float = PATIENCE_
 
 @dataclass(frozen=True, slots=True)
 class Crossing:
-    """What a rule of its source and one of each of its readers name; ``options``: further keys of them all."""
+    """Return the rule of a source and one rule of each reader; ``options``: further keys of all of them."""
 
     name: str
     type_name: str
@@ -98,7 +98,7 @@ class Crossing:
 
     @property
     def metadata(self) -> Metadata:
-        """Return what its name in the overlay digests."""
+        """Return the text whose digest is its name in the overlay."""
         return Metadata({"kind": self.kind, "name": self.name, "type": self.type_name})
 
     def rights(self) -> Iterator[tuple[str, Right, str]]:
@@ -113,21 +113,21 @@ class Crossing:
 
 
 class Ros1Node(Peer):
-    """A real rospy node; see ``live_nodes`` for what it can be told."""
+    """Real rospy node; ``live_nodes`` lists its commands."""
 
     def __init__(self, name: str, words: Sequence[str], environment: Mapping[str, str]) -> None:
         self._process = subprocess.Popen(
             [*words, sys.executable, str(Path(__file__).with_name("live_nodes.py")), name],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,  # what rospy thinks of a master that is away
+            stderr=subprocess.DEVNULL,  # rospy's retry delay while a master is away
             text=True,
             env={**os.environ, **environment},
         )
 
 
 class Proxy:
-    """A ``gdp-proxy``; it can be killed and started again."""
+    """``gdp-proxy`` process that can be killed and started again."""
 
     def __init__(self, pair: Pair, label: str) -> None:
         self._pair = pair
@@ -144,7 +144,7 @@ class Proxy:
 
     @property
     def is_running(self) -> bool:
-        """Return whether it was started and not ended."""
+        """Return whether it was started and has not ended."""
         return self._process is not None
 
     @property
@@ -154,12 +154,12 @@ class Proxy:
 
     @property
     def node_name(self) -> str:
-        """Return what its virtual node is called."""
+        """Return the name of its virtual node."""
         return proxy_node_name(load_identity(self._pair.identity(self._label), time.time()).name.to_text())
 
     @property
     def said(self) -> str:
-        """Return its log, of all its lives."""
+        """Return its log since the first start."""
         return self._log.read_text()
 
     def start(self) -> None:
@@ -168,18 +168,18 @@ class Proxy:
         self._process = self._pair.start(self.machine, argv, self._log, " is attached", self._label)
 
     def end(self, how: signal.Signals = signal.SIGTERM) -> None:
-        """End it, kindly or not; idempotent."""
+        """End it, by signal or kill; idempotent."""
         process, self._process = self._process, None
         if process is not None:
             process.send_signal(how)
             process.communicate(timeout=PATIENCE_S)
 
     def warnings(self, name: str) -> list[str]:
-        """Return what it warned of about a local name: fault and detail."""
+        """Return its warnings about a local name: fault and detail."""
         return re.findall(rf" WARNING \S+ {re.escape(name)}: (.*)", self.said)
 
     def faults(self, fault: str) -> int:
-        """Return what its metrics say of a fault."""
+        """Return the metric of a fault."""
         return int(self.metric(f'gdp_proxy_faults_total{{fault="{fault}"}}'))
 
     def metric(self, name: str) -> float:
@@ -190,18 +190,18 @@ class Proxy:
         return float(found[1]) if found else 0.0
 
     def descriptors(self) -> int:
-        """Return how many it has open."""
+        """Return its number of open files."""
         return len(os.listdir(f"/proc/{self.pid}/fd"))
 
     def memory_kib(self) -> int:
-        """Return what it has resident."""
+        """Return its resident memory."""
         found = re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{self.pid}/status").read_text())
         assert found is not None
         return int(found[1])
 
 
 class Pair:
-    """What runs. Proxies and the ROS 1 master start when first asked for."""
+    """All running processes. Proxies and the ROS 1 master start on first use."""
 
     def __init__(self, run: Run, undo: ExitStack, crossings: Sequence[Crossing], hidden: Mapping[str, str]) -> None:
         self.folder = run.directory
@@ -233,7 +233,7 @@ class Pair:
         return proxy
 
     def node(self, graph: str, name: str = "") -> Peer:
-        """Return a node of a graph, whose proxy runs; without a name always the same one."""
+        """Return a node of a graph whose proxy runs; without a name always the same one."""
         self.proxy(graph)
         if name or graph not in self._nodes:
             made = self._make_node(graph, name or f"node_{graph}")
@@ -243,13 +243,13 @@ class Pair:
         return self._nodes[graph]
 
     def outlive(self) -> None:
-        """Return when what proxies have claimed by now has been renewed for three leases."""
+        """Return when the present advertisements of the proxies have been renewed for three leases."""
         began_s, lasts_s = time.monotonic(), (LEASES + 0.5) * LEASE_S
         time.sleep(lasts_s)
         noted.append(Lifetime("the pair", LEASE_S, time.monotonic() - began_s))
 
     def shape(self, rate: str) -> None:
-        """Bound what machine "a" sends to "b", such as ``20mbit``; empty: as much as it can again."""
+        """Limit the traffic from machine "a" to "b", such as ``20mbit``; empty: no limit."""
         words = ["add", "dev", "b", "root", "tbf", "rate", rate, "burst", "32kb", "latency", "50ms"]
         change = words if rate else ["del", "dev", "b", "root"]
         subprocess.run(self.spaces.command("a", ["tc", "qdisc", *change]), check=True)
@@ -271,7 +271,7 @@ class Pair:
     def start(
         self, machine: str, argv: Sequence[str], log: Path, sign: str, graph: str = ""
     ) -> subprocess.Popen[bytes]:
-        """Start a command of ours on a machine; return it when it has said that it is ready."""
+        """Start a command of ours on a machine; return it when it reports that it is ready."""
         words = [*self.spaces.command(machine, []), *self._environment(graph)]
         if graph in self._hidden:
             words.append(f"PYTHONPATH={self._hide(self._hidden[graph])}{os.pathsep}{PYTHON_PATH}")
@@ -329,7 +329,7 @@ class Pair:
         return Credentials(identity, self.folder / "pair" / ROOT_CERTIFICATE, ())
 
     def _hide(self, package: str) -> Path:
-        """Return a folder at the front of the path in which there is nothing but an empty package of this name."""
+        """Return a folder, first on the path, that holds only an empty package of this name."""
         (self.folder / "hidden" / package).mkdir(parents=True, exist_ok=True)
         (self.folder / "hidden" / package / "__init__.py").touch()
         return self.folder / "hidden"
@@ -352,14 +352,14 @@ class Pair:
         return node
 
     def _environment(self, label: str) -> list[str]:
-        """Return the words that put a command into a graph, and keep what it must not know from it."""
+        """Return the command prefix that puts a command into a graph and hides the other graphs from it."""
         domain = [f"ROS_DOMAIN_ID={_DOMAINS[label]}"] if label in _DOMAINS else []
         return ["env", f"ROS_LOG_DIR={self.folder / 'ros'}", *domain]
 
 
 @contextmanager
 def pair_of(*crossings: Crossing, hidden: Mapping[str, str] | None = None) -> Iterator[Pair]:
-    """The two machines, with proxies that carry these; ``hidden``: a package that a proxy has not. All ends with it."""
+    """Two machines with proxies for these rules; ``hidden``: a package that a proxy lacks. All ends on leaving."""
     run = RunRegistry().start()
     with ExitStack() as undo:
         undo.callback(run.end)
@@ -377,7 +377,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def _await(process: subprocess.Popen[bytes], sign: str, log: Path) -> None:
-    """Return when a process has said this on its standard output."""
+    """Return when a process has printed this on its standard output."""
     assert process.stdout is not None
     said, end_s = b"", time.monotonic() + PATIENCE_S
     while sign.encode() not in said:
@@ -396,4 +396,4 @@ def _metrics(port: int) -> str:
         except urllib.error.HTTPError as error:
             if error.code != HTTPStatus.SERVICE_UNAVAILABLE or time.monotonic() >= end_s:
                 raise
-        time.sleep(0.1)  # a node answers so many scrapes a second, and no more
+        time.sleep(0.1)  # a node answers a limited number of scrapes a second

@@ -1,4 +1,4 @@
-"""A site for tests of the provider ``local``: plain programs, or a real domain with a robot's switch and RIB."""
+"""Site for tests of the provider ``local``: plain programs, or a real domain with a robot's switch and RIB."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _TICKS: Final = "import time\nprint('ready')\nwhile True:\n    time.sleep(0.01)\
 
 
 def until(is_met: Callable[[], object], what: str) -> None:
-    """Look until something holds that tells nobody when it does."""
+    """Poll until a condition holds that causes no event."""
     end_s = time.monotonic() + PATIENCE_S
     while not is_met():
         assert time.monotonic() < end_s, f"{what}: not within {PATIENCE_S:g} s"
@@ -40,13 +40,13 @@ def until(is_met: Callable[[], object], what: str) -> None:
 
 
 def spec(name: str, region: str = "local-a", hardware: Hardware | None = None) -> MachineSpec:
-    """Return what to ask for."""
+    """Return a machine request."""
     has = hardware or Hardware(2, 4.0)
     return MachineSpec("test", name, Offer("local", region, "local.small", has, is_spot=True, usd_per_hour=0.01))
 
 
 def machine_of(provider: LocalProvider, machine: str) -> Machine:
-    """Return what the provider says of a machine."""
+    """Return the provider's description of a machine."""
     (found,) = (each for each in provider.describe("test") if each.id == machine)
     return found
 
@@ -57,7 +57,7 @@ def plain_gateway(_: str, __: Sequence[str]) -> MachineBundle:
 
 
 def ticking(code: str = _TICKS) -> MachineBundle:
-    """Return a machine that writes a line every now and then."""
+    """Return a machine that writes a line from time to time."""
     return MachineBundle({}, (Program("ticker", ("{python}", "-c", code), "ready"),))
 
 
@@ -70,7 +70,7 @@ def leftovers(provider_folder: Path, ids: Sequence[str]) -> list[str]:
 
 
 def _group(process: Path) -> str:
-    """Return the groups of a process; empty: it has ended, though perhaps nobody has taken note of it."""
+    """Return the groups of a process; empty if it has ended, even if its parent has not reaped it."""
     try:
         is_over = (process / "stat").read_text(errors="replace").rpartition(")")[2].split()[0] in "ZX"
         return "" if is_over else (process / "cgroup").read_text()
@@ -79,7 +79,7 @@ def _group(process: Path) -> str:
 
 
 class Domain:
-    """A trust domain, and the boots of its members; ``folder``: for keys and files.
+    """Trust domain and the bootstrap bundles of its members; ``folder``: for keys and files.
 
     The robot's side runs where it was made, and ends with ``close``.
     """
@@ -90,11 +90,11 @@ class Domain:
         make_domain(folder / "domain", "test")
 
     def gateway(self, label: str, ifaces: Sequence[str]) -> MachineBundle:
-        """Return what a gateway runs."""
+        """Return the nodes of a gateway."""
         return MachineBundle(self._switch(label, ifaces), (_command("switch", "gdp.cli.switch"),))
 
     def machine(self, name: str) -> MachineBundle:
-        """Return what a machine runs: a switch, and a proxy that carries nothing."""
+        """Return the nodes of a machine: a switch, and a proxy without flows."""
         files = self._switch(name, ["eth0"], ["proxy0"])
         files |= self._node(Role.PROXY, name, {"iface": "proxy0", "delegations": f"proxy/{DELEGATIONS}"})
         files[f"proxy/{DELEGATIONS}/.none"] = b""
@@ -103,7 +103,7 @@ class Domain:
         )
 
     def replica(self, name: str, service: Metadata) -> MachineBundle:
-        """Return what a machine runs that serves, and that may be the gateway of its group: a switch and a member."""
+        """Return the nodes of a serving machine that may be its group's gateway: a switch and a participant."""
         ports = [{"iface": "eth0"}, {"iface": UP, "optional": True}]
         files = self._node(Role.SWITCH, name, {"ports": ports, "attach": ["proxy0"]})
         keys, served = self._member(name, service, Right.SERVE)
@@ -115,12 +115,12 @@ class Domain:
         return MachineBundle(files, (_command("switch", "gdp.cli.switch"), program))
 
     def start_robot(self, uplink: str, *attach: str) -> None:
-        """Start the robot's switch and the domain's RIB in this namespace; ``attach``: what else the switch makes."""
+        """Start the robot's switch and the domain's RIB in this namespace; ``attach``: further ports of the switch."""
         self._start("switch", self._switch("robot", [uplink], ["rib0", *attach]))
         self._start("rib", self._node(Role.RIB, "robot", {"iface": "rib0"}))
 
     def start_client(self, iface: str, service: Metadata, requests: int, size: int) -> subprocess.Popen[bytes]:
-        """Start a member beside the robot's switch that asks as it is told; see ``uplink_child``."""
+        """Start a participant at the robot's switch that calls on command; see ``uplink_child``."""
         keys, name = self._member("client", service, Right.CALL)
         root = self._folder / "domain" / ROOT_CERTIFICATE
         words = [name.to_text(), str(keys), str(root), iface, "call", str(requests), str(size)]

@@ -1,4 +1,4 @@
-"""A reader in a process of its own: it counts what comes to a device, until an urgent frame has come and nothing more.
+"""Reader in a child process: it counts a device's frames until an urgent frame has come and no more follow.
 
 python -m netns_tests.reader_child q1 BYTES        BYTES of socket memory on each lane
 """

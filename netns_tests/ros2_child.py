@@ -1,4 +1,4 @@
-"""An endpoint in a process of its own, as proxies are: it says on /back what it hears on /out, until its input ends.
+"""Endpoint in a child process, as proxies are: it repeats on /back what it receives on /out, until its input ends.
 
 python -m netns_tests.ros2_child DOMAIN NODE
 
@@ -21,4 +21,4 @@ if __name__ == "__main__":
         for event in endpoint.poll_events() if ready else ():
             if isinstance(event, MessageReceived):
                 endpoint.publish(back, event.raw)
-    endpoint.remove_entity()
+    endpoint.shut_down()

@@ -1,4 +1,4 @@
-"""Three switches' planes in a row on real devices of one namespace, driven by the thread of the test.
+"""Row of three switches' planes on real devices of one namespace, driven by the test's thread.
 
 ::
 
@@ -47,7 +47,7 @@ def frame(
 
 
 def waiting(end: socket.socket) -> Iterator[bytes]:
-    """Yield what has arrived."""
+    """Yield the received frames."""
     end.setblocking(False)
     while True:
         try:
@@ -57,7 +57,7 @@ def waiting(end: socket.socket) -> Iterator[bytes]:
 
 
 class Row:
-    """The planes, and what A and B saw.
+    """Planes of a row, and the frames that A and B saw.
 
     Args:
         kind: a key of ``KINDS``.
@@ -65,9 +65,9 @@ class Row:
 
     Attributes:
         sent: frames that A's device took.
-        delivered: what came to B, in order.
-        discarded: frames that the kernel had nobody to give to, as the test found them counted.
-        punted: frames that planes gave to their node, which here has no use for them.
+        delivered: frames that came to B, in order.
+        discarded: frames that the kernel could not deliver, as counted by the test.
+        punted: frames that planes gave to their node, which does not use them here.
     """
 
     def __init__(self, space: Space, kind: str, **mtus: int) -> None:
@@ -77,7 +77,8 @@ class Row:
         self.sent = self.punted = self.discarded = 0
         self.delivered: list[bytes] = []
         self.a, self.b = far_end("a0"), far_end("d1")
-        self.a.setsockopt(socket.SOL_SOCKET, SO_SNDBUFFORCE, BUFFER_BYTES)  # it holds what waits at the next queue
+        # holds the frames that wait at the next queue
+        self.a.setsockopt(socket.SOL_SOCKET, SO_SNDBUFFORCE, BUFFER_BYTES)
         self.b.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, BUFFER_BYTES)
         self.planes: list[NetdevPlane] = []
         for left, right in pairwise(LINKS):
@@ -90,17 +91,17 @@ class Row:
             self.last_table = table
 
     def send(self, *frames: bytes) -> None:
-        """Let A send; nothing is polled meanwhile."""
+        """Let A send; no plane is polled during this time."""
         for each in frames:
             self.sent += self.a.send(each) == len(each)
 
     def poll(self, *planes: int) -> None:
-        """Let planes (all, if none is named) work once."""
+        """Poll these planes once, or all if none is given."""
         for plane in [self.planes[at] for at in planes] or self.planes:
             self.punted += len(plane.poll(0))
 
     def until(self, done: Callable[[], bool]) -> None:
-        """Let all planes work until something is so."""
+        """Poll all planes until a condition holds."""
         deadline_s = time.monotonic() + PATIENCE_S
         while not done():
             assert time.monotonic() < deadline_s, f"it did not come about: {self.sums()}"
@@ -109,17 +110,17 @@ class Row:
             self.delivered += waiting(self.b)
 
     def drops(self) -> dict[DropReason, int]:
-        """Return what all planes dropped, by reason."""
+        """Return the drops of all planes, by reason."""
         lists = [plane.counters.drops for plane in self.planes]
         found = {reason: sum(counts[reason] for counts in lists) for reason in DropReason}
         return {reason: count for reason, count in found.items() if count}
 
     def sums(self) -> tuple[int, int]:
-        """Return how many frames were sent, and of how many it is known what became of them."""
+        """Return the number of frames sent, and the number whose fate is known."""
         return self.sent, len(self.delivered) + sum(self.drops().values()) + self.punted + self.discarded
 
     def settle(self) -> None:
-        """Return when every frame that was sent is accounted for, and nothing more happens."""
+        """Return when every frame sent is accounted for and no frame moves."""
         self.until(lambda: self.sums()[1] >= self.sent)
         for plane in self.planes:
             while arrivals := plane.poll(LOOK_S):

@@ -1,4 +1,4 @@
-"""One machine with a real switch, a RIB and nodes for the library, in a namespace of its own."""
+"""Machine with a real switch, a RIB and nodes for the library, in a namespace of its own."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Rights = Mapping[str, Mapping[str, Collection[Right]]]  # by node and name
 
 
 class SessionLab:
-    """What runs. ``folder / label`` is the directory of a node; its device is the label and a 0."""
+    """Running processes. ``folder / label`` is the directory of a node; its device is the label and a 0."""
 
     def __init__(self, run: Run, undo: ExitStack, rights: Rights) -> None:
         self.folder = run.directory
@@ -79,7 +79,7 @@ class SessionLab:
         return process
 
     def output(self, process: subprocess.Popen[str]) -> str:
-        """Return what a process that ends by itself has printed."""
+        """Return the output of a process that ends by itself."""
         out, errors = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 0, f"exit {process.returncode}: {out}{errors}"
         return out
@@ -106,7 +106,7 @@ def _end(process: subprocess.Popen[str]) -> None:
 
 @contextmanager
 def session_lab(rights: Rights) -> Iterator[SessionLab]:
-    """Run a lab whose nodes have these rights, without any only an empty machine; end it on leaving."""
+    """Run a lab whose nodes have these rights, without rights only an empty machine; end it on leaving."""
     run = RunRegistry().start()
     with ExitStack() as undo:
         undo.callback(run.end)

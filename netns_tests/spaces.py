@@ -1,4 +1,4 @@
-"""A network namespace without a name: this thread's alone, gone with its last socket, whatever ends the test."""
+"""Unnamed network namespace of this thread; the kernel removes it with its last socket, however the test ends."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Space:
         subprocess.run(["ip", "link", *words], check=True, capture_output=True, text=True)
 
     def veth(self, one: str, other: str, one_mac: bytes, other_mac: bytes, mtu: int = 1500) -> None:
-        """Make a pair of joined devices; return when both are up."""
+        """Create a pair of joined devices; return when both are up."""
         ends = ("mtu", str(mtu), "address", one_mac.hex(":")), ("mtu", str(mtu), "address", other_mac.hex(":"))
         self.ip("add", one, *ends[0], "type", "veth", "peer", "name", other, *ends[1])
         for name in (one, other):
@@ -59,7 +59,7 @@ class Space:
         self.ready(one, other)
 
     def ready(self, *names: str) -> None:
-        """Return when the kernel says that these devices can send.
+        """Return when the kernel reports that these devices can send.
 
         Raises:
             TimeoutError: they did not come up.

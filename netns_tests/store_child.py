@@ -1,6 +1,6 @@
-"""A run with a disk and a store of six servers that says its id and waits, to be killed.
+"""Child process with a run, a disk and a store of six servers; it prints the run's id and waits to be killed.
 
-Place: process of its own.
+I/O.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ __all__: list[str] = []
 
 
 def main() -> None:
-    """Make both, say so, and wait for the end of standard input."""
+    """Create both, print the id, and wait for the end of standard input."""
     topology, _ = make_topology({"a": ("s1",)}, {}, (), ("s1",), {"P": "s1"})
     run = RunRegistry().start()
     Disk(run).fill()

@@ -1,11 +1,11 @@
-"""No frame is lost without a word on real devices: sent = delivered + dropped by reason + handed up, none in flight.
+"""Frame accounting on real devices: sent = delivered + dropped by reason + punted, with none in flight.
 
-What the kernel itself discards, and how it is known: a full packet socket by the socket's own statistics; a queue or a
-device that refuses, by the error of the send, or for what the kernel plane sends on by the device's and the queue's
-statistics; what reaches a device at which nobody listens, by that device's ``rx_dropped``.
+Discards of the kernel are known as follows. A full packet socket: the socket's own statistics. A queue or device that
+refuses: the error of the send, or, for what the kernel plane forwards, the statistics of the device and the queue. A
+device at which no process listens: that device's ``rx_dropped``.
 
-One thing it tells nobody: a frame that the kernel plane redirects to a device that is gone, until the news of that has
-been read (in the tests: the next poll). It counts as forwarded.
+One discard has no report: a frame that the kernel plane redirects to a device that is gone, until the node has read
+that news (in the tests: the next poll). It counts as forwarded.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ WHERE = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, sy
 
 @pytest.fixture(params=list(KINDS))
 def lay(request: pytest.FixtureRequest, space: Space) -> Iterator[MakeRow]:
-    """Lays a row of one kind of plane; it is closed at the end."""
+    """Factory of a row of one kind of plane; the row is closed at the end."""
     made: list[Row] = []
 
     def lay(**mtus: int) -> Row:
@@ -55,7 +55,7 @@ def lay(request: pytest.FixtureRequest, space: Space) -> Iterator[MakeRow]:
 
 
 def discarded(ifname: str) -> int:
-    """Return how many frames a device's kernel had nobody to give to."""
+    """Return how many frames a device's kernel could not deliver."""
     with IPRoute() as here:
         (link,) = here.get_links(socket.if_nametoindex(ifname))
         return int(link.get_attr("IFLA_STATS64")["rx_dropped"])
@@ -73,7 +73,7 @@ def test_every_wrong_frame_is_dropped_for_its_own_reason_at_whichever_switch(lay
             frame(hops_left=2),
             frame(hops_left=3),
             frame(payload=bytes(900)),  # too long for the third link
-            frame()[:-1],  # shorter than it says
+            frame()[:-1],  # shorter than its header states
             frame()[:16],  # not even flags
         )
     row.settle()
@@ -87,7 +87,7 @@ def test_every_wrong_frame_is_dropped_for_its_own_reason_at_whichever_switch(lay
     }
 
 
-def test_a_name_that_one_switch_forgets_in_the_middle_of_a_stream_is_handed_up_there(lay: MakeRow) -> None:
+def test_a_name_that_one_switch_forgets_in_the_middle_of_a_stream_is_punted_there(lay: MakeRow) -> None:
     row = lay()
     row.send(*[frame(FORGOTTEN)] * 50)
     row.settle()
@@ -103,7 +103,7 @@ def test_a_link_that_is_taken_down_under_a_stream_costs_only_what_is_counted(lay
     row.send(*[frame()] * 40)
     row.poll(0)
     row.space.ip("set", end, "down")
-    row.send(*[frame()] * 40)  # before the switches have heard of it
+    row.send(*[frame()] * 40)  # before the switches receive the link event
     row.until(lambda: not row.planes[1].port_state(1))
     row.send(*[frame()] * 40)
     row.settle()
@@ -136,7 +136,7 @@ def test_a_device_that_is_deleted_and_made_again_under_a_stream_loses_nothing_un
     for _ in range(3):
         row.send(*[frame()] * 100)
         row.poll()
-        row.discarded += discarded("c1")  # what the second switch sent before the third had opened the device
+        row.discarded += discarded("c1")  # sent by the second switch before the third had opened the device
         row.space.ip("del", "c0")
         row.until(lambda: not row.planes[1].port_state(1) and not row.planes[2].port_state(0))
         row.send(*[frame()] * 10)
@@ -150,9 +150,7 @@ def test_a_device_that_is_deleted_and_made_again_under_a_stream_loses_nothing_un
     assert set(row.drops()) <= {DropReason.PORT_DOWN, DropReason.PORT_FULL}
 
 
-def test_what_a_full_socket_drops_is_counted_with_what_it_hands_up(
-    lay: MakeRow, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_drops_of_a_full_socket_are_counted_with_its_punts(lay: MakeRow, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sockets, "_BUFFER_BYTES", 4_096)
     row = lay()
     row.send(*[frame(UNKNOWN, bytes(1_000))] * 500)
@@ -188,7 +186,7 @@ def test_what_comes_to_a_reader_that_has_left_is_counted_by_its_device(lay: Make
     row.send(*[frame()] * 50)
     row.settle()
     row.b.close()
-    row.b = far_end("d0")  # where nothing comes in
+    row.b = far_end("d0")  # no frame comes in there
     row.send(*[frame()] * 50)
     row.until(lambda: discarded("d1") >= 50)
     assert (len(row.delivered), discarded("d1"), row.drops()) == (50, 50, {})
@@ -196,7 +194,7 @@ def test_what_comes_to_a_reader_that_has_left_is_counted_by_its_device(lay: Make
 
 @contextlib.contextmanager
 def readers(**buffers: int) -> Iterator[list[subprocess.Popen[str]]]:
-    """Processes that read one device each, with so many bytes of buffer; killed at the end, whatever happens."""
+    """Child processes that read one device each with this buffer size in bytes; all are killed at the end."""
     with contextlib.ExitStack() as stack:
         started = []
         for ifname, buffer_bytes in buffers.items():

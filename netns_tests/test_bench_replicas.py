@@ -1,4 +1,4 @@
-"""The benches of replicas and of healing run: a short round of each, whose figures nobody looks at."""
+"""Benches of replicas and of recovery: a short round of each; the figures are not checked."""
 
 from __future__ import annotations
 
@@ -31,6 +31,6 @@ def test_no_request_fails_while_two_of_three_replicas_are_killed_and_come_back()
     assert told.count("target ≤ 0.00, measured 0.00, met") == 3, told
 
 
-def test_replicas_are_measured_beside_a_single_server() -> None:
+def test_replicas_are_compared_with_a_single_server() -> None:
     told = bench("replicas.py", "--only", "hedged", "--rounds", "1", "--requests", "60")
     assert "two replicas, the second if late" in told

@@ -1,4 +1,4 @@
-"""Every bench runs: a short round of each, whose figures nobody looks at."""
+"""Every bench in a short round; the figures are not checked."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ needs_ros2 = pytest.mark.skipif(find_spec("rclpy") is None, reason="rclpy is not
         pytest.param(["fogros.py", "--quick", "--no-save", "--mtu", "9000"], marks=needs_ros2),
         ["survive.py", "--only", "cut", "--rounds", "1", "--no-save"],
         ["serial.py", "--help"],
-        ["advertisement_verify.py", "--claims", "100"],
+        ["advertisement_verify.py", "--advertisements", "100"],
     ],
     ids=lambda command: command[0],
 )

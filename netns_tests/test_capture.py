@@ -1,4 +1,4 @@
-"""The capture command in a process of its own, read back by Scapy."""
+"""Capture command in a child process, read back by Scapy."""
 
 from __future__ import annotations
 

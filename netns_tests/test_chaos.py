@@ -1,4 +1,4 @@
-"""Real processes in namespaces come through faults of every kind; nothing grows where much comes and goes."""
+"""Real processes in namespaces under faults of every kind; memory and tables stay bounded."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_the_disk_and_the_servers_of_a_killed_run_are_gone_after_the_next_sweep(
     servers = processes_inside(spaces)
     assert len(servers) == 6
     assert (folder / "disk").is_mount()
-    record.processes.clear()  # as if it had been killed before it could note the servers
+    record.processes.clear()  # as if killed before it recorded the servers
     (Path("/run/gdp") / f"{run}.json").write_text(record.to_text())
     assert run in RunRegistry().sweep()
     assert not any(server.alive for server in servers)
@@ -125,7 +125,7 @@ def test_a_rib_comes_through_a_full_disk_and_starts_on_one() -> None:
 
 @pytest.fixture
 def overlay() -> Iterator[Overlay]:
-    """Two switches with a publisher and a reader, running."""
+    """Two running switches with a publisher and a reader."""
     topology, members = make_topology({"a": ("s1", "s2")}, {}, ("s1-s2",), ("s1",), {"P": "s1", "R": "s2"})
     plan = Plan(topology, members, flows=(Flow("/t", "P", ("R",), hz=100.0),))
     run = RunRegistry().start()
@@ -138,12 +138,12 @@ def overlay() -> Iterator[Overlay]:
 
 
 def numbers(overlay: Overlay, member: str) -> list[int]:
-    """Return the numbers of what a member has published or had since last asked."""
+    """Return the numbers that a participant has published, or received since the last request."""
     kinds = (Kind.PUBLISHED, Kind.DELIVERED)
     return [each.number for _, records in overlay.read(member) for each in records if each.kind in kinds]
 
 
-def test_frames_of_a_link_are_lost_doubled_and_delayed_as_told(overlay: Overlay) -> None:
+def test_frames_of_a_link_are_lost_doubled_and_delayed_as_configured(overlay: Overlay) -> None:
     until(lambda: numbers(overlay, "R"), "a message")
     overlay.disturb("s1", "s2", FrameFaults(lost=1.0))
     begun = max(numbers(overlay, "P"))

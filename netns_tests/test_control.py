@@ -1,4 +1,4 @@
-"""``gdp reload``, ``status`` and ``drain`` on real nodes that have given their rights away."""
+"""``gdp reload``, ``status`` and ``drain`` on real nodes that have dropped their privileges."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ pytestmark = [
 
 
 class Nodes:
-    """A switch, a RIB and a recording proxy that run."""
+    """Running switch, RIB and recording proxy."""
 
     def __init__(self, commands: Commands) -> None:
         self.commands = commands
@@ -35,7 +35,7 @@ class Nodes:
         self.proxy = self._start("proxy.cli.proxy", "proxy", "--await-iface", "30")
 
     def gdp(self, *words: str) -> tuple[int, str]:
-        """Run ``gdp`` in the folder of the nodes; return its exit code and all that it printed."""
+        """Run ``gdp`` in the folder of the nodes; return its exit code and its whole output."""
         argv = [sys.executable, "-m", "gdp.cli.gdp", *words]
         ended = subprocess.run(
             argv,

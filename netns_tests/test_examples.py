@@ -1,4 +1,4 @@
-"""The examples of the library with a real switch, a RIB and real keys."""
+"""Examples of the library with a real switch, a RIB and real keys."""
 
 from __future__ import annotations
 

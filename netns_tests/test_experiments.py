@@ -1,4 +1,4 @@
-"""Every experiment runs: a short round of each, whose figures nobody looks at but those that must be nought."""
+"""Every experiment in a short round; only the figures that must be zero are checked."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _NEEDS = {
     "offload": ("rclpy", "cyclonedds", "cv2", "scipy", "matplotlib"),
 }
 
-_OPTIONS = {"fig5": ("--waits", "0")}  # a second field for those would take as long again
+_OPTIONS = {"fig5": ("--waits", "0")}  # a second testbed for these would take as long again
 
 pytestmark = pytest.mark.netns
 

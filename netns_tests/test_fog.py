@@ -1,4 +1,4 @@
-"""The ``fog`` command with real machines, switches, proxies and ROS nodes: launch, trouble, scale, down."""
+"""``fog`` command with real machines, switches, proxies and ROS nodes: launch, faults, scale, down."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _MACHINES_S = 3 * PATIENCE_S
 
 
 class Fog:
-    """The command with a state folder of its own, run in the namespace of the test."""
+    """Command with a state folder of its own, run in the namespace of the test."""
 
     def __init__(self, state: Path) -> None:
         self.state = state
@@ -101,8 +101,8 @@ def test_calls_go_on_while_machines_are_taken_and_killed_and_the_supervisor_is(f
             pass
         first, second = fog.serving()
         os.kill(fog.status()["supervisor_pid"], signal.SIGKILL)
-        fog.run("local", "kill", first)  # nobody looks
-        fog.run("status")  # any command starts another one
+        fog.run("local", "kill", first)  # the fault is not observed yet
+        fog.run("status")  # any command starts another supervisor
         fog.until(lambda: len({*fog.serving()} - {first}) == 2, "a killed machine is replaced")
         fog.run("local", "notice", second, "--seconds", "5")
         fog.until(lambda: len({*fog.serving()} - {first, second}) == 2, "a machine with notice is replaced")
@@ -150,7 +150,7 @@ def test_down_ends_everything_though_launch_and_supervisor_were_killed_and_the_j
 
 
 def left_of(fog: Fog) -> list[str]:
-    """Return the processes and devices that are still there of a site."""
+    """Return the processes and devices of a site that still exist."""
     words = []
     for folder in Path("/proc").iterdir():
         if folder.name.isdigit():

@@ -1,4 +1,4 @@
-"""The demonstration: machines are taken away, no request fails, and nothing of it stays behind."""
+"""Demonstration of preempted machines: no request fails, and no resource stays behind."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def command(*options: object) -> list[str]:
 
 
 def all_of(record_of: int) -> tuple[Path, list[str]]:
-    """Return the folder of the provider's records, and the ids of all that a running demonstration made."""
+    """Return the folder of the provider's records, and the ids of everything that a running demonstration made."""
     (demo,) = (each for each in standing_runs("demo").all() if each.owner.pid == record_of)
     records = Path(demo.files[0]) / STATE / "local"
     return records, [demo.run, *(each.run for each in RunRegistry(records).all())]
 
 
 def line_with(words: Sequence[str], process: subprocess.Popen[str]) -> str:
-    """Return the next line that has all these words."""
+    """Return the next line that contains all these words."""
     assert process.stdout is not None
     for line in process.stdout:
         if all(word in line for word in words):

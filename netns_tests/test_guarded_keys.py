@@ -1,4 +1,4 @@
-"""Commands whose keys lie in a token and under a passphrase: they start, give rights away, and go on signing."""
+"""Commands with keys in a token and under a passphrase: they start, drop their privileges, and continue to sign."""
 
 from __future__ import annotations
 

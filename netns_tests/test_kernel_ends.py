@@ -1,4 +1,4 @@
-"""What the kernel plane leaves behind, however it ends, and what it says where it is not allowed."""
+"""Remains of the kernel plane after every kind of end, and its errors where it is not permitted."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def ports(space: Space) -> list[str]:
 
 @contextlib.contextmanager
 def running(mode: str, ports: list[str]) -> Iterator[tuple[subprocess.Popen[str], list[int]]]:
-    """A process with a kernel plane, and its program; killed at the end, whatever happens."""
+    """Process with a kernel plane and its program; killed at the end in any case."""
     argv = [sys.executable, "-m", "netns_tests.kernel_child", mode, *ports]
     with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True, env=WHERE, cwd=PROJECT) as child:
         try:
@@ -76,7 +76,7 @@ def links_of(program: int) -> int:
 
 
 def gone(program: int) -> bool:
-    """Wait until a program is no more: the kernel frees it a moment after its last user."""
+    """Wait until a program is gone: the kernel frees it a moment after its last user."""
     deadline_s = time.monotonic() + PATIENCE_S
     while program in loaded():
         if time.monotonic() > deadline_s:
@@ -104,7 +104,7 @@ def table() -> Table:
 
 
 def crosses(patience_s: float) -> bool:
-    """Whether a frame that enters at ``p0`` leaves at ``p1`` within this time, with nobody in Python to help."""
+    """Return whether a frame that enters ``p0`` leaves ``p1`` within this time without help from Python."""
     sender, receiver = far_end("q0"), far_end("q1")
     with sender, receiver:
         receiver.settimeout(patience_s)

@@ -1,4 +1,4 @@
-"""Where the kernel plane goes straight to the other end of a veth pair, and where it must not."""
+"""Direct delivery of the kernel plane to the other end of a veth pair, and the cases in which it must not do so."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ XDP_PROGRAM = 6
 
 @contextlib.contextmanager
 def elsewhere() -> Iterator[int]:
-    """A namespace of its own, by the process that holds it."""
+    """Namespace held open by a process."""
     with subprocess.Popen(["unshare", "--net", "cat"], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
         assert holder.stdin is not None
         assert holder.stdout is not None

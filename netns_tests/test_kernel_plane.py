@@ -1,4 +1,4 @@
-"""The kernel plane on real devices: that every frame is accounted for, and what it leaves to Python."""
+"""Kernel plane on real devices: every frame is accounted for, and the frames it leaves to Python."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def filled(entries: dict[bytes, Hops] = ENTRIES) -> Table:
 
 
 def settle(plane: KernelPlane, taken: int) -> int:
-    """Poll until the plane took this many frames since it was made; return how many were handed up."""
+    """Poll until the plane took this many frames since it was made; return how many were punted."""
     deadline_s = time.monotonic() + PATIENCE_S
     punted = 0
     while plane.counters.frames_in < taken or plane._epoll.poll(0):
@@ -72,7 +72,7 @@ def settle(plane: KernelPlane, taken: int) -> int:
 
 
 def waiting(end: socket.socket) -> list[bytes]:
-    """Return what has arrived."""
+    """Return the received frames."""
     end.setblocking(False)
     got: list[bytes] = []
     while True:
@@ -107,7 +107,7 @@ def test_what_was_sent_is_delivered_or_dropped_by_reason(
     punted = settle(plane, rounds * len(kinds))
     delivered = len(waiting(ends[WIDE])) + len(waiting(ends[NARROW]))
     counters = plane.counters
-    copies_more = 3 * rounds  # two ways: three of the kinds have one copy more than there are frames
+    copies_more = 3 * rounds  # two egress ports: three of the kinds have one copy more than there are frames
     dropped = sum(counters.drops)
     assert counters.frames_in == rounds * len(kinds)
     assert rounds * len(kinds) + copies_more == delivered + dropped + punted
@@ -122,7 +122,7 @@ def test_what_was_sent_is_delivered_or_dropped_by_reason(
     assert counters.punted == punted == 2 * rounds
 
 
-def test_what_the_kernel_takes_wakes_nobody(make_kernel: MakeKernel, ends: dict[int, socket.socket]) -> None:
+def test_a_frame_that_the_kernel_takes_wakes_no_thread(make_kernel: MakeKernel, ends: dict[int, socket.socket]) -> None:
     plane = make_kernel(filled())
     plane.poll(0)
     for _ in range(5):
@@ -208,7 +208,7 @@ def test_a_larger_group_than_the_kernel_knows_is_copied_by_python(
     assert plane._counters.frames_in == 1 - by_kernel
 
 
-def test_what_finds_no_room_in_the_kernel_is_forwarded_by_python_until_there_is(
+def test_an_entry_that_does_not_fit_in_the_kernel_is_forwarded_by_python_until_it_does(
     make_kernel: MakeKernel, ends: dict[int, socket.socket]
 ) -> None:
     names = [n.to_bytes(32, "big") for n in range(1, 6)]
@@ -244,7 +244,7 @@ def test_each_entry_counts_its_frames_and_bytes(make_kernel: MakeKernel, ends: d
     assert list(plane.entry_counts(1)) == [ONE]
 
 
-def test_a_removed_entry_goes_to_nobody_any_more(make_kernel: MakeKernel, ends: dict[int, socket.socket]) -> None:
+def test_frames_of_a_removed_entry_are_not_forwarded(make_kernel: MakeKernel, ends: dict[int, socket.socket]) -> None:
     table = filled()
     plane = make_kernel(table)
     table.remove(ONE)

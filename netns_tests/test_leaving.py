@@ -1,4 +1,4 @@
-"""A real proxy that gets SIGUSR1 while a real ROS 2 server works: the answer arrives, then the process ends."""
+"""Real proxy that gets SIGUSR1 while a real ROS 2 server works: the response arrives, then the process ends."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tutorial of the library, followed word by word."""
+"""Tutorial of the library, followed literally."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the kernel says of devices, heard from it and not from a library."""
+"""Link events of the kernel, received over rtnetlink without a library."""
 
 from __future__ import annotations
 
@@ -68,7 +68,8 @@ def test_a_change_is_news(
     watch.poll()
     space.ip(*words)
     news: list[Link] = []
-    while not any(link.ifname == "one" and seen(link) for link in news):  # the kernel may tell of a carrier a bit later
+    # the kernel may report a carrier a moment later
+    while not any(link.ifname == "one" and seen(link) for link in news):
         assert select.select([watch], [], [], PATIENCE_S)[0], news
         news += watch.poll()
     assert seen(last(news, "one"))
@@ -87,7 +88,7 @@ def test_news_that_the_kernel_had_to_skip_is_made_up_for(watch: LinkMonitor, spa
     space.veth("one", "two", MAC, PEER_MAC)
     space.veth("three", "four", MAC, PEER_MAC)
     watch.poll()
-    watch._news.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2_048)  # room for a message or two
+    watch._news.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2_048)  # space for one or two messages
     for mtu in range(1_000, 1_020):
         space.ip("set", "one", "mtu", str(mtu))
     space.ip("del", "three")

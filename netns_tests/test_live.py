@@ -72,7 +72,7 @@ def pair() -> Iterator[Pair]:
 
 
 def node_of(pair: Pair, graph: str, name: str = "") -> Peer:
-    """Return a ROS 2 node with what the tests use."""
+    """Return a ROS 2 node with the helpers of the tests."""
     node = pair.node(graph, name)
     node.tell("!" + _ROS2)
     return node
@@ -118,7 +118,7 @@ def test_a_ros_1_server_serves_a_ros_2_client(a: Peer, one: Peer) -> None:
     a.waits_for("lit", [[True, "lämp"]])
 
 
-def test_a_ros_2_server_serves_a_ros_1_client_which_is_told_why_if_it_does_not(a: Peer, one: Peer, pair: Pair) -> None:
+def test_a_ros_2_server_serves_a_ros_1_client_or_sends_it_the_reason(a: Peer, one: Peer, pair: Pair) -> None:
     a.tell(
         "!def opened(request, response):\n"
         " if not request.data: __import__('time').sleep(2.5)\n"
@@ -176,20 +176,20 @@ def test_an_action_lasts_longer_than_any_timeout_and_each_client_has_its_own_goa
     a.waits_for("goals[1].is_cancel_requested", True)
     a.tell("!goals[1].execute(stopped)")
     other.waits_for("results", [[5, [-1]]])  # STATUS_CANCELED
-    time.sleep(2 * TIMEOUT_S)  # what it is about
+    time.sleep(2 * TIMEOUT_S)  # longer than the timeout, on purpose
     a.tell("!goals[0].execute(folded)")
     b.waits_for("results", [[4, [5]]])  # STATUS_SUCCEEDED
     assert pair.proxy("b").warnings("/fold") == []
 
 
-def test_a_late_reassembler_gets_what_was_latched(a: Peer, b: Peer) -> None:
+def test_a_late_joiner_gets_what_was_latched(a: Peer, b: Peer) -> None:
     a.tell("!map = talk(String, '/map', 'transient_local', 1)")
     a.tell("!map.publish(String(data='old')); map.publish(String(data='new'))")
     b.tell("read(String, '/map', 1, 'transient_local')")
     b.waits_for("heard['/map']", [["new"]])
 
 
-def test_what_two_nodes_latched_in_one_topic_reaches_a_late_reassembler(a: Peer, b: Peer, pair: Pair) -> None:
+def test_what_two_nodes_latched_in_one_topic_reaches_a_late_joiner(a: Peer, b: Peer, pair: Pair) -> None:
     other = node_of(pair, "a", "other")
     for node, frame in ((a, "arm"), (other, "base")):
         node.tell("!statics = talk(TransformStamped, '/statics', 'transient_local', 1)")
@@ -200,7 +200,7 @@ def test_what_two_nodes_latched_in_one_topic_reaches_a_late_reassembler(a: Peer,
 
 
 def said(node: Peer) -> list[int]:
-    """Return the numbers that were heard."""
+    """Return the numbers that were received."""
     numbers = node.tell("[int(text) for text, in heard['/twice']]")
     assert isinstance(numbers, list)
     return numbers
@@ -221,7 +221,7 @@ def test_of_two_proxies_in_one_graph_one_carries_and_the_other_takes_over(a: Pee
     assert [number for number in said(b) if number] == list(range(1, 101))
     carrier = b.tell("[i.node_name for i in node.get_publishers_info_by_topic('/twice')]")
     first = next(proxy for proxy in proxies if carrier == [proxy.node_name])
-    first.end()  # one that is killed stays in the graph for the lease of its DDS participant, 20 s
+    first.end()  # a killed node stays in the graph for the lease of its DDS participant, 20 s
     try:
         until(lambda: say(a, 101, 102) or 101 in said(b), "/twice by the other")
         say(a, 102, 201)

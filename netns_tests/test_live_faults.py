@@ -1,4 +1,4 @@
-"""What wrong things get, with real nodes: one warning with the local name where the trouble is, and the rest flows."""
+"""Faults with real nodes: one warning with the local name where the fault is, and all other flows continue."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def pair() -> Iterator[Pair]:
 
 
 def node_of(pair: Pair, graph: str, name: str = "") -> Peer:
-    """Return a node with what the tests use."""
+    """Return a node with the helpers of the tests."""
     node = pair.node(graph, name)
     node.tell("!from std_srvs.srv import *; from std_msgs.msg import String" if graph == "one" else "!" + _ROS2)
     return node
@@ -85,13 +85,13 @@ def b(pair: Pair) -> Peer:
 
 
 def flows(a: Peer, b: Peer) -> None:
-    """Wait until something said from now on is heard."""
+    """Wait until a message published from now on is received."""
     before = b.tell("len(heard['/pulse'])")
     until(lambda: a.tell("pulse.publish(String())") or b.tell("len(heard['/pulse'])") != before, "the rest")
 
 
 def tells(proxy: Proxy, name: str, fault: str) -> str:
-    """Wait until a proxy has warned of a fault, once, in its log, and counted it in its metrics; return the detail."""
+    """Wait until a proxy has logged a fault once and counted it in its metrics; return the detail."""
     until(lambda: proxy.warnings(name), f"{fault} of {name}")
     warnings = proxy.warnings(name)
     assert [warning.partition(": ")[0] for warning in warnings] == [fault], warnings
@@ -160,7 +160,7 @@ def test_a_publisher_that_is_faster_than_the_path(pair: Pair, a: Peer, b: Peer) 
 
 
 def failures(proxy: Proxy) -> int:
-    """Return how many calls of local clients failed, whoever lost patience first."""
+    """Return how many calls of local clients failed, on either side's timeout."""
     return sum(map(proxy.bridge.faults, ("refused", "timed-out", "no-server")))
 
 
@@ -177,7 +177,7 @@ def test_a_server_that_leaves_or_dies_while_it_is_asked(pair: Pair, a: Peer, b: 
     server.end(kill=kill)
     b.waits_for("len(failed)", 1)
     assert b.tell("failed[0][0]") is False
-    assert str(b.tell("failed[0][1]")).endswith(" is gone") != kill  # who is killed stays in the graph for a while
+    assert str(b.tell("failed[0][1]")).endswith(" is gone") != kill  # a killed node stays in the graph for a while
     assert failures(proxy) > before
     assert proxy.warnings("/gate")
     again = node_of(pair, "a", f"again_{kill}".lower())

@@ -1,4 +1,4 @@
-"""The provider ``local``: machines that boot, are found again, meet with trouble, and leave nothing behind."""
+"""Provider ``local``: machines boot, are found again, suffer injected faults, and leave nothing behind."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_a_machine_boots_and_is_reached_through_the_trees_gateways(folder: Path,
             provider.create(spec("m1", "us-west-1"), domain.machine("m1")),
             provider.create(spec("m2", "us-west-1"), domain.machine("m2")),
         ]
-        for machine in ids:  # its proxy is attached when the robot's RIB has said so
+        for machine in ids:  # its proxy is attached when the robot's RIB has acknowledged it
             until(lambda m=machine: machine_of(provider, m).state is MachineState.RUNNING, "running")
         assert {find(provider.runs, machine).gateway.name[-5:] for machine in ids} == {"-west"}
         provider.drain(ids[0])
@@ -130,7 +130,7 @@ def test_a_frozen_machine_is_taken_at_the_moment_of_its_notice_too(provider: Loc
 
 @pytest.fixture(params=["with cgroups", "without"])
 def either(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let a test run as it does where cgroups may not be written to, too."""
+    """Also let a test run as it does where cgroups may not be written."""
     if request.param == "without":
         monkeypatch.setattr("gdp.host.cgroups._roots", lambda: (None, {}))
 
@@ -149,7 +149,7 @@ def test_a_killed_machine_is_gone_with_its_link(provider: LocalProvider) -> None
 def test_a_frozen_machine_does_nothing_until_it_is_thawed(provider: LocalProvider) -> None:
     machine = booted(provider)
     fault_injection.freeze(provider.runs, machine)
-    time.sleep(0.05)  # it takes a moment to hold
+    time.sleep(0.05)  # it takes a moment to take effect
     before = ticks(provider, machine)
     time.sleep(0.2)
     assert ticks(provider, machine) == before

@@ -1,4 +1,4 @@
-"""Frame size on real links: it follows their MTU while everything runs, and what comes after a change is not lost.
+"""Frame size on real links: it follows their MTU in operation, and nothing sent after a change is lost.
 
 ::
 
@@ -53,7 +53,7 @@ pytestmark = pytest.mark.netns
 LINKS = (("r0", "r1"), ("a0", "a1"), ("e0", "e1"), ("b0", "b1"))
 WIDEST, USUAL, JUMBO = 65_000, 1_500, 9_000
 MEGABYTE = 1_000_000
-PATIENCE_S = 20.0  # until a test gives up; what is waited for comes at once
+PATIENCE_S = 20.0  # limit of a test; the awaited event comes at once
 STEP_S = 0.002
 RECEIVE_BYTES = 1 << 26
 SO_RCVBUFFORCE = 33
@@ -67,7 +67,7 @@ class Lab:
     """Two switches, a RIB, a robot and a server on real devices of one namespace, stepped by one thread.
 
     Attributes:
-        heard: the sizes that the robot's publisher was told, in order.
+        heard: the sizes that the robot's publisher received, in order.
     """
 
     def __init__(self, space: Space) -> None:
@@ -94,7 +94,7 @@ class Lab:
         self._server.subscribe(self._topic(server, Right.READ))
 
     def until(self, done: Callable[[], bool]) -> None:
-        """Let everything work until something is so."""
+        """Step everything until a condition holds."""
         deadline_s = time.monotonic() + PATIENCE_S
         while not done():
             now_s = time.monotonic()
@@ -120,7 +120,7 @@ class Lab:
         return got
 
     def resize(self, mtu: int, ifnames: Sequence[str], told: int) -> None:
-        """Change devices; return when the publisher has heard of it."""
+        """Change devices; return when the publisher has received the new size."""
         for ifname in ifnames:
             self.space.ip("set", ifname, "mtu", str(mtu))
         self.until(lambda: self.heard[-1] == told)
@@ -176,7 +176,7 @@ def settings() -> NodeSettings:
 
 
 def frames_of(tap: socket.socket) -> Iterator[bytes]:
-    """Yield what a socket holds."""
+    """Yield the frames that a socket holds."""
     tap.setblocking(False)
     while True:
         try:
@@ -187,7 +187,7 @@ def frames_of(tap: socket.socket) -> Iterator[bytes]:
 
 @pytest.fixture
 def lab(space: Space, monkeypatch: pytest.MonkeyPatch) -> Iterator[Lab]:
-    """The nodes, at work, with a reader that the publisher knows."""
+    """Running nodes with a reader that the publisher knows."""
     with closing(Lab(space)) as made:
         tell = made.publisher.tree_stands
 

@@ -1,4 +1,4 @@
-"""Topologies in real namespaces: laid, cut, mended, and gone without a trace."""
+"""Topologies in real namespaces: created, cut, repaired, and removed without remains."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def run(runs: RunRegistry) -> Iterator[Run]:
 
 
 def links(namespaces: Namespaces, node: str) -> dict[str, list[str]]:
-    """Return what ``ip -br link`` says of each device: state, MAC, flags."""
+    """Return the fields of ``ip -br link`` for each device: state, MAC, flags."""
     argv = namespaces.command(node, ["ip", "-br", "link"])
     lines = subprocess.run(argv, check=True, capture_output=True, text=True).stdout.splitlines()
     return {line.split("@")[0].split()[0]: line.split()[1:] for line in lines}

@@ -1,4 +1,4 @@
-"""Real switches, RIBs and proxies of one host: a second one is refused, and one that cannot work says why."""
+"""Real switches, RIBs and proxies of one host: a second one is refused, and one that cannot work logs the reason."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _PROGRAMS = {"switch": "gdp.cli.switch", "rib": "gdp.cli.rib", "proxy": "proxy.c
 
 
 class Node:
-    """One command under way; its words are collected as they come."""
+    """Running command; its output is collected as it arrives."""
 
     def __init__(self, argv: list[str]) -> None:
         self.process = subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
@@ -43,7 +43,7 @@ class Node:
                 self._news.notify_all()
 
     def says(self, *words: str) -> str:
-        """Return the first line with all these words, when it has come."""
+        """Return the first line with all these words when it arrives."""
 
         def found() -> str | None:
             return next((line for line in self.said if all(word in line for word in words)), None)
@@ -69,7 +69,7 @@ Start = Callable[..., Node]
 
 @pytest.fixture
 def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
-    """Starts a node of the lab ``robot`` and ``server`` in the thread's namespace; what still runs is ended."""
+    """Factory of nodes of the lab ``robot`` and ``server`` in the thread's namespace; running nodes are ended."""
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit):
         main(["lab", "robot", "server"])
@@ -161,7 +161,7 @@ def test_a_proxy_says_that_its_device_comes_with_a_switch(space: Space, start: S
     start("robot", "proxy").says("error: proxy0: no such device; start gdp-switch with attach: [proxy0] first")
 
 
-def test_a_switch_says_that_its_link_is_down_and_then_that_nobody_answers(space: Space, start: Start) -> None:
+def test_a_switch_reports_that_its_link_is_down_and_then_that_no_neighbour_answers(space: Space, start: Start) -> None:
     space.veth("eth0", "far0", *_MACS)
     space.ip("set", "far0", "down")
     switch = start("robot", "switch")

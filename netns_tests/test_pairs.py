@@ -1,4 +1,4 @@
-"""The veth pairs that a switch makes for nodes on its own host."""
+"""Veth pairs that a switch creates for nodes on its own host."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PAIR = {"rib0", "rib0-s"}
 
 
 def devices() -> dict[str, int]:
-    """Return the MTU of every device but the loopback."""
+    """Return the MTU of every device except the loopback."""
     with contextlib.closing(LinkMonitor()) as links:
         return {link.ifname: link.mtu for link in links.all() if link.ifname != "lo"}
 
@@ -67,5 +67,5 @@ def test_a_device_that_is_there_is_not_waited_for() -> None:
         wait_for_device("rib0", 600.0)
 
 
-def test_whoever_waits_for_no_device_in_vain_goes_on() -> None:
+def test_a_node_whose_devices_all_exist_does_not_wait() -> None:
     wait_for_device("rib0", 0.01)

@@ -1,4 +1,4 @@
-"""Every data plane on real devices: the fixtures, what it lets in, and ports that come and go.
+"""Every data plane on real devices: the fixtures, the ingress filters, and ports that come and go.
 
 A plane's ports are ``p0`` to ``p2``; ``q0`` to ``q2`` are the other ends of their links, where the test sends and
 listens.
@@ -49,17 +49,17 @@ from tests.fixtures_forwarding import (
 pytestmark = pytest.mark.netns
 
 PORT_MACS = {IN: IN_MAC, WIDE: WIDE_MAC, NARROW: NARROW_MAC}
-PATIENCE_S = 10.0  # until a test gives up; what is waited for comes at once
-LOOK_S = 0.05  # what the kernel forwards wakes no poll
+PATIENCE_S = 10.0  # limit of a test; the awaited event comes at once
+LOOK_S = 0.05  # a frame that the kernel forwards wakes no poll
 BURST = 140  # more than two batches, less than an unprivileged socket's buffer holds
 MARK = frame(BOTH, b"mark")
-EXPECTED: WeakKeyDictionary[Plane, int] = WeakKeyDictionary()  # frames that a plane was asked to have taken
+EXPECTED: WeakKeyDictionary[Plane, int] = WeakKeyDictionary()  # frames that a plane was expected to take
 
 MakePlane = Callable[[Sequence[str], Table | None], Plane]
 
 
 def _plain(ifnames: Sequence[str], table: Table | None) -> Plane:
-    """The raw plane as it is where the C library cannot be called."""
+    """Raw plane as it is where the C library cannot be called."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(raw, "make_batch", PlainBatch)
         return RawPlane(ifnames, table)
@@ -77,7 +77,7 @@ KINDS: dict[str, MakePlane] = {
 
 @pytest.fixture(params=list(KINDS.values()), ids=list(KINDS))
 def make(request: pytest.FixtureRequest, space: Space) -> Iterator[MakePlane]:
-    """Makes planes of one kind; the links are there, and the planes are closed at the end."""
+    """Factory of planes of one kind; the links exist, and the planes are closed at the end."""
     for port, mac in PORT_MACS.items():
         space.veth(f"p{port}", f"q{port}", mac, PEER_MACS[port], MTUS[port])
     made: list[Plane] = []
@@ -93,7 +93,7 @@ def make(request: pytest.FixtureRequest, space: Space) -> Iterator[MakePlane]:
 
 @pytest.fixture
 def ends(make: MakePlane) -> Iterator[dict[int, socket.socket]]:
-    """The other ends of the links: plain packet sockets that see what arrives there."""
+    """Other ends of the links: plain packet sockets that see what arrives there."""
     opened = {port: far_end(f"q{port}") for port in PORT_MACS}
     yield opened
     for end in opened.values():
@@ -102,7 +102,7 @@ def ends(make: MakePlane) -> Iterator[dict[int, socket.socket]]:
 
 @pytest.fixture
 def switch(make: MakePlane) -> Plane:
-    """A plane that forwards by the fixtures' table."""
+    """Plane that forwards by the fixtures' table."""
     table = Table()
     for key, hops in ENTRIES.items():
         table.install(key, hops, float("inf"))
@@ -111,7 +111,7 @@ def switch(make: MakePlane) -> Plane:
 
 @pytest.fixture
 def node(make: MakePlane) -> Plane:
-    """A plane without a table."""
+    """Plane without a table."""
     return make(["p0"], None)
 
 
@@ -128,7 +128,7 @@ def numbered(count: int) -> list[bytes]:
 
 
 def poll_until(plane: Plane, done: Callable[[], bool]) -> list[ReceivedFrame]:
-    """Poll until something is so; return what was handed up."""
+    """Poll until a condition holds; return the punted frames."""
     arrivals: list[ReceivedFrame] = []
     deadline_s = time.monotonic() + PATIENCE_S
     while not done():
@@ -138,15 +138,15 @@ def poll_until(plane: Plane, done: Callable[[], bool]) -> list[ReceivedFrame]:
 
 
 def _idle(plane: Plane) -> bool:
-    """Whether nothing more is waiting for the plane."""
+    """Return whether no frame waits for the plane."""
     assert isinstance(plane, NetdevPlane)
     return not plane._epoll.poll(0)
 
 
 def take_in(plane: Plane, count: int) -> list[ReceivedFrame]:
-    """Poll until the plane took ``count`` frames more than this was asked for before; return what was handed up.
+    """Poll until the plane took ``count`` frames more than the previous calls asked for; return the punted frames.
 
-    Not more than it has taken by now: the kernel may have forwarded them while they were sent.
+    The reference is not its present count: the kernel may have forwarded the frames while they were sent.
     """
     wanted = EXPECTED[plane] = EXPECTED.get(plane, 0) + count
     return poll_until(plane, lambda: plane.counters.frames_in >= wanted)
@@ -167,14 +167,14 @@ def test_each_fixture_becomes_what_the_reference_says(
     for port in (WIDE, NARROW):
         expected = [case.out[port]] if port in case.out else []
         assert [ends[port].recv(1 << 16) for _ in expected] == expected
-        assert ends[port].recv(1 << 16) == leaves(MARK, port)[port]  # so nothing else left before it
+        assert ends[port].recv(1 << 16) == leaves(MARK, port)[port]  # so no other frame left before it
     drops = switch.counters.drops
     assert {DropReason(r): n for r, n in enumerate(drops) if n} == {r: case.drops.count(r) for r in case.drops}
     assert switch.counters.forwarded == switch.counters.frames_out == len(case.out) + 2
     assert switch.counters.punted == len(arrivals)
 
 
-def test_frames_of_all_fixtures_in_one_burst_get_each_its_own_ack(
+def test_frames_of_all_fixtures_in_one_burst_get_each_its_own_decision(
     switch: Plane, ends: dict[int, socket.socket]
 ) -> None:
     order = Random(7).choices(CASES, k=4 * len(CASES))
@@ -182,7 +182,7 @@ def test_frames_of_all_fixtures_in_one_burst_get_each_its_own_ack(
         ends[IN].send(case.frame)
     arrivals = take_in(switch, len(order))
     assert sorted(arrival.frame for arrival in arrivals) == sorted(case.frame[14:] for case in order if case.punted)
-    for port in (WIDE, NARROW):  # what is urgent overtakes the rest
+    for port in (WIDE, NARROW):  # urgent frames overtake the rest
         expected = [case.out[port] for case in order if port in case.out]
         assert sorted(ends[port].recv(1 << 16) for _ in expected) == sorted(expected)
     reasons = list(chain.from_iterable(case.drops for case in order))
@@ -200,7 +200,7 @@ def test_an_entry_installed_while_it_runs_counts_at_once(make: MakePlane, ends: 
     assert ends[WIDE].recv(1 << 16) == leaves(frame(ONE), WIDE)[WIDE]
 
 
-# what comes in
+# ingress
 
 
 def test_a_node_without_a_table_gets_everything(node: Plane, ends: dict[int, socket.socket]) -> None:
@@ -231,7 +231,7 @@ def test_what_is_none_of_our_business_is_not_even_counted(
     assert switch.counters.frames_in == 1
 
 
-def test_a_broadcast_hello_is_handed_up(switch: Plane, ends: dict[int, socket.socket]) -> None:
+def test_a_broadcast_hello_is_punted(switch: Plane, ends: dict[int, socket.socket]) -> None:
     hello = BROADCAST + frame(bytes(32), kind=Kind.HELLO)[6:]
     ends[IN].send(hello)
     assert take_in(switch, 1) == [ReceivedFrame(IN, PEER_MACS[IN], hello[14:])]

@@ -1,4 +1,4 @@
-"""What is urgent comes first wherever frames queue: an order, never a time."""
+"""Priority of urgent frames wherever frames queue: the tests check an order, never a time."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Lay = Callable[[], Row]
 
 @pytest.fixture(params=list(KINDS))
 def lay(request: pytest.FixtureRequest, space: Space) -> Iterator[Lay]:
-    """Lays a row of one kind of plane whose first switch has a narrow way out, with bands by priority."""
+    """Factory of a row of one kind of plane whose first switch has a narrow egress with bands by priority."""
     made: list[Row] = []
 
     def lay() -> Row:
@@ -38,7 +38,7 @@ def lay(request: pytest.FixtureRequest, space: Space) -> Iterator[Lay]:
         except LocalError as error:
             pytest.skip(str(error).partition("\n")[0])
         narrow("b0")
-        made[-1].until(lambda: True)  # so that it has heard
+        made[-1].until(lambda: True)  # so that it has received the event
         return made[-1]
 
     yield lay
@@ -47,7 +47,7 @@ def lay(request: pytest.FixtureRequest, space: Space) -> Iterator[Lay]:
 
 
 def narrow(ifname: str) -> None:
-    """Put a token bucket at a device, with ``pfifo_fast`` in it: every kernel has both. It is all but closed."""
+    """Put a nearly closed token bucket at a device, with ``pfifo_fast`` in it: every kernel has both."""
     with IPRoute() as here:
         index = socket.if_nametoindex(ifname)
         here.tc("add", "tbf", index, 0x10000, rate=CLOSED, burst=BURST_BYTES, limit=1 << 20)
@@ -55,19 +55,19 @@ def narrow(ifname: str) -> None:
 
 
 def widen(ifname: str) -> None:
-    """Let what waits at a device go, from the next frame on that comes to it."""
+    """Release the frames that wait at a device, starting with the next frame that comes to it."""
     with IPRoute() as here:
         index = socket.if_nametoindex(ifname)
         here.tc("change", "tbf", index, 0x10000, rate=OPEN, burst=BURST_BYTES, limit=1 << 20)
 
 
 def is_urgent(packet: bytes) -> bool:
-    """Say whether a frame, from its Ethernet header on, is flagged urgent."""
+    """Return whether a frame, from its Ethernet header on, is flagged urgent."""
     return bool(packet[ETHER_BYTES + FLAGS_AT] & Flag.URGENT)
 
 
 def numbers(packets: list[bytes], *, urgent: bool) -> list[int]:
-    """Return the numbers of the frames of one lane, in their order."""
+    """Return the numbers of the frames of one traffic class, in order."""
     return [decode(each, ETHER_BYTES).number for each in packets if is_urgent(each) == urgent]
 
 
@@ -102,7 +102,7 @@ def test_without_the_flag_the_same_frames_come_last(lay: Lay) -> None:
 
 def test_urgent_frames_pass_before_a_flood_that_waits_at_a_switch(space: Space) -> None:
     row = Row(space, "raw")
-    row.send(*(frame(number=number) for number in range(ORDINARY)))  # nobody polls
+    row.send(*(frame(number=number) for number in range(ORDINARY)))  # no plane is polled
     row.send(*(frame(urgent=True, number=number) for number in range(URGENT)))
     row.settle()
     row.close()
@@ -112,7 +112,7 @@ def test_urgent_frames_pass_before_a_flood_that_waits_at_a_switch(space: Space) 
 
 @pytest.fixture
 def reader(space: Space) -> Iterator[RawPlane]:
-    """A node's plane on ``p0``; the far end is ``q0``."""
+    """Node's plane on ``p0``; the far end is ``q0``."""
     space.veth("p0", "q0", mac_of("a1"), mac_of("q0"))
     plane = RawPlane(["p0"])
     yield plane

@@ -40,7 +40,7 @@ def test_a_recording_goes_from_one_machine_to_the_other_by_the_commands_of_a_pag
 
 
 def _follow(machines: Machines, terminals: Terminals, page: list[Block]) -> str:
-    """Do what the page says, in its order; return what was printed."""
+    """Follow the page in its order; return the output."""
     printed = ""
     for block in page:
         if block.language == "yaml":

@@ -1,4 +1,4 @@
-"""Credentials of running commands are replaced while a recording crosses: memberships, several times, and the root."""
+"""Credentials of running commands, replaced while a recording crosses: memberships, several times, and the root."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _REPLAY = "gdp-replay drive.mcap --config robot/proxy.yaml --rate 0.5 --json"
 _NODES = {"robot": ("robot/switch", "robot/rib", "robot/proxy"), "server": ("server/switch", "server/proxy")}
 _AUDITS = {"robot": ("robot/audit-switch", "robot/audit-rib"), "server": ("server/audit-switch",)}
 _RENEWALS = 4
-_TAKEN_UP_S = 4 * LOOK_S  # two looks of every node, late as they may be
+_TAKEN_UP_S = 4 * LOOK_S  # two reconcile periods of every node
 
 
 def test_no_message_is_lost_while_memberships_and_the_root_are_replaced(space: Space, tmp_path: Path) -> None:
@@ -74,7 +74,7 @@ def test_no_message_is_lost_while_memberships_and_the_root_are_replaced(space: S
 
 
 def _stand_up(machines: Machines, terminals: Terminals) -> None:
-    """Do what the tutorial says, but for the replay."""
+    """Follow the tutorial, except for the replay."""
     for block in blocks(ROOT / "docs/tutorials/two-machines.md"):
         if block.language == "yaml":
             machines.write(block)

@@ -1,4 +1,4 @@
-"""What gdp-replay says of messages that nobody confirmed, on the two machines of the tutorial."""
+"""Output of gdp-replay for unconfirmed messages, on the two machines of the tutorial."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_gdp_replay_exits_1_for_a_reliable_topic_without_a_reader_and_0_once_it_
 
 
 def _stand_up(machines: Machines, terminals: Terminals) -> tuple[str, Path]:
-    """Do what the tutorial says, but for the recorder, which is returned, and the replay."""
+    """Follow the tutorial, except for the recorder, which is returned, and the replay."""
     recorder = ("", Path())
     for block in blocks(ROOT / "docs/tutorials/two-machines.md"):
         if block.language == "yaml":
@@ -58,7 +58,7 @@ def _stand_up(machines: Machines, terminals: Terminals) -> tuple[str, Path]:
 
 
 def _replay(machines: Machines, more: str = "") -> tuple[int, dict[str, object]]:
-    """Replay; return the exit code, and what the last events said."""
+    """Replay; return the exit code and the content of the last events."""
     words = f"{_REPLAY} {more}".split()
     done = subprocess.run(
         words, cwd=machines.robot, env=machines.environment, capture_output=True, text=True, check=False

@@ -1,4 +1,4 @@
-"""A machine that is the gateway of its group: its switch forwards to the others, and the role moves when it is lost.
+"""Gateway machine of a group: its switch forwards to the others, and the role moves when the machine is lost.
 
 ::
 
@@ -60,7 +60,7 @@ def provider(tmp_path: Path, space: Space) -> Iterator[LocalProvider]:
 
 
 def received_bytes(machine: str, provider: LocalProvider) -> int:
-    """Return what came out of the robot's uplink at the far end of it: the device of the gateway's namespace."""
+    """Return the traffic out of the robot's uplink at its far end: the device of the gateway's namespace."""
 
     def look() -> int:
         with IPRoute() as ipr:
@@ -127,7 +127,7 @@ def test_the_uplink_carries_one_copy_of_a_request_whichever_machine_is_the_gatew
             if before is not None:
                 provider.detach_uplink(before)
             tell(client, len(machines))
-            tell(client, "go")  # what was on its way when the uplink moved is repaired
+            tell(client, "go")  # frames in flight when the uplink moved are repaired
             sent = received_bytes(gateway, provider)
             tell(client, "go")
             assert once < received_bytes(gateway, provider) - sent < 1.5 * once  # two copies are 2.0 or more
@@ -174,7 +174,7 @@ def test_calls_go_on_when_the_machine_that_is_the_gateway_is_killed(fog: Fog) ->
         lines = [json.loads(line) for line in caller.communicate(timeout=PATIENCE_S)[0].splitlines()]
         last, silence_s = lines[-1], max(each["silence_ms"] for each in lines) / 1e3
         counts = {key: last[key] for key in ("calls", "answered", "failed", "wrong", "unserved")}
-        print(f"silence {silence_s:.2f} s, {counts}")  # pytest -s shows it: the cost of a lost gateway
+        print(f"silence {silence_s:.2f} s, {counts}")  # visible with pytest -s: the cost of a lost gateway
         assert last["answered"] + last["failed"] == last["calls"]
         if silence_s < CALL_QUIET_S:  # on a busy machine the hand-over may take longer; then servers count as gone
             assert last["failed"] == last["wrong"] == last["unserved"] == 0

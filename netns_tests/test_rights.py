@@ -1,4 +1,4 @@
-"""Rights of the real commands once they are up: what the kernel says, and that what they need later still works."""
+"""Privileges of the real commands after their start: the kernel's view, and that later operations still work."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ FILES = {
 
 @dataclass
 class Node:
-    """A command that runs."""
+    """Running command."""
 
     process: subprocess.Popen[bytes]
     log: Path
@@ -92,7 +92,7 @@ class Commands:
 
 @pytest.fixture
 def commands(space: Space, tmp_path: Path) -> Iterator[Commands]:
-    """The files of a switch, a RIB and a recording proxy; a link p0 to q0."""
+    """Files of a switch, a RIB and a recording proxy; a link p0 to q0."""
     make_domain(tmp_path / "lab", "lab")
     make_owner(tmp_path / "owner")
     for role in (Role.SWITCH, Role.RIB, Role.PROXY):

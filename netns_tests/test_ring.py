@@ -1,4 +1,4 @@
-"""The whole journey on real sockets: recordings through the ring, links that fail, an eavesdropper, and hasty ends."""
+"""Whole ring demonstration on real sockets: recordings, links that fail, an eavesdropper, and abrupt ends."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def test_an_eavesdropper_in_the_middle_learns_no_topic_no_type_and_no_content(de
         longest: dict[int, bytes] = {}
         for message in sent.messages():
             longest[message.channel] = max(longest.get(message.channel, b""), message.raw, key=len)
-    secrets = {name for name in names if len(name) > 5}  # shorter ones turn up in megabytes of noise
+    secrets = {name for name in names if len(name) > 5}  # shorter ones occur by chance in megabytes of noise
     words = {b"base_link", b"frame_id", b"position", b"ranges", b"geometry_msgs", b"MSG: "}
     samples = {raw[at : at + 24] for raw in longest.values() for at in (40, len(raw) // 2) if len(set(raw[at:])) > 8}
     assert len(seen) > sum(map(len, longest.values()))
@@ -176,7 +176,7 @@ def test_with_cdr_the_very_bytes_cross(recording: str, tmp_path: Path) -> None:
         (["--mtu", "100"], "an MTU is 576 to 65521 bytes"),
     ],
 )
-def test_wrong_input_is_told_before_anything_starts(arguments: Sequence[str], complaint: str) -> None:
+def test_wrong_input_is_reported_before_anything_starts(arguments: Sequence[str], complaint: str) -> None:
     ended = ring(*arguments)
     assert ended.returncode == 2
     assert complaint in ended.stderr
@@ -196,7 +196,7 @@ def started(demo: Path, *more: str) -> tuple[subprocess.Popen[str], str]:
 
 
 def left_of(run: str) -> list[str]:
-    """Return what there is of a run: records, namespaces, files, processes."""
+    """Return the remains of a run: records, namespaces, files, processes."""
     places = [Path("/run/gdp"), Path("/run/netns"), Path(tempfile.gettempdir())]
     files = [str(path) for place in places if place.is_dir() for path in place.iterdir() if run in path.name]
     commands = [path / "cmdline" for path in Path("/proc").iterdir() if path.name.isdigit()]

@@ -1,4 +1,4 @@
-"""Real ROS nodes at both ends of the ring: what one side says, the other hears, and nothing of it stays behind."""
+"""Real ROS nodes at both ends of the ring: messages cross from one side to the other, and nothing stays behind."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SECONDS = 7  # past three leases
 
 
 def needs(mode: str) -> None:
-    """Skip where a ROS is missing."""
+    """Skip where a ROS distribution is missing."""
     if mode != "ros1":
         for package in ("rclpy", "std_msgs", "sensor_msgs", "nav_msgs", "std_srvs"):
             if importlib.util.find_spec(package) is None:
@@ -80,7 +80,7 @@ def test_an_eavesdropper_learns_nothing_of_what_nodes_say(tmp_path: Path) -> Non
     assert [word for word in (b"/chatter", b"hello ", b"/camera", b"switched", b"std_msgs") if word in seen] == []
 
 
-def test_kept_nodes_talk_on_and_the_ring_comes_down_when_told() -> None:
+def test_kept_nodes_continue_and_the_ring_comes_down_on_command() -> None:
     needs("mixed")
     run = kept("mixed")
     try:
@@ -120,7 +120,7 @@ def test_an_interrupted_live_run_leaves_nothing() -> None:
         ([__file__, "--live"], "--live is without a recording"),
     ],
 )
-def test_wrong_input_is_told_before_anything_starts(arguments: Sequence[str], complaint: str) -> None:
+def test_wrong_input_is_reported_before_anything_starts(arguments: Sequence[str], complaint: str) -> None:
     ended = ring(*arguments)
     assert ended.returncode == 2
     assert complaint in ended.stderr

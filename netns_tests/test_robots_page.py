@@ -1,6 +1,6 @@
-"""What the page on robots promises, done by its own commands on two machines, with real nodes as robot and server.
+"""Page on robots, run by its own commands on two machines, with real nodes as robot and server.
 
-``pkill`` and what a person types between two commands is done by process number: a namespace shares its processes.
+``pkill`` and the keyboard input between two commands use process numbers: a namespace shares its processes.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def terminals(machines: Machines, into_server: list[str]) -> Iterator[Terminals]
 
 @pytest.fixture
 def robot(into_server: list[str]) -> Iterator[Peer]:
-    """A robot's own node: the thread is on the robot."""
+    """Node of the robot: the thread is on the robot."""
     with peer_of("robot") as peer:
         peer.tell("!" + _ROBOT)
         yield peer
@@ -104,14 +104,14 @@ def robot(into_server: list[str]) -> Iterator[Peer]:
 
 @pytest.fixture
 def desk(into_server: list[str]) -> Iterator[Peer]:
-    """An application on the server."""
+    """Application on the server."""
     with peer_of("desk", into_server) as peer:
         peer.tell("!" + _DESK)
         yield peer
 
 
 class Reader:
-    """Does what the page says, section by section."""
+    """Reader of the page who follows it section by section."""
 
     def __init__(self, machines: Machines, terminals: Terminals) -> None:
         self._machines = machines
@@ -119,7 +119,7 @@ class Reader:
         self.passed_over: list[str] = []
 
     def follow(self, heading: str) -> str:
-        """Run every command of a section; return what was printed."""
+        """Run every command of a section; return the output."""
         return "".join(self._do(block) for block in blocks_between(PAGE, heading) if block.title)
 
     def _do(self, block: Block) -> str:
@@ -151,7 +151,7 @@ class Reader:
 
 @pytest.fixture
 def reader(machines: Machines, terminals: Terminals, robot: Peer, desk: Peer) -> Reader:
-    """Somebody who has followed the page up to the start."""
+    """Reader who has followed the page up to the start."""
     made = Reader(machines, terminals)
     for heading in ("What you need", "Keys", "The two files"):
         printed = made.follow(heading)

@@ -1,4 +1,4 @@
-"""The ros2 endpoint and a real node on two machines, as far as they can tell: two namespaces and a cable."""
+"""Endpoint ``ros2`` and a real node on two apparent machines: two namespaces and a cable."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SUBNET = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "FASTDDS_BUILTIN_TRANSPORTS
 
 @pytest.fixture
 def far() -> Iterator[Peer]:
-    """A node at the other end of the cable; the test itself is at this end."""
+    """Node at the other end of the cable; the test itself is at this end."""
     with ExitStack() as stack:
         with Space() as there:  # kept alive by a process that only waits
             there.ip("set", "lo", "up")

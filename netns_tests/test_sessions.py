@@ -1,4 +1,4 @@
-"""Sessions of the library on real devices: threads, asyncio, handlers that fail, and errors that say what to do."""
+"""Sessions of the library on real devices: threads, asyncio, failing handlers, and errors that name the remedy."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def lab() -> Iterator[SessionLab]:
 
 
 def run(lab: SessionLab, code: str) -> list[str]:
-    """Run a program of both nodes to its end and return the lines that it has printed."""
+    """Run a program of both nodes to its end and return the lines it printed."""
     head = "import asyncio, threading, time, gdp\n"
     return lab.output(lab.start("-c", head + code)).splitlines()
 

@@ -1,8 +1,8 @@
-"""A robot's thin uplink carries one copy of a request, whatever the number of replicas: real switches, real counters.
+"""Robot's thin uplink, which carries one copy of a request for any number of replicas: real switches and counters.
 
 ::
 
-    [robot] ---- [gateway, RIB] ---- [r0]  [r1]  [r2]  [r3]           a replica beside each of r0 to r3
+    [robot] ---- [gateway, RIB] ---- [r0]  [r1]  [r2]  [r3]           one replica at each of r0 to r3
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ TOPOLOGY: Final = Topology(
 
 
 class Field:
-    """What runs: switches and the RIB from the start, members as they are asked for."""
+    """Running processes: switches and the RIB from the start, participants on request."""
 
     def __init__(self, run: Run, undo: ExitStack) -> None:
         self._folder = run.directory
@@ -65,14 +65,14 @@ class Field:
         self._command(Role.RIB, rib.switch, rib_yaml(rib, self._credentials(Role.RIB, "rib"), None, metrics=False))
 
     def wait(self) -> None:
-        """Return when all that were started are up."""
+        """Return when all started participants are up."""
         for process in self._starting:
             assert process.stdout is not None
             assert b"up" in process.stdout.readline(), (self._folder / "log").read_text()[-2_000:]
         self._starting.clear()
 
     def member(self, switch: str, right: Right, *load: int) -> subprocess.Popen[bytes]:
-        """Begin to start a member beside a switch."""
+        """Start a participant at a switch without waiting for it."""
         credentials = self._credentials(Role.PROXY, switch)
         given = delegate(self._folder / "owner", credentials.identity / CARD, SERVICE, [right])
         install_delegation(credentials.identity, given)
@@ -80,7 +80,7 @@ class Field:
         return self._start(switch, ["netns_tests.uplink_child", *where, right.value, *map(str, load)])
 
     def sent_bytes(self) -> int:
-        """Return what came out of the robot's uplink at its far end; a frame that the kernel hands over skips ours."""
+        """Return the traffic of the robot's uplink at its far end; a frame the kernel forwards bypasses our end."""
 
         def look() -> int:
             with IPRoute() as ipr:
@@ -121,7 +121,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def tell(robot: subprocess.Popen[bytes], word: object) -> None:
-    """Have the robot do something; return when it is done."""
+    """Send the robot a command; return when it is done."""
     assert robot.stdin is not None
     assert robot.stdout is not None
     robot.stdin.write(f"{word}\n".encode())

@@ -1,10 +1,10 @@
-"""One member of the uplink's test, in a process of its own: a replica that takes requests, or the robot that asks.
+"""Participant of the uplink's test in a child process: a replica that takes requests, or the robot that calls.
 
 python -m netns_tests.uplink_child SERVICE IDENTITY ROOT DEVICE serve
 python -m netns_tests.uplink_child SERVICE IDENTITY ROOT DEVICE call REQUESTS BYTES
 
-The robot takes words on standard input: a number, and it says ``met`` when it has so many peers; ``go``, and it says
-``done`` when its requests are confirmed by all of them; ``ask``, the same with requests to one of them.
+The robot reads commands on standard input. A number: it prints ``met`` when it has this many peers. ``go``: it prints
+``done`` when all peers have confirmed its requests. ``ask``: the same with requests to one peer.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ PATIENCE_S = 30.0
 
 
 class Robot:
-    """Asks as it is told."""
+    """Client that calls on command."""
 
     def __init__(self, member: Participant, runtime: Runtime, topic: Topic, requests: int, size: int) -> None:
         self._member, self._runtime, self._service = member, runtime, topic.name
@@ -39,19 +39,19 @@ class Robot:
         self._stream.bundle_bytes = 0
 
     def meet(self, peers: int) -> None:
-        """Return when it has so many peers."""
+        """Return when it has this many peers."""
         deadline_s = time.monotonic() + PATIENCE_S
         is_met = self._runtime.run(lambda: len(self._member.peers(self._service)) == peers, deadline_s)
         assert is_met, f"{len(self._member.peers(self._service))} peers, not {peers}"
 
     def publish(self) -> None:
-        """Ask all; return when all have confirmed."""
+        """Call all peers; return when all have confirmed."""
         for _ in self._paced():
             self._stream.publish(self._body)
         assert self._runtime.run(self._stream.is_acknowledged, time.monotonic() + PATIENCE_S)
 
     def ask(self) -> None:
-        """Ask one; return when what it was asked has left."""
+        """Call one peer; return when the request has left."""
         server = self._member.peers(self._service)[0]
         for _ in self._paced():
             self._member.ask(self._service, server, self._body)

@@ -1,4 +1,4 @@
-"""What holds for every test."""
+"""Fixtures of every test."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tests.script_packages import share_script_packages
 
 
 def pytest_configure() -> None:
-    """Take Ctrl-C again: a shell starts what is in its background with it ignored, and children inherit that.
+    """Accept Ctrl-C again: a shell starts background processes with it ignored, and children inherit that.
 
     Errors that a node would contain fail the test that draws them.
     """

@@ -1,7 +1,7 @@
-"""One list of frames and what must become of them, driven through ``decide`` and through every data plane.
+"""List of frames and their expected fate, run through ``decide`` and through every data plane.
 
-A case is a frame from the Ethernet header on, and what leaves. The planes run it on port 0 ("in"); ports 1 ("wide") and
-2 ("narrow") lead out; port 3 does not exist, which is how a port that is down looks to the table.
+A case is a frame from the Ethernet header on, and the frames that leave. The planes run it on port 0 ("in"); ports 1
+("wide") and 2 ("narrow") lead out. Port 3 does not exist: a port that is down looks like this to the table.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ ENTRIES: dict[bytes, Hops] = {
 
 @dataclass(frozen=True)
 class Case:
-    """A frame in, and what leaves it: copies by port, drops by reason, or a hand-up."""
+    """Frame in, and its results: copies by port, drops by reason, or a punt."""
 
     name: str
     frame: bytes
@@ -74,7 +74,7 @@ def frame(
 
 
 def leaves(before: bytes, *ports: int) -> dict[int, bytes]:
-    """Return the copies that a frame becomes on these ports, written down independently of the code under test."""
+    """Return the copies of a frame on these ports, written independently of the code under test."""
     macs = {WIDE: TO_WIDE[1], NARROW: TO_NARROW[1]}
     return {port: macs[port] + before[12:17] + bytes([before[17] - 1]) + before[18:] for port in ports}
 

@@ -1,4 +1,4 @@
-"""The two machines of the pages, as two folders in which their commands are run; ``scp`` between them copies."""
+"""Two machines of the pages, as two folders in which their commands run; ``scp`` between them copies."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ sys.exit(subprocess.call(["cp", "-rp", *given, {folder!r} + "/" + last.replace("
 
 
 class Machines:
-    """A robot and a server.
+    """Robot and server.
 
     Attributes:
         done: the command lines that were run, in order.
@@ -38,7 +38,7 @@ class Machines:
         self.environment = {**os.environ, "PATH": path, "PYTHONPATH": PYTHON_PATH}
 
     def home_of(self, block: Block) -> Path:
-        """Return the folder that stands for the machine which a block is about."""
+        """Return the folder of the machine that a block is about."""
         return {"on the robot": self.robot, "on the server": self.server}[block.title]
 
     def write(self, block: Block) -> None:
@@ -46,7 +46,7 @@ class Machines:
         (self.robot / block.title).write_text(block.text)
 
     def run(self, line: str, home: Path) -> str:
-        """Run one command line to its end; return what it printed."""
+        """Run one command line to its end; return its output."""
         done = subprocess.run(
             ["bash", "-ec", line], cwd=home, env=self.environment, capture_output=True, text=True, check=False
         )

@@ -1,4 +1,4 @@
-"""The pages for people, as tests read them: code blocks, tables, links, and the commands that they show."""
+"""Documentation pages, as tests read them: code blocks, tables, links, and the commands that they show."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _PROGRAM = re.compile(r"(?:gdp(?:-\w+)?|fog|scripts/\w+\.(?:sh|py)|scripts/(?:be
 
 @dataclass(frozen=True)
 class Block:
-    """A code block; ``title`` is its first line where that is a comment, such as ``on the robot``."""
+    """Code block; ``title`` is its first line if that is a comment, such as ``on the robot``."""
 
     page: Path
     language: str
@@ -67,12 +67,12 @@ def blocks_between(page: Path, heading: str) -> list[Block]:
 
 
 def links(page: Path) -> list[str]:
-    """Return where a page's links lead."""
+    """Return the targets of a page's links."""
     return _LINK.findall(_FENCE.sub("", page.read_text()))
 
 
 def anchors(page: Path) -> set[str]:
-    """Return what can follow ``#`` in a link to a page, as GitHub makes it of headings."""
+    """Return the possible texts after ``#`` in a link to a page, as GitHub derives them from headings."""
     headings = _HEADING.findall(_FENCE.sub("", page.read_text()))
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
@@ -84,7 +84,7 @@ def rows(text: str) -> Iterator[tuple[str, str]]:
 
 
 def commands(lines: Sequence[str]) -> Iterator[list[str]]:
-    """Yield the words of each command of ours; what a shell would fill in is passed over."""
+    """Yield the words of each command of ours; placeholders of a shell are skipped."""
     for line in lines:
         words = shlex.split(line.removesuffix("&"), comments=True)
         words = words[words[:1] == ["sudo"] :]

@@ -1,4 +1,4 @@
-"""What the pages say holds: commands parse and run, examples load, links lead somewhere, numbers are the code's."""
+"""Content of the pages: commands parse and run, examples load, links resolve, numbers equal the code's."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def _every_command() -> Iterator[Any]:
 
 
 def _parse(command: Any, words: list[str]) -> None:
-    """Read a command line as the command would, without running it."""
+    """Parse a command line like the command, without running it."""
     program, *rest = words
     while hasattr(command, "commands"):
         program, *rest = rest
@@ -73,7 +73,7 @@ def _parse(command: Any, words: list[str]) -> None:
 
 
 def _spelled_out(words: list[str]) -> list[str]:
-    """Return what a script hands to its Python."""
+    """Return the arguments that a script hands to its Python."""
     match words[0]:
         case "scripts/ring_topology.sh":
             return list(ring.spelled_out(words))
@@ -271,7 +271,7 @@ def test_the_readme_has_at_most_130_lines() -> None:
 
 @pytest.fixture(scope="module")
 def machines(tmp_path_factory: pytest.TempPathFactory) -> Machines:
-    """Two machines set up as the tutorial says."""
+    """Two machines set up as in the tutorial."""
     two = Machines(tmp_path_factory.mktemp("machines"))
     for block in blocks(TWO_MACHINES):
         if block.language == "yaml":

@@ -1,4 +1,4 @@
-"""What the page on robots says without commands holds; its commands are run by ``netns_tests/test_robots_page.py``."""
+"""Statements without commands of the page on robots; ``netns_tests/test_robots_page.py`` runs its commands."""
 
 from __future__ import annotations
 

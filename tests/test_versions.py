@@ -1,4 +1,4 @@
-"""Every command says its version, and so does the library."""
+"""Version output of every command and of the library."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What machines there are and what they cost, without asking anybody; and what was measured of spot machines.
+"""Catalogues of machine types with their prices, and measurements of spot machines; no network access.
 
-Place: data and its loaders; reads files of this package only, on first use.
+I/O; reads only files of this package, on first use.
 """

@@ -1,7 +1,7 @@
-"""The price list of AWS EC2 for Linux, as shipped: on-demand list prices, and spot machines at their published savings.
+"""Price list of AWS EC2 for Linux, as shipped: on-demand list prices, and spot machines at their published savings.
 
-Place: reads one file of this package. ``scripts/make_catalog.py`` made it; the file says from what and of when.
-A price that was not known for sure is absent, not guessed.
+I/O; reads one file of this package. ``scripts/make_catalog.py`` generates it; the file states its sources and their
+date. A price that is not known for certain is absent, not estimated.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ __all__ = ["AwsPrices", "aws_offers", "aws_prices"]
 
 @dataclass(frozen=True, slots=True)
 class AwsPrices:
-    """The list.
+    """Price list.
 
     Args:
-        sources: what it was made from, and of when.
-        bands: what a machine's interruption band says in words, such as ``>20%`` of machines a month.
+        sources: sources and their dates.
+        bands: description of each interruption band, such as ``>20%`` of machines a month.
         band: by region and type, an index into ``bands``.
     """
 
@@ -36,7 +36,7 @@ class AwsPrices:
 
 @functools.cache
 def aws_prices() -> AwsPrices:
-    """Return the list; read once a process."""
+    """Return the list; the file is read once per process."""
     items = json.loads(resources.files("fog.catalog").joinpath("aws.json").read_bytes())
     types = {name: Hardware(*has) for name, has in items["types"].items()}
     offers: list[Offer] = []
@@ -52,5 +52,5 @@ def aws_prices() -> AwsPrices:
 
 
 def aws_offers() -> Iterator[Offer]:
-    """Give every offer of the list."""
+    """Yield every offer of the list."""
     yield from aws_prices().offers

@@ -1,7 +1,7 @@
-"""The pretended price list of the provider ``local``, so that choice, cost and budget can be tried out for nothing.
+"""Simulated price list of the provider ``local``, to test choice, cost and budget free of charge.
 
-Place: pure. Nobody pays these prices: 1 cent for a virtual CPU and an hour, 10 cents for a GPU, 60 % less as spot, and
-a little more from region to region, so that there is a cheapest one.
+Sans-I/O. No one is charged. Prices per hour: 1 cent for a virtual CPU, 10 cents for a GPU, 60 % less for spot machines.
+They rise slightly from region to region, so one region is the cheapest.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _USD_PER_CPU, _USD_PER_GPU, _SPOT, _DEARER = 0.01, 0.10, 0.4, 0.02
 
 
 def local_offers(regions: Sequence[str] = LOCAL_REGIONS) -> Iterator[Offer]:
-    """Give every type in every region, also in those of other providers, which ``local`` can pretend to have."""
+    """Yield every type in every region; ``local`` can also simulate regions of other providers."""
     for place, region in enumerate(regions):
         for name, has in _TYPES.items():
             usd = (has.cpus * _USD_PER_CPU + has.gpus * _USD_PER_GPU) * (1 + place * _DEARER)

@@ -1,6 +1,6 @@
-"""What was measured of spot machines, as shipped.
+"""Measurements of spot machines, as shipped.
 
-Place: reads one file of this package, which ``scripts/make_catalog.py`` computed with ``fog.plan.trace``.
+I/O; reads one file of this package, which ``scripts/make_catalog.py`` computed with ``fog.plan.trace``.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ __all__ = ["measured"]
 
 @functools.cache
 def measured() -> Measured:
-    """Return the measurements; read once a process."""
+    """Return the measurements; the file is read once per process."""
     items = json.loads(resources.files("fog.catalog").joinpath("traces.json").read_bytes())
     pairs = tuple(
         Pair(

@@ -1,6 +1,6 @@
-"""One door to the price lists of all providers that have one here.
+"""Lookup in the price lists that this package ships.
 
-Place: reads files of this package only.
+I/O; reads files of this package only.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ PROVIDERS = ("local", "aws")
 def price_list(
     provider: str, hardware: Hardware, *, spot: bool | None = None, regions: Sequence[str] = ()
 ) -> list[Offer]:
-    """Return what has enough, the cheapest first; empty where nothing has.
+    """Return the offers with enough hardware, cheapest first; empty if there are none.
 
     Args:
-        spot: only spot machines, or only others; None: both.
-        regions: only these; ``local`` pretends any region that is named here.
+        spot: only spot machines, or only on-demand machines; None: both.
+        regions: only these; ``local`` simulates any region listed here.
 
     Raises:
         LocalError: no such provider.
@@ -43,7 +43,7 @@ def price_list(
 
 
 def regions_of(provider: str) -> tuple[str, ...]:
-    """Return the regions that a provider's list has.
+    """Return the regions of a provider's list.
 
     Raises:
         LocalError: no such provider.

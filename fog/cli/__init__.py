@@ -1,4 +1,4 @@
-"""Commands of ``fog``."""
+"""Verbs of the ``fog`` command."""
 
 from gdp.extras import require_extra
 

@@ -1,6 +1,6 @@
-"""The ``fog`` command: clusters of replicated ROS services on machines that may be taken away.
+"""``fog`` command: clusters of replicated ROS services on machines that may be preempted.
 
-Place: command; each verb has its function elsewhere. Exit 0 when done, 2 when the input is wrong, 130 after Ctrl-C.
+I/O; each verb is a function of another module. Exit status: 0 done, 2 wrong input, 130 after Ctrl-C.
 """
 
 from __future__ import annotations
@@ -59,10 +59,10 @@ def _fog(
 
 
 def main(arguments: Sequence[str] | None = None, *, name: str = "fog") -> None:
-    """Run the command and leave with its exit code.
+    """Run the command and exit with its status.
 
     Args:
-        arguments: as after the program's name; those of this process if not given.
+        arguments: after the program's name; default: those of this process.
         name: of the program, for its help.
     """
     app(args=None if arguments is None else list(arguments), prog_name=name)

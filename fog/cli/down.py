@@ -1,6 +1,6 @@
-"""``fog down``: machines given back, and at last all that they stood on; whatever died before.
+"""``fog down``: release of machines, and then of the infrastructure under them; works after any crash.
 
-Place: command.
+I/O.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from gdp.errors import LocalError, StoreError
 
 __all__ = ["clear", "down", "end_cluster"]
 
-_PATIENCE_S: Final = 20.0  # with a supervisor; then it is done here
+_PATIENCE_S: Final = 20.0  # time for the supervisor; afterwards this process releases the machines
 _LEAVE_S: Final = 5.0
 _STEP_S: Final = 0.05
 _TRIES: Final = 5
 
-IfUp = Annotated[bool, typer.Option("--if-up", hidden=True)]  # of a launch that need not have begun
+IfUp = Annotated[bool, typer.Option("--if-up", hidden=True)]  # for a launch that may not have started
 All = Annotated[bool, typer.Option("--all", help="every cluster, and all that they stand on")]
 
 
@@ -70,17 +70,17 @@ def down(
 
 
 def clear(site: Site, journal: Journal, *, whatever: bool = False) -> None:
-    """Remove what clusters stand on, if none is up; or ``whatever`` is."""
+    """Remove the infrastructure of clusters if no cluster is up, or in any case with ``whatever``."""
     if whatever or not any(each.is_up for each in journal.clusters()):
         _leave(site)
         tear_down(site)
 
 
 def end_cluster(site: Site, journal: Journal, name: str, why: str, *, as_json: bool) -> int:
-    """Give all machines of a cluster back, and return when they are gone; say how many there were.
+    """Release all machines of a cluster, wait until they are gone, and print their number.
 
     Raises:
-        StoreError: the provider cannot be asked.
+        StoreError: the provider cannot be reached.
     """
     console = a_console(stderr=as_json)
     last = max((each.id for each in journal.events(last=1)), default=0)
@@ -107,7 +107,7 @@ def end_cluster(site: Site, journal: Journal, name: str, why: str, *, as_json: b
 
 
 def _release(site: Site, name: str) -> int:
-    """Terminate whatever the provider still has of a cluster; return how many machines that were."""
+    """Terminate the machines that the provider still has of a cluster; return their number."""
     with closing(open_provider(site)) as provider:
         found: set[str] = set()
         for _ in range(_TRIES):
@@ -122,7 +122,7 @@ def _release(site: Site, name: str) -> int:
 
 
 def _standing(site: Site) -> set[str]:
-    """Return the clusters of which machines stand, by their own records."""
+    """Return the clusters that have machines, by the provider's own records."""
     if site.provider != "local":
         return set()
     from fog.providers.local.machine_handle import list_machines
@@ -131,13 +131,13 @@ def _standing(site: Site) -> set[str]:
 
 
 def _has_machines(site: Site, cluster: str) -> bool:
-    """Return whether the provider has machines of a cluster that no journal knows."""
+    """Return whether the provider has machines of a cluster that the journal does not contain."""
     with closing(open_provider(site)) as provider:
         return any(each.state is not MachineState.GONE for each in provider.describe(cluster))
 
 
 def _leave(site: Site) -> None:
-    """Let the supervisor end; it has nothing to do."""
+    """Stop the supervisor; it has no clusters."""
     pid = pid_of(site)
     if pid is None:
         return

@@ -1,6 +1,6 @@
-"""``fog launch``: a launch file's cluster, and the robot's nodes once it serves.
+"""``fog launch``: start of a launch file's cluster, then of the robot's nodes when it serves.
 
-Place: command.
+I/O.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _STEP_S: Final = 0.05
 
 
 class GatewayKind(Enum):
-    """What the gateway of a site without ``fog.yaml`` is."""
+    """Kind of gateway of a site without ``fog.yaml``."""
 
     DEDICATED = "dedicated"
     REPLICA = "replica"
@@ -53,7 +53,8 @@ Gateway = Annotated[
     Optional[GatewayKind],  # noqa: UP045
     typer.Option("--gateway", help="without fog.yaml: a switch of its own, or one of the machines"),
 ]
-EndsWith = Annotated[str, typer.Option("--ends-with", hidden=True)]  # what else, such as another launch, ends it
+# what else ends the cluster, such as another launch
+EndsWith = Annotated[str, typer.Option("--ends-with", hidden=True)]
 Wait = Annotated[float, typer.Option("--wait", metavar="S", min=0.0, help="how long the replicas may take")]
 
 
@@ -114,10 +115,10 @@ def launch(
         loaded = priced(here).loaded
         plan = loaded.plan
         for node in plan.nodes:
-            command_of(here, node)  # complains before anything is started
+            command_of(here, node)  # raises before anything is started
         robot = [] if detach else [resolved(each) for each in loaded.robot_nodes]
         last = max((each.id for each in journal.events(last=1)), default=0)
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # it ends as with Ctrl-C
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # same effect as Ctrl-C
         try:
             begin(here, journal, plan)
             follow(here, journal, plan, last, wait, as_json=as_json)
@@ -142,10 +143,10 @@ def _with(site: Site, gateway: GatewayKind | None) -> Site:
 
 
 def begin(site: Site, journal: Journal, plan: ClusterPlan) -> None:
-    """Write that a cluster is wanted, and see to it that somebody cares for it.
+    """Store a cluster's plan in the journal, and ensure that a supervisor runs.
 
     Raises:
-        LocalError: what it is to stand on cannot be made.
+        LocalError: the infrastructure cannot be set up.
     """
     set_up(site)
     save_topology(site)
@@ -154,10 +155,10 @@ def begin(site: Site, journal: Journal, plan: ClusterPlan) -> None:
 
 
 def follow(site: Site, journal: Journal, plan: ClusterPlan, after: int, patience_s: float, *, as_json: bool) -> None:
-    """Show what happens until all replicas serve; where no watch can tell, until all machines are up.
+    """Show events until all replicas serve; without a watch, until all machines are up.
 
     Raises:
-        LocalError: they do not in time, or the cluster is given up.
+        LocalError: they do not within ``patience_s``, or the cluster is taken down.
     """
     console = a_console(stderr=as_json)
     end_s = time.monotonic() + patience_s

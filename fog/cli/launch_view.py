@@ -1,6 +1,6 @@
-"""What ``fog launch`` shows before anything starts: the machines with their price, the nodes, what they offer.
+"""Output of ``fog launch`` before the start: machines with their price, nodes, and exported interfaces.
 
-Place: command; reads launch files, starts nothing.
+I/O; reads launch files and starts nothing.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from fog.topology import Gateway
 
 __all__ = ["BY_HAND", "Priced", "loaded_from", "priced", "show_plan"]
 
-MONTH_H: Final = 730.0  # as clouds reckon
+MONTH_H: Final = 730.0  # as cloud providers count
 BY_HAND: Final = "by fog down"
 
 
@@ -37,7 +37,7 @@ def loaded_from(path: Path, words: Sequence[str], *, dry_run: bool) -> Loaded:
     """Run a launch file as ``fog launch FILE name:=value ...`` does.
 
     Args:
-        dry_run: start nothing, not even to find out what the nodes offer; what was found before is used.
+        dry_run: start no process; interface discovery uses cached results only.
 
     Raises:
         ConfigError, LocalError: see ``fog.launch.load.load``.
@@ -50,13 +50,13 @@ def loaded_from(path: Path, words: Sequence[str], *, dry_run: bool) -> Loaded:
 
 @dataclass(frozen=True, slots=True)
 class Priced:
-    """A launch file's plan with what its machines would be.
+    """A launch file's plan with the offers chosen for its machines.
 
     Args:
         choice: for each machine of the plan.
         latencies: of the regions that have offers.
-        target: what the plan's availability came to; None: it asks for none.
-        topology: the gateways to the machines; None: their provider makes none.
+        target: result for the plan's availability; None: the plan has no availability.
+        topology: the gateways to the machines; None: their provider has none.
     """
 
     loaded: Loaded
@@ -66,12 +66,12 @@ class Priced:
     topology: Gateway | None = None
 
     def gateway(self, offer: Offer | None) -> Gateway | None:
-        """Return the gateway next to a machine; None: there is none."""
+        """Return the gateway of a machine; None: there is none."""
         return self.topology.serving(offer.region) if self.topology is not None and offer is not None else None
 
 
 def priced(said: Priced) -> dict[str, object]:
-    """Return a plan with its price, as ``--json`` says it."""
+    """Return a plan with its price, as ``--json`` prints it."""
     plan = said.loaded.plan
     machines = [
         {
@@ -121,7 +121,7 @@ def show_plan(said: Priced, ends: str = BY_HAND, *, as_json: bool) -> None:
     """Print a plan with its price, as a table or as one JSON object.
 
     Args:
-        ends: how the cluster ends, but for its limits.
+        ends: how the cluster ends, apart from its limits.
     """
     fields = priced(said)
     if as_json:

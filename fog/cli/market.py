@@ -1,6 +1,6 @@
-"""What a provider offers for the machines of a plan, how far its regions are, and which offer each machine would be.
+"""Offers of a provider for the machines of a plan, latencies of its regions, and the offer chosen for each machine.
 
-Command.
+I/O.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ __all__ = ["Market", "choices", "market", "reached", "refusal"]
 
 @dataclass(frozen=True, slots=True)
 class Market:
-    """What there is.
+    """Offers and latencies.
 
     Args:
-        offers: of enough hardware for a machine of the plan.
+        offers: with enough hardware for a machine of the plan.
         latencies: of all regions with an offer.
     """
 
@@ -36,15 +36,15 @@ class Market:
 
     @property
     def latency_ms(self) -> dict[str, float]:
-        """Return those that are known."""
+        """Return the known latencies by region."""
         return {region: each.ms for region, each in self.latencies.items() if each.ms is not None}
 
 
 def market(provider: Provider, machines: Sequence[MachineRequest], latencies: Latencies) -> Market:
-    """Ask a provider, and measure how far its regions are where that is not known.
+    """Query a provider, and measure the latency of regions where it is unknown.
 
     Raises:
-        StoreError: the provider cannot be asked now.
+        StoreError: the provider cannot be reached now.
     """
     offers: dict[Offer, None] = {}
     for hardware, is_spot in dict.fromkeys((each.hardware, each.is_spot) for each in machines):
@@ -55,10 +55,10 @@ def market(provider: Provider, machines: Sequence[MachineRequest], latencies: La
 
 
 def reached(plan: ClusterPlan, found: Market) -> tuple[ClusterPlan, Target | None]:
-    """Return a plan with as many machines as its availability takes; None: it asks for none.
+    """Return a plan with the machines that its availability needs, and the result; None: it has no availability.
 
     Raises:
-        LocalError: it is out of reach.
+        LocalError: no number of machines reaches it.
     """
     if plan.availability is None:
         return plan, None
@@ -67,7 +67,7 @@ def reached(plan: ClusterPlan, found: Market) -> tuple[ClusterPlan, Target | Non
 
 
 def choices(found: Market, machines: Sequence[MachineRequest]) -> list[Offer | None]:
-    """Return for each machine what it would be now; None: nothing like it is to be had."""
+    """Return the offer chosen for each machine; None: no offer fits."""
     chosen: list[Offer | None] = []
     for each in machines:
         used = [offer.region for offer in chosen if offer is not None]
@@ -79,7 +79,7 @@ def choices(found: Market, machines: Sequence[MachineRequest]) -> list[Offer | N
 
 
 def refusal(provider: Provider, machines: Sequence[MachineRequest], chosen: Sequence[Offer | None]) -> str:
-    """Return why a machine is not to be had, and what comes nearest."""
+    """Return why no offer fits a machine, and the nearest offer."""
     missing = next(each for each, offer in zip(machines, chosen, strict=True) if offer is None)
     try:
         everything = [offer for spot in (True, False) for offer in provider.offers(Hardware(), spot=spot)]

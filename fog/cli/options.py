@@ -1,6 +1,6 @@
-"""Options and the opened site that the verbs of ``fog`` share.
+"""Options and site access shared by the verbs of ``fog``.
 
-Place: command.
+I/O.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ AsJson = Annotated[bool, typer.Option("--json", help="print JSON")]
 
 @contextmanager
 def opened(file: Path | None, state: Path | None, *, supervised: bool = True) -> Iterator[tuple[Site, Journal]]:
-    """The site and its journal; errors end the command with one line and exit code 2.
+    """Yield the site and its journal; errors end the command with one line and exit status 2.
 
     Args:
-        supervised: start a supervisor again where something is wanted and none lives.
+        supervised: start a supervisor if a cluster is wanted and no supervisor runs.
     """
     with failing_clearly():
         site = open_site(file, state)
@@ -54,7 +54,7 @@ def opened(file: Path | None, state: Path | None, *, supervised: bool = True) ->
 
 @contextmanager
 def peeked(file: Path | None, state: Path | None) -> Iterator[Site]:
-    """The site for a verb that changes nothing; errors as with ``opened``."""
+    """Yield the site for a verb that changes nothing; errors as with ``opened``."""
     with failing_clearly(), peek_site(file, state) as site:
         yield site
 
@@ -63,7 +63,7 @@ def the_cluster(journal: Journal, name: str | None) -> Cluster:
     """Return the named cluster, or the only one that is up.
 
     Raises:
-        LocalError: there is none, or it is not clear which.
+        LocalError: there is none, or several are up and none is named.
     """
     if name is not None:
         return journal.cluster(name)

@@ -1,6 +1,6 @@
-"""``fog plan``: how many machines, which, and at what price. ``fog prices``: what machines cost.
+"""``fog plan``: number, offers and price of machines for a target. ``fog prices``: prices of machines.
 
-Place: command.
+I/O.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""The robot's nodes of a launch file: started beside the robot, ended with the command.
+"""Robot's nodes of a launch file: they start on the robot's host and end with the command.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["INTERRUPTED", "Started", "resolved", "run"]
 
 INTERRUPTED: Final = 130  # exit code after Ctrl-C
-_OWN_S: Final = 1.0  # at a terminal Ctrl-C reaches the nodes as well: a second one would break off how they end
+_OWN_S: Final = 1.0  # at a terminal Ctrl-C reaches the nodes as well; a second signal would interrupt their shutdown
 _END_S: Final = 5.0
 
 Started: TypeAlias = "tuple[RobotNode, tuple[str, ...]]"
@@ -36,20 +36,21 @@ def resolved(each: RobotNode) -> Started:
     """Return a node with its command line.
 
     Raises:
-        LocalError: there is no such node here.
+        LocalError: this host has no such node.
     """
     words = command_line(each.node, os.environ)
     return each, tuple(sys.executable if word == PYTHON else word for word in words)
 
 
 def run(nodes: Sequence[Started], logs: Path) -> int:
-    """Run nodes until all have ended, or Ctrl-C ends them; return the worst exit code.
+    """Run nodes until all have ended, or Ctrl-C ends them; return the highest exit code.
 
     Args:
-        logs: folder for what nodes print that are not to print here. Their errors come here, as with ``ros2 launch``.
+        logs: folder for the output of nodes that do not print to the terminal. Their errors appear in the terminal, as
+            with ``ros2 launch``.
 
     Raises:
-        LocalError: one cannot be started.
+        LocalError: a node cannot be started.
     """
     processes: list[subprocess.Popen[bytes]] = []
     try:
@@ -75,12 +76,12 @@ def _start(each: RobotNode, words: Sequence[str], path: Path) -> subprocess.Pope
 
 
 def _end(processes: Sequence[subprocess.Popen[bytes]]) -> None:
-    """Let nodes end, ask those that do not, and at last kill them; a further Ctrl-C kills at once."""
+    """Wait for nodes to end, then send SIGINT, then kill them; a further Ctrl-C kills at once."""
     with suppress(KeyboardInterrupt):
         if _await(processes, _OWN_S):
             return
         for process in processes:
-            process.send_signal(signal.SIGINT)  # nothing, if it has ended
+            process.send_signal(signal.SIGINT)  # no effect on a process that has ended
         _await(processes, _END_S)
     for process in processes:
         process.kill()
@@ -88,7 +89,7 @@ def _end(processes: Sequence[subprocess.Popen[bytes]]) -> None:
 
 
 def _await(processes: Sequence[subprocess.Popen[bytes]], patience_s: float) -> bool:
-    """Return whether all have ended within ``patience_s``, each."""
+    """Return whether all have ended; each may take ``patience_s`` seconds."""
     try:
         for process in processes:
             process.wait(patience_s)

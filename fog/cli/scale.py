@@ -1,6 +1,6 @@
-"""``fog scale``, ``logs``, ``ssh`` and ``supervise``: clusters and machines that are there already.
+"""``fog scale``, ``logs``, ``ssh`` and ``supervise``: verbs for existing clusters and machines.
 
-Place: command.
+I/O.
 """
 
 from __future__ import annotations
@@ -171,10 +171,10 @@ def supervise(
 
 
 def _machine(journal: Journal, cluster: str | None, name: str) -> Record:
-    """Return a machine that has an id.
+    """Return the record of a machine that has an id.
 
     Raises:
-        LocalError: there is none of that name.
+        LocalError: no machine has that name.
     """
     plan = the_cluster(journal, cluster).plan
     records = journal.machines(plan.name)
@@ -186,10 +186,10 @@ def _machine(journal: Journal, cluster: str | None, name: str) -> Record:
 
 
 def _last_words(journal: Journal, record: Record, program: str, lines: int) -> str:
-    """Return what was kept of a machine that is gone.
+    """Return the final log lines of a machine that is gone.
 
     Raises:
-        LocalError: nothing was.
+        LocalError: none were kept.
     """
     kept = journal.last_words(record.spec.cluster, record.name)
     gone = f"{record.name} is gone: {stage(record)}, {record.reason}"

@@ -1,6 +1,6 @@
-"""``fog ls``, ``status`` and ``cost``: what there is, what happens, what it costs.
+"""``fog ls``, ``status`` and ``cost``: clusters, events and costs.
 
-Place: command.
+I/O.
 """
 
 from __future__ import annotations
@@ -171,7 +171,7 @@ def _events(journal: Journal, name: str, last: int, *, follow: bool, as_json: bo
 
 
 def _follow(journal: Journal, name: str, after: int, *, as_json: bool) -> NoReturn:
-    """Print what happens, a line each, until Ctrl-C."""
+    """Print one line per event until Ctrl-C."""
     console = a_console()
     while True:
         for entry in journal.events(name, after=after):
@@ -185,7 +185,7 @@ def _follow(journal: Journal, name: str, after: int, *, as_json: bool) -> NoRetu
 
 
 def _as_json(look: Callable[[], dict[str, object]], *, follow: bool) -> None:
-    """Print what there is as a line of JSON; with ``follow`` again whenever more than time and cost have changed."""
+    """Print the state as a line of JSON; with ``follow`` again after each change except of time and cost."""
     told: object = None
     while True:
         now = look()

@@ -1,6 +1,6 @@
-"""How clusters, machines and events look: as tables for people, as JSON for programs.
+"""Views of clusters, machines and events: tables for people, JSON for programs.
 
-Place: command; pure but for the printing.
+I/O: prints. The views themselves are computed without I/O.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ __all__ = [
 ]
 
 MONTH_H: Final = 730.0
-_PIPE_COLUMNS: Final = 10_000  # whoever reads a pipe reads whole lines
+_PIPE_COLUMNS: Final = 10_000  # a program that reads a pipe needs whole lines
 _STYLES: Final = {
     "serving": "green",
     "unheard": "red",
@@ -58,10 +58,10 @@ _STYLES: Final = {
 
 
 def stage(record: Record, *, is_watched: bool = True) -> str:
-    """Return where a machine is, in one word.
+    """Return the state of a machine as one word.
 
     Args:
-        is_watched: whether somebody hears who serves; else a machine is *up* at best.
+        is_watched: whether a watch reports which machines serve; otherwise the best state is *running*.
     """
     if record.is_gone:
         return "gone" if record.ending is None else record.ending.value
@@ -81,7 +81,7 @@ def stage(record: Record, *, is_watched: bool = True) -> str:
 def machine_fields(
     record: Record, now_s: float, latency_ms: Mapping[str, float] | None = None, *, is_watched: bool = True
 ) -> dict[str, object]:
-    """Return what JSON says of a machine; ``latency_ms``: of regions, as far as it is known."""
+    """Return a machine's fields of the JSON output; ``latency_ms``: known latencies by region."""
     offer = record.spec.offer
     return {
         "name": record.name,
@@ -105,7 +105,7 @@ def machine_fields(
 
 
 def cluster_fields(cluster: Cluster, records: Sequence[Record], now_s: float) -> dict[str, object]:
-    """Return what JSON says of a cluster; ``records``: all of it, those that are gone included."""
+    """Return a cluster's fields of the JSON output; ``records``: all its machines, also those that are gone."""
     plan = cluster.plan
     live = [each for each in records if not each.is_gone]
     return {
@@ -123,7 +123,7 @@ def cluster_fields(cluster: Cluster, records: Sequence[Record], now_s: float) ->
 
 
 def cost_fields(cluster: Cluster, records: Sequence[Record], now_s: float) -> dict[str, object]:
-    """Return what a cluster has cost and costs."""
+    """Return the cost of a cluster until now and its present cost."""
     per_hour = sum(each.spec.offer.usd_per_hour for each in records if not each.is_gone)
     spent = sum(cost_usd(each, now_s) for each in records)
     this = sum(cost_usd(each, now_s) for each in records if each.asked_unix_s >= cluster.begun_unix_s)
@@ -204,7 +204,7 @@ def events_table(entries: Sequence[Entry]) -> Table:
 
 
 def event_line(entry: Entry) -> Text:
-    """Return one event as people follow it."""
+    """Return one event as a line of text."""
     time = _moment(entry.unix_s, "%H:%M:%S.%f")[:-3]
     return Text.assemble(
         (time, "dim"),
@@ -225,7 +225,7 @@ def _detail(entry: Entry) -> Text:
 
 
 def a_console(*, stderr: bool = False) -> Console:
-    """Return where people read: as wide as their terminal, and without a terminal as wide as what is printed."""
+    """Return a console: as wide as the terminal, or without a terminal as wide as its output."""
     console = Console(stderr=stderr, highlight=False)
     if not console.is_terminal:
         console.width = _PIPE_COLUMNS
@@ -250,7 +250,7 @@ def ms_text(latency: Latency) -> str:
 
 
 def latency_lines(latencies: Mapping[str, Latency]) -> list[str]:
-    """Return where the figures come from, regions with the same source together."""
+    """Return the sources of the figures, regions with the same source on one line."""
     if all(each.source == NO_ENDPOINT for each in latencies.values()):
         return [NO_ENDPOINT]
     sources: dict[str, list[str]] = {}

@@ -1,7 +1,7 @@
-"""What a machine of a cluster, a gateway, and the robot's own side boot: their files and programs.
+"""Bootstrap bundles of a cluster's machines, of gateways and of the robot's side: their files and programs.
 
-Place: I/O, through ``members``. A machine's boot has no key, only the ticket with which it asks for what it is to be.
-Every file names others relative to itself, so it does not matter where they will lie.
+I/O, through ``members``. A machine's bundle contains no key, only the ticket with which the machine enrols. Every file
+refers to others by relative paths, so a bundle works in any folder.
 ::
 
     machine   [node ...] -- ROS graph of its own -- [proxy] -- [leaf] -- iface          towards the gateway
@@ -32,13 +32,14 @@ __all__ += ["robot_boot", "robot_rule"]
 
 PROXY: Final = "proxy"
 SWITCH: Final = "switch"
-_PROFILES: Final = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")  # since Fast DDS 3, and before
-_DOMAINS: Final = 100  # ROS domains of machines, so that no two that lie near each other share one
-_TABLE_MAX: Final = 8_192  # a machine hears of few names, and memory for the usual 131,072 takes time to clear
+# Fast DDS 3 and later, and earlier versions
+_PROFILES: Final = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
+_DOMAINS: Final = 100  # number of ROS domains of machines, so that two adjacent machines never share one
+_TABLE_MAX: Final = 8_192  # a machine uses few names, and clearing memory for the usual 131,072 takes time
 _OWNER: Final = "owner.pub"
-_AWAIT: Final = ("--await-iface", "30")  # the switch beside it makes the device
+_AWAIT: Final = ("--await-iface", "30")  # the switch of the same machine creates the device
 _UDP_ONLY: Final = {
-    # Where machines share a host, shared memory would join their graphs; the range LOCALHOST brings it back.
+    # On a shared host, shared memory would join the graphs of machines; the range LOCALHOST enables it again.
     "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
     "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
 }
@@ -49,12 +50,12 @@ _OFTEN: Final = b"""<?xml version="1.0" encoding="UTF-8"?>
   <leaseAnnouncement><sec>0</sec><nanosec>250000000</nanosec></leaseAnnouncement>
  </discovery_config></builtin></rtps></participant>
 </profiles></dds>
-"""  # a node's first announcements are often missed where nodes start together; the next would come after 3 s
+"""  # nodes that start together often miss the first announcements; the next would follow after 3 s
 
 
 @dataclass(frozen=True, slots=True)
 class RobotDevices:
-    """What the robot's switch joins: the port towards the machines, and what it makes for those beside it."""
+    """Devices of the robot's switch: the port towards the machines, and the devices for local nodes."""
 
     uplink: str
     proxy: str
@@ -63,10 +64,11 @@ class RobotDevices:
 
 
 def machine_seats(plan: ClusterPlan, name: str, *, is_gateway: bool = False) -> tuple[PlannedSeat, PlannedSeat]:
-    """Return what a machine of a cluster is to be: a leaf, and a proxy that gives what is carried.
+    """Return the planned seats of a machine: a leaf, and a proxy that serves the exported interfaces.
 
     Args:
-        is_gateway: it may become the gateway of its group. Then it is a switch, for it carries what is not its own.
+        is_gateway: it may become the gateway of its group. Its switch is then not a leaf, because it carries transit
+            traffic.
     """
     title = f"{plan.name}-{name}"
     switch = Seat(SWITCH, Role.SWITCH if is_gateway else Role.LEAF, title)
@@ -85,16 +87,16 @@ def machine_boot(
     lease_s: float = ADVERTISEMENT_LEASE_S,
     uplink: str = "",
 ) -> MachineBundle:
-    """Return what a machine of a cluster boots; nothing in it is secret but the token.
+    """Return the bootstrap bundle of a machine; its only secret is the token.
 
     Args:
         name: of the machine.
-        command: how a node is started on it.
+        command: command line of a node on the machine.
         ticket: for its ``machine_seats``.
-        iface: its device towards the overlay.
+        iface: device of the machine towards the overlay.
         shares_host: whether other machines run on the same host.
-        lease_s: of its claims.
-        uplink: the device that it has while it is the gateway of its group; empty: it never is.
+        lease_s: of its advertisements.
+        uplink: device that the machine has while it is the gateway of its group; empty: it never is the gateway.
     """
     domain = 1 + int(name[1:]) % _DOMAINS
     ports = [{"iface": iface}, *([{"iface": uplink, "optional": True}] if uplink else [])]
@@ -125,7 +127,7 @@ def machine_boot(
 
 
 def node_names(plan: ClusterPlan) -> list[str]:
-    """Return what the programs of a cluster's nodes are called on each machine."""
+    """Return the program names of a cluster's nodes, the same on each machine."""
     return ["node"] if len(plan.nodes) == 1 else [f"node{index}" for index in range(len(plan.nodes))]
 
 
@@ -141,7 +143,7 @@ def gateway_boot(authority: Authority, label: str, ifaces: Sequence[str], *, day
 
 
 def robot_boot(authority: Authority, devices: RobotDevices, *, days: float) -> MachineBundle:
-    """Enrol the robot's own side of a site that has none: switch, RIB and proxy.
+    """Enrol the robot's side of a site without ``fog.yaml``: switch, RIB and proxy.
 
     Raises:
         LocalError: as ``Authority.enrol``.
@@ -172,7 +174,7 @@ def robot_boot(authority: Authority, devices: RobotDevices, *, days: float) -> M
 
 
 def robot_rule(carried: ExportedInterface) -> dict[str, object]:
-    """Return the rule by which the robot imports what is carried, without its owner."""
+    """Return the rule by which the robot imports an interface, without the owner."""
     return {**_rule(carried), **carried.options}
 
 

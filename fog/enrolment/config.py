@@ -1,4 +1,4 @@
-"""``enrolment:`` of ``fog.yaml``: where rented machines find the launcher.
+"""Section ``enrolment:`` of ``fog.yaml``: the address at which rented machines reach the launcher.
 
 Sans-I/O.
 """
@@ -17,10 +17,10 @@ ENROLMENT_PORT: Final = 4780
 
 
 def host_and_port(text: str) -> tuple[str, int]:
-    """Read ``HOST:PORT``; an IPv6 address stands in brackets, an empty host or ``*`` is every address.
+    """Read ``HOST:PORT``; an IPv6 address is written in brackets; an empty host or ``*`` means every address.
 
     Raises:
-        ValueError: it is something else.
+        ValueError: the text has another form.
     """
     host, colon, port = text.rpartition(":")
     if not colon or not port.isascii() or not port.isdecimal() or not 0 < int(port) < 65_536:
@@ -42,7 +42,7 @@ def _reachable(text: str) -> str:
 
 
 class EnrolmentConfig(Section):
-    """How rented machines enrol."""
+    """Section ``enrolment:`` of ``fog.yaml``."""
 
     address: Annotated[str, AfterValidator(_reachable)] | None = Field(
         default=None,

@@ -1,6 +1,6 @@
-"""What of a machine's keys is remembered: whose they are, until when, and how to take them back.
+"""Record of a machine's credentials: holder, end of validity, and fingerprints for revocation.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ __all__ = ["IssuedCredentials"]
 
 @dataclass(frozen=True, slots=True)
 class IssuedCredentials:
-    """What a machine was enrolled with; until it is, only when all of it will run out.
+    """Credentials issued to a machine; before enrolment only the end of their validity is known.
 
     Args:
-        proxy: the name of its proxy in the overlay, 64 hex digits: who serves, if it does; empty: not enrolled yet.
-        until_unix_s: when its certificates and delegations run out.
-        fingerprints: of its memberships, in hex, to take them back by.
+        proxy: overlay name of the machine's proxy, 64 hex digits; empty: not enrolled yet.
+        until_unix_s: end of validity of its certificates and delegations.
+        fingerprints: of its memberships, in hex, for their revocation.
     """
 
     proxy: str

@@ -1,8 +1,8 @@
-"""The socket at which machines enrol, in one thread: TCP, or a Unix socket for machines of this host.
+"""Listening socket for enrolment, in one thread: TCP, or a Unix socket for machines of this host.
 
-Place: I/O. Anybody may connect, so everything is bounded: connections at once and for each address, bytes, seconds, and
-connections a second. A connection is closed at its first wrong byte. Where all places are taken, the oldest connection
-gives way: silent ones keep no machine out.
+I/O. Any host may connect, so everything is bounded: concurrent connections in total and per address, bytes, seconds,
+and connections a second. A connection is closed at its first wrong byte. When the limit of connections is reached, the
+oldest one is closed, so idle connections do not exclude machines.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ __all__ = ["ACCEPTS_PER_S", "CONNECTIONS_MAX", "CONNECTION_S", "Listener", "bind
 log = logging.getLogger(__name__)
 
 CONNECTIONS_MAX: Final = 64
-CONNECTION_S: Final = 5.0  # from its beginning to its end, however slowly the other side writes or reads
-ACCEPTS_PER_S: Final = 500.0  # some 0.4 ms each, the kernel's part included
-_EACH_MAX: Final = 16  # connections of one address
+CONNECTION_S: Final = 5.0  # total lifetime of a connection, whatever the peer's speed
+ACCEPTS_PER_S: Final = 500.0  # about 0.4 ms each, including the kernel's share
+_EACH_MAX: Final = 16  # connections per address
 _BACKLOG: Final = 128
-_BURST: Final = 64  # connections accepted before others are looked at
+_BURST: Final = 64  # connections accepted before open ones are served
 _FLUSH_S: Final = 60.0
 
 
@@ -42,7 +42,7 @@ class _Connection:
     peer: socket.socket
     host: str
     end_s: float
-    size: int | None = None  # of the whole request, once its head is known
+    size: int | None = None  # bytes of the whole request, known after its header
     request: bytearray = field(default_factory=bytearray)
     answer: memoryview = field(default_factory=lambda: memoryview(b""))
 
@@ -63,7 +63,7 @@ def bind_tcp(host: str, port: int) -> socket.socket:
 
 
 def bind_unix(path: Path) -> socket.socket:
-    """Return a listening socket at a path, in place of what is there; its folder says who reaches it.
+    """Return a listening socket at a path and replace an existing one; the folder's permissions control access.
 
     Raises:
         LocalError: the system refuses.
@@ -84,18 +84,18 @@ def bind_unix(path: Path) -> socket.socket:
 
 
 class Listener:
-    """Hands whole requests to a responder.
+    """Server that passes complete requests to a responder.
 
     Args:
-        listening: ended by ``close``.
+        listening: listening socket; ``close`` closes it.
     """
 
     def __init__(self, listening: socket.socket, responder: Responder) -> None:
         self._listening = listening
         self._responder = responder
-        self._connections: dict[int, _Connection] = {}  # the oldest first
+        self._connections: dict[int, _Connection] = {}  # oldest first
         self._allowance, self._seen_s = ACCEPTS_PER_S, time.monotonic()
-        self._resume_s: float | None = None  # when connections are accepted again
+        self._resume_s: float | None = None  # time at which accepting resumes
         self._flush_s = 0.0
         self._is_closed = False
         listening.setblocking(False)
@@ -108,11 +108,11 @@ class Listener:
 
     @property
     def address(self) -> object:
-        """Return where it listens, as the socket says it."""
+        """Return the listening address as the socket reports it."""
         return self._listening.getsockname()
 
     def close(self) -> None:
-        """End all connections, and return when the address is free again."""
+        """Close all connections, and return when the address is free again."""
         self._is_closed = True
         self._wakes.send(b"x")
         self._thread.join()
@@ -157,7 +157,7 @@ class Listener:
                 peer, address = self._listening.accept()
             except (BlockingIOError, ConnectionAbortedError):
                 return
-            except OSError as error:  # no descriptors left, which this thread cannot mend
+            except OSError as error:  # no descriptors are left, which this thread cannot repair
                 log.warning("enrolment not accepted reason=%s", error.strerror)
                 self._pause(now_s)
                 return
@@ -185,7 +185,7 @@ class Listener:
                 self._read(connection)
         except BlockingIOError:
             return
-        except OSError:  # the other side has gone
+        except OSError:  # the peer has closed
             self._end(connection)
 
     def _read(self, connection: _Connection) -> None:
@@ -204,7 +204,7 @@ class Listener:
         self._selector.modify(connection.peer, selectors.EVENT_WRITE)
 
     def _answer_to(self, connection: _Connection) -> bytes | None:
-        """Return what the connection gets; empty: nothing; None: its request is not whole yet."""
+        """Return the response to a connection; empty: no response; None: the request is incomplete."""
         if connection.size is None:
             try:
                 head = request_head(bytes(connection.request))
@@ -236,10 +236,10 @@ class Listener:
 
 @contextmanager
 def _told(what: str) -> Iterator[None]:
-    """Keep the thread alive: the machine asks again, and the log says why it has to."""
+    """Log an error and keep the thread alive; the machine sends its request again."""
     try:
         yield
     except GdpError as error:
         log.error("enrolment failed at=%s reason=%s", what, error)
-    except Exception:  # a fault of ours ends one request, not the thread that all machines need
+    except Exception:  # an internal error ends one request, not the thread that serves all machines
         log.exception("enrolment failed at=%s", what)

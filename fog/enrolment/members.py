@@ -1,7 +1,7 @@
-"""New members of the site's domain, with what the owner lets them do.
+"""Issuing of memberships in the site's domain and of the owner's delegations.
 
-Place: I/O; reads the domain's and the owner's private keys. Members of this host get keys that are made here and leave
-nothing on disk; a machine's ask with keys of their own.
+I/O; reads the domain's and the owner's private keys. Keys of members on this host are generated here and leave nothing
+on disk; machines generate their own keys.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ _CALLS: Final = (Right.SERVE, Right.CALL)
 
 @dataclass(frozen=True, slots=True)
 class Enrolled:
-    """A new member of this host's own: a gateway, or of the robot's side.
+    """New member on this host: a gateway, or a node of the robot's side.
 
     Args:
-        files: of its directory, to be kept private.
+        files: contents of its directory, private.
     """
 
     member: Membership
     files: Mapping[str, bytes]
 
     def below(self, folder: str) -> dict[str, bytes]:
-        """Return its files with this folder before their names."""
+        """Return its files with this folder prefixed to their names."""
         return {f"{folder}/{name}": data for name, data in self.files.items()}
 
 
 @dataclass(frozen=True, slots=True)
 class _Node:
-    """Whom the owner delegates to; the same request proved both."""
+    """Node that receives a delegation; one request proved both of its keys."""
 
     subject: Subject
     kem: KemPublicKey
@@ -54,10 +54,10 @@ class _Node:
 
 @dataclass(frozen=True, slots=True)
 class Authority:
-    """Who admits and delegates: the directories of a domain and of an owner.
+    """Issuer of memberships and delegations: the directories of a domain and of an owner.
 
     Args:
-        scratch: where files lie for a moment; what a killed process left there may be deleted.
+        scratch: folder for temporary files; leftovers of a killed process may be deleted.
     """
 
     domain: Path
@@ -65,10 +65,10 @@ class Authority:
     scratch: Path | None = None
 
     def enrol(self, role: Role, label: str, *, days: float) -> Enrolled:
-        """Return a new member whose keys are made here.
+        """Return a new member whose keys are generated here.
 
         Raises:
-            LocalError: no domain or no owner there, or its root has run out.
+            LocalError: the domain or the owner is missing, or the root certificate has expired.
         """
         with tempfile.TemporaryDirectory(prefix="gdp-fog-", dir=self.scratch) as scratch:
             node = Path(scratch) / "node"
@@ -79,12 +79,12 @@ class Authority:
     def grant(
         self, application: Application, carried: Iterable[ExportedInterface], *, until_unix_s: float, unix_s: float
     ) -> tuple[Membership, Granted]:
-        """Return the membership that a machine asks for, and what lets it give (serve, publish) what is carried.
+        """Return the requested membership, and delegations to provide (serve, publish) the exported interfaces.
 
-        Whoever calls has seen that role and label are those that were planned.
+        The caller has checked that role and label are the planned ones.
 
         Raises:
-            StatementError: the application does not hold.
+            StatementError: the application is invalid.
             LocalError: as ``enrol``.
         """
         days = (until_unix_s - unix_s) / DAY_S
@@ -99,10 +99,10 @@ class Authority:
         return member, Granted(member.wire, tuple(given))
 
     def grant_access(self, node: Path, delegations: Path, carried: Iterable[ExportedInterface], *, days: float) -> None:
-        """Let a node of the robot's side take (call, read) what is carried; what it had of these names is replaced.
+        """Delegate to a node of the robot's side to use (call, read) interfaces; earlier delegations are replaced.
 
         Raises:
-            LocalError: as ``enrol``, or the node's directory has no card.
+            LocalError: as ``enrol``, or the node's directory has no node descriptor.
         """
         for each in carried:
             given = delegate(self.owner, node / CARD, metadata_of(each), [right_of(each, gives=False)], days=days)
@@ -110,18 +110,18 @@ class Authority:
 
     @property
     def owner_key(self) -> Path:
-        """Return the file with the owner's public key."""
+        """Return the path of the owner's public key."""
         return self.owner / OWNER_PUBLIC
 
 
 def metadata_of(carried: ExportedInterface) -> Metadata:
-    """Return what the overlay's name of a service, action or topic digests."""
+    """Return the metadata that the overlay name of a service, action or topic hashes."""
     own = {"kind": carried.kind, "name": carried.name, "type": carried.type_name}
     more = carried.options.get("metadata", {})
     return Metadata({**own, **more} if isinstance(more, dict) else own)
 
 
 def right_of(carried: ExportedInterface, *, gives: bool) -> Right:
-    """Return what is needed to give, or to take, what is carried."""
+    """Return the right needed to provide an interface, or to use it."""
     give, take = _RIGHTS.get(carried.kind, _CALLS)
     return give if gives else take

@@ -1,8 +1,8 @@
-"""Who answers a machine's request for its memberships: verifies, issues, remembers.
+"""Responder to enrolment requests: verifies them, issues memberships and stores the responses.
 
-Place: I/O, through ``tickets`` and ``members``; no socket, and times come in as arguments.
-A request without a valid tag costs a look-up and a few hashes. One with it costs a decapsulation and four
-verifications, at most ``OPENED_MAX`` times a ticket; the same bytes again cost the tag alone.
+I/O, through ``tickets`` and ``members``; no socket, and times are arguments.
+A request without a valid tag costs a look-up and a few hashes. A request with a valid tag costs a decapsulation and
+four verifications, at most ``OPENED_MAX`` times per ticket. A repeat of the same bytes costs only the tag.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from gdp.trust.enrolment import (
 
 __all__ = ["OPENED_MAX", "Responder"]
 
-OPENED_MAX: Final = 64  # requests of one ticket that are opened; a machine needs one, or a few where answers are lost
+OPENED_MAX: Final = 64  # opened requests per ticket; a machine needs one, or a few if responses are lost
 _REMEMBERED: Final = 1_024  # tickets
 _WHAT: Final = "enrolment"
 _KNOWN: Final = "somebody has read its user data"
@@ -44,10 +44,10 @@ _T = TypeVar("_T")
 
 
 class Responder:
-    """Answers requests, one after the other, from one thread; the domain's audit log has each that is refused.
+    """Handler of requests, sequential, for one thread; the domain's audit log records each refusal.
 
     Raises:
-        LocalError: the domain's folder is not this user's alone.
+        LocalError: other users can access the domain's folder.
     """
 
     def __init__(self, tickets: Tickets, authority: Authority) -> None:
@@ -57,10 +57,10 @@ class Responder:
         self._trail.begin()
         self._audit = AuditLog(authority.domain)
         self._opened: OrderedDict[bytes, int] = OrderedDict()
-        self._answered: OrderedDict[bytes, tuple[bytes, bytes]] = OrderedDict()  # SHA-256 of the request, answer
+        self._answered: OrderedDict[bytes, tuple[bytes, bytes]] = OrderedDict()  # SHA-256 of the request, response
 
     def is_expected(self, identifier: bytes) -> bool:
-        """Return whether there is a ticket of this id; what else its request says may then be read.
+        """Return whether a ticket has this id; the rest of its request may then be read.
 
         Raises:
             StoreError: the tickets cannot be read now.
@@ -71,10 +71,10 @@ class Responder:
         return False
 
     def answer(self, request: bytes, unix_s: float) -> bytes:
-        """Return what a whole request gets; empty: nothing.
+        """Return the response to a complete request; empty: no response.
 
         Raises:
-            StoreError, LocalError: tickets or keys cannot be read or written now; the machine asks again.
+            StoreError, LocalError: tickets or keys cannot be read or written now; the machine retries.
         """
         try:
             head = request_head(request)
@@ -106,10 +106,10 @@ class Responder:
         return sent
 
     def flush(self) -> None:
-        """Write what is due of the audit log.
+        """Write the pending entries of the audit log.
 
         Raises:
-            LocalError: it cannot be written; what was to be written is lost.
+            LocalError: the log cannot be written; the pending entries are lost.
         """
         self._audit.write(self._trail, time.monotonic(), time.time())
 
@@ -169,10 +169,10 @@ class Responder:
 
 
 def _verified(identifier: bytes, kept: Kept, asked: Request) -> list[SubjectInfo]:
-    """Return whom the applications are about: exactly what was planned, each with its key's proof.
+    """Return the subjects of the applications: exactly the planned ones, each with a valid key proof.
 
     Raises:
-        StatementError: they are about something else, or a proof does not hold.
+        StatementError: a subject was not planned, or a proof is invalid.
     """
     if len(asked.applications) != len(kept.seats):
         raise StatementError(DropReason.WRONG_NAME, "another number of members")

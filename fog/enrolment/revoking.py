@@ -1,6 +1,6 @@
-"""Memberships of machines that are gone are taken back, where the robot's switch can be told.
+"""Revocation of the memberships of machines that are gone, in a switch's folder.
 
-Place: I/O; writes into the ``revocations`` folder of a switch.
+I/O; writes into the ``revocations`` folder of a switch.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ _TITLE_CHARS: Final = 32  # of the fingerprint
 def revoke_credentials(
     domain: Path, folder: Path, fingerprints: Iterable[str], *, until_unix_s: float, unix_s: float
 ) -> bool:
-    """Write a revocation for each membership, and remove those whose time is over; return whether one is new.
+    """Write a revocation for each membership and remove expired ones; return whether one is new.
 
     Args:
         fingerprints: in hex.
-        until_unix_s: when the memberships run out.
+        until_unix_s: end of validity of the memberships.
         unix_s: now.
 
     Raises:
-        LocalError: no domain there, or the folder cannot be written.
+        LocalError: the domain is missing, or the folder cannot be written.
     """
     authority = load_domain(domain)
     files = {}
@@ -48,7 +48,7 @@ def revoke_credentials(
             note_once(domain, Action.REVOKED, "membership", about=fingerprint, unix_s=unix_s)
     write_all(folder, files)
     for path in folder.glob(f"[!.]*{_SUFFIX}"):
-        with suppress(StatementError):  # somebody else's: left alone
+        with suppress(StatementError):  # not written by this function: left unchanged
             old = Revocation.from_statement(parse(read_public(path)))
             if old.until_unix_s + 2 * CLOCK_SKEW_S < unix_s:
                 path.unlink(missing_ok=True)

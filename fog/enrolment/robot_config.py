@@ -1,10 +1,9 @@
 """Rules and delegations by which a robot's proxy uses a cluster.
 
-I/O; writes drop-in files and delegations, and asks running nodes to reload through their control sockets.
+I/O; writes drop-in files and delegations, and makes running nodes reload through their control sockets.
 ``proxy.yaml`` never changes. The rules of a cluster are the file ``fog-CLUSTER.yaml`` of the drop-in directory
-(``proxy.config.drop_ins``), which ``forget_rules`` removes. A rule that the proxy already has is not written again.
-The file
-is private (0600) if ``proxy.yaml`` is, or if a rule contains a name's salt.
+(``proxy.config.drop_ins``), which ``remove_rules`` removes. A rule that the proxy already has is not written again. The
+file is private (0600) if ``proxy.yaml`` is, or if a rule contains a name's salt.
 """
 
 from __future__ import annotations
@@ -45,14 +44,14 @@ _RELOAD_S: Final = 10.0
 def add_rules(
     path: Path, authority: Authority, cluster: str, carried: Sequence[ExportedInterface], *, days: float
 ) -> None:
-    """Let a robot's proxy use what a cluster serves, by rule and delegation; the proxy may run or not.
+    """Add rules and delegations with which a robot's proxy uses a cluster; the proxy need not run.
 
     Args:
         path: ``proxy.yaml`` of the robot.
         days: validity of the delegations.
 
     Raises:
-        ConfigError: the configuration is not a proxy's, or a rule conflicts with one of its own.
+        ConfigError: the file is not a proxy configuration, or a new rule conflicts with an existing one.
         LocalError: keys are missing, or the drop-in cannot be written.
     """
     key = load_public_key(authority.owner_key).compressed
@@ -89,15 +88,15 @@ def control_socket_of(identity: Path, configured: Path | None) -> Path:
         configured: ``control_socket`` of its configuration.
 
     Raises:
-        LocalError: the directory is of no node.
+        LocalError: the directory does not belong to a node.
     """
     return configured or find_control_socket(identity)
 
 
 def reload(identity: Path, configured: Path | None = None) -> bool:
-    """Have a node of this host read its configuration again, if it runs; return whether it did.
+    """Reload the configuration of a node of this host, if it runs; return whether it did.
 
-    A node that refuses keeps its old configuration; the reason is logged.
+    A node that rejects it keeps its old configuration; the reason is logged.
 
     Args:
         identity: directory of its keys.
@@ -116,10 +115,10 @@ def reload(identity: Path, configured: Path | None = None) -> bool:
 
 
 def reload_proxy(path: Path) -> bool:
-    """Have the proxy of this ``proxy.yaml`` read it again, if it runs; return whether it did.
+    """Make the proxy of this ``proxy.yaml`` reload it, if it runs; return whether it did.
 
     Raises:
-        ConfigError: the file is not a proxy's.
+        ConfigError: the file is not a proxy configuration.
     """
     config = ProxyConfig.load(path)
     return reload(config.identity, config.control_socket)

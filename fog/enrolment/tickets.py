@@ -1,12 +1,13 @@
-"""Tickets of machines that are to enrol: what each may become, whether it has, and what the supervisor is to know.
+"""Store of enrolment tickets: planned seats, use of each ticket, and reports for the supervisor.
 
-Place: I/O, one folder of the site's state, private::
+I/O, one folder of the site's state, private::
 
-    responder.key       what requests are sealed to
-    tickets.sqlite3     a row a ticket, and news
+    responder.key       key to which requests are sealed
+    tickets.sqlite3     one row per ticket, and news
 
-A ticket is written before its machine is asked for. It is marked as used, on disk, before anything is issued for it:
-whatever is killed in between, no second key gets anything. The responder's thread and the supervisor's use one object.
+A ticket is written before its machine is requested. It is marked as used, on disk, before anything is issued for it.
+A crash at any point therefore never lets a second key obtain credentials. The threads of the responder and of the
+supervisor use one object.
 """
 
 from __future__ import annotations
@@ -49,15 +50,15 @@ CREATE TABLE IF NOT EXISTS news (
 
 
 class Report(Enum):
-    """What happened to a ticket."""
+    """Kind of event of a ticket."""
 
     ENROLLED = "enrolled"
-    MISUSED = "misused"  # whoever asked knows the token, and is not the machine, or not the first one
+    MISUSED = "misused"  # the requester has the token, but is not the machine, or not the first to use it
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedSeat:
-    """A seat, and what its member may give (serve, publish)."""
+    """Seat, and the interfaces that its member may provide (serve, publish)."""
 
     seat: Seat
     carried: tuple[ExportedInterface, ...] = ()
@@ -65,15 +66,15 @@ class PlannedSeat:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Kept:
-    """A ticket as the launcher keeps it.
+    """Stored ticket.
 
     Args:
-        expires_unix_s: until when it can be used.
-        until_unix_s: when all that is issued for it ends.
-        keys: SHA-256 of the keys that used it; None: nobody did.
-        answer: what these were given; None: not complete yet.
-        papers: of who used it.
-        is_reported: a misuse was reported; nothing more is answered.
+        expires_unix_s: end of the time in which it can be used.
+        until_unix_s: end of validity of everything issued for it.
+        keys: SHA-256 of the keys that used it; None: not used.
+        answer: response to these keys; None: not complete yet.
+        papers: credentials issued to the machine that used it.
+        is_reported: a misuse was reported; further requests get no response.
     """
 
     token: bytes = field(repr=False)
@@ -90,7 +91,7 @@ class Kept:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class News:
-    """Something that the supervisor is to act on, told again until it is ``taken``."""
+    """Report for the supervisor, returned repeatedly until it is ``taken``."""
 
     id: int
     cluster: str
@@ -101,11 +102,11 @@ class News:
 
 
 class Tickets:
-    """The folder, opened.
+    """Opened folder of tickets.
 
     Raises:
-        LocalError: the folder is not this user's alone.
-        StoreError: it cannot be read or written now; from every method, too.
+        LocalError: other users can access the folder.
+        StoreError: it cannot be read or written now; every method may raise this too.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -118,7 +119,7 @@ class Tickets:
             os.close(os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
             self._file = sqlite3.connect(self._path, timeout=_PATIENCE_S, isolation_level=None, check_same_thread=False)
             self._file.execute("PRAGMA journal_mode=WAL")
-            self._file.execute("PRAGMA synchronous=FULL")  # a token that was used stays used
+            self._file.execute("PRAGMA synchronous=FULL")  # a used token stays used after a crash
             self._file.executescript(_TABLES)
 
     def close(self) -> None:
@@ -138,10 +139,10 @@ class Tickets:
         expires_unix_s: float,
         until_unix_s: float,
     ) -> Ticket:
-        """Keep and return a machine's ticket; those whose time is over are forgotten.
+        """Store and return a machine's ticket; expired tickets are deleted.
 
         Args:
-            token: 32 bytes drawn for it.
+            token: 32 random bytes.
         """
         with self._writing() as file:
             file.execute(
@@ -155,12 +156,12 @@ class Tickets:
         return Ticket(tuple(addresses), self.responder.public, token, tuple(each.seat for each in seats))
 
     def knows(self, identifier: bytes) -> bool:
-        """Return whether there is a ticket of this id."""
+        """Return whether a ticket has this id."""
         with self._translated(), self._lock:
             return self._file.execute("SELECT 1 FROM tickets WHERE id = ?", (identifier,)).fetchone() is not None
 
     def find(self, identifier: bytes) -> Kept | None:
-        """Return the ticket of this id."""
+        """Return the ticket with this id."""
         query = (
             "SELECT token, cluster, machine, seats, expires_unix_s, until_unix_s, keys, answer, papers, is_reported"
             " FROM tickets WHERE id = ?"
@@ -184,7 +185,7 @@ class Tickets:
         )
 
     def use(self, identifier: bytes, keys: bytes) -> bool:
-        """Mark a ticket as used by these keys; return whether it was not used, or by the same ones."""
+        """Mark a ticket as used by these keys; return whether it was unused or used by the same keys."""
         with self._writing() as file:
             return bool(
                 file.execute(
@@ -194,7 +195,7 @@ class Tickets:
             )
 
     def complete(self, identifier: bytes, answer: bytes, papers: IssuedCredentials, detail: str) -> bool:
-        """Keep what the keys of a ticket are given, and tell the supervisor; False: the ticket was taken back."""
+        """Store the response to a ticket's keys, and report it to the supervisor; False: the ticket was withdrawn."""
         text = json.dumps(asdict(papers))
         with self._writing() as file:
             if not file.execute(
@@ -205,7 +206,7 @@ class Tickets:
         return True
 
     def misused(self, identifier: bytes, detail: str) -> None:
-        """Let a ticket be good for nothing any more, and tell the supervisor, once."""
+        """Invalidate a ticket, and report that to the supervisor once."""
         with self._writing() as file:
             if file.execute(
                 "UPDATE tickets SET is_reported = 1 WHERE id = ? AND is_reported = 0", (identifier,)
@@ -213,12 +214,12 @@ class Tickets:
                 _tell(file, identifier, Report.MISUSED, detail, None)
 
     def take_back(self, cluster: str, machine: str) -> None:
-        """Forget the ticket of a machine that is no more; fine if there is none."""
+        """Delete the ticket of a machine that is gone; no effect if there is none."""
         with self._writing() as file:
             file.execute("DELETE FROM tickets WHERE cluster = ? AND machine = ?", (cluster, machine))
 
     def news(self) -> list[News]:
-        """Return what was not ``taken`` yet, the oldest first."""
+        """Return the news that was not ``taken`` yet, oldest first."""
         with self._translated(), self._lock:
             rows = self._file.execute(
                 "SELECT id, cluster, machine, report, detail, papers FROM news ORDER BY id"
@@ -236,7 +237,7 @@ class Tickets:
         ]
 
     def taken(self, news: News) -> None:
-        """Forget news that were acted on."""
+        """Delete news that was handled."""
         with self._writing() as file:
             file.execute("DELETE FROM news WHERE id = ?", (news.id,))
 

@@ -1,1 +1,1 @@
-"""What runs on every machine of a cluster, whoever rents it out: the programs of its boot, kept up and told of."""
+"""Agent of a cluster's machine, for every provider: it runs the programs of the bundle and reports their status."""

@@ -1,6 +1,6 @@
-"""A machine at work: its programs, its status, its end.
+"""Machine agent: the programs of a machine, its status and its shutdown.
 
-Place: shell.
+I/O.
 ::
 
     BOOTING -- all programs are up --> RUNNING -- notice, drain --> LEAVING -- its end, or the notice's moment --> gone
@@ -28,20 +28,20 @@ __all__ = ["DRAINS", "MachineAgent"]
 
 log = logging.getLogger(__name__)
 
-DRAINS: Final = "proxy"  # the program that knows which calls are under way
+DRAINS: Final = "proxy"  # the program that tracks calls in progress
 _DRAIN_S: Final = 60.0
 _SIGNALS: Final = {signal.SIGTERM, signal.SIGINT, signal.SIGUSR1, signal.SIGUSR2}
 
 
 class MachineAgent:
-    """The machine whose folder is ``home``.
+    """Agent of the machine whose folder is ``home``.
 
-    SIGTERM and SIGINT end it. SIGUSR1 drains it: ``proxy`` is sent the same and may answer what it has, then all ends.
-    SIGUSR2: there is a notice in the folder; at its moment everything is killed, as the provider would do it. The
-    signals may be blocked when this begins.
+    SIGTERM and SIGINT end it. SIGUSR1 drains it: ``proxy`` receives SIGUSR1 too and may finish its calls, then all
+    programs end. SIGUSR2 means that the folder contains a notice; at its time all programs are killed, as the provider
+    would do. The signals may be blocked when the agent starts.
 
     Raises:
-        LocalError: there is no ``boot.json``, or it is none.
+        LocalError: ``boot.json`` is missing or invalid.
     """
 
     def __init__(self, home: Path) -> None:
@@ -58,7 +58,7 @@ class MachineAgent:
         self._tasks: list[asyncio.Task[str]] = []
 
     async def run(self) -> str:
-        """Be the machine until its end; return why it ended."""
+        """Run the machine until its end; return the reason."""
         self._keepers = tuple(ProgramSupervisor(program, self._home, self._tell) for program in self._programs)
         end, drain = asyncio.Event(), asyncio.Event()
         self._listen(end, drain)
@@ -92,7 +92,7 @@ class MachineAgent:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
 
     async def _stand(self) -> str:
-        """Start all programs, wait until all are up; then wait for one that ends for good."""
+        """Start all programs, wait until all are up, then wait until one ends permanently."""
         self._tasks = [asyncio.ensure_future(supervisor.keep()) for supervisor in self._keepers]
         up = asyncio.create_task(self._all_up())
         await asyncio.wait([up, *self._tasks], return_when=asyncio.FIRST_COMPLETED)
@@ -111,7 +111,7 @@ class MachineAgent:
             await supervisor.ready.wait()
 
     async def _drain(self, end: asyncio.Event) -> None:
-        """Let what is under way be answered; nothing is started again."""
+        """Let calls in progress finish; no program is restarted."""
         for task in self._tasks:
             task.cancel()
         for supervisor in self._keepers:
@@ -127,7 +127,7 @@ class MachineAgent:
             asyncio.get_running_loop().call_later(max(leaves_at_unix_s - time.time(), 0.0), self._die)
 
     def _die(self) -> None:
-        """End as a machine does that is switched off."""
+        """End like a machine that is switched off."""
         for supervisor in self._keepers:
             supervisor.kill()
         os.kill(os.getpid(), signal.SIGKILL)

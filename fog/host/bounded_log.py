@@ -1,6 +1,6 @@
-"""A log that cannot fill a disk: when the file is full it becomes the older half, and a new one begins.
+"""Bounded log: a full file becomes the older half, and a new file begins.
 
-Place: I/O.
+I/O.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ _HALF_BYTES: Final = 2 << 20
 
 
 class BoundedLog:
-    """Appends to ``path``; what is older lies in ``path`` with ``.1`` appended, and what is older still is gone.
+    """Log that appends to ``path``; older lines are in ``path`` with ``.1`` appended, still older ones are deleted.
 
     Args:
-        half_bytes: most bytes of either file.
+        half_bytes: maximum size of each of the two files.
     """
 
     def __init__(self, path: Path, half_bytes: int = _HALF_BYTES) -> None:
@@ -28,7 +28,7 @@ class BoundedLog:
         self._file = path.open("ab", buffering=0)
 
     def write(self, data: bytes) -> None:
-        """Append, beginning a new file if this one would grow too long."""
+        """Append; begin a new file if this one would exceed its limit."""
         if self._file.tell() and self._file.tell() + len(data) > self._half_bytes:
             self._file.close()
             self._path.replace(_older(self._path))
@@ -41,7 +41,7 @@ class BoundedLog:
 
 
 def last_lines(path: Path, lines: int) -> str:
-    """Return the last lines of a bounded log, or of any file; empty where there is none."""
+    """Return the last lines of a bounded log, or of any file; empty if there is none."""
     found = [each for each in (_older(path), path) if each.is_file()]
     texts = (each.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True) for each in found)
     return "".join(deque(chain.from_iterable(texts), maxlen=lines))

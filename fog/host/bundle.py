@@ -1,6 +1,6 @@
-"""A machine's boot as plain files, so that any provider can carry it: by hand, in user data, over ssh.
+"""Bootstrap bundle as plain files, which any provider can transfer: by hand, in user data, over ssh.
 
-Place: pure, but for ``install``, which writes them.
+I/O: ``install`` writes the files. All other functions are sans-I/O.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ TICKET_FILE: Final = "enrolment.json"  # until the machine has enrolled
 
 
 def pack(boot: MachineBundle) -> dict[str, bytes]:
-    """Return all files below the machine's folder: the boot's own, and ``boot.json``, which tells its programs.
+    """Return all files below the machine's folder: those of the bundle, and ``boot.json``, which lists its programs.
 
     Raises:
-        LocalError: a path that leads out of the folder, or is ``boot.json`` itself; two programs of one name.
+        LocalError: a path leads out of the folder or is ``boot.json``; two programs have one name.
     """
     for path in boot.files:
         parts = PurePosixPath(path).parts
@@ -39,10 +39,10 @@ def pack(boot: MachineBundle) -> dict[str, bytes]:
 
 
 def unpack(files: Mapping[str, bytes]) -> MachineBundle:
-    """Return the boot that was packed.
+    """Return the bundle that was packed.
 
     Raises:
-        LocalError: ``boot.json`` is not there, or is something else.
+        LocalError: ``boot.json`` is missing or invalid.
     """
     if BOOT_FILE not in files:
         raise LocalError(f"no {BOOT_FILE}")
@@ -51,10 +51,10 @@ def unpack(files: Mapping[str, bytes]) -> MachineBundle:
 
 
 def read_programs(content: bytes) -> tuple[Program, ...]:
-    """Return the programs that a ``boot.json`` tells.
+    """Return the programs that a ``boot.json`` lists.
 
     Raises:
-        LocalError: it is something else.
+        LocalError: the content is invalid.
     """
     try:
         told = json.loads(content)["programs"]
@@ -75,10 +75,10 @@ def _refuse_what_cannot_start(program: Program) -> None:
 
 
 def install(home: Path, boot: MachineBundle) -> None:
-    """Write all files of a boot into a machine's folder, for its owner's eyes.
+    """Write all files of a bundle into a machine's folder, readable only by its owner.
 
     Raises:
-        LocalError: as ``pack``; a file is there already, or the system refuses.
+        LocalError: as ``pack``; a file exists already, or the system refuses.
     """
     for path, content in pack(boot).items():
         place = home / path

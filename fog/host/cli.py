@@ -1,6 +1,6 @@
-"""The ``fog-machine`` command.
+"""``fog-machine`` command, which runs the machine agent.
 
-Place: command.
+I/O.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def machine(
 
     Its folder's status.json tells how they are, logs/ what they say.
     """
-    del version  # it ends the command by itself
+    del version  # the option ends the command
     set_up_logging(verbose=verbose)
     with failing_clearly():
         host = MachineAgent(home.resolve())
@@ -53,9 +53,9 @@ def machine(
             log.warning("nobody says go, so nobody has a record of this machine")
             raise typer.Exit(1)
         if (home / TICKET_FILE).exists():
-            from fog.host.enrolment import enrol  # what it imports no later start needs
+            from fog.host.enrolment import enrol  # later starts do not need these imports
 
-            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR1, signal.SIGUSR2})  # for the host, soon
+            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR1, signal.SIGUSR2})  # until the agent handles them
             enrol(home.resolve())
         reason = asyncio.run(host.run())
         if json:

@@ -1,7 +1,7 @@
-"""A machine's first start: it makes its own keys, and asks for what it is to be with the token of its ticket.
+"""Enrolment of a machine at its first start: it generates keys, and requests memberships with its ticket's token.
 
-Place: I/O. Keys are on disk before they are shown, so that a machine that starts again asks with the same ones. When
-all is there the ticket is removed: no file, no enrolment.
+I/O. Keys are on disk before they are sent, so a restarted machine uses the same keys. After enrolment the ticket is
+deleted; a machine without a ticket does not enrol.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ __all__ = ["enrol"]
 
 log = logging.getLogger(__name__)
 
-_PATIENCE_S: Final = 900.0  # whoever launched gives up then, too
+_PATIENCE_S: Final = 900.0  # the launcher stops waiting at the same time
 _TRY_S: Final = 10.0
 _PAUSE_MIN_S: Final = 0.2
 _PAUSE_MAX_S: Final = 5.0
@@ -49,8 +49,8 @@ def enrol(home: Path, *, patience_s: float = _PATIENCE_S) -> bool:
     """Enrol the machine if its folder has a ticket; return whether it had one.
 
     Raises:
-        LocalError: the ticket is none; the responder refuses it; nobody answers within ``patience_s``; or what was
-            answered does not fit the machine's keys.
+        LocalError: the ticket is invalid; the responder refuses it; no response arrives within ``patience_s``; or the
+            response does not match the machine's keys.
     """
     path = home / TICKET_FILE
     if not path.exists():
@@ -74,20 +74,20 @@ def enrol(home: Path, *, patience_s: float = _PATIENCE_S) -> bool:
 
 
 def _application(home: Path, ticket: Ticket, index: int) -> Application:
-    """Make a member's keys, or find those of an earlier start, and apply with them."""
+    """Generate a member's keys, or load those of an earlier start, and return an application with them."""
     seat = ticket.seats[index]
     folder = home / seat.folder
-    if not (folder / REQUEST).exists():  # the last file to be written
+    if not (folder / REQUEST).exists():  # this file is written last
         make_node_keys(folder, seat.role, seat.label, force=True)
     keys = load_node_keys(folder)
     return apply(ticket.token, keys.key, read_public(folder / REQUEST), keys.kem.public)
 
 
 def _ask(ticket: Ticket, applications: list[Application], patience_s: float) -> EnrolmentResponse:
-    """Ask until somebody answers."""
+    """Send the request until a response arrives."""
     end_s, pause_s, reason = time.monotonic() + patience_s, _PAUSE_MIN_S, ""
     secret = secrets.token_bytes(ANSWER_SECRET_BYTES)
-    request = seal_request(ticket, applications, secret)  # the same each time
+    request = seal_request(ticket, applications, secret)  # the same for each attempt
     while True:
         for address in ticket.addresses:
             try:
@@ -99,17 +99,17 @@ def _ask(ticket: Ticket, applications: list[Application], patience_s: float) -> 
                 reason = said
         if time.monotonic() + pause_s >= end_s:
             raise LocalError(f"nobody let this machine enrol within {patience_s:.0f} s: {reason}")
-        time.sleep(pause_s)  # nothing tells a machine when its launcher is back
+        time.sleep(pause_s)  # no event reports that the launcher is reachable again
         pause_s = min(2 * pause_s, _PAUSE_MAX_S)
 
 
 def _exchange(address: str, request: bytes) -> bytes:
-    """Return what followed the head of the answer.
+    """Return the body of the response.
 
     Raises:
-        OSError: nobody is there, or the connection ends early.
-        StatementError: no answer.
-        LocalError: a refusal.
+        OSError: the peer is unreachable, or the connection ends early.
+        StatementError: the response is malformed.
+            LocalError: the responder refuses the request.
     """
     with closing(_connected(address)) as peer:
         peer.settimeout(_TRY_S)

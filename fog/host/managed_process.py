@@ -1,8 +1,8 @@
-"""One life of a program: started, listened to, ended.
+"""Process of a machine's program: start, output and end.
 
-Place: shell. Each leads a session of its own, so that what it starts ends with it; the kernel kills it when the
-machine's own process ends, however that comes about (``PR_SET_PDEATHSIG``, by setpriv(1)). It inherits no
-credentials of the environment (``fog/child_environment``).
+I/O. Each process leads its own session, so its children end with it. The kernel kills it when the machine agent ends
+for any reason (``PR_SET_PDEATHSIG``, by setpriv(1)). It inherits no credentials from the environment
+(``fog/child_environment``).
 """
 
 from __future__ import annotations
@@ -24,21 +24,22 @@ from fog.machine import Program
 
 __all__ = ["NODE_USER", "ManagedProcess"]
 
-NODE_USER: Final = "FOG_NODE_USER"  # the variable that names the user who runs nodes; without it: the machine's own
+NODE_USER: Final = "FOG_NODE_USER"  # environment variable with the user for nodes; default: the user of the agent
 
 _READ_BYTES: Final = 1 << 16
 
 
 class ManagedProcess:
-    """A process that runs.
+    """Running process.
 
     Args:
-        home: the machine's folder; the process begins there, or in the home of ``FOG_NODE_USER``.
-        log: takes what it says.
+        home: the machine's folder; working directory of the process, unless ``FOG_NODE_USER`` is set: then that user's
+            home.
+        log: receives its output.
         on_ready: called when it is up.
 
     Raises:
-        OSError: it cannot be started, or there is no such user as ``FOG_NODE_USER`` says.
+        OSError: it cannot be started, or the user in ``FOG_NODE_USER`` does not exist.
     """
 
     def __init__(self, program: Program, home: Path, log: BoundedLog, on_ready: Callable[[], None]) -> None:
@@ -53,7 +54,7 @@ class ManagedProcess:
         user = os.environ.get(NODE_USER, "") if program.is_users else ""
         own = _home_of(user)
         self._hears, says = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
-        os.set_blocking(says, True)  # ours alone must not wait
+        os.set_blocking(says, True)  # only this side must not block
         try:
             self._process: subprocess.Popen[bytes] = subprocess.Popen(
                 ["setpriv", "--pdeathsig", "KILL", *_as_user(user), "--", *words],
@@ -77,21 +78,21 @@ class ManagedProcess:
 
     @property
     def pid(self) -> int:
-        """Return the process id, which is also its group's."""
+        """Return the process id, which is also the process group's id."""
         return self._process.pid
 
     def signal(self, number: signal.Signals) -> None:
-        """Send a signal to the program alone; fine if it has ended."""
+        """Send a signal only to the program; no effect if it has ended."""
         if not self.ended.done():
             self._process.send_signal(number)
 
     def kill(self) -> None:
-        """Kill its whole group at once."""
+        """Kill its process group at once."""
         if not self.ended.done():
             os.killpg(self.pid, signal.SIGKILL)
 
     async def end(self, patience_s: float) -> None:
-        """Ask it to end; after ``patience_s`` kill it. Fine if it has ended."""
+        """Send SIGTERM; kill it after ``patience_s`` seconds. No effect if it has ended."""
         self.signal(signal.SIGTERM)
         await asyncio.wait([self.ended], timeout=patience_s)
         self.kill()
@@ -119,11 +120,11 @@ class ManagedProcess:
             tell()
 
     def _reap(self) -> None:
-        """Called by the loop when the process has ended, before its id can be anyone else's."""
+        """Collect the exit status; the event loop calls this before the process id can be reused."""
         self._loop.remove_reader(self._pidfd)
         os.close(self._pidfd)
         with suppress(ProcessLookupError):
-            os.killpg(self.pid, signal.SIGKILL)  # what it started and left
+            os.killpg(self.pid, signal.SIGKILL)  # remaining children
         self._hear()
         self._loop.remove_reader(self._hears)
         os.close(self._hears)
@@ -132,7 +133,7 @@ class ManagedProcess:
 
 
 def _as_user(user: str) -> list[str]:
-    """Return the options of setpriv(1) by which a program runs as another user, without any capability to come."""
+    """Return the options of setpriv(1) to run a program as another user without capabilities."""
     if not user:
         return []
     rights = ["--inh-caps=-all", "--ambient-caps=-all", "--bounding-set=-all", "--no-new-privs"]

@@ -1,6 +1,6 @@
-"""The provider's word that it will take a machine, as ``notice.json`` in the machine's folder.
+"""Preemption notice of a machine: ``notice.json`` in the machine's folder.
 
-Place: the file system.
+I/O: the file system.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ NOTICE_FILE: Final = "notice.json"
 
 
 def write_notice(home: Path, leaves_at_unix_s: float) -> None:
-    """Say when the machine will be taken; an earlier word is replaced.
+    """Write when the machine will be preempted; an earlier notice is replaced.
 
     Raises:
         OSError: the system refuses.
@@ -27,7 +27,7 @@ def write_notice(home: Path, leaves_at_unix_s: float) -> None:
 
 
 def read_notice(home: Path) -> float | None:
-    """Return when the machine will be taken, as Unix time; None: nobody said so."""
+    """Return when the machine will be preempted, as Unix time; None: there is no notice."""
     try:
         leaves_at_unix_s = float(json.loads((home / NOTICE_FILE).read_bytes())["leaves_at_unix_s"])
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):

@@ -1,6 +1,6 @@
-"""Keeps one program of a machine up: starts it, and starts it again with growing pauses when it ends.
+"""Restart supervisor of one program: restarts use growing pauses.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ log = logging.getLogger(__name__)
 
 PAUSE_MIN_S: Final = 0.1
 PAUSE_MAX_S: Final = 10.0
-_STEADY_S: Final = 30.0  # who ran this long is started again at once
+_STEADY_S: Final = 30.0  # a program that ran this long is restarted at once
 _END_PATIENCE_S: Final = 2.0
 
 
 class ProgramSupervisor:
-    """One program over all its lives.
+    """One program across restarts.
 
     Args:
-        changed: called whenever ``status`` is another.
+        changed: called whenever ``status`` changes.
     """
 
     def __init__(self, program: Program, home: Path, changed: Callable[[], None]) -> None:
         self.program = program
         self.status = ProgramStatus()
-        self.ready = asyncio.Event()  # set once it was up for the first time
+        self.ready = asyncio.Event()  # set when it is up for the first time
         self._home = home
         self._changed = changed
         self._life: ManagedProcess | None = None
         self._log = BoundedLog(home / "logs" / f"{program.name}.log")
 
     async def keep(self) -> str:
-        """Run the program until it ends for good; return how, in a few words. To stop it, cancel this, then ``end``."""
+        """Run the program until it ends permanently; return the reason. To stop it, cancel this, then call ``end``."""
         pause_s, restarts = PAUSE_MIN_S, 0
         while True:
             begun_s = asyncio.get_running_loop().time()
@@ -60,7 +60,7 @@ class ProgramSupervisor:
             restarts += 1
 
     def ask(self, number: signal.Signals) -> asyncio.Future[int] | None:
-        """Send the program a signal; return its end, or None if it does not run."""
+        """Send the program a signal; return a future of its exit status, or None if it does not run."""
         if self._life is None or self._life.ended.done():
             return None
         self._life.signal(number)
@@ -72,7 +72,7 @@ class ProgramSupervisor:
             self._life.kill()
 
     async def end(self) -> None:
-        """End the program kindly, after ``keep`` was cancelled."""
+        """End the program with SIGTERM, after ``keep`` was cancelled."""
         if self._life is not None:
             await self._life.end(_END_PATIENCE_S)
         self._log.close()

@@ -1,6 +1,6 @@
-"""What a machine says of itself, in ``status.json`` of its folder: replaced whole, so that a reader never sees half.
+"""Status of a machine: ``status.json`` in its folder, replaced atomically so that readers never see a partial file.
 
-Place: the file system; times come in as arguments.
+I/O: the file system; times come in as arguments.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ STATUS_FILE: Final = "status.json"
 
 @dataclass(frozen=True, slots=True)
 class ProgramStatus:
-    """One program now.
+    """Status of one program.
 
     Args:
-        pid: None: it does not run. It leads a process group of its own.
-        up: it said that it is ready.
-        restarts: how often it was started again.
+        pid: process id, also of its process group; None: it does not run.
+        up: it reported that it is ready.
+        restarts: number of restarts.
     """
 
     pid: int | None = None
@@ -36,7 +36,7 @@ class ProgramStatus:
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """A machine now; ``reason``: why it is leaving or gone, in a few words."""
+    """Status of a machine; ``reason``: why it is leaving or gone, in a few words."""
 
     state: MachineState
     changed_unix_s: float
@@ -44,7 +44,7 @@ class Status:
     reason: str = ""
 
     def write(self, home: Path) -> None:
-        """Replace what the machine said before.
+        """Replace the status file.
 
         Raises:
             OSError: the system refuses.
@@ -56,7 +56,7 @@ class Status:
 
     @classmethod
     def read(cls, home: Path) -> Status | None:
-        """Return what the machine said last; None: nothing yet, or nothing that can be read."""
+        """Return the last status; None: no readable status."""
         try:
             told = json.loads((home / STATUS_FILE).read_bytes())
             programs = {name: ProgramStatus(**each) for name, each in told["programs"].items()}

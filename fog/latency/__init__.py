@@ -1,4 +1,4 @@
-"""How far regions are from here: a probe for each region's endpoint, its results kept for a while, and overridden.
+"""Latency of regions: a probe of each region's endpoint, cached results, and stated values that override them.
 
-``config`` is ``latency:`` of ``fog.yaml``; ``probe`` measures; ``known`` keeps and merges.
+``config`` is ``latency:`` of ``fog.yaml``; ``probe`` measures; ``known`` stores and merges.
 """

@@ -1,4 +1,4 @@
-"""``latency:`` of ``fog.yaml``: which endpoint stands for which region.
+"""Section ``latency:`` of ``fog.yaml``: the endpoint to probe for each region.
 
 Sans-I/O.
 ::
@@ -31,10 +31,10 @@ _EVERY: Final = "*"
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """Where a probe goes.
+    """Endpoint of a probe.
 
     Args:
-        protocol: ``tcp``: the time to connect; ``udp``: the time until an echo service sends a datagram back.
+        protocol: ``tcp``: time to connect; ``udp``: time until an echo service returns a datagram.
     """
 
     protocol: Literal["tcp", "udp"]
@@ -46,7 +46,7 @@ class Endpoint:
         """Read ``HOST:PORT``, ``tcp://HOST:PORT`` or ``udp://HOST:PORT``.
 
         Raises:
-            ValueError: it is none of these.
+            ValueError: the text has another form.
         """
         match = _FORM.fullmatch(text)
         if match is None or not 0 < int(match[3]) < 65_536:
@@ -54,7 +54,7 @@ class Endpoint:
         return cls(cast("Literal['tcp', 'udp']", match[1] or "tcp"), match[2].strip("[]"), int(match[3]))
 
     def to_text(self) -> str:
-        """Return the form that ``from_text`` reads, with its protocol."""
+        """Return the form that ``from_text`` reads, including the protocol."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{self.protocol}://{host}:{self.port}"
 
@@ -65,7 +65,7 @@ def _readable(text: str) -> str:
 
 
 class LatencyConfig(Section):
-    """How latency is measured."""
+    """Section ``latency:`` of ``fog.yaml``."""
 
     endpoints: Mapping[str, Annotated[str, AfterValidator(_readable)]] = Field(
         default_factory=dict,
@@ -76,6 +76,6 @@ class LatencyConfig(Section):
     timeout_s: float = Field(default=1.0, gt=0, le=30, description="How long one try may take.")
 
     def endpoint(self, region: str) -> Endpoint | None:
-        """Return what stands for a region; None: nothing does."""
+        """Return the endpoint of a region; None: there is none."""
         text = self.endpoints.get(region, self.endpoints.get(_EVERY))
         return None if text is None else Endpoint.from_text(text.replace("{region}", region))

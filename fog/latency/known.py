@@ -1,6 +1,6 @@
-"""What is known of how far regions are: what ``fog.yaml`` states, else what was measured lately, else nothing.
+"""Known latencies of regions: stated in ``fog.yaml``, else measured recently, else unknown.
 
-I/O: keeps measurements in ``latency.json`` of the state folder, which any process of the site may read and replace.
+I/O; stores measurements in ``latency.json`` of the state folder, which any process of the site may read and replace.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ log = logging.getLogger(__name__)
 _FILE: Final = "latency.json"
 NO_ENDPOINT: Final = "not measured: latency.endpoints of fog.yaml names no endpoint"
 _EARLY: Final = 0.5  # share of its lifetime after which a measurement is repeated
-_FAILED_S: Final = 60.0  # a region without an answer is asked again after so long
+_FAILED_S: Final = 60.0  # a region without an answer is probed again after this time
 
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """How far a region is.
+    """Latency of a region.
 
     Args:
         ms: round trip; None: unknown.
-        source: where the figure comes from, or why there is none.
+        source: source of the figure, or why there is none.
     """
 
     ms: float | None
@@ -51,12 +51,12 @@ class _Kept:
 
 
 class Latencies:
-    """The regions of a site.
+    """Latencies of a site's regions.
 
     Args:
-        folder: of the state; measurements are kept there.
-        stated: region -> ms, which no measurement overrides.
-        measure: replaced in tests.
+        folder: state folder, which holds the measurements.
+        stated: region -> ms; takes precedence over measurements.
+        measure: probe function; replaced in tests.
     """
 
     def __init__(
@@ -73,10 +73,10 @@ class Latencies:
         self._refreshing: threading.Thread | None = None
 
     def refresh(self, regions: Iterable[str], now_unix_s: float) -> None:
-        """Measure those whose measurement is missing, or past half of its lifetime; waits for the answers.
+        """Measure regions whose measurement is missing or past half of its lifetime; wait for the results.
 
         Raises:
-            StoreError: what was measured cannot be kept.
+            StoreError: the measurements cannot be stored.
         """
         kept = self._read()
         due = {
@@ -95,7 +95,7 @@ class Latencies:
         self._write({**self._read(), **more})
 
     def refresh_in_background(self, regions: Iterable[str], now_unix_s: float) -> None:
-        """Do the same without waiting; one at a time."""
+        """Call ``refresh`` in a thread; at most one runs at a time."""
         if self._refreshing is not None and self._refreshing.is_alive():
             return
         names = tuple(regions)
@@ -110,12 +110,12 @@ class Latencies:
         self._refreshing.start()
 
     def of(self, regions: Iterable[str], now_unix_s: float) -> dict[str, Latency]:
-        """Return what is known of each region; measures nothing."""
+        """Return the known latency of each region without measuring."""
         kept = self._read()
         return {region: self._one(region, kept.get(region), now_unix_s) for region in dict.fromkeys(regions)}
 
     def ms(self, regions: Iterable[str], now_unix_s: float) -> dict[str, float]:
-        """Return region -> ms of those that are known."""
+        """Return region -> ms for the regions with a known latency."""
         return {region: each.ms for region, each in self.of(regions, now_unix_s).items() if each.ms is not None}
 
     def _one(self, region: str, kept: _Kept | None, now_unix_s: float) -> Latency:
@@ -144,7 +144,7 @@ class Latencies:
         try:
             return {region: _Kept(**each) for region, each in json.loads(self._path.read_bytes()).items()}
         except (OSError, ValueError, TypeError, AttributeError, RecursionError):
-            # none yet, or another version's: measured again
+            # missing, or written by another version: regions are measured again
             return {}
 
     def _write(self, kept: Mapping[str, _Kept]) -> None:

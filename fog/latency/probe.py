@@ -1,6 +1,6 @@
-"""Round-trip time to an endpoint: the least of some tries, by TCP connect or UDP echo.
+"""Round-trip time to an endpoint: the minimum of several tries, by TCP connect or UDP echo.
 
-I/O. A TCP connect takes one round trip: SYN, SYN-ACK. An echo is RFC 862; a datagram that is not ours does not count.
+I/O. A TCP connect takes one round trip: SYN, SYN-ACK. The echo service is RFC 862; foreign datagrams are ignored.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ _NONCE_BYTES: Final = 16
 
 @dataclass(frozen=True, slots=True)
 class Probed:
-    """What a probe found.
+    """Result of a probe.
 
     Args:
-        ms: least round trip of ``TRIES``; None: no answer.
+        ms: minimum round trip of ``TRIES``; None: no answer.
         reason: why there is none.
     """
 
@@ -36,7 +36,7 @@ class Probed:
 
 
 def probe_all(endpoints: Mapping[str, Endpoint], timeout_s: float) -> dict[str, Probed]:
-    """Probe one endpoint a region, many at once; takes at most ``TRIES`` times ``timeout_s`` a batch of 16."""
+    """Probe one endpoint per region in parallel; a batch of 16 takes at most ``TRIES`` times ``timeout_s``."""
     if not endpoints:
         return {}
     with ThreadPoolExecutor(min(len(endpoints), _AT_ONCE_MAX), "probe") as threads:
@@ -45,7 +45,7 @@ def probe_all(endpoints: Mapping[str, Endpoint], timeout_s: float) -> dict[str, 
 
 
 def probe(endpoint: Endpoint, timeout_s: float) -> Probed:
-    """Measure one endpoint; a try that fails ends it, unless another one before was answered."""
+    """Measure one endpoint; a failed try ends the probe, unless an earlier try succeeded."""
     kind = socket.SOCK_STREAM if endpoint.protocol == "tcp" else socket.SOCK_DGRAM
     try:
         family, _, _, _, address = socket.getaddrinfo(endpoint.host, endpoint.port, type=kind)[0]
@@ -67,13 +67,13 @@ def probe(endpoint: Endpoint, timeout_s: float) -> Probed:
 def _connect(one: socket.socket, address: object, timeout_s: float) -> float:
     one.settimeout(timeout_s)
     begun_s = time.perf_counter()
-    one.connect(address)  # type: ignore[arg-type]  # as getaddrinfo gives it
+    one.connect(address)  # type: ignore[arg-type]  # as getaddrinfo returns it
     return time.perf_counter() - begun_s
 
 
 def _echo(one: socket.socket, address: object, timeout_s: float) -> float:
     nonce = secrets.token_bytes(_NONCE_BYTES)
-    one.connect(address)  # type: ignore[arg-type]  # so that a refusal is heard
+    one.connect(address)  # type: ignore[arg-type]  # so that a refusal is reported
     begun_s = time.perf_counter()
     one.send(nonce)
     while (left_s := begun_s + timeout_s - time.perf_counter()) > 0:

@@ -1,5 +1,6 @@
-"""Launch descriptions: the paper's Listing 1 as it stands, by ``fog launch`` or by ROS 2's own ``ros2 launch``.
+"""Launch descriptions: the paper's Listing 1 unchanged, for ``fog launch`` and for ROS 2's ``ros2 launch``.
 
-``words`` is what a launch file says; ``load`` runs one; ``wish`` checks what a ``FogCluster`` asks for; ``resolve``
-finds executables; ``probe`` learns what nodes offer; ``ros_action`` is the cluster as an action of ROS 2's ``launch``.
+``lazy_names`` has the names that a launch file uses; ``load`` runs a file; ``cluster_spec`` checks a ``FogCluster``;
+``resolve`` finds executables; ``interface_discovery`` finds the interfaces of nodes; ``ros_action`` is the cluster as
+an action of ROS 2's ``launch``.
 """

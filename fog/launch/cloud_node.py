@@ -1,6 +1,6 @@
-"""A ``Node`` of a launch file as what a plan says of it.
+"""Conversion of a launch file's ``Node`` to the ``CloudNode`` of a plan.
 
-Place: shell; reads the files of parameters, which the machines do not have.
+I/O; reads parameter files, which the machines do not have.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ _TUPLE: Final = "!!python/tuple"
 
 
 def cloud_node(node: Node, given: Mapping[str, str]) -> CloudNode:
-    """Return a node with the launch arguments put in.
+    """Return a node with the launch arguments substituted.
 
     Raises:
-        LocalError: an argument is missing, or a file of parameters cannot be used.
+        LocalError: an argument is missing, or a parameter file cannot be used.
     """
     name = None if node.name is None else written(node.name, given)
     namespace = None if node.namespace is None else written(node.namespace, given)
@@ -44,13 +44,13 @@ def cloud_node(node: Node, given: Mapping[str, str]) -> CloudNode:
 
 
 def parameters_in(path: Path, name: str | None, namespace: str | None, *, has_tuples: bool = False) -> list[str]:
-    """Return the words that set what a file of parameters says of a node.
+    """Return the command-line arguments that set a node's parameters from a parameter file.
 
     Args:
-        has_tuples: launch_ros wrote it, which makes a tuple of every list.
+        has_tuples: launch_ros wrote the file; it writes every list as a tuple.
 
     Raises:
-        LocalError: it cannot be read or used.
+        LocalError: the file cannot be read or used.
     """
     try:
         with path.open("rb") as file:
@@ -67,7 +67,7 @@ def parameters_in(path: Path, name: str | None, namespace: str | None, *, has_tu
 
 
 def parameter_rule(rule: str) -> str:
-    """Return ``name:=value`` as a node reads it, where launch_ros wrote the value as a tuple.
+    """Return ``name:=value`` in the form that a node reads; launch_ros writes lists as tuples.
 
     Raises:
         LocalError: the value is not YAML.
@@ -86,7 +86,7 @@ def _parameters(said: Parameters, given: Mapping[str, str], name: str | None, na
 
 
 def _put_in(parameters: Mapping[str, object], given: Mapping[str, str]) -> dict[str, object]:
-    """Put arguments into values; what comes from the command line is read as YAML, as ROS 2 does."""
+    """Substitute launch arguments in values; values of the command line are parsed as YAML, as ROS 2 does."""
     values: dict[str, object] = {}
     for key, value in parameters.items():
         if isinstance(value, Mapping):

@@ -1,6 +1,6 @@
-"""What a ``FogCluster`` asks for, checked where the launch file says it; with its nodes it becomes a plan.
+"""Specification of a cluster: the checked arguments of a ``FogCluster``; with its nodes it becomes a plan.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ _NAME: Final = "[a-z0-9][a-z0-9-]{0,31}"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClusterSpec:
-    """A cluster but for its nodes.
+    """Cluster without its nodes.
 
     Args:
-        name: empty: called after the first node's executable.
-        carried: None: what its nodes offer is to be found out.
-        defaults: keys of rules on the robot's side for what is found out.
-        keep: whether it stays when the launch ends.
-        availability: share of time for which a machine is to serve; None: ``machines`` says how many there are.
-        notes: what people should be told.
+        name: empty: the name of the first node's executable.
+        carried: exported interfaces; None: to be discovered.
+        defaults: keys of rules on the robot's side for discovered interfaces.
+        keep: whether the cluster continues when the launch ends.
+        availability: share of time for which at least one machine is to serve; None: ``machines`` is the full list.
+        notes: messages for the user.
     """
 
     name: str
@@ -64,7 +64,7 @@ class ClusterSpec:
         """Check the keywords of a ``FogCluster``.
 
         Raises:
-            LocalError: one is wrong; the text names it.
+            LocalError: a keyword is wrong; the text names it.
         """
         if name and not re.fullmatch(_NAME, name):
             raise LocalError(f"name {name!r}: expected small letters, digits and hyphens, at most 32")
@@ -102,10 +102,10 @@ class ClusterSpec:
         """Return the cluster with its nodes.
 
         Args:
-            found: what they offer, if the launch file does not say it.
+            found: discovered interfaces, if the launch file lists none.
 
         Raises:
-            LocalError: no nodes.
+            LocalError: there are no nodes.
         """
         if not nodes:
             raise LocalError("cloud_nodes is empty: expected at least one Node")
@@ -122,7 +122,7 @@ class ClusterSpec:
         )
 
     def carry(self, kind_name_type: Sequence[tuple[str, str, str]]) -> tuple[ExportedInterface, ...]:
-        """Return what was found out, (kind, name, type) each, with the keys that the launch file gave for all."""
+        """Return interfaces, given as (kind, name, type), with the keys that the launch file sets for all."""
         return tuple(
             each
             for kind, name, type_name in kind_name_type

@@ -1,6 +1,6 @@
-"""What a launch file is made of where ROS 2's own ``launch`` and ``launch_ros`` are not installed.
+"""Elements of a launch file for hosts without ROS 2's ``launch`` and ``launch_ros``.
 
-Place: pure. The same names and keywords as ROS 2's, those that mean something here; any other keyword is refused.
+Sans-I/O. The names and keywords are those of ROS 2 that have a meaning here; any other keyword is refused.
 Source: https://docs.ros.org/en/jazzy/Tutorials/Intermediate/Launch/Launch-Main.html.
 """
 
@@ -25,7 +25,7 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class LaunchConfiguration:
-    """The value of a launch argument, put in when the description is launched."""
+    """Value of a launch argument, substituted when the description is launched."""
 
     variable_name: str
     default: str | None = None
@@ -37,11 +37,11 @@ Parameters: TypeAlias = Mapping[str, object] | Text
 
 @dataclass(frozen=True, slots=True)
 class DeclareLaunchArgument:
-    """An argument that a launch file takes as ``name:=value``.
+    """Argument of a launch file, given as ``name:=value``.
 
     Args:
-        default_value: None: it must be given.
-        choices: all values that it may have; None: any.
+        default_value: None: the argument is required.
+            choices: allowed values; None: any.
     """
 
     name: str
@@ -52,12 +52,12 @@ class DeclareLaunchArgument:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Node:
-    """A ROS node.
+    """ROS node.
 
     Args:
         package, executable: as ``ros2 run`` takes them; without such an installed package, the Python module
             ``package.executable``.
-        parameters: maps of values, and paths of YAML files, in the order in which they count.
+        parameters: maps of values and paths of YAML files; later entries override earlier ones.
         remappings: pairs (from, to).
         arguments: after the executable, before ``--ros-args``.
         ros_arguments: after ``--ros-args``.
@@ -76,7 +76,7 @@ class Node:
 
 
 class LaunchDescription:
-    """What is launched, in order."""
+    """Ordered list of launched entities."""
 
     def __init__(self, initial_entities: Iterable[object] = ()) -> None:
         self.entities: list[object] = list(initial_entities)
@@ -87,10 +87,10 @@ class LaunchDescription:
 
 
 def written(text: Text, given: Mapping[str, str]) -> str:
-    """Return a text with the launch arguments put in.
+    """Return a text with the launch arguments substituted.
 
     Raises:
-        LocalError: one is neither given nor has a default.
+        LocalError: an argument has neither a value nor a default.
     """
     if isinstance(text, str):
         return text

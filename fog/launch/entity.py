@@ -1,6 +1,6 @@
-"""``FogCluster``: nodes that run on every machine of a cluster, as a launch file says it.
+"""``FogCluster`` of a launch file: nodes that run on every machine of a cluster.
 
-Place: pure but for ``unreturned``, which remembers it; ``ros_action`` makes an action of ROS 2's ``launch`` of it.
+I/O only through ``unreturned``, which records each cluster; ``ros_action`` derives an action of ROS 2's ``launch``.
 Source: FogROS2-FT, Listing 1.
 """
 
@@ -17,27 +17,28 @@ __all__ = ["FogCluster"]
 
 
 class FogCluster:
-    """Nodes on machines, each machine a replica of all of them.
+    """Nodes on machines; each machine is a replica of all nodes.
 
-    It takes effect by being made within a launch file; the launch description need not have it.
+    Constructing it in a launch file is enough; the launch description need not contain it.
 
     Args:
-        cloud_nodes: ``Node`` each.
+        cloud_nodes: list of ``Node``.
         deployments: one machine for each replica.
-        name: of the cluster, for ``fog scale NAME`` and the like; empty: after the first node's executable.
+        name: name of the cluster for ``fog scale NAME`` and other verbs; empty: the name of the first node's
+            executable.
         replicas: at least this many machines, in different regions; None: 2, or as many as ``deployments`` has.
-        services, actions, topics: full name -> type of what the nodes offer to the robot. Without any of the three, the
-            services and actions are found out by starting the nodes once on this machine, in a graph of their own.
-        replication: ``"all"``, ``"some"`` or ``"hedged"``, or the rule's map; None: all replicas get each request.
-        timeout_s: how long an answer may take; None: the proxy's 5 s.
-        idle: without a call for this long (seconds, or such as ``"30min"``) the machines are given back.
-        budget_usd: when they have cost this much they are given back.
-        availability: share of time for which a machine is to serve, such as 0.9995, in place of ``replicas``:
-            ``fog launch`` adds copies of the listed machines until that is reached, and says what it assumes.
+        services, actions, topics: full name -> type of the interfaces that the nodes offer to the robot. Without any of
+            the three, services and actions are discovered: the nodes run once on this machine, in a separate graph.
+        replication: ``"all"``, ``"some"`` or ``"hedged"``, or the rule's map; None: all replicas receive each request.
+        timeout_s: time limit of a response; None: the proxy's 5 s.
+        idle: after this long without a call (seconds, or a text such as ``"30min"``) the machines are released.
+        budget_usd: when the machines have cost this much they are released.
+        availability: share of time for which at least one machine is to serve, such as 0.9995, instead of ``replicas``:
+            ``fog launch`` adds copies of the listed machines until it is reached, and prints its assumptions.
         keep: leave the cluster running when the launch ends.
 
     Raises:
-        LocalError: something is wrong; the text says which and what was expected.
+        LocalError: an argument is wrong; the text names it and what was expected.
     """
 
     def __init__(

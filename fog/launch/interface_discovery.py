@@ -1,6 +1,7 @@
-"""What nodes offer, found out by starting them once in a ROS graph of their own.
+"""Discovery of the interfaces of nodes: the nodes run once in a separate ROS graph.
 
-Place: shell. Needs rclpy. What was found is kept, by command line and age of the code, in the user's cache folder.
+I/O. Needs rclpy. Results are cached in the user's cache folder, keyed by command line and modification time of the
+code.
 """
 
 from __future__ import annotations
@@ -25,20 +26,21 @@ __all__ = ["cache_file", "free_domain", "kept", "offered"]
 
 Found = tuple[tuple[str, str, str], ...]
 
-_DOMAINS: Final = range(215, 233)  # below them Linux hands out their ports to others; ROS 2, "The ROS_DOMAIN_ID"
-_PORTS: Final = (7400, 250)  # of discovery: base, and gain by domain; DDSI-RTPS 2.5, section 9.6.2
+# the ports of lower domains are in Linux's ephemeral range; ROS 2, "The ROS_DOMAIN_ID"
+_DOMAINS: Final = range(215, 233)
+_PORTS: Final = (7400, 250)  # of discovery: base, and gain per domain; DDSI-RTPS 2.5, section 9.6.2
 
 
 def offered(nodes: Sequence[CloudNode], *, cache: Path | None = None) -> Found:
-    """Return (kind, name, type) of the services and actions that nodes offer; takes some seconds the first time.
+    """Return (kind, name, type) of the services and actions of nodes; takes some seconds the first time.
 
-    Topics are not found out, for a launch file must say which of them are worth carrying.
+    Topics are not discovered, because a launch file must select the topics to export.
 
     Args:
-        cache: where findings are kept; None: ``cache_file()``.
+        cache: file of cached results; None: ``cache_file()``.
 
     Raises:
-        LocalError: a node is not found, ends, or offers nothing; or ROS 2 is not installed.
+        LocalError: a node is not found, ends, or offers no interface; or ROS 2 is not installed.
     """
     cache = cache or cache_file()
     if (before := kept(nodes, cache=cache)) is not None:
@@ -53,13 +55,13 @@ def offered(nodes: Sequence[CloudNode], *, cache: Path | None = None) -> Found:
 
 
 def kept(nodes: Sequence[CloudNode], *, cache: Path | None = None) -> Found | None:
-    """Return what was found out before; None: nothing. Starts nothing."""
+    """Return the cached result without starting nodes; None: there is none."""
     found = _read(cache or cache_file()).get(_key(nodes))
     return None if found is None else tuple((kind, name, type_name) for kind, name, type_name in found)
 
 
 def cache_file() -> Path:
-    """Return where findings are kept by default."""
+    """Return the default cache file."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gdp" / "offered.json"
 
 
@@ -102,7 +104,7 @@ def _argv(node: CloudNode) -> list[str]:
 
 
 def free_domain() -> int:
-    """Return a domain id that nobody on this machine uses, another one for another process."""
+    """Return a domain id that is unused on this machine; other processes get other ids."""
     taken = set(_bound_ports(Path("/proc/net/udp").read_text(encoding="ascii").splitlines()[1:]))
     base, gain = _PORTS
     free = [domain for domain in _DOMAINS if base + gain * domain not in taken]
@@ -125,6 +127,6 @@ def _key(nodes: Sequence[CloudNode]) -> str:
 def _read(cache: Path) -> Mapping[str, Sequence[tuple[str, str, str]]]:
     try:
         found: dict[str, list[tuple[str, str, str]]] = json.loads(cache.read_text(encoding="utf-8"))
-    except (OSError, ValueError):  # a cache that is not there, or torn, is an empty one
+    except (OSError, ValueError):  # a missing or damaged cache counts as empty
         return {}
     return found

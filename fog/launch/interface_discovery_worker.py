@@ -1,8 +1,8 @@
-"""``python -m fog.launch.interface_discovery_worker FOLDER``: start nodes, look at their graph until nothing new
-comes, end them.
+"""Worker process of interface discovery: starts nodes, polls their graph until no change occurs, and ends them.
 
-Place: shell; a process of its own, since the ROS domain and the reach of discovery are a process's. Reads what to start
-from standard input, answers with one line of JSON: ``{"offered": [[kind, name, type], ...]}`` or ``{"error": ...}``.
+I/O. ``python -m fog.launch.interface_discovery_worker FOLDER``. It is a separate process because the ROS domain and the
+discovery range apply to a whole process. It reads the nodes from standard input and writes one line of JSON:
+``{"offered": [[kind, name, type], ...]}`` or ``{"error": ...}``.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from proxy.endpoints.ros2 import Ros2Endpoint
 __all__ = ["main", "offers"]
 
 PATIENCE_S: Final = 30.0
-QUIET_S: Final = 2.0  # after the last news; a node rarely takes longer between two of its services
+QUIET_S: Final = 2.0  # after the last change; a node rarely takes longer between two of its services
 _END_S: Final = 5.0
 _LINES: Final = 8
 
@@ -39,7 +39,7 @@ class _Start(TypedDict):
 
 
 def main() -> None:
-    """Answer one question."""
+    """Read one request and write its result."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     question = json.load(sys.stdin)
     try:
@@ -50,7 +50,7 @@ def main() -> None:
 
 
 def offers(graph: Graph) -> list[tuple[str, str, str]]:
-    """Return (kind, name, type) of all services and actions that somebody in a graph serves."""
+    """Return (kind, name, type) of all services and actions that have a server in a graph."""
     found = set()
     for end in graph:
         if end.role is Role.SERVES and end.type_name:
@@ -68,14 +68,14 @@ def _seen(domain: int, nodes: Sequence[_Start], folder: Path) -> list[tuple[str,
             ends = dict(stack.enter_context(_started(each, folder / f"{n}.log")) for n, each in enumerate(nodes))
             return _settled(endpoint, ends)
     finally:
-        endpoint.remove_entity()
+        endpoint.shut_down()
 
 
 def _settled(endpoint: Ros2Endpoint, ends: Mapping[int, Path]) -> list[tuple[str, str, str]]:
-    """Wait until something is offered and nothing more comes.
+    """Wait until an interface is offered and no further one appears.
 
     Args:
-        ends: descriptor that is readable when a node has ended -> its output.
+        ends: descriptor that becomes readable when a node ends -> its output.
     """
     begin_s = news_s = time.monotonic()
     before: list[tuple[str, str, str]] = []
@@ -113,7 +113,7 @@ def _started(start: _Start, log: Path) -> Iterator[tuple[int, Path]]:
         yield descriptor, log
     finally:
         os.close(descriptor)
-        process.send_signal(signal.SIGINT)  # what ROS nodes end on
+        process.send_signal(signal.SIGINT)  # ROS nodes end on SIGINT
         try:
             process.wait(_END_S)
         except subprocess.TimeoutExpired:

@@ -1,6 +1,6 @@
-"""What a launch file says that a cluster's nodes offer: ``services={"/plan": "nav_msgs/srv/GetPlan"}`` and such.
+"""Exported interfaces of a launch file, such as ``services={"/plan": "nav_msgs/srv/GetPlan"}``.
 
-Place: pure. The value may be a map with ``type`` and keys of the proxies' rules (docs/reference/configuration.md).
+Sans-I/O. The value may be a map with ``type`` and keys of the proxies' rules (docs/reference/configuration.md).
 """
 
 from __future__ import annotations
@@ -38,15 +38,14 @@ _EXAMPLES: Final[dict[Kind, str]] = {
 
 
 def carried(kind: Kind, offered: Offered, defaults: Mapping[str, object]) -> list[ExportedInterface]:
-    """Return what the proxies are to carry.
+    """Return the interfaces that the proxies carry.
 
     Args:
         offered: full name -> type, or a map of ``type`` and further keys.
-        defaults: keys for the robot's side where an entry does not have its own; those a kind does not know are left
-            out.
+        defaults: keys of the robot's side for entries that do not set them; keys that a kind does not have are omitted.
 
     Raises:
-        LocalError: not a full name, not a type of that kind, or an unknown key.
+        LocalError: a name is not a full name, a type is not of that kind, or a key is unknown.
     """
     return [_one(kind, name, said, defaults) for name, said in offered.items()]
 
@@ -55,10 +54,10 @@ def replication_rule(said: SomeReplication) -> dict[str, object]:
     """Return the value of the rule key ``replication``.
 
     Args:
-        said: a mode's word, a map of ``mode``, ``copies`` and ``budget``, or a ``Replication``.
+        said: name of a mode, a map of ``mode``, ``copies`` and ``budget``, or a ``Replication``.
 
     Raises:
-        LocalError: no such mode or key.
+        LocalError: the mode or key does not exist.
     """
     if isinstance(said, Replication):
         said = {"mode": said.mode.value, "copies": said.copies, "budget": said.budget}
@@ -87,7 +86,7 @@ def _one(kind: Kind, name: str, said: str | Mapping[str, object], defaults: Mapp
         raise LocalError(f'{kind} {name}: stop goes with "at_once": 1, or it breaks off what another client asked for')
     if isinstance(replication := keys.get("replication"), str | Mapping | Replication):
         keys["replication"] = replication_rule(replication)
-    own = {"replication"} if keys.get("state") == "ordered" else set()  # all have every request then
+    own = {"replication"} if keys.get("state") == "ordered" else set()  # all replicas then receive every request
     keys = {**{key: value for key, value in defaults.items() if key in robot and key not in own}, **keys}
     options = {key: keys[key] for key in robot if key in keys}
     return ExportedInterface(kind, name, type_name, options, {key: keys[key] for key in machine if key in keys})

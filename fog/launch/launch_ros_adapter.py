@@ -1,7 +1,7 @@
-"""Nodes of ROS 2's ``launch_ros`` as the nodes of a plan.
+"""Adapter from nodes of ROS 2's ``launch_ros`` to the nodes of a plan.
 
-I/O; imports ROS 2's ``launch``. Its actions say what a node is only once substitutions are performed in a context; a
-node of the cloud is asked that and never executed here.
+I/O; imports ROS 2's ``launch``. Its actions describe a node only after substitutions are performed in a context.
+The adapter performs them for a cloud node and never executes the node here.
 Source: launch 3.4 and launch_ros 0.26 (jazzy).
 """
 
@@ -22,14 +22,14 @@ from gdp.errors import LocalError
 
 __all__ = ["cloud_node"]
 
-_MADE: Final = "launch_params_"  # by launch_ros for maps of parameters, and left behind
+_MADE: Final = "launch_params_"  # prefix of files that launch_ros creates for maps of parameters and does not delete
 
 
 def cloud_node(node: object, context: LaunchContext) -> CloudNode:
     """Return a node with all substitutions performed.
 
     Raises:
-        LocalError: it is no node with a package, or one of its files of parameters cannot be used.
+        LocalError: the node has no package, or one of its parameter files cannot be used.
     """
     if not isinstance(node, Node) or node.node_package is None:
         raise LocalError(f"cloud_nodes: expected launch_ros.actions.Node with a package, not {type(node).__name__}")
@@ -37,7 +37,7 @@ def cloud_node(node: object, context: LaunchContext) -> CloudNode:
     name = str(node.node_name).rpartition("/")[2]
     namespace = str(node.expanded_node_namespace or "")
     context.extend_locals({"ros_specific_arguments": {"name": f"__node:={name}", "ns": f"__ns:={namespace}"}})
-    # The first word is the executable, for which this machine need not have the package.
+    # The first word is the executable; this machine need not have its package.
     words = [str(perform_substitutions(context, word)) for word in node.cmd[1:]]
     package, executable = (
         str(perform_substitutions(context, normalize_to_list_of_substitutions(said)))

@@ -1,7 +1,7 @@
-"""The words of a launch file: ROS 2's own where ``launch`` and ``launch_ros`` are installed, else ours of that name.
+"""Lazily loaded names for launch files: ROS 2's if ``launch`` and ``launch_ros`` are installed, else those of ``fog``.
 
-Place: shell; looks where packages lie and imports what is asked for. PyPI's ``launch`` is an unrelated project, so a
-package of that name counts only with ROS 2's files in it.
+I/O; finds packages and imports a requested name. PyPI's ``launch`` is an unrelated project, so a package of that
+name counts only if it contains ROS 2's files.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Final
 __all__ = ["WORDS", "has_ros_launch", "word"]
 
 _OWN: Final = {"CloudMachine": "fog.launch.machines", "SpotMachine": "fog.launch.machines"}
-_EITHER: Final = {  # word -> where ours is, where ROS 2's is
+_EITHER: Final = {  # name -> location in ``fog``, location in ROS 2
     "DeclareLaunchArgument": ("fog.launch.description", "launch.actions"),
     "FogCluster": ("fog.launch.entity", "fog.launch.ros_action"),
     "LaunchConfiguration": ("fog.launch.description", "launch.substitutions"),
@@ -32,10 +32,10 @@ def has_ros_launch() -> bool:
 
 
 def word(name: str) -> object:
-    """Return what a launch file means by a word of ``WORDS``.
+    """Return the object for a name of ``WORDS``.
 
     Raises:
-        AttributeError: it is none.
+        AttributeError: the name is not in ``WORDS``.
     """
     if name in _OWN:
         module = _OWN[name]

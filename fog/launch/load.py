@@ -1,6 +1,6 @@
-"""Running a launch file: what cluster it wants, and which nodes run beside the robot.
+"""Loader of launch files: the cluster of a file, and its nodes for the robot's side.
 
-Place: shell; executes the file, which is Python, and starts nothing.
+I/O; executes the file, which is Python, and starts no node.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ _ENTRY: Final = "generate_launch_description"
 
 @dataclass(frozen=True, slots=True)
 class Loaded:
-    """What a launch file comes to.
+    """Result of loading a launch file.
 
     Args:
-        keep: whether the cluster stays when the launch ends.
-        notes: what people should be told.
-        is_known: whether what the nodes offer is in the plan; else it is yet to be found out.
+        keep: whether the cluster continues when the launch ends.
+        notes: messages for the user.
+        is_known: whether the plan contains the exported interfaces; otherwise they are still to be discovered.
     """
 
     plan: ClusterPlan
@@ -53,7 +53,7 @@ def key_values(words: Sequence[str]) -> dict[str, str]:
     """Read launch arguments, ``name:=value`` each.
 
     Raises:
-        LocalError: one is of another form, or there twice.
+        LocalError: an argument has another form or occurs twice.
     """
     given: dict[str, str] = {}
     for word in words:
@@ -65,15 +65,15 @@ def key_values(words: Sequence[str]) -> dict[str, str]:
 
 
 def load(path: Path, arguments: Mapping[str, str], probe: Probe | None = None) -> Loaded:
-    """Run a launch file, or read the plan (``.json``) that one came to.
+    """Run a launch file, or read a plan (``.json``).
 
     Args:
-        probe: finds out what nodes offer (``fog.launch.interface_discovery.offered``) where the file does not say;
-        None: left open.
+        probe: discovers interfaces (``fog.launch.interface_discovery.offered``) if the file lists none; None: no
+            discovery.
 
     Raises:
-        ConfigError: the file is not there, not Python, or fails; the text names the line.
-        LocalError: what it describes cannot be; the text says why.
+        ConfigError: the file is missing, is not Python, or fails; the text names the line.
+        LocalError: the description is invalid; the text states the reason.
     """
     if path.suffix == ".json":
         try:
@@ -101,7 +101,7 @@ def _planned(
     cluster_spec, nodes = clusters[0]
     found: Sequence[ExportedInterface] = ()
     if cluster_spec.carried is None and probe is not None:
-        cluster_spec.plan(nodes)  # complains before anything is started
+        cluster_spec.plan(nodes)  # raises before anything is started
         found = cluster_spec.carry(probe(nodes))
     is_known = cluster_spec.carried is not None or probe is not None
     return Loaded(cluster_spec.plan(nodes, found), tuple(robot), cluster_spec.keep, cluster_spec.notes, is_known)
@@ -149,7 +149,7 @@ def _arguments(entities: Sequence[object], given: Mapping[str, str]) -> dict[str
 
 
 def _described(path: Path) -> object:
-    """Run the file and call its entry."""
+    """Run the file and call its entry point."""
     try:
         module = _module(path)
         entry = getattr(module, _ENTRY, None)
@@ -165,7 +165,7 @@ def _described(path: Path) -> object:
         raise ConfigError(_place(path, error), "", f"{error}{advice}") from error
     except GdpError as error:
         raise ConfigError(_place(path, error), "", str(error)) from error
-    except (Exception, SystemExit) as error:  # whatever the user's code raises is the user's to know, with its line
+    except (Exception, SystemExit) as error:  # any error of the user's code is reported with its line
         raise ConfigError(_place(path, error), "", f"{type(error).__name__}: {error}") from error
     return described
 
@@ -188,7 +188,7 @@ def _module(path: Path) -> ModuleType:
 
 
 def _place(path: Path, error: BaseException) -> str:
-    """Return ``file:line`` of the last line of the launch file that the error went through."""
+    """Return ``file:line`` of the last launch-file line in the error's traceback."""
     if isinstance(error, SyntaxError) and error.filename == str(path):
         return f"{path}:{error.lineno}"
     lines = [at.lineno for at in traceback.extract_tb(error.__traceback__) if at.filename == str(path)]

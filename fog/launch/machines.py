@@ -1,6 +1,6 @@
-"""The machines that a launch description asks for, and the list filled up to the wanted number of replicas.
+"""Machines of a launch description, and extension of the list to the wanted number of replicas.
 
-Place: pure.
+Sans-I/O.
 Source: FogROS2-FT, Listing 1.
 """
 
@@ -22,14 +22,14 @@ REPLICAS: Final = 2
 
 @dataclass(frozen=True, slots=True)
 class CloudMachine:
-    """A machine that stays until it is given back.
+    """Machine that runs until it is released.
 
     Args:
-        region: as the provider calls it; empty: chosen.
-        hardware: at least this much, such as ``cpu:16``, ``T4``, ``mem:64`` or ``cpu:8,mem:32,gpu:T4:2``.
+        region: in the provider's notation; empty: chosen by the supervisor.
+        hardware: minimum hardware, such as ``cpu:16``, ``T4``, ``mem:64`` or ``cpu:8,mem:32,gpu:T4:2``.
 
     Raises:
-        LocalError: no such hardware; the text says what is expected.
+        LocalError: the hardware is unknown; the text states what is expected.
     """
 
     is_spot: ClassVar[bool] = False
@@ -41,13 +41,13 @@ class CloudMachine:
         object.__setattr__(self, "_read", Hardware.from_text(self.hardware))
 
     def wanted(self) -> MachineRequest:
-        """Return it as a plan says it."""
+        """Return the request for a plan."""
         return MachineRequest(self._read, self.region, self.is_spot)
 
 
 @dataclass(frozen=True, slots=True)
 class SpotMachine(CloudMachine):
-    """A cheaper machine that its provider may take away; then another takes its place."""
+    """Cheaper machine that its provider may preempt; another machine then replaces it."""
 
     is_spot: ClassVar[bool] = True
 
@@ -55,15 +55,15 @@ class SpotMachine(CloudMachine):
 def filled(
     deployments: Sequence[CloudMachine], replicas: int | None
 ) -> tuple[tuple[MachineRequest, ...], tuple[str, ...]]:
-    """Return the machines of a cluster, and what people should be told about them.
+    """Return the machines of a cluster, and messages about them for the user.
 
-    Too short a list is filled up with copies of its machines, in other regions.
+    A list that is too short is extended with copies of its machines in other regions.
 
     Args:
-        replicas: how many there must be; None: as many as are listed, and at least ``REPLICAS``.
+        replicas: required number; None: the length of the list, and at least ``REPLICAS``.
 
     Raises:
-        LocalError: no deployment, or more of them than replicas.
+        LocalError: there are no deployments, or more deployments than replicas.
     """
     for each in deployments:
         if not isinstance(each, CloudMachine):

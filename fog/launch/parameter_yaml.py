@@ -1,8 +1,8 @@
-"""YAML of parameters: one document, bounded, without aliases.
+"""Parser of parameter YAML: one document of bounded size, without aliases.
 
-Place: pure.
-Source: rcl_yaml_param_parser, which refuses aliases too ("Will not support aliasing"). An alias lets a few hundred
-bytes unroll into gigabytes. The events are looked at before anything is built.
+Sans-I/O.
+Source: rcl_yaml_param_parser, which refuses aliases too ("Will not support aliasing"). With aliases, a few hundred
+bytes can expand to gigabytes. Events are checked before any object is built.
 """
 
 from __future__ import annotations
@@ -22,14 +22,15 @@ _TUPLE: Final = "tag:yaml.org,2002:python/tuple"
 
 
 def read_parameters(text: str, where: str, *, has_tuples: bool = False) -> object:
-    """Return what a YAML text says.
+    """Return the value of a YAML text.
 
     Args:
-        where: for errors: a file, or what the text is about.
-        has_tuples: ``!!python/tuple`` is read as a list; anything else of Python is refused.
+        where: file or subject of the text, for errors.
+        has_tuples: ``!!python/tuple`` is read as a list; other Python tags are refused.
 
     Raises:
-        LocalError: too long, too deep, with an alias, or not YAML; the text names the place and the line.
+        LocalError: the text is too long, too deep, has an alias, or is not YAML; the error names ``where`` and the
+            line.
     """
     size = len(text.encode(errors="replace"))
     if size > BYTES_MAX:
@@ -66,7 +67,7 @@ def _list(loader: yaml.SafeLoader, node: yaml.SequenceNode) -> list[object]:
 
 
 class _WithTuples(LOADER):  # type: ignore[misc]
-    """Reads ``!!python/tuple`` as a list."""
+    """Loader that reads ``!!python/tuple`` as a list."""
 
 
 _WithTuples.add_constructor(_TUPLE, _list)

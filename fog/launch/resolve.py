@@ -1,7 +1,8 @@
-"""Which program a node's ``package`` and ``executable`` are.
+"""Resolution of a node's ``package`` and ``executable`` to a program.
 
-Place: shell; looks where ROS packages lie. First what ``ros2 run`` would start, ``lib/<package>/<executable>`` of a
-prefix in ``AMENT_PREFIX_PATH``; else the Python module ``<package>.<executable>``.
+I/O; searches the folders of ROS packages. The first choice is the program of ``ros2 run``,
+``lib/<package>/<executable>`` of a prefix in ``AMENT_PREFIX_PATH``; the second is the Python module
+``<package>.<executable>``.
 Source: https://docs.ros.org/en/jazzy/Concepts/Advanced/About-Build-System.html (the prefix's layout).
 """
 
@@ -18,17 +19,17 @@ from gdp.errors import LocalError
 
 __all__ = ["PYTHON", "command_line", "deferred", "file_of"]
 
-PYTHON: Final = "{python}"  # the machine's own, as fog.machine.Program has it
+PYTHON: Final = "{python}"  # the machine's Python, see fog.machine.Program
 
 
 def command_line(node: CloudNode, environment: Mapping[str, str]) -> tuple[str, ...]:
-    """Return what starts a node on a machine that has the same packages as this one.
+    """Return the command line of a node for a machine that has the same packages as this one.
 
     Args:
         environment: of the machine, for ``AMENT_PREFIX_PATH``.
 
     Raises:
-        LocalError: there is no such executable and no such module.
+        LocalError: neither the executable nor the module exists.
     """
     path = _program(node, environment)
     if path is not None:
@@ -42,18 +43,18 @@ def command_line(node: CloudNode, environment: Mapping[str, str]) -> tuple[str, 
 
 
 def deferred(node: CloudNode) -> tuple[str, ...]:
-    """Return what looks for a node on the machine itself, when it starts there."""
+    """Return the command line that resolves a node on the machine itself, at its start."""
     return (PYTHON, "-m", "fog.launch.run", node.package, node.executable, *node.arguments)
 
 
 def file_of(node: CloudNode, environment: Mapping[str, str]) -> Path | None:
-    """Return the file that a node's code begins in; None: it is not found."""
+    """Return the file of a node's executable or module; None: it is not found."""
     module = _module(node)
     return _program(node, environment) or (Path(module) if module else None)
 
 
 def _program(node: CloudNode, environment: Mapping[str, str]) -> Path | None:
-    """Return the executable that ``ros2 run`` would start; None: there is none."""
+    """Return the executable for ``ros2 run``; None: there is none."""
     for prefix in environment.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
         path = Path(prefix) / "lib" / node.package / node.executable
         if prefix and path.is_file() and os.access(path, os.X_OK):

@@ -1,4 +1,4 @@
-"""A node of the robot's side, as a launch file describes it.
+"""Node of the robot's side, as a launch file describes it.
 
 Sans-I/O.
 """
@@ -14,10 +14,10 @@ __all__ = ["RobotNode"]
 
 @dataclass(frozen=True, slots=True)
 class RobotNode:
-    """A node of the robot's side.
+    """Node of the robot's side.
 
     Args:
-        output: ``screen``, ``both`` or ``log``: where its output goes.
+        output: destination of its output: ``screen``, ``both`` or ``log``.
     """
 
     node: CloudNode

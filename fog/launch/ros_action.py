@@ -1,10 +1,10 @@
-"""``FogCluster`` as an action of ROS 2's ``launch``: ``ros2 launch`` starts the cluster, and ends it.
+"""``FogCluster`` as an action of ROS 2's ``launch``: ``ros2 launch`` starts and ends the cluster.
 
-Place: shell; imports ROS 2's ``launch``. The cluster itself is the ``fog`` command's business, in processes of its own.
-Processes that come after the cluster in the description start when it serves: ``hold`` is put before them, through
-the launch configuration ``launch-prefix``; a node with a ``prefix`` of its own is not held.
-A cluster that cannot start ends the launch as any fault of an action does, with its reason and exit code 1: an
-exception in an event handler does that, ``Shutdown(reason=...)`` does neither.
+I/O; imports ROS 2's ``launch``. Separate processes of the ``fog`` command operate the cluster.
+Processes that follow the cluster in the description start when it serves: the launch configuration ``launch-prefix``
+puts ``start_gate`` before their command line. A node with its own ``prefix`` does not wait.
+A cluster that cannot start ends the launch like any failed action, with its reason and exit code 1. An exception in an
+event handler has this effect; ``Shutdown(reason=...)`` has neither.
 Source: launch 3.4.3 (jazzy): ``Action``, ``OnShutdown``, ``LaunchService.run_async``; ``descriptions/executable.py``
 for the prefix, ``actions/group_action.py`` for scopes.
 """
@@ -46,39 +46,39 @@ class FogCluster(entity.FogCluster, Action):  # type: ignore[misc]  # launch has
     """Nodes on machines; see ``fog.launch.entity``."""
 
     _starting: asyncio.Task[None] | None = None
-    _is_begun = False  # then there may be a cluster to end
+    _is_begun = False  # set when a cluster may exist that must be ended
 
     def execute(self, context: LaunchContext) -> None:
-        """Start or join the cluster, without waiting for it.
+        """Start or join the cluster without waiting until it serves.
 
         Raises:
-            LocalError: a node cannot be what it says.
+            LocalError: a node is invalid.
         """
         if self._starting is not None:
-            return  # it stands twice in the description
+            return  # the description contains it twice
         nodes = tuple(cloud_node(node, context) for node in self.cloud_nodes)
         name = self.cluster_spec.plan(nodes).name
         for note in self.cluster_spec.notes:
             log.warning("cluster %s: %s", name, note)
         run = RunRegistry().start()
-        gate = StartGate.remove_entity(run.directory / "gate")
+        gate = StartGate.closed(run.directory / "gate")
         _hold(context, shlex.join(gate.prefix()))
         context.register_event_handler(_Fails(lambda event: isinstance(event, _Failed) and event.cluster is self))
         self._starting = context.asyncio_loop.create_task(self._start(context, nodes, run.directory, gate))
         context.register_event_handler(OnShutdown(on_shutdown=lambda *_: _Ending(self, name, run, gate)))
 
     def get_asyncio_future(self) -> asyncio.Future[None] | None:
-        """Return what is done when the cluster serves, or cannot."""
+        """Return a future that is done when the cluster serves or has failed."""
         return self._starting
 
     async def end(self, name: str, run: Run, gate: StartGate) -> None:
-        """Break off what is being started, let go of those who wait, and give the machines back unless kept."""
+        """Cancel the start, release waiting processes, and release the machines unless the cluster is kept."""
         if self._starting is not None:
             self._starting.cancel()
             await asyncio.wait([self._starting])
         gate.open(serving=False)
         if self._is_begun and not self.cluster_spec.keep:
-            # In a session of its own: a second Ctrl-C must not leave machines running.
+            # In its own session: a second Ctrl-C must not leave machines running.
             process = await asyncio.create_subprocess_exec(*FOG, "down", name, "--if-up", start_new_session=True)
             if await process.wait():
                 log.error("cluster not ended name=%s; try: fog down %s", name, name)
@@ -88,7 +88,7 @@ class FogCluster(entity.FogCluster, Action):  # type: ignore[misc]  # launch has
         try:
             await self._begin(context, nodes, folder / "plan.json")
         except asyncio.CancelledError:
-            log.info("start of a cluster broken off")  # by ``end`` alone, so that it goes no further
+            log.info("start of a cluster broken off")  # only ``end`` cancels, so the cancellation is not propagated
         except GdpError as error:
             await context.emit_event(_Failed(self, str(error)))
         else:
@@ -98,7 +98,7 @@ class FogCluster(entity.FogCluster, Action):  # type: ignore[misc]  # launch has
         """Start or join the cluster, and return when it serves.
 
         Raises:
-            GdpError: it does not; the text says why.
+            GdpError: it does not serve; the text states the reason.
         """
         plan = await self._plan(context, nodes)
         file.write_text(plan.to_json(), encoding="utf-8")
@@ -125,7 +125,7 @@ class FogCluster(entity.FogCluster, Action):  # type: ignore[misc]  # launch has
 
 
 class _Ending(Action):  # type: ignore[misc]  # launch has no types
-    """The end of a cluster; the launch waits for it."""
+    """Action that ends a cluster; the launch waits for it."""
 
     _ending: asyncio.Task[None] | None = None
 
@@ -142,7 +142,7 @@ class _Ending(Action):  # type: ignore[misc]  # launch has no types
 
 
 class _Failed(Event):  # type: ignore[misc]  # launch has no types
-    """A cluster that does not serve."""
+    """Event: a cluster does not serve."""
 
     name = "fog.launch.Failed"
 
@@ -151,7 +151,7 @@ class _Failed(Event):  # type: ignore[misc]  # launch has no types
 
 
 class _Fails(BaseEventHandler):  # type: ignore[misc]  # launch has no types
-    """Ends the launch, with the reason and exit code 1."""
+    """Event handler that ends the launch with the reason and exit code 1."""
 
     def __init__(self, matcher: Callable[[Event], bool]) -> None:
         super().__init__(matcher=matcher)
@@ -162,7 +162,7 @@ class _Fails(BaseEventHandler):  # type: ignore[misc]  # launch has no types
 
 
 def _hold(context: LaunchContext, words: str) -> None:
-    """Put words before every process that is started from now on, in this scope and in those that it is in."""
+    """Prefix every process started from now on with words, in this scope and its enclosing scopes."""
     scopes: list[dict[str, str]] = []
     while True:
         here = context.launch_configurations
@@ -170,7 +170,7 @@ def _hold(context: LaunchContext, words: str) -> None:
         scopes.append(dict(here))
         try:
             PopLaunchConfigurations().execute(context)
-        except RuntimeError:  # there is no scope around this one
+        except RuntimeError:  # this is the outermost scope
             break
     for scope in reversed(scopes[:-1]):
         PushLaunchConfigurations().execute(context)
@@ -179,7 +179,7 @@ def _hold(context: LaunchContext, words: str) -> None:
 
 
 async def _reason(process: asyncio.subprocess.Process) -> str:
-    """Pass on what a ``fog`` command says on its standard error; return the last error of it."""
+    """Forward the standard error of a ``fog`` command; return its last error."""
     reason = ""
     assert process.stderr is not None
     while line := await process.stderr.readline():

@@ -1,8 +1,8 @@
-"""Names, remappings and parameters of a node as words of its command line, so that they travel without files.
+"""Command-line arguments for a node's name, remappings and parameters, which need no files on the machine.
 
-Place: pure.
-Source: https://design.ros2.org/articles/ros_command_line_arguments.html; the files of parameters as
-rcl_yaml_param_parser reads them (sections of nodes, ``ros__parameters`` within).
+Sans-I/O.
+Source: https://design.ros2.org/articles/ros_command_line_arguments.html; parameter files in the format of
+rcl_yaml_param_parser (sections of nodes that contain ``ros__parameters``).
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ _Section: TypeAlias = tuple[Sequence[str], Mapping[str, object]]
 
 
 def named(name: str | None, namespace: str | None) -> list[str]:
-    """Return the words that give a node its name and namespace."""
+    """Return the arguments that set a node's name and namespace."""
     words = ["-r", f"__node:={name}"] if name else []
     return [*words, "-r", f"__ns:={_absolute(namespace)}"] if namespace else words
 
 
 def remapped(pairs: Iterable[tuple[str, str]]) -> list[str]:
-    """Return the words that rename what a node uses."""
+    """Return the arguments that remap names."""
     return [word for old, new in pairs for word in ("-r", f"{old}:={new}")]
 
 
 def parameters_of_map(parameters: Mapping[str, object], prefix: str = "") -> list[str]:
-    """Return the words that set parameters; a map within a map is a group, joined with dots.
+    """Return the arguments that set parameters; a nested map is a group, joined with dots.
 
     Args:
-        prefix: before each name, such as ``detector:`` for the node of that name only.
+        prefix: text before each name, such as ``detector:`` to address only the node of that name.
 
     Raises:
-        LocalError: a value that no parameter can have.
+        LocalError: a value is not of a parameter type.
     """
     words = []
     for key, value in _flat(parameters):
@@ -51,15 +51,15 @@ def parameters_of_map(parameters: Mapping[str, object], prefix: str = "") -> lis
 
 
 def parameters_of_file(document: object, where: str, name: str | None, namespace: str | None) -> list[str]:
-    """Return the words that set what a file of parameters says of a node.
+    """Return the arguments that set a node's parameters from a parameter file.
 
     Args:
-        document: the file as YAML reads it.
+        document: parsed YAML of the file.
         where: its path, for errors.
-        name, namespace: of the node; None: not given, so that its own code says it.
+        name, namespace: of the node; None: not given, so the node's code determines it.
 
     Raises:
-        LocalError: it is no such file, or cannot be used without the node's name.
+        LocalError: the document is not a parameter file, or cannot be used without the node's name.
     """
     words = []
     for path, parameters in _sections(document, where, ()):
@@ -117,5 +117,5 @@ def _yaml(key: str, value: object) -> str:
     if isinstance(value, float) and not math.isfinite(value):
         return ".nan" if math.isnan(value) else ".inf" if value > 0 else "-.inf"
     if isinstance(value, bool | int | float | str):
-        return json.dumps(value, ensure_ascii=False)  # is YAML, too
+        return json.dumps(value, ensure_ascii=False)  # JSON is also YAML
     raise LocalError(f"parameter {key}: {value!r}: expected text, a number, a truth value or a list of such")

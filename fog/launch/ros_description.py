@@ -1,6 +1,6 @@
-"""Whole descriptions of ROS 2's ``launch`` as clusters and nodes of the robot's side.
+"""Conversion of ROS 2 launch descriptions to clusters and nodes of the robot's side.
 
-I/O; imports ROS 2's ``launch``. Conditions are evaluated, includes and groups are followed; nothing is started.
+I/O; imports ROS 2's ``launch``. Conditions are evaluated, includes and groups are followed; no process is started.
 Source: launch 3.4 and launch_ros 0.26 (jazzy).
 """
 
@@ -29,7 +29,7 @@ def gathered(
     """Return the clusters of a description and the nodes of the robot's side, includes and groups followed.
 
     Raises:
-        LocalError: something in it can only be run by ``ros2 launch``, or an argument is missing.
+        LocalError: only ``ros2 launch`` can run an entity of it, or an argument is missing.
     """
     if not isinstance(description, LaunchDescription):
         raise LocalError(f"expected a LaunchDescription, not {type(description).__name__}")
@@ -55,7 +55,7 @@ def gathered(
 
 
 def _output(node: Node, context: LaunchContext) -> str:
-    """Return where a node's standard output goes, ``screen`` or ``log``, as ``launch.logging`` reads it."""
+    """Return the destination of a node's standard output, ``screen`` or ``log``, as in ``launch.logging``."""
     said = node.output
     if isinstance(said, dict):
         words = {*said.get("stdout", ()), *said.get("both", ())}
@@ -67,5 +67,5 @@ def _output(node: Node, context: LaunchContext) -> str:
 def _inside(entity: object, context: LaunchContext) -> Iterable[object]:
     try:
         return entity.visit(context) or ()  # type: ignore[attr-defined]
-    except Exception as error:  # an action may do anything when visited
+    except Exception as error:  # visiting an action may raise any error
         raise LocalError(f"{type(entity).__name__}: {error}; does ros2 launch take it?") from error

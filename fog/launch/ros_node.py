@@ -1,7 +1,7 @@
-"""``Node`` of a launch file where ROS 2's ``launch_ros`` is installed: its own, and Python modules as well.
+"""``Node`` of a launch file with ROS 2's ``launch_ros``: its own node, extended to Python modules.
 
-Shell; imports ROS 2's ``launch``. ``package`` and ``executable`` mean what they mean without ROS 2's launch: what
-``ros2 run`` would start, else the Python module ``PACKAGE.EXECUTABLE`` (``resolve``).
+I/O; imports ROS 2's ``launch``. ``package`` and ``executable`` have the same meaning as without ROS 2's launch: the
+program of ``ros2 run``, else the Python module ``PACKAGE.EXECUTABLE`` (``resolve``).
 Source: launch_ros 0.26.6 (jazzy): ``actions/node.py``.
 """
 
@@ -22,20 +22,20 @@ __all__ = ["Node"]
 
 
 class Node(launch_ros.actions.Node):  # type: ignore[misc]  # launch_ros has no types
-    """A ROS node; see ``launch_ros.actions.Node``.
+    """ROS node; see ``launch_ros.actions.Node``.
 
     Args:
-        exec_name: what its output is marked with; None: its executable, also while it waits for a cluster.
+        exec_name: label of its output; None: its executable, also while it waits for a cluster.
     """
 
     def __init__(self, *, executable: object, exec_name: object = None, **keywords: object) -> None:
         super().__init__(executable=executable, exec_name=executable if exec_name is None else exec_name, **keywords)
 
     def execute(self, context: LaunchContext) -> list[LaunchDescriptionEntity] | None:
-        """Start it.
+        """Start the node.
 
         Raises:
-            Exception: whatever launch_ros raises, such as for a package that is neither installed nor a module.
+            Exception: any error of launch_ros, such as for a package that is neither installed nor a module.
         """
         if self.node_package is not None:
             package, executable = (
@@ -45,7 +45,7 @@ class Node(launch_ros.actions.Node):  # type: ignore[misc]  # launch_ros has no 
             try:
                 words = command_line(CloudNode(package, executable), os.environ)
             except LocalError:
-                words = ()  # launch_ros says what is wrong
+                words = ()  # launch_ros reports the error
             if words[:1] == (PYTHON,):
                 started = (sys.executable, *words[1:])
                 self.cmd[:1] = [normalize_to_list_of_substitutions(word) for word in started]

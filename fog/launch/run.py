@@ -1,6 +1,6 @@
-"""``python -m fog.launch.run PACKAGE EXECUTABLE ...``: become a node, found on the machine where this runs.
+"""Starter of a node that is resolved on this machine: ``python -m fog.launch.run PACKAGE EXECUTABLE ...``.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ __all__ = ["main"]
 
 
 def main() -> None:
-    """Replace this process by the node; exit 2 if it is not found."""
+    """Replace this process with the node; exit with status 2 if it is not found."""
     if len(sys.argv) < 3:
         sys.exit("expected: PACKAGE EXECUTABLE [ARGUMENT ...]")
     try:

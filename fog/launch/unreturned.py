@@ -1,11 +1,11 @@
-"""Clusters that a launch file makes and does not return, as the paper's Listing 1 does.
+"""Tracking of clusters that a launch file constructs and does not return, as in the paper's Listing 1.
 
-Shell: reads the call stack and sets the class of a launch file's module. A launch file that is loaded under watch has a
-list of the clusters made while it ran; when ``generate_launch_description`` returns, those to which nothing
-refers, the description least of all, are put into it, before the first entity that is not a setting.
+I/O: reads the call stack and sets the class of a launch file's module. A watched launch file has a list of the clusters
+constructed while it ran. When ``generate_launch_description`` returns, clusters without any reference are inserted into
+the description, before the first entity that is not a setting.
 
-Under ROS 2's launch ``watch_ros_launch`` puts every launch file under watch: it wraps the one function of launch 3.4
-that runs launch files, and finds the file that is just being run, which is the one that imports ``fog``.
+Under ROS 2's launch, ``watch_ros_launch`` watches every launch file. It wraps the one function of launch 3.4 that runs
+launch files. It also finds the launch file that runs at this moment, which is the one that imports ``fog``.
 Source: FogROS2-FT, Listing 1; launch 3.4.3 ``python_launch_file_utilities.py``.
 """
 
@@ -45,7 +45,7 @@ _SETTINGS: Final = {
 
 
 class LaunchFile(ModuleType):
-    """A launch file under watch: what its entry returns has the clusters that it made."""
+    """Watched launch file: the description that its entry point returns contains the clusters that it constructed."""
 
     def _entry(self) -> object:
         if _ENTRY not in self.__dict__:
@@ -65,17 +65,17 @@ class LaunchFile(ModuleType):
 
 
 def watch(module: ModuleType) -> None:
-    """Put a launch file under watch, before or while it runs; twice is as good as once."""
+    """Watch a launch file, before or while it runs; idempotent."""
     module.__dict__.setdefault(_MADE, [])
     if type(module) is ModuleType:
         module.__class__ = LaunchFile
 
 
 def note(cluster: object) -> None:
-    """Remember a cluster with the launch file that makes it. One that is made outside any is its maker's to launch.
+    """Record a cluster for the launch file that constructs it; a cluster of any other code is not recorded.
 
     Raises:
-        LocalError: ROS 2's launch is running a launch file that cannot be watched any more.
+        LocalError: ROS 2's launch is running a launch file that can no longer be watched.
     """
     for frame in _stack(sys._getframe(1)):
         if (made := frame.f_globals.get(_MADE)) is not None:
@@ -89,7 +89,7 @@ def note(cluster: object) -> None:
 
 
 def adopt(module: ModuleType, description: object) -> None:
-    """Put into a description the clusters of its launch file that are nowhere else; the watch ends."""
+    """Insert unreferenced clusters of a launch file into its description, and stop watching the file."""
     made: list[object] = module.__dict__.pop(_MADE, [])
     if not hasattr(description, "entities"):
         return
@@ -102,7 +102,7 @@ def adopt(module: ModuleType, description: object) -> None:
 
 
 def watch_ros_launch() -> None:
-    """Put every Python launch file that ROS 2's launch runs from now on under watch, and the one it just runs."""
+    """Watch every Python launch file that ROS 2's launch runs from now on, and the one that runs now."""
     loader = importlib.import_module(_LOADER)
     load: Callable[[str], ModuleType] = getattr(loader, _LOAD)
     own: Callable[[str], ModuleType] = getattr(load, "__wrapped__", load)
@@ -129,9 +129,9 @@ def _stack(frame: FrameType | None) -> Iterator[FrameType]:
 
 
 def _is_held(cluster: object, module: ModuleType, made: list[object]) -> bool:
-    """Return whether something else has it: the description, a group in it, the closure of an ``OpaqueFunction``.
+    """Return whether something refers to it: the description, a group in it, the closure of an ``OpaqueFunction``.
 
-    The names of the launch file do not count: a cluster that was only assigned is as lost as one that was not.
+    Variables of the launch file do not count: assigning a cluster to a variable does not launch it.
     """
     own = (id(made), id(module.__dict__))
     return any(id(each) not in own and not isinstance(each, FrameType) for each in gc.get_referrers(cluster))

@@ -1,4 +1,4 @@
-"""How many machines, which ones and where: failure arithmetic, choice by price and latency, replayed traces.
+"""Planning of machines: failure arithmetic, choice by price and latency, and replay of recorded traces.
 
-Place: pure.
+Sans-I/O.
 """

@@ -1,6 +1,6 @@
-"""What ``fog plan`` answers: pool, choice and price in one, with everything that was assumed on the way.
+"""Result of ``fog plan``: pool, choices and price, with all assumptions.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ __all__ = ["Answer", "Question", "answer", "assumptions"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Question:
-    """What is asked.
+    """Input of a plan.
 
     Args:
         target: largest share of time without any replica.
         uptime_s, recovery_s: None: the paper's worked example.
-        kinds: which machines may be added, of ``spot`` and ``on-demand``.
-        spot, on_demand: how many of each run already.
+        kinds: kinds of machines that may be added: ``spot``, ``on-demand``.
+        spot, on_demand: number of each that run already.
         latency_ms: of regions, as measured from the robot.
     """
 
@@ -47,17 +47,17 @@ class Question:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answer:
-    """The answer.
+    """Computed plan.
 
     Args:
-        replicas: with those that run already.
-        p_vm: share of time for which one of the machines to be added is down; of a mixed pool, a spot machine.
+        replicas: total, including those that run already.
+        p_vm: share of time for which one of the machines to be added is down; in a mixed pool: of a spot machine.
         p_system: share of time for which all replicas are down, placed as chosen: different regions are independent,
             spot machines of one region are not.
-        factor: how often a pair of one region fails together, against independence.
+        factor: ratio of joint failures of a pair in one region to independent failures.
         choices: of the machines to be added.
-        independent: what the formula alone says.
-        as_recorded: the same, if machines stayed no longer than in the recorded traces.
+        independent: result of the formula alone.
+        as_recorded: the same with the uptime of the recorded traces.
     """
 
     replicas: int
@@ -73,15 +73,15 @@ class Answer:
 
     @property
     def usd_per_hour(self) -> float:
-        """Of the machines to be added."""
+        """Return the price of the machines to be added."""
         return sum(choice.offer.usd_per_hour for choice in self.choices)
 
 
 def answer(question: Question, offers: Sequence[Offer], seen: Measured) -> Answer:
-    """Answer a question.
+    """Compute a plan.
 
     Raises:
-        LocalError: something asked for is out of bounds, or no machine of the list has enough.
+        LocalError: an input is out of bounds, or no offer has enough hardware.
     """
     uptime_s = question.uptime_s or PAPER_UPTIME_S
     recovery_s = question.recovery_s or PAPER_RECOVERY_S
@@ -113,7 +113,7 @@ def answer(question: Question, offers: Sequence[Offer], seen: Measured) -> Answe
 def _placed(
     question: Question, offers: Sequence[Offer], pool: Pool, down: float, factor: float
 ) -> tuple[list[Choice], float]:
-    """Return where the pool goes, with further spot machines where it has to share regions, and what comes of it."""
+    """Return the choices for a pool and its joint failure, with more spot machines if it must share regions."""
     more = dict(zip(question.kinds, pool.mix.more, strict=True))
     steady = joint([down] * question.spot + [ON_DEMAND_DOWN] * (question.on_demand + more.get("on-demand", 0)))
 
@@ -132,7 +132,7 @@ def _placed(
         spots += 1
         one_more = place(spots)
         if one_more[1] >= best[1]:
-            return first  # a further one in the same regions changes nothing
+            return first  # another machine in the same regions changes nothing
         best = one_more
     return best
 
@@ -156,7 +156,7 @@ def _cheapest(question: Question, offers: Sequence[Offer], *, spot: bool) -> flo
 def assumptions(
     kinds: Sequence[str], seen: Measured, uptime_s: float | None = None, recovery_s: float | None = None
 ) -> list[str]:
-    """Return what an answer about machines of these kinds (``spot``, ``on-demand``) rests on.
+    """Return the assumptions of a plan with machines of these kinds (``spot``, ``on-demand``).
 
     Args:
         uptime_s, recovery_s: of a spot machine; None: the paper's worked example.

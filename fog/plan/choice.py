@@ -1,6 +1,6 @@
-"""Which offer for which replica: by price and measured latency, in different regions where that can be had.
+"""Choice of an offer for each replica, by price and measured latency, in different regions if possible.
 
-Place: pure. Money and milliseconds are made comparable by one number that people can set: what a millisecond is worth.
+Sans-I/O. A configurable price of one millisecond makes money and latency comparable.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ __all__ = ["BY_BOTH", "BY_PRICE", "Choice", "Weights", "choose"]
 
 @dataclass(frozen=True, slots=True)
 class Weights:
-    """What counts.
+    """Weights of the choice.
 
     Args:
-        usd_per_hour_per_ms: what a replica that is one millisecond nearer may cost more.
-        spreads: whether replicas go to different regions first of all, and then by price and latency.
+        usd_per_hour_per_ms: additional price that one millisecond less latency justifies.
+        spreads: whether different regions take precedence over price and latency.
     """
 
     usd_per_hour_per_ms: float = 0.001
@@ -38,10 +38,10 @@ BY_PRICE: Final = Weights(usd_per_hour_per_ms=0.0)
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """An offer, and why this one.
+    """Chosen offer, and the reason.
 
     Args:
-        score: the lower the better: USD an hour, with the latency's price.
+        score: USD per hour including the price of the latency; lower is better.
     """
 
     offer: Offer
@@ -57,19 +57,19 @@ def choose(
     used: Sequence[str] = (),
     avoid: Sequence[str] = (),
 ) -> list[Choice]:
-    """Return one choice for each machine wanted, in their order.
+    """Return one choice for each requested machine, in their order.
 
     Args:
-        latency_ms: of regions as measured from the robot; one without a figure counts as the slowest measured one.
-        used: regions of replicas that stand already, one entry for each.
-        avoid: regions to take only where nothing else is to be had, as after a preemption there.
+        latency_ms: of regions, measured from the robot; a region without a figure counts as the slowest measured one.
+        used: regions of existing replicas, one entry for each.
+        avoid: regions to use only if no other region has an offer, as after a preemption.
 
     Raises:
-        LocalError: nothing fits; the text names what comes nearest.
+        LocalError: no offer fits; the text names the nearest one.
     """
     regions = Counter(used)
     choices: dict[int, Choice] = {}
-    # Those that may not choose go first, so that the others keep away from them.
+    # Machines with a fixed region are placed first, so that the others avoid these regions.
     for at in sorted(range(len(wanted)), key=lambda index: not wanted[index].region):
         choice = _best(offers, wanted[at], latency_ms or {}, weights, regions, frozenset(avoid))
         choices[at] = choice
@@ -143,7 +143,7 @@ def _nearest(wanted: MachineRequest, allowed: Sequence[Offer], offers: Sequence[
 
 
 def _lacks(wanted: Hardware, has: Hardware) -> float:
-    """Return how far short it falls: the sum of what is missing, each as a share of what is wanted."""
-    gpus = has.gpus if has.gpu == wanted.gpu else has.gpus / 2  # another model is nearer than none
+    """Return the shortfall: the sum of the missing amounts, each as a share of the requested amount."""
+    gpus = has.gpus if has.gpu == wanted.gpu else has.gpus / 2  # another model is nearer than no GPU
     pairs = ((wanted.cpus, has.cpus), (wanted.memory_gib, has.memory_gib), (wanted.gpus, gpus))
     return math.fsum(max(0.0, 1 - there / want) for want, there in pairs if want)

@@ -1,11 +1,11 @@
-"""The same where machines in one region fail together more often than independence says.
+"""Joint failure of machines when failures within one region are correlated.
 
-Place: pure; numbers in, numbers out.
-Model: of machines in one region, the first is down with its own chance, and each further one ``factor`` times as often
-as alone while those before it are down: P = p1 * min(1, factor * p2) * min(1, factor * p3) * ... Different regions
-multiply. With the largest factor of a pair this lies above what three machines did in the traces that it was measured
-from (13.6 times independence against 7.0; ``fog.plan.evidence``). It says nothing of regions that fail together:
-there are no data for that.
+Sans-I/O; numbers in, numbers out.
+Model: the first machine of a region is down with its own chance. Each further machine is down ``factor`` times as often
+as alone while the machines before it are down: P = p1 * min(1, factor * p2) * min(1, factor * p3) * ... Chances of
+different regions multiply. With the largest factor of a pair, the model exceeds the measurement for three machines in
+the same traces (13.6 times independence against 7.0; ``fog.plan.evidence``). The model does not cover joint failures of
+regions: there are no data for them.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ __all__ = ["joint_in_one_region", "joint_over_regions", "more_in_one_region"]
 
 
 def joint_in_one_region(chances: Iterable[float], factor: float) -> float:
-    """Return the chance that all machines of one region are down at once; 1 for no machine at all.
+    """Return the chance that all machines of one region are down at once; 1 for an empty region.
 
     Args:
-        factor: how many times as often as independent ones two of them are down together; at least 1.
+        factor: ratio of joint failures of two machines to independent failures; at least 1.
 
     Raises:
         LocalError: ``factor`` is less than 1.
@@ -35,19 +35,19 @@ def joint_in_one_region(chances: Iterable[float], factor: float) -> float:
 
 
 def joint_over_regions(chances: Mapping[str, Iterable[float]], factor: float) -> float:
-    """Return the chance that all machines are down at once, given each region's; regions are independent."""
+    """Return the chance that all machines are down at once; different regions are independent."""
     return joint(joint_in_one_region(each, factor) for each in chances.values())
 
 
 def more_in_one_region(machine: float, target: float, factor: float, have: Sequence[float] = ()) -> int | None:
-    """Return how many to add, all in one region with ``have``, until their joint failure is at most ``target``.
+    """Return the number of machines to add in the region of ``have`` for a joint failure of at most ``target``.
 
     Args:
-        machine: chance that one of the new ones is down, in (0, 1).
-        have: the chances of those there already.
+        machine: chance that a new machine is down, in (0, 1).
+        have: chances of the existing machines.
 
     Returns:
-        None: no number is enough, because with ``factor`` a further one is down whenever those before it are.
+        None: no number is enough, because with ``factor`` each further machine is down whenever the others are.
 
     Raises:
         LocalError: a chance or the target lies outside (0, 1), or ``factor`` is less than 1.

@@ -1,6 +1,6 @@
-"""What a set-up costs, by the hour and the month, beside others: the form of the paper's Table I.
+"""Comparison of costs per hour and month, in the form of the paper's Table I.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ HOURS_A_MONTH: Final = 730.0  # 365 days of 24 hours, over 12
 
 @dataclass(frozen=True, slots=True)
 class Bill:
-    """A set-up and its price.
+    """Configuration and its price.
 
     Args:
-        of_single: its price over that of a single on-demand machine.
+        of_single: ratio of its price to that of a single on-demand machine.
     """
 
     what: str
@@ -29,12 +29,12 @@ class Bill:
 
     @property
     def usd_per_month(self) -> float:
-        """For a month of running all the time."""
+        """Return the price of a month of continuous operation."""
         return self.usd_per_hour * HOURS_A_MONTH
 
 
 def compared(on_demand: Offer, spot: Offer) -> tuple[Bill, Bill, Bill]:
-    """Return the bills of a single on-demand machine, of two of those, and of two spot machines."""
+    """Return the bills of one on-demand machine, two on-demand machines, and two spot machines."""
     single = on_demand.usd_per_hour
     rows = (
         ("one on-demand machine", single),

@@ -1,6 +1,6 @@
-"""Spans of time as people write them: ``15h``, ``20min``, ``90s``.
+"""Durations in textual form: ``15h``, ``20min``, ``90s``.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ _UNITS_S: Final = {"d": 86400.0, "h": 3600.0, "min": 60.0, "s": 1.0}
 
 
 def seconds_from_text(text: str) -> float:
-    """Read one or more numbers with units, the larger unit first: ``1h30min``, ``0.5h``; a bare number is seconds.
+    """Parse one or more numbers with units, larger units first: ``1h30min``, ``0.5h``; a bare number is seconds.
 
     Raises:
-        LocalError: anything else, or nothing at all.
+        LocalError: the text is empty or has another form.
     """
     if re.fullmatch(r"\d+(?:\.\d+)?", text):
         return float(text)
@@ -31,7 +31,7 @@ def seconds_from_text(text: str) -> float:
 
 
 def duration_text(seconds: float) -> str:
-    """Return a span in its largest unit that keeps it above one, with at most two decimals."""
+    """Return a duration in the largest unit that gives at least one, with at most two decimals."""
     for unit, unit_s in _UNITS_S.items():
         if seconds >= unit_s:
             return f"{round(seconds / unit_s, 2):g}{unit}"

@@ -1,11 +1,12 @@
-"""What was measured of spot machines in recorded traces: how long they stay, and how they fail together.
+"""Measurements of spot machines in recorded traces: uptime and joint failures.
 
-Place: pure.
+Sans-I/O.
 
-Which share of time two zones are *both* without machines says little when that is the normal state of each: no ratio to
-independence can exceed one over the larger share. The factor is therefore taken over the rarer state, here "a machine
-is to be had": 1.6 to 3.7 for the pairs of one region. Outages of a given length after each preemption, the other way to
-ask, coincide 0.8 to 3.5 times as often; they are few. ``fog.catalog`` ships all of them.
+The share of time in which *both* zones lack machines is not informative when this is the normal state of each zone: the
+ratio to independence cannot exceed one over the larger share. The factor is therefore measured on the rarer state, here
+"a machine is available": 1.6 to 3.7 for the pairs of one region. An alternative measure are outages of a given length
+after each preemption. They coincide 0.8 to 3.5 times as often as independent ones, but they are few.
+``fog.catalog`` ships all these figures.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ __all__ = ["Measured", "Pair"]
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """Two zones of one region; ratios are to what independence says.
+    """Two zones of one region; ratios are relative to independence.
 
     Args:
-        free_together: machines to be had in both; the rarer state.
-        taken_together: in neither.
-        outages_together: both within so many seconds of a preemption -> ratio.
+        free_together: machines available in both; the rarer state.
+        taken_together: machines available in neither.
+        outages_together: seconds after a preemption within which both have one -> ratio.
     """
 
     zones: tuple[str, str]
@@ -33,14 +34,14 @@ class Pair:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Measured:
-    """The measurements.
+    """Measurements of all zones.
 
     Args:
         source: of the traces, with machine type, region and length.
-        uptime_s: mean time until a machine was taken, over all zones.
-        back_s: mean time until the same zone had one again, over all zones.
-        taken_share: by zone, the share of time without a machine to be had.
-        all_free_together: as ``Pair.free_together``, of all zones at once.
+        uptime_s: mean time until a machine was preempted, over all zones.
+        back_s: mean time until the same zone had a machine again, over all zones.
+        taken_share: zone -> share of time without an available machine.
+        all_free_together: as ``Pair.free_together``, for all zones at once.
     """
 
     source: str
@@ -52,6 +53,6 @@ class Measured:
 
     @property
     def factors(self) -> tuple[float, float]:
-        """The smallest and the largest ratio of a pair of one region, over the rarer state."""
+        """Return the smallest and the largest ratio of a pair of one region, on the rarer state."""
         each = [pair.free_together for pair in self.pairs]
         return min(each), max(each)

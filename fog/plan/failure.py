@@ -1,8 +1,8 @@
-"""How many replicas buy the wanted availability, if machines fail independently.
+"""Replica count for a target availability, if machines fail independently.
 
-Place: pure; numbers in, numbers out.
+Sans-I/O; numbers in, numbers out.
 Source: FogROS2-FT, the section on spot machines. P_VM = recovery / (uptime + recovery), P_system = product of all P_i,
-N = ceil(log P_system / log P_VM). The paper prints the ratio of logarithms upside down; this form follows from its own
+N = ceil(log P_system / log P_VM). The paper prints the ratio of logarithms inverted; this form follows from its own
 product formula and gives its worked figure (15 h up, 20 min to recover: two spot machines are under 0.05 %).
 """
 
@@ -16,18 +16,18 @@ from gdp.errors import LocalError
 
 __all__ = ["chance_down", "joint", "replicas_needed"]
 
-_ROUNDING: Final = 1e-9  # 0.1 ** 3 is a little more than 0.001, and three replicas are enough
+_ROUNDING: Final = 1e-9  # 0.1 ** 3 exceeds 0.001 by rounding, but three replicas are enough
 
 
 def chance_down(uptime_s: float, recovery_s: float) -> float:
     """Return the share of time for which one machine is not serving, in (0, 1).
 
     Args:
-        uptime_s: mean time from its service being up to the machine being taken away.
+        uptime_s: mean time from the start of its service until the machine is preempted.
         recovery_s: mean time from then until a replacement serves.
 
     Raises:
-        LocalError: one is not positive.
+        LocalError: a value is not positive.
     """
     if not (0 < uptime_s < math.inf and 0 < recovery_s < math.inf):
         raise LocalError("uptime and recovery: expected more than no time, and less than forever")
@@ -35,7 +35,7 @@ def chance_down(uptime_s: float, recovery_s: float) -> float:
 
 
 def joint(chances: Iterable[float]) -> float:
-    """Return the chance that all are down at once, if they are independent; 1 for no machine at all."""
+    """Return the chance that all machines are down at once, if they are independent; 1 without machines."""
     return math.prod(chances)
 
 

@@ -1,6 +1,6 @@
-"""Pools of different machines: how many of which kind reach a target for the least money, given some that run already.
+"""Mixed pools: the cheapest number of machines of each kind that reaches a target, given those that run already.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ _MOST_MIXES: Final = 200_000
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A kind of machine that a pool can have.
+    """Kind of machine in a pool.
 
     Args:
-        chance: that one is down, in (0, 1), independent of all others.
-        usd_per_hour: of one; not negative.
+        chance: that one machine is down, in (0, 1), independent of all others.
+        usd_per_hour: price of one machine; not negative.
     """
 
     name: str
@@ -35,12 +35,12 @@ class Kind:
 
 @dataclass(frozen=True, slots=True)
 class Mix:
-    """A pool.
+    """Pool of machines.
 
     Args:
-        more: how many of each kind to add, in the order of the kinds asked about.
+        more: number of each kind to add, in the order of the given kinds.
         chance: that all machines, old and new, are down at once.
-        usd_per_hour: of the new ones.
+        usd_per_hour: price of the new machines.
     """
 
     more: tuple[int, ...]
@@ -49,15 +49,15 @@ class Mix:
 
 
 def cheapest_mix(kinds: Sequence[Kind], target: float, have: Sequence[float] = (), least: int = 1) -> Mix:
-    """Return what to add; of mixes with one price the one with fewer machines, then the safer one.
+    """Return the machines to add; among equal prices, the mix with fewer machines, then the safer one.
 
     Args:
         target: largest joint chance accepted, in (0, 1).
-        have: the chances of machines that are there already.
-        least: fewest machines in all.
+        have: chances of the existing machines.
+        least: minimum total number of machines.
 
     Raises:
-        LocalError: no kinds, a chance or the target outside (0, 1), or more combinations than can be looked through.
+        LocalError: there are no kinds, a chance or the target lies outside (0, 1), or there are too many combinations.
     """
     if not kinds or any(kind.usd_per_hour < 0 for kind in kinds):
         raise LocalError("expected at least one kind of machine, and no negative price")
@@ -82,5 +82,5 @@ def cheapest_mix(kinds: Sequence[Kind], target: float, have: Sequence[float] = (
 
 
 def _alone(kind: Kind, target: float, already: float) -> int:
-    """Return how many of one kind are enough without any other."""
+    """Return the number of machines of one kind that is enough without the others."""
     return 0 if already <= target else replicas_needed(kind.chance, target / already)

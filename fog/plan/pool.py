@@ -1,7 +1,7 @@
-"""A pool that reaches a target, under each assumption that can be made about failing together.
+"""Pools that reach a target, under each assumption about joint failures.
 
-Place: pure. It answers with several numbers, because the data decide between them for nobody: machines that fail
-independently, and machines of one region that fail together as often as the worst pair in the recorded traces.
+Sans-I/O. The result has several numbers because the data do not decide between the assumptions: machines fail
+independently, or machines of one region fail together as often as the worst pair in the recorded traces.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ ON_DEMAND_DOWN: Final = 0.005  # AWS's service level agreement promises 99.5 % a
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """Machines that run already: the chances that each is down."""
+    """Machines that run already: the chance of each that it is down."""
 
     spot: tuple[float, ...] = ()
     on_demand: tuple[float, ...] = ()
@@ -34,14 +34,14 @@ NONE: Final = Standing()
 
 @dataclass(frozen=True, slots=True)
 class Pool:
-    """What to add, and what comes of it.
+    """Machines to add, and the resulting figures.
 
     Args:
-        mix: what to add, if machines are independent, as they are assumed to be in different regions.
-        replicas: with those that stand already.
+        mix: machines to add if failures are independent, as assumed for different regions.
+        replicas: total, including those that run already.
         chance: that all are down at once.
-        chance_in_one_region: the same pool's, if all its spot machines stood in one region.
-        replicas_in_one_region: how many the target takes there; None: no number of spot machines reaches it.
+        chance_in_one_region: the same, if all spot machines of the pool were in one region.
+        replicas_in_one_region: number that the target needs there; None: no number of spot machines reaches it.
     """
 
     mix: Mix
@@ -52,14 +52,14 @@ class Pool:
 
 
 def pool_for(target: float, spot: Kind, on_demand: Kind | None, factor: float, standing: Standing = NONE) -> Pool:
-    """Return the cheapest pool of spot machines, or of these and others where a kind of others is given.
+    """Return the cheapest pool of spot machines, or a mixed pool if ``on_demand`` is given.
 
     Args:
         target: largest chance that all are down at once, in (0, 1).
-        factor: how many times as often as independent ones two spot machines of one region are down together.
+        factor: ratio of joint failures of two spot machines in one region to independent failures.
 
     Raises:
-        LocalError: a chance or the target lies outside (0, 1), ``factor`` is less than 1.
+        LocalError: a chance or the target lies outside (0, 1), or ``factor`` is less than 1.
     """
     kinds: Sequence[Kind] = (spot,) if on_demand is None else (spot, on_demand)
     have = (*standing.spot, *standing.on_demand)

@@ -1,7 +1,7 @@
 """Machines for a target availability, from the machines that a launch file lists.
 
-Sans-I/O. Source: FogROS2-FT, the section on spot machines; ``failure`` has the formula, ``correlation`` what is added
-to it where machines share a region.
+Sans-I/O. Source: FogROS2-FT, the section on spot machines; ``failure`` has the formula, and ``correlation`` its
+extension for machines that share a region.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class Target:
     """Machines that reach an availability.
 
     Args:
-        availability: share of time, in (0, 1), for which at least one of them is to serve.
-        machines: what to ask for.
+        availability: share of time, in (0, 1), for which at least one machine is to serve.
+        machines: requests.
         p_vm: share of time for which a spot machine is down.
         p_system: share of time for which all are down.
     """
@@ -52,11 +52,11 @@ def machines_for(
     latency_ms: Mapping[str, float] | None = None,
     weights: Weights = BY_BOTH,
 ) -> Target:
-    """Return the listed machines, and as many copies of them in other regions as the target takes.
+    """Return the listed machines, and as many copies in other regions as the target needs.
 
     Raises:
-        LocalError: the target lies outside (0, 1), nothing like a listed machine is offered, or no number of machines
-            reaches it.
+        LocalError: the target lies outside (0, 1), no offer fits a listed machine, or no number of machines reaches
+            the target.
     """
     if not 0 < availability < 1:
         raise LocalError(f"availability={availability:g}: expected a share of time between 0 and 1, such as 0.9995")
@@ -78,7 +78,7 @@ def machines_for(
 
 
 def _chance(choices: Sequence[Choice], down: float, factor: float) -> float:
-    """Return the chance that all are down: spot machines of one region are not independent, all others are."""
+    """Return the chance that all are down; only spot machines of one region are correlated."""
     regions: dict[str, list[float]] = {}
     steady = []
     for choice in choices:

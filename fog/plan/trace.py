@@ -1,8 +1,8 @@
-"""What a recorded trace of spot machines says: how long they stay, how they fail together, how a pool would have done.
+"""Analysis of recorded spot traces: uptime, joint failures, and the simulated availability of a pool.
 
-Place: pure; chance comes in as a ``numpy`` generator.
+Sans-I/O; randomness is an argument, a ``numpy`` generator.
 Source of the format: the traces published with "Can't Be Late: Optimizing Spot Instance Savings under Deadlines"
-(NSDI 2024); its simulator takes 1 as "no spot machine to be had", and so does this.
+(NSDI 2024); as in its simulator, 1 means "no spot machine available".
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ Steps = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """One zone.
+    """Trace of one zone.
 
     Args:
-        taken: for each step, whether no spot machine was to be had.
+        taken: for each step, whether no spot machine was available.
     """
 
     zone: str
@@ -46,7 +46,7 @@ class Trace:
         """Read the published form: ``{"metadata": {"gap_seconds": ...}, "data": [0, 1, ...]}``.
 
         Raises:
-            LocalError: it is not of that form.
+            LocalError: the document has another form.
         """
         match document:
             case {"metadata": {"gap_seconds": int() | float() as step_s}, "data": [_, *_] as data} if (
@@ -57,19 +57,19 @@ class Trace:
 
     @property
     def preemptions(self) -> list[int]:
-        """The steps at which a machine that ran was taken."""
+        """Return the steps at which a running machine was preempted."""
         return [int(step) for step in np.flatnonzero(self.taken[1:] & ~self.taken[:-1]) + 1]
 
     @property
     def uptime_s(self) -> float:
-        """Mean time for which a machine ran; infinite if none was ever taken."""
+        """Return the mean time for which a machine ran; infinite if none was ever preempted."""
         lost = len(self.preemptions)
         return float(np.count_nonzero(~self.taken)) * self.step_s / lost if lost else float("inf")
 
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """A share of time, with the interval that 95 % of resamples lie in."""
+    """Share of time, with the interval that contains 95 % of the resamples."""
 
     share: float
     low: float
@@ -77,13 +77,13 @@ class Share:
 
 
 def times_independent(*steps: Steps) -> float:
-    """Return how many times as often as independent ones these are all true at once; ``nan`` if one never is."""
+    """Return the ratio of joint occurrence to independence; ``nan`` if one of the steps is never true."""
     expected = float(np.prod([each.mean() for each in steps]))
     return float(np.logical_and.reduce(steps).mean()) / expected if expected else float("nan")
 
 
 def replica_down(trace: Trace, recovery_s: float) -> Steps:
-    """Return when a replica that stays in its zone does not serve: while none is to be had, and ``recovery_s`` more."""
+    """Return the steps in which a replica fixed to its zone is down: without a machine, and ``recovery_s`` longer."""
     late = _steps(trace, recovery_s)
     down: Steps = trace.taken.copy()
     for back in np.flatnonzero(trace.taken[:-1] & ~trace.taken[1:]) + 1:
@@ -92,7 +92,7 @@ def replica_down(trace: Trace, recovery_s: float) -> Steps:
 
 
 def outages(trace: Trace, recovery_s: float) -> Steps:
-    """Return the ``recovery_s`` after each preemption, as for a replica that is replaced wherever there is room."""
+    """Return the ``recovery_s`` after each preemption, for a replica that is replaced in any zone with capacity."""
     late = _steps(trace, recovery_s)
     down = np.zeros_like(trace.taken)
     for lost in trace.preemptions:
@@ -101,13 +101,14 @@ def outages(trace: Trace, recovery_s: float) -> Steps:
 
 
 def pool_down(traces: Sequence[Trace], replicas: int, recovery_s: float, on_demand: int = 0) -> Steps:
-    """Return when a pool that moves has no replica up.
+    """Return the steps in which a pool that may change zones has no replica up.
 
-    It wants ``replicas`` spot machines. One that is taken is replaced at once in the zone with the fewest of ours among
-    those that have room, and serves ``recovery_s`` later; while no zone has room it waits for one.
+    The pool wants ``replicas`` spot machines. A preempted machine is replaced at once and serves ``recovery_s`` later.
+    The replacement is in the zone with the fewest machines of the pool among the zones with capacity. It waits while no
+    zone has capacity.
 
     Args:
-        on_demand: machines beside them that are never taken.
+        on_demand: number of additional machines that are never preempted.
     """
     if on_demand:
         return np.zeros_like(traces[0].taken)
@@ -128,15 +129,15 @@ def pool_down(traces: Sequence[Trace], replicas: int, recovery_s: float, on_dema
 
 
 def none_up(downs: Sequence[Steps]) -> Steps:
-    """Return when all are down at once."""
+    """Return the steps in which all are down at once."""
     return np.asarray(np.logical_and.reduce(downs), dtype=np.bool_)
 
 
 def share_with_interval(down: Steps, block: int, resamples: int, chance: np.random.Generator) -> Share:
-    """Return the share of steps that are true, with a moving-block bootstrap interval: blocks keep runs whole.
+    """Return the share of true steps with a moving-block bootstrap interval; blocks preserve runs.
 
     Args:
-        block: steps of a block: longer than an outage, much shorter than the trace.
+        block: steps per block: longer than an outage, much shorter than the trace.
     """
     sums = np.concatenate(([0], np.cumsum(down, dtype=np.int64)))
     blocks = sums[block:] - sums[:-block]
@@ -148,5 +149,5 @@ def share_with_interval(down: Steps, block: int, resamples: int, chance: np.rand
 
 
 def _steps(trace: Trace, span_s: float) -> int:
-    """Return a span in whole steps, upwards."""
+    """Return a duration in whole steps, rounded up."""
     return int(-(-span_s // trace.step_s))

@@ -1,13 +1,13 @@
-"""What a rented machine is told at its first start: the files of its boot, and a service that installs and runs it.
+"""First-boot configuration of a rented machine: the files of its bundle, and a service that installs and runs it.
 
-Place: pure.
+Sans-I/O.
 Source: cloud-init's "cloud config" format (modules write_files, packages, runcmd), systemd.service(5); Amazon EC2
-takes at most 16 KiB of user data, before base64, and cloud-init reads it gzipped.
+accepts at most 16 KiB of user data, before base64, and cloud-init reads it gzipped.
 
-``cloud_config`` is for providers that take user data, ``shell_script`` for those that only run a script as root; both
-come to the same files. What programs say goes to the journal and the console under their names, ``switch[712]: ...``;
-``lines_of`` finds it there. What pip installs is pinned by hash (``requirements``), for it runs beside the machine's
-keys. A machine whose programs are done powers itself off.
+``cloud_config`` is for providers that accept user data, ``shell_script`` for those that only run a script as root; both
+produce the same files. The output of programs goes to the journal and the console under their names, such as
+``switch[712]: ...``; ``lines_of`` finds it there. Packages of pip are pinned by hash (``requirements``), because their
+code can reach the machine's keys. A machine whose programs have ended powers itself off.
 """
 
 from __future__ import annotations
@@ -43,21 +43,23 @@ _REQUIREMENTS: Final = "/etc/fog-requirements.txt"
 _INSTALL: Final = "/usr/local/sbin/fog-install"
 _PACKAGES: Final = ("python3-venv", "iproute2", "util-linux")
 _PRIVATE: Final = 0o600
-_NODE_USER: Final = "fog-node"  # runs the users' nodes: it reads no key of the machine
+_NODE_USER: Final = "fog-node"  # user account of the users' nodes, which cannot read the machine's keys
 _NODE_HOME: Final = "/var/lib/fog-node"
 _MAKE_USER: Final = (
     f"id -u {_NODE_USER} >/dev/null 2>&1 || useradd --system --user-group --shell /usr/sbin/nologin"
     f" --home-dir {_NODE_HOME} --create-home {_NODE_USER}"
 )
-# User data, with the machine's keys, can be read from the metadata service: only root's programs reach it. By rules of
-# routing, which need no packet filter; name service on that address (UDP) is left alone.
+# The metadata service exposes user data with the machine's secrets, so only programs of root may reach it. Routing
+# rules
+# enforce this without a packet filter; DNS on that address (UDP) remains reachable.
 _METADATA: Final = "".join(
     f"{ip} rule del pref 90 2>/dev/null || true\n"
     f"{ip} rule add pref 90 uidrange 1-4294967294 ipproto tcp dport 80 to {address} prohibit{otherwise}\n"
     for ip, address, otherwise in (("ip", "169.254.169.254", ""), ("ip -6", "fd00:ec2::254", " || true"))
 )
-# Source: systemd.exec(5), systemd.resource-control(5). Root without most capabilities: it changes to the nodes' user
-# (SETUID, SETGID, SETPCAP), ends their processes (KILL), and meets ROS's files of that user (DAC_OVERRIDE).
+# Source: systemd.exec(5), systemd.resource-control(5). Root without most capabilities: the service changes to
+# the nodes' user (SETUID, SETGID, SETPCAP), ends their processes (KILL), and accesses ROS files of that user
+# (DAC_OVERRIDE).
 _FENCES: Final = f"""NoNewPrivileges=yes
 CapabilityBoundingSet=CAP_NET_RAW CAP_NET_ADMIN CAP_BPF CAP_PERFMON CAP_SETUID CAP_SETGID CAP_SETPCAP CAP_KILL
 CapabilityBoundingSet=CAP_DAC_OVERRIDE
@@ -84,7 +86,7 @@ RuntimeDirectoryMode=0700
 """
 _CLOSE: Final = (
     ["chmod", "-R", "go-rwx", HOME],
-    ["chmod", "go+x", HOME],  # to what nodes of their own user read, by its path
+    ["chmod", "go+x", HOME],  # so that nodes of another user reach the files that they read
     ["find", HOME, "-maxdepth", "1", "-name", "*.xml", "-exec", "chmod", "go+r", "{}", "+"],  # the middleware's profile
 )
 _LOG: Final = f"""[Unit]
@@ -103,9 +105,11 @@ WantedBy=multi-user.target
 
 
 class Vxlan(Section):
-    """A layer-2 device through a tunnel that the operator's side ends. It is neither encrypted nor authenticated by
-    itself: frames on it are sealed, but who may inject some is for the firewall or a VPN below to say. ``remote`` is
-    the other end as the machine reaches it, ``device`` what the tunnel is called on the machine: the switch's port.
+    """Layer-2 device through a tunnel to the operator's side.
+
+    The tunnel is neither encrypted nor authenticated: frames in it are sealed, but a firewall or a VPN below must
+    prevent injected frames. ``remote`` is the address of the other end as the machine reaches it. ``device`` is the
+    name of the tunnel on the machine: the switch's port.
     """
 
     remote: IPv4Address | IPv6Address
@@ -114,10 +118,12 @@ class Vxlan(Section):
 
 
 class Setup(Section):
-    """What a machine installs beside its boot: for pip, each with its hash, ``requirements`` (the wheel of this
-    package, those with the nodes, and all that they need) and the file ``requirements_file``; ``packages`` of the
-    distribution, beside those that are needed anyway. Without ``vxlan`` the devices that the boot's switch names must
-    be there without it. There is no default for pip: a name that nobody holds on an index would be somebody's to take.
+    """Software that a machine installs in addition to its bundle.
+
+    For pip, each with its hash: ``requirements`` (the wheel of this package, wheels with the nodes, and all
+    dependencies) and the file ``requirements_file``. ``packages`` are packages of the distribution in addition to the
+    required ones. Without ``vxlan``, the devices of the bundle's switch must exist. There is no default for pip,
+    because anyone could register an unused name on an index.
     """
 
     requirements: tuple[Annotated[str, AfterValidator(pinned)], ...] = ()
@@ -127,17 +133,17 @@ class Setup(Section):
 
     @property
     def has_requirements(self) -> bool:
-        """Return whether pip installs anything; else the image brings ``/opt/fog``."""
+        """Return whether pip installs anything; otherwise the image contains ``/opt/fog``."""
         return bool(self.requirements) or self.requirements_file is not None
 
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """A file of the machine, owned by root.
+    """File of the machine, owned by root.
 
     Args:
-        path: absolute.
-        mode: its permissions.
+        path: absolute path.
+        mode: permission bits.
     """
 
     path: str
@@ -146,13 +152,13 @@ class Placed:
 
 
 def placed(files: Mapping[str, bytes], setup: Setup) -> list[Placed]:
-    """Return all that is written on the machine.
+    """Return all files to write on the machine.
 
     Args:
-        files: a packed boot: path below the machine's folder -> content.
+        files: packed bundle: path below the machine's folder -> content.
 
     Raises:
-        LocalError: a path leads out of that folder, or the file of requirements is not pinned by hash.
+        LocalError: a path leads out of that folder, or the requirements file is not pinned by hash.
     """
     for path in files:
         if path.startswith("/") or ".." in path.split("/"):
@@ -168,7 +174,7 @@ def placed(files: Mapping[str, bytes], setup: Setup) -> list[Placed]:
 
 
 def cloud_config(files: Mapping[str, bytes], setup: Setup) -> str:
-    """Return the machine's set-up as ``#cloud-config``. Text stays readable; the rest is base64.
+    """Return the machine's set-up as ``#cloud-config``. Text remains readable; other content is base64.
 
     Raises:
         LocalError: a path of ``files`` leads out of the machine's folder.
@@ -191,10 +197,10 @@ def cloud_config(files: Mapping[str, bytes], setup: Setup) -> str:
 
 
 def user_data(files: Mapping[str, bytes], setup: Setup) -> bytes:
-    """Return ``cloud_config`` as EC2 takes it: gzipped.
+    """Return ``cloud_config`` in EC2's form: gzipped.
 
     Raises:
-        LocalError: it is more than EC2 takes, or a path of ``files`` leads out of the machine's folder.
+        LocalError: it exceeds EC2's limit, or a path of ``files`` leads out of the machine's folder.
     """
     data = gzip.compress(cloud_config(files, setup).encode(), mtime=0)
     if len(data) > USER_DATA_MAX_BYTES:
@@ -207,7 +213,7 @@ def user_data(files: Mapping[str, bytes], setup: Setup) -> bytes:
 
 
 def shell_script(files: Mapping[str, bytes], setup: Setup) -> str:
-    """Return a script for bash that, run by root or one who may ``sudo``, does what ``cloud_config`` does.
+    """Return a bash script with the effect of ``cloud_config``, for root or a user with ``sudo``.
 
     Raises:
         LocalError: a path of ``files`` leads out of the machine's folder.
@@ -224,7 +230,7 @@ def shell_script(files: Mapping[str, bytes], setup: Setup) -> str:
 
 
 def lines_of(journal: Iterable[str], program: str, lines: int) -> str:
-    """Return the last lines that a program wrote; of ``fog-machine`` itself where none is named."""
+    """Return the last lines that a program wrote; of ``fog-machine`` itself if no program is named."""
     sign = f"{program or 'fog-machine'}["
     return "\n".join(deque((line.rstrip() for line in journal if sign in line), maxlen=lines))
 
@@ -246,7 +252,7 @@ def _start(files: Mapping[str, bytes], setup: Setup) -> list[str]:
 
 
 def _install(setup: Setup) -> str:
-    # the service runs it before each start, so that an index that cannot be reached now is asked again
+    # the service runs it before each start, so an unreachable index is tried again
     if not setup.has_requirements:
         return f"""#!/bin/sh
 set -eu

@@ -1,6 +1,6 @@
-"""What the supervisor knows of a provider of machines.
+"""Protocol between the supervisor and providers of machines.
 
-Place: interface.
+Sans-I/O: interfaces only.
 """
 
 from __future__ import annotations
@@ -16,53 +16,53 @@ __all__ = ["GatewayProvider", "Provider"]
 
 
 class Provider(Protocol):
-    """Machines to be had somewhere. All calls may block for a while; none keeps state that a restart would miss.
+    """Provider of machines. All calls may block; none keeps state that a restart would lose.
 
     Attributes:
         name: as in offers and in ``fog.yaml``.
-        poll_s: how often ``describe`` is worth asking.
+        poll_s: useful interval between calls of ``describe``.
     """
 
     name: str
     poll_s: float
 
     def offers(self, hardware: Hardware, *, spot: bool) -> list[Offer]:
-        """Return the price list for what has enough, the cheapest first.
+        """Return the offers with enough hardware, cheapest first.
 
         Raises:
-            StoreError: the provider cannot be asked now.
+            StoreError: the provider cannot be reached now.
         """
         ...
 
     def create(self, spec: MachineSpec, boot: MachineBundle) -> str:
-        """Ask for a machine; return its id as soon as the provider has taken the request.
+        """Request a machine; return its id as soon as the provider has accepted the request.
 
         Raises:
-            StoreError: there is none to be had now; try again, or elsewhere.
-            LocalError: it will never be had this way: wrong credentials, quota, region.
+            StoreError: no capacity now; try again, or elsewhere.
+            LocalError: the request can never succeed: wrong credentials, quota, region.
         """
         ...
 
     def describe(self, cluster: str) -> list[Machine]:
-        """Return all machines of a cluster that were not gone before, in any state: also those no journal knows.
+        """Return all machines of a cluster in any state, also those that the journal does not contain.
 
-        A machine that ended is told as ``GONE`` for a while, or not at all.
+        A machine that ended is reported as ``GONE`` for a while, or not at all.
 
         Raises:
-            StoreError: the provider cannot be asked now.
+            StoreError: the provider cannot be reached now.
         """
         ...
 
     def terminate(self, ids: Sequence[str]) -> None:
-        """Give machines back; what is gone already is fine.
+        """Terminate machines; machines that are gone already are ignored.
 
         Raises:
-            StoreError: the provider cannot be asked now.
+            StoreError: the provider cannot be reached now.
         """
         ...
 
     def drain(self, machine: str) -> None:
-        """Let a machine's programs finish what is under way and take on nothing new."""
+        """Let a machine's programs finish calls in progress and accept no new ones."""
         ...
 
     def log(self, machine: str, program: str, lines: int) -> str:
@@ -74,7 +74,7 @@ class Provider(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of what the provider's adapter holds; machines stay."""
+        """Release the adapter's resources; machines continue."""
         ...
 
 
@@ -82,27 +82,27 @@ class Provider(Protocol):
 class GatewayProvider(Protocol):
     """Provider whose machines can be the gateway of their group: FogROS2-FT, Figure 4, right.
 
-    A machine that is the gateway has one device more, towards the robot. Any machine of the group can be given it at
-    any time, and two may have theirs at once.
+    A machine that is the gateway has one additional device, towards the robot. Any machine of the group can receive it
+    at any time, and two machines may have one at once.
 
     Attributes:
-        uplink_iface: that device, as the machine's switch names it.
+        uplink_iface: name of that device in the configuration of the machine's switch.
     """
 
     uplink_iface: str
 
     def replica_gateway(self, region: str) -> str:
-        """Return the label of the replica gateway of a region's machines; empty: their gateway is no machine."""
+        """Return the label of the replica gateway of a region's machines; empty: their gateway is dedicated."""
         ...
 
     def attach_uplink(self, machine: str) -> None:
-        """Make a machine the gateway. Fine if it is.
+        """Make a machine the gateway; no effect if it is.
 
         Raises:
-            LocalError: there is no such machine, or its gateway is dedicated.
+            LocalError: the machine does not exist, or its gateway is dedicated.
         """
         ...
 
     def detach_uplink(self, machine: str) -> None:
-        """Let a machine be the gateway no longer. Fine if it is not, or is gone."""
+        """End a machine's role as gateway; no effect if it is not the gateway, or is gone."""
         ...

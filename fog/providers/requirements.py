@@ -1,9 +1,8 @@
-"""Requirements of a machine: what pip installs on it, each pinned by version and hash.
+"""Requirements of a machine for pip, each pinned by version and hash.
 
-Place: pure, but for ``read_requirements``, which reads one file.
-Source: pip's "Secure installs" and "Requirements File Format". What pip installs runs beside a machine's keys, so
-nothing is taken from an index by its name alone: pip is called with ``--require-hashes``, which also refuses a
-dependency that is not listed.
+I/O: ``read_requirements`` reads one file. All other functions are sans-I/O.
+Source: pip's "Secure installs" and "Requirements File Format". Installed code can reach a machine's keys, so no package
+is selected by its name alone: pip runs with ``--require-hashes``, which also refuses unlisted dependencies.
 """
 
 from __future__ import annotations
@@ -33,10 +32,10 @@ _COMMENT: Final = re.compile(r"(?:^|\s)#.*")
 
 
 def pinned(requirement: str) -> str:
-    """Return a requirement that names what it installs by hash.
+    """Return the requirement if it is pinned by hash.
 
     Raises:
-        ValueError: it does not.
+        ValueError: it is not pinned by hash.
     """
     if not (_URL.match(requirement) or _PINNED.match(requirement)) or "\n" in requirement:
         raise ValueError(f"{requirement!r}: {_EXPECTED}")
@@ -44,10 +43,10 @@ def pinned(requirement: str) -> str:
 
 
 def read_requirements(path: Path) -> bytes:
-    """Return a requirements file for pip, whose every requirement is pinned by hash.
+    """Return a requirements file for pip in which every requirement is pinned by hash.
 
     Raises:
-        LocalError: it cannot be read, or has a line of another kind; the text names the line.
+        LocalError: the file cannot be read, or a line is not pinned; the text names the line.
     """
     try:
         with path.open("rb") as file:
@@ -74,7 +73,7 @@ def read_requirements(path: Path) -> bytes:
 
 
 def _lines(text: str) -> Iterator[tuple[int, str]]:
-    """Yield each logical line with the number of its first; continuations are joined, comments left out."""
+    """Yield each logical line with the number of its first; continuations are joined, comments omitted."""
     begun, whole = 0, ""
     for number, line in enumerate(text.splitlines(), 1):
         begun = begun or number

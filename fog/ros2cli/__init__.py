@@ -1,1 +1,1 @@
-"""``ros2 fog ...``: the ``fog`` command as a plug-in of ROS 2's own command line."""
+"""Plug-in of ROS 2's command line: the ``fog`` command as ``ros2 fog ...``."""

@@ -1,6 +1,6 @@
-"""The command ``fog`` of ``ros2``.
+"""Command ``fog`` of ``ros2``.
 
-Place: command; imported by ros2cli through the entry point ``ros2cli.command``.
+I/O; imported by ros2cli through the entry point ``ros2cli.command``.
 Source: ros2cli 0.32 (jazzy), ``ros2cli.command``.
 """
 

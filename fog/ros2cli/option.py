@@ -1,6 +1,6 @@
-"""``ros2 launch``: every launch file that it runs may make a ``FogCluster`` without returning it.
+"""Option of ``ros2 launch``: every launch file may construct a ``FogCluster`` without returning it.
 
-Command; imported by ros2launch through the entry point ``ros2launch.option``, before it loads a launch file.
+I/O; imported by ros2launch through the entry point ``ros2launch.option``, before it loads a launch file.
 Source: ros2launch 0.26 (jazzy), ``ros2launch.option``.
 """
 
@@ -17,7 +17,7 @@ class FogOption(OptionExtension):  # type: ignore[misc]  # ros2launch has no typ
     """Adds no option."""
 
     def prestart(self, args: argparse.Namespace) -> None:  # noqa: ARG002  # their call
-        """Put launch files under watch."""
+        """Watch launch files from now on."""
         from fog.launch.unreturned import watch_ros_launch
 
         watch_ros_launch()

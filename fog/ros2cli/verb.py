@@ -1,6 +1,6 @@
-"""The verbs of ``ros2 fog``: each hands its words to the ``fog`` command, so that both are one.
+"""Verbs of ``ros2 fog``: each passes its arguments to the ``fog`` command.
 
-Place: command; imported by ros2cli through the entry points ``ros2cli.extension_point`` and ``fog.verb``.
+I/O; imported by ros2cli through the entry points ``ros2cli.extension_point`` and ``fog.verb``.
 Source: ros2cli 0.32 (jazzy), ``ros2cli.plugin_system``.
 """
 
@@ -28,7 +28,7 @@ __all__ = [
 
 
 class VerbExtension:
-    """The extension point ``fog.verb``; ros2cli sets ``NAME`` to the entry point's."""
+    """The extension point ``fog.verb``; ros2cli sets ``NAME`` to the name of the entry point."""
 
     NAME: str | None = None
     EXTENSION_POINT_VERSION = "0.1"
@@ -37,12 +37,12 @@ class VerbExtension:
         satisfies_version(PLUGIN_SYSTEM_VERSION, "^0.1")
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:  # noqa: ARG002  # their call
-        """Take all words as they are, ``--help`` included: the ``fog`` command knows what they mean."""
-        parser.prefix_chars = "\0"  # so that no word counts as an option
+        """Accept all arguments unparsed, including ``--help``; the ``fog`` command parses them."""
+        parser.prefix_chars = "\0"  # so that no argument is parsed as an option
         parser.add_argument("words", nargs=argparse.REMAINDER)
 
     def main(self, *, args: argparse.Namespace) -> int:
-        """Run ``fog NAME WORDS``; leaves with its exit code if that is not 0."""
+        """Run ``fog NAME WORDS``; exit with its status if that is not 0."""
         from fog.cli.app import main
 
         main([str(self.NAME), *args.words], name="ros2 fog")

@@ -1,6 +1,6 @@
-"""What a provider is asked to do, each in a thread of its own, so that no slow one keeps the supervisor from looking.
+"""Runner of provider calls, each in its own thread, so that a slow call does not block reconciliation.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from gdp.errors import GdpError
 
 __all__ = ["ActionRunner", "Done"]
 
-_MAX: Final = 8  # at once
+_MAX: Final = 8  # concurrent actions
 
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """An act that is over.
+    """Finished action.
 
     Args:
-        result: what the provider said; empty where there is nothing to say.
+        result: result of the provider; empty if there is none.
         error: why it failed.
     """
 
@@ -34,10 +34,10 @@ class Done:
 
 
 class ActionRunner:
-    """Acts under way, one a machine.
+    """Running actions, at most one per machine.
 
     Args:
-        wake: called when one is over, from its thread.
+        wake: called when an action has ended, from its thread.
     """
 
     def __init__(self, wake: Callable[[], None]) -> None:
@@ -46,22 +46,22 @@ class ActionRunner:
         self._futures: dict[tuple[str, str], tuple[str, Future[str | None]]] = {}
 
     def begin(self, cluster: str, machine: str, what: str, act: Callable[[], str | None]) -> None:
-        """Do something about a machine about which nothing else is being done."""
+        """Begin an action on a machine that is not busy."""
         future = self._threads.submit(act)
         self._futures[cluster, machine] = what, future
         future.add_done_callback(lambda _: self._wake())
 
     def is_busy(self, cluster: str, machine: str = "") -> bool:
-        """Return whether something is being done about a machine, or without one about any of the cluster."""
+        """Return whether an action runs on a machine, or without a machine on any of the cluster."""
         return any(key == (cluster, machine) or (not machine and key[0] == cluster) for key in self._futures)
 
     @property
     def running(self) -> int:
-        """Return how many acts are not over."""
+        """Return the number of actions that have not ended."""
         return sum(not future.done() for _, future in list(self._futures.values()))
 
     def poll_done(self) -> list[Done]:
-        """Return, once, what is over. An error that is none of ours is raised."""
+        """Return each finished action once. An error other than ``GdpError`` is raised."""
         over = [(key, what, future) for key, (what, future) in self._futures.items() if future.done()]
         found = []
         for key, what, future in over:
@@ -73,5 +73,5 @@ class ActionRunner:
         return found
 
     def close(self) -> None:
-        """Wait until all is over."""
+        """Wait until all actions have ended."""
         self._threads.shutdown(wait=True)

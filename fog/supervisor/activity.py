@@ -1,4 +1,4 @@
-"""Whether a cluster is used, from the message counters of proxies.
+"""Activity of a cluster, computed from message counters of proxies.
 
 Sans-I/O.
 """
@@ -14,7 +14,7 @@ class Activity:
     """Time since the last call of a cluster.
 
     Args:
-        begun_unix_s: when the cluster was first looked at.
+        begun_unix_s: when the cluster was first observed.
     """
 
     def __init__(self, begun_unix_s: float) -> None:
@@ -22,9 +22,9 @@ class Activity:
         self._counts: dict[str, int] = {}
 
     def idle_s(self, counts: Mapping[str, int | None], now_s: float) -> float:
-        """Take in the counter of each proxy, and return for how many seconds none has grown.
+        """Update the counter of each proxy, and return for how many seconds none has grown.
 
-        A proxy that does not answer counts as used: nothing is ended on a guess.
+        A proxy that does not respond counts as used, so a cluster never ends without evidence.
         """
         for proxy, count in counts.items():
             if count is None or count > self._counts.get(proxy, 0):

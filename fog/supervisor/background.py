@@ -1,6 +1,6 @@
-"""One supervisor a site, in the background: started where none lives, known by a lock that the kernel ends with it.
+"""Background process of a site's single supervisor, identified by a lock that the kernel releases with the process.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ __all__ = ["LOG", "ensure", "held", "is_running", "pid_of"]
 _LOCK: Final = "supervisor.lock"
 LOG: Final = "supervisor.log"
 _LOG_MAX_BYTES: Final = 4 << 20
-_CONFLICT_S: Final = 1.0  # the lock is held by whoever looks, or by another supervisor
+_CONFLICT_S: Final = 1.0  # the lock is held for a check, or by another supervisor
 _STEP_S: Final = 0.05
 
 
 def is_running(site: Site) -> bool:
-    """Return whether a supervisor of this site lives."""
+    """Return whether a supervisor of this site runs."""
     with (site.state / _LOCK).open("a") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -38,7 +38,7 @@ def is_running(site: Site) -> bool:
 
 
 def pid_of(site: Site) -> int | None:
-    """Return the process id of the supervisor that lives."""
+    """Return the process id of the running supervisor; None: there is none."""
     if not is_running(site):
         return None
     with suppress(OSError, ValueError):
@@ -47,9 +47,9 @@ def pid_of(site: Site) -> int | None:
 
 
 def ensure(site: Site) -> bool:
-    """Start a supervisor if none lives; return whether one was started.
+    """Start a supervisor if none runs; return whether one was started.
 
-    The lock is taken here and handed down, so that of many who ask at once one starts it.
+    This process acquires the lock and the child inherits it, so only one of several concurrent callers starts it.
     """
     with (site.state / _LOCK).open("a") as lock:
         try:
@@ -78,10 +78,10 @@ def _of(site: Site) -> list[str]:
 
 @contextmanager
 def held(site: Site, descriptor: int | None) -> Iterator[None]:
-    """Hold the supervisor's lock while within; this process is the one then.
+    """Hold the supervisor's lock within the context; this process is then the supervisor.
 
     Raises:
-        LocalError: another one has it.
+        LocalError: another process holds it.
     """
     if descriptor is not None:
         with os.fdopen(descriptor, "a"):

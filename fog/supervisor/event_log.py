@@ -1,4 +1,4 @@
-"""Events of clusters and machines: written into the journal, and logged.
+"""Log of events of clusters and machines, in the journal and in the process log.
 
 I/O.
 """
@@ -17,27 +17,27 @@ log = logging.getLogger(__name__)
 
 
 class EventLog:
-    """Writes what happens to clusters and machines; each trouble once, until it is over."""
+    """Writer of events of clusters and machines; it writes each trouble once until it is cleared."""
 
     def __init__(self, journal: Journal) -> None:
         self._journal = journal
         self._troubles: dict[str, str] = {}
 
     def put(self, record: Record, what: str, detail: str, now_s: float, since_unix_s: float | None = None) -> None:
-        """Store a machine's record, with the event if ``what`` names one; ``since_unix_s``: when it happened."""
+        """Store a machine's record, with the event if ``what`` names one; ``since_unix_s``: time of the event."""
         self._journal.put(record, now_s, what, detail, since_unix_s)
         if what:
             log.info("machine %s cluster=%s machine=%s %s", what, record.spec.cluster, record.name, detail)
 
     def add_trouble(self, cluster: str, reason: str, *, key: str = "") -> None:
-        """Write what is wrong with a cluster, once; ``key``: of several troubles of one cluster."""
+        """Write a trouble of a cluster once; ``key`` distinguishes troubles of one cluster."""
         if self._troubles.get(key or cluster) != reason:
             self._troubles[key or cluster] = reason
             self._journal.tell(time.time(), cluster, "", "trouble", reason)
             log.warning("trouble cluster=%s reason=%s", cluster, reason)
 
     def clear_trouble(self, key: str) -> None:
-        """Note that a trouble is over."""
+        """Record that a trouble has ended."""
         self._troubles.pop(key, None)
 
     def has_trouble(self, key: str) -> bool:

@@ -1,6 +1,6 @@
-"""What happened to a machine, from what was known of it before and is now: the lines of ``fog status --events``.
+"""Events of a machine, derived from its records before and after an observation, for ``fog status --events``.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ __all__ = ["Change", "changes"]
 
 
 class Change(NamedTuple):
-    """What happened; ``since_unix_s``: when, if the machine's or the provider's records say so."""
+    """Event; ``since_unix_s``: its time, if the machine's or the provider's records contain it."""
 
     what: str
     detail: str
@@ -23,10 +23,10 @@ class Change(NamedTuple):
 
 
 def changes(before: Record, after: Record, seen: Machine | None, now_s: float) -> Iterator[Change]:
-    """Yield what happened.
+    """Yield the events between two records.
 
     Args:
-        seen: what the provider said of it now.
+        seen: the provider's present description.
     """
     since = f"{now_s - after.asked_unix_s:.1f} s after it was asked for"
     if before.up_unix_s is None and after.up_unix_s is not None:

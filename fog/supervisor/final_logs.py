@@ -1,6 +1,6 @@
-"""What the programs of a machine that was lost said last: a provider forgets that with the machine.
+"""Final log lines of a lost machine's programs, which the provider deletes with the machine.
 
-Place: shell; asks the provider.
+I/O; queries the provider.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from gdp.errors import GdpError
 
 __all__ = ["MACHINE", "keep", "kept"]
 
-MACHINE: Final = "machine"  # itself, beside its programs
+MACHINE: Final = "machine"  # log of the machine agent, in addition to those of its programs
 _LINES: Final = 20
 _CHARS: Final = 4_000
 
 
 def keep(provider: Provider, machine: str, nodes: Sequence[str]) -> str:
-    """Return what ``kept`` reads; what cannot be had now is lost.
+    """Return the text that ``kept`` reads; logs that cannot be read now are lost.
 
     Args:
-        machine: the provider's id of it.
-        nodes: names of the programs beside switch and proxy.
+        machine: the provider's id.
+        nodes: names of the programs in addition to switch and proxy.
     """
     found = {}
     for program in (*nodes, PROXY, SWITCH, ""):
-        with suppress(GdpError):  # its provider may not show them, or has forgotten it already
+        with suppress(GdpError):  # the provider may not offer logs, or has deleted them already
             if text := provider.log(machine, program, _LINES).strip():
                 found[program or MACHINE] = text[-_CHARS:]
     return json.dumps(found)

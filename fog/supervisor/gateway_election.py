@@ -3,8 +3,8 @@
 Sans-I/O. Source: FogROS2-FT, Figure 4, right; the election is made by the supervisor, not among the machines as in VRRP
 (RFC 9568), because only the provider can move the uplink.
 
-A gateway keeps its role while it works. Each answer follows from the records alone, so a supervisor that was killed and
-started again elects the same machine.
+A gateway keeps its role while it works. Each result follows from the records alone, so a restarted supervisor elects
+the same machine.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ __all__ = ["Election", "elect", "is_settling"]
 
 @dataclass(frozen=True, slots=True)
 class Election:
-    """A change of the role.
+    """Change of the role.
 
     Args:
-        new: the machine that becomes the gateway.
-        old: the machine that was it, if it is there still.
+        new: machine that becomes the gateway.
+        old: previous gateway, if the machine still exists.
         reason: why, in a few words.
     """
 
@@ -34,13 +34,12 @@ class Election:
 
 
 def elect(group: Sequence[Record], label: str, now_s: float, patience: Timeouts) -> Election | None:
-    """Return the change of a group's gateway that is due; None: it stays as it is, or no machine can be the gateway.
+    """Return the due change of a group's gateway; None: no change, or no machine can be the gateway.
 
-    Preferred are, in this order: machines that are up, that are heard, that were not the gateway before, that are not
-    spot machines, that are older.
+    Criteria in this order: up, reachable, not the gateway before, not a spot machine, older.
 
     Args:
-        group: the machines next to this gateway, of all clusters. Those that are gone only explain a change.
+        group: machines of this gateway, of all clusters. Machines that are gone only explain a change.
         label: of the gateway.
     """
     there = [each for each in group if not each.is_gone and each.id]
@@ -53,11 +52,11 @@ def elect(group: Sequence[Record], label: str, now_s: float, patience: Timeouts)
         lost = max((each for each in group if each.is_gone and each.gateway == label), key=_last_s, default=None)
         return Election(best, None, "the first machine" if lost is None else f"{lost.name} is gone: {lost.reason}")
     if old.up_unix_s is None:
-        is_cut_off = best.up_unix_s is not None and not best.is_serving  # else its switch may forward already
+        is_cut_off = best.up_unix_s is not None and not best.is_serving  # otherwise its switch may already forward
         is_late = now_s - _last_s(old) >= (patience.gateway_s if is_cut_off else patience.partition_timeout_s)
         return Election(best, old, f"{old.name} does not come up") if is_late else None
     if best.up_unix_s is None:
-        return None  # it would forward nothing yet
+        return None  # it would not forward yet
     if old.is_outgoing:
         return Election(best, old, f"{old.name} leaves: {old.reason}")
     if _is_suspect(old, there, now_s, patience) and _last_s(best) < (old.unreachable_unix_s or 0.0):
@@ -66,16 +65,16 @@ def elect(group: Sequence[Record], label: str, now_s: float, patience: Timeouts)
 
 
 def is_settling(group: Sequence[Record], label: str, now_s: float, patience: Timeouts) -> bool:
-    """Return whether the gateway is so new that the silence of the machines behind it means nothing yet."""
+    """Return whether the gateway is too new to interpret unreachable machines behind it."""
     since_s = max((_last_s(each) for each in group if each.gateway == label), default=0.0)
     return now_s - since_s < patience.gateway_s
 
 
 def _is_suspect(gateway: Record, there: Sequence[Record], now_s: float, patience: Timeouts) -> bool:
-    """Return whether a gateway that runs seems to forward nothing: no replica of the group is heard."""
+    """Return whether a running gateway seems not to forward: no replica of the group is reachable."""
     if gateway.unreachable_unix_s is None or any(each.is_serving for each in there):
         return False
-    since_s = max(gateway.unreachable_unix_s + patience.unreachable_s, _last_s(gateway) + patience.gateway_s)
+    since_s = max(gateway.unreachable_unix_s + patience.unreachable_timeout_s, _last_s(gateway) + patience.gateway_s)
     return now_s >= since_s
 
 

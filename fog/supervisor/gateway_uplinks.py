@@ -1,6 +1,6 @@
-"""Gateways of groups of machines: who is elected, and the moves of uplinks that follow.
+"""Gateways of groups of machines: elections, and the resulting moves of uplinks.
 
-I/O; writes the journal and asks the provider.
+I/O; writes the journal and calls the provider.
 """
 
 from __future__ import annotations
@@ -22,24 +22,25 @@ __all__ = ["GatewayUplinks"]
 
 
 class GatewayUplinks:
-    """Keeps one gateway in each group of machines."""
+    """Controller that maintains one gateway in each group of machines."""
 
     def __init__(self, journal: Journal, events: EventLog, actions: MachineActions, patience: Timeouts) -> None:
         self._journal = journal
         self._events = events
         self._actions = actions
         self._patience = patience
-        self._uplinks: set[str] = set()  # machines whose uplink was seen to, since this supervisor began
+        self._uplinks: set[str] = set()  # machines whose uplink was checked since this supervisor started
 
     def reconcile(
         self, cluster: str, records: list[Record], seen: Mapping[str, Machine], now_s: float
     ) -> frozenset[str]:
-        """Elect gateways among machines, and have the provider move their uplinks.
+        """Elect gateways among machines, and make the provider move their uplinks.
 
         Args:
-            records: of the cluster; those whose role changes are replaced.
+            records: of the cluster; records whose role changes are replaced.
 
-        Returns the machines that may be silent because their gateway is new.
+        Returns:
+            Names of machines that may be unreachable because their gateway is new.
         """
         provider = self._actions.provider
         if not isinstance(provider, GatewayProvider):
@@ -69,7 +70,7 @@ class GatewayUplinks:
         return frozenset(excused)
 
     def _reconcile_uplink(self, provider: GatewayProvider, record: Record, seen: Machine) -> None:
-        """Begin to move an uplink where the provider has it otherwise; a machine on its way out keeps its own."""
+        """Begin to move an uplink if the provider's state differs; an outgoing machine keeps its uplink."""
         if record.is_gone or seen.state is MachineState.GONE:
             return
         cluster, name = record.spec.cluster, record.name

@@ -1,7 +1,6 @@
-"""What a site's clusters stand on: the provider, and on this machine its network and the robot's own side.
+"""Infrastructure of a site's clusters: the provider, and on this host the network and the robot's side.
 
-Place: shell. All of it outlives the command that made it, is found again by records in the state folder, and ends with
-``fall``.
+I/O. It outlives the command that created it. Records in the state folder describe it, and ``tear_down`` removes it.
 """
 
 from __future__ import annotations
@@ -41,13 +40,13 @@ _STEP_S: Final = 0.05
 
 
 def open_provider(site: Site, regions: Sequence[str] = ()) -> Provider:
-    """Return the site's provider; nothing is made yet.
+    """Return the site's provider; this creates no resources.
 
     Args:
-        regions: that plans name: ``local`` pretends to have them.
+        regions: regions in plans, which ``local`` simulates.
 
     Raises:
-        LocalError: what it needs is not installed, or its settings are wrong.
+        LocalError: a requirement is not installed, or its settings are wrong.
     """
     match site.provider:
         case "local":
@@ -67,7 +66,7 @@ def local_provider(site: Site, regions: Sequence[str] = ()) -> LocalProvider:
     """Return the provider ``local`` of a site.
 
     Raises:
-        LocalError: its folder belongs to somebody else.
+        LocalError: its folder belongs to another user.
     """
     from fog.providers.local.provider import LocalProvider
 
@@ -76,19 +75,19 @@ def local_provider(site: Site, regions: Sequence[str] = ()) -> LocalProvider:
 
 
 def command_of(site: Site, node: CloudNode) -> Sequence[str]:
-    """Return how a node is started on a machine of this site.
+    """Return the command line of a node on a machine of this site.
 
     Raises:
-        LocalError: machines share this host, and there is no such node here.
+        LocalError: machines share this host, and this host has no such node.
     """
     return command_line(node, os.environ) if site.provider == "local" else deferred(node)
 
 
 def set_up(site: Site) -> None:
-    """Make what machines and the robot meet on; what stands is left as it is.
+    """Set up the network between machines and robot; existing parts are unchanged.
 
     Raises:
-        LocalError: the kernel refuses, or the robot's side does not come up; the text says where its logs are.
+        LocalError: the kernel refuses, or the robot's side does not come up; the text names its logs.
     """
     with site.locked("ground"):
         if site.provider == "local":
@@ -98,22 +97,22 @@ def set_up(site: Site) -> None:
 
 
 def is_up(site: Site) -> bool:
-    """Return whether the robot's own side runs."""
+    """Return whether the robot's side runs."""
     return any(record.kept and not record.dead for record in _robot_runs(site).all())
 
 
 def tear_down(site: Site) -> None:
-    """Remove what ``stand`` made, and what is left of machines. Fine if nothing stands."""
+    """Remove what ``set_up`` created, and leftovers of machines. No effect if there are none."""
     with site.locked("ground"):
         _robot_runs(site).take_down()
         if site.devices is not None:
             for name in (site.devices.proxy, site.devices.rib, site.devices.watch):
-                delete(None, f"{name}-s")  # where its switch was killed
+                delete(None, f"{name}-s")  # left over by a killed switch
         if site.provider == "local":
             provider = local_provider(site)
             provider.close_network()
             provider.sweep()
-        for left in (site.state / SCRATCH).iterdir():  # keys of a machine whose making was killed
+        for left in (site.state / SCRATCH).iterdir():  # keys of a machine whose creation was interrupted
             shutil.rmtree(left, ignore_errors=True)
 
 
@@ -138,7 +137,7 @@ def _start_robot(site: Site, home: Path) -> None:
 
 
 def _await_up(home: Path) -> None:
-    """Return when all programs are up; status files tell nobody when they change."""
+    """Wait until all programs are up, by polling: status files have no change notification."""
     end_s = time.monotonic() + _BOOT_S
     while (status := Status.read(home)) is None or status.state is not MachineState.RUNNING:
         restarts = sum(each.restarts for each in status.programs.values()) if status is not None else 0

@@ -1,7 +1,7 @@
-"""The journal: what is wanted, which machines there are, and what happened, in one SQLite file.
+"""Journal of a site: desired clusters, machines and events, in one SQLite file.
 
-Place: I/O. An intention is written before the act; whatever dies in between, the next look finds the machine by name.
-Commands write what is wanted, the supervisor everything else; both may have the file open at once.
+I/O. An intention is written before its action; after a crash in between, the next reconciliation finds the machine by
+name. Commands write the desired state, the supervisor everything else; both may have the file open at once.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ __all__ = ["LAST_WORDS", "Cluster", "Entry", "Journal"]
 
 LAST_WORDS: Final = "last words"
 
-_PATIENCE_S: Final = 10.0  # for another process that is writing
-_EVENTS_MAX: Final = 10_000  # older ones go
+_PATIENCE_S: Final = 10.0  # wait for another writing process
+_EVENTS_MAX: Final = 10_000  # older ones are deleted
 _TABLES: Final = """
 CREATE TABLE IF NOT EXISTS clusters (
   name TEXT PRIMARY KEY, plan TEXT NOT NULL, is_up INTEGER NOT NULL, why TEXT NOT NULL,
@@ -48,12 +48,12 @@ _LATER: Final = {"since_unix_s": "REAL", "lines": "TEXT NOT NULL DEFAULT ''"}  #
 
 @dataclass(frozen=True, slots=True)
 class Cluster:
-    """What is wanted of a cluster.
+    """Desired state of a cluster.
 
     Args:
-        is_up: whether its machines are wanted at all.
-        why: it is not up, in a few words.
-        begun_unix_s: since when, for what it costs and how long it has been idle.
+        is_up: whether its machines are wanted.
+        why: reason why it is not up, in a few words.
+        begun_unix_s: start of the cluster, for its cost and idle time.
     """
 
     plan: ClusterPlan
@@ -64,12 +64,12 @@ class Cluster:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """Something that happened. ``machine`` is empty where it is about the whole cluster.
+    """Event. ``machine`` is empty for an event of the whole cluster.
 
     Args:
-        unix_s: when it was seen.
-        since_unix_s: when it came about, as the machine's or the provider's records say; None: they do not.
-        lines: of ``LAST_WORDS``, what the program ``detail`` of a machine that is gone wrote last.
+        unix_s: time of the observation.
+        since_unix_s: time of the event by the machine's or the provider's records; None: unknown.
+        lines: for ``LAST_WORDS``: final log lines of the program ``detail`` of a machine that is gone.
     """
 
     id: int
@@ -83,10 +83,10 @@ class Entry:
 
 
 class Journal:
-    """The file, opened. Every method is one transaction.
+    """Opened journal. Every method is one transaction.
 
     Raises:
-        StoreError: it cannot be read or written now; from every method, too.
+        StoreError: it cannot be read or written now; every method may raise this too.
     """
 
     def __init__(self, path: Path) -> None:
@@ -106,7 +106,7 @@ class Journal:
         self._file.close()
 
     def want(self, plan: ClusterPlan, now_s: float, *, why: str = "") -> None:
-        """Write that a cluster is wanted; one of that name that is up gets the new plan and goes on."""
+        """Write that a cluster is wanted; a running cluster of that name receives the new plan and continues."""
         with self._writing() as file:
             file.execute(
                 "INSERT INTO clusters (name, plan, is_up, why, begun_unix_s) VALUES (?, ?, 1, '', ?)"
@@ -117,7 +117,7 @@ class Journal:
             _tell(file, now_s, plan.name, "", "wanted", why or f"{len(plan.machines)} machines")
 
     def unwant(self, name: str, why: str, now_s: float) -> None:
-        """Write that a cluster is wanted no more; one that is not up already stays as it is."""
+        """Write that a cluster is no longer wanted; a cluster that is not up is unchanged."""
         with self._writing() as file:
             if file.execute(
                 "UPDATE clusters SET is_up = 0, why = ? WHERE name = ? AND is_up = 1", (why, name)
@@ -125,7 +125,7 @@ class Journal:
                 _tell(file, now_s, name, "", "down", why)
 
     def clusters(self) -> list[Cluster]:
-        """Return all clusters that there are or were, in the order of their names."""
+        """Return all present and past clusters, in the order of their names."""
         with _translated(self._path):
             query = "SELECT name, plan, is_up, why, begun_unix_s FROM clusters ORDER BY name"
             rows = self._file.execute(query).fetchall()
@@ -135,7 +135,7 @@ class Journal:
         """Return a cluster.
 
         Raises:
-            LocalError: there is none of that name.
+            LocalError: no cluster has that name.
         """
         found = {each.plan.name: each for each in self.clusters()}
         if name not in found:
@@ -144,7 +144,7 @@ class Journal:
         return found[name]
 
     def next_machine(self, cluster: str) -> str:
-        """Return a name that no machine of the cluster ever had."""
+        """Return a name that no machine of the cluster has ever had."""
         with self._writing() as file:
             (number,) = file.execute(
                 "UPDATE clusters SET machines = machines + 1 WHERE name = ? RETURNING machines", (cluster,)
@@ -154,7 +154,7 @@ class Journal:
     def put(
         self, record: Record, now_s: float, what: str = "", detail: str = "", since_unix_s: float | None = None
     ) -> None:
-        """Write what is known of a machine, and with it, if given, what happened; see ``Entry``."""
+        """Write a machine's record, and an event if given; see ``Entry``."""
         spec = record.spec
         with self._writing() as file:
             file.execute(
@@ -165,10 +165,10 @@ class Journal:
                 _tell(file, now_s, spec.cluster, spec.name, what, detail, since_unix_s)
 
     def machines(self, cluster: str, *, gone: bool = True) -> list[Record]:
-        """Return the machines of a cluster in the order in which they were asked for.
+        """Return the machines of a cluster in the order of their requests.
 
         Args:
-            gone: those that are no more as well.
+            gone: include machines that are gone.
         """
         query = "SELECT name, record FROM machines WHERE cluster = ?" + ("" if gone else " AND is_gone = 0")
         with _translated(self._path):
@@ -186,23 +186,23 @@ class Journal:
         since_unix_s: float | None = None,
         lines: str = "",
     ) -> None:
-        """Write that something happened; see ``Entry``."""
+        """Write an event; see ``Entry``."""
         with self._writing() as file:
             _tell(file, now_s, cluster, machine, what, detail, since_unix_s, lines)
 
     def last_words(self, cluster: str, machine: str) -> dict[str, str]:
-        """Return by program the last lines that were kept of a machine when it failed or was taken."""
+        """Return program -> final log lines of a machine that failed or was preempted."""
         query = "SELECT detail, lines FROM events WHERE what = ? AND cluster = ? AND machine = ? ORDER BY id"
         with _translated(self._path):
             return dict(self._file.execute(query, (LAST_WORDS, cluster, machine)).fetchall())
 
     def events(self, cluster: str = "", after: int = 0, last: int | None = None) -> list[Entry]:
-        """Return what happened, the oldest first.
+        """Return events, oldest first.
 
         Args:
-            cluster: empty: to any.
-            after: the id of the last one that is known.
-            last: only so many of the newest.
+            cluster: empty: events of all clusters.
+            after: id of the last known event.
+            last: maximum number; the newest are returned.
         """
         query = (
             "SELECT id, unix_s, cluster, machine, what, detail, since_unix_s, lines FROM events"
@@ -257,7 +257,7 @@ def _translated(path: Path) -> Iterator[None]:
         yield
     except sqlite3.Error as error:
         raise StoreError(f"{path}: {error}") from error
-    except UnicodeDecodeError as error:  # texts of a broken file, sqlite3's own words about them among those
+    except UnicodeDecodeError as error:  # text of a damaged file, also within error messages of sqlite3
         raise StoreError(f"{path}: not a text: {error}") from error
 
 
@@ -285,6 +285,6 @@ def _record(items: dict[str, object]) -> Record:
 
 
 def _number(record: Record) -> int:
-    """Return the number of a machine, as ``next_machine`` gave it."""
+    """Return the number in a machine's name, as assigned by ``next_machine``."""
     digits = record.name[1:]
     return int(digits) if digits.isascii() and digits.isdigit() and len(digits) < 20 else 0

@@ -1,6 +1,6 @@
-"""Actions on machines: create, drain, release, and what became of them.
+"""Actions on machines: create, drain and release, and their results.
 
-I/O; asks the provider, in threads. The journal is written before an action begins.
+I/O; calls the provider in threads. The journal is written before an action begins.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ DETACH: Final = "detach uplink"
 
 
 class MachineActions:
-    """Begins actions on the machines of a site, and writes their results.
+    """Executor of actions on a site's machines, which writes their results.
 
     Args:
-        provider: whose machines they are; may be replaced.
-        command: how a node is started on a machine.
-        wake: called when an action is over, from its thread.
+        provider: provider of the machines; may be replaced.
+        command: returns the command line of a node.
+        wake: called when an action has ended, from its thread.
     """
 
     def __init__(
@@ -60,15 +60,15 @@ class MachineActions:
         self._command = command
         self._acts = ActionRunner(wake)
         self._offers = OfferCache(site.latencies)
-        self._swept: set[str] = set()  # machines of which nothing is left
+        self._swept: set[str] = set()  # machines without leftovers at the provider
 
     @property
     def running(self) -> int:
-        """Return how many actions have not ended."""
+        """Return the number of actions that have not ended."""
         return self._acts.running
 
     def use(self, provider: Provider) -> None:
-        """Ask another adapter of the same provider from now on."""
+        """Use another adapter of the same provider from now on."""
         self.provider = provider
         self._offers.clear()
 
@@ -85,7 +85,7 @@ class MachineActions:
         self._acts.close()
 
     def apply(self, plan: ClusterPlan, action: Action, records: list[Record], now_s: float) -> None:
-        """Begin what was decided about a machine; a machine that is busy keeps its action."""
+        """Begin a decided action on a machine; a busy machine keeps its action."""
         if isinstance(action, Launch):
             self._launch(plan, action.wanted, records, now_s)
             return
@@ -116,7 +116,7 @@ class MachineActions:
                     self._events.put(record.ended(Outcome.FAILED, reason, now_s), "refused", reason, now_s)
                 elif not record.is_gone:
                     self._events.put(replace(record, id=done.result), "", "", now_s)
-            elif done.what in (ATTACH, DETACH) and done.error is not None:  # tried again at the next look
+            elif done.what in (ATTACH, DETACH) and done.error is not None:  # retried at the next reconciliation
                 self._events.add_trouble(
                     done.cluster, f"{done.machine}: {done.what}: {done.error}", key=f"{done.cluster} uplink"
                 )
@@ -126,7 +126,7 @@ class MachineActions:
                 self._journal.tell(now_s, done.cluster, done.machine, LAST_WORDS, program, lines=lines)
 
     def release(self, plan: ClusterPlan, name: str, machine: str, *, is_lost: bool) -> None:
-        """Begin to give a machine back; of one that was lost, what its programs said last is kept."""
+        """Begin to release a machine; the final log lines of a lost machine are stored."""
         provider, programs = self.provider, node_names(plan)
 
         def act() -> str:
@@ -139,7 +139,7 @@ class MachineActions:
     def release_orphans(
         self, plan: ClusterPlan, records: Sequence[Record], seen: Mapping[str, Machine], now_s: float
     ) -> None:
-        """Give back what the journal does not know, or thought gone; and what is left of a machine that is gone."""
+        """Release machines that the journal does not contain or records as gone, and leftovers of gone machines."""
         cluster = plan.name
         known = {each.name for each in records if not each.is_gone}
         lost = {each.name for each in records if each.is_gone and each.ending is not Outcome.RELEASED}

@@ -1,4 +1,4 @@
-"""Credentials of machines: tickets to enrol, what was issued, and revocation.
+"""Credentials of machines: enrolment tickets, issued credentials and revocation.
 
 I/O; writes tickets, the journal and revocations.
 """
@@ -30,14 +30,15 @@ __all__ = ["MachineCredentials", "Release"]
 
 log = logging.getLogger(__name__)
 
-Release: TypeAlias = "Callable[[ClusterPlan, str, str], None]"  # of a plan, a machine's name and the provider's id
+# arguments: plan, name of the machine, the provider's id
+Release: TypeAlias = "Callable[[ClusterPlan, str, str], None]"
 
 
 class MachineCredentials:
-    """Issues and revokes what machines prove themselves with.
+    """Issuer of machine credentials, which also revokes them.
 
     Args:
-        boot_s: seconds that a machine has to enrol.
+        boot_s: seconds within which a machine must enrol.
     """
 
     def __init__(self, site: Site, journal: Journal, events: EventLog, tickets: Tickets, *, boot_s: float) -> None:
@@ -48,13 +49,13 @@ class MachineCredentials:
         self._boot_s = boot_s
 
     def issue_ticket(self, plan: ClusterPlan, name: str, now_s: float, *, is_gateway: bool) -> tuple[Ticket, float]:
-        """Return a new machine's ticket, and until when what is issued for it will hold.
+        """Return a new machine's ticket, and the end of validity of its credentials (Unix time).
 
         Args:
             is_gateway: the machine may become the gateway of its group.
 
         Raises:
-            LocalError: no domain there, or its root has run out.
+            LocalError: the domain is missing, or its root certificate has expired.
         """
         root = load_domain(self._site.authority.domain).root
         until_s = min(now_s + self._site.credential_days * DAY_S, float(root.validity.not_after_unix_s))
@@ -73,7 +74,7 @@ class MachineCredentials:
         return ticket, until_s
 
     def handle_reports(self, release: Release, now_s: float) -> None:
-        """Take in which machines enrolled, and release those whose token somebody else used."""
+        """Record the machines that enrolled, and release machines whose token was misused."""
         for news in self._tickets.news():
             record = next((each for each in self._journal.machines(news.cluster) if each.name == news.machine), None)
             if record is not None:
@@ -88,7 +89,7 @@ class MachineCredentials:
             self._tickets.taken(news)
 
     def revoke(self, record: Record, now_s: float) -> None:
-        """Take the memberships of a machine back, and its ticket."""
+        """Revoke the memberships of a machine, and delete its ticket."""
         self._tickets.take_back(record.spec.cluster, record.name)
         if self._site.revocations is None:
             return

@@ -1,6 +1,6 @@
-"""Offers of a provider, kept for a minute each.
+"""Cache of a provider's offers; entries are valid for one minute.
 
-I/O; asks the provider.
+I/O; queries the provider.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from fog.providers.provider import Provider
 
 __all__ = ["OfferCache"]
 
-_OFFERS_S: Final = 60.0  # a price list holds
+_OFFERS_S: Final = 60.0  # validity of a price list
 
 
 class OfferCache:
-    """Offers by what is wanted.
+    """Offers by machine request.
 
     Args:
-        latencies: of regions; measured in the background for regions that have offers.
+        latencies: of regions; measured in the background for regions with offers.
     """
 
     def __init__(self, latencies: Latencies) -> None:
@@ -33,7 +33,7 @@ class OfferCache:
         self._offers.clear()
 
     def get(self, provider: Provider, wanted: MachineRequest, now_s: float) -> list[Offer]:
-        """Return what the provider offers of what is wanted, at most a minute old."""
+        """Return the provider's offers for a request, at most one minute old."""
         at_s, offers = self._offers.get(wanted, (0.0, []))
         if now_s - at_s >= _OFFERS_S or not offers:
             offers = provider.offers(wanted.hardware, spot=wanted.is_spot)

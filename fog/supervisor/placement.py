@@ -1,6 +1,6 @@
-"""Where the next machine is to be: the best of what is offered, away from the others and from where one was just lost.
+"""Placement of the next machine: the best offer, away from other machines and from recent losses.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from fog.supervisor.record import Outcome, Record
 
 __all__ = ["held_until", "place", "wary_until"]
 
-_WARY_S: Final = 60.0  # after a loss, doubled by each further one
+_WARY_S: Final = 60.0  # after a loss; each further loss doubles it
 _WARY_MAX_S: Final = 3_600.0
-_HOLD_S: Final = 1.0  # after a failure to get one, doubled by each further one
+_HOLD_S: Final = 1.0  # after a failed request; each further failure doubles it
 _HOLD_MAX_S: Final = 300.0
 _MEMORY_S: Final = 3_600.0  # how long a loss counts
-_PATIENCE: Final = 4  # so many failures in a row anywhere, and the cause is rather ours than a region's
+_PATIENCE: Final = 4  # after this many consecutive failures in any region, the cause is probably not a region
 
 
 def place(
@@ -31,17 +31,18 @@ def place(
     now_s: float,
     latency_ms: Mapping[str, float] | None = None,
 ) -> Choice | None:
-    """Return the offer to take, and why. Where a wished region has just taken a machine, another one does.
+    """Return the chosen offer and the reason. A requested region is replaced if it has just preempted a machine.
 
     Args:
-        offers: of enough hardware.
-        records: of the cluster, those that are gone included.
-        latency_ms: of regions, as measured from the robot.
+        offers: with enough hardware.
+        records: of the cluster, including machines that are gone.
+        latency_ms: of regions, measured from the robot.
 
-    Returns None while whoever could offer it failed so lately that it is too early to ask again.
+    Returns:
+        None while all regions with offers failed so recently that it is too early to retry.
 
     Raises:
-        LocalError: nothing fits, now or later.
+        LocalError: no offer fits, now or later.
     """
     if _is_resting(records, now_s):
         return None
@@ -59,19 +60,19 @@ def place(
 
 
 def wary_until(records: Iterable[Record], now_s: float) -> float:
-    """Return until when a place is better left alone, for machines were taken there."""
+    """Return until when a location is avoided because machines were preempted there."""
     lost = _moments(records, Outcome.TAKEN, now_s)
     return lost[-1] + min(_WARY_S * 2 ** (len(lost) - 1), _WARY_MAX_S) if lost else 0.0
 
 
 def held_until(records: Iterable[Record], now_s: float) -> float:
-    """Return until when a place is not asked again, for machines were not to be had there."""
+    """Return until when a location is not retried because it had no capacity."""
     failed = _moments(records, Outcome.FAILED, now_s)
     return failed[-1] + min(_HOLD_S * 2 ** (len(failed) - 1), _HOLD_MAX_S) if failed else 0.0
 
 
 def _is_resting(records: Sequence[Record], now_s: float) -> bool:
-    """Return whether so many failed since one last served that each further try would only cost."""
+    """Return whether so many machines failed since the last one served that requests must pause."""
     served_s = max((each.served_unix_s or 0.0 for each in records), default=0.0)
     failed = [moment for moment in _moments(records, Outcome.FAILED, now_s) if moment > served_s]
     if len(failed) < _PATIENCE:

@@ -1,6 +1,6 @@
-"""The process that is a site's supervisor: what it is made of, its signals, its end.
+"""Supervisor process of a site: its parts, signals and shutdown.
 
-Place: shell. Apart from ``background``, for what it imports takes longer than most commands need in all.
+I/O. Separate from ``background``, because its imports take longer than most commands run.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ __all__ = ["supervise"]
 
 log = logging.getLogger(__name__)
 
-_ELSEWHERE_S: Final = 900.0  # a machine of a cloud has an image to boot and packages to install
-_DONE_S: Final = 2.0  # nothing is wanted for so long: it ends
+_ELSEWHERE_S: Final = 900.0  # a cloud machine must boot an image and install packages
+_DONE_S: Final = 2.0  # it ends after this time without a wanted cluster
 
 
 def supervise(site: Site, *, stays: bool = False, lock: int | None = None) -> None:
-    """Be the supervisor, until SIGTERM or, unless ``stays``, until nothing is wanted any more.
+    """Run the supervisor until SIGTERM or, unless ``stays``, until no cluster is wanted.
 
     Args:
-        lock: descriptor of the lock, where it was taken already.
+        lock: descriptor of the lock, if it is already held.
 
     Raises:
-        LocalError: another one lives, the provider cannot be had, or machines have nowhere to enrol: a port is taken.
+        LocalError: another supervisor runs, the provider is not available, or the enrolment port is taken.
     """
     with (
         held(site, lock),
@@ -60,7 +60,7 @@ def supervise(site: Site, *, stays: bool = False, lock: int | None = None) -> No
 
 
 def _bound(site: Site) -> socket.socket:
-    """Return the socket at which the site's machines enrol."""
+    """Return the listening socket for enrolment of the site's machines."""
     if site.enrolment_address:
         return bind_tcp(*site.enrolment_listens)
     return bind_unix(site.enrolment_socket)
@@ -100,7 +100,7 @@ def _run(site: Site, journal: Journal, tickets: Tickets, *, stays: bool) -> None
     try:
         stack.enter_context(serve_control_in_thread(site.state / CONTROL_SOCKET, handlers))
         if any(each.is_up for each in journal.clusters()):
-            set_up(site)  # after a crash of this machine nothing stands
+            set_up(site)  # after a crash of this host the infrastructure is gone
         while not ended.is_set():
             try:
                 if (now := _offered(site, journal)) != offered:
@@ -141,7 +141,7 @@ def _call_on_signals(drain: Callable[[], None]) -> None:
 
 
 def _status(site: Site, supervisor: Supervisor, begun_s: float) -> dict[str, object]:
-    """Return what ``gdp status`` shows of the supervisor; called from the thread of the control socket."""
+    """Return the supervisor's fields of ``gdp status``; called from the thread of the control socket."""
     with closing(Journal(site.journal)) as journal:
         clusters = [each.plan.name for each in journal.clusters() if each.is_up]
         machines = sum(len(journal.machines(each, gone=False)) for each in clusters)
@@ -155,12 +155,12 @@ def _status(site: Site, supervisor: Supervisor, begun_s: float) -> dict[str, obj
 
 
 def _offered(site: Site, journal: Journal) -> tuple[tuple[str, ...], Gateway]:
-    """Return what the provider is to have: the regions that plans name, and the gateways."""
+    """Return what the provider must offer: the regions in plans, and the gateways."""
     wanted = (each for cluster in journal.clusters() for each in cluster.plan.machines)
     return tuple(dict.fromkeys(each.region for each in wanted if each.region)), topology_now(site)
 
 
 def _begun_unix_s() -> float:
-    """Return when this process was started, its imports included."""
+    """Return when this process was started, before its imports."""
     started_s = Process.of(os.getpid()).started / os.sysconf("SC_CLK_TCK")
     return time.time() - (time.clock_gettime(time.CLOCK_BOOTTIME) - started_s)

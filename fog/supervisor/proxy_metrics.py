@@ -1,7 +1,7 @@
 """Message counters of proxies on this host, for the idle limit of clusters.
 
 I/O. The counters come from the control socket of a proxy. If the socket of a robot's proxy cannot be reached, as in a
-container, its metrics port is asked. What it sends includes topics: more than calls, never fewer.
+container, its metrics port is queried. The count includes topics, so it is never less than the number of calls.
 Source: Prometheus text exposition format, version 0.0.4.
 """
 
@@ -27,7 +27,7 @@ _TIMEOUT_S: Final = 0.5
 
 
 def received_by(proxy: str) -> int | None:
-    """Return how many messages a machine's proxy on this host has received since its start; None: it does not answer.
+    """Return the messages received by a machine's proxy on this host since its start; None: no response.
 
     Args:
         proxy: its name, 64 hex digits.
@@ -39,13 +39,13 @@ def received_by(proxy: str) -> int | None:
 
 
 def sent_by(proxy: Path) -> int | None:
-    """Return how many messages a robot's proxy has sent since its start; None: it does not answer.
+    """Return the messages sent by a robot's proxy since its start; None: no response.
 
     Args:
         proxy: its ``proxy.yaml``.
 
     Raises:
-        ConfigError: the file is not a proxy's.
+        ConfigError: the file is not a proxy configuration.
     """
     config = ProxyConfig.load(proxy)
     try:
@@ -66,5 +66,5 @@ def _sent_by_metrics(port: int) -> int | None:
         with urlopen(f"http://127.0.0.1:{port}/metrics", timeout=_TIMEOUT_S) as answer:
             found = _SENT.search(answer.read())
     except (OSError, HTTPException):
-        return None  # it does not run, or not here
+        return None  # it does not run, or runs on another host
     return None if found is None else int(float(found[1]))

@@ -1,7 +1,7 @@
-"""What to do next, from what is wanted and what there is.
+"""Reconciliation decisions: the next actions from desired and observed state.
 
-Place: pure. The same question may be asked at any time, and after any crash: the answer follows from the records alone.
-A machine that serves is let go only when as many others as are wanted serve, or when its time is over anyway.
+Sans-I/O. The result follows from the records alone, so it can be computed at any time and after any crash.
+A serving machine is released only when as many others as are wanted serve, or when its time ends in any case.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ __all__ = ["Action", "Drain", "Launch", "Release", "Timeouts", "decide"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timeouts:
-    """How long what may last, in seconds.
+    """Time limits in seconds.
 
     Args:
-        boot_s: from asking for a machine until its replica serves.
-        unreachable_timeout_s: a replica that served is not heard, while another is.
-        partition_timeout_s: the same while none is: then it is rather the way to all of them that is cut.
-        drain_s: from telling a machine to finish until it is given back.
-        release_s: until a machine that was given back and is still there is given back again.
-        credential_renewal_s: this long before its papers run out, another machine takes its place.
-        gateway_s: after a machine became the gateway of its group, until silence behind it means something.
+        boot_s: from the request of a machine until its replica serves.
+        unreachable_timeout_s: limit for an unreachable replica while another replica is reachable.
+        partition_timeout_s: the same while no replica is reachable; the cause is then probably a network partition.
+        drain_s: from the drain request to a machine until its release.
+        release_s: until the release of a machine that still exists is repeated.
+        credential_renewal_s: another machine replaces it this long before its credentials expire.
+        gateway_s: after a gateway change, until unreachable machines behind the gateway count.
     """
 
     boot_s: float = 90.0
-    unreachable_s: float = 1.0
+    unreachable_timeout_s: float = 1.0
     partition_timeout_s: float = 10.0
     drain_s: float = 12.0
     release_s: float = 5.0
@@ -41,14 +41,14 @@ class Timeouts:
 
 @dataclass(frozen=True, slots=True)
 class Launch:
-    """Ask for a machine."""
+    """Action: request a machine."""
 
     wanted: MachineRequest
 
 
 @dataclass(frozen=True, slots=True)
 class Drain:
-    """Tell a machine to finish what is under way."""
+    """Action: let a machine finish its calls and accept no new ones."""
 
     name: str
     reason: str
@@ -56,7 +56,7 @@ class Drain:
 
 @dataclass(frozen=True, slots=True)
 class Release:
-    """Give a machine back."""
+    """Action: release a machine."""
 
     name: str
     reason: str
@@ -75,13 +75,13 @@ def decide(
     told: bool = True,
     excused: Collection[str] = (),
 ) -> list[Action]:
-    """Return what brings a cluster nearer to what is wanted.
+    """Return the actions that bring a cluster closer to its desired state.
 
     Args:
-        wanted: one a machine; empty: all are given back at once.
-        records: of the cluster; those that are gone are of no account.
-        told: whether the overlay can be asked who serves; if not, a machine that is up counts as serving.
-        excused: names of machines that are not heard for another reason than their own, and are kept.
+        wanted: one request per machine; empty: all machines are released at once.
+        records: of the cluster; machines that are gone are ignored.
+        told: whether the overlay reports which machines serve; if not, a machine that is up counts as serving.
+        excused: names of machines that are unreachable for an external reason, and are kept.
     """
     there = [record for record in records if not record.is_gone]
     if not wanted:
@@ -92,8 +92,8 @@ def decide(
         ]
     view = _View(now_s, patience, told, any(_serves(each, told=told) for each in there), excused)
     actions: list[Action] = []
-    fit: list[Record] = []  # to stay, if wanted
-    leaving: list[Record] = []  # serve on until others do, or their time is over
+    fit: list[Record] = []  # kept if wanted
+    leaving: list[Record] = []  # serve until others do, or until their time ends
     for each in there:
         if (ended := view.ended(each)) is not None:
             actions.append(ended)
@@ -107,7 +107,7 @@ def decide(
     kept, missing = _match(wanted, fit)
     actions += [Launch(each) for each in missing]
     spare = [each for each in fit if each not in kept]
-    owed = len(wanted) - sum(view.serves(each) for each in kept)  # how many more should serve
+    owed = len(wanted) - sum(view.serves(each) for each in kept)  # number of machines that should serve in addition
     for each in [*spare, *sorted(leaving, key=lambda each: -(each.leaves_at_unix_s or now_s))]:
         why = each.reason if each.noticed_unix_s is not None else "another took its place"
         if not view.serves(each):
@@ -125,7 +125,7 @@ def _serves(record: Record, *, told: bool) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class _View:
-    """A look at machines, one by one."""
+    """Predicates on the machines of a cluster at one time."""
 
     now_s: float
     patience: Timeouts
@@ -140,13 +140,13 @@ class _View:
         return record.papers.until_unix_s - self.patience.credential_renewal_s <= self.now_s
 
     def is_due(self, record: Record) -> bool:
-        """Return whether half of the notice is over: what is under way needs the rest."""
+        """Return whether half of the notice period is over; calls in progress need the rest."""
         if record.noticed_unix_s is None or record.leaves_at_unix_s is None:
             return record.papers.until_unix_s <= self.now_s
         return self.now_s >= (record.noticed_unix_s + record.leaves_at_unix_s) / 2
 
     def ended(self, record: Record) -> Release | None:
-        """Return how to let go of what is to serve no more."""
+        """Return the release of a machine that must no longer serve; None: it is kept."""
         limit, now_s = self.patience, self.now_s
         if record.released_unix_s is not None:
             is_late = now_s - record.released_unix_s >= limit.release_s
@@ -160,16 +160,16 @@ class _View:
             is_late = now_s - record.asked_unix_s >= limit.boot_s
             return Release(record.name, "did not serve in time", Outcome.FAILED) if is_late else None
         since_s = record.unreachable_unix_s
-        patience_s = limit.unreachable_s if self.is_any_serving else limit.partition_timeout_s
+        patience_s = limit.unreachable_timeout_s if self.is_any_serving else limit.partition_timeout_s
         if since_s is not None and now_s - since_s >= patience_s and record.name not in self.excused:
             return Release(record.name, "its replica is not heard any more", Outcome.TAKEN)
         return None
 
 
 def _match(wanted: Sequence[MachineRequest], fit: Sequence[Record]) -> tuple[list[Record], list[MachineRequest]]:
-    """Return the machines that do for what is wanted, the best first, and what is missing.
+    """Return the machines that satisfy the requests, best first, and the unsatisfied requests.
 
-    A region counts for nothing here: where a machine was taken, its successor is elsewhere.
+    Regions are ignored, because the successor of a preempted machine is in another region.
     """
     open_, kept = list(wanted), list[Record]()
     for is_same in (True, False):

@@ -1,6 +1,6 @@
-"""What the journal knows of one machine, and how it learns from what is seen of it.
+"""Journal record of one machine, and its update from observations.
 
-Place: pure; time comes in as ``now_s``, seconds since 1970: a journal outlives every monotonic clock.
+Sans-I/O; time is the argument ``now_s``, seconds since 1970, because a journal outlives every monotonic clock.
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ __all__ = ["Outcome", "Record", "cost_usd", "learn"]
 
 
 class Outcome(Enum):
-    """How a machine ended."""
+    """Outcome of a machine."""
 
-    RELEASED = "released"  # we gave it back
-    TAKEN = "taken"  # the provider took it, or it died
-    FAILED = "failed"  # it was not to be had, or never served
+    RELEASED = "released"  # the supervisor released it
+    TAKEN = "taken"  # the provider preempted it, or it failed
+    FAILED = "failed"  # no capacity, or it never served
 
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """A machine from the intention to ask for it until it is gone. Times are seconds since 1970.
+    """Machine from the intention to request it until it is gone. Times are seconds since 1970.
 
     Args:
-        wanted: what it was launched for.
-        id: the provider's; empty until the provider has said it.
+        wanted: request for which it was launched.
+        id: the provider's id; empty until it is known.
         up_unix_s: when its programs were up.
-        served_unix_s: when its replica was heard for the first time.
-        unheard_unix_s: since when it runs and its replica is not heard; None: it is, or nobody knows.
-        noticed_unix_s: when the provider's notice was seen.
-        drained_unix_s, released_unix_s: when it was told to finish, and given back.
-        ending: how it ended, or will have ended once what was given back is gone.
-        gateway: the label of the replica gateway that it is; empty: it is none.
-        gateway_unix_s: when it last became the gateway, or ceased to be it.
+        served_unix_s: when its replica was observed for the first time.
+        unreachable_unix_s: since when it runs and its replica is unreachable; None: reachable or unknown.
+        noticed_unix_s: when the provider's notice was observed.
+        drained_unix_s, released_unix_s: when it was drained and released.
+        ending: its outcome; of a released machine, the outcome when it is gone.
+        gateway: label of the replica gateway that it is; empty: none.
+        gateway_unix_s: when it last became the gateway, or stopped being the gateway.
     """
 
     spec: MachineSpec
@@ -68,44 +68,44 @@ class Record:
 
     @property
     def is_gone(self) -> bool:
-        """Return whether it is no more."""
+        """Return whether it is gone."""
         return self.gone_unix_s is not None
 
     @property
     def is_serving(self) -> bool:
-        """Return whether its replica takes calls, as far as is known."""
+        """Return whether its replica accepts calls, as far as known."""
         return not self.is_gone and self.served_unix_s is not None and self.unreachable_unix_s is None
 
     @property
     def is_outgoing(self) -> bool:
-        """Return whether it is on its way out."""
+        """Return whether it has a notice, or was drained or released."""
         return self.noticed_unix_s is not None or self.drained_unix_s is not None or self.is_released
 
     @property
     def is_released(self) -> bool:
-        """Return whether it was given back."""
+        """Return whether it was released."""
         return self.released_unix_s is not None
 
     def ended(self, ending: Outcome, reason: str, now_s: float) -> Record:
-        """Return it as gone."""
+        """Return the record as gone."""
         return replace(
             self, state=MachineState.GONE, gone_unix_s=now_s, ending=ending, reason=reason, unreachable_unix_s=None
         )
 
 
 def cost_usd(record: Record, now_s: float) -> float:
-    """Return what a machine has cost until now: its price from asking for it to its end."""
+    """Return the cost of a machine until now, from its request to its end, in US dollars."""
     end_s = record.gone_unix_s if record.gone_unix_s is not None else now_s
     return max(end_s - record.asked_unix_s, 0.0) / 3_600 * record.spec.offer.usd_per_hour
 
 
 def learn(record: Record, seen: Machine | None, serves: bool | None, now_s: float, *, grace_s: float) -> Record:
-    """Return what is known of a machine after a look.
+    """Return a machine's record after an observation.
 
     Args:
-        seen: what the provider said; None: it knows no such machine.
-        serves: whether its replica is heard in the overlay; None: nobody can tell.
-        grace_s: how long a new machine may be missing from what the provider says.
+        seen: the provider's description; None: the provider does not list the machine.
+        serves: whether the overlay reports its replica; None: unknown.
+        grace_s: how long the provider may omit a new machine.
     """
     if record.is_gone:
         return record

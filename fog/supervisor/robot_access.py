@@ -18,23 +18,23 @@ _ROBOT_DAYS: Final = 365.0
 
 
 class RobotAccess:
-    """Gives the robots of a site access to clusters.
+    """Access control of a site's robots to clusters.
 
     Args:
-        on_names: called when the watch is to know more names.
+        on_names: called when the watch needs more names.
     """
 
     def __init__(self, site: Site, on_names: Callable[[], None]) -> None:
         self._site = site
         self._on_names = on_names
-        self._plans: dict[str, ClusterPlan] = {}  # that the robots have access to
+        self._plans: dict[str, ClusterPlan] = {}  # plans to which the robots have access
 
     def has(self, plan: ClusterPlan) -> bool:
         """Return whether the robots have access to exactly this plan."""
         return self._plans.get(plan.name) == plan
 
     def grant(self, plan: ClusterPlan) -> None:
-        """Give robots, and the watch, rules and delegations for what a cluster serves.
+        """Add rules and delegations of robots, and delegations of the watch, for a cluster's interfaces.
 
         Raises:
             LocalError: keys are missing, or a rule cannot be added.

@@ -1,7 +1,8 @@
-"""Reconciliation of clusters: what is wanted, what there is, and the actions in between.
+"""Reconciliation loop of clusters: desired state, observed state, and actions.
 
-I/O. The supervisor carries no application data. What it must not forget is in the journal before it acts; all else it
-observes again after a restart. ``machine_actions`` acts, ``event_log`` and ``last_words`` write what happened.
+I/O. The supervisor carries no application data. It writes persistent state to the journal before it acts, and
+observes all other state again after a restart. ``machine_actions`` acts; ``event_log`` and ``final_logs`` record
+events.
 """
 
 from __future__ import annotations
@@ -34,19 +35,19 @@ __all__ = ["Heard", "Supervisor"]
 
 Heard: TypeAlias = "Mapping[str, frozenset[str]]"  # service -> proxies that serve it, each 64 hex digits
 
-_GRACE_POLLS: Final = 5  # looks in which a new machine may be missing
+_GRACE_POLLS: Final = 5  # polls in which a new machine may be missing
 _GRACE_MIN_S: Final = 2.0
 PATIENCE: Final = Timeouts()
 
 
 class Supervisor:
-    """Keeps the clusters of a site as they are wanted.
+    """Supervisor that keeps the clusters of a site in their desired state.
 
     Args:
-        tickets: with which machines enrol.
-        command: how a node is started on a machine.
-        heard: what the overlay says of who serves; None: it cannot be asked.
-        on_names: called when the watch is to know more names.
+        tickets: store of enrolment tickets.
+        command: returns the command line of a node.
+        heard: servers that the overlay reports; None: the overlay cannot be queried.
+        on_names: called when the watch needs more names.
     """
 
     def __init__(
@@ -81,39 +82,39 @@ class Supervisor:
         self._gateways = GatewayUplinks(journal, self._events, self._actions, patience)
         self._limits = UsageLimits(site, journal)
         self._robots = RobotAccess(site, on_names)
-        self._settled: set[str] = set()  # down, and nothing is left of them
+        self._settled: set[str] = set()  # clusters that are down without leftovers
         self._owner_key = load_public_key(site.authority.owner_key).compressed
 
     @property
     def is_done(self) -> bool:
-        """Return whether nothing is wanted and nothing is left."""
+        """Return whether no cluster is wanted and none has leftovers."""
         return all(not each.is_up and each.plan.name in self._settled for each in self._journal.clusters())
 
     @property
     def running_actions(self) -> int:
-        """Return how many actions on machines have not ended."""
+        """Return the number of actions on machines that have not ended."""
         return self._actions.running
 
     def use(self, provider: Provider) -> None:
-        """Ask another adapter of the same provider from now on, such as one that offers more regions."""
+        """Use another adapter of the same provider from now on, such as one with more regions."""
         self._actions.use(provider)
 
     def wake(self) -> None:
-        """Have ``wait`` return at once; from any thread."""
+        """Make ``wait`` return at once; callable from any thread."""
         self._woken.set()
 
     def wait(self) -> None:
-        """Return when it is time for the next look."""
+        """Wait until the next reconciliation is due."""
         self._woken.wait(self._actions.provider.poll_s)
         self._woken.clear()
 
     def close(self) -> None:
-        """Wait for what is being done, and write it down; machines stay."""
+        """Wait for running actions and write their results; machines continue."""
         self._actions.close()
         self._actions.collect_results(time.time())
 
     def reconcile(self) -> None:
-        """Look at every cluster once, and do what is to be done.
+        """Reconcile every cluster once.
 
         Raises:
             StoreError: the journal cannot be read or written.
@@ -133,7 +134,7 @@ class Supervisor:
                 self._events.add_trouble(name, str(error))
 
     def reconciled(self, begun_unix_s: float) -> None:
-        """Write that all is as the journal says again, after the start at ``begun_unix_s``; not of what is in trouble.
+        """Write that clusters without trouble match the journal again after the start at ``begun_unix_s``.
 
         Raises:
             StoreError: the journal cannot be written.
@@ -149,7 +150,7 @@ class Supervisor:
         plan = cluster.plan
         is_new = cluster.is_up and not self._robots.has(plan)
         if is_new and not self._journal.machines(plan.name, gone=False):
-            self._robots.grant(plan)  # what is wrong there is told before a machine costs something
+            self._robots.grant(plan)  # its errors are reported before a machine costs money
         seen = {each.spec.name: each for each in self._actions.provider.describe(plan.name)}
         heard, now_s = self._heard(), time.time()
         names = [] if self._site.watch is None else _services(plan, self._owner_key)
@@ -184,7 +185,7 @@ class Supervisor:
             after, machine = before, seen.get(before.name)
             if before.id or not self._actions.is_busy(plan.name, before.name):
                 serves = None if heard is None else all(before.papers.proxy in heard.get(each, ()) for each in names)
-                if not names:  # of topics nobody asks: a machine that is up does what it is for
+                if not names:  # topics have no calls: a machine that is up counts as serving
                     serves = machine is not None and machine.state is not MachineState.BOOTING
                 after = learn(before, machine, serves, now_s, grace_s=self._grace_s)
             for change in changes(before, after, machine, now_s):
@@ -197,11 +198,11 @@ class Supervisor:
         return records
 
     def _release_misused(self, plan: ClusterPlan, name: str, machine: str) -> None:
-        """Release a machine whose token was misused, unless an action on it runs already."""
+        """Release a machine whose token was misused, unless it is busy."""
         if not self._actions.is_busy(plan.name, name):
             self._actions.release(plan, name, machine, is_lost=True)
 
 
 def _services(plan: ClusterPlan, owner_key: bytes) -> list[str]:
-    """Return the overlay's names of what can be called."""
+    """Return the overlay names of services and actions."""
     return [metadata_of(each).name(owner_key).to_text() for each in plan.carried if each.kind != "topic"]

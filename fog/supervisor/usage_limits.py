@@ -1,7 +1,8 @@
-"""Limits at which a cluster is ended: its budget, and how long nobody has called it.
+"""Limits at which a cluster ends: its budget, and the time without a call.
 
-I/O; reads the journal and the message counters of proxies. Counters of machines on this host are those of their own
-proxies. For machines elsewhere the robots' proxies say how much they send; without them a cluster counts as used.
+I/O; reads the journal and the message counters of proxies. For machines on this host, the counters are those of the
+machines' proxies. For other machines, they are the send counters of the robots' proxies; without them a cluster counts
+as used.
 """
 
 from __future__ import annotations
@@ -31,14 +32,14 @@ class UsageLimits:
         self._asked_s: dict[str, float] = {}  # when the counters were last read
 
     def forget(self, cluster: str) -> None:
-        """Begin again for the next cluster of this name."""
+        """Reset the state for the next cluster of this name."""
         self._activities.pop(cluster, None)
 
     def reached(self, provider: str, cluster: Cluster, records: Sequence[Record], now_s: float) -> str:
         """Return which limit of the cluster is reached; empty: none.
 
         Args:
-            provider: name of where its machines come from.
+            provider: name of the provider of its machines.
         """
         plan = cluster.plan
         if plan.budget_usd is not None:

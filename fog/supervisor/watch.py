@@ -1,7 +1,7 @@
-"""Who serves, as the overlay itself tells: a light member beside the robot's switch that would call every service.
+"""Watch of the servers of services: a lightweight participant at the robot's switch that attaches as a client.
 
-Place: shell; a thread of its own drives it. It asks nothing and is answered nothing; of an action's feedback it hears
-what any client does. Whom it hears, the robot's proxy hears as well: both learn it from the same switch and RIB.
+I/O; its own thread drives it. It sends no requests and receives no responses; it receives the feedback of actions like
+any client. The robot's proxy sees the same servers, because both learn them from the same switch and RIB.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ log = logging.getLogger(__name__)
 
 _STEP_S: Final = 0.05
 _AGAIN_S: Final = 0.5
-_SETTLED_S: Final = 3.0  # after it is attached, until silence means something
+_SETTLED_S: Final = 3.0  # after it is attached, until a missing server counts as unreachable
 
 
 class Watch:
-    """Looks from a device that the robot's switch made, with the keys in a folder.
+    """Watch on a device of the robot's switch, with the keys in a folder.
 
     Args:
-        identity: a proxy's directory with delegations to call.
-        iface: the device.
+        identity: directory of a proxy with delegations to call.
+        iface: name of the device.
     """
 
     def __init__(self, identity: Path, iface: str) -> None:
@@ -56,12 +56,12 @@ class Watch:
         self._thread.start()
 
     def heard(self) -> Mapping[str, frozenset[str]] | None:
-        """Return by service (64 hex digits) the proxies that serve it now; None: the overlay cannot be asked."""
+        """Return service (64 hex digits) -> proxies that serve it now; None: the overlay cannot be queried."""
         with self._lock:
             return self._heard
 
     def reload(self) -> None:
-        """Read the delegations again."""
+        """Reload the delegations."""
         self._again.set()
 
     def close(self) -> None:
@@ -70,7 +70,7 @@ class Watch:
         self._thread.join()
 
     def _keep(self) -> None:
-        """Look, and begin anew where that fails: the robot's switch may come later, or again."""
+        """Run the participant, and restart it after errors: the robot's switch may start later, or restart."""
         told = ""
         while not self._ended.is_set():
             try:
@@ -80,7 +80,7 @@ class Watch:
                     log.warning("the overlay cannot be asked reason=%s", error)
                     told = str(error)
             finally:
-                self._tell(None)  # what was heard before is worth nothing now
+                self._tell(None)  # earlier results are no longer valid
             self._ended.wait(_AGAIN_S)
 
     def _look(self) -> None:

@@ -244,7 +244,7 @@ class Endpoint(Protocol):
     def close(self, handle: int) -> None:
         """Close a subscription, publisher, server or client."""
 
-    def remove_entity(self) -> None:
+    def shut_down(self) -> None:
         """Leave the graph and free everything; no method is called afterwards."""
 
 

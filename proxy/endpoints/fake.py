@@ -360,7 +360,7 @@ class FakeEndpoint:
         """Close a handle."""
         self._open.pop(handle).close()
 
-    def remove_entity(self) -> None:
+    def shut_down(self) -> None:
         """Leave the graph."""
         for handle in list(self._open):
             self.close(handle)

@@ -40,5 +40,5 @@ def open_endpoints(ends: Sequence[RosGraphConfig], node: str) -> Iterator[list[E
         opened = list[Endpoint]()
         for end in ends:
             opened.append(open_endpoint(end, node))
-            stack.callback(opened[-1].remove_entity)
+            stack.callback(opened[-1].shut_down)
         yield opened

@@ -48,7 +48,7 @@ def open_recording_bridge(
     finally:
         node.on_reload = None
         node.runtime.unwatch(endpoint)
-        endpoint.remove_entity()
+        endpoint.shut_down()
 
 
 def work(node: ProxyNode, bridge: Bridge) -> None:

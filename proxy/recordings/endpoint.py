@@ -93,7 +93,7 @@ class _TopicsEndpoint:
     def drop(self, handle: int, call: int) -> None:
         """Ignore the call: there is none."""
 
-    def remove_entity(self) -> None:
+    def shut_down(self) -> None:
         """Free the descriptor; the recording itself belongs to the caller."""
         os.close(self._wake)
 

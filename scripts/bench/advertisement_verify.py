@@ -9,7 +9,7 @@ Each advertisement is for another name, so the verifier has seen none of its own
     refresh    AdCerts known, a new sequence number: one check
 
 Example:
-    python scripts/bench/advertisement_verify.py --claims 2000 --json claims.json
+    python scripts/bench/advertisement_verify.py --advertisements 2000 --json verify.json
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ def run(count: int) -> dict[str, dict[str, float]]:
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--claims", type=int, default=2_000, help="claims in each run")
+    parser.add_argument("--advertisements", type=int, default=2_000, help="advertisements in each run")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to this file")
     options = parser.parse_args()
     results = run(options.advertisements)

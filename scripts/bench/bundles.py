@@ -126,6 +126,6 @@ if __name__ == "__main__":
     parser.add_argument("--topics", type=int, default=20)
     parser.add_argument("--mtu", type=int, default=1_500, help="bytes after the Ethernet header")
     parser.add_argument(
-        "--spin-us", type=int, default=SPIN_US, help="as busy_poll_us of proxy.yaml (default: %(default)s)"
+        "--busy-poll-us", type=int, default=SPIN_US, help="as busy_poll_us of proxy.yaml (default: %(default)s)"
     )
     run_bench(parser, measure)

@@ -36,7 +36,7 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--mtu", type=int, default=1_500, help="bytes after the Ethernet header")
     parser.add_argument("--plane", choices=("kernel", "raw"), default="raw", help="of the switches")
     parser.add_argument(
-        "--spin-us", type=int, default=SPIN_US, help="as busy_poll_us of proxy.yaml (default: %(default)s)"
+        "--busy-poll-us", type=int, default=SPIN_US, help="as busy_poll_us of proxy.yaml (default: %(default)s)"
     )
     parser.add_argument("--json", type=Path, help="write all figures here")
     return parser

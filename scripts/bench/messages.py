@@ -79,7 +79,7 @@ def arguments(names: Sequence[str]) -> argparse.ArgumentParser:
     parser.add_argument("--offloads", choices=("off", "on", "both"), default="both", help="of the veth devices")
     parser.add_argument("--encoding", action="append", choices=ENCODINGS, help="of ours; may be repeated")
     parser.add_argument(
-        "--spin-us", type=int, default=SPIN_US, help="as busy_poll_us of proxy.yaml (default: %(default)s)"
+        "--busy-poll-us", type=int, default=SPIN_US, help="as busy_poll_us of proxy.yaml (default: %(default)s)"
     )
     parser.add_argument("--realtime", action="store_true", help="SCHED_FIFO for all: what else runs does not disturb")
     parser.add_argument("--json", type=Path, help="write all figures here")

@@ -179,7 +179,7 @@ if __name__ == "__main__":
     parser.add_argument("--only", action="append", choices=PLANES, help="this data plane")
     parser.add_argument("--link", action="append", choices=list(LINKS), help="on such links")
     parser.add_argument(
-        "--spin-us", type=int, default=SPIN_US, help="as busy_poll_us of proxy.yaml (default: %(default)s)"
+        "--busy-poll-us", type=int, default=SPIN_US, help="as busy_poll_us of proxy.yaml (default: %(default)s)"
     )
     parser.add_argument("--realtime", action="store_true", help="SCHED_FIFO: what else runs does not disturb")
     run_bench(parser, measure)

@@ -1,4 +1,4 @@
-"""Small real ROS nodes, for demonstrations and tests: ``echo`` serves, ``caller`` asks.
+"""Small ROS nodes for demonstrations and tests: ``echo`` and ``counter`` serve, ``caller`` calls.
 
-They are found as Python modules: ``Node(package="fog_demo", executable="echo")``.
+Launch files refer to them as Python modules: ``Node(package="fog_demo", executable="echo")``.
 """

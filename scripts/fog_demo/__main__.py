@@ -1,6 +1,6 @@
-"""``python -m fog_demo``.
+"""Entry point of ``python -m fog_demo``.
 
-Place: shell. Importing takes a second, in which nothing has been made yet: Ctrl-C then simply ends the process.
+I/O. Imports take one second, in which no resource exists yet, so Ctrl-C then ends the process directly.
 """
 
 import os

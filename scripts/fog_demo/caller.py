@@ -1,12 +1,12 @@
-"""A robot's node that calls ``/echo`` at a rate and counts what comes back, as lines of JSON.
+"""Robot's node that calls ``/echo`` at a fixed rate and prints statistics as lines of JSON.
 
-Place: shell; needs rclpy. Parameters: ``rate_hz``; ``calls``: how many in all, 0: until Ctrl-C; ``timeout_s``: when a
-call counts as failed; ``report_s``: how often a line is written; ``depth``: how many answers may wait for this node
-(ROS 2 has 10, and drops more; after an outage all calls under way are answered at once). SIGUSR1: it calls no more, and
-ends when the calls under way have. A line is ``{"calls", "answered", "failed", "wrong", "unserved", "under_way",
-"median_ms", "p99_ms", "silence_ms", "unix_s", "by_machine", "done"}``; ``unserved`` are calls left out since, after the
-first, no server was there; ``silence_ms`` is the longest time between two answers since the line before, ``unix_s`` is
-when the line was written. The last line has ``"done": true``. Exit 1 if any call failed.
+I/O; needs rclpy. Parameters: ``rate_hz``; ``calls``: total number, 0: until Ctrl-C; ``timeout_s``: time after which a
+call counts as failed; ``report_s``: interval of lines; ``depth``: queue of responses for this node (ROS 2's default is
+10, and it drops more; after an outage all pending calls are answered at once). After SIGUSR1 the node starts no calls
+and ends when the pending ones have ended. A line is ``{"calls", "answered", "failed", "wrong", "unserved", "under_way",
+"median_ms", "p99_ms", "silence_ms", "unix_s", "by_machine", "done"}``. ``unserved`` are calls omitted because no server
+existed after the first call. ``silence_ms`` is the longest time between two responses since the previous line,
+``unix_s`` the time of the line. The last line has ``"done": true``. Exit status 1 if any call failed.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class _Answer(Protocol):
 
 @dataclass(slots=True)
 class Tally:
-    """What became of calls; of latencies only the newest are kept."""
+    """Statistics of calls; only the newest latencies are kept."""
 
     calls: int = 0
     failed: int = 0
@@ -48,7 +48,7 @@ class Tally:
     answered_s: float | None = None
 
     def answered(self, asked: bool, answer: _Answer, took_s: float, now_s: float) -> None:
-        """Count an answer; ``now_s``: monotonic seconds."""
+        """Count a response; ``now_s``: monotonic seconds."""
         self.silence_s = max(self.silence_s, now_s - (now_s if self.answered_s is None else self.answered_s))
         self.answered_s = now_s
         if answer.success != asked:
@@ -57,7 +57,7 @@ class Tally:
         self.latencies_s.append(took_s)
 
     def line(self, *, unix_s: float, done: bool) -> str:
-        """Return the counts as one line of JSON; the longest silence begins again."""
+        """Return the counts as one line of JSON; resets the longest silence."""
         silence_s, self.silence_s = self.silence_s, 0.0
         answered = self.by_machine.total()
         ranked = sorted(self.latencies_s)
@@ -81,7 +81,7 @@ def main() -> None:
     """Call until Ctrl-C or SIGTERM, or until enough calls have ended."""
     rclpy.init()
     node = rclpy.create_node("caller")
-    number = ParameterDescriptor(dynamic_typing=True)  # so that 20 is as good as 20.0
+    number = ParameterDescriptor(dynamic_typing=True)  # accepts 20 as well as 20.0
     rate_hz = float(node.declare_parameter("rate_hz", 20.0, number).value)
     most = int(node.declare_parameter("calls", 0).value)
     timeout_s = float(node.declare_parameter("timeout_s", 10.0, number).value)
@@ -124,14 +124,14 @@ def main() -> None:
     node.create_timer(1.0 / rate_hz, call)
 
     def report(*, done: bool = False) -> None:
-        print(stats.line(unix_s=time.time(), done=done), flush=True)  # its output
+        print(stats.line(unix_s=time.time(), done=done), flush=True)  # the program's output
 
     node.create_timer(report_s, report)
     try:
         while not (most and stats.calls >= most and not waiting):
             rclpy.spin_once(node)
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # both are how it ends
+        pass  # both end the node normally
     report(done=True)
     node.destroy_node()
     rclpy.try_shutdown()

@@ -1,6 +1,6 @@
-"""``python -m fog_demo``, which ``scripts/fog_demo.sh`` runs once everything is set up.
+"""Command ``python -m fog_demo``, which ``scripts/fog_demo.sh`` runs after its setup.
 
-Place: shell. Exit codes: 0 nothing failed, 1 something did, 2 wrong input, 130 and 143 for Ctrl-C and SIGTERM.
+I/O. Exit status: 0 no failure, 1 a failure, 2 wrong input, 130 and 143 for Ctrl-C and SIGTERM.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _PASSED: Final = 0
 _FAILED: Final = 1
 _WRONG_INPUT: Final = 2
 _PACE: Final = Pace()
-_WIDE: Final = 160  # columns where no terminal says how many there are
+_WIDE: Final = 160  # columns without a terminal
 
 _EXAMPLES: Final = """\b
 Examples:
@@ -81,7 +81,7 @@ def main() -> None:
 
 
 def _run(run: Run, launch_file: Path, pace: Pace, console: Console, *, as_json: bool) -> int:
-    """Play, and take down everything."""
+    """Run the scenario, and take down everything."""
     try:
         outcome = asyncio.run(interruptible(_play(run, launch_file, pace, console)))
     except Interrupted as interrupted:

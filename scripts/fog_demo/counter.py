@@ -1,7 +1,7 @@
-"""A ROS service that keeps state, as ``docs/how-to/state.md`` asks: ``/count``, ``std_srvs/srv/SetBool``.
+"""ROS service with state, in the form of ``docs/how-to/state.md``: ``/count``, ``std_srvs/srv/SetBool``.
 
-Place: shell; needs rclpy. A request with ``data: true`` adds one; the answer's message is the count. The node's
-parameter ``state``, a byte array, is the count as eight bytes: who reads it has the state, who writes it restores it.
+I/O; needs rclpy. A request with ``data: true`` adds one; the response's message is the count. The node's parameter
+``state``, a byte array, is the count as eight bytes: reading it saves the state, writing it restores it.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ def main() -> None:
     try:
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # both are how it ends
+        pass  # both end the node normally
     finally:
         node.destroy_node()
         rclpy.try_shutdown()
 
 
 def _bytes_of(count: int) -> list[bytes]:
-    """Return the state as rclpy wants a byte array: a list of single bytes."""
+    """Return the state in rclpy's form of a byte array: a list of single bytes."""
     return [bytes([each]) for each in _COUNT.pack(count)]
 
 

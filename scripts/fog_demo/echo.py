@@ -1,7 +1,7 @@
-"""A ROS service that tells which machine answered: ``/echo``, ``std_srvs/srv/SetBool``.
+"""ROS service that returns the name of its machine: ``/echo``, ``std_srvs/srv/SetBool``.
 
-Place: shell; needs rclpy. The answer is {success: what was asked, message: the machine}, which the environment's
-``FOG_MACHINE`` names. Parameter ``delay_s``: how long an answer takes.
+I/O; needs rclpy. The response is {success: value of the request, message: the machine}; the environment variable
+``FOG_MACHINE`` names the machine. Parameter ``delay_s``: time until a response.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def main() -> None:
     try:
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # both are how it ends
+        pass  # both end the node normally
     finally:
         node.destroy_node()
         rclpy.try_shutdown()

@@ -1,6 +1,6 @@
-"""What happens in the demonstration: requests flow, one machine is preempted, the other one killed, nothing fails.
+"""Scenario of the demonstration: requests flow, one machine is preempted, the other is killed, no request fails.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ __all__ = ["Outcome", "Pace", "play"]
 
 _LOOK_S: Final = 0.2
 _BOOT_S: Final = 90.0
-_END_S: Final = 20.0  # more than the caller waits for an answer
+_END_S: Final = 20.0  # longer than the caller's timeout of a response
 _PATIENCE_S: Final = 60.0
 
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """How fast things go.
+    """Timing of the scenario.
 
     Args:
         rate_hz: requests a second.
-        calm_s: of plain traffic before, between and after what befalls the machines.
+        calm_s: seconds of undisturbed traffic before, between and after the faults.
         notice_s: between a preemption's notice and its end.
     """
 
@@ -51,11 +51,11 @@ class Pace:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What came of it.
+    """Result of the scenario.
 
     Args:
-        steps_s: how long it took from the notice, or the death, until it was seen, and until a replacement served.
-        complaints: lines of the robot's node, about requests that failed.
+        steps_s: seconds from the notice, or the kill, until its detection, and until a replacement served.
+        complaints: lines of the robot's node about failed requests.
     """
 
     counts: Counts
@@ -65,12 +65,12 @@ class Outcome:
 
     @property
     def ack(self) -> str:
-        """Return the last line."""
+        """Return the last line of the output."""
         return f"{self.counts.failed} failed of {self.counts.requests} requests"
 
 
 class _Looking:
-    """Looks at the journal and at the caller's lines, and shows both, until it is cancelled."""
+    """Poller of the journal and the caller's lines, which displays both until it is cancelled."""
 
     def __init__(self, journal: Journal, view: View) -> None:
         self._journal = journal
@@ -80,29 +80,29 @@ class _Looking:
         self._told_s = 0.0
 
     async def run(self) -> None:
-        """Look again and again."""
+        """Poll repeatedly."""
         while True:
             self.look()
             await asyncio.sleep(_LOOK_S)
 
     async def hear(self, caller: Child) -> None:
-        """Take in what the caller says, to its last line."""
+        """Read the caller's lines to the last one."""
         async for event in caller.events():
             self._take(event)
 
     def machines(self) -> list[Record]:
-        """Return all machines, those that are gone included."""
+        """Return all machines, including those that are gone."""
         return [each for cluster in self._journal.clusters() for each in self._journal.machines(cluster.plan.name)]
 
     def look(self) -> None:
-        """Look once."""
+        """Poll once."""
         news = self._journal.events(after=self.events[-1].id if self.events else 0)
         self.events += news
         self._view.happened(news)
         self._view.show(self.machines(), self.counts)
 
     def first_event(self, machine: str, what: set[str]) -> Entry | None:
-        """Return the first that the journal tells of a machine and is one of these."""
+        """Return the first event of a machine that is one of these."""
         return next((each for each in self.events if each.machine == machine and each.what in what), None)
 
     def _take(self, event: Event) -> None:
@@ -123,11 +123,11 @@ class _Looking:
 
 
 async def play(stage: Stage, launch_file: Path, pace: Pace, view: View) -> Outcome:
-    """Play it on a stage that was just made.
+    """Run the scenario on a new stage.
 
     Raises:
         ChildError: a process failed.
-        LocalError: something did not happen in time.
+        LocalError: an expected event did not occur in time.
     """
     view.step("a ring of five switches, the RIB at nuc3, the robot at nuc1, the site of fog beyond nuc5")
     plane = await stage.stand_up()
@@ -155,7 +155,7 @@ async def play(stage: Stage, launch_file: Path, pace: Pace, view: View) -> Outco
 
 
 async def _befall(site: Site, looking: _Looking, pace: Pace, view: View) -> dict[str, float]:
-    """Let one machine be preempted, then the other one die; return how long what took."""
+    """Preempt one machine, then kill the other; return the durations in seconds."""
     runs = local_provider(site).runs
     steps_s: dict[str, float] = {}
     await _until(lambda: looking.counts.answered > 0, "the first answer")
@@ -179,7 +179,7 @@ async def _befall(site: Site, looking: _Looking, pace: Pace, view: View) -> dict
 
 
 async def _replaced(looking: _Looking, machine: Record, signs: set[str], at_s: float, what: str) -> dict[str, float]:
-    """Wait until a machine that was asked for after this moment serves."""
+    """Wait until a machine that was requested after this time serves."""
 
     def serving() -> Record | None:
         later = (each for each in looking.machines() if each.asked_unix_s >= at_s and each.is_serving)
@@ -200,10 +200,10 @@ def _is_gone(looking: _Looking, machine: Record) -> bool:
 
 
 async def _until(is_met: Callable[[], bool], what: str) -> None:
-    """Look until something holds that tells nobody when it does.
+    """Poll until a condition without notification holds.
 
     Raises:
-        LocalError: it does not in time.
+        LocalError: it does not hold in time.
     """
     end_s = time.monotonic() + _PATIENCE_S
     while not is_met():

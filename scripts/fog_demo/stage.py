@@ -1,13 +1,13 @@
-"""Where the demonstration takes place: a ring of five switches, the robot at nuc1, a site of ``fog`` beyond nuc5.
+"""Environment of the demonstration: a ring of five switches, the robot at nuc1, a site of ``fog`` behind nuc5.
 
-Place: shell; makes namespaces, keys and files, all of one run.
+I/O; creates namespaces, keys and files of one run.
 ::
 
     caller -- proxy -- nuc1 -- nuc2 -- nuc3 (RIB) -- nuc4 -- nuc5 -- gateway --+-- m1
                          |____________ cost 100 ______________|                +-- m2 ...
 
-What ``fog`` makes stands without us, as machines elsewhere do. So a run ends with ``fog down``, and whatever a killed
-one left is found by its record: the records lie in a folder of their own, which nobody else sweeps.
+Resources of ``fog`` outlive this process, like machines of a cloud. A run therefore ends with ``fog down``, and records
+lead to the leftovers of a killed run. The records are in a separate folder, which no other program sweeps.
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ STATE: Final = "state"
 SITE: Final = "fog.yaml"
 ENVIRONMENT: Final = {
     "ROS_DOMAIN_ID": str(_DOMAIN),
-    "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",  # LOCALHOST brings shared memory, which crosses namespaces
+    "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",  # LOCALHOST enables shared memory, which crosses namespaces
     "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
 }
 
 
 class Stage:
-    """The ring of one run and its site.
+    """Ring of one run and its site.
 
     Args:
-        run: takes down what is made here; ``end_all_of`` first takes down what ``fog`` made.
+        run: registry that takes down the ring; ``end_all_of`` first takes down the resources of ``fog``.
 
     Raises:
         LocalError: the kernel refuses.
@@ -73,7 +73,7 @@ class Stage:
         self.site_file = run.directory / SITE
 
     async def stand_up(self) -> str:
-        """Start switches, RIB and the robot's proxy; return the data plane that the switches took.
+        """Start switches, RIB and the robot's proxy; return the data plane of the switches.
 
         Raises:
             ChildError: a process failed.
@@ -95,10 +95,10 @@ class Stage:
         return ", ".join(sorted(planes))
 
     async def fog(self, *words: str, patience_s: float) -> None:
-        """Run a command of ``fog`` beside the far switch, to its end.
+        """Run a command of ``fog`` on the host of the far switch until it ends.
 
         Raises:
-            ChildError: it failed; the text has its last words.
+            ChildError: it failed; the text has its last output.
         """
         argv = fog_command(self._run, words)
         child = self._start(FAR, f"fog-{words[0]}", argv, heard=False)
@@ -106,7 +106,7 @@ class Stage:
             raise child.failed("failed")
 
     def start_caller(self, rate_hz: float) -> Child:
-        """Start the robot's node: it calls ``/echo`` at this rate until it is interrupted."""
+        """Start the robot's node: it calls ``/echo`` at this rate until SIGINT."""
         told = ["-p", f"rate_hz:={rate_hz}", "-p", "report_s:=0.5"]
         return self._start(ROBOT, "caller", ["-m", "fog_demo.caller", "--ros-args", *told])
 
@@ -127,7 +127,7 @@ class Stage:
         return self._write("proxy.yaml", content)
 
     def _write_far_switch(self, uplink: str) -> Path:
-        """Write ``switch.yaml`` of the switch towards the machines: a port more, and where revocations come."""
+        """Write ``switch.yaml`` of the far switch, with an additional port and the folder of revocations."""
         path = self._materials.switch(FAR, "auto")
         revocations = self._run.directory / "revocations"
         revocations.mkdir(mode=0o700)
@@ -163,16 +163,16 @@ class Stage:
 
 
 def standing_runs(what: str) -> RunRegistry:
-    """Return the records of runs of one kind, such as ``demo``, that ``fog`` made machines for.
+    """Return the records of runs of one kind, such as ``demo``, with machines of ``fog``.
 
     Raises:
-        LocalError: the folder belongs to somebody else.
+        LocalError: the folder belongs to another user.
     """
     return RunRegistry(Path(tempfile.gettempdir()) / f"gdp-fog-{what}-{outer_uid()}")
 
 
 def sweep(runs: RunRegistry) -> list[str]:
-    """Take down what killed ones left; return their ids."""
+    """Take down the leftovers of killed runs; return their ids."""
     dead = [each.run for each in runs.all() if each.dead]
     for run in dead:
         end_all_of(runs.resume(run))
@@ -180,10 +180,10 @@ def sweep(runs: RunRegistry) -> list[str]:
 
 
 def end_all_of(run: Run) -> None:
-    """Give the machines of a run back, and take down the rest.
+    """Release the machines of a run, and take down the rest.
 
     Raises:
-        LocalError: machines are left; the text says what ``fog down`` had to say.
+        LocalError: machines remain; the text has the output of ``fog down``.
     """
     if (run.directory / STATE).exists():
         argv = [sys.executable, *fog_command(run, ["down", "--all"])]
@@ -194,7 +194,7 @@ def end_all_of(run: Run) -> None:
 
 
 def fog_command(run: Run, words: Sequence[str]) -> list[str]:
-    """Return what Python is told so that ``fog`` does something in a run's folder."""
+    """Return Python's arguments to run ``fog`` in a run's folder."""
     site = run.directory / SITE
     told = ["--site", str(site)] if site.exists() else []
     return ["-m", "fog.cli.app", *words, *told, "--state", str(run.directory / STATE)]

@@ -1,6 +1,6 @@
-"""What the demonstration shows while it goes on: in a terminal a table that moves, elsewhere plain lines.
+"""Display of the demonstration: a live table in a terminal, otherwise plain lines.
 
-Place: shell; prints. What a page says is made of records, events and counts alone.
+I/O; prints. The content depends only on records, events and counts.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from fog.supervisor.record import Record
 
 __all__ = ["Counts", "View"]
 
-_EVENTS: Final = 10  # of the newest
+_EVENTS: Final = 10  # number of the newest events shown
 _PLAIN_EVERY_S: Final = 4.0
 
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """What the robot's node says of its requests.
+    """Request statistics of the robot's node.
 
     Args:
-        failed: those without an answer or with a wrong one, and those that were not sent since no server was there.
-        rate: answered a second, lately.
-        by_machine: who answered first how often.
+        failed: requests without a response or with a wrong one, and requests that were not sent for lack of a server.
+        rate: recent responses a second.
+        by_machine: machine -> number of its first responses.
     """
 
     requests: int = 0
@@ -45,7 +45,7 @@ class Counts:
     by_machine: tuple[tuple[str, int], ...] = ()
 
     def line(self) -> Text:
-        """Return it as one line."""
+        """Return the counts as one line."""
         median, p99 = ("-" if each is None else f"{each:.1f} ms" for each in (self.median_ms, self.p99_ms))
         failed = Text(f"{self.failed} failed", style="bold red" if self.failed else "green")
         won = ", ".join(f"{machine} {count}" for machine, count in self.by_machine)
@@ -56,10 +56,10 @@ class Counts:
 
 
 class View:
-    """Shows steps, machines, events and counts; a context manager.
+    """Display of steps, machines, events and counts; a context manager.
 
     Args:
-        console: where to.
+        console: destination.
     """
 
     def __init__(self, console: Console) -> None:
@@ -77,20 +77,20 @@ class View:
             self._live.stop()
 
     def step(self, text: str) -> None:
-        """Tell what is done now."""
+        """Show the present step."""
         self._console.print(
             f"[dim]{time.monotonic() - self._begun_s:5.1f} s[/dim]  [bold]{text}[/bold]", highlight=False
         )
 
     def happened(self, entries: Sequence[Entry]) -> None:
-        """Take in what the journal says is new."""
+        """Add new events of the journal."""
         self._events.extend(entries)
         if self._live is None:
             for each in entries:
                 self._console.print(Text("         ") + event_line(each), soft_wrap=True)
 
     def show(self, machines: Sequence[Record], counts: Counts) -> None:
-        """Show how it is now. Plain lines come every few seconds."""
+        """Show the present state; plain lines appear every few seconds."""
         if self._live is not None:
             if not self._live.is_started:
                 self._live.start()

@@ -1,4 +1,4 @@
-"""Files of another user, for tests that run as root or as anybody."""
+"""Files of another user, for tests that run as root or as an ordinary user."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ NOBODY = 65_534
 
 
 def give_away(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let a file belong to another user: root gives it away, anybody else becomes another user for the check."""
+    """Give a file to another user: root changes its owner, an ordinary user changes identity for the check."""
     monkeypatch.delenv("SUDO_UID", raising=False)
     if os.geteuid() == 0:
         os.chown(path, NOBODY, NOBODY)

@@ -1,4 +1,4 @@
-"""What is asked of EC2, as its API (moto's server) then tells it."""
+"""Requests to EC2, as its API (moto's server) then reports them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recorded questions, claims and answers between switches and RIBs, played back by a stranger: nothing comes of it."""
+"""Recorded queries, advertisements and responses between switches and RIBs, replayed by a stranger without effect."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.journeys.test_attacks import mac_of, still_flows
 
 
 def at_rib(world: Simulation) -> tuple[str, Tap, Tap]:
-    """Return a RIB's node, and what goes to it and comes from it from now on."""
+    """Return a RIB's node, and the frames to it and from it from now on."""
     node = world.rib_node("school")
     switch = node.partition("/")[0]
     there, back = Tap(switch, node), Tap(node, switch)
@@ -22,7 +22,7 @@ def at_rib(world: Simulation) -> tuple[str, Tap, Tap]:
 
 
 def played(world: Simulation, node: str, frames: list[bytes], times: int = 1) -> int:
-    """Play frames to a node over its lead; return how many bytes that were."""
+    """Play frames to a node over its link; return their size in bytes."""
     for _ in range(times):
         for frame in frames:
             world.network.inject(node, 0, frame, mac_of(world, node))
@@ -36,7 +36,7 @@ def of_rib(tap: Tap) -> list[bytes]:
 
 
 def test_a12_a13_recorded_questions_and_advertisements_draw_no_more_than_their_own_bytes() -> None:
-    world = ring(lease_s=60.0)  # nothing is renewed meanwhile
+    world = ring(lease_s=60.0)  # nothing is renewed during this time
     node, there, back = at_rib(world)
     flow = flowing(world)
     for number in range(5):
@@ -60,7 +60,7 @@ def test_a39_a_rib_that_restarted_takes_no_advertisement_that_a_stranger_recorde
     flow = flowing(world)
     world.network.run(1)
     recorded = of_rib(there)
-    world.network.freeze(node.partition("/")[0])  # nobody but the stranger speaks to it
+    world.network.freeze(node.partition("/")[0])  # only the stranger speaks to it
     world.kill_rib("school")
     rib = world.restart_rib("school")
     world.network.thaw(node.partition("/")[0])
@@ -71,12 +71,12 @@ def test_a39_a_rib_that_restarted_takes_no_advertisement_that_a_stranger_recorde
         played(world, node, recorded)
         taken.append(rib.rib.accepted - before)
     assert rib.drops()[DropReason.NO_CHANNEL] >= len(recorded) // 4
-    assert rib.rib.refusals[DropReason.STALE] == 0  # no old claim came as far as that
+    assert rib.rib.refusals[DropReason.STALE] == 0  # no old advertisement came that far
     still_flows(flow)
     flow.outlive()
 
 
-def test_an_old_nobody_delays_no_message() -> None:
+def test_an_old_negative_response_delays_no_message() -> None:
     world = ring()
     tap = Tap("nuc4", "nuc5")
     world.network.taps.append(tap)

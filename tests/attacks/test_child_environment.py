@@ -1,4 +1,4 @@
-"""What programs of others inherit of the operator's environment."""
+"""Environment of the operator that foreign programs inherit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Clocks that are an hour off, and link states of the dead: who restarts is heard at once, what is over stays over."""
+"""Clocks that are an hour off, and link states of dead switches: a restarted node works at once, old state ends."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _M = TypeVar("_M")
 
 
 def off(machine: _M, by_s: float) -> _M:
-    """Let a machine see a wall clock that is wrong."""
+    """Give a machine a wrong wall clock."""
     for name in ("add_port", "receive", "port_changed", "handle_timer"):
         method = getattr(machine, name)
 
@@ -65,7 +65,7 @@ def restart_rib(world: Simulation, label: str, by_s: float) -> None:
 
 
 def flows_within(flow: Flow, seconds: float) -> bool:
-    """Return whether what is published from now on all arrives so soon."""
+    """Return whether everything published from now on arrives within this time."""
     flow.collect()
     before = len(flow.got[SERVER])
     flow.stream(10, seconds / 20)
@@ -85,7 +85,7 @@ def test_a30_a_switch_that_restarts_with_its_clock_an_hour_off_is_heard_at_once(
 
 
 @pytest.mark.momentary("how soon a flow goes on is the question")
-def test_a30_clocks_an_hour_off_to_both_sides_part_nobody() -> None:
+def test_a30_clocks_an_hour_off_to_both_sides_separate_no_nodes() -> None:
     world = ring()
     flow = flowing(world)
     world.network.run(1)
@@ -122,7 +122,7 @@ def buried(world: Simulation, label: str) -> list[bytes]:
 
 
 def play(world: Simulation, wires: list[bytes], to: str = "nuc1") -> None:
-    """Let the neighbour of a switch, who has gone over to the enemy, play link states."""
+    """Let the compromised neighbour of a switch replay link states."""
     for wire in wires:
         for frame in world.switches["nuc2"]._fragmenter.split(Kind.LINK_STATE, wire, 1_500):
             world.network.inject(to, 0, frame, mac_of(world, to))
@@ -153,7 +153,7 @@ def test_a38_a_switch_that_has_restarted_since_refuses_it_by_its_time() -> None:
     world = ring()
     world.network.run(1)
     wires = buried(world, "nuc3")
-    restart_switch(world, "nuc1", LINK_STATE_AGE_MAX_S)  # so much later
+    restart_switch(world, "nuc1", LINK_STATE_AGE_MAX_S)  # much later
     world.network.run(2)
     play(world, wires)
     assert bytes(world.identities["nuc3"].name) not in origins(world, "nuc1")
@@ -180,7 +180,7 @@ def test_a38_a30_a_new_life_is_heard_below_the_numbers_of_the_last_and_that_stay
     states.expire(LINK_STATE_LEASE_S)
     assert states.put(replace(old, sequence=3, life=b"2" * 16), b"wire", 200.0) is True
     assert states.put(old, b"wire", 201.0) is False
-    for number in range(3, 20):  # an origin that draws lives to have its own forgotten
+    for number in range(3, 20):  # an origin that draws incarnations to have its own forgotten
         states.put(replace(old, sequence=500 + number, life=bytes([number]) * 16), b"wire", 202.0)
     states.expire(202.0 + LINK_STATE_LEASE_S)
     assert states.put(old, b"wire", 400.0) is False

@@ -1,4 +1,4 @@
-"""Paths in configuration files that the system does not take."""
+"""Paths in configuration files that the system does not accept."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A member says another's nonce as its own: H2 and J2 of docs/model."""
+"""Member that presents another's nonce as its own: H2 and J2 of docs/model."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MALLORY = node("mallory")
 
 def test_x01_a_neighbour_that_heard_our_nonce_from_another_member_only_does_not_come_up() -> None:
     one, two = hello_protocol(A, 1), hello_protocol(B, 2)
-    hellos(one, 0.0)  # two never hears these
+    hellos(one, 0.0)  # two never receives these
     nonce = one.ports[0].nonce
     hear(two, forged(MALLORY, nonce=nonce), 0.0, mac=b"\x02mall\x00")
     for hello in hellos(two, HELLO_S):
@@ -33,7 +33,7 @@ def test_x05_a_join_to_another_member_that_said_our_nonce_is_not_taken() -> None
     ours = two.ports[0].nonce
     hear(one, forged(MALLORY, nonce=ours), 1.0, mac=b"\x02mall\x00")
     theirs = one.ports[0].neighbours[MALLORY.name]
-    # What ``one`` signs for Mallory, as the planter makes it: the session is the nonce of Mallory's hellos.
+    # Statement that ``one`` signs for Mallory, as MulticastTrees does: its session is the nonce of Mallory's hellos.
     session = one.ports[0].nonce
     domain = B.member.domain
     join = Join(B.name, B.name, B.name, domain, frozenset(), 1_500, 5.0, b"", theirs.echo, 1, 0, ZERO, session)

@@ -1,4 +1,4 @@
-"""One-time enrolment of machines: what user data tells, and what a token is good for."""
+"""One-time enrolment of machines: content of user data, and limits of a token."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def reports(tickets: Tickets) -> list[Report]:
     return [each.report for each in tickets.news()]
 
 
-# what user data tells
+# content of user data
 
 
 def launchers_secrets(desk: Desk) -> list[bytes]:
@@ -109,7 +109,7 @@ def test_a52_no_provider_tells_a_machine_a_private_key(
     assert not [each for each in launchers_secrets(desk) if each in told]
 
 
-def test_a52_ec2_is_told_no_private_key(desk: Desk, cloud: Cloud, aws: AwsProvider) -> None:
+def test_a52_ec2_receives_no_private_key(desk: Desk, cloud: Cloud, aws: AwsProvider) -> None:
     told = cloud.user_data(aws.create(spec("enrolled"), desk.boot(shares_host=False)))
     paths = [each["path"] for each in told["write_files"]]
     assert f"/var/lib/fog/{TICKET_FILE}" in paths
@@ -238,7 +238,7 @@ def test_a52_the_token_of_a_machine_that_was_given_back_is_good_for_nothing(desk
     assert asked(desk, machine.request()) == b""
 
 
-# exactly what was planned
+# exactly the planned requests
 
 
 def other_seats(ticket: Ticket, role: Role, label: str) -> list[NodeKeys]:
@@ -295,7 +295,7 @@ def test_a52_a_proof_for_another_token_or_kem_key_is_refused(desk: Desk) -> None
     assert asked(desk, again.request(swapped)) == REFUSED
 
 
-# who listens, and who answers
+# the parties that listen and answer
 
 
 def test_a52_a_request_shows_neither_token_nor_machine_and_is_good_for_its_ticket_alone(desk: Desk) -> None:
@@ -322,7 +322,7 @@ def test_a52_an_observer_who_replays_a_request_learns_nothing_and_changes_nothin
 
 
 class Impostor:
-    """Stands in the way of a machine, has read its user data, and lacks the responder's private key."""
+    """Machine in the middle that has read its victim's user data and lacks the responder's private key."""
 
     def __init__(self, ticket: Ticket, answer: bytes) -> None:
         self._ticket, self._answer = ticket, answer
@@ -355,12 +355,12 @@ def test_a52_who_knows_the_token_alone_cannot_answer_in_the_launchers_place(desk
     assert not list((tmp_path / "home").rglob("node.crt"))
 
 
-# what costs nothing
+# requests that cost nothing
 
 
 @pytest.fixture
 def dear(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What was done that costs more than a hash."""
+    """Counter of operations that cost more than a hash."""
     done: list[str] = []
     opened, verified = KemPrivateKey.open, PublicKey._verify
     monkeypatch.setattr(KemPrivateKey, "open", lambda self, *words: done.append("open") or opened(self, *words))
@@ -391,7 +391,7 @@ def test_a52_who_has_a_token_draws_a_bounded_number_of_decapsulations(desk: Desk
         asked(desk, request)
     assert dear.count("open") == OPENED_MAX
     dear.clear()
-    assert asked(desk, requests[OPENED_MAX - 1]) not in (b"", REFUSED)  # the last one, again: nothing is opened
+    assert asked(desk, requests[OPENED_MAX - 1]) not in (b"", REFUSED)  # the last token again: nothing is opened
     assert dear == []
 
 
@@ -478,11 +478,11 @@ def test_a52_a_machine_enrols_in_a_flood_of_wrong_tokens(desk: Desk, tmp_path: P
     assert [each.result() for each in floods] == [None] * 4
 
 
-# what the supervisor does
+# actions of the supervisor
 
 
 class Told(Memory):
-    """A provider that keeps what it was given."""
+    """Provider that keeps its arguments."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Hellos in floods, recorded or forged: they cost a bounded share, take no place and draw nothing larger back."""
+"""Floods of recorded or forged hellos: their cost is bounded, they take no port and draw no larger reply."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ def said(
 
 
 class Link:
-    """A segment with greeters at it; what they say reaches all others at once.
+    """Segment with HelloProtocol instances; each statement reaches all others at once.
 
     Attributes:
-        sent: bytes that the first one said.
-        drops: why it refused what came.
+        sent: bytes that the first one sent.
+        drops: reasons for which it refused statements.
     """
 
     def __init__(self, *ends: HelloProtocol) -> None:
@@ -71,7 +71,7 @@ class Link:
                 self.drops.append(error.reason)
 
     def run(self, duration_s: float) -> None:
-        """Let time go on."""
+        """Advance the clock."""
         end_s = self.now_s + duration_s
         while self.now_s < end_s - 1e-9:
             self.now_s += STEP_S
@@ -138,7 +138,7 @@ def test_a20_a41_a_flood_of_hellos_costs_a_bounded_number_of_signatures(
         link.inject(flood[number % len(flood)], mac_of(number % addresses))
         if number % 10 == 9:
             link.run(STEP_S)
-    # 1 s: what strangers may have at once and in that time; each may be a certificate and a hello; B's own ones
+    # 1 s: the burst and the rate of strangers; each may be a certificate and a hello; B's own ones
     seconds = 2_000 / 10 * STEP_S
     most = 2 * (admission.STRANGER_HELLOS[1] + seconds * admission.STRANGER_HELLOS[0]) + 100
     assert len(verified) <= most
@@ -262,13 +262,13 @@ def test_a22_a_hello_of_an_earlier_life_played_at_another_port_lets_no_neighbour
     assert known.state is NeighbourState.UP
 
 
-def test_a20_a_conflict_that_has_not_proved_itself_draws_no_more_than_it_sent() -> None:
+def test_a20_a_second_node_of_an_identity_without_proof_draws_no_more_than_it_sent() -> None:
     calm, link = pair(FAST), pair(FAST)
     for each in (calm, link):
         each.run(4.0)
         each.sent = 0
     received = 0
-    for number in range(16):  # younger lives of the neighbour, at another address
+    for number in range(16):  # later incarnations of the neighbour, at another address
         hello = Hello(number.to_bytes(8, "big"), 1, (), 1_500, bytes(8), B.membership, life=bytes(15) + b"\x09")
         received += link.inject(hello.to_wire(B.name, B.key), mac_of(number))
         link.run(1.0)

@@ -1,4 +1,4 @@
-"""What the fuzzing of insiders found (tests/insiders): each statement is validly signed, and ends no node."""
+"""Findings of the insider fuzzer (tests/insiders): each statement is validly signed, and ends no node."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from tests.journeys.test_attacks import control, still_flows
 
 
 def test_a_hello_of_an_older_life_from_another_address_ends_no_switch() -> None:
-    """The switch let the younger life go by setting back when it was heard, and took that for lateness of its own."""
+    """The switch removed the later incarnation by resetting its time of receipt, and took that for its own delay."""
     world = ring()
     flow = flowing(world)
     world.add_member("nuc1/insider", "nuc1")
     assert world.settle()
     insider, nuc1 = world.identities["nuc1/insider"], world.switches["nuc1"]
-    world.network.connect("nuc1", "nuc1/insider").is_up = False  # a second port of it
+    world.network.connect("nuc1", "nuc1/insider").is_up = False  # a second port of the same node
     port = max(nuc1.hello_protocol.ports)
     hello = Hello(
         b"a nonce!", 1, (nuc1.hello_protocol.ports[port].echo,), 1_500, bytes(8), insider.membership, Timing(0, 0, 1)

@@ -1,4 +1,4 @@
-"""Issuing memberships: only what the issuer states is signed, and all of it is written down."""
+"""Issue of memberships: the authority signs only what the issuer states, and records all of it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ISSUE = "cert issue --domain school --request far/node.csr --out far.crt"
 
 @pytest.fixture
 def far(gdp: Run) -> None:
-    """A domain, and the keys of a node that asks to be a RIB under the label of a server."""
+    """Domain, and the keys of a node that asks to be a RIB under the label of a server."""
     assert gdp("domain init school --label school").code == 0
     assert gdp("keygen node far --role rib --label server").code == 0
 
@@ -140,7 +140,7 @@ def test_a73_issuers_at_the_same_time_write_one_chain(tmp_path: Path) -> None:
     assert {each.label for each in read_ledger(tmp_path / "lab")} == {f"p{index}" for index in range(8)}
 
 
-def test_a73_nothing_is_handed_out_that_cannot_be_written_down(tmp_path: Path) -> None:
+def test_a73_nothing_is_issued_that_cannot_be_recorded(tmp_path: Path) -> None:
     make_domain(tmp_path / "lab", "lab")
     os.symlink(tmp_path / "elsewhere", tmp_path / "lab" / LEDGER)
     with pytest.raises(LocalError, match=LEDGER):

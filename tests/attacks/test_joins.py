@@ -1,4 +1,4 @@
-"""A neighbouring switch that says where somebody else's publisher is: what it did not prove moves no tree."""
+"""Neighbour switch that advertises the location of another's publisher: without proof it moves no tree."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.journeys.test_attacks import counted, still_flows
 
 
 def aside(world: Simulation, flow: Flow) -> tuple[SwitchCore, Tree, Neighbour, Identity]:
-    """Return the reader's switch, its tree, a neighbour that is not on the tree's way, and whose that is."""
+    """Return the reader's switch, its tree, a neighbour off the tree's path, and that neighbour's identity."""
     reader = world.members[SERVER].name
     (home,) = (
         each for each in world.switches.values() if any(a.advertisement.node == reader for a in each.attached.all())

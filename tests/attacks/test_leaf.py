@@ -29,7 +29,7 @@ DEAR, CHEAP = 100, 1
 
 
 def detour(*, far: bool = False) -> Simulation:
-    """Return a world in which the cheap way between two switches leads through a leaf, the dear one through a third.
+    """Return a network whose cheap path between two switches leads through a leaf, the dear one through a third switch.
 
     ::
 
@@ -108,7 +108,7 @@ def test_l01_a_leaf_on_the_cheapest_way_carries_its_own_nodes_only() -> None:
     own.outlive()
 
 
-def test_l02_a_leaf_that_lists_links_to_everybody_attracts_nobody() -> None:
+def test_l02_a_leaf_that_lists_links_to_all_switches_attracts_no_traffic() -> None:
     world = detour()
     flow = flowing(world, source=TALKER, readers=(LISTENER,))
     leaf = world.identities["leaf"]
@@ -153,7 +153,7 @@ def test_l03_where_the_only_way_leads_through_a_leaf_frames_stop_and_it_is_said(
     world.network.set_link(world.cables[frozenset(("left", "middle"))], up=True)
     world.network.run(10)
     assert arrives(flow, LISTENER)
-    world.network.run(3)  # what it missed is repaired
+    world.network.run(3)  # lost messages are repaired
     flow.outlive()
 
 
@@ -194,7 +194,7 @@ def test_l05_a_leaf_is_no_border_and_no_neighbour_of_another_domain() -> None:
     before = right.drops()[DropReason.THROUGH_LEAF]
     wire = border.to_wire(leaf.key, leaf.membership)
     for frame in world.switches["leaf"]._fragmenter.split(Kind.LINK_STATE, wire, 1_500):
-        world.network.inject("right", 0, frame, mac_of(world, "right", 0))  # as if its neighbour passed it on
+        world.network.inject("right", 0, frame, mac_of(world, "right", 0))  # as if its neighbour forwarded it
     assert right.drops()[DropReason.THROUGH_LEAF] > before
     assert not any(each.origin == leaf.name for each in right._flooding.link_states.states(Scope.BORDER))
     assert first_to(world, "right", "left") == "middle"
@@ -233,7 +233,7 @@ def test_l07_frames_in_anothers_name_from_a_leaf_become_no_copies() -> None:
     flow.outlive()
 
 
-def test_l08_a_leaf_that_advertisements_for_another_switchs_node_is_refused_by_the_rib() -> None:
+def test_l08_a_leaf_that_advertises_for_another_switchs_node_is_refused_by_the_rib() -> None:
     world = detour()
     flow = flowing(world, source=TALKER, readers=(LISTENER,))
     leaf = world.switches["leaf"]

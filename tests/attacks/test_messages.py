@@ -1,4 +1,4 @@
-"""Attacks with the bytes of a message that a publisher describes as it likes."""
+"""Attacks with the bytes of a message whose description the publisher chooses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The metrics port, to which every user of the host may connect."""
+"""Metrics port, to which every user of the host may connect."""
 
 from __future__ import annotations
 

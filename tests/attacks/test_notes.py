@@ -1,4 +1,4 @@
-"""Attacks with the notes of readers: in another's name, far ahead, recorded, under an epoch that is over."""
+"""Attacks with control datagrams of readers: in another's name, far ahead, recorded, or of an epoch that is over."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def notes_of(pipe: Pipe, label: bytes, *, secrets: dict[int, bytes] | None = Non
 
 
 def by_the_secret_alone(pipe: Pipe, end: End, number: int, report: AckNack) -> bytes:
-    """Return the note that proved a reader while the topic's secret was all that it took."""
+    """Return the control datagram that proved a reader when the topic's secret alone was sufficient."""
     source, reader = pipe.source, end.reader
     key = seal_key(SECRETS[1], Kind.ACKNACK, reader.name, reader.incarnation, source.name)
     to = source.name, TOPIC, source.incarnation
@@ -94,7 +94,7 @@ def test_a33_a_reader_whose_state_was_lost_is_heard_again_at_once() -> None:
     assert pipe.run(1.0, lambda: again.messages == [b"for the new life"])
 
 
-def test_a24_who_was_left_out_of_the_new_epoch_fills_no_place_and_speaks_for_nobody() -> None:
+def test_a24_a_reader_left_out_of_the_new_epoch_fills_no_quota_and_speaks_for_no_other() -> None:
     pipe = Pipe(publisher_of())
     end = live(pipe, b"a")
     end.writer_proxy.renew(TWO)
@@ -159,7 +159,7 @@ def lives() -> Iterator[tuple[bytes, int, int]]:
 
 
 def test_a33_no_note_is_accepted_that_is_forged_or_recorded_whatever_restarts() -> None:
-    """Every kind of note, forged by each other reader and played back over restarts of both ends and over epochs."""
+    """Every kind of control datagram, forged by other readers and replayed over restarts of both ends and epochs."""
     secrets = {epoch: bytes([epoch]) * 32 for epoch in (1, 2, 3)}
     pipe = Pipe(publisher_of(secrets={1: secrets[1]}))
     recorded: list[bytes] = []
@@ -193,7 +193,7 @@ def test_a33_no_note_is_accepted_that_is_forged_or_recorded_whatever_restarts() 
 
 
 def snapshot(pipe: Pipe) -> object:
-    """Return what notes can change at a publisher."""
+    """Return the state of a publisher that control datagrams can change."""
     publisher = pipe.publisher
     readers = {name: publisher._readers[name] for name in publisher._readers}
     states = {name: (each.incarnation, each.heard_s, each.sequence, each.lost) for name, each in readers.items()}
@@ -207,24 +207,24 @@ def test_a56_a_reader_that_asks_for_everything_costs_a_bounded_share() -> None:
     frames = [bytes(1_000)] * 20_000
     window.add(1, frames, 20_000_000)
     now_s = 0.0
-    while window.sent[0] < 2:  # all of it is under way
+    while window.sent[0] < 2:  # all of it is in flight
         taken = len(window.frames_to_send(now_s))
         part = window.sent[1] if window.sent[0] < 2 else len(frames)
         window.handle_acknack(reader, AckNack(AckNackFlag.NONE, 1, max(part - 1, 0), ()), now_s)
         now_s += 0.01 if taken else 0.1
     everything = tuple(MissingRange(1, 0, 0xFFFF_FFFF) for _ in range(NACKS_PER_REPORT))
     greedy = AckNack(AckNackFlag.NONE, 1, 0, everything)
-    for _ in range(200):  # nothing is sent, as over a slow link: all that is looked at waits already
+    for _ in range(200):  # nothing is sent, as over a slow link: all fragments checked are already waiting
         now_s += 0.02
         window.handle_acknack(reader, greedy, now_s)
-    with lines_run(2_000_000):  # each of 2,000 reports in a tenth of a second looked at 8,192 parts: 80 million
+    with lines_run(2_000_000):  # each of 2,000 reports in a tenth of a second checked 8,192 fragments: 80 million
         for _ in range(2_000):
             now_s += 0.000_05
             window.handle_acknack(reader, greedy, now_s)
 
 
 @pytest.mark.parametrize("said", [(576, 9_000), tuple(range(8_999, 577, -7))])
-def test_a57_a_path_of_every_width_has_what_is_kept_sealed_anew_a_few_times_only(said: tuple[int, ...]) -> None:
+def test_a57_a_path_of_every_width_has_kept_messages_sealed_again_a_few_times_only(said: tuple[int, ...]) -> None:
     path, width, narrowed = PathMtu(), 9_000, 0
     path.receive_mtu(width, 0.0)
     for turn in range(1_000):

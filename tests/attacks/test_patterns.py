@@ -1,4 +1,4 @@
-"""Names of the local graph against the operator's patterns: what a match may cost."""
+"""Cost of matching names of the local graph against the operator's patterns."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from proxy.config.pattern import is_pattern
 
-_CPU_S = 5  # a thousand times what is measured; a pattern that backtracks needs hours
+_CPU_S = 5  # a thousand times the measured time; a pattern that backtracks needs hours
 
 _MATCH = f"""
 import resource, sys

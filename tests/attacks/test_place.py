@@ -1,4 +1,4 @@
-"""Switches that say that somebody else's RIB, proxy or switch is reached through them: they draw nothing."""
+"""Switches that falsely advertise a path to another's RIB, proxy or switch: they attract no traffic."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_a07_a_border_that_lists_switches_of_another_domain_is_no_way_to_them() 
     flow.outlive()
 
 
-def test_a55_joins_of_invented_domains_compute_no_paths_anew() -> None:
+def test_a55_joins_of_invented_domains_recompute_no_paths() -> None:
     world = ring()
     paths = world.switches["nuc1"]._paths
     target, domain = world.switches["nuc4"].name, world.identities["nuc4"].root.domain

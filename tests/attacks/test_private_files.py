@@ -1,4 +1,4 @@
-"""Private files of other users: a key that somebody else wrote is nobody's key."""
+"""Private files of other users: a key that another user wrote is not accepted."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_a48_a_private_key_in_a_folder_that_all_may_write_is_refused(tmp_path: P
     (tmp_path / "lab").chmod(0o777)
     with pytest.raises(LocalError, match="chmod go-w"):
         load_domain(tmp_path / "lab")
-    (tmp_path / "lab").chmod(0o1777)  # as /tmp: nobody can replace what is another's
+    (tmp_path / "lab").chmod(0o1777)  # as /tmp: no user can replace another user's file
     load_domain(tmp_path / "lab")
 
 

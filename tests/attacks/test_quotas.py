@@ -1,4 +1,4 @@
-"""One member's appetite: watches, claims, names, questions and branches leave room for the others."""
+"""Quotas of one member: its watches, advertisements, names, queries and branches leave capacity for the others."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ RIB = NodeKeys.generate(Role.RIB, "rib").join(SCHOOL, DAY)
 CLOUD_SWITCH = NodeKeys.generate(Role.SWITCH, "nuc4").join(CLOUD, DAY)
 CLOUD_PROXY = NodeKeys.generate(Role.PROXY, "elsewhere").join(CLOUD, DAY)
 START = Timestamps(0.0, NOW)
-ROOM = 64  # for branches, in a test of how it is shared
+ROOM = 64  # limit of branches, in a test of how they are shared
 
 
 def rib(**settings: int) -> RibCore:
@@ -53,7 +53,7 @@ def watch(at: RibCore, by: Identity, number: int) -> None:
     at.statements_to_send()
 
 
-def test_a14_a_greedy_asker_leaves_room_for_the_watches_of_others() -> None:
+def test_a14_a_greedy_client_leaves_capacity_for_the_watches_of_others() -> None:
     at = rib(watches=100)
     for number in range(1, 200):
         watch(at, CLOUD_SWITCH, number)
@@ -164,13 +164,13 @@ def test_a15_advertisements_and_withdrawals_beyond_a_neighbours_pace_draw_nothin
 
 
 def renamed(one: Advertisement, name: Name) -> Advertisement:
-    """Return a claim on another name, which nobody verified: what costs room is counted before."""
+    """Return an unverified advertisement of another name: the quota is counted before verification."""
     subject = copy.copy(one.subject)
     object.__setattr__(subject, "name", name)
     return replace(one, subject=subject)
 
 
-def test_a16_one_nodes_names_leave_room_for_the_other_nodes_of_its_switch() -> None:
+def test_a16_one_nodes_names_leave_capacity_for_the_other_nodes_of_its_switch() -> None:
     at = rib(names_per_sender=20)
     for number in range(30):
         tell(at, advertisement(subject=_subject(f"/own{number}"), chain=[]))
@@ -199,7 +199,7 @@ def _port_of(world: Simulation, switch: str, label: str) -> int:
     return next(port for port, (_, _, far) in ports.items() if far.node == label)
 
 
-def test_a17_a18_frames_to_invented_names_are_asked_for_within_a_budget_and_delay_nobody_else() -> None:
+def test_a17_a18_frames_to_invented_names_cause_queries_within_a_budget_and_delay_no_others() -> None:
     world = ring()
     flow = flowing(world)
     other = world.add_member("nuc1/other", "nuc1")
@@ -223,7 +223,7 @@ def test_a17_a18_frames_to_invented_names_are_asked_for_within_a_budget_and_dela
     flow.outlive()
 
 
-def test_a65_one_neighbours_branches_leave_room_for_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a65_one_neighbours_branches_leave_capacity_for_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gdp.switch.multicast.TREES_MAX", ROOM)
     world = ring()
     multicast = world.switches["nuc1"].multicast

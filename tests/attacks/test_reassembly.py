@@ -1,4 +1,4 @@
-"""Attacks on the memory in which the parts of messages wait for the rest."""
+"""Attacks on the memory of unfinished messages."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Stream:
         return [joined for joined in got if joined is not None]
 
     def forge(self, numbers: range = range(10, 14)) -> None:
-        """Give parts that another reader made: they open, and no message of them is ever whole."""
+        """Insert fragments of another reader: they open, but no message of them is ever complete."""
         for number in numbers:
             self.give(self.frames(number, bytes(12 << 10), OTHER)[:-1])
 
@@ -72,7 +72,7 @@ def test_a58_parts_forged_in_one_topic_leave_the_publishers_other_topics_alone()
     assert [joined.message for joined in other.give(other.frames(1, IMAGE))] == [IMAGE]
 
 
-def test_a58_no_source_holds_more_than_its_bound_and_nobody_all() -> None:
+def test_a58_no_source_holds_more_than_its_bound_or_the_whole_quota() -> None:
     budget = ReassemblyQuota(TOTAL_BYTES, SOURCE_BYTES)
     streams = [Stream(budget, bytes([name]) * 32) for name in range(5)]
     for stream in streams:

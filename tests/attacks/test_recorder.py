@@ -1,4 +1,4 @@
-"""Attacks of a publisher on a proxy that records what it sends, and on one with a live graph."""
+"""Attacks of a publisher on a recording proxy, and on one with a live graph."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ NEVER = (9_223_372_036, 854_775_807)
 
 
 class Sink:
-    """A recording in memory."""
+    """Recording in memory."""
 
     path = Path("memory.mcap")
     ros: RosVersion = 2
@@ -50,7 +50,7 @@ class Sink:
 
 
 class Recorder:
-    """The way from a member to a recording, about one topic: /chatter."""
+    """Path from a member to a recording, about one topic: /chatter."""
 
     def __init__(self) -> None:
         self.sink = Sink()
@@ -154,7 +154,7 @@ def test_a54_a_far_publisher_writes_neither_lines_nor_escapes_into_the_log(caplo
     assert text.isprintable()
 
 
-def test_a54_many_messages_that_cannot_be_taken_are_told_in_a_few_lines(caplog: pytest.LogCaptureFixture) -> None:
+def test_a54_many_messages_that_cannot_be_taken_are_logged_in_a_few_lines(caplog: pytest.LogCaptureFixture) -> None:
     recorder = Recorder()
     with caplog.at_level(logging.DEBUG):
         recorder.receive(described(channel()), *[b""] * 16_000)

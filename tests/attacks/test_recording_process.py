@@ -1,4 +1,4 @@
-"""Attacks with recordings on the process that decodes them, and by that process where it was taken over."""
+"""Attacks with recordings on the decoder process, and by that process after an exploit."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def recording(path: Path, count: int = 3, size: int = 100) -> Path:
 
 
 def child_of(process: int) -> int:
-    """Return the one process that a process has started."""
+    """Return the only child process of a process."""
     (child,) = Path(f"/proc/{process}/task/{process}/children").read_text().split()
     return int(child)
 
@@ -67,7 +67,7 @@ def ends(process: int) -> bool:
     return True
 
 
-# --- what a decoder that was taken over can do
+# --- actions of an exploited decoder
 
 PROBE = """
 import ctypes, json, os, pathlib, resource, socket, sys
@@ -107,7 +107,7 @@ print(json.dumps(found))
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """What became of each attempt of a decoder: ``done``, or the kind of error."""
+    """Result of each attempt of a decoder: ``done``, or the kind of error."""
     folder = tmp_path_factory.mktemp("decoder")
     (folder / "scratch").mkdir()
     (folder / "secret").write_bytes(b"x")
@@ -205,7 +205,7 @@ def test_b02_words_of_a_decoder_are_printed_without_control_characters(
         BagReader(recording(tmp_path / "a.mcap"))
 
 
-# --- what a recording can cost
+# --- cost of a recording
 
 
 @pytest.mark.parametrize("kind", ["mcap", "bag"])

@@ -1,4 +1,4 @@
-"""Attacks with recordings: files that somebody else has made."""
+"""Attacks with recordings: files of an untrusted author."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ def test_a29_a_tree_of_pages_that_shares_its_leaves_ends(tmp_path: Path, suffix:
     path = database(tmp_path / f"a{suffix}", TOPICS, MESSAGES, topic, *rows)
     raw = bytearray(path.read_bytes())
     interior = [at for at in range(4_096, len(raw), 4_096) if raw[at] == 5]
-    for at in interior:  # each page of the tree points to the root again and again
+    for at in interior:  # each page of the tree points to the root again
         (count,) = struct.unpack_from(">H", raw, at + 3)
         for cell in range(count):
             (offset,) = struct.unpack_from(">H", raw, at + 12 + 2 * cell)

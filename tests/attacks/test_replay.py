@@ -1,4 +1,4 @@
-"""Recorded frames and statements, of any age, that a stranger at a link plays back: nothing acts twice."""
+"""Recorded frames and statements of any age, played back by a stranger at a link: nothing acts twice."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.journeys.test_attacks import mac_of, still_flows
 
 
 def recorded_life(flow: Flow) -> Tap:
-    """Return what went to the reader while the robot sent it five commands."""
+    """Return the frames to the reader while the robot sent it five commands."""
     tap = Tap("nuc5", SERVER)
     flow.world.network.taps.append(tap)
     for number in range(5):
@@ -28,13 +28,13 @@ def recorded_life(flow: Flow) -> Tap:
 
 
 @pytest.mark.parametrize("reliable", [True, False])
-def test_a10_commands_of_an_hour_ago_are_not_handed_to_a_restarted_reader(reliable: bool) -> None:
+def test_a10_commands_of_an_hour_ago_are_not_delivered_to_a_restarted_reader(reliable: bool) -> None:
     world = ring()
     tap = Tap("nuc5", SERVER)
     world.network.taps.append(tap)
     flow = flowing(world, reliable=reliable)
     tap.frames += recorded_life(flow).frames
-    world.network.freeze(ROBOT)  # nothing of its own comes in between
+    world.network.freeze(ROBOT)  # no command of its own comes in between
     reader = world.restart_member(SERVER)
     assert world.network.run(10, lambda: reader.attachment.is_attached)
     reader.subscribe(world.topic(flow.name, reader, [Right.READ]))
@@ -52,7 +52,7 @@ def test_a10_commands_of_an_hour_ago_are_not_handed_to_a_restarted_reader(reliab
     flow.outlive()
 
 
-def test_a11_a_request_of_ten_minutes_ago_is_not_handed_to_a_restarted_server() -> None:
+def test_a11_a_request_of_ten_minutes_ago_is_not_delivered_to_a_restarted_server() -> None:
     world = ring()
     tap = Tap("nuc5", SERVER)
     world.network.taps.append(tap)

@@ -1,4 +1,4 @@
-"""What a machine installs: nothing by its name alone, for anybody may take a name on a public index."""
+"""Packages that a machine installs: none by name alone, because anyone may take a name on a public index."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames in a publisher's name from where it is not: they are dropped where they enter, not multiplied."""
+"""Frames in a publisher's name from the wrong location: the ingress drops them and multiplies none."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Revocations as a weapon: they fill no place of others, cost little, amplify nothing, and are not forgotten."""
+"""Revocations as a weapon: they fill no quota of others, cost little, amplify nothing, and stay in effect."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def until(world: Simulation) -> int:
 
 
 def junk_of(key: SigningKey, number: int, until_s: int) -> bytes:
-    """Return a revocation of nothing by a key that anybody can make."""
+    """Return a void revocation by a key that anyone can make."""
     subject = Subject.of(Metadata({"kind": "topic", "name": f"/junk/{number % 7}"}), key.public.compressed)
     return Revocation.make(key, subject, number.to_bytes(32, "big"), until_s)
 
@@ -63,7 +63,7 @@ def port_of(world: Simulation, label: str) -> int:
 
 
 def with_thief(flow_of: Simulation | None = None) -> tuple[Simulation, Flow]:
-    """Return the ring with a flow, and a member of the robot's switch that means no good."""
+    """Return the ring with a flow, and a hostile participant at the robot's switch."""
     world = flow_of or ring()
     world.add_member(THIEF, "nuc1")
     assert world.settle()
@@ -71,7 +71,7 @@ def with_thief(flow_of: Simulation | None = None) -> tuple[Simulation, Flow]:
 
 
 def revoke(world: Simulation, flow: Flow, at: str = "nuc3") -> None:
-    """Have the owner take the publisher's delegation back, at one switch."""
+    """Let the owner revoke the publisher's delegation, at one switch."""
     fingerprint = parse(flow.topic.delegation.chain[-1]).fingerprint
     wire = world.owner.revoke(flow.topic.delegation.subject, fingerprint, until(world))
     world.switches[at].revoke(wire, world.network.now)
@@ -81,14 +81,14 @@ def revoke(world: Simulation, flow: Flow, at: str = "nuc3") -> None:
 @pytest.mark.parametrize("matters", [False, True])
 def test_a03_inventions_of_one_member_keep_no_owners_revocation_out(matters: bool) -> None:
     world, flow = with_thief()
-    key = world.identities[THIEF].key if matters else MINE  # it has claimed a name of its own, so its key is held
+    key = world.identities[THIEF].key if matters else MINE  # it has advertised a name of its own, so its key is stored
     far = (1 << 64) - 1 if not matters else until(world)
     for number in range(1_200):
         say(world, junk_of(key, number, far), THIEF, "nuc1")
     world.network.run(2)
     kept = {node: len(switch._policy.revoked) for node, switch in world.switches.items()}
     assert kept["nuc1"] <= (700 if matters else 0)
-    assert kept["nuc4"] == kept["nuc5"] == 0  # nothing of it passed those who hold nothing of that key
+    assert kept["nuc4"] == kept["nuc5"] == 0  # none of it passed nodes that store nothing of that key
     still_flows(flow)
     revoke(world, flow)
     world.network.run(1)
@@ -118,7 +118,7 @@ def test_a04_a_switch_that_restarts_does_not_believe_a_revoked_member(tmp_path: 
     for node in ("nuc1", "nuc2"):
         world.network.stop(node)
     world.network.run(2)
-    restarted = world.restart_switch("nuc1")  # neither neighbour comes back: nobody can tell it
+    restarted = world.restart_switch("nuc1")  # neither neighbour comes back: no node can inform it
     again = RevocationUpkeep(tmp_path, restarted._policy.revoked)
     again.load(world.network.now)
     again.close()
@@ -129,7 +129,7 @@ def test_a04_a_switch_that_restarts_does_not_believe_a_revoked_member(tmp_path: 
     flow.outlive(nobody=True)
 
 
-def test_a04_a_restarted_switch_is_told_by_its_neighbour_whatever_junk_came_in_between() -> None:
+def test_a04_a_restarted_switch_learns_from_its_neighbour_whatever_junk_came_in_between() -> None:
     world, flow = with_thief()
     member = world.identities[ROBOT].member
     world.switches["nuc2"].revoke(by_root(world, "school", member.fingerprint), world.network.now)
@@ -176,9 +176,9 @@ def test_a05_a_junk_revocation_has_nothing_verified_again(monkeypatch: pytest.Mo
             switch._revoker.receive_revocation(statement, neighbour, now)
     spent_s = time.process_time() - begun_s
     assert (looks, verified) == ([0], [0])
-    assert spent_s / len(junk) < 0.005  # no benchmark: it was 46.6 ms
+    assert spent_s / len(junk) < 0.005  # not a benchmark: it was 46.6 ms
     wire = world.owner.revoke(flow.topic.delegation.subject, b"x" * 32, until(world))
-    switch._revoker.receive_revocation(parse(wire), neighbour, now)  # an owner's, of something else
+    switch._revoker.receive_revocation(parse(wire), neighbour, now)  # an owner's, for another object
     assert looks == [0]
     flow.outlive()
 
@@ -210,7 +210,7 @@ def test_a05_a_real_revocation_has_only_what_rests_on_it_verified_again(monkeypa
 
 
 class Bytes:
-    """Counts what goes from one node to another, keepalives and hellos apart."""
+    """Counter of frames from one node to another, keepalives and hellos apart."""
 
     def __init__(self, world: Simulation, a: str, b: str) -> None:
         self.sent = 0

@@ -1,4 +1,4 @@
-"""Attacks with the words of a ROS 1 server and the answers of a ROS 1 master."""
+"""Attacks with the messages of a ROS 1 server and the responses of a ROS 1 master."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ ANSWERS = [
 
 @contextmanager
 def master(answer: bytes, head: bytes = b"HTTP/1.1 200 OK\r\nContent-Type: text/xml\r\n") -> Iterator[str]:
-    """Serve one answer to every question."""
+    """Serve one response to every request."""
     with socket.create_server(("127.0.0.1", 0)) as server:
 
         def serve() -> None:
@@ -99,7 +99,7 @@ def test_a66_a_packed_answer_of_a_master_is_refused() -> None:
 
 
 def reason() -> object:
-    """Return the function that reads a server's words; its module needs rospy, which few machines have."""
+    """Return the function that reads a server's messages; its module needs rospy, which few machines have."""
     tree = ast.parse(SERVICES.read_text())
     wanted = [
         node

@@ -1,4 +1,4 @@
-"""The salt of a name, which no other user of the host may read."""
+"""Salt of a name, which no other user of the host may read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rights that a process has given away, in a process of its own: each forbidden thing is tried."""
+"""Privileges that a process has dropped, tested in a child process: each forbidden operation is tried."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ print(json.dumps(found))
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
-    """What became of each attempt: ``done``, or an error number."""
+    """Result of each attempt: ``done``, or an error number."""
     folder = tmp_path_factory.mktemp("sandbox")
     (folder / "mine").mkdir()
     (folder / "secret").write_text("x")

@@ -1,4 +1,4 @@
-"""One statement that a trusted member signs, shaped to end whoever takes it or passes it on: nobody ends."""
+"""Statement that a trusted member signs, shaped to end each node that receives or forwards it: no node ends."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PADDINGS = (ADVERTISEMENT_MAX_BYTES - 2_000, 12_000, 13_000, 14_000, 15_000)
 
 
 def padded(world: Simulation, wire: bytes, size: int) -> bytes:
-    """Return a statement of the robot's with more in it, under a key that nobody reads."""
+    """Return a statement of the robot's with an additional value under a key that no node reads."""
     statement, robot = parse(wire), world.identities[ROBOT]
     body = {**statement.body, "zz": b""}
     wide = sign(statement.type, body, robot.name, robot.key)
@@ -35,7 +35,7 @@ def padded(world: Simulation, wire: bytes, size: int) -> bytes:
 
 
 def say(world: Simulation, kind: Kind, wire: bytes, number: int) -> None:
-    """Have the robot say a statement to its switch, in as many frames as that takes."""
+    """Let the robot send a statement to its switch, in as many frames as needed."""
     parts = [wire[at : at + 1_300] for at in range(0, len(wire), 1_300)]
     for part, chunk in enumerate(parts):
         flags = Flag.LAST if part == len(parts) - 1 else Flag.NONE
@@ -83,7 +83,7 @@ def test_a70_a_link_state_of_a_rib_called_zero_is_malformed() -> None:
 
 
 @pytest.mark.parametrize("sequence", [(1 << 64) - 1, 1 << 60])
-def test_a23_a71_a_ack_of_a_giant_number_ends_no_proxy(sequence: int) -> None:
+def test_a23_a71_an_ack_of_a_giant_number_ends_no_proxy(sequence: int) -> None:
     world = ring()
     flow = flowing(world)
     rib, robot = world.identities["rib:school"], world.members[ROBOT]

@@ -1,4 +1,4 @@
-"""Attacks with a machine that is snapshotted while it runs, and resumed twice: both copies go on with one state."""
+"""Attacks with a machine that is snapshotted in operation and resumed twice: both copies continue with one state."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fences of the services: what systemd says of the units, and users' code apart from the machine's keys."""
+"""Sandboxes of the services: systemd's rating of the units, and the separation of user code from the machine's keys."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def machine_unit() -> str:
 
 @pytest.fixture(params=[*UNITS, None], ids=lambda each: each.stem if each else "fog-machine")
 def unit(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """A unit file, with a program that is there."""
+    """Unit file with an existing program."""
     text = machine_unit() if request.param is None else request.param.read_text()
     path = tmp_path / ("fog-machine.service" if request.param is None else request.param.name)
     path.write_text(re.sub(r"(?m)^(Exec\w+=\+?)/(?:opt|usr/local)/\S+", r"\1/bin/true", text))
@@ -125,14 +125,14 @@ def test_a53_only_the_middlewares_profile_is_open_to_the_nodes_user(tmp_path: Pa
 
 @pytest.fixture
 def home() -> Iterator[Path]:
-    """A machine's folder, as other users see one."""
+    """Machine's folder, as other users see one."""
     with tempfile.TemporaryDirectory(prefix="gdp-test-") as folder:
         Path(folder).chmod(0o711)
         yield Path(folder)
 
 
 def looked(tmp_path: Path, *, is_users: bool) -> dict[str, object]:
-    """Return what a program of a machine finds of itself."""
+    """Return the view that a machine's program has of itself."""
     key = tmp_path / "own.key"
     key.write_text("secret")
     key.chmod(0o600)

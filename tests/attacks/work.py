@@ -1,4 +1,4 @@
-"""Bounds of work for tests: lines of Python that a block may run, which no other program on the machine changes."""
+"""Work bounds for tests: lines of Python that a block may run, independent of other programs on the machine."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["TooMuchWorkError", "lines_run"]
 
 
 class TooMuchWorkError(BaseException):
-    """More lines were run than a test allows; no handler of the tested code catches it."""
+    """Raised when more lines ran than a test allows; no handler of the tested code catches it."""
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""The site of the documentation: it builds without a broken link, its drawings are current, and each page is found."""
+"""Documentation site: it builds without a broken link, its drawings are current, and each page is found."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The threat model's tables: each answered attack names a test that exists, each open one has none."""
+"""Tables of the threat model: each answered attack names a test that exists, each open one has none."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _NAMED = re.compile(r"(?<![a-z0-9])([a-z]\d\d)(?![0-9])")
 
 
 class Row(NamedTuple):
-    """One attack."""
+    """Attack of a table."""
 
     id: str
     attacker: str

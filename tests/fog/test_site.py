@@ -1,3 +1,5 @@
+"""Site configuration of a launcher: addresses, devices and defaults."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -45,7 +47,7 @@ def test_a_tunnel_of_ones_own_is_named(tmp_path: Path) -> None:
     assert site(tmp_path, "provider: skypilot", "machine_iface: tap0", installs, enrols).device == "tap0"
 
 
-def test_rented_machines_enrol_at_the_tunnels_end_unless_told_otherwise(tmp_path: Path) -> None:
+def test_rented_machines_enrol_at_the_tunnels_end_by_default(tmp_path: Path) -> None:
     assert site(tmp_path, "provider: aws", TUNNEL).enrolment_address == "198.51.100.7:4780"
 
 
@@ -61,7 +63,7 @@ def test_an_address_that_machines_cannot_reach_is_refused(tmp_path: Path, addres
         site(tmp_path, f"enrolment: {{address: {address}}}")
 
 
-def test_the_supervisor_listens_where_it_is_told(tmp_path: Path) -> None:
+def test_the_supervisor_listens_at_the_configured_address(tmp_path: Path) -> None:
     for name in ("domain", "owner"):
         (tmp_path / name).mkdir()
     (tmp_path / "fog.yaml").write_text(

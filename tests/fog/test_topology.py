@@ -1,4 +1,4 @@
-"""The tree of gateways, as ``fog.yaml`` states it."""
+"""Tree of gateways, as stated in ``fog.yaml``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A decoder to fuzz: a function of bytes, what it may raise, and what it should find among its inputs."""
+"""Decoder to fuzz: a function of bytes, its permitted errors, and its expected inputs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Decoders of files: recordings, configurations, parameters, and what this machine keeps of its own."""
+"""Decoders of files: recordings, configurations, parameters, and local state."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _TEXT_MAX: Final = 8_192  # bytes: the readers of YAML are slow
 
 
 def _in_file(name: str, read: Callable[[Path], object]) -> Callable[[bytes], object]:
-    """Return what reads bytes as a file in a folder of its own."""
+    """Return a function that reads bytes as a file in a folder of its own."""
 
     def run(data: bytes) -> object:
         with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:

@@ -28,7 +28,7 @@ _NUMBERS: Final = struct.Struct("QQQdd")  # executions, refused, foreign, slowes
 _MEMORY_EVERY: Final = 64
 _MEMORY_LEAST_BYTES: Final = 64 << 10
 _REPEATS: Final = 3  # of an execution that took too long: the machine may be busy
-_OTHERS: Final = 4  # inputs of the corpus beside the one that is mutated
+_OTHERS: Final = 4  # inputs of the corpus in addition to the mutated one
 
 
 def instrumented_decoders() -> tuple[Decoder, ...]:
@@ -45,7 +45,7 @@ def instrumented_decoders() -> tuple[Decoder, ...]:
 
 
 def guided(decoder: Decoder, seconds: float, seed: int) -> Outcome:
-    """Run a decoder under libFuzzer in a child; return what came of it."""
+    """Run a decoder under libFuzzer in a child; return the result."""
     shared = mmap.mmap(-1, _NUMBERS.size)
     with tempfile.TemporaryDirectory(prefix="gdp-fuzz-") as name:
         folder = Path(name)
@@ -115,7 +115,7 @@ def _mutator(decoder: Decoder) -> Callable[[bytes, int, int], bytes]:
 
 
 class _Tried:
-    """What libFuzzer calls with each input; it never raises, so that the run goes on after a finding."""
+    """Callback of libFuzzer for each input; it never raises, so that the run continues after a finding."""
 
     def __init__(self, decoder: Decoder, folder: Path, shared: mmap.mmap) -> None:
         self._outcome = Outcome(decoder)
@@ -146,7 +146,7 @@ class _Tried:
             self._find("memory", Finding(data, f"{ratio:.1f} times {size} bytes", True))
 
     def _find(self, place: str, finding: Finding) -> None:
-        """Write a finding down, the first of each place."""
+        """Record a finding, the first of each position."""
         path = self._folder / (hashlib.sha256(place.encode()).hexdigest()[:16] + ".json")
         if not path.exists():
             told = {"data": finding.data.hex(), "error": finding.error, "excess": finding.is_excess}

@@ -1,7 +1,7 @@
-"""Count of all executions, kept beside the corpus, so that several runs add up.
+"""Count of all executions, kept next to the corpus, so that several runs add up.
 
-Layer: I/O. One JSON object a decoder: ``executions``, ``foreign`` (with a foreign exception), ``slowest_ms`` (processor
-time) and ``memory_ratio`` (over an input's length) of the worst one. What a fix has made better stays in the record
+I/O. One JSON object a decoder: ``executions``, ``foreign`` (with a foreign exception), ``slowest_ms`` (processor
+time) and ``memory_ratio`` (over an input's length) of the worst one. A value that a fix improved stays in the record
 until its line is deleted.
 """
 
@@ -23,7 +23,7 @@ RECORD: Final = CORPUS / "executions.json"
 
 @dataclass(frozen=True, slots=True)
 class Tried:
-    """What was tried of one decoder so far."""
+    """Executions of one decoder so far."""
 
     executions: int = 0
     foreign: int = 0

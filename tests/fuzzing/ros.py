@@ -1,4 +1,4 @@
-"""Decoders of what far proxies say: envelopes of ROS messages, descriptions, definitions, messages."""
+"""Decoders of data from remote proxies: envelopes of ROS messages, descriptions, definitions, messages."""
 
 from __future__ import annotations
 

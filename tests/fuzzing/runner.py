@@ -1,7 +1,7 @@
-"""The loop that gives a decoder mutated inputs, and what came of it.
+"""Loop that gives a decoder mutated inputs and records the results.
 
-An input that runs steps from line to line that none before it ran joins the corpus. They are traced in one execution
-of ``_TRACE_EVERY``, since tracing slows a decoder down by a factor of ten or more; ``guided.py`` does without that.
+An input that runs new steps from line to line joins the corpus. Tracing slows a decoder down by a factor of ten or
+more, so only one execution of ``_TRACE_EVERY`` is traced; ``guided.py`` does without it.
 """
 
 from __future__ import annotations
@@ -45,20 +45,20 @@ _MEMORY_EVERY: Final = 16
 _MEMORY_LEAST_BYTES: Final = 4 << 10  # a shorter input counts as one of this length
 _CORPUS_MAX: Final = 512
 _KEPT_MAX_BYTES: Final = 4 << 10  # of a file that is added to the corpus
-_KEPT_BYTES: Final = 24 << 10  # of all of one decoder; findings are kept beside
-_COVER: Final = "cover-"  # how names of files begin that are kept for what they run, not because they once broke
+_KEPT_BYTES: Final = 24 << 10  # of all of one decoder; findings are kept next to it
+_COVER: Final = "cover-"  # prefix of files that are kept for the lines they run, not because they once broke a decoder
 _HANG_S: Final = 10.0  # processor time
 
 _Step = tuple[str, int, int]  # file, line, the line that ran next in that frame
 
 
 class HangError(BaseException):
-    """A decoder took too much processor time."""
+    """Raised when a decoder took too much processor time."""
 
 
 @contextmanager
 def watched() -> Iterator[None]:
-    """Make an ``execute`` that takes too long raise ``HangError``; its handler is set once, which costs 12 us."""
+    """Make an ``execute`` that raises ``HangError`` after too long; its handler is set once, which costs 12 us."""
     before = signal.signal(signal.SIGPROF, _hang)
     try:
         yield
@@ -68,7 +68,7 @@ def watched() -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """An input for which a decoder raised what it may not; ``is_excess``: or took too much time or memory."""
+    """Input for which a decoder raised a foreign error; ``is_excess``: or took too much time or memory."""
 
     data: bytes
     error: str
@@ -77,7 +77,7 @@ class Finding:
 
 @dataclass(slots=True)
 class Outcome:
-    """What became of one decoder.
+    """Results of one decoder.
 
     Attributes:
         findings: the first input of each kind of foreign exception.
@@ -98,7 +98,7 @@ class Outcome:
 
 
 def corpus_of(decoder: Decoder) -> list[bytes]:
-    """Return the seeds of a decoder, and what its folder holds."""
+    """Return the seeds of a decoder and the content of its folder."""
     folder = CORPUS / decoder.name
     kept = [path.read_bytes() for path in sorted(folder.iterdir())] if folder.is_dir() else []
     return [*decoder.seeds, *kept]
@@ -134,7 +134,7 @@ def fuzz(decoder: Decoder, seconds: float, seed: int, executions_max: int | None
 
 
 def keep(outcome: Outcome) -> list[Path]:
-    """Write short inputs that run what no other runs, and all findings, into the corpus; return the new files."""
+    """Write short inputs with lines that no other runs, and all findings, into the corpus; return the new files."""
     folder = CORPUS / outcome.decoder.name
     written = []
     for finding in outcome.findings.values():
@@ -149,9 +149,9 @@ def keep(outcome: Outcome) -> list[Path]:
 
 
 def minimise(decoder: Decoder) -> list[Path]:
-    """Delete kept inputs that run nothing which shorter ones do not run; return the files that went.
+    """Delete kept inputs whose lines shorter ones also run; return the deleted files.
 
-    What once broke a decoder stays, and so does what came before inputs were kept for what they run.
+    Inputs that once broke a decoder stay, and so do inputs older than this selection.
     """
     covers = {path.read_bytes(): path for path in _covers(decoder)}
     rest = [data for data in corpus_of(decoder) if data not in covers]
@@ -175,7 +175,7 @@ def _write(path: Path, data: bytes) -> list[Path]:
 
 
 def _adding(decoder: Decoder, corpus: Sequence[bytes], inputs: Sequence[bytes]) -> list[bytes]:
-    """Return those short inputs, shortest first, that run what neither the corpus nor a shorter one runs."""
+    """Return the short inputs, shortest first, with lines that neither the corpus nor a shorter one runs."""
     seen: set[_Step] = set()
     outcome = Outcome(decoder)
     short = sorted((data for data in inputs if len(data) <= _KEPT_MAX_BYTES), key=lambda data: (len(data), data))
@@ -186,7 +186,7 @@ def _adding(decoder: Decoder, corpus: Sequence[bytes], inputs: Sequence[bytes]) 
 
 
 def execute(outcome: Outcome, data: bytes) -> None:
-    """Give the decoder one input, and count what came of it; only while ``watched``."""
+    """Give the decoder one input and count the result; only while ``watched``."""
     outcome.executions += 1
     signal.setitimer(signal.ITIMER_PROF, _HANG_S)
     try:
@@ -203,7 +203,7 @@ def execute(outcome: Outcome, data: bytes) -> None:
 
 
 def _traced(outcome: Outcome, data: bytes, seen: set[_Step]) -> bool:
-    """Execute; return whether that ran steps that were not seen before."""
+    """Execute; return whether new steps ran."""
     count = len(seen)
 
     def trace(frame: FrameType, event: str, arg: Any) -> Any:
@@ -252,7 +252,7 @@ def _hang(number: int, frame: FrameType | None) -> None:
 
 
 def _place(error: BaseException) -> str:
-    """Return the kind of an exception and where it was raised, which tells findings apart."""
+    """Return the kind of an exception and its origin; both identify a finding."""
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next

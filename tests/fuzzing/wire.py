@@ -1,4 +1,4 @@
-"""Decoders of what comes from the network: frames, statements, certificates, sealed parts, notes."""
+"""Decoders of network data: frames, statements, certificates, sealed fragments, control datagrams."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Metadata: what may stand in them, and that the canonical bytes are the only ones."""
+"""Metadata: permitted content, and that the canonical bytes are the only ones."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""What hostile members say: statements of every type, well formed and signed by a real key, but meant ill.
+"""Statements of hostile members: of every type, well formed and signed by a real key, but with harmful content.
 
-A body begins as an honest one would be at this moment of the network: sessions, sequence numbers and names are those
-that its signer knows. Some of its fields then take a hostile value of their own type: a boundary, somebody else's
-name or certificate, an old statement, a list at its maximum. What remains honest is what lets the rest be believed.
+A body begins as an honest one would be at this moment of the network: its sessions, sequence numbers and names are
+known to its signer. Some of its fields then take a hostile value of their own type: a boundary, another node's name
+or certificate, an old statement, a list at its maximum. The honest fields let receivers accept the rest.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ _MAXIMA: Final = {
     "chain": CHAIN_MAX, "p": FETCH_PREFIXES_MAX, "k": FETCH_KEYS_MAX, "e": ENTRIES_MAX, "rights": 4,
 }  # fmt: skip
 _RIGHTS: Final = tuple(Right)
-_REMEMBERED: Final = 96  # old statements that are said again, or put into others
+_REMEMBERED: Final = 96  # old statements that are sent again, or put into others
 
 _Body = dict[str, Any]
 
@@ -81,10 +81,10 @@ class Utterance:
 
 
 class Forge:
-    """Makes utterances for a stage; the same randomness in the same state makes the same one.
+    """Generator of utterances for a stage; equal randomness in an equal state gives equal utterances.
 
     Args:
-        may_break: also those of personas whose office lets them hurt the good flow.
+        may_break: also those of personas whose role lets them hurt the good flow.
     """
 
     def __init__(self, stage: Stage, *, may_break: bool = True) -> None:
@@ -105,13 +105,13 @@ class Forge:
         self._sealers: dict[tuple[str, str, int], Any] = {}
 
     def utter(self, rng: random.Random) -> Utterance | None:
-        """Return what some persona says next, or None where it is cut off."""
+        """Return the next utterance of some persona, or None where it is cut off."""
         persona = rng.choice(self._personas)
         places = self._stage.places(persona.node)
         if not places:
             return None
         place = rng.choice(places)
-        if rng.random() < 0.04:  # as a stranger, at somebody else's port
+        if rng.random() < 0.04:  # as a stranger, at another node's port
             ports = self._stage.world.network._nodes[place.node].ports
             mac = place.mac if rng.random() < 0.5 else b"\x02evil" + bytes([rng.randrange(4)])
             place = Place(place.node, rng.choice(list(ports)), mac)
@@ -123,7 +123,7 @@ class Forge:
         return None if wire is None else self._sent(rng, persona, type_, place, kind, destination, wire)
 
     def say(self, rng: random.Random, persona: Persona, what: str, place: Place) -> Utterance | None:
-        """Return something well formed: a statement of a type, or a frame of a kind, as in ``KINDS_OF_WORDS``."""
+        """Return a well-formed statement of a type, or frame of a kind, as in ``KINDS_OF_WORDS``."""
         for each, make in _FRAMES:
             if each == what:
                 frames = make(self, rng, persona, place)
@@ -136,7 +136,7 @@ class Forge:
     def _sent(
         self, rng: random.Random, persona: Persona, type_: StatementType, place: Place, kind: int, to: Name, wire: bytes
     ) -> Utterance | None:
-        """Return a statement in frames, in a channel most of the time where it belongs in one."""
+        """Return a statement in frames, usually in a channel if it belongs in one."""
         if kind in (Kind.RIB_REQUEST, Kind.RIB_ANSWER) and rng.random() < 0.8:
             return self._in_channel(persona, type_, place, to, wire)
         try:
@@ -149,7 +149,7 @@ class Forge:
     def _in_channel(
         self, persona: Persona, type_: StatementType, place: Place, to: Name, wire: bytes
     ) -> Utterance | None:
-        """Say a statement over the channel of the persona's own machine, or what opens one."""
+        """Send a statement over the channel of the persona's own machine, or the handshake that opens one."""
         machine = self._stage.machines().get(persona.node)
         channels = getattr(machine, "_channels", None)
         if channels is None or to == ZERO:
@@ -238,7 +238,7 @@ class Forge:
             return [*items[:at], self._hostile(rng, key, items[at]), *items[at + 1 :]]
         size = rng.choice((1, 2, most - 1, most, most + 1))
         if chance < 0.6:
-            return (items * (size // len(items) + 1))[:size]  # all the same
+            return (items * (size // len(items) + 1))[:size]  # encode it in any case
         return [self._like(rng, rng.choice(items)) for _ in range(size)]
 
     def _like(self, rng: random.Random, item: Any) -> Any:
@@ -282,12 +282,12 @@ class Forge:
         return list(self._stage.world.identities.values())
 
     def _recorded(self) -> list[bytes]:
-        """Return statements that honest nodes made: claims that switches hold."""
+        """Return statements of honest nodes: advertisements that switches store."""
         switches = self._stage.world.switches.values()
         return [each.advertisement.wire for switch in switches for each in switch.attached.all()]
 
     def _publishers(self) -> list[Advertisement]:
-        """Return the claims, of honest nodes too, that a join can show."""
+        """Return the advertisements, of honest nodes too, that a join can show."""
         switches = self._stage.world.switches.values()
         advertisements = [each.advertisement for switch in switches for each in switch.attached.all()]
         return [advertisement for advertisement in advertisements if advertisement.right in HEARS.values()]
@@ -305,7 +305,7 @@ class Forge:
         return self._stage.own_nonce(persona, place)
 
     def _own_life(self, identity: Identity, rng: random.Random) -> bytes:
-        """Return the life of the persona's machine most of the time, or an older or a newer one."""
+        """Return the incarnation of the persona's machine, usually the present one, else an older or a newer one."""
         machine = next((each for each in self._stage.machines().values() if each.name == identity.name), None)
         hello_protocol = getattr(machine, "hello_protocol", None) or getattr(
             getattr(machine, "attachment", None), "hello_protocol", None
@@ -337,7 +337,8 @@ class Forge:
 
         def rib() -> list[Any]:
             other = rng.choice([identity, *(world.identities[f"rib:{label}"] for label in world.ribs)])
-            accomplice = self._stage.identity(rng.choice(PERSONAS))  # no honest node signs what it did not say
+            # no honest node signs a statement that it did not send
+            accomplice = self._stage.identity(rng.choice(PERSONAS))
             proof = RtCert.make(rng.choice((identity, accomplice)), identity.name, self._lasting())
             other = accomplice if rng.random() < 0.3 else other
             return [other.name, other.root.domain, rng.randbytes(8), rng.randbytes(16), other.membership, proof]
@@ -359,7 +360,7 @@ class Forge:
         switch = rng.choice([each for each in self._identities() if each.role.value == "switch"])
         advertisements = [each for each in self._old if b"read" in each or b"serve" in each or b"call" in each]
         shown = self._publishers()
-        if shown and rng.random() < 0.8:  # as an honest switch below says it
+        if shown and rng.random() < 0.8:  # like an honest switch below
             advertisement = rng.choice(shown)
             topic, publisher, place_of = advertisement.name, advertisement.node, advertisement.switch
             version, proof = advertisement.sequence, advertisement.wire
@@ -390,7 +391,7 @@ class Forge:
     def _advertisement_body(
         self, rng: random.Random, identity: Identity, topic: Name, right: Right, switch: Name
     ) -> _Body:
-        """Return a claim on the node's own name, on a topic by its delegation, or on a name of its own making."""
+        """Return an advertisement of the node's own name, of a delegated topic, or of a name of its own making."""
         now = self._stage.world.network.now.unix_s
         subject, chain = identity.subject, []
         mine = [each for key, each in self._stage.topics.items() if each.delegation.node == identity.name]
@@ -400,7 +401,7 @@ class Forge:
         elif mine and chance < 0.6:
             delegation = rng.choice(mine).delegation
             subject, chain = delegation.subject, list(delegation.chain)
-        else:  # a name that this node owns: as many as it likes
+        else:  # a name that this node owns: in any number
             own = type(subject)(rng.randbytes(32), identity.key.public.compressed)
             subject = own
             if chance < 0.75:
@@ -437,7 +438,7 @@ class Forge:
         return {"n": rng.choice(own), "right": rng.choice(_RIGHTS).value, "s": next(self._numbers)}
 
     def _inner(self, rng: random.Random, identity: Identity) -> bytes:
-        """Return a claim or a withdrawal, of this node or of another insider, to be put into something."""
+        """Return an advertisement or a withdrawal, of this node or another insider, for use in another statement."""
         other = self._stage.identity(rng.choice(PERSONAS)) if rng.random() < 0.5 else identity
         chance = rng.random()
         if chance < 0.2:
@@ -590,10 +591,10 @@ class Forge:
         unix_s = int(self._stage.world.network.now.unix_s)
         return Validity(unix_s // 600 * 600 - 600, unix_s // 600 * 600 + 1_800)
 
-    # -- on their way
+    # -- framing
 
     def _delivery(self, rng: random.Random, type_: StatementType, place: Place) -> tuple[int, Name]:
-        """Return the kind of frame that carries a statement, and whom it is for."""
+        """Return the kind of frame that carries a statement, and its addressee."""
         if rng.random() < 0.03:
             return rng.choice(tuple(Kind)), rng.choice((ZERO, self._name(rng)))
         kind = rng.choice(_KINDS[type_])
@@ -642,7 +643,7 @@ class Forge:
         return [encode(self._header(rng, Kind.ECHO_REQUEST, to, source, len(payload))) + payload]
 
     def _report(self, rng: random.Random, persona: Persona, place: Place) -> list[bytes]:
-        """Return a hostile note of a reader's own feed, by the key that it agreed with its publisher."""
+        """Return a hostile control datagram of a reader's own writer proxy, by the key agreed with its publisher."""
         member = self._stage.world.members.get(persona.node)
         writer_proxies = (
             [] if member is None else [each for each in member.writer_proxies() if each.state is WriterProxyState.LIVE]
@@ -661,7 +662,7 @@ class Forge:
         return [writer_proxy._sealer.seal(report)]
 
     def _status(self, rng: random.Random, persona: Persona, place: Place) -> list[bytes]:
-        """Return what a publisher or a server says of its stream."""
+        """Return a control datagram of a publisher or a server about its stream."""
         identity = self._stage.identity(persona)
         found = self._secret(rng, identity)
         if found is None:

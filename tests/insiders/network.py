@@ -1,4 +1,4 @@
-"""A network in memory that knows which frames were drawn by what a hostile member said."""
+"""Simulated network that records which frames were caused by a hostile member's frames."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ __all__ = ["Echo", "TracingNetwork"]
 
 @dataclass(slots=True)
 class Echo:
-    """What one utterance drew, from all nodes, as far as frames drew it; timers are nobody's.
+    """Effect of one utterance on all nodes, as far as frames caused it; timers are not attributed.
 
     Args:
-        said: its frames. A machine that sends one of them on, once, carries it as a data plane would.
+        said: its frames. A machine that forwards one of them once acts like a data plane.
 
     Attributes:
         sent: bytes after the Ethernet header that machines sent, by node.
@@ -46,14 +46,14 @@ class Echo:
 
 
 class TracingNetwork(SimNetwork):
-    """Frames that a machine sends while it takes a traced frame are traced, too, wherever they lead.
+    """Network that traces frames: those a machine sends while it takes a traced frame are traced, too.
 
     Attributes:
-        echo: of what is being delivered now; None: of nothing that is traced.
+        echo: trace of the frame in delivery; None: of no traced frame.
     """
 
     echo: Echo | None = None
-    _is_machine = False  # what enters a link now is of a machine
+    _is_machine = False  # a frame that enters a link now is from a machine
 
     def _push(self, at_s: float, action: Callable[[], None]) -> None:
         echo = self.echo
@@ -83,5 +83,5 @@ class TracingNetwork(SimNetwork):
 
 
 def _but_hops(frame: bytes) -> bytes:
-    """Return a frame without the field that changes on its way."""
+    """Return a frame without the field that changes on its path."""
     return frame[:HOPS_AT] + frame[HOPS_AT + 1 :]

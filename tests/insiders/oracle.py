@@ -1,8 +1,8 @@
-"""An ideal signature scheme in place of ECDSA, so that making and checking statements costs little.
+"""Ideal signature scheme in place of ECDSA, so that signing and verifying statements costs little.
 
-A signature is BLAKE2b over SHA-256 of the data, keyed by the public key. It is deterministic, 64 bytes long, and
-nobody but the harness can make one: what a verifier decides is the same as with ECDSA, but for malleated signatures
-and points that are no point. Certificates (X.509) keep their real signatures and their real verification.
+A signature is BLAKE2b over SHA-256 of the data, keyed by the public key. It is deterministic, 64 bytes long, and only
+the harness can make one. A verifier decides as with ECDSA, except for malleated signatures and invalid curve points.
+Certificates (X.509) keep their real signatures and their real verification.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def _verify_digest(self: PublicKey, signature: bytes, digest: bytes) -> None:
 
 @contextmanager
 def signing_oracle() -> Iterator[None]:
-    """Replace ECDSA of statements and messages, in this process, for as long as this lasts."""
+    """Replace ECDSA of statements and messages, in this process, for the duration of the context."""
     with (
         mock.patch.object(SoftwareKey, "sign", _sign),
         mock.patch.object(SoftwareKey, "sign_digest", _sign_digest),

@@ -1,4 +1,4 @@
-"""Many trials of the insiders, over processes, and what came of them."""
+"""Many trials of the insiders, over processes, and their results."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _PLACE_FRAMES: Final = 1
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A trial that broke.
+    """Trial that broke.
 
     Args:
-        place: kind of the error and where it was raised, or what invariant broke.
-        at: what was being said, by whom and to whom.
+        place: kind and origin of the error, or the broken invariant.
+        at: the utterance, its sender and its addressee.
     """
 
     plan: Plan
@@ -39,7 +39,7 @@ class Found:
 
 @dataclass(slots=True)
 class Search:
-    """What many trials found.
+    """Results of many trials.
 
     Attributes:
         found: the first of each place.
@@ -55,11 +55,11 @@ class Search:
 
     @property
     def statements(self) -> int:
-        """Return how many utterances were tried."""
+        """Return the number of tried utterances."""
         return sum(self.figures.count.values())
 
     def add(self, figures: Figures, found: Found | None) -> None:
-        """Add what one trial brought."""
+        """Add the results of one trial."""
         self.trials += 1
         self.figures.add(figures)
         if found is not None:
@@ -75,7 +75,7 @@ def plan_of(seed: int, words: int = WORDS) -> Plan:
 
 
 def run_plan(plan: Plan) -> tuple[Figures, Found | None]:
-    """Run one plan; return what was counted, and what broke."""
+    """Run one plan; return the counts and the failure, if any."""
     ErrorBoundary.reraises = True
     with prepared(plan.seed):
         trial = Trial(plan)
@@ -87,7 +87,7 @@ def run_plan(plan: Plan) -> tuple[Figures, Found | None]:
 
 
 def searched(statements: int, processes: int, seed: int, seconds: float | None = None) -> Iterator[Search]:
-    """Run trials until so many statements were tried, or the time is over; yield what there is after each."""
+    """Run trials until this many statements were tried, or the time is over; yield the results after each."""
     search, begun_s = Search(), time.monotonic()
     seeds, words = iter(range(seed, seed + 1_000_000_000)), min(statements, WORDS)
     with ProcessPoolExecutor(processes, mp_context=get_context("fork"), max_tasks_per_child=None) as pool:

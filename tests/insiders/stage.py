@@ -1,4 +1,4 @@
-"""The stage of the insiders: a network in memory in which some members of every kind are hostile.
+"""Stage of the insiders: a simulated network in which some members of every kind are hostile.
 
 ::
 
@@ -7,7 +7,7 @@
     cloud:             nuc4          far (hostile switch) at nuc3 and nuc4; hostile RIB at far
     stranger:          x1 at nuc2    no domain of the others trusts it
 
-The good flow goes from nuc1/robot to nuc4/server; no insider has a right on its topic, and none is on its way.
+The good flow goes from nuc1/robot to nuc4/server; no insider has a right on its topic, and none is on its path.
 """
 
 from __future__ import annotations
@@ -86,12 +86,12 @@ _TOPOLOGY: Final = Topology(
 
 @dataclass(frozen=True, slots=True)
 class Persona:
-    """A hostile member.
+    """Hostile member.
 
     Args:
-        node: what it is called in the network.
+        node: its name in the network.
         identity: label in ``Simulation.identities``.
-        may_break: whether its office lets it hurt the good flow: RIBs of the flow's domains say where names are.
+        may_break: whether its role lets it hurt the good flow: RIBs of the flow's domains answer where names are.
     """
 
     node: str
@@ -118,7 +118,7 @@ PERSONAS: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A port of a node, and the address from which its neighbour there speaks."""
+    """Port of a node, and the address of its neighbour there."""
 
     node: str
     port: int
@@ -127,7 +127,7 @@ class Place:
 
 @dataclass(slots=True)
 class Stage:
-    """The network, settled: topics flow, a service works, one member is revoked.
+    """Settled network: topics flow, a service works, one member is revoked.
 
     Attributes:
         rib_limits: names of one sender, and watches, that each RIB keeps.
@@ -179,7 +179,7 @@ class Stage:
             self.take_part_again(label)
 
     def take_part_again(self, label: str) -> None:
-        """Let a member do what it is here for, as far as it does not."""
+        """Give a member its role, unless it has it already."""
         member = self.world.members[label]
         pending_advertisement = {each.right for each in member.attachment.advertisements}
         for name, right in PARTS.get(label, ()):
@@ -198,7 +198,7 @@ class Stage:
         self.world.network.touch(label)
 
     def publish(self, message: bytes) -> None:
-        """Let the insiders' publisher publish, and their server answer whom it hears."""
+        """Let the insiders' publisher publish, and their server answer its clients."""
         member = self.world.members["nuc1/insider"]
         for publisher in member.publishers():
             publisher.publish(message)
@@ -209,7 +209,7 @@ class Stage:
         self.world.network.touch("nuc1/insider")
 
     def revoke(self, label: str) -> None:
-        """Have nuc1's operator take a member's membership back."""
+        """Let nuc1's operator revoke a member's membership."""
         world = self.world
         member = world.identities[label].member
         authority = world.authorities["school"]
@@ -224,7 +224,7 @@ class Stage:
         return self.world.identities[persona.identity]
 
     def places(self, node: str) -> list[Place]:
-        """Return where a node's frames come in: a port of each of its neighbours."""
+        """Return the ingress of a node's frames: a port of each of its neighbours."""
         ports = self.world.network._nodes[node].ports.values()
         return [Place(far.node, far.port, own.mac) for sim_link, own, far in ports if sim_link.is_up]
 
@@ -236,24 +236,24 @@ class Stage:
         return {node: each for node, each in machines.items() if world.network._nodes[node].is_alive}
 
     def nonce_at(self, place: Place) -> bytes:
-        """Return the nonce that a port says in its hellos."""
+        """Return the nonce that a port sends in its hellos."""
         port = self._port_at(place)
         return bytes(8) if port is None else port.nonce
 
     def echo_at(self, place: Place) -> bytes:
-        """Return how others refer to a port's session."""
+        """Return the reference to a port's session that others use."""
         port = self._port_at(place)
         return bytes(ECHO_BYTES) if port is None else port.echo
 
     def own_nonce(self, persona: Persona, place: Place) -> bytes:
-        """Return the nonce of the persona's own port that leads to a place."""
+        """Return the nonce of the persona's own port that leads to a location."""
         ports = self.world.network._nodes[persona.node].ports
         index = next((i for i, (_, _, far) in ports.items() if (far.node, far.port) == (place.node, place.port)), -1)
         port = self._port_at(Place(persona.node, index, b""))
         return bytes(8) if port is None else port.nonce
 
     def believes(self, persona: Persona, place: Place) -> bool:
-        """Return whether a node believes a persona: its domain is trusted there, and it is not revoked."""
+        """Return whether a node accepts a persona: its domain is trusted there, and it is not revoked."""
         domain = self.identity(persona).root.domain
         machine = self.machines().get(place.node)
         holder = machine if isinstance(machine, SwitchCore) or machine is None else machine.attachment

@@ -1,4 +1,4 @@
-"""Every table of a machine, and how long it may get."""
+"""Every table of a machine, and its size limit."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gdp.switch.name_queries import QUERIES_MAX, USED_NAMES_MAX
 
 __all__ = ["GENERAL_MAX", "LIMITS", "sizes"]
 
-GENERAL_MAX: Final = 4_096  # what remembers peers, sessions or old statements keeps no more than this
+GENERAL_MAX: Final = 4_096  # tables of peers, sessions or old statements keep no more than this
 LIMITS: Final[Mapping[str, int]] = {
     "NameQueries._queries": QUERIES_MAX + USED_NAMES_MAX,
     "Parked._by_name": PENDING_FRAMES_MAX,
@@ -26,7 +26,7 @@ LIMITS: Final[Mapping[str, int]] = {
     "ReplayWindow._finished": REPLAY_WINDOW_MESSAGES,
 }
 _CONTAINERS: Final = (dict, list, set, frozenset, deque)
-_DEEP_ITEMS: Final = 64  # of one container, that are looked into
+_DEEP_ITEMS: Final = 64  # items of one container that are examined
 _ROOMS: Final = "gdp."
 
 

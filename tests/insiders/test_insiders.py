@@ -1,4 +1,4 @@
-"""Members that turned hostile say well-formed things, meant ill: no node ends, nothing grows, the others go on."""
+"""Hostile members that send well-formed, harmful statements: no node ends, no table grows, other flows continue."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""One trial of the insiders: a journey brings the network into some state, then hostile members speak.
+"""Trial of the insiders: a journey brings the network into some state, then hostile members send statements.
 
-A ``Plan`` prints itself; given back to ``Trial`` it happens again, keys included. Each act and each utterance is drawn
-from a number of its own, so that those that do not matter can be left out (``shrunk``).
+A ``Plan`` prints itself; given back to ``Trial`` it repeats the trial, keys included. Each act and each utterance is
+drawn from a number of its own, so that irrelevant ones can be left out (``shrunk``).
 
-What must hold all the time: no error of our own leaves a machine; no table grows beyond its bound; what an utterance
-draws is in proportion to its bytes; and, where no insider's office lets it do harm, the good flow delivers in time.
+The invariants are: no error of our own leaves a machine; no table exceeds its bound; the effect of an utterance is in
+proportion to its bytes; and, unless an insider's role lets it do harm, the good flow delivers in time.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from tests.journeys.networks import reproducible_keys
 
 __all__ = ["BrokenError", "Figures", "Plan", "Trial", "prepared", "shrunk"]
 
-STRANGERS_MAX: Final = 1.0  # bytes drawn for each byte of somebody unproven
-_LOOK_EVERY: Final = 2_000  # utterances between two looks at the tables
+STRANGERS_MAX: Final = 1.0  # bytes caused by each byte of an unproven sender
+_LOOK_EVERY: Final = 2_000  # utterances between two checks of the tables
 _GOOD_EVERY: Final = 100  # ... and between two messages of the good flow
-_PAUSES_S: Final = (*[0.0] * 80, *[0.0005] * 10, *[0.002] * 9, 0.05)  # after an utterance; in no time others follow
-_ECHO_S: Final = 0.01  # after which what an utterance drew has been counted
+_PAUSES_S: Final = (*[0.0] * 80, *[0.0005] * 10, *[0.002] * 9, 0.05)  # after an utterance; others follow without delay
+_ECHO_S: Final = 0.01  # after which the effect of an utterance has been counted
 _ACT_CHANCE: Final = 0.002  # of an act between two utterances of a stormy trial
 _HEALED_S: Final = 12.0  # leases, once all works again
 
 
 class BrokenError(AssertionError):
-    """An invariant does not hold."""
+    """Raised when an invariant does not hold."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What happens.
+    """Script of a trial.
 
     Args:
         seed: of keys and network.
@@ -60,14 +60,14 @@ class Plan:
 
 @dataclass
 class Figures:
-    """What was counted; trials add up.
+    """Counters of a trial; trials add up.
 
     Attributes:
-        worst: highest ratio of the bytes that one machine sent to the bytes said, with both, by what was said and
-            whether its sender was proven.
-        said, drawn: bytes in all, by the same; what the busiest machine sent each time.
-        slowest: seconds of the slowest delivery, by what was said.
-        spent: seconds in all, by what was said; ``count`` so many.
+        worst: highest ratio of the bytes one machine sent to an utterance's bytes, with both, by statement type
+            and whether its sender was proven.
+        said, drawn: bytes in all, by the same; for ``drawn`` those of the busiest machine each time.
+        slowest: seconds of the slowest delivery, by statement type.
+        spent: seconds in all, by statement type; ``count`` so many.
         tables: longest of each.
     """
 
@@ -81,7 +81,7 @@ class Figures:
     drops: Counter[str] = field(default_factory=Counter)
 
     def add(self, other: Figures) -> None:
-        """Add what another trial counted."""
+        """Add the counters of another trial."""
         for mine, its in (
             (self.count, other.count), (self.said, other.said), (self.drawn, other.drawn), (self.spent, other.spent),
             (self.drops, other.drops),
@@ -96,11 +96,11 @@ class Figures:
 
 @dataclass(frozen=True, slots=True)
 class _Said:
-    """An utterance and what it has drawn so far.
+    """Utterance and its effect so far.
 
     Args:
         spent_s: time of its delivery.
-        at_s: when it was said.
+        at_s: when it was sent.
     """
 
     utterance: Utterance
@@ -112,7 +112,7 @@ class _Said:
 
 @contextmanager
 def prepared(seed: int) -> Iterator[None]:
-    """Let stages have keys by a seed, the signing oracle and a tracing network."""
+    """Prepare a stage with keys by a seed, the signing oracle and a tracing network."""
     with ExitStack() as stack:
         stack.enter_context(reproducible_keys(seed))
         stack.enter_context(signing_oracle())
@@ -121,21 +121,21 @@ def prepared(seed: int) -> Iterator[None]:
 
 
 class Trial:
-    """Runs a plan; ``stage`` is made within ``prepared`` unless given (a settled one of the same seed)."""
+    """Runner of a plan; ``stage`` is made within ``prepared`` unless given (a settled one of the same seed)."""
 
     def __init__(self, plan: Plan, stage: Stage | None = None) -> None:
         self.plan = plan
         self.stage = stage or Stage(plan.seed)
         self.forge = Forge(self.stage, may_break=plan.is_stormy)
         self.figures = Figures()
-        self.at: Utterance | str | None = None  # what happens now
+        self.at: Utterance | str | None = None  # present activity
         self._sent = 0
         self._got: list[bytes] = []
-        self._open: list[tuple[float, bytes]] = []  # messages of the good flow under way, with their deadlines
+        self._open: list[tuple[float, bytes]] = []  # messages of the good flow in flight, with their deadlines
         self._echoes: deque[_Said] = deque()
 
     def run(self) -> Figures:
-        """Let it happen.
+        """Run the plan.
 
         Raises:
             BrokenError: an invariant does not hold.
@@ -185,7 +185,7 @@ class Trial:
             self._note_echoes(network.now.mono_s - _ECHO_S)
 
     def _note_echoes(self, until_s: float) -> None:
-        """Count what was said until then."""
+        """Count the frames sent until then."""
         while self._echoes and self._echoes[0].at_s <= until_s:
             self._note(self._echoes.popleft())
 
@@ -202,7 +202,7 @@ class Trial:
         if not said.is_proven and drawn > STRANGERS_MAX * size:
             raise BrokenError(f"{size} bytes of somebody unproven draw {drawn}: {what}")
 
-    # -- what must hold
+    # -- invariants
 
     def _check_tables(self) -> None:
         for node, machine in self.stage.machines().items():
@@ -221,7 +221,7 @@ class Trial:
         self._open.append((flow.world.network.now.mono_s + PROMISE_S, message))
 
     def _look_at_good(self) -> None:
-        """Raise if the first message that is still under way should have come."""
+        """Raise if the first message in flight is overdue."""
         flow = self.stage.flow
         flow.collect()
         got = [each.message for each in flow.got[GOOD[1]]]
@@ -241,7 +241,7 @@ class Trial:
             self._look_at_good()
 
     def _heal(self) -> None:
-        """Repair every cable and let leases end, so that all timers that were armed fire."""
+        """Repair every link and let leases end, so that all timers that were armed fire."""
         world, network = self.stage.world, self.stage.world.network
         for sim_link in [*world.cables.values(), *world.leads.values()]:
             if not sim_link.is_up:
@@ -302,7 +302,7 @@ class Trial:
         self.stage.world.network.touch(label)
 
     def _join_in(self, rng: random.Random) -> None:
-        """Take part anew, where it does not any more."""
+        """Restore the participation of a node that left."""
         self.stage.join_in()
 
     def _roam(self, rng: random.Random) -> None:
@@ -334,7 +334,7 @@ _ACTS: Final[tuple[_Act, ...]] = (
 
 
 def broken(plan: Plan, stage: Stage | None = None) -> Exception | None:
-    """Run a plan; return what broke, or None. An error of the harness's own is none."""
+    """Run a plan; return the failure, or None. An error of the harness itself is no failure."""
     try:
         Trial(plan, stage).run()
     except LocalError as error:
@@ -345,7 +345,7 @@ def broken(plan: Plan, stage: Stage | None = None) -> Exception | None:
 
 
 def shrunk(plan: Plan, fails: Callable[[Plan], bool], budget_s: float = 120.0) -> Plan:
-    """Return a plan with acts and words left out that the fault does not need (delta debugging)."""
+    """Return a plan without the acts and words that the failure does not need (delta debugging)."""
     until_s = time.monotonic() + budget_s
     for part in ("words", "acts"):
         items: Sequence[int] = getattr(plan, part)

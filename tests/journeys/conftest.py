@@ -1,6 +1,6 @@
-"""Every journey outlives the leases that it depends on: what holds only until the first of them ends is no promise.
+"""Check that every journey outlives its leases: a promise that holds only until the first lease ends is none.
 
-A test that built a world fails here unless one of its worlds ran for three leases after it had settled, or the test is
+A test that built a simulation fails here unless one of them ran for three leases after it had settled, or the test is
 marked ``momentary`` with the reason why no lease matters to it.
 """
 
@@ -37,7 +37,7 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
 
 
 def too_short(worlds: list[Simulation], marker: pytest.Mark | None) -> str:
-    """Return why a test does not outlive its leases; empty: it does, or need not."""
+    """Return why a test does not outlive its leases; empty if it does, or does not have to."""
     if marker is not None:
         reasons = [reason for reason in marker.args if isinstance(reason, str) and reason.strip()]
         return "" if reasons else "momentary needs a reason: why does no lease matter here?"

@@ -1,4 +1,4 @@
-"""A topic from one member of a world to others, and what came of it."""
+"""Topic from one member of a simulation to others, and its received messages."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ STEP_S = 0.25  # between messages of a flow that is to outlive leases
 
 @dataclass(slots=True)
 class Flow:
-    """One publisher of a topic and its readers, by label."""
+    """Publisher of a topic and its readers, by label."""
 
     world: Simulation
     name: str
@@ -57,7 +57,7 @@ class Flow:
             self.world.network.call(number * every_s, partial(self.publish, message))
 
     def collect(self) -> None:
-        """Take what came to each reader."""
+        """Poll the received messages of each reader."""
         for label, got in self.got.items():
             messages = self.world.members[label].poll_messages()
             got += [each.delivered for each in messages if each.topic == self.topic.name]
@@ -68,19 +68,19 @@ class Flow:
         return [int.from_bytes(each.message[:4], "big") for each in self.got[label]]
 
     def has(self, label: str, count: int) -> bool:
-        """Return whether so many messages came to a reader."""
+        """Return whether this many messages came to a reader."""
         self.collect()
         return len(self.got[label]) >= count
 
     def hops(self, label: str) -> list[int]:
-        """Return how many switches each message passed on its way to a reader."""
+        """Return how many switches each message passed on its path to a reader."""
         self.collect()
         return [each.hops for each in self.got[label]]
 
     def outlive(self, *labels: str, nobody: bool = False, leases: float = 3.25) -> None:
         """Publish at a steady rate until three leases are over; each of these readers, or all, gets all of it in order.
 
-        Other readers that were there get nothing of it; ``nobody``: none does.
+        Other readers that were there get none of it; ``nobody``: no reader does.
         """
         self.collect()
         world, expected = self.world, () if nobody else labels or tuple(self.got)
@@ -98,13 +98,13 @@ class Flow:
             assert later == (sent if label in expected else []), f"what {label} got"
 
     def is_read_by(self, count: int) -> bool:
-        """Return whether so many readers have introduced themselves."""
+        """Return whether this many readers have introduced themselves."""
         return self.publisher.readers >= count
 
 
 @dataclass(slots=True)
 class Tap:
-    """Sees the frames of some kinds that enter one cable in one direction."""
+    """Observer of frames of some kinds that enter one link in one direction."""
 
     a: str
     b: str
@@ -124,7 +124,7 @@ class Tap:
 def ring(
     seed: int = 1, transits: Mapping[str, tuple[str, ...]] | None = None, *, lease_s: float = LEASE_S
 ) -> Simulation:
-    """Return the ring of five, every member attached."""
+    """Return the ring of five, with every member attached."""
     world = Simulation(ring5(), seed, transits=transits, lease_s=lease_s)
     assert world.settle()
     return world

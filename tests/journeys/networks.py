@@ -1,6 +1,6 @@
-"""Networks and faults drawn at random, and what graph and policy say must still arrive.
+"""Networks and faults drawn at random, and the deliveries that graph and policy still require.
 
-A drawn plan prints itself; given back to ``Trial`` it happens again, keys included.
+A drawn plan prints itself; given back to ``Trial`` it repeats the trial, keys included.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ TIERS_MAX: Final = 3
 LEASE_S: Final = JOIN_LEASE_S + 1.0  # of names and of link states, so that none is longer
 PERIOD_S: Final = 0.5  # between messages of each publisher
 SETTLE_S: Final = 40.0
-_FAST_SWITCHES: Final = 8  # timers of larger networks are slower in proportion, for time's sake
+_FAST_SWITCHES: Final = 8  # timers of larger networks are slower in proportion, to save time
 _FAULT_S: Final = 2.0  # the first fault, from the first message on
 _P256_ORDER: Final = 0xFFFFFFFF00000000FFFFFFFFFFFFFFFFBCE6FAADA7179E84F3B9CAC2FC632551
 
 
 class Fate(Enum):
-    """What graph and policy say of a reader."""
+    """Requirement of graph and policy on a reader."""
 
     ALL = "all"  # every message arrives, in order
     NONE = "none"  # nothing that was published after the faults does
@@ -45,7 +45,7 @@ class Fate(Enum):
 
 @dataclass(frozen=True)
 class Fault:
-    """A link or a switch that fails for ever, ``after_s`` after the first message; ``which`` counts modulo all."""
+    """Link or switch that fails for ever, ``after_s`` after the first message; ``which`` counts modulo all."""
 
     is_switch: bool
     which: int
@@ -54,16 +54,16 @@ class Fault:
 
 @dataclass(frozen=True)
 class Plan:
-    """One network, who talks in it, and what fails.
+    """Network, its members, and its faults.
 
     Args:
         sizes: switches of each domain.
         uppers: for each domain but the first, the domain of the tier above.
         chords: links inside domains, as (domain, switch, switch), counted modulo.
         joints: further links between domains, as (domain, switch, domain, switch), counted modulo.
-        ribs: for each domain, at which switch its RIB stands; -1: it has none. The first has one in any case.
-        members: at which switches the members are attached, of all switches, counted modulo.
-        barred: domains through which nobody lets traffic pass; none that is a tier above.
+        ribs: for each domain, the switch of its RIB; -1: it has none. The first has one in any case.
+        members: the switches of the members, of all switches, counted modulo.
+        barred: domains through which no domain lets traffic pass; none that is a tier above.
     """
 
     sizes: tuple[int, ...]
@@ -77,7 +77,7 @@ class Plan:
     seed: int
 
     def topology(self) -> Topology:
-        """Return it, realised: each domain a ring with chords, joined to the tier above at two of its switches."""
+        """Return its topology: each domain a ring with chords, joined to the tier above at two of its switches."""
         domains = [[f"d{d}s{s}" for s in range(size)] for d, size in enumerate(self.sizes)]
         links: dict[frozenset[str], Link] = {}
 
@@ -120,7 +120,7 @@ class Plan:
         )
 
     def transits(self, topology: Topology) -> dict[str, tuple[str, ...]]:
-        """Return through which domains each lets its traffic pass."""
+        """Return the domains through which each lets its traffic pass."""
         open_to_all = tuple(f"d{d}" for d in range(len(self.sizes)) if d not in self.barred)
         return {each.label: open_to_all for each in topology.domains}
 
@@ -209,7 +209,7 @@ class Trial:
         )
 
     def run(self) -> None:
-        """Let everybody publish to everybody, let the faults happen, and check what came of it."""
+        """Let all members publish to all others, inject the faults, and check the deliveries."""
         assert self.world.settle(SETTLE_S), "not every member is attached"
         flows = [self._established(label) for label in self.world.members]
         count = int((self._faults_end_s() + 3.25 * LEASE_S) / PERIOD_S)
@@ -225,7 +225,7 @@ class Trial:
         self._check_late()
 
     def fate(self, source: str, reader: str) -> Fate:
-        """Return what must come of a flow from one member to another after the faults."""
+        """Return the requirement on a flow from one member to another after the faults."""
         start, end = (label.split("/", maxsplit=1)[0] for label in (reader, source))
         return self._fate(start, end)
 
@@ -273,7 +273,7 @@ class Trial:
             self.world.network.set_link(self.world.cables[link.ends()], up=False)
 
     def _collect(self, flows: list[Flow]) -> None:
-        """Take what came to each member, who reads several of the flows."""
+        """Poll the received messages of each member, which reads several of the flows."""
         of = {flow.topic.name: flow for flow in flows}
         for label, member in self.world.members.items():
             for each in member.poll_messages():
@@ -290,7 +290,7 @@ class Trial:
             assert max(numbers, default=0) * PERIOD_S <= self._faults_end_s() + PERIOD_S, told
 
     def _check_late(self) -> None:
-        """Check that who comes after the faults finds what it wants, where every RIB is still there for it."""
+        """Check that members that join after the faults find their names, if every RIB still exists for them."""
         first, *_, last = self.world.members
         places = {self.topology.domain_of(at.switch).label: at.switch for at in self.topology.attached("rib")}
         asks = [(place, places[upper]) for label, place in places.items() if (upper := self._upper(label)) in places]

@@ -1,4 +1,4 @@
-"""Servers and clients of one name in a world, and what came of their calls."""
+"""Servers and clients of one name in a simulation, and the results of their calls."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SERVICE = "/add_two_ints"
 
 @dataclass(slots=True)
 class Party:
-    """One member that serves or calls a name: a server answers each request at once, by what it got and its label."""
+    """Member that serves or calls a name: a server answers each request at once, with its content and its own label."""
 
     world: Simulation
     label: str
@@ -34,7 +34,7 @@ class Party:
 
     @property
     def member(self) -> Participant:
-        """Return the member, in its present life."""
+        """Return the member, in its present incarnation."""
         return self.world.members[self.label]
 
     def begin(self) -> None:
@@ -56,7 +56,7 @@ class Party:
         self._flush()
 
     def collect(self) -> list[Message]:
-        """Take, and answer, what has come; return all that came yet."""
+        """Receive and answer new messages; return all received so far."""
         messages = self.member.poll_messages()
         self.got += messages
         if self.right is Right.SERVE and self.answers:
@@ -77,11 +77,11 @@ class Party:
 
 
 def outlive(world: Simulation, client: Party, *servers: Party, leases: float = 3.25) -> None:
-    """Ask at a steady rate until three leases are over; each server answers each request once, and in order."""
+    """Call at a steady rate until three leases are over; each server answers each request once, and in order."""
     client.collect()
     before, count = len(client.got), ceil(leases * world.lease_s / STEP_S)
     for server in servers:
-        server.collect()  # what came before is not to be answered now
+        server.collect()  # earlier requests are not to be answered now
         server.answers = True
     asked = [b"outlives %d" % number for number in range(count)]
     for number, request in enumerate(asked):
@@ -95,7 +95,7 @@ def outlive(world: Simulation, client: Party, *servers: Party, leases: float = 3
 
 
 def meet(world: Simulation, *parties: Party, within_s: float = 5.0) -> bool:
-    """Let time go on until every client has met every server; return whether that came true."""
+    """Advance time until every client has met every server; return whether that came true."""
     servers = sum(party.right is Right.SERVE for party in parties)
     clients = len(parties) - servers
 
@@ -109,7 +109,7 @@ def meet(world: Simulation, *parties: Party, within_s: float = 5.0) -> bool:
 
 
 def work(world: Simulation, *parties: Party, until_s: float, have: int = 0) -> bool:
-    """Let servers answer for a while; return whether so many messages have come to the last party."""
+    """Let servers answer for a while; return whether this many messages have come to the last party."""
 
     def is_done() -> bool:
         for party in parties:

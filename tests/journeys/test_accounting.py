@@ -1,6 +1,6 @@
-"""No part is lost without a word in the simulated network: published = delivered + dropped by reason + in flight.
+"""Frame accounting in the simulated network: published = delivered + dropped by reason + in flight.
 
-The network counts what its planes drop; what is on a cable that is pulled, and what chance takes, is noted here.
+The network counts the drops of its planes; the losses of pulled links and of chance are recorded here.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def is_data(frame: bytes) -> bool:
 
 
 class Ledger(SimNetwork):
-    """Notes what became of DATA frames: dropped by a plane, lost by chance, cut off with their cable, still flying."""
+    """Fate of DATA frames: dropped by a plane, lost by chance, cut off with their link, still in flight."""
 
     def __init__(self, seed: int = 1) -> None:
         super().__init__(seed)
@@ -81,7 +81,7 @@ class Ledger(SimNetwork):
 
 
 def note_others(monkeypatch: pytest.MonkeyPatch) -> Counter[DropReason]:
-    """Return a count, which grows, of what switches' machines drop of other kinds than DATA."""
+    """Return a growing count of the drops of switches' machines of other kinds than DATA."""
     others: Counter[DropReason] = Counter()
     find, send = Unicast._find, Unicast.send
 
@@ -111,7 +111,7 @@ def note_others(monkeypatch: pytest.MonkeyPatch) -> Counter[DropReason]:
 
 
 class Books:
-    """A best-effort flow over five switches, three of them between, and the sum of what became of its messages."""
+    """Best-effort flow over five switches, three of them transit, and the sum of the fates of its messages."""
 
     def __init__(self, others: Counter[DropReason]) -> None:
         self._others = others
@@ -126,7 +126,7 @@ class Books:
         self._attempts = 0
 
     def stream(self, count: int, every_s: float = 0.001) -> None:
-        """Publish so many messages from now on."""
+        """Publish this many messages from now on."""
         self._attempts += count
         self.flow.stream(count, every_s, SIZE - 4)
 
@@ -136,11 +136,11 @@ class Books:
         self.network.inject("s1", 0, frame, mac)
 
     def reasons(self) -> Counter[DropReason]:
-        """Return why messages went no further: planes, switches' machines, both members."""
+        """Return the drop reasons of messages: planes, switches' machines, both members."""
         return self.ledger.dropped + self._machines() - self._before
 
     def settle(self) -> None:
-        """Let everything come to rest, and add it up."""
+        """Wait until no frame moves, and add up."""
         self.network.run(3)
         self.flow.collect()
         world = self.world
@@ -160,7 +160,7 @@ class Books:
 
 @pytest.fixture
 def books(monkeypatch: pytest.MonkeyPatch) -> Books:
-    """A flow that is at work, with its books open."""
+    """Running flow whose counters are open."""
     monkeypatch.setattr(worlds, "SimNetwork", Ledger)
     return Books(note_others(monkeypatch))
 
@@ -257,7 +257,7 @@ def altered(frame: bytes, at: int, value: bytes) -> bytes:
     return frame[:at] + value + frame[at + len(value) :]
 
 
-def test_every_frame_that_a_reader_is_handed_is_delivered_or_dropped_for_a_reason(books: Books) -> None:
+def test_every_frame_that_a_reader_gets_is_delivered_or_dropped_for_a_reason(books: Books) -> None:
     flow, world = books.flow, books.world
     tap = Tap("s5", B)
     books.network.taps.append(tap)

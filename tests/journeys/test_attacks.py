@@ -1,4 +1,4 @@
-"""What a hostile link brings: counted under its reason, bounded in memory, and the good flow flows on."""
+"""Attacks of a hostile link: counted under their reason, bounded in memory, and the good flow continues."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ NODES = ("nuc1", "nuc3", ROBOT, SERVER, "nuc2/rib")
 
 
 def counted(world: Simulation) -> Counter[DropReason]:
-    """Return everything that was dropped anywhere, by reason."""
+    """Return all drops anywhere, by reason."""
     total = Counter(world.network.drops)
     machines: list[SwitchCore | RibHost | Participant] = [*world.switches.values(), *world.ribs.values()]
     for machine in [*machines, *world.members.values()]:
@@ -40,7 +40,7 @@ def counted(world: Simulation) -> Counter[DropReason]:
 
 
 def still_flows(flow: Flow) -> None:
-    """Publish once more, and see it arrive."""
+    """Publish once more, and check its arrival."""
     flow.collect()
     before = len(flow.got[SERVER])
     flow.publish(b"after the attack")
@@ -49,7 +49,7 @@ def still_flows(flow: Flow) -> None:
 
 
 def attack(flow: Flow, frames: Iterable[bytes], nodes: tuple[str, ...] = NODES) -> Counter[DropReason]:
-    """Throw frames at a port of each node while the flow goes on; return what was counted more than before."""
+    """Inject frames at a port of each node while the flow continues; return the increase of the counters."""
     world = flow.world
     before = counted(world)
     for frame in frames:
@@ -230,7 +230,7 @@ def test_recorded_leaves_played_back_again_and_again_cut_no_branch() -> None:
     flow.outlive()
 
 
-def test_a_recorded_withdrawal_takes_nothing_down_once_the_name_is_pending_advertisement_anew() -> None:
+def test_a_recorded_withdrawal_takes_nothing_down_once_the_name_is_advertised_again() -> None:
     world = ring()
     tap = Tap(ROBOT, "nuc1")
     world.network.taps.append(tap)
@@ -298,7 +298,7 @@ def test_altered_parts_of_messages_die_and_the_message_arrives() -> None:
 
 
 @pytest.mark.momentary("the forged join bears the neighbour's own key: what that neighbour says later is older")
-def test_a_join_without_evidence_plants_nothing() -> None:
+def test_a_join_without_evidence_installs_nothing() -> None:
     world = ring()
     flow = flowing(world)
     nuc2, nuc1 = world.identities["nuc2"], world.switches["nuc1"]
@@ -316,7 +316,7 @@ def test_a_join_without_evidence_plants_nothing() -> None:
 
 
 @pytest.mark.momentary("the forged join bears the neighbour's own key: what that neighbour says later is older")
-def test_a_join_with_evidence_of_another_topic_plants_nothing() -> None:
+def test_a_join_with_evidence_of_another_topic_installs_nothing() -> None:
     world = ring()
     flow = flowing(world)
     nuc2, nuc1 = world.identities["nuc2"], world.switches["nuc1"]
@@ -333,7 +333,7 @@ def test_a_join_with_evidence_of_another_topic_plants_nothing() -> None:
     still_flows(flow)
 
 
-def test_a_ack_of_a_member_that_may_not_judge_is_not_believed() -> None:
+def test_an_ack_of_a_member_that_may_not_acknowledge_is_not_accepted() -> None:
     world = ring()
     flow = flowing(world)
     liar = world.identity(Role.PROXY, "liar", "school")
@@ -347,7 +347,7 @@ def test_a_ack_of_a_member_that_may_not_judge_is_not_believed() -> None:
     flow.outlive()
 
 
-def test_a_ack_from_another_address_than_the_switch_is_from_nobody() -> None:
+def test_an_ack_from_another_address_than_the_switch_is_ignored() -> None:
     world = ring()
     flow = flowing(world)
     rib = world.identities["rib:school"]
@@ -416,7 +416,7 @@ def test_a_hello_of_a_stranger_is_not_answered() -> None:
 
 
 def recorded_hello(world: Simulation) -> bytes:
-    """Return a hello of another network's switch, whose root nobody here knows."""
+    """Return a hello of another network's switch, whose root no node here knows."""
     tap = Tap("nuc2", "nuc1")
     world.network.taps.append(tap)
     world.network.run(1)

@@ -1,4 +1,4 @@
-"""What switches and RIBs note for their audit logs while a topic flows."""
+"""Audit log entries of switches and RIBs while a topic flows."""
 
 from __future__ import annotations
 

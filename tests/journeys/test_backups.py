@@ -1,4 +1,4 @@
-"""Backup branches: a topic's frames have another way before any switch has computed one."""
+"""Backup branches: a topic's frames have another path before any switch has computed one."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PERIOD_S = 0.002
 
 
 def square(mtu: int = 1_500) -> Simulation:
-    """Return ``P - s1 - s2 - s4 - R`` with a dearer way by s3, settled."""
+    """Return ``P - s1 - s2 - s4 - R`` with a path of higher cost by s3, settled."""
     topology = Topology(
         (Link("s1", "s2", 10), Link("s2", "s4", 10), Link("s1", "s3", 12, mtu=mtu), Link("s3", "s4", 10)),
         (DomainPlan("home", ("s1", "s2", "s3", "s4")),),
@@ -39,7 +39,7 @@ def protected(world: Simulation, *readers: str) -> Flow:
 
 
 def frames(world: Simulation, a: str, b: str) -> Tap:
-    """Return what passes a link from now on."""
+    """Return the frames that pass a link from now on."""
     tap = Tap(a, b)
     world.network.taps.append(tap)
     return tap
@@ -51,7 +51,7 @@ def test_no_message_is_lost_where_the_backup_is_taken_before_anybody_knows() -> 
     flow = protected(world)
     flow.stream(200, PERIOD_S, size=100)
     world.network.run(0.05)
-    world.cables[frozenset(("s1", "s2"))].is_up = False  # the port is down; no machine has been told
+    world.cables[frozenset(("s1", "s2"))].is_up = False  # the port is down; no machine has received the event
     world.network.run(0.1)
     in_flight = set(range(200)) - set(flow.numbers(R)) - set(range(70, 200))
     assert len(in_flight) <= 2

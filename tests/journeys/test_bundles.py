@@ -1,4 +1,4 @@
-"""Many small messages over the ring: few seals, nothing lost, nothing twice, and a step costs what there is to do."""
+"""Many small messages over the ring: few seals, nothing lost or doubled, and a step's cost follows its work."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two nodes with one identity: the older one keeps its place, and both are told."""
+"""Two nodes with one identity: the older one keeps its location, and both get a report."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def own_refusal(member: Participant) -> DropReason | None:
 
 
 def place_of(world: Simulation) -> str:
-    """Return the switch at which the RIB of the school knows the robot to be."""
+    """Return the switch of the robot according to the RIB of the school."""
     name = world.identities[ROBOT].name
     (route,) = world.ribs["school"].rib._store.routes(name)
     return next(label for label, switch in world.switches.items() if switch.name == route.switch)
@@ -70,7 +70,7 @@ def keeps_its_place(world: Simulation, member: Participant) -> None:
     assert member.attachment.is_attached
 
 
-def test_the_older_of_two_nodes_keeps_serving_past_three_leases_and_both_are_told() -> None:
+def test_the_older_of_two_nodes_keeps_serving_past_three_leases_and_both_are_informed() -> None:
     world = ring()
     flow = advertise(world)
     converter = add_converter(world, ELSEWHERE)
@@ -116,7 +116,7 @@ def test_a_node_whose_old_switch_does_not_answer_is_taken() -> None:
     keeps_its_place(world, converter)
 
 
-def test_at_one_switch_the_older_of_two_nodes_keeps_its_place_and_both_are_told() -> None:
+def test_at_one_switch_the_older_of_two_nodes_keeps_its_location_and_both_are_informed() -> None:
     world = ring()
     flow = flowing(world)
     converter = add_converter(world, "nuc1")
@@ -130,7 +130,7 @@ def test_at_one_switch_the_older_of_two_nodes_keeps_its_place_and_both_are_told(
     assert world.network.run(DEAD_S + 2, lambda: converter.attachment.is_attached)
 
 
-def test_the_older_of_two_ribs_serves_and_both_are_told() -> None:
+def test_the_older_of_two_ribs_serves_and_both_are_informed() -> None:
     world = ring()
     flow = flowing(world)
     older = world.ribs["school"]
@@ -147,7 +147,7 @@ def test_the_older_of_two_ribs_serves_and_both_are_told() -> None:
 
 
 @pytest.mark.parametrize("at", ["nuc1", "nuc3", "nuc5"])
-def test_the_older_of_two_switches_keeps_its_place_and_both_are_told(at: str) -> None:
+def test_the_older_of_two_switches_keeps_its_location_and_both_are_informed(at: str) -> None:
     world = ring()
     there, back = flowing(world), flowing(world, "/answers", SERVER, (ROBOT,))
     older = world.switches["nuc2"]
@@ -178,7 +178,7 @@ def test_two_switches_with_one_identity_that_meet_when_a_link_comes_back_leave_t
     flowing(world).outlive()
 
 
-def test_a_switch_that_is_restarted_is_nobodys_conflict() -> None:
+def test_a_restarted_switch_conflicts_with_no_node() -> None:
     world = ring()
     flow = flowing(world)
     world.restart_switch("nuc2")
@@ -188,7 +188,7 @@ def test_a_switch_that_is_restarted_is_nobodys_conflict() -> None:
     assert all(switch.hello_protocol.conflicts.refusals == 0 for switch in world.switches.values())
 
 
-def test_a_switch_whose_death_not_all_neighbours_have_noticed_is_nobodys_conflict() -> None:
+def test_a_switch_whose_death_not_all_neighbours_have_noticed_conflicts_with_no_node() -> None:
     world = ring()
     flow = flowing(world)
     world.network.stop("nuc2")

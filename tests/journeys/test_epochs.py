@@ -1,4 +1,4 @@
-"""Topic secrets change while messages flow, and none is lost."""
+"""Topic secrets that change while messages flow, without a loss."""
 
 from __future__ import annotations
 

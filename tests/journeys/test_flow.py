@@ -1,4 +1,4 @@
-"""Messages across the ring of five: through three intermediate switches, past failures, to whoever may read."""
+"""Messages across the ring of five: through three transit switches, past failures, to all permitted readers."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_a_link_that_comes_back_is_used_again() -> None:
 
 
 @pytest.mark.parametrize("name", ["nuc1", "nuc2", "nuc3", "nuc4", "nuc5"])
-def test_a_switch_that_starts_anew_is_taken_back_and_nothing_is_lost(name: str) -> None:
+def test_a_restarted_switch_is_accepted_again_and_nothing_is_lost(name: str) -> None:
     flow = flowing(ring())
     network = flow.world.network
     flow.stream(200, 0.02, size=100)
@@ -68,7 +68,7 @@ def test_a_switch_that_starts_anew_is_taken_back_and_nothing_is_lost(name: str) 
     flow.outlive()
 
 
-def test_a_switch_that_starts_anew_in_an_instant_is_noticed_by_its_session() -> None:
+def test_a_switch_that_restarts_in_an_instant_is_noticed_by_its_session() -> None:
     flow = flowing(ring())
     flow.stream(100, 0.02)
     flow.world.network.call(1.0, lambda: (flow.world.restart_switch("nuc3"), None)[1])
@@ -78,7 +78,7 @@ def test_a_switch_that_starts_anew_in_an_instant_is_noticed_by_its_session() -> 
 
 
 @pytest.mark.parametrize("label", ["school", "backbone", "cloud"])
-def test_a_rib_that_starts_anew_disturbs_no_flow_and_is_refilled(label: str) -> None:
+def test_a_restarted_rib_disturbs_no_flow_and_is_refilled(label: str) -> None:
     flow = flowing(ring())
     world = flow.world
     names = world.ribs[label].rib.names
@@ -92,7 +92,7 @@ def test_a_rib_that_starts_anew_disturbs_no_flow_and_is_refilled(label: str) -> 
     flow.outlive()
 
 
-def test_a_late_reassembler_of_a_latched_topic_gets_the_last_messages() -> None:
+def test_a_late_joiner_of_a_latched_topic_gets_the_last_messages() -> None:
     flow = advertise(ring(), depth=3)
     for number in range(5):
         flow.publish(b"%d" % number)

@@ -1,4 +1,4 @@
-"""A robot whose own switch is a leaf drives from one switch to the next: make before break, and nothing through it."""
+"""Robot whose own switch is a leaf and moves between switches: make before break, and no transit through it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def corridor() -> Simulation:
 
 
 def drive(world: Simulation, flows: list[Flow], stops: tuple[str, ...]) -> None:
-    """Join the leaf to one stop after the other; the cable before is pulled ``OVERLAP_S`` after the next is put in."""
+    """Link the leaf to each stop in turn; the previous link is pulled ``OVERLAP_S`` after the next one is added."""
     network, sim_link = world.network, world.cables[frozenset(("hall", "leaf"))]
     count = int((len(stops) + 1) * 3.0 / EVERY_S)
     for flow in flows:

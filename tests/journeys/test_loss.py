@@ -1,4 +1,4 @@
-"""Published is delivered plus lost, whoever is away and for however long: over switches and RIBs, past three leases."""
+"""Published is delivered plus lost, for absences of any member and length, over switches and RIBs and three leases."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def flow_of(*, reliable: bool = True) -> Flow:
 
 
 def away(flow: Flow, label: str, away_s: float) -> None:
-    """Stream for three claim leases, while a member is unplugged for some of the time."""
+    """Stream for three advertisement leases, while a member is unplugged for some of the time."""
     network, lead = flow.world.network, flow.world.leads[label]
     count = round(max(3 * ADVERTISEMENT_LEASE_S, away_s + 20) / EVERY_S)
     flow.stream(count, EVERY_S, 100)
@@ -123,7 +123,7 @@ def test_reading_again_on_purpose_is_no_loss() -> None:
     assert 10 < len(flow.numbers(READER)) < 40
 
 
-def test_a_latched_topic_that_nobody_read_yet_has_lost_nothing_for_its_first_reader() -> None:
+def test_a_latched_topic_without_earlier_readers_has_lost_nothing_for_its_first_reader() -> None:
     world = Simulation(chain(2))
     assert world.settle()
     flow = advertise(world, source=SOURCE, depth=2)

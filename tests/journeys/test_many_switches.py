@@ -1,4 +1,4 @@
-"""Two hundred switches in eight domains: they find each other, and a message finds its way."""
+"""Two hundred switches in eight domains: they discover each other, and a message reaches its reader."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames as large as the narrowest link of the tree takes, whichever links and readers come and go."""
+"""Frame size of the narrowest link of the tree, while links and readers come and go."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from tests.journeys.flows import LEASE_S, ROBOT, SERVER, Flow, Tap, advertise, f
 
 MIDDLE = frozenset(("nuc2", "nuc3"))
 DETOUR = frozenset(("nuc5", "nuc1"))
-NEWS_S = 0.05  # more than news of a link takes through the ring, less than any renewal
+NEWS_S = 0.05  # more than link news needs through the ring, less than any renewal
 SMALL, USUAL, JUMBO, LARGEST = 576, 1_500, 9_000, 65_000
 
 
 def largest(flow: Flow, size: int = 100_000) -> int:
-    """Publish a message, see it arrive at every reader, and return its largest frame at the source."""
+    """Publish a message, check its arrival at every reader, and return its largest frame at the source."""
     tap = Tap(flow.source, flow.source.split("/")[0])
     network, wanted = flow.world.network, {label: len(got) + 1 for label, got in flow.got.items()}
     network.taps.append(tap)
@@ -40,7 +40,7 @@ def too_big(flow: Flow) -> int:
 
 
 def wide(topology: Topology, mtu: int = JUMBO, **links: int) -> Simulation:
-    """Return a network of wide links, but for those given as ``a_b=mtu``."""
+    """Return a network of wide links, except those given as ``a_b=mtu``."""
     narrow = {frozenset(ends.split("_")): size for ends, size in links.items()}
     made = tuple(replace(link, mtu=narrow.get(link.ends(), mtu)) for link in topology.links)
     world = Simulation(replace(topology, links=made), lead_mtu=mtu, lease_s=LEASE_S)
@@ -171,10 +171,10 @@ def test_frames_too_large_for_a_link_that_shrank_under_them_are_counted() -> Non
     flow = flowing(ring(), reliable=False)
     network, sim_link = flow.world.network, flow.world.cables[frozenset(("nuc4", "nuc5"))]
     flow.publish(bytes(20_000))
-    network.call(0.001, partial(network.set_mtu, sim_link, 1_000))  # they have passed two links of five by then
+    network.call(0.001, partial(network.set_mtu, sim_link, 1_000))  # by then they have passed two links of five
     network.run(NEWS_S)
     parts = -(-(20_000 + 64) // (USUAL - 96 - 16))
-    assert (too_big(flow), flow.numbers(SERVER)) == (parts - 1, [])  # the last part is a small one
+    assert (too_big(flow), flow.numbers(SERVER)) == (parts - 1, [])  # the last fragment is a small one
     flow.outlive()
 
 
@@ -199,7 +199,7 @@ def test_of_news_that_overtake_each_other_the_newest_counts(where: str) -> None:
     world.cables[MIDDLE].jitter_s = 0.02 if where == "links" else 0.0
     seen = []
     for last in (JUMBO, 1_280, JUMBO, 800):
-        network.run(MTU_HOLD_S * MTU_NARROWINGS)  # so often it may narrow again
+        network.run(MTU_HOLD_S * MTU_NARROWINGS)  # the limit of reductions
         for mtu in (1_000, USUAL, SMALL, JUMBO, 700, last):
             network.set_mtu(sim_link, mtu)
             network.run(0.0015)
@@ -217,13 +217,13 @@ def test_what_was_sealed_too_large_for_its_link_arrives_all_the_same() -> None:
     network, sim_link = flow.world.network, flow.world.cables[MIDDLE]
     flow.stream(20, 0.0005, size=20_000)
     network.call(0.004, partial(network.set_mtu, sim_link, 1_000))
-    assert network.run(3, lambda: flow.has(SERVER, 20))  # sooner than a standing reader is let go
+    assert network.run(3, lambda: flow.has(SERVER, 20))  # sooner than a standing reader is evicted
     assert flow.numbers(SERVER) == list(range(20))
     assert too_big(flow) > 0
     flow.outlive()
 
 
-def test_of_two_readers_neither_gets_a_message_twice_that_had_to_be_split_anew() -> None:
+def test_of_two_readers_neither_gets_a_refragmented_message_twice() -> None:
     world = wide(ring5())
     world.add_member("nuc2/near", "nuc2")
     assert world.settle()
@@ -237,7 +237,7 @@ def test_of_two_readers_neither_gets_a_message_twice_that_had_to_be_split_anew()
     flow.outlive()
 
 
-def test_a_late_reassembler_behind_a_narrow_link_gets_what_was_kept_for_it() -> None:
+def test_a_late_joiner_behind_a_narrow_link_gets_what_was_kept_for_it() -> None:
     world = wide(ring5())
     world.lead_mtu = 1_000
     world.add_member("nuc3/narrow", "nuc3")

@@ -1,4 +1,4 @@
-"""Whose domains carry what, who may read, and what a listener on the way learns."""
+"""Transit policy of domains, rights to read, and the knowledge of an eavesdropper on the path."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.journeys.flows import SERVER, Tap, advertise, flowing, ring
 
 SHORT = frozenset(("nuc5", "nuc1"))
 WITHOUT_BACKBONE = {"school": ("cloud",), "cloud": ("school",), "backbone": ("school", "cloud")}
-# The upper RIB stands in the backbone: to be found, one trusts its word; to be carried, one need not pass through it.
+# The upper RIB is in the backbone: resolution requires trust in its responses; transit through it is not required.
 NOT_THROUGH_BACKBONE = {"school": ("school", "cloud"), "cloud": ("school", "cloud")}
 
 

@@ -1,4 +1,4 @@
-"""What is urgent goes first, and one slow reader costs only itself."""
+"""Urgent messages go first, and a slow reader delays only itself."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever one or two links or switches fail, all arrives that graph and policy allow, for longer than every lease."""
+"""Random networks: under failures of links and switches, all deliveries that graph and policy permit arrive."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from hypothesis import HealthCheck, Phase, example, given, settings
 from tests.journeys.networks import Fault, Plan, Trial, plans, reproducible
 
 TRIALS = int(os.environ.get("GDP_RANDOM_NETWORKS", "8"))
-# The way within a domain was longer than one through its neighbour, which sent back what left.
+# The path within a domain was longer than one through its neighbour, which sent back the frames that left.
 LOOPED_AT_A_BORDER = Plan(
     (9, 6, 6, 4), (0, 1, 1), (), (), (2, 3, 0, 0), (3, 0), frozenset({2}), (Fault(False, 0, 2.0),), seed=1
 )
-# Two tiers up, a claim was taken for one of the tier between, through which its frames then might not pass.
+# Two tiers up, an advertisement was taken for one of the tier between, through which its frames then might not pass.
 THREE_TIERS = Plan(
     (1, 7, 3, 6, 2, 4), (0, 1, 1, 0, 0), (), ((9, 13, 20, 26), (31, 36, 31, 39)), (6, 4, 4, 4, 3, 8), (22, 28, 12),
     frozenset({3}), (Fault(False, 141, 2.1),), seed=304,
@@ -26,7 +26,7 @@ IS_LONG = "GDP_RANDOM_NETWORKS" in os.environ
 @settings(
     max_examples=TRIALS,
     deadline=None,
-    derandomize=not IS_LONG,  # what the suite draws is the same each time; more of it is drawn anew
+    derandomize=not IS_LONG,  # the suite draws the same each time; additional draws are new
     print_blob=True,
     suppress_health_check=list(HealthCheck),
     phases=(Phase.explicit, Phase.reuse, Phase.generate, Phase.shrink) if IS_LONG else (Phase.explicit, Phase.generate),

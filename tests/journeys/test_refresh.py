@@ -1,4 +1,4 @@
-"""Ways that links have changed are computed anew a slice at a time, and all of them in the end."""
+"""Recomputation of changed paths, one slice at a time, and of all of them in the end."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tests.journeys.flows import SERVER, flowing, ring
 LONG = frozenset(("nuc2", "nuc3"))
 
 
-def test_every_way_is_found_anew_when_a_slice_is_one_way(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_path_is_recomputed_when_a_slice_is_one_path(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(unicast, "_REFRESH_AT_ONCE", 1)
     world = ring()
     flow, *_ = [flowing(world, f"/topic{number}") for number in range(4)]

@@ -1,4 +1,4 @@
-"""Links that fall silent, lose frames or flap, and what goes on meanwhile."""
+"""Links that fall silent, lose frames or flap, and the traffic that continues during the fault."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def sim_link(world: Simulation, one: str, two: str) -> SimLink:
 
 
 def neighbours(world: Simulation, switch: str) -> set[str]:
-    """Return who is up at a switch."""
+    """Return the neighbours of a switch that are up."""
     label_of = {each.name: label for label, each in world.switches.items()}
     return {label_of[each.name] for each in world.switches[switch].hello_protocol.all_up()}
 
@@ -59,7 +59,7 @@ def echo(world: Simulation) -> bytes:
 
 
 def passed(world: Simulation, one: str, two: str) -> list[float]:
-    """Return, from now on, when echo requests pass a link."""
+    """Return the times at which echo requests pass a link from now on."""
     seen: list[float] = []
 
     def tap(now_s: float, source: str, target: str, frame: bytes) -> None:
@@ -71,7 +71,7 @@ def passed(world: Simulation, one: str, two: str) -> list[float]:
 
 
 def send_to_d(world: Simulation) -> None:
-    """Let a frame come in at a as one of its neighbour c."""
+    """Let a frame come in at a as from its neighbour c."""
     port, (_, own, far) = next(
         (port, wired) for port, wired in world.network._nodes["a"].ports.items() if wired[2].node == "c"
     )
@@ -128,7 +128,7 @@ def test_frames_take_the_alternate_before_the_switch_itself_knows_of_the_cut() -
     send_to_d(world)
     world.network.run(0.5)
     assert (len(by_b), len(by_c)) == (1, 0)
-    sim_link(world, "a", "b").is_up = False  # the port is down; nobody has told the machine
+    sim_link(world, "a", "b").is_up = False  # the port is down; the machine has received no event
     send_to_d(world)
     assert (len(by_b), len(by_c)) == (1, 1)
 

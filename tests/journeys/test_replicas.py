@@ -1,4 +1,4 @@
-"""Several servers of one name: requests to all or to one, one copy where the way is one, and what a dead one costs."""
+"""Several servers of one name: requests to all or to one, one copy on a shared path, and the cost of a dead one."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SERVERS = ("s3/a", "s3/b", "s3/c")
 
 
 def cluster(*labels: str, lease_s: float = LEASE_S) -> tuple[Simulation, Party, list[Party]]:
-    """Return a client and servers at the other end of a chain, which answer nothing, and have met."""
+    """Return a client and servers that answer nothing at the other end of a chain, matched with each other."""
     world = Simulation(chain(3), lease_s=lease_s)
     for label in labels:
         world.add_member(label, "s3")
@@ -40,7 +40,7 @@ def ask(client: Party, server: Party, message: bytes) -> None:
 
 
 class Load:
-    """Numbered requests at a steady rate to all servers, and when each came to whom."""
+    """Numbered requests at a steady rate to all servers, and the arrival times at each."""
 
     def __init__(self, client: Party, servers: list[Party], *, size: int) -> None:
         self._network = client.world.network
@@ -65,7 +65,7 @@ class Load:
                 assert self.waits_s[server.label].setdefault(number, waited_s) == waited_s
 
     def run(self, for_s: float, *, per_s: int, every_s: float = 0.01) -> None:
-        """Let time go on under load, and half a second without."""
+        """Advance time under load, and half a second without."""
         steps = round(for_s / every_s)
         for step in range(steps):
             self._network.call(step * every_s, partial(self.send, round(per_s * every_s)))
@@ -162,7 +162,7 @@ def test_requests_to_a_former_life_of_a_server_do_not_reach_the_new_one() -> Non
 def test_what_a_client_may_ask_before_it_has_said_what_its_requests_are_is_bounded() -> None:
     world, client, (one,) = cluster(SERVERS[0])
     (public,) = one.member.writer_proxies_of(one.service)
-    public.state = WriterProxyState.NEW  # as if its first status had been lost
+    public.state = WriterProxyState.NEW  # as if its first Heartbeat had been lost
     public._schedule.due_s = float("inf")
     messages = 40
     for number in range(messages):
@@ -228,7 +228,7 @@ def test_two_of_three_servers_may_freeze_at_once() -> None:
     outlive(world, client, servers[0])
 
 
-def test_a_server_that_thaws_goes_on_with_what_is_new_and_holds_nobody_up() -> None:
+def test_a_server_that_thaws_continues_with_new_requests_and_delays_no_other() -> None:
     world, client, servers = cluster(*SERVERS)
     load = Load(client, servers, size=3_000)
     frozen = servers[2]
@@ -244,7 +244,7 @@ def test_a_server_that_thaws_goes_on_with_what_is_new_and_holds_nobody_up() -> N
     outlive(world, client, *servers)
 
 
-def test_a_silent_server_is_no_peer_though_nobody_asks_anything() -> None:
+def test_a_silent_server_is_no_peer_even_without_requests() -> None:
     world, client, (heard, silent) = cluster(*SERVERS[:2])
     world.network.run(3)
     assert len(client.member.peers(client.service)) == 2
@@ -258,7 +258,7 @@ def test_a_client_that_had_no_time_does_not_take_its_servers_for_silent() -> Non
     world, client, _ = cluster(*SERVERS[:2])
     world.network.freeze(client.label)
     world.network.run(CALL_QUIET_S + 1)
-    client.member.handle_timer(world.network.now)  # before it has read what came meanwhile
+    client.member.handle_timer(world.network.now)  # before it has read the messages of that time
     assert len(client.member.peers(client.service)) == 2
 
 
@@ -272,7 +272,7 @@ def test_the_only_server_keeps_its_requests_as_long_as_ever() -> None:
     outlive(world, client, *servers)
 
 
-def test_a_server_that_starts_anew_is_a_peer_again_as_soon_as_it_is_there() -> None:
+def test_a_restarted_server_is_a_peer_again_as_soon_as_it_is_there() -> None:
     world, client, servers = cluster(*SERVERS, lease_s=ADVERTISEMENT_LEASE_S)
     load = Load(client, servers, size=100)
     again = servers[2]

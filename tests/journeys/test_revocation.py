@@ -1,4 +1,4 @@
-"""A revoked certificate closes what it opened, in every tier, within a second."""
+"""Revoked certificate: it closes the access that it opened, in every tier, within a second."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gdp.trust.delegation import Delegation
 from gdp.trust.revocation import Revocation
 from tests.journeys.flows import LEASE_S, ROBOT, SERVER, Tap, flowing, ring
 
-HERE = "nuc3"  # where the operator hands the revocation in: neither end's domain
+HERE = "nuc3"  # where the operator inserts the revocation: neither end's domain
 WITHIN_S = 1.0
 TIERS = {"t": ("t1",), "m": ("m1",), "n": ("n1",), "l": ("l1",), "r": ("r1",)}
 
@@ -36,7 +36,7 @@ def three_tiers() -> Simulation:
 
 
 def keeps(world: Simulation, fingerprint: bytes, key: bytes) -> set[str]:
-    """Return who keeps a revocation: switches by name, RIBs by domain in capitals, members."""
+    """Return the nodes that store a revocation: switches by name, RIBs by domain in capitals, members."""
     who = {node for node, switch in world.switches.items() if switch._policy.revoked.has(fingerprint, key)}
     who |= {label.upper() for label, host in world.ribs.items() if host.rib._policy.revoked.has(fingerprint, key)}
     members = world.members.items()
@@ -76,7 +76,7 @@ def test_a_revocation_closes_a_flow_in_all_of_three_tiers(end: str, at: str) -> 
 
 
 def revoke(world: Simulation, delegation: Delegation) -> None:
-    """Take a delegation's AdCert back, at one switch."""
+    """Revoke a delegation's AdCert, at one switch."""
     fingerprint = parse(delegation.chain[-1]).fingerprint
     until = int(world.network.now.unix_s) + 100_000
     world.switches[HERE].revoke(world.owner.revoke(delegation.subject, fingerprint, until), world.network.now)
@@ -95,7 +95,7 @@ def test_a_publisher_whose_delegation_is_revoked_is_gone_from_every_tier() -> No
     flow.outlive(nobody=True)
 
 
-def test_what_a_revoked_publisher_still_sends_reaches_nobody() -> None:
+def test_messages_of_a_revoked_publisher_reach_no_reader() -> None:
     flow = flowing(ring())
     revoke(flow.world, flow.topic.delegation)
     flow.world.network.run(WITHIN_S)
@@ -105,7 +105,7 @@ def test_what_a_revoked_publisher_still_sends_reaches_nobody() -> None:
     flow.outlive(nobody=True)
 
 
-def test_a_revoked_publisher_that_advertisements_again_is_refused() -> None:
+def test_a_revoked_publisher_that_advertises_again_is_refused() -> None:
     flow = flowing(ring())
     world = flow.world
     revoke(world, flow.topic.delegation)

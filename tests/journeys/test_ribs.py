@@ -1,4 +1,4 @@
-"""Several RIBs serve a domain: any of them may die, and no live name is lost."""
+"""Several RIBs of a domain: any of them may die, and no live name is lost."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_each_rib_dies_and_returns_in_turn_and_no_name_is_lost_or_unfindable() -
     flow.stream(number, 1.0, size=100)
     for dead in RIBS:
         world.kill_rib(dead)
-        network.run(0.1)  # before anybody can have noticed
+        network.run(0.1)  # before any node can have noticed
         late = advertise(world, f"/late/{dead}")
         late.read_by(SERVER)
         assert network.run(3, partial(late.is_read_by, 1))

@@ -1,4 +1,4 @@
-"""A robot drives on: it attaches at another switch and is found there, in every tier."""
+"""Moving robot: it attaches at another switch and is found there, in every tier."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
 
 
 def place_in(world: Simulation, rib: str, name: Name, node: Name) -> str:
-    """Return the switch at which a RIB believes a node to be attached."""
+    """Return the switch of a node according to a RIB."""
     route = world.ribs[rib].rib._store.get(name, node)
     assert isinstance(route, Route)
     switch = parse(UnverifiedAdvertisement.from_statement(parse(route.advertisement)).rtcert).fields.name("switch")
@@ -67,7 +67,7 @@ def test_moving_there_and_back_again_ends_where_it_began() -> None:
     flow.outlive()
 
 
-def test_who_watches_is_told_within_the_blink_of_an_eye() -> None:
+def test_a_watcher_is_informed_at_once() -> None:
     flow = flowing(ring())
     world = flow.world
     world.roam(ROBOT, "nuc2")
@@ -94,7 +94,7 @@ def test_the_old_branch_is_left_at_once() -> None:
     flow.outlive()
 
 
-def test_a_new_life_of_a_publisher_is_read_anew() -> None:
+def test_a_new_incarnation_of_a_publisher_is_read_from_its_start() -> None:
     flow = flowing(ring())
     world = flow.world
     flow.publish(b"first life")
@@ -109,7 +109,7 @@ def test_a_new_life_of_a_publisher_is_read_anew() -> None:
 
 
 def _again(flow: Flow) -> Flow:
-    """Start the robot anew at another switch, under the same name."""
+    """Restart the robot at another switch, under the same name."""
     world = flow.world
     member = world.restart_member(ROBOT)
     world.roam(ROBOT, "nuc2")

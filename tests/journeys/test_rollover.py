@@ -1,4 +1,4 @@
-"""Memberships that run out, a domain's root and an owner's key are replaced while messages flow, and none is lost."""
+"""Replacement of expiring memberships, a domain's root and an owner's key while messages flow, without a loss."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def unix_s(world: Simulation) -> int:
 
 
 def renew_all(world: Simulation, lasts_s: int) -> None:
-    """Issue every membership anew, by the present root of its domain."""
+    """Issue every membership again, by the present root of its domain."""
     for identity in world.identities.values():
         authority = next(each for each in world.authorities.values() if each.root.domain == identity.member.domain)
         validity = Validity(unix_s(world) - 2 * SKEW_S, unix_s(world) + lasts_s - SKEW_S)

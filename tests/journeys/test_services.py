@@ -1,4 +1,4 @@
-"""Calls across the ring of five: requests to every server by a tree, each answer to the one that asked."""
+"""Calls across the ring of five: requests to every server by a tree, each response to its client."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def test_answers_to_a_former_life_do_not_reach_the_new_one() -> None:
     outlive(world, client, server)
 
 
-def test_a_server_that_starts_anew_answers_again() -> None:
+def test_a_restarted_server_answers_again() -> None:
     world = ring()
     server, client = pair(world)
     client.publish(b"1")
@@ -163,7 +163,7 @@ def test_a_lost_part_of_an_answer_is_repaired() -> None:
     assert work(world, client, until_s=20, have=20)
     assert client.bodies() == [large] * 20
     for sim_link in world.cables.values():
-        sim_link.loss = 0.0  # claims of these short leases do not live long on such links
+        sim_link.loss = 0.0  # advertisements with these short leases do not last on such links
     outlive(world, client, server)
 
 
@@ -210,7 +210,7 @@ def test_a_node_without_the_right_to_serve_or_call_does_neither() -> None:
         member.call(world.topic(SERVICE, member, [Right.SERVE], kind="service"), b"")
 
 
-def test_who_may_only_call_is_heard_by_no_client_however_it_advertisements() -> None:
+def test_a_node_that_may_only_call_reaches_no_client_however_it_advertises() -> None:
     world = ring()
     server, client = pair(world)
     world.add_member(OTHER, "nuc4")
@@ -294,7 +294,7 @@ def test_a_narrower_path_lets_answers_go_in_smaller_frames() -> None:
     outlive(world, client, server)
 
 
-def test_a_private_stream_that_nobody_uses_is_forgotten_and_goes_on_above_its_numbers() -> None:
+def test_an_unused_unicast_stream_is_forgotten_and_goes_on_above_its_numbers() -> None:
     world = ring()
     server, client = pair(world)
     server.answer(client.member.name, b"1")
@@ -307,7 +307,7 @@ def test_a_private_stream_that_nobody_uses_is_forgotten_and_goes_on_above_its_nu
         for writer_proxy in client.member.writer_proxies()
         if writer_proxy not in client.member.writer_proxies_of(client.service)
     ]
-    writer_proxy._schedule.due_s = float("inf")  # it says nothing any more
+    writer_proxy._schedule.due_s = float("inf")  # it sends nothing any more
     world.network.run(READER_LEASE_S + 1.5 * IDLE_S)
     assert len(streams) == 0
     server.answer(client.member.name, b"2")
@@ -376,7 +376,7 @@ def test_a_client_whose_delegation_is_revoked_is_answered_no_more() -> None:
 
 
 def test_calls_over_links_that_lose_and_reorder_are_all_answered_once() -> None:
-    # A claim of seven frames crosses three such links half of the time: a lease has to last for many tries.
+    # An advertisement of seven frames crosses three such links half of the time: a lease has to last for many tries.
     world = ring(lease_s=8.0)
     server, client = pair(world)
     for sim_link in [*world.cables.values(), *world.leads.values()]:

@@ -1,4 +1,4 @@
-"""One slow reader among many costs only itself: what is best effort goes on, what is reliable waits, but not long."""
+"""Slow reader among many: best-effort traffic continues, reliable traffic waits for a bounded time."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from tests.journeys.flows import LEASE_S, Flow, flowing
 
 SOURCE, NEAR, FAR, SLOW = "s1/left", "s1/near", "s3/right", "s2/slow"
 QUEUE_FRAMES = 64  # of the slow reader
-SOON_S = 0.02  # more than the way takes, less than any timer of a publisher or reader
+SOON_S = 0.02  # more than the path needs, less than any timer of a publisher or reader
 
 
 class Behind:
-    """A member behind a narrow link: what comes waits in a short queue, neighbours' words do not.
+    """Member behind a narrow link: data waits in a short queue, statements of neighbours do not.
 
     Attributes:
         frames_s: how many frames a second get through; 0: none.
@@ -71,7 +71,7 @@ class Behind:
 
 
 def world_with_a_slow_one(frames_s: float) -> tuple[Simulation, Behind]:
-    """Return three switches, a source with a reader beside it, a far reader, and a slow one on the way."""
+    """Return three switches, a source with a local reader, a far reader, and a slow one on the path."""
     world = Simulation(chain(3), lease_s=LEASE_S)
     world.add_member(NEAR, "s1")
     slow = Behind(world.add_member(SLOW, "s2"), frames_s)
@@ -81,7 +81,7 @@ def world_with_a_slow_one(frames_s: float) -> tuple[Simulation, Behind]:
 
 
 def late_of(flow: Flow, count: int, every_s: float, size: int, labels: Sequence[str]) -> list[tuple[str, int]]:
-    """Stream from now on; the list fills with what did not come to a reader soon after it was published."""
+    """Stream from now on; the list fills with messages that reached a reader late or never."""
     late: list[tuple[str, int]] = []
 
     def look(label: str, number: int) -> None:
@@ -98,7 +98,7 @@ def late_of(flow: Flow, count: int, every_s: float, size: int, labels: Sequence[
 def test_best_effort_a_slow_reader_makes_the_others_neither_lose_nor_wait() -> None:
     world, slow = world_with_a_slow_one(frames_s=50)
     flow = flowing(world, source=SOURCE, readers=(NEAR, FAR, SLOW), reliable=False)
-    world.network.run(0.1)  # a reader that is counted has yet to hear from where it begins
+    world.network.run(0.1)  # a counted reader has not yet received its first number
     late = late_of(flow, 400, 0.005, 500, (NEAR, FAR))
     world.network.run(20)
     assert late == []
@@ -117,7 +117,7 @@ def test_reliable_a_slow_reader_slows_its_own_publisher_and_no_other_topic_of_th
     held = flowing(world, "/held", SOURCE, (NEAR, SLOW))
     other = flowing(world, "/other", SOURCE, (FAR,))
     slow.frames_s = 0
-    held.stream(200, 0.001, size=50_000)  # more than may be under way
+    held.stream(200, 0.001, size=50_000)  # more than may be in flight
     late = late_of(other, 400, 0.01, 500, (FAR,))
     world.network.run(4)
     assert len(held.numbers(NEAR)) < 200  # it waits for the slow one
@@ -129,7 +129,7 @@ def test_reliable_a_slow_reader_slows_its_own_publisher_and_no_other_topic_of_th
 
 
 @pytest.mark.parametrize("frames_s", [0, 20])
-def test_reliable_after_the_lease_the_slow_one_holds_nothing_and_is_told_what_it_will_not_get(frames_s: int) -> None:
+def test_reliable_after_the_lease_the_slow_one_holds_nothing_and_learns_what_it_will_not_get(frames_s: int) -> None:
     world, slow = world_with_a_slow_one(frames_s=1e6)
     flow = flowing(world, source=SOURCE, readers=(NEAR, FAR, SLOW))
     world.network.run(SOON_S)  # the slow one knows where to begin
@@ -139,7 +139,7 @@ def test_reliable_after_the_lease_the_slow_one_holds_nothing_and_is_told_what_it
     assert world.network.run(5, flow.publisher.is_acknowledged)
     assert len(flow.numbers(SLOW)) < 200
     slow.frames_s = 1e6
-    world.network.run(2)  # it takes what still waits for it
+    world.network.run(2)  # it takes the frames that still wait for it
     flow.publish((1_000).to_bytes(4, "big"))
     assert world.network.run(10, lambda: all(flow.numbers(label)[-1:] == [1_000] for label in (NEAR, FAR, SLOW)))
     (writer_proxy,) = world.members[SLOW].writer_proxies()
@@ -159,7 +159,7 @@ def test_reliable_a_reader_that_lagged_holds_its_publisher_again_only_after_a_su
     slow.frames_s = 0
     before = len(flow.numbers(NEAR))
     flow.stream(200, 0.001, size=50_000)
-    assert world.network.run(2, lambda: flow.has(NEAR, before + 200))  # nobody waited for it
+    assert world.network.run(2, lambda: flow.has(NEAR, before + 200))  # no reader waited for it
     flow.outlive(NEAR)
 
 
@@ -174,7 +174,7 @@ def test_a_reader_that_dies_holds_its_publisher_for_no_longer_than_its_lease() -
     flow.outlive(NEAR)
 
 
-def test_best_effort_of_what_nobody_takes_the_oldest_go_and_are_counted() -> None:
+def test_best_effort_the_oldest_unsent_messages_are_dropped_and_counted() -> None:
     world, _ = world_with_a_slow_one(frames_s=1e6)
     flow = flowing(world, source=SOURCE, readers=(FAR,), reliable=False)
     world.network.set_link(world.leads[SOURCE], up=False)

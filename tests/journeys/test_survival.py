@@ -1,4 +1,4 @@
-"""What stays of a network goes on for longer than every lease: cuts, parted domains, dead RIBs, moves."""
+"""Networks that outlive every lease after cuts, partitions, dead RIBs and moves."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SHORT_S = 3 * LEASE_S + 8
 
 
 def complete(flow: Flow, label: str, count: int, within_s: float) -> None:
-    """Let time go on until so many messages have come to a reader: all of them, in order, once."""
+    """Advance time until this many messages have come to a reader: all of them, in order, once."""
     flow.world.network.run(within_s, lambda: flow.has(label, count))
     assert flow.numbers(label) == list(range(count))
 
@@ -46,7 +46,7 @@ def restart_switch(world: Simulation, name: str) -> None:
 
 
 def three_sites() -> Topology:
-    """Return domains a, b and c around top, in two ways, each with two access switches and a border."""
+    """Return domains a, b and c around top, on two paths, each with two access switches and a border."""
     nodes = {label: (f"{label}0", f"{label}1", f"{label}2") for label in ("a", "b", "c")}
     links = [Link(n[0], each) for n in nodes.values() for each in n[1:]]
     links += [Link(n[1], n[2]) for n in nodes.values()]
@@ -202,7 +202,7 @@ def test_a_switch_at_the_border_of_a_domain_that_never_rests_stays_in_its_own() 
     world = Simulation(plan, lease_s=LEASE_S)
     world.network.run(5)
     ribs = {world.ribs[domain].name for domain in ("a", "b")}
-    for _ in range(9):  # each time something changes at the border, and nothing in a3's own part of the domain
+    for _ in range(9):  # at each change of the border, and no message in a3's own part of the domain
         world.network.stop("a2")
         world.network.run(1.5)
         world.restart_switch("a2")

@@ -1,4 +1,4 @@
-"""The models of the exchanges: their results are those that the page states, and of the files that are here."""
+"""Models of the exchanges: their results equal those on the page, and belong to the present files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of rules, for tests: a place with keys, and what loading a text there gives."""
+"""Files of rules, for tests: a folder with keys, and the result of loading a text there."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FIRST_LINE = NODE.count("\n") + 1
 
 
 def furnish(folder: Path) -> None:
-    """Make what the files name."""
+    """Create the files that the rules name."""
     (folder / "id").mkdir()
     (folder / "root.crt").write_text("a certificate")
     (folder / "owner.pub").write_bytes(OWNER.public.to_pem())
@@ -30,7 +30,7 @@ def furnish(folder: Path) -> None:
 
 
 def proxy(folder: Path, text: str) -> ProxyConfig:
-    """Return the configuration that this text, after the keys of every node, gives."""
+    """Return the configuration of this text, after the keys of every node."""
     (folder / "proxy.yaml").write_text(NODE + text)
     return ProxyConfig.load(folder / "proxy.yaml")
 
@@ -46,7 +46,7 @@ def rule(folder: Path, text: str) -> Rule:
 
 
 def refusals(folder: Path, text: str) -> list[str]:
-    """Return what is said about a text, without the folder."""
+    """Return the error about a text, without the folder."""
     with pytest.raises(ConfigFileError) as caught:
         proxy(folder, text)
     return str(caught.value).replace(f"{folder}/", "").splitlines()

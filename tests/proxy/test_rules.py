@@ -1,4 +1,4 @@
-"""Rules as people write them: which are taken, which are refused and where, and what they mean."""
+"""Rules, as people write them: accepted ones, refused ones with the position, and their meaning."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lets tests import what lies under ``scripts/experiments`` by its bare name, as those scripts do among themselves."""
+"""Import path for modules under ``scripts/experiments`` by bare name, as those scripts import each other."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The bench of messages, as far as it thinks: the message, the loop, the addresses, the figures to reach."""
+"""Sans-I/O parts of the message bench: the message, the loop, the addresses, the targets."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ LOAD = Load((100, 10_000), 5)
 
 
 class Echo:
-    """A way whose far end answers at once; each test breaks it in its own manner."""
+    """Path whose far end answers at once; each test breaks it in its own manner."""
 
     def __init__(self) -> None:
         self.sent: list[bytes] = []
@@ -68,7 +68,7 @@ def test_a_message_passes_every_encoding_unchanged_and_not_as_opaque(encoding: E
     assert b"$raw" not in body
 
 
-def test_a_message_without_room_for_its_number_is_refused() -> None:
+def test_a_message_too_short_for_its_number_is_refused() -> None:
     with pytest.raises(ValueError, match="at least"):
         image(SIZE_MIN - 1)
 
@@ -112,7 +112,7 @@ def test_a_message_that_is_not_answered_ends_the_measurement() -> None:
         exchange(Mute(), LOAD, {})
 
 
-def test_nobody_at_the_far_end_is_an_error_and_not_a_wait_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_absent_far_end_is_an_error_and_not_an_endless_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     class Nobody(Echo):
         def send(self, message: bytes) -> None:
             monkeypatch.setattr(time, "monotonic", lambda: float("inf"))
@@ -156,14 +156,14 @@ def test_every_machine_reaches_every_address_over_its_neighbours(start: str, end
         assert len(passed) == abs(NODES.index(start) - NODES.index(end)) + 1
 
 
-def test_two_ends_of_a_link_share_a_network_and_nobody_else_does() -> None:
+def test_two_ends_of_a_link_share_a_network_and_no_other_does() -> None:
     links = row(9_000).links
     nets = [{ip_network(f"{address(*pair)}/24", strict=False) for pair in ((x.a, x.b), (x.b, x.a))} for x in links]
     assert all(len(each) == 1 for each in nets)
     assert len(set.union(*nets)) == len(links)
 
 
-def test_cyclone_knows_its_peer_by_address_and_asks_nobody_else() -> None:
+def test_cyclone_knows_its_peer_by_address_and_queries_no_other() -> None:
     tree = ElementTree.fromstring(cyclone_xml("10.99.0.1", "10.99.3.2"))
     found = {each.tag: each for each in tree.iter()}
     assert found["AllowMulticast"].text == "false"

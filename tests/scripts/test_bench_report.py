@@ -1,4 +1,4 @@
-"""What all benches share, as far as it thinks: figures over rounds, the search for a rate, frames ready made."""
+"""Sans-I/O parts that all benches share: figures over rounds, the search for a rate, prepared frames."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_who_is_not_here_leaves_a_reason_in_place_of_a_figure() -> None:
     assert str(target) == "speed: target ≥ 1.00, not measured: ours is not here: no CAP_BPF"
 
 
-def test_a_figure_without_a_bound_is_only_told() -> None:
+def test_a_figure_without_a_bound_is_only_printed() -> None:
     target = rounds(ours=[1.0], theirs=[4.0]).ratio("beside", "ours", "theirs", CASE, COLUMN, None)
     assert target.met is None
     assert str(target) == "beside: measured 0.25"
@@ -125,7 +125,7 @@ def test_frames_that_come_late_make_the_rate_smaller() -> None:
 
 
 class Path40k:
-    """A path that carries 40,000 frames/s and loses what is more; a source that can send 100,000/s."""
+    """Path that carries 40,000 frames/s and loses the excess; its source can send 100,000/s."""
 
     def __init__(self, carries: float = 40_000.0, spoilt: int = 0) -> None:
         self.carries = carries

@@ -1,4 +1,4 @@
-"""The benches with real ROS nodes, as far as they think: names, cases, figures to reach, sizes of the tasks."""
+"""Sans-I/O parts of the benches with real ROS nodes: names, cases, targets, sizes of the tasks."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_every_case_is_measured_directly_too(options: Options) -> None:
         assert cases == {turn.case for turn in bench.turns if turn.contender != DIRECT}
 
 
-def test_what_was_asked_is_judged_by_what_the_turns_fill_in(options: Options) -> None:
+def test_targets_are_compared_with_the_results_of_the_rounds(options: Options) -> None:
     for bench in benches(options):
         over = Rounds()
         for turn in bench.turns:

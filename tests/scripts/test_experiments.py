@@ -1,4 +1,4 @@
-"""What the experiments' figures rest on: statistics, frames whose truth is known, planners that can be stopped."""
+"""Basis of the experiments' figures: statistics, frames with known truth, planners that can be stopped."""
 
 from __future__ import annotations
 
@@ -105,11 +105,11 @@ def test_a_drawn_tag_is_found_where_it_is() -> None:
 
 
 @pytest.mark.skipif(not MESHES.is_dir(), reason="no ../shared/data/planning here")
-def test_a_planner_finds_a_way_and_breaks_off_when_told() -> None:
+def test_a_planner_finds_a_path_and_stops_on_command() -> None:
     for module in ("ompl", "fcl", "trimesh", "collada"):
         if importlib.util.find_spec(module) is None:
             pytest.skip(f"{module} is not installed: pip install 'gdp-ros[experiments]'")
-    # In a process of its own: beside the libraries of ROS, that of OMPL has been seen to abort while it is loaded.
+    # In a child process: in one process with the libraries of ROS, OMPL's library has been seen to abort on loading.
     environment = {**os.environ, "PYTHONPATH": f"{PYTHON_PATH}:{ROOT / 'scripts/experiments'}:{ROOT / 'scripts/bench'}"}
     done = subprocess.run(
         [sys.executable, "-c", PLANNING, str(MESHES)],

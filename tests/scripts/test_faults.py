@@ -1,4 +1,4 @@
-"""What the chaos bench decides without processes: networks and faults from a seed, the oracle, the books."""
+"""Sans-I/O parts of the chaos bench: networks and faults from a seed, the oracle, the accounting."""
 
 from __future__ import annotations
 
@@ -159,17 +159,17 @@ def books(*arrived: Record, sent: int = 0) -> Books:
     return found
 
 
-def test_a_message_that_is_missing_and_was_not_told_is_found() -> None:
+def test_a_message_that_is_missing_and_was_not_reported_is_found() -> None:
     found = books(*(delivered(n) for n in (2, 3, 5)), sent=5).incomplete(lambda *_: True, SECOND_NS)
     assert found == ["/t at R (life 1): 1 messages missing, 0 told"]
 
 
-def test_a_loss_that_was_told_exactly_is_none() -> None:
+def test_a_loss_that_was_reported_exactly_is_accepted() -> None:
     lost = Record(Kind.LOST, 0, 1, 0, 2, 0)
     assert not books(*(delivered(n) for n in (1, 4)), lost, sent=4).incomplete(lambda *_: True, SECOND_NS)
 
 
-def test_what_a_publisher_said_before_it_died_between_two_lives_of_a_reader_may_be_told() -> None:
+def test_the_last_messages_of_a_dead_publisher_between_two_incarnations_of_a_reader_may_be_reported() -> None:
     found = books(delivered(1), delivered(2))
     found.take("P", 1, (Record(Kind.PUBLISHED, 0, 1, 0, number, number) for number in range(1, 100)))
     found.take("P", 2, (Record(Kind.PUBLISHED, 0, 2, 0, number, number) for number in range(1, 6)))
@@ -181,12 +181,12 @@ def test_what_a_publisher_said_before_it_died_between_two_lives_of_a_reader_may_
     assert found.incomplete(lambda _, life: life == 2, SECOND_NS)
 
 
-def test_more_told_than_missing_is_found() -> None:
+def test_more_reported_than_missing_is_found() -> None:
     lost = Record(Kind.LOST, 0, 1, 0, 2, 0)
     assert books(delivered(1), delivered(2), lost, sent=2).incomplete(lambda *_: True, SECOND_NS)
 
 
-def test_the_end_of_a_flow_is_missed_only_where_nobody_was_killed() -> None:
+def test_the_end_of_a_flow_is_required_only_where_no_process_was_killed() -> None:
     cut_short = books(delivered(1), delivered(2), sent=9)
     assert cut_short.incomplete(lambda *_: True, SECOND_NS)
     assert not cut_short.incomplete(lambda *_: False, SECOND_NS)

@@ -1,4 +1,4 @@
-"""The fuzzer, and each decoder for a fraction of a second."""
+"""Fuzzer, and each decoder for a fraction of a second."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_every_decoder_has_a_name_of_its_own_and_an_input() -> None:
     assert all(corpus_of(decoder) for decoder in DECODERS)
 
 
-def test_a_foreign_exception_is_found_and_told_apart_by_its_place() -> None:
+def test_a_foreign_exception_is_found_and_identified_by_its_position() -> None:
     def bad(data: bytes) -> object:
         if b"x" in data:
             return data[1_000_000]

@@ -1,3 +1,5 @@
+"""Generator of the demonstration recording."""
+
 from __future__ import annotations
 
 import subprocess

@@ -1,3 +1,5 @@
+"""Price experiments: their tables and the shipped prices."""
+
 from __future__ import annotations
 
 import json
@@ -30,7 +32,7 @@ def test_the_page_of_table_one_is_of_the_shipped_prices() -> None:
     assert shown == table1.page("us-east-1", table1.bills("us-east-1"), table1.applications())
 
 
-def test_every_application_of_the_paper_has_its_three_prices_beside_ours() -> None:
+def test_every_application_of_the_paper_has_its_three_prices_next_to_ours() -> None:
     needed = table1.applications()
     assert [each.name for each in needed] == list(table1.APPLICATIONS)
     for each in needed:

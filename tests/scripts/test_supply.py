@@ -1,4 +1,4 @@
-"""Locks, audit, bill of materials and signed checksums: what is installed and released is what was meant."""
+"""Locks, audit, bill of materials and signed checksums: installed and released files are the intended ones."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def lock(folder: Path, text: str = PINNED) -> Path:
 
 
 def install(folder: Path, name: str, at: str, meta: str = "") -> Path:
-    """Install a package of one file as pip would; return that file."""
+    """Install a package of one file like pip; return that file."""
     module, info = folder / f"{name}.py", folder / f"{name}-{at}.dist-info"
     info.mkdir(parents=True)
     module.write_text(f"NAME = {name!r}\n")
@@ -76,7 +76,7 @@ def found(folder: Path) -> list[Distribution]:
 
 @pytest.fixture
 def site(tmp_path: Path) -> Path:
-    """A folder of packages in which alpha and beta are installed as pinned."""
+    """Folder of packages in which alpha and beta are installed as pinned."""
     folder = tmp_path / "site"
     install(folder, "alpha", "1.2", "License-Expression: MIT\nRequires-Dist: Beta>=1\n")
     install(folder, "beta", "2.0", "Classifier: License :: OSI Approved :: BSD License\n")
@@ -298,7 +298,7 @@ def test_the_bill_of_a_lock_is_whole_and_the_same_each_time(tmp_path: Path) -> N
 
 @pytest.fixture
 def signed(tmp_path: Path) -> tuple[Path, Path]:
-    """A signed folder of two files, and the keys."""
+    """Signed folder of two files, and the keys."""
     folder, keys = tmp_path / "dist", tmp_path / "keys"
     folder.mkdir()
     make_owner(keys)

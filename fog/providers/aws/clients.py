@@ -1,6 +1,6 @@
-"""One EC2 client for each region, made when it is first asked for; boto3 finds credentials its own way.
+"""EC2 clients, one per region, created on first use; boto3 finds the credentials.
 
-Place: shell.
+I/O.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ __all__ = ["Clients", "filters"]
 _CONNECT_S = 5.0
 _ANSWER_S = 30.0
 _ATTEMPTS = 4
-_FIRST_REGION = "us-east-1"  # every account has it enabled
+_FIRST_REGION = "us-east-1"  # enabled in every account
 
 
 class Clients:
-    """All regions of an account, or the chosen ones. May be used by several threads.
+    """Clients of all regions of an account, or of the chosen ones; thread-safe.
 
     Raises:
         LocalError: boto3 is not installed.
@@ -40,13 +40,13 @@ class Clients:
             self._session = boto3.session.Session()
         self._regions = chosen
         self._clients: dict[str, EC2Client] = {}
-        self._lock = Lock()  # a session makes clients for one thread at a time
+        self._lock = Lock()  # a session may create clients in one thread at a time only
 
     def __getitem__(self, region: str) -> EC2Client:
         """Return the client of a region.
 
         Raises:
-            LocalError: there is no such region, or it is not among the chosen.
+            LocalError: the region does not exist, or is not among the chosen ones.
         """
         from botocore.config import Config
 
@@ -67,8 +67,8 @@ class Clients:
         """Return the chosen regions, else those that the account has enabled.
 
         Raises:
-            StoreError: EC2 cannot be asked now.
-            LocalError: it refuses the credentials.
+            StoreError: EC2 cannot be reached now.
+            LocalError: EC2 refuses the credentials.
         """
         if not self._regions:
             with asking("regions"):
@@ -85,5 +85,5 @@ class Clients:
 
 
 def filters(wanted: Mapping[str, str]) -> list[FilterTypeDef]:
-    """Return EC2's form of "all of these are so"."""
+    """Return EC2's filter for the conjunction of these values."""
     return [{"Name": key, "Values": [value]} for key, value in wanted.items()]

@@ -1,6 +1,6 @@
-"""The settings of provider ``aws``: regions, image, network, and who may log in. Credentials are boto3's own affair.
+"""Settings of provider ``aws``: regions, image, network and logins. boto3 finds the credentials.
 
-Place: pure.
+Sans-I/O.
 Source: Debian's images are published by account 136693071363 (wiki.debian.org/Cloud/AmazonEC2Image).
 """
 
@@ -19,7 +19,7 @@ __all__ = ["AwsConfig", "Ssh"]
 
 
 class Ssh(Section):
-    """Logging in: ``key_pair`` as EC2 calls it, ``sources`` the addresses that port 22 is opened to."""
+    """Settings of logins: ``key_pair`` is EC2's name, ``sources`` are the addresses for which port 22 is open."""
 
     key_pair: str
     sources: IPv4Network
@@ -28,9 +28,11 @@ class Ssh(Section):
 
 
 class AwsConfig(Section):
-    """``aws:`` of ``fog.yaml``. Without ``regions`` all that the account has enabled are looked through. ``images``,
-    ``subnets`` and ``security_groups`` go by region; what is not there is the newest image of that owner and name, the
-    default VPC, and a security group of our own that lets nothing in but what ``ssh`` and ``setup.vxlan`` need.
+    """Section ``aws:`` of ``fog.yaml``.
+
+    Without ``regions``, all enabled regions of the account are used. ``images``, ``subnets`` and ``security_groups``
+    map regions to values. Defaults are the newest image of that owner and name, the default VPC, and a new security
+    group. The group admits only what ``ssh`` and ``setup.vxlan`` need.
     """
 
     regions: tuple[str, ...] = ()

@@ -1,6 +1,6 @@
-"""What an error of EC2 means for who asked: try again or elsewhere, or it will never be had this way.
+"""Mapping of EC2 errors to ``StoreError`` (try again or elsewhere) and ``LocalError`` (permanent).
 
-Place: shell; waits for nothing itself.
+I/O; waits for nothing itself.
 Source: "Error codes for the Amazon EC2 API" of the EC2 API reference.
 """
 
@@ -44,11 +44,11 @@ _WHAT_TO_DO: Final = {
 
 @contextmanager
 def asking(what: str) -> Iterator[None]:
-    """Translate what boto3 raises inside; ``what`` was asked, such as ``us-east-1: create m3``.
+    """Translate exceptions of boto3; ``what``: the request, such as ``us-east-1: create m3``.
 
     Raises:
-        StoreError: it may be had later, or elsewhere; or EC2 cannot be reached.
-        LocalError: credentials, permissions, quota or parameters are wrong; the text says what to do.
+        StoreError: the request may succeed later or elsewhere, or EC2 cannot be reached.
+        LocalError: credentials, permissions, quota or parameters are wrong; the text states the remedy.
     """
     from botocore import exceptions as boto
 
@@ -72,7 +72,7 @@ def asking(what: str) -> Iterator[None]:
 
 
 def is_code(error: Exception | None, code: str) -> bool:
-    """Return whether EC2 answered with this code; ``error`` is what boto3 raised."""
+    """Return whether EC2 responded with this code; ``error``: exception of boto3."""
     from botocore.exceptions import ClientError
 
     return isinstance(error, ClientError) and error.response["Error"]["Code"] == code

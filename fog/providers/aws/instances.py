@@ -1,8 +1,8 @@
-"""An EC2 instance, and its spot request, as a machine; the tags that make this possible without a journal.
+"""Conversion of EC2 instances and spot requests to machines, by tags that replace a journal.
 
-Place: pure.
+Sans-I/O.
 Source: EC2 user guide, "Instance lifecycle" and "Spot request status": a spot instance is marked for termination two
-minutes before it ends. Tag keys are of the characters that instance metadata shows.
+minutes before it ends. Tag keys use only characters that instance metadata supports.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ NOTICE_S: Final = 120.0
 _STATES: Final = {
     "pending": MachineState.BOOTING,
     "running": MachineState.RUNNING,
-    "stopping": MachineState.LEAVING,  # still paid for, so not gone
+    "stopping": MachineState.LEAVING,  # still billed, so not gone
     "stopped": MachineState.LEAVING,
     "shutting-down": MachineState.GONE,
     "terminated": MachineState.GONE,
@@ -39,7 +39,7 @@ _STATES: Final = {
 
 
 def tags_of(spec: MachineSpec) -> dict[str, str]:
-    """Return what is written on a machine so that ``machine_of`` can read it back."""
+    """Return the tags of a machine, which ``machine_of`` reads."""
     offer = spec.offer
     return {
         "Name": f"{spec.cluster}-{spec.name}",
@@ -51,12 +51,12 @@ def tags_of(spec: MachineSpec) -> dict[str, str]:
 
 
 def machine_of(region: str, instance: InstanceTypeDef, request: SpotInstanceRequestTypeDef | None = None) -> Machine:
-    """Return what EC2 says of an instance that carries our tags; ``request`` is the one that a spot instance answers.
+    """Return the machine of a tagged instance; ``request``: spot request of a spot instance.
 
-    EC2 knows that a machine runs, not that its programs do: the RIB knows that.
+    EC2 reports that a machine runs, not that its programs do; the RIB knows that.
 
     Raises:
-        LocalError: somebody changed the tags so that they make no sense.
+        LocalError: the tags were changed and are invalid.
     """
     tags = {tag["Key"]: tag["Value"] for tag in instance.get("Tags", [])}
     status = request.get("Status", {}) if request else {}

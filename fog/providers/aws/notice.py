@@ -1,11 +1,11 @@
-"""A program of every EC2 machine: it watches the instance's metadata, and tells ``fog-machine`` that it is to leave.
+"""Watcher of EC2 instance metadata: a program of every EC2 machine that signals ``fog-machine`` to leave.
 
-Place: shell; asks the instance metadata service (version 2) every few seconds, for it cannot be waited on.
-Source: EC2 user guide, "Spot Instance interruption notices" (two minutes before; look every five seconds; 404 where
-there is none) and "Use IMDSv2"; 169.254.169.254 is where it listens on every instance.
+I/O; polls the instance metadata service (version 2) every few seconds, because it has no notification.
+Source: EC2 user guide, "Spot Instance interruption notices" (two minutes before; poll every five seconds; 404 if there
+is none) and "Use IMDSv2"; 169.254.169.254 is its address on every instance.
 
-A spot interruption becomes the machine's ``notice.json`` at once. The machine serves on, for its replacement may not be
-up, and drains in time. The tag by which ``AwsProvider.drain`` asks drains it at once.
+A spot interruption is written to the machine's ``notice.json`` at once. The machine continues to serve, because its
+replacement may not be up, and drains before the deadline. The tag of ``AwsProvider.drain`` drains it at once.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ METADATA_URL: Final = "http://169.254.169.254"
 POLL_S: Final = 5.0
 DRAIN_BEFORE_S: Final = 60.0
 _TOKEN_HEADER: Final = "X-aws-ec2-metadata-token"
-_TOKEN_S: Final = 21_600  # the longest that is allowed
+_TOKEN_S: Final = 21_600  # the longest allowed lifetime
 _ANSWER_S: Final = 2.0
 _NONE: Final = 404
 _TOKEN_EXPIRED: Final = 401
@@ -43,15 +43,15 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 
 class Metadata:
-    """The metadata of this instance. What it raises is an OSError: no answer, or none that makes sense."""
+    """Metadata of this instance. All methods raise OSError without a valid response."""
 
     def __init__(self, url: str = METADATA_URL) -> None:
         self._url = url
         self._token = ""
-        self._open = build_opener(ProxyHandler({})).open  # a proxy would see the metadata of its own machine
+        self._open = build_opener(ProxyHandler({})).open  # a proxy would return the metadata of its own machine
 
     def interrupted_at_unix_s(self) -> float | None:
-        """Return when EC2 takes this spot machine; None: it does not say so."""
+        """Return when EC2 preempts this spot machine, as Unix time; None: there is no notice."""
         text = self._get("spot/instance-action")
         if text is None:
             return None
@@ -62,7 +62,7 @@ class Metadata:
         return at.replace(tzinfo=timezone.utc).timestamp()
 
     def is_to_drain(self) -> bool:
-        """Return whether this machine carries the tag."""
+        """Return whether this machine has the drain tag."""
         return self._get(f"tags/instance/{DRAIN}") is not None
 
     def _get(self, path: str) -> str | None:
@@ -91,10 +91,10 @@ class Metadata:
 
 
 class Watch:
-    """What was seen until now.
+    """State of the watcher.
 
     Args:
-        notice: told once, when EC2 will take the machine (Unix time).
+        notice: called once with the time of the preemption (Unix time).
         drain: called once.
     """
 
@@ -105,7 +105,7 @@ class Watch:
         self._leaves_at: float | None = None
 
     def look(self, now_unix_s: float) -> bool:
-        """Look once; return whether there is nothing more to watch for, as the machine drains.
+        """Poll once; return whether watching has ended because the machine drains.
 
         Raises:
             OSError: the metadata cannot be read now.

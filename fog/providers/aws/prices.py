@@ -1,6 +1,6 @@
-"""What spot machines of a region cost now.
+"""Current spot prices of a region.
 
-Place: shell; asks EC2 and the clock.
+I/O; queries EC2 and reads the clock.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _LINUX: Final = ("Linux/UNIX", "Linux/UNIX (Amazon VPC)")
 
 
 def spot_prices(client: EC2Client, type_names: Sequence[str]) -> dict[str, float]:
-    """Return type -> US dollars an hour in its cheapest zone; what is not sold there is left out.
+    """Return type -> US dollars per hour in its cheapest zone; types that are not sold there are omitted.
 
     Raises:
         ClientError, BotoCoreError: boto3's own.
@@ -28,7 +28,7 @@ def spot_prices(client: EC2Client, type_names: Sequence[str]) -> dict[str, float
     pages = client.get_paginator("describe_spot_price_history").paginate(
         InstanceTypes=[cast("InstanceTypeType", each) for each in type_names],
         ProductDescriptions=_LINUX,
-        StartTime=datetime.now(timezone.utc),  # EC2 then tells the price that holds in each zone
+        StartTime=datetime.now(timezone.utc),  # EC2 then returns the current price of each zone
     )
     for page in pages:
         for each in page["SpotPriceHistory"]:

@@ -1,10 +1,10 @@
-"""Machines of Amazon EC2, on demand and spot.
+"""Provider of Amazon EC2 machines, on demand and spot.
 
-Place: shell; asks EC2, several regions at once.
+I/O; queries EC2, several regions in parallel.
 Source: EC2 API reference (RunInstances, "Ensuring idempotency"), EC2 user guide ("Spot Instance interruption notices").
 
-All that must outlast a restart stands in the tags of the instances. A spot machine is a one-time request that ends
-with its instance; a machine that powers itself off is terminated.
+All state that must survive a restart is in the tags of the instances. A spot machine is a one-time request that ends
+with its instance. A machine that powers itself off is terminated.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ _LIVING: Final = ("pending", "running", "stopping", "stopped")
 
 
 class AwsProvider:
-    """Provider ``aws``; an id is ``region/instance``. It may be used by several threads.
+    """Provider ``aws``; an id is ``region/instance``. Thread-safe.
 
     Args:
-        prices: the catalogue: what has enough, whether spot -> its lines of provider ``aws``.
+        prices: catalogue: (hardware, whether spot) -> lines of provider ``aws`` with enough hardware.
 
     Raises:
         LocalError: boto3 is not installed.
@@ -63,11 +63,11 @@ class AwsProvider:
         self._threads = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="aws")
 
     def offers(self, hardware: Hardware, *, spot: bool) -> list[Offer]:
-        """Return the catalogue's lines, of spot machines with what they cost now where EC2 tells it.
+        """Return the catalogue's lines; spot machines have the current price if EC2 reports it.
 
         Raises:
-            StoreError: EC2 cannot be asked now.
-            LocalError: it refuses the credentials.
+            StoreError: EC2 cannot be reached now.
+            LocalError: EC2 refuses the credentials.
         """
         regions = self._clients.regions()
         lines = [each for each in self._prices(hardware, spot) if each.region in regions]
@@ -79,11 +79,11 @@ class AwsProvider:
         return sorted(lines, key=lambda each: each.usd_per_hour)
 
     def create(self, spec: MachineSpec, boot: MachineBundle) -> str:
-        """Run one instance; asking again for the same machine returns the one that there is.
+        """Run one instance; a repeated request for the same machine returns the existing instance.
 
         Raises:
-            StoreError: there is none to be had there now, or EC2 cannot be asked.
-            LocalError: credentials, quota, type or settings are wrong, or the boot is too large.
+            StoreError: no capacity is available there now, or EC2 cannot be reached.
+            LocalError: credentials, quota, type or settings are wrong, or the bundle is too large.
         """
         region = spec.offer.region
         client = self._clients[region]
@@ -101,7 +101,7 @@ class AwsProvider:
         """Return the machines with this cluster's tag, of all regions.
 
         Raises:
-            StoreError: a region cannot be asked now: half an answer would look like machines that are gone.
+            StoreError: a region cannot be reached now; a partial result would look like machines that are gone.
             LocalError: EC2 refuses the credentials.
         """
         regions = self._clients.regions()
@@ -112,8 +112,8 @@ class AwsProvider:
         """Terminate instances; their disks and spot requests end with them.
 
         Raises:
-            StoreError: EC2 cannot be asked now.
-            LocalError: it refuses, or an id is not of this provider.
+            StoreError: EC2 cannot be reached now.
+            LocalError: EC2 refuses, or an id is not of this provider.
         """
         by_region: dict[str, list[str]] = defaultdict(list)
         for each in ids:
@@ -122,29 +122,29 @@ class AwsProvider:
         for region, instances in by_region.items():
             client = self._clients[region]
             with asking(f"{region}: terminate {', '.join(instances)}"):
-                # by a filter, for one unknown id would refuse the whole request
+                # by a filter, because EC2 refuses a whole request with one unknown id
                 found = _instances(client, [{"Name": "instance-id", "Values": instances}])
                 known = [each["InstanceId"] for each in found]
                 if known:
                     client.terminate_instances(InstanceIds=known)
 
     def drain(self, machine: str) -> None:
-        """Tag the instance; its watcher sees that in the instance's metadata within seconds and drains.
+        """Tag the instance; its watcher reads the tag in the metadata within seconds and drains.
 
         Raises:
-            StoreError: EC2 cannot be asked now.
-            LocalError: it refuses, or there is no such instance.
+            StoreError: EC2 cannot be reached now.
+            LocalError: EC2 refuses, or the instance does not exist.
         """
         region, instance = _split(machine)
         with asking(f"{region}: drain {instance}"):
             self._clients[region].create_tags(Resources=[instance], Tags=[{"Key": DRAIN, "Value": "1"}])
 
     def log(self, machine: str, program: str, lines: int) -> str:
-        """Return the last lines of a program in the instance's console, which EC2 shows a minute or more late.
+        """Return the last lines of a program in the instance's console, which EC2 updates a minute or more late.
 
         Raises:
-            StoreError: EC2 cannot be asked now.
-            LocalError: it refuses, or there is no such instance.
+            StoreError: EC2 cannot be reached now.
+            LocalError: EC2 refuses, or the instance does not exist.
         """
         region, instance = _split(machine)
         with asking(f"{region}: console of {instance}"):
@@ -155,7 +155,7 @@ class AwsProvider:
         """Return an ssh command line.
 
         Raises:
-            StoreError: EC2 cannot be asked now.
+            StoreError: EC2 cannot be reached now.
             LocalError: ``aws.ssh`` is not configured, or the machine has no address.
         """
         region, instance = _split(machine)
@@ -171,7 +171,7 @@ class AwsProvider:
         return ["ssh", "-o", "StrictHostKeyChecking=accept-new", *key, f"{ssh.user}@{address}"]
 
     def close(self) -> None:
-        """Close connections and threads; machines stay."""
+        """Close connections and threads; machines continue."""
         self._threads.shutdown(cancel_futures=True)
         self._clients.close()
 

@@ -1,8 +1,8 @@
-"""What a region must hold before a machine can stand there: an image, a subnet, a security group.
+"""Prerequisites of a region for machines: an image, a subnet and a security group.
 
-Place: shell; asks EC2, and makes a security group where none fits.
-The group's name says what it lets in, so one made for other settings is never widened. It holds no run's name and is
-not removed: it costs nothing, and the next cluster takes it.
+I/O; queries EC2, and creates a security group if none fits.
+The group's name encodes what it admits, so a group for other settings is never widened. The group belongs to no run and
+is not removed: it is free of charge, and the next cluster uses it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ __all__ = ["ground_of"]
 
 
 def ground_of(client: EC2Client, region: str, config: AwsConfig) -> Ground:
-    """Return what machines of a region stand on.
+    """Return the prerequisites of a region's machines.
 
     Raises:
         LocalError: no image fits, or there is no default VPC and no subnet is configured.
@@ -70,7 +70,7 @@ def _create(client: EC2Client, name: str, vpc: str) -> str:
     try:
         return client.create_security_group(GroupName=name, Description=what, VpcId=vpc)["GroupId"]
     except client.exceptions.ClientError as error:
-        if not is_code(error, "InvalidGroup.Duplicate"):  # else another launcher was quicker
+        if not is_code(error, "InvalidGroup.Duplicate"):  # else another launcher created it at the same time
             raise
     place = filters({"group-name": name, "vpc-id": vpc})
     return client.describe_security_groups(Filters=place)["SecurityGroups"][0]["GroupId"]

@@ -1,6 +1,6 @@
-"""What is asked of EC2 for one machine.
+"""RunInstances request for one machine.
 
-Place: pure.
+Sans-I/O.
 Source: EC2 API reference, RunInstances and "Ensuring idempotency"; EC2 user guide, "Configure the instance metadata
 service" (IMDSv2 and its hop limit) and "Amazon EBS encryption".
 """
@@ -24,12 +24,12 @@ __all__ = ["Ground", "order"]
 
 @dataclass(frozen=True, slots=True)
 class Ground:
-    """What the machines of a region stand on.
+    """Prerequisites of a region's machines.
 
     Args:
-        image: its id.
-        root_device: the name under which the image expects its disk.
-        security_groups: their ids.
+        image: id of the image.
+        root_device: name under which the image expects its disk.
+        security_groups: ids of the groups.
     """
 
     image: str
@@ -38,8 +38,8 @@ class Ground:
 
 
 def order(spec: MachineSpec, ground: Ground, config: AwsConfig, data: bytes) -> RunInstancesRequestTypeDef:
-    """Return the parameters of ``run_instances``; ``data``: the user data, not in base64."""
-    # the data too, whose keys are new with each boot: a cluster's name, and so its machines', may come again
+    """Return the parameters of ``run_instances``; ``data``: user data, not in base64."""
+    # includes the data, which has new keys for each machine, because names of clusters and machines may be reused
     token = sha256(b"\0".join([spec.cluster.encode(), spec.name.encode(), data])).hexdigest()
     kinds: list[ResourceTypeType] = ["instance", "volume"]
     wanted: RunInstancesRequestTypeDef = {
@@ -48,12 +48,12 @@ def order(spec: MachineSpec, ground: Ground, config: AwsConfig, data: bytes) -> 
         "MinCount": 1,
         "MaxCount": 1,
         "ClientToken": token,
-        "UserData": cast("str", data),  # boto3 takes bytes, which its stubs do not say
+        "UserData": cast("str", data),  # boto3 accepts bytes, but its stubs do not
         "InstanceInitiatedShutdownBehavior": "terminate",
         "MetadataOptions": {
             "HttpTokens": "required",
             "HttpEndpoint": "enabled",
-            "HttpPutResponseHopLimit": 1,  # a container's or a forwarded request for a token gets no answer
+            "HttpPutResponseHopLimit": 1,  # token requests of containers or forwarders get no response
             "InstanceMetadataTags": "enabled",
         },
         "BlockDeviceMappings": [
@@ -63,7 +63,7 @@ def order(spec: MachineSpec, ground: Ground, config: AwsConfig, data: bytes) -> 
                     "VolumeSize": config.disk_gib,
                     "VolumeType": "gp3",
                     "DeleteOnTermination": True,
-                    "Encrypted": True,  # keys and delegations lie on it
+                    "Encrypted": True,  # it stores keys and delegations
                 },
             }
         ],

@@ -1,1 +1,1 @@
-"""Machines on this one: network namespaces with processes of their own, which can be taken, killed, held or slowed."""
+"""Provider of local machines: network namespaces with their own processes, for tests with injected faults."""

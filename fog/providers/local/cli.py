@@ -1,6 +1,6 @@
-"""``fog local``: what can befall a local machine, by hand.
+"""``fog local``: fault injection on local machines.
 
-Place: command; the application that registers it says where the records are.
+I/O; the application that registers it supplies the folder of records.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Ms = Annotated[float, typer.Option("--ms", min=0.0, help="each way; 0: none")]
 
 
 def local_app(directory: Callable[[], Path]) -> typer.Typer:
-    """Return the verbs; ``directory``: asked, when one runs, where the provider's records are."""
+    """Return the verbs; ``directory``: called when a verb runs, returns the folder of the provider's records."""
     app = typer.Typer(
         no_args_is_help=True, help="Let something happen to a local machine. Example: fog local notice m2 --seconds 30"
     )

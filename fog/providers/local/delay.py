@@ -1,8 +1,8 @@
-"""A link that takes longer: what arrives on one device leaves on the other, and the reverse, so much later.
+"""Delay line between two devices: each frame leaves on the other device after a fixed time, in both directions.
 
-Place: shell; two AF_PACKET sockets, hence CAP_NET_RAW. Run as ``python -m fog.providers.local.delay DEVICE DEVICE MS``.
-It begins when a line comes on its standard input (see ``begin``), and ends when a device goes. It stands where netem
-would, which not every kernel has; a frame costs it about 20 us, so it carries some ten thousand a second.
+I/O; two AF_PACKET sockets, hence CAP_NET_RAW. Run as ``python -m fog.providers.local.delay DEVICE DEVICE MS``. It
+starts when it reads a line on its standard input (see ``spawn``), and ends when a device is removed. It replaces netem,
+which not every kernel has. A frame costs about 20 us, so it carries about ten thousand frames a second.
 Source: packet(7); Linux, include/uapi/linux/if_packet.h and include/uapi/asm-generic/socket.h for the numbers.
 """
 
@@ -33,11 +33,11 @@ _STAMP: Final = struct.Struct("=qq")  # struct timespec of a 64-bit machine
 
 
 class DelayLine:
-    """Frames on their way in one direction or the other, in the order in which they are due.
+    """Delayed frames of both directions, ordered by due time.
 
     Args:
-        delay_ns: how long each waits.
-        most_bytes: what may wait; a frame beyond is dropped and counted.
+        delay_ns: delay of each frame.
+        most_bytes: limit of queued bytes; frames beyond it are dropped and counted.
     """
 
     def __init__(self, delay_ns: int, most_bytes: int = _WAITING_BYTES) -> None:
@@ -47,7 +47,7 @@ class DelayLine:
         self._waiting: deque[tuple[int, int, bytes]] = deque()
 
     def put(self, arrived_ns: int, side: int, frame: bytes) -> None:
-        """Take a frame that arrived on a side."""
+        """Queue a frame that arrived on a side."""
         if len(frame) > self._room_bytes:
             self.dropped += 1
             return
@@ -55,7 +55,7 @@ class DelayLine:
         self._waiting.append((arrived_ns + self._delay_ns, 1 - side, frame))
 
     def poll_frames(self, now_ns: int) -> list[tuple[int, bytes]]:
-        """Return what is due: the side to leave by, and the frame."""
+        """Return the due frames, each with its outgoing side."""
         due = []
         while self._waiting and self._waiting[0][0] <= now_ns:
             _, side, frame = self._waiting.popleft()
@@ -64,7 +64,7 @@ class DelayLine:
         return due
 
     def pause_s(self, now_ns: int) -> float | None:
-        """Return how long until something is due; None: nothing waits."""
+        """Return the time until the next frame is due; None: the queue is empty."""
         return max(self._waiting[0][0] - now_ns, 0) / 1e9 if self._waiting else None
 
 
@@ -84,10 +84,10 @@ def _open(device: str) -> socket.socket:
 
 
 def _relay(sides: tuple[socket.socket, socket.socket], line: DelayLine) -> None:
-    """Relay until a device goes.
+    """Relay until a device is removed.
 
     Raises:
-        OSError: it went.
+        OSError: a device was removed.
     """
     while True:
         ready, _, _ = select.select(sides, (), (), line.pause_s(time.time_ns()))
@@ -107,14 +107,14 @@ def _relay(sides: tuple[socket.socket, socket.socket], line: DelayLine) -> None:
 
 
 def main() -> None:
-    """Run the relay that the command line asks for."""
+    """Run the relay of the command line."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s %(message)s")
     first, second, ms = sys.argv[1:]
     if not sys.stdin.readline():
         return
     line = DelayLine(int(float(ms) * 1e6))
     with _open(first) as one, _open(second) as other:
-        os.write(sys.stdout.fileno(), b"ready\n")  # in one piece: its starter waits for no more than a word
+        os.write(sys.stdout.fileno(), b"ready\n")  # one write, because the starter reads only once
         try:
             _relay((one, other), line)
         except OSError as error:

@@ -1,7 +1,7 @@
-"""What can befall a local machine: notice, death, a stop, a slow processor, a late link.
+"""Fault injection on local machines: preemption notice, kill, freeze, slow processor and delayed link.
 
-Place: shell; for tests, demonstrations and experiments. Each function takes the site's records and a machine's id, or
-its name where only one is called so, and raises ``LocalError`` where there is no such machine.
+I/O; for tests, demonstrations and experiments. Each function takes the site's records and a machine's id or unique
+name, and raises ``LocalError`` if there is no such machine.
 """
 
 from __future__ import annotations
@@ -26,18 +26,19 @@ __all__ = ["delay", "freeze", "hold", "kill", "notice", "slow", "thaw"]
 
 
 def notice(runs: RunRegistry, machine: str, seconds: float) -> None:
-    """Say that the machine will be taken; it is killed after so many seconds, whatever anybody does."""
+    """Give notice of a preemption; the machine is killed after ``seconds`` in any case."""
     found = _alive(runs, machine)
     write_notice(found.home, time.time() + seconds)
     _signal(found, signal.SIGUSR2)
 
 
 def kill(runs: RunRegistry, machine: str) -> None:
-    """Kill all processes of the machine at once, without a goodbye, and unplug it: what a power cut does."""
+    """Kill all processes of the machine at once and disconnect it, like a power failure."""
     found = find(runs, machine)
     groups = list(_groups(found))
     if found.is_alive and found.file.gone_unix_s is None:
-        replace(found.file, gone_unix_s=time.time()).write(found.directory)  # whoever notices knows how late it is
+        # a later reader can compute the detection time
+        replace(found.file, gone_unix_s=time.time()).write(found.directory)
     found.cgroup.kill()
     for group in groups:
         with suppress(ProcessLookupError):
@@ -47,20 +48,20 @@ def kill(runs: RunRegistry, machine: str) -> None:
 
 
 def freeze(runs: RunRegistry, machine: str) -> None:
-    """Stop the machine where it is; its link stays up, and nothing answers."""
+    """Stop all processes of the machine; its link remains up."""
     hold(_alive(runs, machine), held=True)
 
 
 def thaw(runs: RunRegistry, machine: str) -> None:
-    """Let a frozen machine go on."""
+    """Continue a frozen machine."""
     hold(_alive(runs, machine), held=False)
 
 
 def slow(runs: RunRegistry, machine: str, share: float | None) -> None:
-    """Let the machine take this share of one processor, such as 0.1; None: what its hardware has again.
+    """Limit the machine to this share of one processor, such as 0.1; None: the limit of its hardware.
 
     Raises:
-        LocalError: there are no cgroups to do it with; a share of nothing.
+        LocalError: cgroups are not available, or the share is not positive.
     """
     found = _alive(runs, machine)
     if share is not None and share <= 0:
@@ -69,10 +70,10 @@ def slow(runs: RunRegistry, machine: str, share: float | None) -> None:
 
 
 def delay(runs: RunRegistry, machine: str, ms: float) -> None:
-    """Let every frame take ``ms`` longer, each way, on the machine's link; 0: no longer.
+    """Delay every frame on the machine's link by ``ms`` in each direction; 0: no delay.
 
     Raises:
-        LocalError: a negative time, or the kernel refuses.
+        LocalError: the time is negative, or the kernel refuses.
     """
     if ms < 0:
         raise LocalError(f"delay {ms:g} ms: expected none or more")
@@ -93,10 +94,10 @@ def delay(runs: RunRegistry, machine: str, ms: float) -> None:
 
 
 def hold(machine: LocalMachine, *, held: bool) -> None:
-    """Stop all processes of a machine where they are, or let them go on; fine if it has none."""
+    """Stop all processes of a machine, or continue them; no effect if it has none."""
     if machine.cgroup.hold(held=held):
         return
-    for group in _groups(machine):  # without cgroups; what a program began as a session of its own goes on
+    for group in _groups(machine):  # without cgroups; child processes in their own session continue
         with suppress(ProcessLookupError):
             os.killpg(group, signal.SIGSTOP if held else signal.SIGCONT)
 

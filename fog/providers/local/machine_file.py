@@ -1,6 +1,6 @@
-"""What the provider keeps of a local machine: ``machine.json`` in the folder of its run.
+"""Record of a local machine: ``machine.json`` in the folder of its run.
 
-Place: the file system; times come in as arguments.
+I/O: the file system; times are arguments.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ _FILE: Final = "machine.json"
 
 @dataclass(frozen=True, slots=True)
 class MachineFile:
-    """A machine as it was asked for.
+    """Machine as it was requested.
 
     Args:
-        gateway: the file that holds the namespace of the gateway it is next to.
-        is_bounded: its processes take no more processor time and memory than its hardware has.
-        gone_unix_s: when it was killed, or first seen to be gone.
+        gateway: file of the namespace of its gateway.
+        is_bounded: cgroups limit processor time and memory of its processes to its hardware.
+        gone_unix_s: when it was killed, or first observed as gone.
     """
 
     spec: MachineSpec
@@ -36,7 +36,7 @@ class MachineFile:
     gone_unix_s: float | None = None
 
     def write(self, directory: Path) -> None:
-        """Replace what was there.
+        """Replace the file.
 
         Raises:
             OSError: the system refuses.
@@ -47,7 +47,7 @@ class MachineFile:
 
     @classmethod
     def read(cls, directory: Path) -> MachineFile | None:
-        """Return what was written; None: this is not the folder of a machine, or not yet."""
+        """Return the record; None: the folder has no record of a machine (yet)."""
         try:
             told = json.loads((directory / _FILE).read_bytes())
             offer = told["spec"]["offer"]

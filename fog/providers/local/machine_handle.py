@@ -1,6 +1,6 @@
-"""A local machine as it is found on disk: where everything of it is, and how it is.
+"""Handle of a local machine found on disk: its paths, devices and state.
 
-Place: shell; it reads, and changes nothing.
+I/O; reads only.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ __all__ = ["LocalMachine", "find", "list_machines"]
 
 @dataclass(frozen=True, slots=True)
 class LocalMachine:
-    """A machine whose record is there.
+    """Machine with a record on disk.
 
     Attributes:
-        host: the process that is the machine; None: it was not started yet.
+        host: process of the machine agent; None: not started yet.
     """
 
     record: Record
@@ -39,52 +39,52 @@ class LocalMachine:
 
     @property
     def directory(self) -> Path:
-        """Return the folder of the machine."""
+        """Return the folder of the machine's run."""
         return Path(self.record.files[0])
 
     @property
     def home(self) -> Path:
-        """Return the machine's own folder."""
+        """Return the machine's home folder, for the machine agent."""
         return self.directory / "home"
 
     @property
     def space(self) -> Path:
-        """Return the file of the machine's network namespace."""
+        """Return the path of the machine's network namespace."""
         return space_path(self.id, self.directory, self.file.spec.name)
 
     @property
     def plug(self) -> str:
-        """Return the far end of its device, in its gateway's namespace."""
+        """Return the device name of its link's other end, in its gateway's namespace."""
         return f"m-{self.id}"
 
     @property
     def gateway(self) -> Path:
-        """Return the namespace of its gateway."""
+        """Return the path of its gateway's namespace."""
         return Path(self.file.gateway)
 
     @property
     def relay_out(self) -> str:
-        """Return the device beyond its plug by which a relay sends on; see ``trouble.delay``."""
+        """Return the device behind ``plug`` to which a delay relay sends; see ``fault_injection.delay``."""
         return f"d-{self.id}"
 
     @property
     def relay_in(self) -> str:
-        """Return the other end of that, which is in the segment then."""
+        """Return the other end of ``relay_out``, which is then in the segment."""
         return f"e-{self.id}"
 
     @property
     def uplink_plug(self) -> str:
-        """Return the far end of its second device, which it has while it is the gateway."""
+        """Return the other end of its second device, which exists while it is the gateway."""
         return f"g-{self.id}"
 
     @property
     def gateway_mark(self) -> Path:
-        """Return the file that is there while it is the gateway."""
+        """Return the path of a file that exists while it is the gateway."""
         return self.directory / "gateway"
 
     @property
     def address(self) -> str:
-        """Return its own address: the id's three bytes."""
+        """Return its loopback address, which contains the id's three bytes."""
         return ".".join(map(str, (10, *bytes.fromhex(self.id))))
 
     @property
@@ -99,11 +99,11 @@ class LocalMachine:
 
     @property
     def is_alive(self) -> bool:
-        """Return whether it runs, or its creator still works on it."""
+        """Return whether it runs or is still being created."""
         return not self.record.dead and (self.host is None or self.host.alive)
 
     def describe(self) -> Machine:
-        """Return what the provider says of it."""
+        """Return the provider's description of it."""
         state, reason = self._state()
         return Machine(
             self.id,
@@ -118,7 +118,7 @@ class LocalMachine:
         )
 
     def _since_unix_s(self, state: MachineState) -> float | None:
-        """Return since when it has been so: by its own word, by whoever killed it, or by its notice."""
+        """Return the start of its state: from its status, from the record of its kill, or from its notice."""
         if state is MachineState.LEAVING and (given_s := given_unix_s(self.home)) is not None:
             return given_s
         said = Status.read(self.home)
@@ -145,10 +145,10 @@ def list_machines(runs: RunRegistry, cluster: str | None = None) -> list[LocalMa
 
 
 def find(runs: RunRegistry, machine: str) -> LocalMachine:
-    """Return the machine of this id, or the one of this name if there is only one.
+    """Return the machine with this id, or with this name if it is unique.
 
     Raises:
-        LocalError: there is none.
+        LocalError: there is no such machine.
     """
     everyone = list_machines(runs)
     found = [each for each in everyone if each.id == machine]

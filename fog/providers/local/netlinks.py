@@ -1,6 +1,6 @@
-"""The devices between machines, gateways and the robot.
+"""Network devices between machines, gateways and the robot.
 
-Place: shell; needs CAP_NET_ADMIN in the namespaces it works in. One gateway's namespace, with two machines::
+I/O; needs CAP_NET_ADMIN in the affected namespaces. A gateway's namespace with two machines::
 
     up ---- towards the robot          to-LABEL ---- towards a gateway behind this one
 
@@ -11,13 +11,13 @@ Place: shell; needs CAP_NET_ADMIN in the namespaces it works in. One gateway's n
                   eth0 of a machine    ||
                                     eth0 of another
 
-Where a machine is the gateway, the namespace has no switch and no ``machines``. A second bridge keeps the link towards
+If a machine is the gateway, the namespace has no switch and no ``machines``. A second bridge keeps the link towards
 the robot up while the role moves::
 
     up ---- uplink (a bridge) ---- g-1f2e3d ==== up of the machine that is the gateway
 
-Two ends of a pair must not share an index, or Linux may tell of a lost carrier a whole second late (see
-``gdp/simulation/namespaces.py``); so one end has a high one. No device but the loopback has an address.
+If both ends of a pair have the same index, Linux may report a lost carrier one second late, so one end has a high index
+(see ``gdp/simulation/namespaces.py``). Only the loopback device has an address.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from gdp.host import netns_files
 from gdp.host.run_registry import in_first_user_namespace
 
 if TYPE_CHECKING:
-    from pyroute2 import IPRoute  # and what imports it: 0.2 s to load, which most commands need not wait for
+    from pyroute2 import IPRoute  # imported here: it takes 0.2 s to load, and most commands do not need it
 
 __all__ = [
     "MACHINES",
@@ -66,13 +66,13 @@ T = TypeVar("T")
 
 
 def space_path(run: str, directory: Path, label: str) -> Path:
-    """Return the file that holds a namespace of a run; ``directory``: the run's own."""
+    """Return the path of a namespace of a run; ``directory``: folder of the run."""
     folder = netns_files.IP_NETNS_DIRECTORY if in_first_user_namespace() else directory / "netns"
     return folder / f"gdp-{run}-{label}"
 
 
 def make_space(path: Path, address: str) -> None:
-    """Make a namespace whose loopback has this address beside its own; empty: none.
+    """Create a namespace whose loopback has this additional address; empty: none.
 
     Raises:
         LocalError: the kernel refuses.
@@ -83,10 +83,10 @@ def make_space(path: Path, address: str) -> None:
 
 
 def join(near: Path | None, near_device: str, far: Path, far_device: str) -> None:
-    """Join two namespaces by a pair of devices; ``near`` None: the namespace of the caller.
+    """Connect two namespaces by a veth pair; ``near`` None: the namespace of the caller.
 
     Raises:
-        LocalError: the kernel refuses; a device of that name is there.
+        LocalError: the kernel refuses, or a device of that name exists.
     """
     with _opened(far) as far_fd:
         _ask(near, partial(_add_pair, near_device, {"ifname": far_device, "net_ns_fd": far_fd}))
@@ -94,7 +94,7 @@ def join(near: Path | None, near_device: str, far: Path, far_device: str) -> Non
 
 
 def join_within(space: Path, device: str, other: str) -> None:
-    """Make a pair of devices in one namespace.
+    """Create a veth pair in one namespace.
 
     Raises:
         LocalError: the kernel refuses.
@@ -108,7 +108,7 @@ def join_within(space: Path, device: str, other: str) -> None:
 
 
 def make_segment(gateway: Path) -> None:
-    """Make a dedicated gateway's bridge, and its port on it.
+    """Create a dedicated gateway's bridge and the gateway's port on it.
 
     Raises:
         LocalError: the kernel refuses.
@@ -119,7 +119,7 @@ def make_segment(gateway: Path) -> None:
 
 
 def make_bridge(space: Path, name: str) -> None:
-    """Make a bridge.
+    """Create a bridge.
 
     Raises:
         LocalError: the kernel refuses.
@@ -133,7 +133,7 @@ def make_bridge(space: Path, name: str) -> None:
 
 
 def plug(gateway: Path, device: str, *, into: bool = True, bridge: str = SEGMENT) -> None:
-    """Connect a device with a bridge of a gateway's namespace, or take it off.
+    """Connect a device with a bridge in a gateway's namespace, or disconnect it.
 
     Raises:
         LocalError: the kernel refuses.
@@ -142,12 +142,12 @@ def plug(gateway: Path, device: str, *, into: bool = True, bridge: str = SEGMENT
 
 
 def delete(space: Path | None, device: str) -> None:
-    """Delete a device, and with it the other end of its pair; fine if it is gone, with its namespace or without."""
+    """Delete a device and the other end of its pair; no effect if the device or its namespace is gone."""
 
     from pyroute2.netlink.exceptions import NetlinkError
 
     def work(links: IPRoute) -> None:
-        with suppress(NetlinkError):  # gone between the look and the act
+        with suppress(NetlinkError):  # removed after the check
             for index in links.link_lookup(ifname=device):
                 links.link("del", index=index)
 
@@ -156,7 +156,7 @@ def delete(space: Path | None, device: str) -> None:
 
 
 def exists(space: Path | None, device: str) -> bool:
-    """Return whether there is a device of this name."""
+    """Return whether a device of this name exists."""
     return _ask(space, lambda links: bool(links.link_lookup(ifname=device)))
 
 
@@ -193,7 +193,7 @@ def _raise_loopback(address: str, links: IPRoute) -> None:
 
 
 def _add_pair(device: str, peer: dict[str, object], links: IPRoute) -> None:
-    """Make a pair and switch its near end on."""
+    """Create a pair and set its near end up."""
     number = {} if "net_ns_fd" not in peer else {"index": _HIGH_INDEX}
     links.link("add", kind="veth", ifname=device, mtu=_MTU, peer={**peer, **number, "mtu": _MTU})
     _set_up(device, links)

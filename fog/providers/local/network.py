@@ -1,8 +1,8 @@
-"""The gateways of a site: namespaces joined to the robot and to each other as a tree.
+"""Network of a site's gateways: namespaces connected to the robot and to each other as a tree.
 
-Place: shell; needs root of the machine or of a user namespace. All of it is one kept run; ``network.json`` in its
-folder tells which. A dedicated gateway has a switch in its namespace. A replica gateway has two bridges there: the
-switch is that of a machine, which ``provider.py`` connects with both.
+I/O; needs root of the machine or of a user namespace. The network is one persistent run, described by ``network.json``
+in its folder. A dedicated gateway has a switch in its namespace. A replica gateway has two bridges there: its switch is
+that of a machine, which ``provider.py`` connects with both.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _FILE: Final = "network.json"
 
 @dataclass(frozen=True, slots=True)
 class _Standing:
-    """A network that is there, or was."""
+    """Network with a record on disk; it may be down."""
 
     record: Record
     topology: Gateway
@@ -59,7 +59,7 @@ class _Standing:
         return Path(self.record.files[0]) / label
 
     def is_up(self, label: str) -> bool:
-        """Return whether a gateway's process runs."""
+        """Return whether the process of a gateway runs."""
         try:
             pid, started = json.loads((self.home(label) / "process.json").read_bytes())
         except (OSError, ValueError):
@@ -68,14 +68,14 @@ class _Standing:
 
 
 class Network:
-    """The one network of a site.
+    """The single network of a site.
 
     Args:
-        runs: where its record is.
+        runs: registry with its record.
         topology: its gateways.
-        boot: makes what a gateway runs, of its label and its ports.
+        boot: returns a gateway's bundle for its label and its ports.
         uplink: the robot's end of its link to the first gateway.
-        robot: the namespace of that end; None: that of whoever opens the network.
+        robot: namespace of that end; None: the namespace of the caller of ``open``.
     """
 
     def __init__(
@@ -88,10 +88,10 @@ class Network:
         self._robot = robot
 
     def open(self) -> None:
-        """Make what is not there, and start gateways that do not run; what stands is left as it is.
+        """Create missing devices and start gateways that do not run; existing ones are unchanged.
 
         Raises:
-            LocalError: the kernel refuses; the uplink is somebody else's device; another topology stands.
+            LocalError: the kernel refuses; the uplink is a foreign device; another topology is up.
         """
         standing = self._find()
         if standing is None or not standing.record.kept or standing.record.dead:
@@ -107,14 +107,14 @@ class Network:
                 self._start(run, standing, gateway)
 
     def close(self) -> None:
-        """Remove it all; fine if nothing stands."""
+        """Remove the network; no effect if there is none."""
         standing = self._find()
         if standing is not None:
-            delete(self._robot, self._uplink)  # by itself it would go some time after its namespace
+            delete(self._robot, self._uplink)  # otherwise the kernel removes it some time after its namespace
             self._runs.resume(standing.record.run).end()
 
     def gateway(self, region: str) -> Path:
-        """Return the namespace of the gateway next to a region's machines.
+        """Return the namespace of the gateway of a region's machines.
 
         Raises:
             LocalError: the network is not open.
@@ -125,7 +125,7 @@ class Network:
         return standing.space(standing.topology.serving(region).gateway)
 
     def replica_gateway(self, region: str) -> str:
-        """Return the label of the replica gateway of a region's machines; empty: theirs is dedicated."""
+        """Return the label of the replica gateway of a region's machines; empty: their gateway is dedicated."""
         serving = self._topology.serving(region)
         return serving.gateway if serving.replica else ""
 
@@ -137,7 +137,7 @@ class Network:
                 continue
             try:
                 topology = Gateway.model_validate_json(told)
-            except ValueError as error:  # pydantic's is one
+            except ValueError as error:  # pydantic's error is a ValueError
                 raise StoreError(f"{record.files[0]}/{_FILE}: not the network that fog wrote: {error}") from error
             return _Standing(record, topology)
         return None

@@ -1,8 +1,8 @@
-"""Machines on this one: each a network namespace with an address, a process group, bounds and programs of its own.
+"""Provider of machines on this host: each is a network namespace with its own address, processes and limits.
 
-Place: shell; needs root of the machine or of a user namespace. A machine is a kept run (``gdp.host.run_registry``) with
-``machine.json`` in its folder: all that is known lies there, so that whoever comes later, or after a crash, finds it.
-They live on when their creator is killed, as machines elsewhere do.
+I/O; needs root of the machine or of a user namespace. A machine is a persistent run (``gdp.host.run_registry``) with
+``machine.json`` in its folder. The folder contains the whole state, so later processes find it, also after a crash.
+Machines continue to run when their creator is killed, like machines of a cloud.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ log = logging.getLogger(__name__)
 
 UPLINK: Final = "fog0"
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,40}")
-_GONE_S: Final = 600.0  # its logs may be read for so long
+_GONE_S: Final = 600.0  # its logs remain readable for this time
 _END_PATIENCE_S: Final = 6.0
 _GIB: Final = 1 << 30
 
@@ -51,15 +51,15 @@ class LocalProvider:
     """``Provider`` of namespaces.
 
     Args:
-        directory: the records of this site's machines and gateways; made if it is not there.
-        gateway_boot: makes what a gateway runs, of its label and its ports.
-        topology: the tree of gateways.
+        directory: records of this site's machines and gateways; created if missing.
+        gateway_boot: returns a gateway's bundle for its label and its ports.
+        topology: tree of gateways.
         uplink: the robot's end of its link to the first gateway.
-        robot: the namespace of that end; None: that of whoever calls ``open_network``.
-        regions: to be offered beside the provider's own: it pretends to have any.
+        robot: namespace of that end; None: the namespace of the caller of ``open_network``.
+        regions: offered in addition to the provider's own; it simulates any region.
 
     Raises:
-        LocalError: the directory belongs to somebody else.
+        LocalError: the directory belongs to another user.
     """
 
     name = "local"
@@ -85,23 +85,23 @@ class LocalProvider:
     # the network
 
     def open_network(self) -> None:
-        """Make the gateways and the uplink, and start gateways that do not run; what stands is left as it is.
+        """Create the gateways and the uplink, and start gateways that do not run; existing ones are unchanged.
 
-        The uplink is there afterwards, so that a switch with a port on it can be started.
+        The uplink exists afterwards, so a switch with a port on it can start.
 
         Raises:
-            LocalError: the kernel refuses; the uplink is somebody else's device; another topology stands.
+            LocalError: the kernel refuses; the uplink is a foreign device; another topology is up.
         """
         with self._alone():
             self._network.open()
 
     def close_network(self) -> None:
-        """Remove gateways and uplink. Machines that stand lose their links."""
+        """Remove gateways and uplink. Existing machines lose their links."""
         with self._alone():
             self._network.close()
 
     def sweep(self) -> list[str]:
-        """Remove what ended, or was begun by somebody who is gone; return the ids."""
+        """Remove runs that ended, or whose creator died before they were complete; return their ids."""
         gone = [each.id for each in list_machines(self._runs) if not each.is_alive]
         self._end(gone)
         with self._alone():
@@ -116,13 +116,13 @@ class LocalProvider:
         return sorted(fitting, key=lambda each: each.usd_per_hour)
 
     def create(self, spec: MachineSpec, boot: MachineBundle) -> str:
-        """Make a machine on this host and start its programs; return its id."""
+        """Create a machine on this host and start its programs; return its id."""
         if not _NAME.fullmatch(spec.name):
             raise LocalError(f"machine {spec.name!r}: a name has letters, digits, '-' and '_'")
         with self._alone():
             for each in list_machines(self._runs, spec.cluster):
                 if each.file.spec.name == spec.name:
-                    return each.id  # asked for again by somebody who was killed before noting it
+                    return each.id  # a repeated request: the requester was killed before it stored the id
             gateway = self._network.gateway(spec.offer.region)
             run = self._runs.start()
             file = MachineFile(spec, time.time(), str(gateway))
@@ -147,25 +147,25 @@ class LocalProvider:
                 if self._is_forgotten(each, now_unix_s):
                     continue
             elif machine.leaves_at_unix_s is not None and machine.leaves_at_unix_s < now_unix_s:
-                kill(self._runs, each.id)  # held, it could not end itself
+                kill(self._runs, each.id)  # a stopped machine cannot end itself
                 machine = replace(machine, state=MachineState.GONE)
             told.append(machine)
         return told
 
     def terminate(self, ids: Sequence[str]) -> None:
-        """End machines and remove all that they own."""
+        """End machines and remove all their resources."""
         self._end(ids)
 
     def drain(self, machine: str) -> None:
-        """Have a machine answer what it has begun, and end its programs."""
+        """Let a machine finish its calls, and end its programs."""
         self._tell(machine, signal.SIGUSR1)
 
     def replica_gateway(self, region: str) -> str:
-        """Return the group whose gateway one of the machines of a region is; empty: it has none."""
+        """Return the label of the replica gateway of a region's machines; empty: their gateway is dedicated."""
         return self._network.replica_gateway(region)
 
     def attach_uplink(self, machine: str) -> None:
-        """Give a machine the uplink of its group."""
+        """Connect a machine to the uplink of its group."""
         with self._alone():
             found = find(self._runs, machine)
             if not self.replica_gateway(found.file.spec.offer.region):
@@ -176,7 +176,7 @@ class LocalProvider:
             found.gateway_mark.touch()
 
     def detach_uplink(self, machine: str) -> None:
-        """Take the uplink from a machine."""
+        """Disconnect a machine from the uplink."""
         with self._alone():
             for each in list_machines(self._runs):
                 if each.id == machine:
@@ -184,7 +184,7 @@ class LocalProvider:
                     each.gateway_mark.unlink(missing_ok=True)
 
     def log(self, machine: str, program: str, lines: int) -> str:
-        """Return the last lines of a program's log, or without a program of the machine's own."""
+        """Return the last lines of a program's log; without a program, of the machine's own log."""
         if not _NAME.fullmatch(program or "machine"):
             raise LocalError(f"no program {program!r}")
         return last_lines(find(self._runs, machine).home / "logs" / f"{program or 'machine'}.log", lines)
@@ -196,11 +196,11 @@ class LocalProvider:
         return ["nsenter", f"--net={found.space}", "--", *inside]
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing; the provider holds no resources."""
 
     @property
     def runs(self) -> RunRegistry:
-        """Return the records of this site, for ``trouble``."""
+        """Return the records of this site, for ``fault_injection``."""
         return self._runs
 
     def _make(self, run: Run, file: MachineFile, boot: MachineBundle) -> None:
@@ -228,9 +228,9 @@ class LocalProvider:
         spawn_detached(run, machine.space, argv, machine.home / "logs" / "machine.log", confine)
 
     def _is_forgotten(self, machine: LocalMachine, now_unix_s: float) -> bool:
-        """Note when it was first seen to be gone, and remove it some time after."""
+        """Record when it was first observed as gone, and remove it after ``_GONE_S``; return whether it was removed."""
         if machine.file.gone_unix_s is None:
-            with suppress(OSError):  # somebody else removes it
+            with suppress(OSError):  # another process removes it
                 replace(machine.file, gone_unix_s=now_unix_s).write(machine.directory)
             return False
         if now_unix_s - machine.file.gone_unix_s < _GONE_S:
@@ -239,7 +239,7 @@ class LocalProvider:
         return True
 
     def _end(self, ids: Sequence[str]) -> None:
-        """Let machines end, all at once, and remove what is left of them. Others may be at it, too."""
+        """End machines in parallel and remove their resources; other processes may do the same concurrently."""
         machines = [each for each in list_machines(self._runs) if each.id in ids]
         if new := [each.id for each in machines if not (each.record.kept or each.record.dead)]:
             raise StoreError(f"just being made: {', '.join(new)}")
@@ -248,8 +248,8 @@ class LocalProvider:
         end_all([each.host for each in machines if each.host is not None], _END_PATIENCE_S)
         for each in machines:
             for device in (each.plug, each.uplink_plug, each.relay_out):
-                delete(each.gateway, device)  # by itself it would go some time after its namespace
-            with self._alone():  # a command may end what the supervisor just ends
+                delete(each.gateway, device)  # otherwise the kernel removes it some time after its namespace
+            with self._alone():  # a command and the supervisor may end the same machine
                 if each.id in {record.run for record in self._runs.all()}:
                     self._runs.resume(each.id).end()
 
@@ -261,7 +261,7 @@ class LocalProvider:
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
-        """Keep others of this site, in any process, from changing what stands meanwhile."""
+        """Exclude all other changes of this site's machines, by any process."""
         with (self._directory / ".lock").open("w") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
             yield

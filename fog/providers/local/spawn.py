@@ -1,7 +1,7 @@
-"""Starting what outlives its starter, without a moment in which nobody knows of it.
+"""Start of detached processes that are recorded before they act.
 
-Place: shell. The process waits for one line on its standard input, which it is sent only when the run's record names it
-and the record is kept; if its starter dies before, it reads the end of its input instead, and ends.
+I/O. The process waits for one line on its standard input. The starter sends it after the run's record, with the
+process in it, is stored. If the starter dies before, the process reads end of file and ends.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from gdp.host.run_registry import Run
 
 __all__ = ["spawn_detached"]
 
-_HELD: Final = {signal.SIGUSR1, signal.SIGUSR2}  # until the process can take them; else they would end it
+_HELD: Final = {signal.SIGUSR1, signal.SIGUSR2}  # until the process handles them; by default they would end it
 
 
 def spawn_detached(
@@ -35,13 +35,13 @@ def spawn_detached(
     """Start a Python module with arguments in a namespace, as the leader of a session; return its process id.
 
     Args:
-        log: a file that takes all that it says.
-        confine: called with the process id before it does anything.
-        is_heard: wait for the first word on its standard output, which is to be the last one there.
+        log: file for its output.
+        confine: called with the process id before the process acts.
+        is_heard: wait for the first output on its standard output, which must be the only one.
 
     Raises:
         OSError: it cannot be started.
-        LocalError: it ended at once; or what ``confine`` raises, and it has ended then.
+        LocalError: the process ended at once; or the error of ``confine``, after which the process has ended.
     """
     (hears, says), (answer, answers) = os.pipe2(os.O_CLOEXEC), os.pipe2(os.O_CLOEXEC)
     try:

@@ -1,6 +1,6 @@
-"""The settings of provider ``skypilot``: where to look, and what a machine installs.
+"""Settings of provider ``skypilot``: regions, and the software of a machine.
 
-Place: pure.
+Sans-I/O.
 """
 
 from __future__ import annotations
@@ -14,8 +14,10 @@ __all__ = ["SkyPilotConfig"]
 
 
 class SkyPilotConfig(Section):
-    """``skypilot:`` of ``fog.yaml``. ``places`` are SkyPilot's ``infra``, a cloud and a region each: the regions of
-    this provider. Clouds, credentials and images are SkyPilot's own affair (``sky check``).
+    """Section ``skypilot:`` of ``fog.yaml``.
+
+    ``places`` are SkyPilot's ``infra``, each a cloud and a region: the regions of this provider. SkyPilot manages
+    clouds, credentials and images (``sky check``).
     """
 
     places: tuple[str, ...] = Field(default=("aws/us-east-1", "aws/us-west-2"), min_length=1)

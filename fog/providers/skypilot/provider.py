@@ -1,10 +1,10 @@
-"""Machines of any cloud that SkyPilot knows: each is a SkyPilot cluster of one node.
+"""Provider of machines on any cloud of SkyPilot: each machine is a SkyPilot cluster of one node.
 
-Place: shell; asks SkyPilot's API server, which it starts where there is none, through the package of PyPI.
-Source: SkyPilot 0.14 (docs.skypilot.co, "Python SDK"); prices are its catalogue's, which it loads when first asked.
+I/O; queries SkyPilot's API server through the package of PyPI, and starts the server if there is none.
+Source: SkyPilot 0.14 (docs.skypilot.co, "Python SDK"); prices are from its catalogue, which it loads on first use.
 
-SkyPilot keeps its own records beside the API server; the labels of a machine say the rest. It gives no notice before
-a spot machine is taken: that it was, ``describe`` sees at the next look, and the RIB before.
+SkyPilot stores its own records at the API server; the labels of a machine contain the rest. SkyPilot gives no notice
+before a preemption: the RIB detects it first, and ``describe`` at the next poll.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from gdp.errors import LocalError, StoreError
 __all__ = ["SkyPilotProvider"]
 
 _SERVICE: Final = "fog-machine"
-_WRONG: Final = (  # names in sky.exceptions of what asking again does not mend
+_WRONG: Final = (  # names in sky.exceptions of permanent errors
     "NoCloudAccessError",
     "CloudUserIdentityError",
     "InvalidCloudConfigs",
@@ -41,14 +41,14 @@ HOUR_S: Final = 3600
 
 
 class SkyPilotProvider:
-    """Provider ``skypilot``; a region is one of ``places``, an id SkyPilot's name of the cluster.
+    """Provider ``skypilot``; a region is one of ``places``, an id is SkyPilot's cluster name.
 
     Raises:
         LocalError: SkyPilot is not installed.
     """
 
     name: str = "skypilot"
-    poll_s: float = 30.0  # it asks the cloud each time
+    poll_s: float = 30.0  # each poll queries the cloud
 
     def __init__(self, config: SkyPilotConfig | None = None, sky: ModuleType | None = None) -> None:
         self._config = config or SkyPilotConfig()
@@ -58,10 +58,10 @@ class SkyPilotProvider:
             raise LocalError("provider skypilot needs SkyPilot: pip install 'gdp-ros[skypilot]'") from missing
 
     def offers(self, hardware: Hardware, *, spot: bool) -> list[Offer]:
-        """Return what fits best in each place, by SkyPilot's catalogue: few types, not all that fit.
+        """Return the best fits in each place by SkyPilot's catalogue: a few types, not all.
 
         Raises:
-            StoreError: the catalogue is not here and cannot be loaded now.
+            StoreError: the catalogue is missing and cannot be loaded now.
             LocalError: a place is unknown to SkyPilot.
         """
         lines = []
@@ -77,11 +77,11 @@ class SkyPilotProvider:
         return sorted(lines, key=lambda each: each.usd_per_hour)
 
     def create(self, spec: MachineSpec, boot: MachineBundle) -> str:
-        """Ask for a machine. That there is none to be had is not known yet: it then is not described any more.
+        """Request a machine. Missing capacity is detected later: ``describe`` then omits the machine.
 
         Raises:
-            StoreError: the API server cannot be asked now.
-            LocalError: credentials, place or type are wrong, as far as SkyPilot sees before it tries.
+            StoreError: the API server cannot be reached now.
+            LocalError: credentials, place or type are wrong, as far as SkyPilot checks beforehand.
         """
         name = cluster_name(spec)
         with self._asking(f"create {name}"):
@@ -89,46 +89,46 @@ class SkyPilotProvider:
         return name
 
     def dry_run(self, spec: MachineSpec, boot: MachineBundle) -> None:
-        """Let SkyPilot check all that it checks before it asks a cloud.
+        """Run all checks of SkyPilot that need no request to a cloud.
 
         Raises:
-            StoreError, LocalError: as ``create``; also that no cloud has it.
+            StoreError, LocalError: as ``create``; also if no cloud has the type.
         """
         name = cluster_name(spec)
         with self._asking(f"dry run of {name}"):
             self._sky.get(self._sky.launch(self._task(spec, boot), cluster_name=name, dryrun=True))
 
     def describe(self, cluster: str) -> list[Machine]:
-        """Return the machines that SkyPilot has a record of or makes now; spot machines are looked after in the cloud.
+        """Return the machines that SkyPilot has recorded or is creating; spot machines are checked in the cloud.
 
         Raises:
-            StoreError: the API server cannot be asked now.
-            LocalError: somebody changed a machine's labels.
+            StoreError: the API server cannot be reached now.
+            LocalError: the labels of a machine were changed.
         """
         with self._asking(f"machines of {cluster}"):
             told = self._sky.get(self._sky.status(refresh=self._sky.StatusRefreshMode.AUTO))
-            requests = self._sky.api_status()  # those that are not finished
+            requests = self._sky.api_status()  # unfinished requests
         found = [machine for each in told if (machine := machine_of(each, cluster))]
         return found + being_made(requests, cluster, [each.id for each in found])
 
     def terminate(self, ids: Sequence[str]) -> None:
-        """Take machines down, all at once; a launch that is under way is ended too.
+        """Terminate machines in parallel; a launch in progress is cancelled.
 
         Raises:
-            StoreError: the API server or a cloud cannot be asked now; machines may be left.
+            StoreError: the API server or a cloud cannot be reached now; machines may remain.
         """
         with self._asking(f"terminate {', '.join(ids)}"):
             requests = [self._sky.down(name) for name in ids]
             for request in requests:
-                with suppress(self._sky.exceptions.ClusterDoesNotExist):  # it is gone already
+                with suppress(self._sky.exceptions.ClusterDoesNotExist):  # already gone
                     self._sky.get(request)
 
     def drain(self, machine: str) -> None:
-        """Have the machine drained by a job of SkyPilot's on it.
+        """Drain the machine by a SkyPilot job.
 
         Raises:
-            StoreError: it cannot be reached now.
-            LocalError: there is no such machine.
+            StoreError: the machine cannot be reached now.
+            LocalError: the machine does not exist.
         """
         with self._asking(f"drain {machine}"):
             task = self._sky.Task("drain", run=f"sudo systemctl kill --kill-who=main --signal=USR1 {_SERVICE}")
@@ -146,11 +146,11 @@ class SkyPilotProvider:
             return lines_of((line for line in told if line), program, lines)
 
     def shell(self, machine: str) -> list[str]:
-        """Return an ssh command line; SkyPilot writes what it needs into ``~/.ssh`` of who launched."""
+        """Return an ssh command line; SkyPilot writes its configuration to ``~/.ssh`` of the launching user."""
         return ["ssh", machine]
 
     def close(self) -> None:
-        """Nothing is held; the API server goes on."""
+        """Do nothing; the API server continues."""
 
     def _task(self, spec: MachineSpec, boot: MachineBundle) -> object:
         offer = spec.offer
@@ -163,13 +163,13 @@ class SkyPilotProvider:
             **({"accelerators": _accelerators(offer.hardware)} if offer.hardware.gpu else {}),
         )
         setup = shell_script(pack(boot), self._config.setup)
-        # so that SkyPilot's log of the job is the machine's
+        # makes SkyPilot's job log equal to the machine's log
         run = f"sudo journalctl --follow --unit {_SERVICE} --unit 'fog-log@*'"
         return self._sky.Task(spec.name, setup=setup, run=run, resources=resources)
 
     @contextmanager
     def _asking(self, what: str) -> Iterator[None]:
-        """Translate what SkyPilot raises: its exceptions tell apart what may be mended by asking again."""
+        """Translate exceptions of SkyPilot: temporary errors to ``StoreError``, permanent ones to ``LocalError``."""
         known = self._sky.exceptions
         named = (getattr(known, each) for each in _WRONG if hasattr(known, each))
         wrong: tuple[type[Exception], ...] = (ValueError, TypeError, *named)
@@ -179,7 +179,7 @@ class SkyPilotProvider:
             raise
         except wrong as error:
             raise LocalError(f"skypilot: {what}: {error}") from error
-        except Exception as error:  # SkyPilot has no root of its errors, and passes on those of its clouds
+        except Exception as error:  # SkyPilot has no base class of errors, and forwards those of its clouds
             raise StoreError(f"skypilot: {what}: {type(error).__name__}: {error}") from error
 
 

@@ -1,8 +1,8 @@
-"""A machine as SkyPilot's records tell it: one cluster of one node, its labels, its state.
+"""Conversion of SkyPilot's records to machines: one cluster of one node, its labels and its state.
 
-Place: pure.
-Source: SkyPilot 0.14, ``ClusterStatus`` and ``StatusResponse``. Some clouds allow only small letters, digits, ``-`` and
-``_`` in a label, at most 63, so what is not of that form is written in hexadecimal digits, and prices in millionths.
+Sans-I/O.
+Source: SkyPilot 0.14, ``ClusterStatus`` and ``StatusResponse``. Some clouds allow only lowercase letters, digits, ``-``
+and ``_`` in a label, at most 63. Other values are therefore written in hexadecimal digits, and prices in millionths.
 """
 
 from __future__ import annotations
@@ -33,21 +33,21 @@ _STATES: Final = {
     "INIT": MachineState.BOOTING,
     "PENDING": MachineState.BOOTING,
     "UP": MachineState.RUNNING,
-    "STOPPED": MachineState.LEAVING,  # still paid for, so not gone
+    "STOPPED": MachineState.LEAVING,  # still billed, so not gone
     "AUTOSTOPPING": MachineState.LEAVING,
 }
 
 
 class Named(Protocol):
-    """A value of an enumeration of SkyPilot's."""
+    """Member of a SkyPilot enumeration."""
 
     @property
     def value(self) -> str:
-        """Return the word of the enumeration's member."""
+        """Return the value of the member."""
 
 
 class Status(Protocol):
-    """What is read of a ``StatusResponse``."""
+    """Used fields of a ``StatusResponse``."""
 
     @property
     def name(self) -> str:
@@ -79,7 +79,7 @@ class Status(Protocol):
 
 
 class Request(Protocol):
-    """What is read of a ``RequestPayload``: something that the API server was asked and has not finished."""
+    """Used fields of a ``RequestPayload``: an unfinished request of the API server."""
 
     @property
     def name(self) -> str:
@@ -87,7 +87,7 @@ class Request(Protocol):
 
     @property
     def cluster_name(self) -> str | None:
-        """Return the cluster that the request is about."""
+        """Return the name of the request's cluster."""
 
     @property
     def created_at(self) -> float:
@@ -95,12 +95,12 @@ class Request(Protocol):
 
 
 def cluster_name(spec: MachineSpec) -> str:
-    """Return what SkyPilot calls a machine."""
+    """Return SkyPilot's cluster name for a machine."""
     return f"{_PREFIX}-{spec.cluster}-{spec.name}"
 
 
 def labels_of(spec: MachineSpec) -> dict[str, str]:
-    """Return what is written on a machine so that ``machine_of`` can read it back.
+    """Return the labels of a machine, which ``machine_of`` reads.
 
     Raises:
         LocalError: a name is too long.
@@ -121,9 +121,9 @@ def labels_of(spec: MachineSpec) -> dict[str, str]:
 
 
 def machine_of(status: Status, cluster: str) -> Machine | None:
-    """Return the machine that a record tells of; None: it is not of this cluster.
+    """Return the machine of a record; None: it belongs to another cluster.
 
-    SkyPilot knows that a machine is set up, not that its programs serve: the RIB knows that.
+    SkyPilot reports that a machine is set up, not that its programs serve; the RIB knows that.
     """
     labels = status.labels or {}
     if labels.get(_CLUSTER) != _hex(cluster):
@@ -150,13 +150,13 @@ def machine_of(status: Status, cluster: str) -> Machine | None:
 
 
 def being_made(requests: Sequence[Request], cluster: str, known: Sequence[str]) -> list[Machine]:
-    """Return the machines of a cluster that were asked for and have no record yet; of their offers nothing is known."""
+    """Return the requested machines of a cluster that have no record yet; their offers are unknown."""
     prefix = f"{_PREFIX}-{cluster}-"
     found = {}
     for request in requests:
         name = request.cluster_name or ""
         machine = name.removeprefix(prefix)
-        # a machine's name has no hyphen, so "fog-a-b-m1" is of cluster "a-b", not of "a"
+        # a machine's name has no hyphen, so "fog-a-b-m1" belongs to cluster "a-b", not to "a"
         if request.name == LAUNCH and name.startswith(prefix) and "-" not in machine and name not in known:
             offer = Offer("skypilot", "", "", Hardware(), is_spot=False, usd_per_hour=0.0)
             spec = MachineSpec(cluster, machine, offer)

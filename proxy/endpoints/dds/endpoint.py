@@ -184,7 +184,7 @@ class DdsEndpoint:
         """Close a subscription, publisher, server or client."""
         self._open.pop(handle).close()
 
-    def remove_entity(self) -> None:
+    def shut_down(self) -> None:
         """Leave the graph and free everything."""
         self._discovery.close()
         self._open.clear()

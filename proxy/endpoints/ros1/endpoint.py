@@ -211,7 +211,7 @@ class Ros1Endpoint:
             self._link.send(Kind.CLOSE, handle)
             self._events = [event for event in self._events if getattr(event, "handle", None) != handle]
 
-    def remove_entity(self) -> None:
+    def shut_down(self) -> None:
         """Leave the graph; may block two seconds while the process unregisters from the master."""
         self._link.close()
         self._ended.append(self._process)

@@ -223,7 +223,7 @@ class Ros2Endpoint:
         elif client_entity := self._client_entity.pop(handle, None):
             self._node.destroy_client(client_entity.entity)
 
-    def remove_entity(self) -> None:
+    def shut_down(self) -> None:
         """Leave the graph and free everything."""
         self._waiting.close()
         self._session.close()

@@ -1,3 +1,5 @@
+"""Price catalogue: offers in price order, the origin of prices, and the shipped data."""
+
 from __future__ import annotations
 
 import json

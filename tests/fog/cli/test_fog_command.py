@@ -1,3 +1,5 @@
+"""``fog`` command with a prepared state folder: texts, JSON, exit codes and refusals."""
+
 from __future__ import annotations
 
 import json
@@ -61,7 +63,7 @@ def test_where_nothing_is_up_that_is_said(fog: Run) -> None:
     assert (result.exit_code, "fog launch" in result.output) == (2, True)
 
 
-def test_machines_and_their_stage_are_told(fog: Run, journal: Journal) -> None:
+def test_machines_and_their_stage_are_reported(fog: Run, journal: Journal) -> None:
     up(journal)
     told = json.loads(fog("status", "--json").output)
     assert (told["wanted"], told["serving"]) == (2, 1)
@@ -69,7 +71,7 @@ def test_machines_and_their_stage_are_told(fog: Run, journal: Journal) -> None:
     assert "serving" in fog("status").output
 
 
-def test_the_machine_that_is_the_gateway_is_told(fog: Run, journal: Journal) -> None:
+def test_the_machine_that_is_the_gateway_is_reported(fog: Run, journal: Journal) -> None:
     journal.want(PLAN, time.time())
     for each in (replace(serving("m1"), gateway="edge"), serving("m2")):
         journal.put(each, time.time())
@@ -106,7 +108,7 @@ def test_cost_is_price_by_time(fog: Run, journal: Journal) -> None:
     assert told["usd_per_hour"] == pytest.approx(0.2)
 
 
-def test_events_are_told_as_lines_of_json(fog: Run, journal: Journal) -> None:
+def test_events_are_printed_as_lines_of_json(fog: Run, journal: Journal) -> None:
     up(journal)
     events = [json.loads(line)["what"] for line in fog("status", "--events", "--json").output.splitlines()]
     assert events == ["wanted", "asked", "asked"]
@@ -135,13 +137,13 @@ def test_of_several_clusters_one_must_be_named(fog: Run, journal: Journal) -> No
     assert fog("status", "d").exit_code == 0
 
 
-def test_a_wrong_key_of_fog_yaml_is_told_with_its_place(fog: Run, tmp_path: Path) -> None:
+def test_a_wrong_key_of_fog_yaml_is_reported_with_its_position(fog: Run, tmp_path: Path) -> None:
     (tmp_path / "fog.yaml").write_text("provider: lokal\n")
     result = fog("ls", "--site", "fog.yaml")
     assert (result.exit_code, "fog.yaml:1:11: provider" in result.output) == (2, True)
 
 
-def test_a_launch_file_that_is_not_there_is_told(fog: Run) -> None:
+def test_a_missing_launch_file_is_reported(fog: Run) -> None:
     result = fog("launch", "nowhere.py", "--dry-run")
     assert (result.exit_code, "nowhere.py" in result.output) == (2, True)
 
@@ -173,7 +175,7 @@ def test_a_regions_latency_is_shown(fog: Run, journal: Journal, tmp_path: Path) 
 @pytest.mark.parametrize(
     ("more", "how"), [((), "with the robot's nodes, or by fog down"), (("--detach",), "by fog down")]
 )
-def test_how_a_cluster_will_end_is_told_before_it_begins(fog: Run, more: tuple[str, ...], how: str) -> None:
+def test_the_end_of_a_cluster_is_announced_before_it_begins(fog: Run, more: tuple[str, ...], how: str) -> None:
     said = fog("launch", str(ROOT / "examples" / "echo.launch.py"), "--dry-run", *more).output
     assert f"ends    {how}, after 30min" in said
 
@@ -184,7 +186,7 @@ def test_ros_launch_is_named_as_what_ends_its_cluster(fog: Run, tmp_path: Path) 
     assert "ends    with this launch, or by fog down" in said
 
 
-def test_a_cluster_that_nobody_knows_is_not_ended_in_silence(fog: Run, journal: Journal) -> None:
+def test_an_unknown_cluster_is_not_ended_in_silence(fog: Run, journal: Journal) -> None:
     up(journal)
     result = fog("down", "typo")
     assert (result.exit_code, result.output) == (2, f"error: no cluster is called typo; up: {PLAN.name}\n")
@@ -210,7 +212,7 @@ def test_a_dry_run_makes_neither_a_site_nor_keys(fog: Run, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("options", [["--dry-run"], []])
-def test_hardware_that_nobody_has_is_refused_at_once_with_the_nearest(
+def test_hardware_without_an_offer_is_refused_at_once_with_the_nearest(
     fog: Run, tmp_path: Path, options: list[str]
 ) -> None:
     result = fog("launch", launch_file(tmp_path, "hardware='cpu:999'"), *options)
@@ -257,5 +259,5 @@ def test_a_missing_argument_is_named(fog: Run, verb: str, missing: str) -> None:
     assert missing in result.stderr
 
 
-def test_a_machine_that_nobody_watches_is_up_and_not_serving() -> None:
+def test_an_unwatched_machine_is_running_and_not_serving() -> None:
     assert stage(serving("m1"), is_watched=False) == "up"

@@ -1,3 +1,5 @@
+"""Nodes that ``fog`` runs on the robot: their output, exit codes and end."""
+
 from __future__ import annotations
 
 import signal
@@ -31,7 +33,7 @@ def test_the_worst_exit_code_is_that_of_all(tmp_path: Path) -> None:
     assert run([node(""), node("raise SystemExit(3)")], tmp_path) == 3
 
 
-def test_what_a_node_is_not_to_print_here_lies_in_a_file_that_is_told(
+def test_output_that_a_node_must_not_print_goes_to_a_named_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run([node("print('word')", "log")], tmp_path / "nodes") == 0

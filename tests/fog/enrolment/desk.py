@@ -1,4 +1,4 @@
-"""Where machines of a test enrol: tickets, responder and listener, with a machine's side by hand."""
+"""Enrolment of machines in tests: tickets, responder and listener, with a machine's side by hand."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ DAY_S = 86_400.0
 
 @dataclass
 class Desk:
-    """A launcher with tickets of its own."""
+    """Launcher with tickets of its own."""
 
     folder: Path
     tickets: Tickets
@@ -85,7 +85,7 @@ class Desk:
             yield made
 
     def enrol(self, home: Path, name: str = "m7", *, is_gateway: bool = False) -> None:
-        """Be a machine at its first start."""
+        """Act as a machine at its first start."""
         install(home, self.boot(name, self.ticket(name, is_gateway=is_gateway)))
         with self.listening():
             assert enrol(home)
@@ -93,7 +93,7 @@ class Desk:
 
 @dataclass
 class Machine:
-    """A machine without a disk: keys for the seats of a ticket."""
+    """Machine without a disk: keys for the seats of a ticket."""
 
     ticket: Ticket
     keys: list[NodeKeys] = field(default_factory=list)

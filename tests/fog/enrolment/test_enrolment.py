@@ -1,3 +1,5 @@
+"""Enrolment of a machine: its files and keys, the listener, and the robot's rules."""
+
 from __future__ import annotations
 
 import time
@@ -96,7 +98,7 @@ def test_a_machine_asks_until_its_launcher_is_there(desk: Desk, tmp_path: Path) 
             assert asking.result()
 
 
-def test_a_machine_gives_up_where_nobody_answers(desk: Desk, tmp_path: Path) -> None:
+def test_a_machine_gives_up_without_an_answer(desk: Desk, tmp_path: Path) -> None:
     install(tmp_path / "home", desk.boot())
     with pytest.raises(LocalError, match=r"nobody let this machine enrol.*socket"):
         enrol(tmp_path / "home", patience_s=0.1)

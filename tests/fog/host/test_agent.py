@@ -36,7 +36,7 @@ def teller(name: str, number: str = "signal.SIGTERM") -> Program:
 
 
 def until(home: Path, is_met: Callable[[Status], bool]) -> Status:
-    """Look until a machine's status is as wanted; nobody tells when it changes."""
+    """Poll until a machine's status is as wanted; no event reports a change."""
     end_s = time.monotonic() + _PATIENCE_S
     while True:
         status = Status.read(home)
@@ -158,7 +158,7 @@ def test_a_machine_is_switched_off_at_the_moment_of_its_notice(start: Start, tmp
     until_gone(pid_of(first, "a"))
 
 
-def test_a_machine_that_nobody_has_a_record_of_does_not_begin(start: Start, tmp_path: Path) -> None:
+def test_a_machine_without_a_record_does_not_begin(start: Start, tmp_path: Path) -> None:
     host = start(program("a"), options=("--await-go",))
     host.communicate(timeout=_PATIENCE_S)
     assert host.returncode == 1

@@ -1,4 +1,4 @@
-"""Logs that stay small."""
+"""Logs with a bounded size."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A machine's boot as files."""
+"""Bootstrap bundle of a machine as files."""
 
 from __future__ import annotations
 
@@ -48,6 +48,6 @@ def test_another_file_of_that_name_is_refused(content: bytes) -> None:
         unpack({"boot.json": content})
 
 
-def test_a_folder_without_a_boot_is_told() -> None:
+def test_a_folder_without_a_bundle_is_reported() -> None:
     with pytest.raises(LocalError, match=r"no boot\.json"):
         unpack({})

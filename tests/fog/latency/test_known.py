@@ -1,3 +1,5 @@
+"""Stored latencies: measured once in a lifetime, each with its source."""
+
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -13,7 +15,7 @@ CONFIG = LatencyConfig(endpoints={"near": "127.0.0.1:1", "*": "udp://{region}.ex
 
 
 class Probes:
-    """Answers with what a test says, and notes what was asked."""
+    """Probe with prepared responses that records the requests."""
 
     def __init__(self, **answers: Probed) -> None:
         self.answers = answers

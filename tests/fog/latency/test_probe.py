@@ -1,3 +1,5 @@
+"""Latency probes by TCP connect and UDP echo."""
+
 from __future__ import annotations
 
 import socket

@@ -1,4 +1,4 @@
-"""ROS 2's ``launch``, ``launch_ros`` and ``ros2cli``: stand-ins, or the real ones (``ros2/README.md``)."""
+"""ROS 2's ``launch``, ``launch_ros`` and ``ros2cli``: stand-ins, or the real packages (``ros2/README.md``)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _REAL = "FOG_TEST_ROS2"
 
 @pytest.fixture(params=["stand-ins", "real"])
 def ros2(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
-    """Have ROS 2's packages on the path, and nothing of them afterwards."""
+    """Put ROS 2's packages on the path, and remove them afterwards."""
     folder = str(Path(__file__).parent / "ros2")
     if request.param == "real":
         folder = os.environ.get(_REAL, "")
@@ -38,7 +38,7 @@ def ros2(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, tmp_pa
     monkeypatch.syspath_prepend(folder)
     if request.param == "real":
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of what these packages import
+            warnings.simplefilter("ignore")  # imported by these packages
             importlib.import_module("launch_ros.actions")
         _forget()
     yield

@@ -1,3 +1,5 @@
+"""Cluster specification of a launch: names, keys, services and refusals."""
+
 import pytest
 
 from fog.cluster import CloudNode, ClusterPlan, ExportedInterface

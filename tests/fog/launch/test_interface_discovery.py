@@ -24,7 +24,7 @@ def test_what_a_node_offers_is_found_out_and_kept(tmp_path: Path) -> None:
     assert kept((*ECHO, *ECHO), cache=cache) is None
 
 
-def test_a_node_that_ends_is_told_with_its_last_words(tmp_path: Path) -> None:
+def test_a_node_that_ends_is_reported_with_its_last_output(tmp_path: Path) -> None:
     pytest.importorskip("rclpy", reason="needs ROS 2's rclpy")
     with pytest.raises(LocalError, match=r"a node ended: .*can't open 'absent'"):
         offered([CloudNode("json", "tool", ("absent",))], cache=tmp_path / "offered.json")

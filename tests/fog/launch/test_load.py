@@ -1,3 +1,5 @@
+"""Launch files with Fog actions: loaded nodes, arguments, and errors with positions."""
+
 import subprocess
 import sys
 from pathlib import Path
@@ -118,7 +120,7 @@ def test_a_word_that_is_no_argument_is_refused() -> None:
         ("x = 1", "generate_launch_description: expected a function"),
     ],
 )
-def test_a_fault_in_the_file_is_told_with_its_line(tmp_path: Path, text: str, says: str) -> None:
+def test_a_fault_in_the_file_is_reported_with_its_line(tmp_path: Path, text: str, says: str) -> None:
     with pytest.raises(ConfigError, match=says):
         load(written(tmp_path, text), {})
 

@@ -1,3 +1,5 @@
+"""Machine requests of a cluster: replicas, regions, hardware and refusals."""
+
 import pytest
 
 from fog.cluster import MachineRequest
@@ -15,7 +17,7 @@ def test_the_listed_machines_are_the_replicas() -> None:
     assert notes == ()
 
 
-def test_one_machine_becomes_two_in_different_regions_and_this_is_told() -> None:
+def test_one_machine_becomes_two_in_different_regions_and_this_is_reported() -> None:
     machines, notes = filled([SpotMachine("us-west-1", "cpu:4")], None)
     assert [each.region for each in machines] == ["us-west-1", ""]
     assert [each.is_spot for each in machines] == [True, True]

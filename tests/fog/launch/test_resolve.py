@@ -1,3 +1,5 @@
+"""Resolution of a node's executable to a command line."""
+
 import subprocess
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Against a stand-in of ``ros2cli``, or the real one (``ros2/README.md``)."""
+"""``ros2 fog`` with a stand-in of ``ros2cli``, or the real package (``ros2/README.md``)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ VERBS = (
 
 @pytest.fixture
 def said(ros2: None, monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], str]]:
-    """Return what the ``fog`` command is given, and as what."""
+    """Return the arguments of the ``fog`` command and its program name."""
     words: list[tuple[list[str], str]] = []
     app = ModuleType("fog.cli.app")
     app.main = lambda given, *, name: words.append((given, name))  # type: ignore[attr-defined]
@@ -31,7 +31,7 @@ def said(ros2: None, monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], s
 
 
 def stated_entry_points() -> metadata.EntryPoints:
-    """Return what pyproject.toml states, for what is installed here may be of an older one."""
+    """Return the statement of pyproject.toml; the installed package may be older."""
     found, group = [], ""
     for line in (ROOT / "pyproject.toml").read_text(encoding="utf-8").splitlines():
         if line.startswith("["):

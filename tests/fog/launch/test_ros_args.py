@@ -1,3 +1,5 @@
+"""ROS arguments of a node: parameters and remappings as command-line words."""
+
 import math
 
 import pytest

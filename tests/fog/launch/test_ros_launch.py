@@ -1,4 +1,4 @@
-"""Against stand-ins of ROS 2's ``launch`` and ``launch_ros``, or the real ones (``ros2/README.md``)."""
+"""Fog actions with stand-ins of ROS 2's ``launch`` and ``launch_ros``, or the real packages (``ros2/README.md``)."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def launched(
     code: int = 0,
     keep: bool = False,
 ) -> SimpleNamespace:
-    """Launch a file in which a process appends a line, with a ``fog`` command that only takes notes."""
+    """Launch a file in which a process appends a line, with a ``fog`` command that only records its calls."""
     launch, actions = importlib.import_module("launch"), importlib.import_module("launch.actions")
     sources = importlib.import_module("launch.launch_description_sources")
     log = folder / "log"

@@ -1,3 +1,5 @@
+"""Dry run of a launch: its table, prices and latencies."""
+
 from __future__ import annotations
 
 import json

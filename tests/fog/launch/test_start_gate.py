@@ -1,3 +1,5 @@
+"""Start gate, which holds commands back until the cluster serves."""
+
 import subprocess
 from pathlib import Path
 
@@ -11,7 +13,7 @@ def held(gate: StartGate) -> subprocess.Popen[str]:
 
 
 def test_a_command_begins_when_the_gate_opens_and_at_once_afterwards(tmp_path: Path) -> None:
-    gate = StartGate.remove_entity(tmp_path / "gate")
+    gate = StartGate.closed(tmp_path / "gate")
     with held(gate) as waiting:
         gate.open(serving=True)
         gate.open(serving=False)
@@ -20,8 +22,8 @@ def test_a_command_begins_when_the_gate_opens_and_at_once_afterwards(tmp_path: P
         assert late.communicate()[0] == "begun\n"
 
 
-def test_nobody_waits_for_a_launch_that_is_gone(tmp_path: Path) -> None:
-    gate = StartGate.remove_entity(tmp_path / "gate")
+def test_no_node_waits_for_a_launch_that_is_gone(tmp_path: Path) -> None:
+    gate = StartGate.closed(tmp_path / "gate")
     with held(gate) as waiting:
         gate.open(serving=False)
         assert waiting.communicate() == ("", "not started: the cluster does not serve\n")

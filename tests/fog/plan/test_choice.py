@@ -1,3 +1,5 @@
+"""Choice of offers for replicas: price, region and latency."""
+
 from __future__ import annotations
 
 import pytest
@@ -39,7 +41,7 @@ def test_a_near_region_is_worth_its_price() -> None:
     assert regions(LIST, [FOUR], latency_ms=latency, weights=BY_PRICE) == ["far"]
 
 
-def test_a_region_that_nobody_measured_counts_as_the_slowest() -> None:
+def test_an_unmeasured_region_counts_as_the_slowest() -> None:
     assert regions(LIST, [FOUR], latency_ms={"east": 10.0, "west": 200.0}) == ["east"]
 
 

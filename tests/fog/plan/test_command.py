@@ -1,3 +1,5 @@
+"""``fog plan`` command: its answers, assumptions and refusals."""
+
 from __future__ import annotations
 
 import json

@@ -1,3 +1,5 @@
+"""Replica count for a target availability, with the worked example of FogROS2-FT."""
+
 from __future__ import annotations
 
 import pytest

@@ -1,3 +1,5 @@
+"""Number of machines for a target availability, with shared regions."""
+
 from __future__ import annotations
 
 from dataclasses import replace

@@ -1,3 +1,5 @@
+"""Preemption traces: uptime, downtime and recovery of replicas and pools."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -38,7 +40,7 @@ def test_a_replica_that_is_replaced_elsewhere_is_down_for_the_recovery_only() ->
     assert drawn(outages(trace("0011111000"), 15)) == "0011000000"
 
 
-def test_a_pool_that_moves_is_down_while_no_zone_has_room_and_until_it_has_recovered() -> None:
+def test_a_pool_that_moves_is_down_while_no_zone_has_capacity_and_until_it_has_recovered() -> None:
     one, other = trace("0011110000"), trace("0000110000", "b")
     assert drawn(pool_down([one, other], 1, 10)) == "0010111000"
     assert drawn(pool_down([one, other], 2, 10)) == "0000111000"

@@ -1,7 +1,7 @@
-"""What ``test_skypilot`` has done in a process of its own: SkyPilot's real package, without its API server.
+"""Child process of ``test_skypilot``: SkyPilot's real package, without its API server.
 
-The API server runs the functions that are called here; it starts dozens of processes, which is no thing for a test.
-Prints one line of JSON: what came of each step.
+The API server runs the functions that are called here; it starts dozens of processes, too many for a test.
+Prints one line of JSON with the result of each step.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from gdp.errors import GdpError
 
 
 class Unserved:
-    """``sky``, but that each request is done at once."""
+    """``sky`` in which each request is done at once."""
 
     def __getattr__(self, name: str) -> object:
         return getattr(sky, name)

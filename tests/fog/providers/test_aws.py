@@ -29,7 +29,7 @@ BOOT = MachineBundle({"keys/own.key": b"\x00\xff", "proxy.yaml": b"rules: []\n"}
 
 @dataclass(frozen=True)
 class Cloud:
-    """The pretended EC2, from behind."""
+    """Simulated EC2, seen from behind its API."""
 
     def client(self, region: str = EAST):
         return boto3.client("ec2", region_name=region)
@@ -178,7 +178,7 @@ def test_only_what_is_asked_for_is_let_in(cloud: Cloud) -> None:
     open_.close()
 
 
-def test_nobody_logs_in_where_nobody_may(cloud: Cloud, aws: AwsProvider) -> None:
+def test_a_machine_without_ssh_settings_has_no_shell(cloud: Cloud, aws: AwsProvider) -> None:
     with pytest.raises(LocalError, match=r"aws\.ssh"):
         aws.shell(aws.create(spec("closed"), BOOT))
 

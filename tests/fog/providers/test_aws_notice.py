@@ -1,4 +1,4 @@
-"""The watcher of an EC2 machine, against a metadata service on a loopback port."""
+"""Watcher of an EC2 machine, against a metadata service on a loopback port."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ print(json.dumps({"signals": signals, "exit": program.returncode, "told": words.
 
 
 class Service(ThreadingHTTPServer):
-    """Version 2 of the service: a path's text, for those who have a token."""
+    """Version 2 of the service: a path's text, for clients with a token."""
 
     def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), Answer)
@@ -85,7 +85,7 @@ def service() -> Iterator[Service]:
 
 
 class Seen:
-    """A watch and what it told."""
+    """Watch and its reports."""
 
     def __init__(self, service: Service) -> None:
         self.notices: list[float] = []
@@ -106,7 +106,7 @@ def test_a_machine_that_may_stay_hears_nothing(service: Service) -> None:
     assert (seen.notices, seen.drains, service.tokens_given) == ([], 0, 1)
 
 
-def test_a_notice_is_told_at_once_and_the_machine_drains_in_time(service: Service) -> None:
+def test_a_notice_is_reported_at_once_and_the_machine_drains_in_time(service: Service) -> None:
     seen = Seen(service)
     interrupt(service)
     assert not seen.watch.look(LEAVES_AT - 120)

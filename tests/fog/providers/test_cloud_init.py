@@ -1,4 +1,4 @@
-"""What a rented machine is told at its first start."""
+"""User data of a rented machine at its first start."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_a_tunnel_that_cannot_be_is_refused(wrong: dict[str, object]) -> None:
 def test_the_script_comes_to_the_same_files(tmp_path: Path) -> None:
     root, asked = tmp_path / "root", tmp_path / "asked"
     root.mkdir()
-    sudo = tmp_path / "sudo"  # does what touches files below `root`, writes down what would change the machine
+    sudo = tmp_path / "sudo"  # executes file operations below `root`, records commands that would change the machine
     sudo.write_text(
         f'#!/bin/sh\nif [ "$1" = tar ]; then exec "$@" --directory {root}; fi\necho "$@" >> {asked}\n', encoding="ascii"
     )

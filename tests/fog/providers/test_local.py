@@ -1,4 +1,4 @@
-"""What of the provider ``local`` needs no namespace."""
+"""Parts of the provider ``local`` that need no namespace."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def provider(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> LocalProvider:
 
 
 def machine(provider: LocalProvider, process: Process | None = None) -> Run:
-    """Note a machine whose process is this one (or a dead one), without making any."""
+    """Record a machine whose process is this one (or a dead one), without creating any."""
     run = provider.runs.start()
     MachineFile(SPEC, 1.0, "/run/netns/none").write(run.directory)
     (run.directory / "home").mkdir()
@@ -82,14 +82,14 @@ def test_a_machine_with_a_notice_is_leaving(provider: LocalProvider) -> None:
 
 
 @pytest.mark.parametrize(("said", "reason"), [("drained", "drained"), ("", "killed")])
-def test_a_machine_that_ended_is_told_with_its_reason(provider: LocalProvider, said: str, reason: str) -> None:
+def test_a_machine_that_ended_is_reported_with_its_reason(provider: LocalProvider, said: str, reason: str) -> None:
     run = machine(provider)
     if said:
         Status(MachineState.GONE, 1.0, reason=said).write(run.directory / "home")
     assert state(provider) == (MachineState.GONE, reason)
 
 
-def test_a_machine_that_was_taken_is_told_so(provider: LocalProvider) -> None:
+def test_a_preempted_machine_is_reported_as_such(provider: LocalProvider) -> None:
     run = machine(provider)
     write_notice(run.directory / "home", 1.0)
     assert state(provider) == (MachineState.GONE, "preempted")
@@ -103,7 +103,7 @@ def test_a_machine_long_gone_is_forgotten(provider: LocalProvider, tmp_path: Pat
     assert [path.name for path in tmp_path.rglob("*")] == ["local", ".lock"]
 
 
-def test_another_clusters_machines_are_not_told(provider: LocalProvider) -> None:
+def test_another_clusters_machines_are_not_reported(provider: LocalProvider) -> None:
     machine(provider)
     assert provider.describe("d") == []
 
@@ -161,7 +161,7 @@ def test_a_frame_is_due_after_the_delay_at_the_other_side() -> None:
     assert line.pause_s(99 * _MS) is None
 
 
-def test_what_a_delay_has_no_room_for_is_dropped_and_counted() -> None:
+def test_frames_beyond_the_capacity_of_a_delay_are_dropped_and_counted() -> None:
     line = DelayLine(_MS, most_bytes=3)
     line.put(0, 0, b"aa")
     line.put(0, 0, b"bb")

@@ -1,4 +1,4 @@
-"""What docs/reference/providers.md shows can be read, and its tables name the keys that there are."""
+"""Examples of docs/reference/providers.md can be read, and its tables name the existing keys."""
 
 from __future__ import annotations
 

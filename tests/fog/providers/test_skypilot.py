@@ -1,4 +1,4 @@
-"""Provider ``skypilot``: its side of the talk with a stand-in for the package; the package itself with a seeded
+"""Provider ``skypilot``: its requests to a stand-in for the package; the package itself with a seeded
 catalogue and its own API server, in a process of its own, where it is installed.
 """
 
@@ -47,7 +47,7 @@ class NoCloudAccessError(Exception):
 
 @dataclass
 class Sky:
-    """A stand-in for the package: what was asked, and what there is."""
+    """Stand-in for the package: the requests it got, and the machines that exist."""
 
     records: list[SimpleNamespace] = field(default_factory=list)
     requests: list[SimpleNamespace] = field(default_factory=list)
@@ -156,7 +156,7 @@ def test_states_are_those_of_a_machine(
     assert (machine.state, machine.reason) == expected
 
 
-def test_changed_labels_are_told(sky: Sky, provider: SkyPilotProvider) -> None:
+def test_changed_labels_are_reported(sky: Sky, provider: SkyPilotProvider) -> None:
     sky.record(SPEC, State.UP, labels={"fog-cluster": b"a-demo".hex()})
     with pytest.raises(LocalError, match="labels make no sense"):
         provider.describe("a-demo")
@@ -217,12 +217,12 @@ skypilot:custom-cpu-ubuntu,us-west-2,ubuntu,22.04,IMAGE,20260101,IMAGE
     "aws/instance_quota_mapping.csv": "SpotInstanceCode,OnDemandInstanceCode,InstanceType\n",
     "common/accelerators.csv": "AcceleratorName,Clouds\nT4,[AWS]\n",
 }
-PYTHON = os.environ.get("FOG_SKYPILOT_PYTHON", sys.executable)  # SkyPilot may live in a virtual environment of its own
+PYTHON = os.environ.get("FOG_SKYPILOT_PYTHON", sys.executable)  # SkyPilot may be in a virtual environment of its own
 
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
-    """A home folder with prices made up for this test, and programs that SkyPilot only looks for."""
+    """Home folder with prices made up for this test, and programs whose presence alone SkyPilot checks."""
     if sys.executable == PYTHON and not importlib.util.find_spec("sky"):
         pytest.skip("the extra `skypilot` is not installed, and FOG_SKYPILOT_PYTHON names no interpreter that has it")
     for path, text in CATALOGUE.items():
@@ -241,7 +241,7 @@ def home(tmp_path: Path) -> Path:
 
 
 def an_image(region: str, endpoint: str) -> str:
-    """Return one that moto's EC2 has."""
+    """Return an image that moto's EC2 has."""
     boto3 = pytest.importorskip("boto3", reason="the extra `aws` is not installed")
     keys = {"aws_access_key_id": "testing", "aws_secret_access_key": "testing"}
     client = boto3.client("ec2", region_name=region, endpoint_url=endpoint, **keys)

@@ -1,4 +1,4 @@
-"""Machines for the tests of the supervisor's thinking: records, and a provider in a world of virtual seconds."""
+"""Machines for the tests of the supervisor's decisions: records, and a provider in a simulation of virtual seconds."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ OFFERS = [offer(region) for region in REGIONS]
 def record(
     name: str, region: str = "east", *, asked_s: float = NOW_S - 100.0, credential_renewal_s: float = 1e6
 ) -> Record:
-    """Return a machine that was asked for."""
+    """Return a requested machine."""
     spec = MachineSpec("c", name, offer(region))
     return Record(
         spec, SPOT, IssuedCredentials(f"proxy-{name}", NOW_S + credential_renewal_s), asked_s, id=f"id-{name}"
@@ -37,14 +37,14 @@ def record(
 
 
 def serving(name: str, region: str = "east", **more: float) -> Record:
-    """Return a machine whose replica is heard."""
+    """Return a machine whose replica is visible."""
     up_s = NOW_S - 90.0
     return replace(record(name, region, **more), state=MachineState.RUNNING, up_unix_s=up_s, served_unix_s=up_s)
 
 
 @dataclass
 class World:
-    """A provider, an overlay and a clock, played against ``learn``, ``place`` and ``decide``."""
+    """Provider, overlay and clock, played against ``learn``, ``place`` and ``decide``."""
 
     now_s: float = NOW_S
     boot_s: float = 3.0
@@ -55,7 +55,7 @@ class World:
     made: int = 0
 
     def add(self, known: Record, state: MachineState, *, is_frozen: bool = False, is_known: bool = True) -> None:
-        """Put a machine into the world, and into the journal if it is known."""
+        """Add a machine to the simulation, and to the journal if it is known."""
         self.machines[known.name] = Machine(known.id or f"id-{known.name}", known.spec, state, known.asked_unix_s)
         if is_frozen:
             self.frozen.add(known.name)
@@ -64,7 +64,7 @@ class World:
         self.made = max(self.made, int(known.name[1:]))
 
     def serving(self) -> set[str]:
-        """Return whose replicas really take calls."""
+        """Return the machines whose replicas really take calls."""
         return {
             name
             for name, machine in self.machines.items()
@@ -74,7 +74,7 @@ class World:
         }
 
     def step(self, wanted: tuple[MachineRequest, ...], patience: Timeouts, seconds: float = 0.2) -> list[object]:
-        """Let time pass, look, and do what is decided; return that."""
+        """Advance time, observe, and apply the decisions; return them."""
         self.now_s += seconds
         for name, machine in list(self.machines.items()):
             if machine.state is MachineState.BOOTING and self.now_s - machine.started_unix_s >= self.boot_s:

@@ -1,3 +1,5 @@
+"""Idle detection of a cluster by its requests."""
+
 from __future__ import annotations
 
 from fog.supervisor.activity import Activity

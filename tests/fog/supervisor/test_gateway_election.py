@@ -1,4 +1,4 @@
-"""Which machine of a group is the gateway, as tables of records."""
+"""Gateway election of a group, as tables of records."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_the_gateway_stays(group: list[Record]) -> None:
 
 
 def test_behind_a_silent_gateway_each_machine_is_tried_once() -> None:
-    began_s = NOW_S - PATIENCE.unreachable_s
+    began_s = NOW_S - PATIENCE.unreachable_timeout_s
     group = [silent(each, began_s) for each in (gateway(serving("m1")), serving("m2"), serving("m3"))]
     now_s, tried = NOW_S, []
     for _ in range(20):

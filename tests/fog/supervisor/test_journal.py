@@ -1,3 +1,5 @@
+"""Journal of a cluster on disk, shared by processes."""
+
 from __future__ import annotations
 
 import sqlite3
@@ -48,20 +50,20 @@ def test_no_name_of_a_machine_comes_twice(journal: Journal) -> None:
     assert [*names, journal.next_machine("c")] == ["m1", "m2"]
 
 
-def test_a_new_plan_of_a_cluster_that_is_up_does_not_begin_it_anew(journal: Journal) -> None:
+def test_a_new_plan_of_a_cluster_that_is_up_does_not_restart_it(journal: Journal) -> None:
     journal.want(PLAN, NOW_S)
     journal.want(replace(PLAN, machines=(SPOT,)), NOW_S + 5)
     assert journal.cluster("c").begun_unix_s == NOW_S
     assert len(journal.cluster("c").plan.machines) == 1
 
 
-def test_a_cluster_that_nobody_knows_is_told_with_those_that_are(journal: Journal) -> None:
+def test_an_unknown_cluster_is_reported_with_the_known_ones(journal: Journal) -> None:
     journal.want(PLAN, NOW_S)
     with pytest.raises(LocalError, match="there are c"):
         journal.cluster("d")
 
 
-def test_events_are_told_in_order_and_once(journal: Journal) -> None:
+def test_events_are_reported_in_order_and_once(journal: Journal) -> None:
     journal.want(PLAN, NOW_S)
     journal.put(record("m1"), NOW_S, "asked", "east")
     journal.unwant("c", "idle", NOW_S)

@@ -1,3 +1,5 @@
+"""Placement of replicas on offers, regions and providers."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -20,12 +22,12 @@ def test_replicas_go_to_different_regions() -> None:
     assert region_of(SPOT, OFFERS, [serving("m1", "east")], NOW_S) != "east"
 
 
-def test_a_wished_region_is_taken_though_another_is_cheaper() -> None:
+def test_a_requested_region_is_taken_though_another_is_cheaper() -> None:
     offers = [offer("east", usd=0.01), offer("west", usd=1.0)]
     assert region_of(replace(SPOT, region="west"), offers, [], NOW_S) == "west"
 
 
-def test_a_region_that_took_a_machine_is_avoided_even_if_it_was_wished_for() -> None:
+def test_a_region_that_took_a_machine_is_avoided_even_if_it_was_requested() -> None:
     lost = serving("m1", "west").ended(Outcome.TAKEN, "", NOW_S - 1)
     assert region_of(replace(SPOT, region="west"), OFFERS, [lost], NOW_S) != "west"
 

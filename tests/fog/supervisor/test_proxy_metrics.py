@@ -1,3 +1,5 @@
+"""Counters of the robot's proxies, read by the supervisor."""
+
 from __future__ import annotations
 
 import socket

@@ -1,3 +1,5 @@
+"""Reconcile decisions of the supervisor, as tables of records."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -53,7 +55,7 @@ def test_where_none_is_heard_the_way_is_suspected_before_the_machines() -> None:
     assert decide((SPOT,), [silent], NOW_S, PATIENCE) == []
 
 
-def test_nothing_is_judged_while_the_overlay_cannot_be_asked() -> None:
+def test_nothing_is_decided_while_the_overlay_cannot_be_queried() -> None:
     silent = replace(serving("m1"), unreachable_unix_s=NOW_S - 50.0)
     assert decide((SPOT,), [silent], NOW_S, PATIENCE, told=False) == []
 
@@ -79,7 +81,7 @@ def test_a_drained_machine_is_given_back_when_its_time_is_over() -> None:
     assert Release("m1", "") in decide((SPOT,), [drained, serving("m2")], NOW_S, PATIENCE)
 
 
-def test_before_its_papers_run_out_a_machine_is_replaced_and_serves_until_then() -> None:
+def test_before_its_credentials_expire_a_machine_is_replaced_and_serves_until_then() -> None:
     old = serving("m1", credential_renewal_s=60.0)
     assert decide((SPOT,), [old], NOW_S, PATIENCE) == [Launch(SPOT)]
     assert decide((SPOT,), [old, serving("m2")], NOW_S, PATIENCE) == [Drain("m1", "another took its place")]

@@ -1,4 +1,4 @@
-"""The supervisor with a provider in memory: what it must not forget, it sees again."""
+"""Supervisor with a provider in memory: it observes again what it must not forget."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PLAN = ClusterPlan("c", (CloudNode("p", "e"),), (SPOT, SPOT), (ExportedInterface
 
 
 class Memory:
-    """A provider whose machines are up at once."""
+    """Provider whose machines are up at once."""
 
     name = "memory"
     poll_s = 0.01
@@ -33,7 +33,7 @@ class Memory:
     def __init__(self) -> None:
         self.said: dict[str, str] = {}
         self.machines: dict[str, Machine] = {}
-        self.refuses = 0  # so many more
+        self.refuses = 0  # number of next calls that fail
         self.spent: list[str] = []
 
     def offers(self, hardware: Hardware, *, spot: bool) -> list[Offer]:
@@ -67,14 +67,14 @@ class Memory:
 
 
 class Grouped(Memory):
-    """A provider whose machines are one group, of which one is the gateway."""
+    """Provider whose machines are one group, one of which is the gateway."""
 
     uplink_iface = "up"
 
     def __init__(self) -> None:
         super().__init__()
         self.ports: dict[str, list[object]] = {}
-        self.fails = 0  # so many more
+        self.fails = 0  # number of next calls that fail
 
     def create(self, spec: MachineSpec, boot: MachineBundle) -> str:
         self.ports[spec.name] = yaml.safe_load(boot.files["switch.yaml"])["ports"]
@@ -174,7 +174,7 @@ def test_a_machine_that_no_journal_knows_is_given_back(site: Site, journal: Jour
     ours.close()
 
 
-def test_a_lost_machine_is_replaced_and_told(site: Site, journal: Journal) -> None:
+def test_a_lost_machine_is_replaced_and_reported(site: Site, journal: Journal) -> None:
     provider = Memory()
     ours = supervisor(site, journal, provider)
     journal.want(PLAN, time.time())
@@ -185,7 +185,7 @@ def test_a_lost_machine_is_replaced_and_told(site: Site, journal: Journal) -> No
     assert [each.what for each in journal.events("c") if each.machine == "m1"][-1] == "taken"
 
 
-def test_a_refusal_is_told_and_tried_elsewhere(site: Site, journal: Journal) -> None:
+def test_a_refusal_is_reported_and_tried_elsewhere(site: Site, journal: Journal) -> None:
     provider = Memory()
     provider.refuses = 1
     ours = supervisor(site, journal, provider)
@@ -203,7 +203,7 @@ def test_a_spent_budget_ends_a_cluster(site: Site, journal: Journal) -> None:
     assert "budget" in journal.cluster("c").why
 
 
-def test_a_cluster_that_nobody_calls_is_ended_and_one_that_is_called_is_not(
+def test_a_cluster_without_calls_is_ended_and_one_that_is_called_is_not(
     site: Site, journal: Journal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     provider, now_s = Memory(), time.time()
@@ -350,7 +350,7 @@ def test_a_supervisor_that_begins_again_finds_the_gateway(site: Site, journal: J
     second.close()
 
 
-def test_an_uplink_that_cannot_be_attached_is_told_once_and_tried_again(site: Site, journal: Journal) -> None:
+def test_an_uplink_that_cannot_be_attached_is_reported_once_and_tried_again(site: Site, journal: Journal) -> None:
     provider = Grouped()
     provider.fails = 5
     ours = supervisor(site, journal, provider)

@@ -1,4 +1,4 @@
-"""The ``gdp`` command, as a person or a script calls it."""
+"""``gdp`` command, as called by a person or a script."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def gdp(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
 
 @pytest.fixture
 def keys(gdp: Run) -> None:
-    """A domain, a node of it, and an owner."""
+    """Domain, a node of it, and an owner."""
     for line in (
         "domain init school --label school",
         "keygen node robot --role proxy --label robot --meta site=roof",

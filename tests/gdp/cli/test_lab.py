@@ -1,4 +1,4 @@
-"""``gdp lab``, as a person calls it."""
+"""``gdp lab``, as called by a person."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a node loads until it is up: a machine that replaces another is to serve within seconds."""
+"""Modules loaded at the start of a node: a machine that replaces another must serve within seconds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lives of readers and publishers with keys of their own, and the notes that each can make."""
+"""Incarnations of readers and publishers with keys of their own, and the control datagrams that each can make."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def key_of(label: bytes) -> SigningKey:
 
 
 def subject_of(label: bytes) -> Subject:
-    """Return who the reader of a label is; the same each time."""
+    """Return the reader identity of a label; the same each time."""
     return Subject(hashlib.sha256(label).digest(), key_of(label).public.compressed)
 
 
@@ -43,14 +43,14 @@ def source_of(name: Name, incarnation: int, signer: Signer) -> WriterIdentity:
 
 
 def reader_of(label: bytes, incarnation: int = 7, *, started: int | None = None) -> ReaderIdentity:
-    """Return a life of a reader, by default one that began after those of lower incarnations."""
+    """Return an incarnation of a reader, by default later than those of lower numbers."""
     notes, at = note_keys(), incarnation if started is None else started
     wire = Introduction.make(subject_of(label), key_of(label), incarnation, at, notes.public)
     return ReaderIdentity(name_of(label), incarnation, notes, lambda: wire)
 
 
 class Notes:
-    """What one life of a reader can say to a publisher, under any name; by default its own, and the truth."""
+    """Control datagrams that one incarnation of a reader can send, under any name; by default its own, and true."""
 
     def __init__(
         self,
@@ -82,7 +82,7 @@ class Notes:
         return self._sealer(key, epoch, Kind.ACKNACK, life).seal(report.to_wire())
 
     def hello(self, epoch: int = 1) -> list[bytes]:
-        """Return the frames by which a reader begins."""
+        """Return the first frames of a reader."""
         return [self.introduction(epoch), self.report(AckNack(AckNackFlag.NEW, 0, 0, ()), epoch)]
 
     def _sealer(self, key: bytes, epoch: int, kind: Kind, life: int) -> ControlSealer:

@@ -1,4 +1,4 @@
-"""A publisher and its readers joined by a pipe that loses, doubles and reorders frames, under a clock that jumps."""
+"""Publisher and its readers, joined by a pipe that loses, doubles and reorders frames, under a clock that jumps."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ DELAY_S = 0.002
 
 
 def sequenced(sequence: int, body: bytes) -> bytes:
-    """Return what a publisher seals: a message or a bundle behind its sequence number."""
+    """Return the plaintext that a publisher seals: a message or a bundle behind its sequence number."""
     return sequence.to_bytes(8, "big") + body
 
 
@@ -45,15 +45,15 @@ def publisher_of(
 
 @dataclass
 class End:
-    """A reader at the end of the pipe."""
+    """Reader at the end of the pipe."""
 
     reader: ReaderIdentity
     writer_proxy: WriterProxy
     budget: ReassemblyQuota
     loss: float = 0.0
-    mtu: int = 65_535  # what the link to it takes
-    deaf: bool = False  # hears nothing
-    mute: bool = False  # says nothing
+    mtu: int = 65_535  # capacity of the link to it
+    deaf: bool = False  # receives nothing
+    mute: bool = False  # sends nothing
     delivered: list[Delivered] = field(default_factory=list)
 
     @property
@@ -109,7 +109,7 @@ class Pipe:
             self._flush()
 
     def run(self, for_s: float, until: Callable[[], bool] = lambda: False) -> bool:
-        """Let time pass; return whether ``until`` came true."""
+        """Advance time; return whether ``until`` came true."""
         end_s = self.now_s + for_s
         turns = 0
         while not until():
@@ -161,7 +161,7 @@ class Pipe:
         return arrive
 
     def tell(self, *notes: bytes) -> None:
-        """Give notes to the publisher."""
+        """Give control datagrams to the publisher."""
         for note in notes:
             header = decode(note)
             if header.kind == Kind.INTRODUCTION:

@@ -1,4 +1,4 @@
-"""A node's hold on the overlay: claims, verdicts, renewals, and which switch it holds on to."""
+"""Attachment of a node to the overlay: advertisements, AdvertiseAcks, renewals, and the choice of its switch."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.journeys.flows import ROBOT, SERVER, Tap, advertise, ring
 
 
 def advertisement_without_delegation(world: Simulation) -> None:
-    """Let the robot claim a name of an owner who gave it nothing."""
+    """Let the robot advertise a name of an owner that delegated nothing to it."""
     subject = world.owner.subject(Metadata({"kind": "topic", "name": "/not/mine"}))
     world.members[ROBOT].attachment.advertisement(subject, Right.PUBLISH, (), is_global=True)
     world.network.touch(ROBOT)
@@ -28,7 +28,7 @@ def of(world: Simulation, right: Right) -> PendingAdvertisement:
     return next(each for each in world.members[ROBOT].attachment.advertisements if each.right is right)
 
 
-def test_a_refused_advertisement_is_judged_and_says_why() -> None:
+def test_a_refused_advertisement_is_acknowledged_with_the_reason() -> None:
     world = ring()
     advertisement_without_delegation(world)
     assert world.network.run(2, lambda: of(world, Right.PUBLISH).is_acknowledged)

@@ -1,4 +1,4 @@
-"""Small messages that wait together go under one seal, and everything that counts messages still counts messages."""
+"""Bundles: small messages that wait together go under one seal, and every count still counts messages."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_a_latched_topic_has_no_bundles_so_that_late_joiners_get_so_many_message
     assert (early.messages, late.messages) == (SMALL[:20], SMALL[17:20])
 
 
-def test_without_room_for_bundles_each_message_has_its_own_seal() -> None:
+def test_without_space_for_bundles_each_message_has_its_own_seal() -> None:
     pipe, (end,) = live(publisher_of())
     pipe.publisher.bundle_bytes = 0
     publish(pipe.publisher, SMALL[:100])
@@ -135,7 +135,7 @@ def test_a_message_above_the_limit_is_refused_and_what_waited_before_it_goes() -
 
 
 @pytest.mark.parametrize("reliable", [True, False])
-def test_what_nobody_takes_is_bounded_in_memory_and_what_goes_is_counted_in_messages(reliable: bool) -> None:
+def test_undelivered_messages_are_bounded_in_memory_and_evictions_are_counted_in_messages(reliable: bool) -> None:
     publisher = publisher_of(reliable=reliable)
     pipe, (end,) = live(publisher)
     message, count = bytes(10_000 if reliable else 300), 0

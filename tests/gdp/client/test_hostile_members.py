@@ -1,4 +1,4 @@
-"""Members of a topic that mean harm: they hold its secret, and must neither stall nor flood the others."""
+"""Hostile members of a topic: they hold its secret, and must neither stall nor flood the others."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MALLORY = SigningKey.generate()
 def forge(
     number: int, message: bytes, *, kind: Kind = Kind.DATA, signer: Signer = MALLORY, mtu: int = 1500
 ) -> list[bytes]:
-    """Return what a reader can make: parts that open, under a signature that is not the writer's."""
+    """Return messages that a reader can make: fragments that open, under a signature that is not the writer's."""
     sealer = Sealer(SECRETS[1], 1, kind, PUBLISHER, 1, TOPIC, signer, urandom)
     return list(sealer.seal(number, Flag.RELIABLE, message, mtu))
 
@@ -126,7 +126,7 @@ def test_a_status_whose_oldest_is_giant_ends_its_own_writer_proxy_and_no_more() 
 
 
 @pytest.mark.parametrize("reliable", [Flag.RELIABLE, Flag.NONE])
-def test_a_message_whose_number_has_no_next_is_refused_and_ends_nobody(reliable: Flag) -> None:
+def test_a_message_whose_number_has_no_next_is_refused_and_ends_no_reader(reliable: Flag) -> None:
     pipe, end = live()
     status = Heartbeat((1 << 64) - 2, (1 << 64) - 1, 0, {}, b"").to_wire()
     give(pipe, end, forge(500, status, kind=Kind.HEARTBEAT, signer=WRITER))
@@ -169,7 +169,7 @@ def test_a_reader_that_asks_for_everything_again_and_again_gets_a_flight_in_a_ro
         pipe.now_s += 0.0001
     rounds = (pipe.now_s - begun_s) / 0.01 + 1
     assert sent <= rounds * (4 << 20)
-    assert sent < 20_000_000  # unbounded it would be so much for each of 400 reports
+    assert sent < 20_000_000  # unbounded it would be as much for each of 400 reports
 
 
 def test_readers_that_say_they_are_new_again_and_again_get_one_status_in_a_while() -> None:

@@ -1,4 +1,4 @@
-"""Every message published is delivered, or counted as lost at its reader, exactly, with a range and a reason."""
+"""Loss accounting: every published message is delivered, or counted exactly as lost at its reader with its reason."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def silence(end: End, *, is_silent: bool) -> None:
 
 
 def stream(pipe: Pipe, seconds: float, every_s: float = 0.1, size: int = 100) -> None:
-    """Publish a message from time to time, for so long."""
+    """Publish a message from time to time, for this long."""
     for _ in range(round(seconds / every_s)):
         pipe.publish([pipe.publisher.messages.to_bytes(4, "big") + bytes(size)])
         pipe.run(every_s)
@@ -41,7 +41,7 @@ def sequences(end: End) -> list[int]:
 
 
 def assert_complete(pipe: Pipe, end: End) -> None:
-    """Nothing doubled, in order, and each message delivered or in a range of lost ones."""
+    """Check that nothing is doubled, in order, and each message is delivered or in a range of lost ones."""
     pipe.run(5.0)
     numbers = sequences(end)
     lost = [each for span in end.writer_proxy.losses.ranges for each in range(span.first, span.last + 1)]
@@ -66,7 +66,7 @@ def test_a_reader_that_was_away_within_the_grace_time_loses_nothing(away_s: floa
     assert pipe.publisher.acknowledged == pipe.publisher.messages
 
 
-def test_a_reader_that_was_away_for_longer_is_told_exactly_what_it_lost_and_why() -> None:
+def test_a_reader_that_was_away_for_longer_learns_exactly_what_it_lost_and_why() -> None:
     pipe = Pipe(publisher_of())
     (end,) = live(pipe, b"a")
     stream(pipe, 2.0)
@@ -84,7 +84,7 @@ def test_a_reader_that_was_away_for_longer_is_told_exactly_what_it_lost_and_why(
     assert pipe.publisher.messages - pipe.publisher.acknowledged == end.writer_proxy.lost
 
 
-def test_a_suspended_reader_holds_up_nobody_and_gets_what_it_lacks_when_it_returns() -> None:
+def test_a_suspended_reader_delays_no_other_and_gets_what_it_lacks_when_it_returns() -> None:
     pipe = Pipe(publisher_of())
     stays, moves = live(pipe, b"a", b"b")
     silence(moves, is_silent=True)

@@ -1,4 +1,4 @@
-"""Messages that no longer fit the path: split anew under new numbers, and still once and in order at every reader."""
+"""Renumbering: messages that no longer fit the path are fragmented again, and stay single and in order at readers."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_confirmed_messages_are_counted_and_not_their_numbers() -> None:
     assert pipe.publisher.acknowledged == pipe.publisher.messages == len(one.messages) == 30
 
 
-def test_a_late_reassembler_gets_latched_messages_in_the_new_size_and_nobody_gets_them_again() -> None:
+def test_a_late_joiner_gets_latched_messages_in_the_new_size_and_no_reader_gets_them_again() -> None:
     pipe = wide(depth=3)
     (one,) = joined(pipe, b"a")
     sent = messages(10)

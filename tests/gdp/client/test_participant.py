@@ -1,4 +1,4 @@
-"""A member takes names up, lays them down and takes them up again: numbers go on, and nothing is left behind."""
+"""Participant that adds names, removes them and adds them again: numbers continue, and no state stays behind."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_topic_may_come_back_as_something_else() -> None:
     assert writer_proxy.description == b"described anew"
 
 
-def test_what_was_withdrawn_reaches_nobody() -> None:
+def test_messages_of_a_withdrawn_name_reach_no_reader() -> None:
     flow = flowing(ring())
     flow.member.withdraw(flow.topic.name)
     flow.member.withdraw(flow.topic.name)
@@ -169,7 +169,7 @@ def test_late_joiners_get_as_many_messages_as_the_depth_is_now(before: int, afte
 
 
 def sizes(world: Simulation) -> list[int]:
-    """Return how much the tables of all nodes hold, names aside that are the world's own."""
+    """Return the size of all nodes' tables, except names of the simulation itself."""
     switches = [
         (len(switch.attached), len(switch.resolver.cache), len(switch.multicast.trees), len(switch.table.entries))
         for switch in world.switches.values()
@@ -179,13 +179,13 @@ def sizes(world: Simulation) -> list[int]:
 
 
 def count_objects() -> int:
-    """Return how many objects there are that could hold others."""
+    """Return the number of objects that could hold others."""
     gc.collect()
     return len(gc.get_objects())
 
 
 def rounds(world: Simulation, member: Participant, times: int) -> None:
-    """Take a topic and a service up and lay them down again, both ways."""
+    """Add a topic and a service and remove them again, in both directions."""
     publishes = world.topic("/appears", member, [Right.PUBLISH])
     reads = world.topic("/chatter", member, [Right.READ])
     serves = world.topic("/serves", member, [Right.SERVE], kind="service")
@@ -214,5 +214,5 @@ def test_ten_thousand_appearances_and_disappearances_leave_nothing_behind() -> N
     tables, objects = sizes(world), count_objects()
     rounds(world, member, ROUNDS)
     assert max(now - before for now, before in zip(sizes(world), tables, strict=True)) <= 2
-    assert count_objects() - objects < ROUNDS // 2  # a RIB knows each validity that it saw for ten minutes
+    assert count_objects() - objects < ROUNDS // 2  # a RIB keeps each validity that it saw for ten minutes
     assert flow.publisher.readers == 0

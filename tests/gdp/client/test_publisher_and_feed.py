@@ -1,4 +1,4 @@
-"""A publisher and its readers over a pipe that loses, doubles and reorders."""
+"""Publisher and its readers over a pipe that loses, doubles and reorders."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_without_a_reader_nothing_is_sealed_and_the_loss_is_counted() -> None:
 
 
 @pytest.mark.parametrize("reliable", [True, False])
-def test_a_late_reassembler_of_a_latched_topic_gets_the_last_messages(reliable: bool) -> None:
+def test_a_late_joiner_of_a_latched_topic_gets_the_last_messages(reliable: bool) -> None:
     pipe = Pipe(publisher_of(depth=3, reliable=reliable))
     early = pipe.join(b"a")
     pipe.run(1.0, lambda: early.writer_proxy.state is WriterProxyState.LIVE)
@@ -97,7 +97,7 @@ def test_the_first_reader_of_a_latched_topic_gets_the_last_messages_from_before_
     assert end.messages == MESSAGES[17:20]
 
 
-def test_a_reassembler_between_two_audiences_gets_no_more_than_the_depth() -> None:
+def test_a_joiner_between_two_audiences_gets_no_more_than_the_depth() -> None:
     pipe = Pipe(publisher_of(depth=3))
     first = pipe.join(b"a")
     pipe.run(1.0)
@@ -113,7 +113,7 @@ def test_a_reassembler_between_two_audiences_gets_no_more_than_the_depth() -> No
     assert second.messages == MESSAGES[4:7]
 
 
-def test_a_dead_reader_is_let_go_after_its_lease_and_holds_up_nobody_after() -> None:
+def test_a_dead_reader_is_evicted_after_its_lease_and_delays_no_other_after() -> None:
     pipe = Pipe(publisher_of())
     live, dead = pipe.join(b"a"), pipe.join(b"b")
     pipe.run(1.0)
@@ -181,7 +181,7 @@ def test_notes_of_two_writer_proxies_of_one_reader_never_share_a_nonce() -> None
     reader = reader_of(b"a")
     pipe.attach(reader)
     pipe.run(1.0)
-    pipe.attach(reader)  # its switch took the publisher away, and brought it back
+    pipe.attach(reader)  # its switch lost the publisher and found it again
     pipe.run(1.0)
     notes = [decode(frame) for frame in pipe.seen if decode(frame).kind == Kind.ACKNACK]
     nonces = [(note.source, note.incarnation, note.destination, note.number) for note in notes]

@@ -1,4 +1,4 @@
-"""Of the publishers that have something to send, urgent ones go first, and the others in turn."""
+"""Send scheduler: of the publishers with data to send, urgent ones go first, the others in turn."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The next of many timers is known by looking at those that were touched, and is the one that asking all would give."""
+"""Timer queue: it examines only changed timers, and returns the same next timer as a full scan."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gdp.client.timer_queue import TimerQueue
 
 
 class Clock:
-    """Something with a timer that counts how often it was asked."""
+    """Timer that counts how often it was queried."""
 
     def __init__(self, due_s: float | None = None) -> None:
         self.due_s = due_s
@@ -61,7 +61,7 @@ def test_one_that_is_due_again_and_again_leaves_nothing_behind() -> None:
     clock = Clock(0.0)
     timers = timers_of(clock)
     for at in range(1_000):
-        clock.due_s = 1_000.0 - at / 2  # always sooner than before
+        clock.due_s = 1_000.0 - at / 2  # always sooner than the time before
         timers.reschedule(clock)
         timers.next_due()
     clock.due_s = float("inf")
@@ -70,7 +70,7 @@ def test_one_that_is_due_again_and_again_leaves_nothing_behind() -> None:
     assert [len(each) for each in (timers._heap, timers._due_s, timers._place_s, timers._touched)] == [0, 0, 0, 0]
 
 
-def test_one_that_was_taken_is_asked_anew() -> None:
+def test_a_timer_that_fired_is_queried_again() -> None:
     clock = Clock(1.0)
     timers = timers_of(clock)
     assert timers.poll_due(0.5) == []

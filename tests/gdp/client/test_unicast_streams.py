@@ -1,4 +1,4 @@
-"""The private streams of one node: how many there may be, which are forgotten, and where they go on."""
+"""Unicast streams of one node: their number, which ones are forgotten, and where their numbers continue."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_a_former_life_of_a_client_does_not_close_the_stream_to_its_present_one(
     assert desk.stream(Party(CLIENT, EXCHANGE), 1500, 0.0) is stream
 
 
-def test_sequence_registry_are_bounded_and_what_is_forgotten_raises_the_floor() -> None:
+def test_the_sequence_registry_is_bounded_and_a_forgotten_name_raises_the_lowest_number() -> None:
     sequence_registry = SequenceRegistry(2)
     for number in range(3):
         sequence_registry.put(Name(bytes([number]) * 32), SequenceState(10 + number, number))

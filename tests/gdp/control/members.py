@@ -1,4 +1,4 @@
-"""Nodes of two domains that trust each other and of one that nobody trusts, for tests of the control plane."""
+"""Nodes of two domains that trust each other and of one untrusted domain, for tests of the control plane."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ def node(
 
 
 def at(mono_s: float, unix_s: float = UNIX_S) -> Timestamps:
-    """Return a moment."""
+    """Return timestamps."""
     return Timestamps(mono_s, unix_s)
 
 
 class Nonces:
-    """A source of bytes that never gives the same twice."""
+    """Source of bytes that never repeats."""
 
     def __init__(self, salt: int) -> None:
         self._next = salt << 32
@@ -47,18 +47,18 @@ class Nonces:
 
 
 def hello_protocol(identity: Identity, salt: int, policy: Policy = POLICY) -> HelloProtocol:
-    """Return a greeter with one port, numbered 0."""
+    """Return a HelloProtocol with one port, numbered 0."""
     made = HelloProtocol(identity, policy, ControlFragmenter(identity.name, salt), Nonces(salt))
     made.add_port(0, bytes([2, salt, 0, 0, 0, 0]), 1_500, 10, 0.0)
     return made
 
 
 def statement_of(frame: bytes) -> bytes:
-    """Return what a frame carries, without its padding."""
+    """Return the payload of a frame, without its padding."""
     return frame[HEADER_BYTES : HEADER_BYTES + decode(frame).length]
 
 
 def hello_in(statement: bytes, port: int = 0, mac: bytes = b"\x02far\x00\x00", padded_bytes: int = 0) -> ReceivedFrame:
-    """Return the arrival of a hello in one frame, with zeros behind up to ``padded_bytes``."""
+    """Return the received hello in one frame, with zeros behind up to ``padded_bytes``."""
     (frame,) = ControlFragmenter(bytes(32), 1).split(Kind.HELLO, statement, 60_000)
     return ReceivedFrame(port, mac, frame.ljust(padded_bytes, b"\0"))

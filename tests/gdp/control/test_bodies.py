@@ -1,4 +1,4 @@
-"""Every statement of the control plane reads back as it was written, and refuses what it is not."""
+"""Bodies of every statement of the control plane: each reads back as written, and refuses anything else."""
 
 from __future__ import annotations
 
@@ -101,6 +101,6 @@ def test_what_is_taken_has_no_reason() -> None:
     assert AdvertiseAck.from_fields(parse(taken.to_wire(NODE.name, NODE.key, b"")).fields) == taken
 
 
-def test_an_answer_that_names_the_name_itself_without_a_advertisement_is_nobody() -> None:
+def test_a_response_that_names_the_name_itself_without_an_advertisement_is_negative() -> None:
     assert Response(A, A, b"", C, (), 2.0).is_nobody
     assert not Response(A, B, b"", C, (), 0.0).is_nobody

@@ -1,4 +1,4 @@
-"""Channels: what comes in one is from its signer, now; recorded handshakes and records open nothing."""
+"""Channels: each statement is from its signer and fresh; recorded handshakes and records open nothing."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SAID = b"\xd2 a statement"
 
 @dataclass
 class Pair:
-    """A switch that asks and a RIB, with all that either ever sent."""
+    """Querying switch and a RIB, with all frames that either ever sent."""
 
     asker: Channels
     rib: Channels
@@ -36,7 +36,7 @@ class Pair:
         return Timestamps(self.now_s, NOW + self.now_s)
 
     def exchange(self) -> tuple[list[bytes], list[bytes]]:
-        """Carry everything over; return the fresh statements that came to the RIB, and to the asker."""
+        """Carry all frames over; return the fresh statements that came to the RIB, and to the switch."""
         at_rib: list[bytes] = []
         at_asker: list[bytes] = []
         while there := (out := self.asker.records_to_send()) + (back := self.rib.records_to_send()):

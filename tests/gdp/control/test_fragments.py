@@ -1,4 +1,4 @@
-"""Statements in frames: split, joined in any order, and bounded whatever comes."""
+"""Statements in fragments: split, reassembled in any order, and bounded on any input."""
 
 from __future__ import annotations
 

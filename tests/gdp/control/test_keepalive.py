@@ -1,4 +1,4 @@
-"""Keepalives: how fast silence is noticed, what a recording is worth, and who is given time."""
+"""Keepalives: detection time of silence, value of a recording, and nodes that get more time."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Filter = Callable[[str, bytes], bool]
 
 
 class Pair:
-    """Two greeters on one link, under a clock that goes on in small steps."""
+    """Two HelloProtocol instances on one link, under a clock that advances in small steps."""
 
     def __init__(self, one: Timing = FAST, two: Timing = FAST, identities: tuple[Identity, Identity] = (A, B)) -> None:
         self.now_s = 0.0
@@ -165,7 +165,7 @@ def test_a_neighbour_comes_back_in_the_same_session() -> None:
     pair.run(1.0)
     assert pair.is_up("a")
     assert pair.is_up("b")
-    assert set(pair.refused) <= {DropReason.UNKNOWN_SENDER}  # until the other has heard our echo
+    assert set(pair.refused) <= {DropReason.UNKNOWN_SENDER}  # until the other has received our echo
 
 
 def test_two_keepalives_lost_in_a_row_lose_no_neighbour_and_are_followed_by_polls() -> None:
@@ -237,7 +237,7 @@ def test_a_strangers_keepalive_is_refused_and_not_answered() -> None:
     pair = up(Pair())
     pair.run(0.1)
     frame = keepalives_of(pair, "a")[-1]  # a's own, come back
-    pair.ends["a"].hellos_to_send(pair.now_s)  # what is due anyhow
+    pair.ends["a"].hellos_to_send(pair.now_s)  # frames that are due anyway
     assert refusal(pair, frame) == [DropReason.UNKNOWN_SENDER]
     assert pair.ends["a"].hellos_to_send(pair.now_s) == []
 
@@ -255,7 +255,7 @@ def test_keepalives_do_not_keep_up_whose_membership_ran_out() -> None:
     assert not pair.is_up("a")
 
 
-def test_a_node_that_had_no_time_itself_calls_nobody_silent() -> None:
+def test_a_node_that_had_no_time_itself_reports_no_neighbour_as_silent() -> None:
     pair = up(Pair())
     pair.frozen |= {"a", "b"}
     pair.run(1.0)

@@ -1,4 +1,4 @@
-"""Greeting: who becomes a neighbour, who stays one, and what recorded hellos are worth."""
+"""Neighbour discovery: how a node becomes a neighbour and stays one, and the value of recorded hellos."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ UP = NeighbourState.UP
 
 
 def hellos(of: HelloProtocol, now_s: float) -> list[bytes]:
-    """Return the statements that a greeter says now."""
+    """Return the statements that a HelloProtocol sends now."""
     return [statement_of(frame) for transmit in of.hellos_to_send(now_s) for frame in transmit.frames]
 
 
@@ -51,7 +51,7 @@ def refusal(listener: HelloProtocol, statement: bytes, now_s: float = 0.0) -> Dr
 
 
 def greet(one: HelloProtocol, two: HelloProtocol, begin_s: float, rounds: int = 4) -> list[bytes]:
-    """Let two greeters talk; return all that the second said."""
+    """Let two HelloProtocol instances exchange statements; return all that the second sent."""
     said = []
     for step in range(rounds):
         now_s = begin_s + step * HELLO_S
@@ -64,7 +64,7 @@ def greet(one: HelloProtocol, two: HelloProtocol, begin_s: float, rounds: int = 
 
 
 def pair() -> tuple[HelloProtocol, HelloProtocol, list[bytes]]:
-    """Return two greeters that are up, and what the second said."""
+    """Return two HelloProtocol instances that are up, and all that the second sent."""
     one, two = hello_protocol(A, 1), hello_protocol(B, 2)
     return one, two, greet(one, two, 0.0)
 
@@ -108,7 +108,7 @@ def test_a_hello_played_back_at_once_is_refused() -> None:
     assert refusal(one, said[-1], 1.0) is DropReason.REPLAYED
 
 
-def test_a_recorded_hello_brings_nobody_back_after_its_silence() -> None:
+def test_a_recorded_hello_revives_no_neighbour_after_its_silence() -> None:
     one, _, said = pair()
     one.drop_silent(5.0)
     assert one.all_up() == []
@@ -126,7 +126,7 @@ def test_a_recorded_hello_of_an_older_session_neither_raises_nor_fells_nor_moves
     assert [(n.nonce, n.mac) for n in one.all_up()] == before != []
 
 
-def test_a_recorded_hello_of_a_session_of_long_ago_fells_nobody() -> None:
+def test_a_recorded_hello_of_a_session_of_long_ago_ends_no_adjacency() -> None:
     one, _, _ = pair()
     assert hear(one, forged(), 1.0) is None
     assert [n.name for n in one.all_up()] == [B.name]
@@ -277,7 +277,7 @@ def test_hellos_fit_the_narrowest_end_that_was_heard() -> None:
     assert max(map(len, frames)) <= 576
 
 
-def test_a_neighbour_that_advertisements_to_take_nothing_is_taken_for_the_narrowest_there_may_be() -> None:
+def test_a_neighbour_that_announces_to_take_nothing_is_taken_for_the_narrowest_there_may_be() -> None:
     one = hello_protocol(A, 1)
     hello = Hello(b"n" * 8, 1, (one.ports[0].echo,), 0, bytes(8), B.membership)
     hear(one, hello.to_wire(B.name, B.key), 0.0)
@@ -300,7 +300,7 @@ def test_a_narrow_neighbour_that_is_gone_leaves_the_link_as_wide_as_before() -> 
     assert (before, one.ports[0].mtu) == (1_000, 1_500)
 
 
-def test_another_address_takes_the_neighbours_away_and_begins_anew() -> None:
+def test_another_address_removes_the_neighbours_and_starts_again() -> None:
     one, _, _ = pair()
     nonce = one.ports[0].nonce
     changes = one.add_port(0, b"\x02new\x00\x00", 1_500, 10, 2.0)
@@ -361,7 +361,7 @@ def test_joins_of_two_neighbours_do_not_hinder_each_other() -> None:
     assert [is_taken(port, port.echo, each, 1, each.nonce) for each in both] == [True, True]
 
 
-def test_a_join_counts_from_anew_in_a_new_session_of_its_sender_and_one_of_the_last_session_not_at_all() -> None:
+def test_a_join_counts_from_the_start_in_a_new_session_of_its_sender_and_one_of_the_last_session_not_at_all() -> None:
     port, before, after = hello_protocol(A, 1).ports[0], neighbour_of(b"b"), neighbour_of(b"b", b"o" * 8)
     assert is_taken(port, port.echo, before, 1_000)
     assert is_taken(port, port.echo, after, 1, b"o" * 8)

@@ -1,4 +1,4 @@
-"""What a node that makes no progress says, and when."""
+"""Report of a node that makes no progress, and its time."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_a_node_whose_link_is_down_and_then_up_says_so() -> None:
 
 
 @pytest.mark.parametrize(("role", "reason"), [(Role.SWITCH, WaitReason.ONE_WAY), (Role.PROXY, WaitReason.NO_SWITCH)])
-def test_a_neighbour_that_does_not_answer_is_told_from_one_that_is_no_switch(role: Role, reason: WaitReason) -> None:
+def test_a_neighbour_that_does_not_answer_differs_from_one_that_is_no_switch(role: Role, reason: WaitReason) -> None:
     alone, other = attachment(), hello_protocol(node("other", role), 2)
     alone.hello_protocol.add_port(0, bytes(6), 1_500, 10, 0.0)
     for hello in other.hellos_to_send(0.0):

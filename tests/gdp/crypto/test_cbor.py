@@ -1,4 +1,4 @@
-"""The strict CBOR reader against an independent one, and against strangers."""
+"""Strict CBOR reader, compared with an independent one and run on foreign bytes."""
 
 from __future__ import annotations
 

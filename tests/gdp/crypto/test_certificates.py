@@ -1,4 +1,4 @@
-"""Roots and memberships: what holds, what does not, and that OpenSSL agrees."""
+"""Roots and memberships: valid and invalid ones, and agreement with OpenSSL."""
 
 from __future__ import annotations
 
@@ -307,7 +307,7 @@ def test_openssl_reads_name_role_and_label(files: Path) -> None:
 
 @needs_openssl
 def test_a_membership_issued_by_openssl_holds_here(tmp_path: Path) -> None:
-    now = time.time()  # openssl goes by the real clock
+    now = time.time()  # openssl uses the real clock
     authority = CertificateAuthority.create("school", SigningKey.generate(), Validity.lasting(now - 60, 86_400))
     root, key, request, out = (tmp_path / name for name in ("root.crt", "root.key", "node.csr", "node.crt"))
     root.write_bytes(to_pem(authority.root.wire))

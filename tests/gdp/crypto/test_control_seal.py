@@ -1,4 +1,4 @@
-"""Notes between members: what opens, and what does not."""
+"""Sealed control datagrams between members: those that open, and those that do not."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_a_note_opens_with_padding_behind_it(body: bytes) -> None:
 def test_an_older_number_than_the_last_is_a_replay() -> None:
     numbers = ControlReplayWindow()
     numbers.check(2, 0.0)
-    assert numbers.check(1, 0.0) is None  # what did not open moves nothing
+    assert numbers.check(1, 0.0) is None  # a datagram that did not open moves nothing
     numbers.accept(2, 0.0)
     assert refused(numbers, 1) is refused(numbers, 2) is DropReason.REPLAYED
 
@@ -104,7 +104,7 @@ def test_two_sealers_that_share_numbers_make_no_nonce_twice() -> None:
 
 def test_only_hops_left_may_change_on_the_way() -> None:
     frame = sealer().seal(b"body")
-    topic = range(HEADER_BYTES, HEADER_BYTES + 32)  # tells which opener to use; another topic's will not open it
+    topic = range(HEADER_BYTES, HEADER_BYTES + 32)  # selects the opener; another topic's opener will not open it
     for at in (at for at in range(len(frame)) if at != HOPS_AT and at not in topic):
         changed = bytearray(frame)
         changed[at] ^= 1

@@ -1,4 +1,4 @@
-"""Sealing and opening: the published vectors, and what must not open."""
+"""Sealing and opening: the published vectors, and inputs that must not open."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def test_only_hops_left_may_change_on_the_way() -> None:
 
 
 @pytest.mark.parametrize("length", [0, SEAL_BYTES - 1, SIGNATURE_BYTES + SEAL_BYTES - 1])
-def test_a_part_without_room_for_a_tag_is_truncated(length: int) -> None:
+def test_a_fragment_too_short_for_a_tag_is_truncated(length: int) -> None:
     (frame,) = seal(1, b"short")
     with pytest.raises(EnvelopeError) as caught:
         opener_of(1).open(decode(frame)._replace(length=length), frame)

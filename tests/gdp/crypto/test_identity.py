@@ -1,4 +1,4 @@
-"""A node as it knows itself."""
+"""Identity of a node, as the node itself holds it."""
 
 from __future__ import annotations
 

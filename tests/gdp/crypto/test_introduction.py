@@ -1,4 +1,4 @@
-"""Introductions: what a reader proves of itself, and what is refused."""
+"""Introductions: a reader's proof of itself, and refused ones."""
 
 from __future__ import annotations
 

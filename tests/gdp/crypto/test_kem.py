@@ -1,4 +1,4 @@
-"""The hybrid key that receives secrets."""
+"""Hybrid key that receives secrets."""
 
 from __future__ import annotations
 

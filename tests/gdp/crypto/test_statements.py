@@ -1,4 +1,4 @@
-"""Signed statements: COSE_Sign1 as others read it, and nothing else."""
+"""Signed statements: COSE_Sign1 in a form that other libraries read, and no other input."""
 
 from __future__ import annotations
 

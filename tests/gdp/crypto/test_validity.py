@@ -1,4 +1,4 @@
-"""From when until when."""
+"""Validity: its first and last second."""
 
 from __future__ import annotations
 

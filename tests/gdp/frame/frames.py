@@ -1,4 +1,4 @@
-"""Headers made by hypothesis, for the twin tests."""
+"""Headers made by hypothesis, for tests that compare the codec, the Scapy layer and the kernel program."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ u8, u16, u32, u64 = (st.integers(0, (1 << bits) - 1) for bits in (8, 16, 32, 64)
 
 @st.composite
 def headers(draw: st.DrawFn, length: int) -> Header:
-    """A header that a receiver accepts, for a payload of ``length`` bytes."""
+    """Header that a receiver accepts, for a payload of ``length`` bytes."""
     parts = draw(st.integers(1, PARTS_MAX))
     return Header(
         kind=draw(u8),
@@ -32,6 +32,6 @@ def headers(draw: st.DrawFn, length: int) -> Header:
 
 @st.composite
 def frames(draw: st.DrawFn) -> tuple[Header, bytes, bytes]:
-    """A header, its payload, and padding behind it."""
+    """Header, its payload, and padding behind it."""
     payload = draw(st.binary(max_size=64))
     return draw(headers(len(payload))), payload, draw(st.binary(max_size=46))

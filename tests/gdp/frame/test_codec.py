@@ -1,3 +1,5 @@
+"""Frame codec: round trips, refusals, and the sealed part of a header."""
+
 from __future__ import annotations
 
 import json

@@ -1,3 +1,5 @@
+"""Diagnostic notation of statements (CBOR, RFC 8949, section 8)."""
+
 from __future__ import annotations
 
 import cbor2

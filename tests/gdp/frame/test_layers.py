@@ -1,3 +1,5 @@
+"""Scapy layers of GDP, compared with the codec on generated headers."""
+
 from __future__ import annotations
 
 import cbor2
@@ -30,7 +32,7 @@ ALICE, BOB = b"a" * 32, b"b" * 32
 
 
 def read(layer: GDP) -> Header:
-    """What the Scapy layer says, as the codec would."""
+    """Return the fields of the Scapy layer in the codec's form."""
     return Header(*(int(v) if not isinstance(v, bytes) else v for v in (getattr(layer, f) for f in Header._fields)))
 
 
@@ -39,7 +41,7 @@ def statement(body: dict[str, object], signature: bytes = b"s" * 64) -> bytes:
     return cbor2.dumps(cbor2.CBORTag(18, [protected, {}, cbor2.dumps(body), signature]))
 
 
-# twins
+# equality of the Scapy layer and the codec
 
 
 @given(frames())
@@ -140,7 +142,7 @@ def test_the_defaults_make_a_frame_that_decodes() -> None:
     assert header.parts <= PARTS_MAX
 
 
-# for people
+# texts for people
 
 
 def test_ethernet_above_a_frame_gets_the_ethertype() -> None:
@@ -169,7 +171,7 @@ def test_the_summary_tells_the_way_and_the_part() -> None:
     assert packet.mysummary() == "GDP data 616…161 > 626…262 #5 2/3 hops 64"
 
 
-# questions and answers
+# queries and responses
 
 
 @pytest.mark.parametrize(

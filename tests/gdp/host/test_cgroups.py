@@ -1,4 +1,4 @@
-"""Control groups, where the system lets us make some."""
+"""Control groups, where the system permits their creation."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ def test_a_running_process_is_alive_and_an_ended_one_is_not() -> None:
         assert known.alive
         process.kill()
         os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
-        assert not known.alive  # though its parent has not taken note of it yet
+        assert not known.alive  # although its parent has not reaped it yet
         process.wait()
         assert not known.alive
         with pytest.raises(ProcessLookupError):

@@ -1,4 +1,4 @@
-"""Records of runs, and what the next start does about dead ones."""
+"""Records of runs, and the clean-up of dead ones by the next start."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sealed messages of one writer, and a joiner for them."""
+"""Sealed messages of one writer, and a Reassembler for them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TOPIC = b"t" * 32
 INCARNATION = 9
 WRITER = SigningKey.generate()
 OTHER = SigningKey.generate()
-MTU = 300  # room for 188 bytes in a part
+MTU = 300  # a fragment carries 188 bytes
 
 
 def seal(

@@ -1,4 +1,4 @@
-"""Several messages under one seal: exact, or refused whole; and how many messages went under each number."""
+"""Several messages under one seal: exact, or refused whole; and the number of messages under each sequence number."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_what_is_not_exact_is_refused(wire: bytes) -> None:
         unpack(wire)
 
 
-def test_what_waits_goes_together_in_order_as_far_as_there_is_room() -> None:
+def test_waiting_messages_go_together_in_order_as_far_as_they_fit() -> None:
     gathered = Gathered()
     messages = [bytes([at]) * 100 for at in range(10)]
     for message in messages:
@@ -52,7 +52,7 @@ def test_what_waits_goes_together_in_order_as_far_as_there_is_room() -> None:
     assert len(gathered) == 2
 
 
-def test_a_message_for_which_there_is_no_room_any_more_goes_alone() -> None:
+def test_a_message_that_no_longer_fits_goes_alone() -> None:
     gathered = Gathered()
     gathered.add(1, bytes(100))
     gathered.add(1, bytes(100))

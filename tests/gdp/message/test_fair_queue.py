@@ -1,4 +1,4 @@
-"""Whoever fills a queue, each owner has its turn."""
+"""Fair queue: each owner has its turn, even if another one fills the queue."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Joining parts: whatever comes, in whatever order, within bounds."""
+"""Reassembly of fragments: any input, in any order, within bounds."""
 
 from __future__ import annotations
 
@@ -185,7 +185,7 @@ def test_a_message_that_is_needed_sooner_takes_the_memory_of_a_later_one() -> No
     assert to.drops[DropReason.ABANDONED] > 0
 
 
-def test_more_unfinished_messages_than_allowed_leave_room_for_the_next_one_needed() -> None:
+def test_more_unfinished_messages_than_allowed_leave_space_for_the_next_one_needed() -> None:
     to = reassembler()
     for number in range(10, 10 + JOIN_MESSAGES_MAX + 5):
         add(to, seal(number, bytes(200))[0])
@@ -194,7 +194,7 @@ def test_more_unfinished_messages_than_allowed_leave_room_for_the_next_one_neede
     assert to.drops[DropReason.ABANDONED] == 1
 
 
-def test_the_gaps_of_a_message_are_told_as_ranges() -> None:
+def test_the_gaps_of_a_message_are_reported_as_ranges() -> None:
     to, frames = reassembler(), seal(5, LONG)
     assert len(frames) == 12
     add_all(to, [frames[0], frames[1], frames[4], frames[6], frames[7]])
@@ -223,7 +223,7 @@ def test_what_is_held_and_what_is_missing_make_up_the_message(held: set[int], to
     assert missing == everything - held
 
 
-def test_the_longest_way_of_a_part_is_told() -> None:
+def test_the_longest_path_of_a_fragment_is_reported() -> None:
     to, frames = reassembler(), seal(1, bytes(300), mtu=MTU)
     hops = [bytearray(frame) for frame in frames]
     hops[1][HOPS_AT] = HOPS_MAX - 5

@@ -1,4 +1,4 @@
-"""The budget of unfinished messages."""
+"""Reassembly quota of unfinished messages."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_all_sources_together_get_no_more_than_the_total() -> None:
     assert budget.held_bytes == 60
 
 
-def test_a_refusal_takes_nothing_and_a_release_makes_room() -> None:
+def test_a_refusal_takes_nothing_and_a_release_frees_quota() -> None:
     budget = ReassemblyQuota(100, 60)
     assert not budget.reserve(b"a", 61)
     assert budget.held_bytes == 0

@@ -1,4 +1,4 @@
-"""Moves: every number is either an old one or a new one, and order stays."""
+"""Renumbering: every number is either an old one or a new one, and order stays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The replay window against a plain set."""
+"""Replay window, compared with a plain set."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_the_unfinished_numbers_are_those_that_are_not_finished(finished: list[i
     assert list(window.unfinished(begin, end)) == [n for n in range(begin, end) if not window.is_finished(n)]
 
 
-def test_a_walk_over_the_unfinished_costs_nothing_for_the_finished_between() -> None:
+def test_an_iteration_over_the_unfinished_costs_nothing_for_the_finished_between() -> None:
     window = ReplayWindow()
     window.finish(1 << 63)
     assert next(window.unfinished(1, (1 << 64) - 1)) == (1 << 63) - 16_383

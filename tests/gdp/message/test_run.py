@@ -1,4 +1,4 @@
-"""Parts that come in order take a short way; it must lead where the long way leads."""
+"""Fast path of fragments in order; its result must equal that of the general path."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LONG = bytes(range(256)) * 64
 
 
 def take(to: Reassembler, frames: list[bytes], at_once: int = 64) -> tuple[list[ReassembledMessage], int]:
-    """Give frames in batches, the short way where it is open; return what was joined, and how many went that way."""
+    """Give frames in batches, on the fast path where possible; return the messages and the count of fast ones."""
     joined: list[ReassembledMessage] = []
     short = 0
     for begin in range(0, len(frames), at_once):
@@ -68,7 +68,7 @@ def test_an_altered_part_dies_alone(part: int, at: int, bit: int) -> None:
     to = reassembler()
     try:
         decode(bytes(bad))
-    except FrameError:  # never reaches the joiner
+    except FrameError:  # never reaches the Reassembler
         return
     joined, _ = take(to, [*frames[:part], bytes(bad), *frames[part:]])
     assert [each.message for each in joined] == [LONG]

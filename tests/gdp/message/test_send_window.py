@@ -1,4 +1,4 @@
-"""What a publisher keeps, has under way, and sends again."""
+"""Send window: the messages that a publisher keeps, has in flight, and sends again."""
 
 from __future__ import annotations
 
@@ -154,12 +154,12 @@ def test_no_more_parts_are_looked_at_for_one_report_than_a_flight_of_small_frame
     put(window, 1, [bytes(10)] * 20_000)
     assert len(window.frames_to_send(0.0)) == 20_000
     absurd = tuple(MissingRange(1, 0, 0xFFFF_FFFF) for _ in range(NACKS_PER_REPORT))
-    for at in range(3):  # the second and third look only at what the first has queued
+    for at in range(3):  # the second and third check only fragments that the first has queued
         window.handle_acknack(A, has(1, 0, absurd), 0.1 + at * 1e-6)
     assert len(window.frames_to_send(0.2)) == 8_192
 
 
-def test_a_reader_that_advertisements_what_was_not_sent_takes_nothing_from_another() -> None:
+def test_a_reader_that_reports_unsent_messages_takes_nothing_from_another() -> None:
     window = window_of(20, 100, (A, B))
     window.frames_to_send(0.0)
     window.handle_acknack(A, has((1 << 64) - 1, 0xFFFF_FFFF), 0.1)
@@ -168,7 +168,7 @@ def test_a_reader_that_advertisements_what_was_not_sent_takes_nothing_from_anoth
     assert window.acknowledged == 0
 
 
-def test_a_reader_that_advertisements_what_was_not_sent_does_not_make_it_best_effort_queue() -> None:
+def test_a_reader_that_reports_unsent_messages_does_not_make_them_unsent() -> None:
     window = window_of(5, 100)
     sent = window.frames_to_send(0.0)
     window.handle_acknack(A, has((1 << 64) - 1), 0.1)
@@ -272,7 +272,7 @@ def test_a_reader_is_slow_when_it_has_not_confirmed_for_so_long_what_another_has
     for reader in (A, B):
         window.add_reader(reader, 1, 0.0)
     now_s = 10.0
-    for number in range(1, 5):  # both have everything each time, until B says nothing more
+    for number in range(1, 5):  # both have everything each time, until B reports nothing more
         put(window, number, message(number, 1))
         window.frames_to_send(now_s)
         window.handle_acknack(A, has(number + 1), now_s)

@@ -1,4 +1,4 @@
-"""Reports and statuses on the wire."""
+"""AckNacks and Heartbeats on the wire."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Audit of a node: where it is kept, and that refused statements are counted."""
+"""Audit of a node: its location, and the count of refused statements."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gdp.stores.audit_log import verify_audit
 from gdp.trust.audit import AuditTrail
 
 
-def test_a_node_audits_where_it_is_told_or_where_systemd_keeps_state(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_node_audits_in_the_configured_folder_or_where_systemd_keeps_state(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("STATE_DIRECTORY", raising=False)
     assert audit_folder(None) is None
     assert audit_folder(Path("kept")) == Path("kept")
@@ -36,7 +36,7 @@ def test_refused_statements_are_counted_and_losses_on_the_way_are_not(tmp_path: 
     assert found.lines == 5
 
 
-def test_a_folder_that_is_gone_is_told_once_and_the_node_goes_on(
+def test_a_folder_that_is_gone_is_reported_once_and_the_node_goes_on(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     drops: Counter[DropReason] = Counter()

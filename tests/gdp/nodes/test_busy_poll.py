@@ -1,11 +1,11 @@
-"""When it pays to look again before going to sleep."""
+"""Busy polling: the cases in which it pays before a thread sleeps."""
 
 from __future__ import annotations
 
 from gdp.nodes.busy_poll import BusyPoll
 
 
-def test_at_first_nobody_spins() -> None:
+def test_at_first_no_thread_polls() -> None:
     assert not BusyPoll(0.000_3).pays
 
 

@@ -1,4 +1,4 @@
-"""switch.yaml and rib.yaml as people write them."""
+"""switch.yaml and rib.yaml, as people write them."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_every_error_of_a_file_is_listed_in_its_order(place: Path) -> None:
     ]
 
 
-def test_a_missing_key_is_told_at_what_should_hold_it(place: Path) -> None:
+def test_a_missing_key_is_reported_at_its_parent(place: Path) -> None:
     assert refusals(place, SWITCH + "metrics: {}\n") == ["switch.yaml:3:10: metrics.port: required, but not there"]
 
 

@@ -1,4 +1,4 @@
-"""The control protocol: requests and responses as lines."""
+"""Control protocol: requests and responses as lines."""
 
 from __future__ import annotations
 

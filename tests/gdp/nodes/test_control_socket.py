@@ -1,4 +1,4 @@
-"""Control sockets: who reaches them, what stays of them, and what clients are answered."""
+"""Control sockets: their permissions, their remains, and the responses to clients."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ WAIT_S = 5.0
 
 
 class Node:
-    """Handlers that note what they are asked."""
+    """Handlers that record their requests."""
 
     def __init__(self) -> None:
         self.asked: list[str] = []

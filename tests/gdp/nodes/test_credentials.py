@@ -1,4 +1,4 @@
-"""A running node takes up certificates that are replaced on disk, and nothing that does not hold."""
+"""Running node that loads replaced certificates from disk, and rejects invalid ones."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_a_root_rolls_over_while_the_node_runs(site: Site) -> None:
     assert load_identity(site.node, NOW + 40 * DAY_S).member == renewed
 
 
-def test_a_root_that_nobody_vouched_for_is_not_taken_up(site: Site, tmp_path: Path) -> None:
+def test_an_unvouched_root_is_not_accepted(site: Site, tmp_path: Path) -> None:
     make_domain(tmp_path / "twin", "school", unix_s=NOW)
     before = site.policy.roots
     write_all(site.node, {"root.crt": public((tmp_path / "twin/root.crt").read_bytes())}, force=True)
@@ -93,7 +93,7 @@ def test_a_root_that_nobody_vouched_for_is_not_taken_up(site: Site, tmp_path: Pa
     assert site.policy.roots is before
 
 
-def test_a_membership_that_ends_soon_is_told_once(site: Site, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_membership_that_ends_soon_is_reported_once(site: Site, caplog: pytest.LogCaptureFixture) -> None:
     site.look(NOW + 20 * DAY_S)
     assert not caplog.records
     site.look(NOW + 25 * DAY_S)

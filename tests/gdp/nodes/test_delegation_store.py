@@ -1,3 +1,5 @@
+"""Delegation store of a node: lookup, expiry and foreign delegations."""
+
 from __future__ import annotations
 
 import time
@@ -62,7 +64,7 @@ def test_what_is_held_says_what_it_is_about(tmp_path: Path, robot: Identity) -> 
     assert list(found.described(Right.CALL)) == []
 
 
-def test_one_that_has_run_out_is_told_and_left_out(
+def test_an_expired_one_is_reported_and_left_out(
     tmp_path: Path, robot: Identity, caplog: pytest.LogCaptureFixture
 ) -> None:
     give(tmp_path, OTHER, [Right.READ], ago_s=5 * 86_400)
@@ -71,7 +73,7 @@ def test_one_that_has_run_out_is_told_and_left_out(
     assert told.startswith("delegation left out of=/other reason=")
 
 
-def test_one_of_another_node_is_told_and_left_out(
+def test_one_of_another_node_is_reported_and_left_out(
     tmp_path: Path, robot: Identity, caplog: pytest.LogCaptureFixture
 ) -> None:
     other = make_node(tmp_path / "other", Role.PROXY, "other", tmp_path / "school")

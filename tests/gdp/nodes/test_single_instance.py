@@ -1,4 +1,4 @@
-"""One process for each identity on a host."""
+"""Lock for one process of each identity on a host."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def _directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @contextmanager
 def holder(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
-    """A process that holds the locks."""
+    """Process that holds the locks."""
     argv = [sys.executable, "-c", _HOLD, NAME.to_text(), str(tmp_path / "locks")]
     with subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         try:

@@ -1,4 +1,4 @@
-"""What a YAML file may hold, and that errors point into it."""
+"""Permitted content of a YAML file, and errors that point into it."""
 
 from __future__ import annotations
 
@@ -67,13 +67,13 @@ def test_an_empty_file_holds_no_keys(tmp_path: Path) -> None:
         ("[" * 100, "1:33: nested deeper than 32"),
     ],
 )
-def test_what_is_not_accepted_is_told_with_its_place(tmp_path: Path, text: str, complaint: str) -> None:
+def test_unaccepted_input_is_reported_with_its_position(tmp_path: Path, text: str, complaint: str) -> None:
     with pytest.raises(ConfigError) as caught:
         read(tmp_path, text)
     assert str(caught.value) == f"{tmp_path}/file.yaml:{complaint}"
 
 
-def test_bytes_that_are_not_utf_8_are_told_with_their_line(tmp_path: Path) -> None:
+def test_bytes_that_are_not_utf_8_are_reported_with_their_line(tmp_path: Path) -> None:
     path = tmp_path / "file.yaml"
     path.write_bytes(b"a: 1\nb: \xff\n")
     with pytest.raises(ConfigError, match=r"file\.yaml:2: UTF-8 text is expected"):

@@ -1,4 +1,4 @@
-"""Both kinds of batch over a pair of local datagram sockets: the same calls as on a packet socket, no privilege."""
+"""Both kinds of batch over a pair of local datagram sockets: the same calls as on a packet socket, unprivileged."""
 
 from __future__ import annotations
 

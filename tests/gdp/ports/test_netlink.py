@@ -1,4 +1,4 @@
-"""What a refused question reads as; the kernel is played by the other end of a pair of sockets."""
+"""Texts of refused netlink requests; the other end of a socket pair plays the kernel."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_a_late_answer_is_not_taken_for_the_next_ones(kernel: socket.socket) -> 
         asking.link(7)
     kernel.send(device(2, b"late"))
     kernel.send(device(3, b"later"))
-    asking._has_leftovers = False  # as if they came while it asks
+    asking._has_leftovers = False  # as if they came during the request
     assert asking.link(7) == {QUEUE: b"later"}
 
 

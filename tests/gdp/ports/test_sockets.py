@@ -1,4 +1,4 @@
-"""Which frames a port's sockets let in: each of ours by one lane and no other, whatever its length.
+"""Ingress filters of a port's sockets: exactly one traffic class takes each frame of ours, of any length.
 
 The filters run here as the kernel runs them (classic BPF, Linux, Documentation/networking/filter.rst), as far as they
 use it.
@@ -33,7 +33,7 @@ FLAGS = (Flag.NONE, Flag.LAST, Flag.URGENT, Flag.URGENT | Flag.RELIABLE, 0xFF, 0
 
 
 def takes(lane: TrafficClass, packet: bytes, kind: int = TO_US, neighbours: tuple[bytes, ...] = ()) -> bool:
-    """Run a lane's filter on a packet, from the Ethernet header on."""
+    """Run a traffic class's filter on a packet, from the Ethernet header on."""
     at, value = 0, 0
     steps = steps_of(lane, neighbours)
     while True:
@@ -62,7 +62,7 @@ def takes(lane: TrafficClass, packet: bytes, kind: int = TO_US, neighbours: tupl
 
 
 def lanes_of(packet: bytes, kind: int = TO_US, neighbours: tuple[bytes, ...] = ()) -> list[str]:
-    """Return the names of the lanes that take a packet."""
+    """Return the names of the traffic classes that take a packet."""
     return [lane.name for lane in TrafficClass if takes(lane, packet, kind, neighbours)]
 
 
@@ -71,7 +71,7 @@ def lane_of_control(kind: int) -> str:
 
 
 def neighbourhood(packet: bytes, count: int) -> tuple[bytes, ...]:
-    """Return addresses, of which the packet's sender has one; others differ from it in one byte."""
+    """Return addresses, one of which is the packet's sender; the others differ from it in one byte."""
     mac = packet[6:12]
     others = (mac[:at] + bytes([mac[at] ^ 1 << bit]) + mac[at + 1 :] for bit in range(8) for at in range(6))
     return (mac, *others)[:count]
@@ -124,7 +124,7 @@ def test_every_jump_of_a_filter_ends_inside_it() -> None:
 
 
 class Recorder:
-    """A socket that notes what it is asked, and refuses one option."""
+    """Socket that records its requests and refuses one option."""
 
     def __init__(self, refuses: int | None = None, number: int = errno.ENOPROTOOPT) -> None:
         self.options: dict[tuple[int, int], int | bytes] = {}
@@ -161,7 +161,7 @@ def test_buffers_are_asked_for_past_the_limit_and_else_up_to_it() -> None:
 
 
 class BoundRecorder(Recorder):
-    """A socket of a process that may not pass the system's limits."""
+    """Socket of a process that may not exceed the system's limits."""
 
     def setsockopt(self, level: int, option: int, value: int | bytes) -> None:
         if option in (32, 33):

@@ -1,4 +1,4 @@
-"""A RIB: what it takes, what it refuses and why, whom it answers and tells."""
+"""RIB: accepted statements, refused ones with their reason, responses, and watches."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def relay(statement: bytes, by: Identity = SWITCH) -> bytes:
 
 
 def tell(to: RibCore, statement: bytes, by: Identity = SWITCH, now: Timestamps = START) -> list[OutgoingStatement]:
-    """Relay a claim or a withdrawal; return what the RIB sends."""
+    """Relay an advertisement or a withdrawal; return the statements that the RIB sends."""
     to.receive(relay(statement, by), by.name, now)
     return to.statements_to_send()
 
@@ -120,7 +120,7 @@ def local_advertisement(sequence: int = 1) -> bytes:
 
 
 def foreign_advertisement(*, is_global: bool = True, sequence: int = 1) -> bytes:
-    """Return a claim of the robot at a switch of the cloud's domain."""
+    """Return an advertisement of the robot at a switch of the cloud's domain."""
     return sign_advertisement(
         ROBOT,
         Right.PUBLISH,
@@ -135,15 +135,15 @@ def foreign_advertisement(*, is_global: bool = True, sequence: int = 1) -> bytes
 
 
 def altered(change: dict[str, object]) -> bytes:
-    """Return the robot's claim with a changed body, signed again by the robot."""
+    """Return the robot's advertisement with a changed body, signed again by the robot."""
     body = {**UnverifiedAdvertisement.from_statement(parse(advertisement())).to_fields(), **change}
     return sign(StatementType.ADVERTISE, body, ROBOT.name, ROBOT.key)
 
 
-# -- what is taken, what is refused
+# -- accepted and refused advertisements
 
 
-def test_a_good_advertisement_is_taken_and_its_relay_told() -> None:
+def test_a_good_advertisement_is_accepted_and_its_relay_informed() -> None:
     at_rib = rib()
     (ack,) = verdicts(tell(at_rib, advertisement(sequence=4)))
     assert (ack.name, ack.advertiser, ack.refused, ack.sequence) == (NAME, ROBOT.name, None, 4)
@@ -168,7 +168,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("why", REFUSED)
-def test_a_advertisement_that_does_not_hold_is_refused_with_its_reason(why: str) -> None:
+def test_an_advertisement_that_does_not_hold_is_refused_with_its_reason(why: str) -> None:
     wire, reason = REFUSED[why]
     at_rib = rib()
     told = verdicts(tell(at_rib, wire))
@@ -214,7 +214,7 @@ def test_an_expired_delegation_is_refused() -> None:
     assert at_rib.refusals == {DropReason.EXPIRED: 1}
 
 
-def test_a_advertisement_of_a_stranger_is_refused() -> None:
+def test_an_advertisement_of_a_stranger_is_refused() -> None:
     policy = Policy(SCHOOL.root)
     at_rib = RibCore(RIB, policy, MemoryStore(), RibSettings())
     tell(at_rib, advertisement(STRANGER))
@@ -277,16 +277,16 @@ def test_a_sender_has_a_quota_of_names() -> None:
     assert verdicts(tell(at_rib, advertisement(sequence=2)))[0].refused is None
 
 
-def test_claiming_and_withdrawing_in_turn_does_not_pass_the_quota() -> None:
+def test_advertising_and_withdrawing_in_turn_does_not_pass_the_quota() -> None:
     at_rib = rib(names_per_sender=5)
     for number in range(10):
         own = Subject.of(Metadata({"kind": "topic", "name": f"/own{number}"}), ROBOT.key.public.compressed)
         tell(at_rib, advertisement(subject=own, chain=[]))
         tell(at_rib, sign(StatementType.WITHDRAW, {"n": own.name, "s": 2}, ROBOT.name, ROBOT.key))
-    assert at_rib.refusals == {DropReason.QUOTA: 7, DropReason.STALE: 7}  # a node may hold as many as are free
+    assert at_rib.refusals == {DropReason.QUOTA: 7, DropReason.STALE: 7}  # a node may have as many as are free
 
 
-def test_a_node_leaves_room_for_the_other_nodes_of_its_switch() -> None:
+def test_a_node_leaves_capacity_for_the_other_nodes_of_its_switch() -> None:
     at_rib = rib(names_per_sender=30)
     for number in range(40):
         own = Subject.of(Metadata({"kind": "topic", "name": f"/own{number}"}), ROBOT.key.public.compressed)
@@ -312,7 +312,7 @@ def test_what_is_no_statement_for_a_rib_is_malformed(wire: bytes) -> None:
     assert (at_rib.statements_to_send(), at_rib.refusals) == ([], {DropReason.MALFORMED: 1})
 
 
-def test_a_ack_is_shorter_than_the_relay_that_it_answers() -> None:
+def test_an_ack_is_shorter_than_the_relay_that_it_answers() -> None:
     at_rib = rib()
     for wire in (advertisement(), advertisement(chain=[]), REFUSED["forged"][0]):
         sent = relay(wire)
@@ -323,7 +323,7 @@ def test_a_ack_is_shorter_than_the_relay_that_it_answers() -> None:
 # -- withdrawals and leases
 
 
-def test_a_withdrawn_name_is_answered_with_nobody() -> None:
+def test_a_withdrawn_name_gets_a_negative_response() -> None:
     at_rib = rib()
     tell(at_rib, advertisement(sequence=3))
     assert verdicts(tell(at_rib, withdrawal(4)))[0].refused is None
@@ -378,7 +378,7 @@ def test_no_lease_outlasts_its_evidence() -> None:
     assert at_rib.get_timer() == pytest.approx(10.0)
 
 
-# -- questions and watches
+# -- queries and watches
 
 
 def test_an_answer_carries_the_advertisement_as_it_was_signed() -> None:
@@ -405,7 +405,7 @@ def test_a_switch_of_another_domain_hears_of_global_names_only() -> None:
     ]
 
 
-def test_who_watches_is_told_of_what_is_new_and_of_what_is_gone() -> None:
+def test_a_watcher_is_informed_of_new_and_of_removed_routes() -> None:
     at_rib = rib()
     assert answers(ask(at_rib, watch_s=20.0))[0].is_nobody
     found = answers(tell(at_rib, advertisement(), OTHER_SWITCH)) or answers(tell(at_rib, advertisement()))
@@ -414,7 +414,7 @@ def test_who_watches_is_told_of_what_is_new_and_of_what_is_gone() -> None:
     assert (gone.advertiser, gone.advertisement) == (ROBOT.name, b"")
 
 
-def test_who_watches_is_told_when_a_lease_ends() -> None:
+def test_a_watcher_is_informed_when_a_lease_ends() -> None:
     at_rib = rib()
     tell(at_rib, advertisement(lease_s=5.0))
     ask(at_rib, watch_s=20.0)
@@ -422,7 +422,7 @@ def test_who_watches_is_told_when_a_lease_ends() -> None:
     assert [each.advertisement for each in answers(at_rib.statements_to_send())] == [b""]
 
 
-def test_a_watch_that_ended_is_told_nothing() -> None:
+def test_a_watch_that_ended_gets_no_news() -> None:
     at_rib = rib()
     ask(at_rib, watch_s=5.0)
     assert answers(tell(at_rib, advertisement(), now=at(6.0))) == []
@@ -437,7 +437,7 @@ def test_too_many_watches_are_counted_and_answered_all_the_same() -> None:
     assert (at_rib.watching, at_rib.refusals) == (0, {DropReason.QUOTA: 1})
 
 
-def test_a_switch_that_loses_a_name_to_another_is_told() -> None:
+def test_a_switch_that_loses_a_name_to_another_is_informed() -> None:
     at_rib = rib()
     tell(at_rib, advertisement())
     moved = advertisement(rtcert=RtCert.make(ROBOT, OTHER_SWITCH.name, DAY), sequence=2)
@@ -453,7 +453,7 @@ def test_a_switch_that_relays_an_old_advertisement_of_a_node_that_moved_hears_wh
     assert [parse(each.advertisement).fields.uint("seq") for each in answers(letters)] == [2]
 
 
-def test_a_switch_whose_node_is_withdrawn_elsewhere_is_told() -> None:
+def test_a_switch_whose_node_is_withdrawn_elsewhere_is_informed() -> None:
     at_rib = rib()
     tell(at_rib, advertisement())
     letters = tell(at_rib, withdrawal(2), OTHER_SWITCH)
@@ -483,7 +483,7 @@ def test_a_local_name_stays() -> None:
     assert [outgoing.to for outgoing in letters] == [SWITCH.name]
 
 
-def test_a_local_name_is_told_to_the_own_domain_only() -> None:
+def test_a_local_name_is_announced_to_the_own_domain_only() -> None:
     at_rib = rib()
     tell(at_rib, local_advertisement())
     assert [each.is_nobody for each in answers(ask(at_rib))] == [False]
@@ -540,7 +540,7 @@ def test_a_tier_above_that_is_silent_is_asked_again_and_then_answered_for() -> N
     assert at_rib.get_timer() is None
 
 
-def test_a_name_gone_above_is_gone_here_and_watchers_are_told() -> None:
+def test_a_name_gone_upstream_is_gone_here_and_watchers_are_informed() -> None:
     at_rib = rib(UPPER.name)
     ask(at_rib, watch_s=20.0)
     answer_from_above(at_rib, advertisement())
@@ -564,7 +564,7 @@ def test_an_answer_from_no_tier_above_is_refused() -> None:
     assert at_rib.refusals == {DropReason.WRONG_DOMAIN: 1}
 
 
-def test_the_tier_above_cannot_forge_a_advertisement_either() -> None:
+def test_the_tier_above_cannot_forge_an_advertisement_either() -> None:
     at_rib = rib(UPPER.name)
     ask(at_rib)
     assert answer_from_above(at_rib, REFUSED["forged"][0]) == []

@@ -1,4 +1,4 @@
-"""One server or client that misbehaves within its rights: what it may not spoil for the others."""
+"""Server or client that misbehaves within its rights: damage that it must not do to the others."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_one_that_refuses_at_once_does_not_draw_the_requests() -> None:
     begin(dispatch, 1.0)
     assert asked_first(dispatch) == (SLOW,)
     begin(dispatch, 1.0 + 2 * LATELY_S)
-    assert asked_first(dispatch) == (BAD,)  # it may be well by now
+    assert asked_first(dispatch) == (BAD,)  # it may work again by now
 
 
 def test_one_that_rejects_goals_at_once_does_not_draw_them() -> None:
@@ -65,7 +65,7 @@ def test_one_that_says_nothing_does_not_take_the_second_copies_from_one_that_wou
         servers = asked_first(dispatch) or ()
         if at_s % 4 != 3:
             server, took_s = FAST, 0.01
-        elif SLOW in servers:  # for the fast one is stuck
+        elif SLOW in servers:  # because the fast one is stuck
             server, took_s, saved = SLOW, 0.1, saved + 1
         else:
             server, took_s = FAST, 0.3
@@ -75,7 +75,7 @@ def test_one_that_says_nothing_does_not_take_the_second_copies_from_one_that_wou
     assert saved >= 8  # of ten
 
 
-def test_late_calls_without_a_budget_wake_nobody_again_and_again() -> None:
+def test_late_calls_without_a_budget_cause_no_repeated_wakeups() -> None:
     dispatch = dispatch_to(POOR, FAST, SLOW)
     for _ in range(100):
         begin(dispatch, 0.0, None)
@@ -121,7 +121,7 @@ def test_a_client_with_many_requests_waits_its_turn() -> None:
     assert set(clients) == {GREEDY, MODEST}
 
 
-def test_a_client_leaves_room_for_the_next_in_number_and_in_bytes() -> None:
+def test_a_client_leaves_capacity_for_the_next_in_number_and_in_bytes() -> None:
     for serving in (Serving[bytes](0, 1, limit=8), Serving[bytes](0, 1, waiting_max_bytes=80)):
         for call in range(4):
             serving.begin(0.0, None, Asked(GREEDY, 0, call), bytes(10))
@@ -130,7 +130,7 @@ def test_a_client_leaves_room_for_the_next_in_number_and_in_bytes() -> None:
         serving.begin(0.0, None, Asked(MODEST, 0, 0), bytes(10))
 
 
-def test_room_is_there_again_when_all_has_ended_however_it_ended() -> None:
+def test_capacity_is_free_again_after_any_kind_of_end() -> None:
     serving: Serving[bytes] = Serving(0, 1, limit=8)
     for at_s in range(50):
         for call in range(4):
@@ -152,7 +152,7 @@ def test_words_of_one_client_do_not_push_out_what_another_was_answered() -> None
     assert serving.answer_of(Asked(GREEDY, 0, 0)) is None
 
 
-def test_a_replica_that_advertisements_more_than_the_log_has_does_not_break_it() -> None:
+def test_a_replica_that_reports_more_than_the_log_has_does_not_break_it() -> None:
     sequencer = Sequencer[str](life=lambda: 7)
     sequencer.came(BAD, 0.0)
     sequencer.positioned(BAD, ReplicaStatus(tells=True), 0.1)
@@ -178,7 +178,7 @@ def test_a_request_whose_call_has_ended_is_not_sent() -> None:
     assert dispatch.poll_effects() == []
 
 
-def test_a_request_for_which_there_is_no_room_is_not_even_written() -> None:
+def test_a_request_beyond_the_capacity_is_not_even_written() -> None:
     written: list[int] = []
 
     def write(call: int) -> bytes:
@@ -197,7 +197,7 @@ def test_a_request_for_which_there_is_no_room_is_not_even_written() -> None:
     assert written == []
 
 
-def test_a_replica_cannot_advertisement_a_log_after_which_there_is_none() -> None:
+def test_a_replica_cannot_report_a_log_after_which_there_is_none() -> None:
     sequencer = Sequencer[str](life=lambda: 7)
     sequencer.came(BAD, 0.0)
     sequencer.positioned(BAD, ReplicaStatus(LogId((1 << 64) - 1, 5), 3, 3), 0.1)

@@ -1,4 +1,4 @@
-"""Calls under way: each ends exactly once, whatever happens in which order."""
+"""Calls in flight: each ends exactly once, with any events in any order."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gdp.errors import LocalError
 from gdp.service.calls import Calls
 
 
-def test_the_first_answer_wins_and_a_later_one_finds_nobody() -> None:
+def test_the_first_response_wins_and_a_later_one_finds_no_call() -> None:
     calls: Calls[str] = Calls(4, 7)
     number = calls.add_call(0.0, 5.0, "first")
     assert [calls.get(number), calls.end(number), calls.end(number)] == ["first", "first", None]

@@ -1,4 +1,4 @@
-"""Requests to several servers: one callback for each call, whatever happens in which order."""
+"""Requests to several servers: one callback for each call, with any events in any order."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ HEDGED = Replication(Mode.HEDGED, budget=1.0)
 
 @dataclass(slots=True)
 class Bench:
-    """A dispatch with servers, and what came of its calls."""
+    """Dispatch with servers, and the results of its calls."""
 
     replication: Replication = ALL
     servers: tuple[Name, ...] = (A, B, C)
@@ -66,7 +66,7 @@ def test_an_answer_of_one_that_was_not_asked_is_not_taken() -> None:
     assert (bench.ends[call], bench.dispatch.strange) == ([], 2)
 
 
-def test_those_that_owe_an_answer_are_told_in_one_word_a_little_later() -> None:
+def test_servers_that_owe_a_response_get_one_batched_message_a_little_later() -> None:
     bench = Bench()
     first, second, third = (bench.begin() for _ in range(3))
     for call in (first, second, third):
@@ -80,7 +80,7 @@ def test_those_that_owe_an_answer_are_told_in_one_word_a_little_later() -> None:
     assert bench.stops(9.0) == []
 
 
-def test_with_some_each_is_told_privately_what_it_owes() -> None:
+def test_with_some_each_gets_a_private_message_of_what_it_owes() -> None:
     bench = Bench(SOME)
     call = bench.begin()
     bench.dispatch.answered(call, A, "a", 0.1)
@@ -127,7 +127,7 @@ def test_one_that_refuses_or_goes_is_replaced_at_once() -> None:
 def test_a_call_fails_when_all_refused_or_went(replication: Replication) -> None:
     bench = Bench(replication)
     refused, left = bench.begin(), bench.begin()
-    for server in (A, B, C) * 3:  # those that were not asked yet are not heard
+    for server in (A, B, C) * 3:  # responses of servers without a request are ignored
         bench.dispatch.refused(refused, server, "busy", 0.1)
     for server in (A, B, C):
         bench.dispatch.gone(server, 0.2, "gone")
@@ -136,7 +136,7 @@ def test_a_call_fails_when_all_refused_or_went(replication: Replication) -> None
         bench.begin()
 
 
-def test_an_answer_that_says_no_counts_if_nobody_says_yes() -> None:
+def test_a_negative_response_counts_if_no_server_sends_a_positive_one() -> None:
     bench = Bench(servers=(A, B))
     rejected, accepted, late = bench.begin(), bench.begin(), bench.begin()
     for call in (rejected, accepted, late):
@@ -303,7 +303,7 @@ def test_each_call_ends_exactly_once(replication: Replication, steps: list[tuple
 
 
 def _one(bench: Bench) -> tuple[Name, str]:
-    """Return whom the last call asked, and an answer."""
+    """Return the servers of the last call, and a response."""
     whom = bench.asked()[-1]
     assert whom is not None
     return whom[0], "quick"

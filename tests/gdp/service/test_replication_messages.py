@@ -1,4 +1,4 @@
-"""A service that keeps state, its replicas and its keepers on a network that delays: all that live agree at the end."""
+"""Service with state, its replicas and sequencers on a network that delays: all live replicas agree at the end."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SERVERS = tuple(Name(bytes([number]) * 32) for number in (11, 12, 13))
 
 @dataclass(slots=True)
 class Replica:
-    """A server that notes what it was given, and the proxy that follows for it."""
+    """Server that records its requests, and the proxy that follows for it."""
 
     tells: bool
     done: list[bytes] = field(default_factory=list)
@@ -38,7 +38,7 @@ class Replica:
 
 @dataclass(slots=True)
 class Client:
-    """A client's proxy, and what came of its calls."""
+    """Client's proxy, and the results of its calls."""
 
     sequencer: Sequencer[bytes]
     answered: list[bytes] = field(default_factory=list)
@@ -46,7 +46,7 @@ class Client:
 
 
 class World:
-    """Keepers, replicas and what is on its way between them: in order from one to another, each way on its own."""
+    """Sequencers, replicas and their messages in flight: in order between each pair, each direction independent."""
 
     def __init__(self, seed: int, *, tells: bool, replicas: int = 3) -> None:
         self.dice = random.Random(seed)
@@ -71,7 +71,7 @@ class World:
             sequencer.came(server, self.now_s)
 
     def start(self, server: Name, *, keeps_state: bool = False) -> None:
-        """Start a replica, or only its proxy anew."""
+        """Start a replica, or restart only its proxy."""
         before = self.replicas.get(server)
         self.stop(server)
         self.replicas[server] = Replica(self.tells, before.done if before is not None and keeps_state else [])
@@ -95,7 +95,7 @@ class World:
         self.ways = {way: sent for way, sent in self.ways.items() if name not in way[:2]}
 
     def ask(self, name: Name = KEEPERS[0]) -> str:
-        """Let a client ask; return why it was refused at once, if it was."""
+        """Let a client call; return the reason if it was refused at once."""
         client, text = self.clients[name], b"%d" % self.asked
         self.asked += 1
         try:
@@ -111,7 +111,7 @@ class World:
         return ""
 
     def step(self, loss: float = 0.0) -> None:
-        """Let one thing happen, and a little time pass."""
+        """Process one event, and advance time a little."""
         self.now_s += self.dice.uniform(0, 0.02)
         for name, client in self.clients.items():
             client.sequencer.handle_timer(self.now_s)
@@ -186,7 +186,7 @@ class World:
             self.step(loss)
 
     def settle(self) -> None:
-        """Let everything come to rest."""
+        """Process all pending events."""
         for _ in range(60):
             self.run(100)
             states = [replica.done for replica in self.replicas.values()]
@@ -195,7 +195,7 @@ class World:
                 return
 
     def agreed(self) -> list[bytes]:
-        """Return what all replicas have done."""
+        """Return the executed requests of all replicas."""
         first, *others = [replica.done for replica in self.replicas.values()]
         assert all(other == first for other in others), [first, *others]
         assert len(set(first)) == len(first)
@@ -261,7 +261,7 @@ def test_a_sequencer_that_restarts_goes_on_from_the_replica_that_is_furthest(see
     assert world.agreed()[-1] == b"%d" % (world.asked - 1)
 
 
-def test_a_second_client_is_told_who_keeps_the_order_until_that_one_is_gone() -> None:
+def test_a_second_client_learns_the_sequencer_until_that_one_is_gone() -> None:
     world = World(1, tells=True)
     assert world.ask() == ""
     world.settle()
@@ -317,7 +317,7 @@ def test_without_states_a_replica_that_is_unlike_the_others_stays_out() -> None:
     world = World(1, tells=False, replicas=2)
     world.ask()
     world.settle()
-    world.open(KEEPERS[0])  # what it had kept is forgotten
+    world.open(KEEPERS[0])  # its log is lost
     world.run(1000)
     world.ask()
     world.settle()
@@ -338,7 +338,7 @@ def test_a_calls_time_runs_out_though_its_entry_stays() -> None:
     assert world.agreed() == [b"0"]
 
 
-def test_words_that_are_nobodys_change_nothing() -> None:
+def test_unexpected_messages_of_replicas_change_nothing() -> None:
     world = World(1, tells=True, replicas=1)
     world.settle()
     sequencer = world.clients[KEEPERS[0]].sequencer

@@ -1,4 +1,4 @@
-"""Requests at the server's side: each is given to the local server once, in order, and never after it was stopped."""
+"""Requests at the server's side: each reaches the local server once, in order, and never after it was cancelled."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def test_what_waits_for_another_is_given_when_that_has_ended_however_it_ends() -
         assert given(serving) == ["result"]
 
 
-def test_all_fail_but_those_that_nobody_waits_for() -> None:
+def test_all_fail_except_those_without_a_waiting_client() -> None:
     serving: Serving[str] = Serving(7, at_once=1)
     begun(serving, 1, 2)
     serving.poll_turns()

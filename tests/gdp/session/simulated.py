@@ -1,4 +1,4 @@
-"""Sessions over the in-memory network, whose clock jumps from event to event."""
+"""Sessions over the simulated network, whose clock jumps from event to event."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Rights = Mapping[str, Mapping[str, Collection[Right]]]  # by node and name
 
 
 class _Node:
-    """A node without a device."""
+    """Node without a device."""
 
     def __init__(self, core: SessionCore) -> None:
         self.core = core
@@ -69,7 +69,7 @@ class _Driver:
 
 
 class Simulated:
-    """A switch, a RIB, and a session for each node."""
+    """Switch, a RIB, and a session for each node."""
 
     def __init__(self, rights: Rights) -> None:
         attachments = (Attachment("s", "rib", "rib0"), *(Attachment("s", "proxy", label) for label in rights))
@@ -90,12 +90,12 @@ class Simulated:
         return self.world.network.now.mono_s
 
     def send(self, label: str) -> None:
-        """Carry away what a session has to send."""
+        """Send the pending frames of a session."""
         self.cores[label].member.flush(self.now_s)
         self.world.network.touch(f"s/{label}")
 
     def run(self, duration_s: float, is_ready: Callable[[], bool] = lambda: False) -> bool:
-        """Let time go on; return whether ``is_ready`` came true."""
+        """Advance time; return whether ``is_ready`` came true."""
 
         def handle() -> bool:
             for label, core in self.cores.items():

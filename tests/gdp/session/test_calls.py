@@ -1,3 +1,5 @@
+"""Calls of the session API: servers, replicas and refusals."""
+
 from __future__ import annotations
 
 import pytest
@@ -32,7 +34,7 @@ def begin(net: Simulated, timeout_s: float | None = 5.0, replication: str | int 
 
 
 def respond(net: Simulated, server: ServerCore, label: str, outcome: bytes | str) -> None:
-    """Let the server finish the request that it has."""
+    """Let the server finish its present request."""
     assert net.run(5.0, lambda: bool(server.turns)), "no request came"
     server.finish(server.turns.popleft().number, outcome)
     net.send(label)

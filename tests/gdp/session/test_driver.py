@@ -1,4 +1,4 @@
-"""The driver for threads over a runtime whose frames are pushed by the test."""
+"""Driver for threads over a runtime whose frames the test pushes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PATIENCE_S = 20.0
 
 
 class Stub:
-    """A core, its member, its publisher and its runtime in one: what is pushed arrives, what is published is noted."""
+    """Core, member, publisher and runtime in one: pushed values arrive, published values are recorded."""
 
     has_services = False
 
@@ -108,7 +108,7 @@ def take(driver: ThreadDriver, stub: Stub, queue: int) -> int:
 
 
 def in_threads(count: int, work: Callable[[int], object]) -> None:
-    """Run ``work`` in so many threads; their errors fail the test."""
+    """Run ``work`` in this many threads; their errors fail the test."""
     errors: list[BaseException] = []
 
     def guarded(number: int) -> None:
@@ -166,7 +166,7 @@ def test_a_message_is_published_while_another_thread_waits(stub: Stub, driver: T
 
 
 def taken_in(stub: Stub) -> threading.Event:
-    """Return what is set when a thread takes in what is pushed."""
+    """Return an event that is set when a thread receives a pushed value."""
     took, queue = threading.Event(), stub.queue
 
     def noted(number: int) -> deque[int]:

@@ -1,3 +1,5 @@
+"""Session API over the simulated network: publish, subscribe and close."""
+
 from __future__ import annotations
 
 import pytest
@@ -96,7 +98,7 @@ def test_a_flushed_message_is_confirmed(pair: Simulated) -> None:
     assert publisher.confirmed == 1
 
 
-def test_a_message_for_nobody_is_counted_as_lost(pair: Simulated) -> None:
+def test_a_message_without_a_reader_is_counted_as_lost(pair: Simulated) -> None:
     publisher = pair.sessions["robot"].publisher("camera")
     publisher.put(b"x")
     assert publisher.lost == 1

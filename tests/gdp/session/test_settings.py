@@ -1,3 +1,5 @@
+"""Settings of a session from a node's directory or a configuration file."""
+
 from __future__ import annotations
 
 from pathlib import Path
@@ -33,13 +35,13 @@ def test_a_directory_alone_says_all_that_a_session_needs(node: Path) -> None:
     assert settings.delegation_directory == node / "delegations"
 
 
-def test_a_configuration_beside_the_directory_goes_before_its_defaults(node: Path) -> None:
+def test_a_configuration_next_to_the_directory_goes_before_its_defaults(node: Path) -> None:
     write(node, PROXY)
     settings = settings_of(node)
     assert (settings.iface, settings.lease_s, settings.delegation_directory) == ("eth7", 5.0, node)
 
 
-def test_a_configuration_of_another_node_beside_the_directory_is_not_used(node: Path, tmp_path: Path) -> None:
+def test_a_configuration_of_another_node_next_to_the_directory_is_not_used(node: Path, tmp_path: Path) -> None:
     make_node(tmp_path / "robot" / "other", Role.PROXY, "other", tmp_path / "lab")
     write(node, PROXY.replace("identity: proxy", "identity: other"))
     assert settings_of(node).iface == "proxy0"

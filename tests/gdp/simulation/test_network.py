@@ -1,4 +1,4 @@
-"""The network in memory: delay, loss, order and links as said, and a clock that only machines hold up."""
+"""Simulated network: delay, loss, order and links as configured, and a clock that only machines hold back."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from gdp.simulation.network import SimLink, SimNetwork
 
 
 class Talker:
-    """Sends what it is told to, and notes what comes."""
+    """Machine that sends frames on command and records those it receives."""
 
     def __init__(self, network: SimNetwork) -> None:
         self.network = network
         self.out: list[OutgoingFrames] = []
         self.got: list[tuple[float, bytes]] = []
         self.links: list[bool] = []
-        self.facts: list[tuple[int, int]] = []  # MTU and cost of its port, as told
+        self.facts: list[tuple[int, int]] = []  # MTU and cost of its port, as reported
         self.due_s: float | None = None
         self.called_s: list[float] = []
 
@@ -48,7 +48,7 @@ class Talker:
 
 
 class Spinner(Talker):
-    """A machine whose timer is due for ever."""
+    """Machine whose timer is always due."""
 
     def handle_timer(self, now: Timestamps) -> None:
         self.due_s = now.mono_s - 1
@@ -139,7 +139,7 @@ def test_a_sim_link_that_changes_tells_both_ends_and_carries_what_it_now_takes()
     assert (len(b.got), network.drops) == (1, {DropReason.TOO_BIG: 1})
 
 
-def test_a_sim_link_that_changes_while_pulled_is_told_of_when_it_is_back() -> None:
+def test_a_sim_link_that_changes_while_pulled_is_reported_when_it_is_back() -> None:
     sim_link = SimLink()
     network, a, _ = two(sim_link)
     network.set_link(sim_link, up=False)
@@ -180,7 +180,7 @@ def test_who_was_killed_neither_hears_nor_is_called() -> None:
     assert (b.got, b.called_s) == ([], [])
 
 
-def test_who_starts_anew_has_its_ports_as_they_are() -> None:
+def test_a_restarted_machine_has_its_ports_as_they_are() -> None:
     sim_link = SimLink()
     network, _, _ = two(sim_link)
     network.set_link(sim_link, up=False)
@@ -197,7 +197,7 @@ def test_time_goes_on_to_the_end_though_nothing_happens() -> None:
     assert network.run(1, lambda: False) is False
 
 
-def test_a_port_that_is_none_is_the_remote_clients_mistake() -> None:
+def test_an_invalid_port_is_the_callers_mistake() -> None:
     network, a, _ = two(SimLink())
     a.out.append(OutgoingFrames(9, BROADCAST, [b"x"]))
     with pytest.raises(LocalError):

@@ -91,6 +91,6 @@ def test_what_does_not_fit_together_is_refused(
         Topology(links, domains, attachments)
 
 
-def test_a_link_that_is_not_there_is_told_with_those_that_are() -> None:
+def test_a_missing_link_is_reported_with_the_existing_ones() -> None:
     with pytest.raises(LocalError, match="no link nuc1-nuc3; there are nuc1-nuc2, nuc2-nuc3"):
         ring5().link("nuc1", "nuc3")

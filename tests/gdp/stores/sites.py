@@ -1,4 +1,4 @@
-"""A domain in the present, for stores whose servers have a clock of their own, and RIBs over each kind of store."""
+"""Domain in the present, for stores whose servers have a clock of their own, and RIBs over each kind of store."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
 from gdp.trust.verifier import AdvertisementVerifier
 
-EVIDENCE_S = 3_600  # for which claims can be proven: the RtCert ends before the memberships
+EVIDENCE_S = 3_600  # for which advertisements can be proven: the RtCert ends before the memberships
 START_CLUSTER = Path(__file__).parents[3] / "scripts" / "start_cluster.sh"
 
 
@@ -92,7 +92,7 @@ class Site:
 
 
 class Pair:
-    """Two RIBs of a domain; ``sync`` lets the second learn what the first took."""
+    """Two RIBs of a domain; ``sync`` lets the second learn the advertisements of the first."""
 
     def __init__(self, site: Site, stores: tuple[Store, Store], peers: tuple[Name, ...] = ()) -> None:
         self.site = site
@@ -103,7 +103,7 @@ class Pair:
         self.sent: list[OutgoingStatement] = []
 
     def give(self, rib: RibCore, wire: bytes, later_s: float = 0.0) -> list[OutgoingStatement]:
-        """Hand a statement of the switch to a RIB; return what goes back to the switch."""
+        """Hand a statement of the switch to a RIB; return the statements back to the switch."""
         rib.receive_all([(wire, self.site.switch.name)], self.site.now(later_s))
         return self.take(rib)
 
@@ -113,7 +113,7 @@ class Pair:
         return [outgoing for outgoing in letters if outgoing.to == self.site.switch.name]
 
     def sync(self, later_s: float = 0.0) -> list[OutgoingStatement]:
-        """Return what the second RIB tells the switch of it."""
+        """Return the second RIB's statements to the switch about it."""
         raise NotImplementedError
 
     def close(self) -> None:
@@ -143,7 +143,7 @@ class MemoryPair(Pair):
 
 
 class SnapshotPair(Pair):
-    """The second RIB reads what the first wrote to disk."""
+    """Second RIB that reads what the first wrote to disk."""
 
     def __init__(self, site: Site, path: Path) -> None:
         self._path = path
@@ -187,7 +187,7 @@ class ClusterPair(Pair):
 
 @contextmanager
 def cluster(folder: Path) -> Iterator[Path]:
-    """Run six servers; yield the file that says how to reach them."""
+    """Run six servers; yield the file with their addresses."""
     started = subprocess.run([START_CLUSTER, folder], capture_output=True, text=True, check=False, timeout=120)
     try:
         assert started.returncode == 0, started.stderr
@@ -203,7 +203,7 @@ def kill_server(folder: Path, port: int) -> None:
 
 @contextmanager
 def frozen_server(folder: Path, port: int) -> Iterator[None]:
-    """Give the server that listens on a port no time meanwhile."""
+    """Stop the server that listens on a port for this time."""
     pid = _pid_of_server(folder, port)
     os.kill(pid, signal.SIGSTOP)
     try:

@@ -1,4 +1,4 @@
-"""The audit log on disk: a change is found at its line, a flood does not fill the disk."""
+"""Audit log on disk: a change is found at its line, a flood does not fill the disk."""
 
 from __future__ import annotations
 

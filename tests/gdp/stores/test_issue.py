@@ -1,4 +1,4 @@
-"""Domains, nodes, owners and delegations on disk, as the command and the testbed make them."""
+"""Domains, nodes, owners and delegations on disk, as made by the command and the simulation."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ PRIVATE = {"root.key", "owner.key", "master.key", "node.key", "kem.key", "issued
 
 @pytest.fixture
 def keys(tmp_path: Path) -> Path:
-    """A domain ``school`` with a proxy ``robot``, and an owner ``lab``."""
+    """Domain ``school`` with a proxy ``robot``, and an owner ``lab``."""
     make_domain(tmp_path / "school", "school", unix_s=NOW)
     make_node(tmp_path / "robot", Role.PROXY, "robot", tmp_path / "school", more={"site": "roof"}, unix_s=NOW)
     make_owner(tmp_path / "lab")
@@ -82,7 +82,7 @@ def test_a_second_call_replaces_nothing(keys: Path) -> None:
     assert {path: path.read_bytes() for path in keys.rglob("*") if path.is_file()} == before
 
 
-def test_a_delegation_leads_to_a_advertisement_that_is_believed(keys: Path) -> None:
+def test_a_delegation_leads_to_an_advertisement_that_is_accepted(keys: Path) -> None:
     given = delegate(keys / "lab", keys / "robot/node.card", CAMERA, [Right.PUBLISH], [0, 1], unix_s=NOW)
     install_delegation(keys / "robot", given, unix_s=NOW)
     (found,) = load_delegations(keys / "robot" / "delegations")
@@ -145,7 +145,7 @@ def test_a_membership_ends_with_the_root_at_the_latest(keys: Path) -> None:
     assert identity.member.not_after_unix_s == identity.root.validity.not_after_unix_s
 
 
-def test_a_root_that_has_run_out_admits_nobody(keys: Path) -> None:
+def test_an_expired_root_admits_no_node(keys: Path) -> None:
     make_domain(keys / "short", "short", days=1, unix_s=NOW)
     with pytest.raises(LocalError, match="run out"):
         make_node(keys / "node", Role.SWITCH, "node", keys / "short", unix_s=NOW + 100_000)

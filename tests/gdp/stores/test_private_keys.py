@@ -1,4 +1,4 @@
-"""Private keys at rest: under a passphrase, opened by whoever has it, and by nobody else."""
+"""Private keys on disk under a passphrase, which only its holder can open."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The file of revocations: what was synced comes back, verified; a broken file, or a folder of others, is no source."""
+"""File of revocations: synced entries come back verified; a broken file, or another user's folder, is no source."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_what_a_killed_node_had_synced_comes_back(tmp_path: Path) -> None:
     revoked.receive_revocation(of_school(1), b"a", AT, lambda _: True)
     upkeep.work(AT)
     upkeep.close()
-    for path in tmp_path.iterdir():  # a copy of what a kill would leave behind
+    for path in tmp_path.iterdir():  # a copy of the state that a kill would leave behind
         (tmp_path / "left").mkdir(exist_ok=True, mode=0o700)
         (tmp_path / "left" / path.name).write_bytes(path.read_bytes()) if path.is_file() else None
     assert len(read(tmp_path / "left")) == 1

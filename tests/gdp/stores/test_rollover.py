@@ -1,4 +1,4 @@
-"""Rollover of a root by commands: each step may be cut off, and nothing but a successor is trusted."""
+"""Rollover of a root by commands: each step may be interrupted, and only a successor is trusted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What holds of every store: in memory and replicated, read back from a snapshot, shared in a cluster."""
+"""Properties of every store: in memory and replicated, read back from a snapshot, shared in a cluster."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ from tests.gdp.stores.sites import (
     verdicts,
 )
 
-FORGOTTEN_S = EVIDENCE_S + int(CLOCK_SKEW_S) + 1  # after this nobody believes the claim any more
+FORGOTTEN_S = EVIDENCE_S + int(CLOCK_SKEW_S) + 1  # after this no node accepts the advertisement any more
 HAS_SERVER = shutil.which("redis-server") or shutil.which("valkey-server")
 
 
@@ -89,7 +89,7 @@ class TestEveryStore:
 
     def test_a_watch_at_one_rib_hears_what_the_other_took(self, pair: Pair) -> None:
         if isinstance(pair, MemoryPair):
-            pair.sync()  # a RIB that has not met its peer denies nothing
+            pair.sync()  # a RIB that has not met its peer sends no negative response
         pair.give(pair.two, pair.site.query("/a", watch_s=20.0))
         pair.give(pair.one, pair.site.relay("/a", 1))
         assert [each.advertisement != b"" for each in answers(pair.sync())] == [True]
@@ -166,7 +166,7 @@ def test_a_snapshot_keeps_no_withdrawal_for_longer_than_the_rib(tmp_path: Path) 
 def test_of_two_writes_at_once_the_newer_wins_and_the_other_is_not_confirmed(servers: Path) -> None:
     pair = ClusterPair(Site(), config_of(servers))
     for rib in (pair.one, pair.two):
-        pair.give(rib, pair.site.query("/a"))  # both believe that there is nobody
+        pair.give(rib, pair.site.query("/a"))  # both agree that no node advertises it
     assert verdicts(pair.give(pair.one, pair.site.relay("/a", 9)))[0].refused is None
     assert verdicts(pair.give(pair.two, pair.site.relay("/a", 8))) == []
     (ack,) = verdicts(pair.give(pair.two, pair.site.relay("/a", 8)))
@@ -189,7 +189,7 @@ def test_a_rib_starts_while_a_primary_is_frozen_and_brings_it_the_functions_late
     while not upkeep.is_complete and time.monotonic() < deadline_s:
         at = Timestamps(at.mono_s + 1.0, at.unix_s + 1.0)
         upkeep.work(at)
-        select.select([], [], [], 0.05)  # the servers agree in their own time who is a primary
+        select.select([], [], [], 0.05)  # the servers agree asynchronously on the primary
     assert (was_complete, upkeep.is_complete) == (False, True)
     upkeep.close()
 
@@ -215,7 +215,7 @@ def test_names_outlive_a_primary(servers: Path) -> None:
     pair.stores[1]._cache.clear()
     deadline_s = time.monotonic() + 60
     while not (found := answers(pair.give(pair.two, pair.site.query("/a")))) and time.monotonic() < deadline_s:
-        time.sleep(0.05)  # the servers promote the replica in their own time
+        time.sleep(0.05)  # the servers promote the replica asynchronously
     assert [each.is_nobody for each in found] == [False]
     while not verdicts(pair.give(pair.one, pair.site.relay("/a", 2))):
         assert time.monotonic() < deadline_s
@@ -282,7 +282,7 @@ def test_what_waits_for_a_full_disk_is_bounded_by_what_is_kept(tmp_path: Path, m
         begin = site.now(100.0 * number)
         site.rtcert = RtCert.make(site.robot, site.switch.name, Validity.lasting(begin.unix_s, 50))
         rib.receive(site.relay(f"/{number}", 1, lease_s=5.0), site.switch.name, begin)
-        for later_s in (10.0, 60.0):  # the lease ends, then what is remembered of it
+        for later_s in (10.0, 60.0):  # the lease ends, then the memory of it
             rib.handle_timer(site.now(100.0 * number + later_s))
         upkeep.work(site.now(100.0 * number + 60.0))
         waiting = upkeep._memory.changes

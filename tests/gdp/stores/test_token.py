@@ -1,4 +1,4 @@
-"""Keys in tokens: a domain and its nodes sign by a PKCS #11 library, and nobody else can tell."""
+"""Keys in tokens: a domain and its nodes sign by a PKCS #11 library, and verifiers see no difference."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_the_pin_may_lie_in_a_private_file(token: SoftToken, tmp_path: Path, mon
     assert opened.public == made.public
 
 
-def test_no_key_a_wrong_token_and_a_second_key_are_told(token: SoftToken) -> None:
+def test_no_key_a_wrong_token_and_a_second_key_are_reported(token: SoftToken) -> None:
     key(token, "node")
     with pytest.raises(LocalError, match="0 private keys"):
         open_token_key(token.uri("other"), Path("node.key"))
@@ -93,7 +93,7 @@ def test_no_key_a_wrong_token_and_a_second_key_are_told(token: SoftToken) -> Non
         key(token, "node")
 
 
-def test_a_wrong_pin_is_told(token: SoftToken, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wrong_pin_is_reported(token: SoftToken, monkeypatch: pytest.MonkeyPatch) -> None:
     key(token, "node")
     token.forget()
     monkeypatch.setenv("GDP_PASSPHRASE", "0000")
@@ -131,7 +131,7 @@ def test_an_address_is_read_with_its_escapes() -> None:
     assert (uri.token, uri.label, uri.key_id, uri.pin_file) == ("my token", "a;b", b"\x01\xff", Path("/p"))
 
 
-def test_a_library_that_is_none_is_told(tmp_path: Path) -> None:
+def test_an_invalid_library_is_reported(tmp_path: Path) -> None:
     pytest.importorskip("pkcs11", reason="python-pkcs11 is not installed")
     write_all(tmp_path / "pin", {"pin": private(b"1234")})
     with pytest.raises(LocalError, match="no library"):

@@ -1,4 +1,4 @@
-"""A token of SoftHSM for one test: its folder, its configuration, its address."""
+"""SoftHSM token for one test: its folder, its configuration, its address."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WHY_NOT = "a token of SoftHSM needs the package softhsm2 and the extra pkcs11"
 
 @dataclass(frozen=True)
 class SoftToken:
-    """An initialised token named ``test``."""
+    """Initialised token named ``test``."""
 
     module: Path
     configuration: Path
@@ -27,7 +27,7 @@ class SoftToken:
         return f"pkcs11:token=test;object={label}?module-path={self.module}"
 
     def forget(self) -> None:
-        """End what this process has open, so that the next opening logs in."""
+        """Close this process's sessions, so that the next opening logs in."""
         import pkcs11
 
         pkcs11.unload(str(self.module))

@@ -9,7 +9,7 @@ from gdp.switch.paths import Paths
 
 
 def name(label: str) -> Name:
-    """Return a name that a test can read."""
+    """Return a name that people can read."""
     return Name(label.encode().ljust(32, b"-"))
 
 
@@ -39,7 +39,7 @@ def state(
 
 
 def known(*states: LinkState) -> LinkStateDatabase:
-    """Return what a switch of HOME knows."""
+    """Return the database of a switch of HOME."""
     link_states = LinkStateDatabase(HOME)
     for each in states:
         link_states.put(each, b"wire of " + each.origin, 0.0)

@@ -1,4 +1,4 @@
-"""Link states between switches: they reach who should have them and nobody else."""
+"""Flooding of link states between switches: each reaches its intended switches and no others."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.journeys.flows import ring
 
 
 def say(world: Simulation, state: LinkState, by: str, to: str, port: int = 0) -> None:
-    """Let a neighbour of ``to`` pass on a link state that ``by`` signed."""
+    """Let a neighbour of ``to`` forward a link state that ``by`` signed."""
     identity = world.identities[by]
     state = replace(state, said_unix_s=int(world.network.now.unix_s))
     wire = state.to_wire(identity.key, identity.membership)

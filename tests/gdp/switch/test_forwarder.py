@@ -1,3 +1,5 @@
+"""Forwarding decisions of ``decide`` on the fixtures and on arbitrary bytes."""
+
 from __future__ import annotations
 
 import pytest
@@ -10,7 +12,7 @@ from tests.fixtures_forwarding import CASES, ENTRIES, MTUS, ONE, TO_WIDE, Case, 
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_each_fixture_gets_its_ack(case: Case) -> None:
+def test_each_fixture_gets_its_decision(case: Case) -> None:
     ack = decide(case.frame, ENTRIES, MTUS)
     assert isinstance(ack, Punt) == case.punted
     if isinstance(ack, Drop):
@@ -27,7 +29,7 @@ def test_another_ethertype_is_dropped() -> None:
 
 
 @given(st.binary(max_size=300))
-def test_arbitrary_bytes_get_a_ack(data: bytes) -> None:
+def test_arbitrary_bytes_get_a_decision(data: bytes) -> None:
     assert isinstance(decide(data, ENTRIES, MTUS), Drop | Punt | Forward)
 
 

@@ -1,4 +1,4 @@
-"""The link-state database: the newest counts, what is not renewed goes, a domain's inside stays inside."""
+"""Link-state database: the newest counts, unrenewed ones expire, a domain's inside stays inside."""
 
 from __future__ import annotations
 

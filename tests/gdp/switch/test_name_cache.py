@@ -1,4 +1,4 @@
-"""Cache of locations: entries live for a lease, negative entries for a moment."""
+"""Name cache of locations: entries last for a lease, negative entries for a moment."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ def test_two_advertisers_of_one_name_are_both_known() -> None:
     assert [each.advertiser for each in places.of(TOPIC, 0.0)] == [name("two")]
 
 
-def test_nobody_is_believed_for_a_moment() -> None:
+def test_a_negative_entry_lasts_for_a_moment() -> None:
     places = NameCache()
     places.put_negative(TOPIC, 0.0)
     assert places.is_negative(TOPIC, NEGATIVE_LEASE_S - 0.1)
     assert not places.is_negative(TOPIC, NEGATIVE_LEASE_S)
 
 
-def test_somebody_ends_nobody() -> None:
+def test_a_location_ends_a_negative_entry() -> None:
     places = NameCache()
     places.put_negative(TOPIC, 0.0)
     places.put(place())

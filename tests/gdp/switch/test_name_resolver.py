@@ -1,4 +1,4 @@
-"""Name resolution at a switch: one miss from the query to the frame, and everything that can end it."""
+"""Name resolution at a switch: one miss from the query to the frame, and every event that can end it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Shortest paths: over links that both ends name, through domains that are allowed."""
+"""Shortest paths: over links that both ends advertise, through permitted domains."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_each_direction_has_its_own_cost() -> None:
 
 
 def three_domains() -> Paths:
-    """Return a's paths: a to the border x of AWAY, dear; or over the border t of THIRD, cheap."""
+    """Return a's paths: a to the border x of AWAY at a high cost, or over the border t of THIRD at a low cost."""
     border = Scope.BORDER
     return paths(
         "a",
@@ -70,7 +70,7 @@ def test_a_rib_at_ones_own_switch_needs_no_way() -> None:
     assert set(found.ribs()) == {name("rib")}
 
 
-def test_a_rib_that_nobody_names_is_nowhere() -> None:
+def test_an_unnamed_rib_has_no_path() -> None:
     assert three_domains().to_rib(name("no rib"), ALL) == (None, None)
 
 
@@ -119,7 +119,7 @@ def test_paths_follow_the_link_states() -> None:
 
 
 def parted_home() -> Paths:
-    """Return a's paths, whose domain is parted: d and its inner e are reached over x of AWAY only."""
+    """Return a's paths, whose domain is partitioned: d and its inner e are reached over x of AWAY only."""
     border = Scope.BORDER
     return paths(
         "a",

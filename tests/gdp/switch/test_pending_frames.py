@@ -1,4 +1,4 @@
-"""Parked frames: in order, bounded in number, bytes and time, and counted when dropped."""
+"""Pending frames: in order, bounded in number, bytes and time, and counted when dropped."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_more_frames_than_fit_are_counted() -> None:
     assert pending.drops[DropReason.PENDING_FULL] == 3
 
 
-def test_more_bytes_than_fit_are_counted_and_room_comes_back() -> None:
+def test_more_bytes_than_fit_are_counted_and_space_comes_back() -> None:
     pending = PendingFrames()
     quarter = bytes(PENDING_BYTES_MAX // 4)
     for _ in range(3):

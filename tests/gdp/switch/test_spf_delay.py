@@ -24,7 +24,7 @@ LINK = (1, Name(b"n" * 32))
 
 
 def delay_after(spf: SpfDelay, now_s: float) -> float:
-    """Return how long after news paths are computed, and compute them."""
+    """Return the delay from news to path computation, and compute the paths."""
     spf.news(now_s)
     assert spf.due_s is not None
     delay_s = spf.due_s - now_s

@@ -1,3 +1,5 @@
+"""Forwarding table: leases, observers, and bounds."""
+
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -120,7 +122,7 @@ def test_what_was_taken_back_leaves_no_lasting_trace(changes: list[tuple[bool, f
 
 
 class Copy:
-    """An observer that keeps a copy, and refuses news that is none."""
+    """Observer that keeps a copy, and refuses changes that change nothing."""
 
     def __init__(self) -> None:
         self.entries: dict[bytes, Hops] = {}
@@ -168,7 +170,7 @@ def test_a_wrong_one_among_many_leaves_those_before_it() -> None:
 
 
 class TableAgainstPlainDict(RuleBasedStateMachine):
-    """The table does what a dictionary with a scan would."""
+    """Compare the table with a dictionary and a scan."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Trees: a copy for each branch, soft state that ends by itself."""
+"""Multicast trees: a copy for each branch, soft state that expires by itself."""
 
 from __future__ import annotations
 

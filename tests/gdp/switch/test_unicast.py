@@ -1,4 +1,4 @@
-"""Ways to one name, in a running network: found when asked for, negative when there is none, never in a tree's way."""
+"""Unicast routes in a running network: resolved on demand, negative if there is none, never in a tree's way."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def send(world: Simulation, destination: Name, source: str = ROBOT, kind: int = 
     world.network.touch(source)
 
 
-def test_a_name_that_nobody_has_is_answered_and_then_dropped_by_the_data_plane() -> None:
+def test_an_unadvertised_name_is_answered_and_then_dropped_by_the_data_plane() -> None:
     world = ring()
     robot, nuc1 = world.members[ROBOT].name, world.switches["nuc1"]
     send(world, ABSENT)

@@ -1,3 +1,5 @@
+"""Metrics of nodes: names, labels and scrapes."""
+
 from __future__ import annotations
 
 import socket
@@ -80,7 +82,7 @@ def test_a_histogram_counts_a_duration_in_every_bucket_from_its_own_on() -> None
     assert "gdp_latency_seconds_sum 9.3" in text
 
 
-def test_each_scrape_asks_anew() -> None:
+def test_each_scrape_reads_fresh_values() -> None:
     counts = {"in": 1}
     metrics = Metrics(Sources(frames=lambda: counts))
     before = metrics.text()
@@ -127,7 +129,7 @@ def test_serving_twice_is_our_own_fault(metrics: Metrics) -> None:
         metrics.serve(0)
 
 
-def test_entries_are_told_by_short_names_and_those_that_look_alike_together() -> None:
+def test_entries_are_reported_by_short_names_and_those_that_look_alike_together() -> None:
     one, other = bytes(range(32)), bytes(range(16)) + b"x" * 14 + bytes([30, 31])
     assert Name(one).short == Name(other).short
     text = Metrics(Sources(entries=lambda: {one: (3, 300), other: (1, 50), one + other: (2, 200)})).text()

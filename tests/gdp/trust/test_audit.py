@@ -1,4 +1,4 @@
-"""The audit trail: chained, and a flood is one line and a count."""
+"""Audit trail: chained, and a flood is one line and a count."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_lines_are_numbered_and_each_holds_the_hash_of_the_one_before() -> None:
     assert not taken(of, 0.0, [one, two])
 
 
-def test_a_trail_that_nobody_takes_keeps_nothing() -> None:
+def test_an_unread_trail_keeps_nothing() -> None:
     of = AuditTrail()
     of.note(Action.ACCEPTED, "name")
     assert not of.is_due(1e9)

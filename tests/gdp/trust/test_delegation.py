@@ -1,4 +1,4 @@
-"""Delegations: what an owner gives to a node, as one file."""
+"""Delegations: an owner's permission for a node, as one file."""
 
 from __future__ import annotations
 

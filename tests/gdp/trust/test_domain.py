@@ -1,4 +1,4 @@
-"""A domain's policy."""
+"""Policy of a domain."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_a_domain_trusts_itself_and_those_it_names() -> None:
     assert not Policy(CLOUD.root).trusts(SCHOOL.root.domain)
 
 
-def test_traffic_passes_all_trusted_domains_unless_told_otherwise() -> None:
+def test_traffic_passes_all_trusted_domains_by_default() -> None:
     both = {SCHOOL.root.domain, CLOUD.root.domain}
     assert Policy(SCHOOL.root, [CLOUD.root]).transit == both
     assert Policy(SCHOOL.root, [CLOUD.root], []).transit == {SCHOOL.root.domain}
@@ -81,7 +81,7 @@ def test_a_foreign_member_is_refused() -> None:
     assert refusal(Policy(SCHOOL.root), STRANGER.membership) is DropReason.WRONG_DOMAIN
 
 
-def test_domains_of_the_same_label_are_told_apart() -> None:
+def test_domains_of_the_same_label_are_distinguished() -> None:
     converter = CertificateAuthority.create("school", SigningKey.generate(), DAY)
     node = NodeKeys.generate(Role.RIB, "rib").join(converter, DAY)
     policy = Policy(SCHOOL.root, [converter.root])

@@ -1,4 +1,4 @@
-"""The bounded memory of what was found good."""
+"""Bounded cache of positive verification results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cards: what a node shows to owners."""
+"""Node descriptors: the public identity that a node shows to owners."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Revocations: who may, whose are kept, how long, and that one giver's cannot crowd out another's or the roots'."""
+"""Revocations: permitted issuers, storage, retention, and quotas that separate origins and roots."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_an_owner_takes_back_only_what_is_its_own() -> None:
 
 
 @pytest.mark.parametrize("make", [by_lab, by_root])
-def test_what_is_new_is_told_from_what_is_known(make: object) -> None:
+def test_new_revocations_are_distinguished_from_known_ones(make: object) -> None:
     revoked, statement = Revocations(ROOTS), make(1)  # type: ignore[operator]
     assert take(revoked, statement) is not None
     assert take(revoked, statement) is None
@@ -136,7 +136,7 @@ def test_whose_certificates_are_not_held_is_refused_before_its_signature_is_look
     assert len(revoked) == 0
 
 
-def test_what_the_operator_hands_in_is_kept_whoever_issued_it() -> None:
+def test_a_revocation_of_the_operator_is_kept_for_any_issuer() -> None:
     revoked = Revocations(ROOTS, per_issuer=2, per_origin=2, of_owners=2)
     for number in range(5):
         assert revoked.receive_revocation(by_lab(number), OPERATOR, AT, lambda _: False) is not None
@@ -144,7 +144,7 @@ def test_what_the_operator_hands_in_is_kept_whoever_issued_it() -> None:
     assert all(has(revoked, number) for number in range(5))
 
 
-def test_a_known_one_that_the_operator_hands_in_never_gives_way() -> None:
+def test_a_known_one_that_the_operator_inserts_never_gives_way() -> None:
     revoked = Revocations(ROOTS, of_owners=3)
     for number in range(3):
         take(revoked, by_lab(number))
@@ -166,7 +166,7 @@ def test_who_gives_too_many_gives_up_its_own_only() -> None:
     take(revoked, by_other(0), b"b")
     for number in range(3):
         take(revoked, by_lab(number), b"a")
-    assert refusal(revoked, by_lab(3), b"a") is DropReason.QUOTA  # its own owner has most of it already
+    assert refusal(revoked, by_lab(3), b"a") is DropReason.QUOTA  # its own owner has most of its quota already
     assert take(revoked, by_other(1), b"b") is not None
     assert [has(revoked, number) for number in range(3)] == [False, True, True]
     assert refusal(revoked, by_other(2), b"b") is DropReason.QUOTA
@@ -182,7 +182,7 @@ def test_within_a_givers_share_the_owner_that_has_most_gives_way() -> None:
     assert refusal(revoked, by_lab(3)) is DropReason.QUOTA
 
 
-def test_roots_have_room_that_nobody_else_can_fill() -> None:
+def test_roots_have_capacity_that_no_other_key_can_fill() -> None:
     revoked = Revocations(ROOTS, of_owners=2)
     for number in range(2):
         take(revoked, by_lab(number), b"ab"[number : number + 1])
@@ -190,7 +190,7 @@ def test_roots_have_room_that_nobody_else_can_fill() -> None:
     assert refusal(revoked, by_other(3), b"c") is DropReason.QUOTA
 
 
-def test_a_origin_has_a_rate_and_another_one_is_not_held_up() -> None:
+def test_an_origin_has_a_rate_and_another_one_is_not_delayed() -> None:
     revoked = Revocations(ROOTS, per_issuer=10_000)
     reasons = set()
     for number in range(600):
@@ -204,7 +204,7 @@ def test_a_origin_has_a_rate_and_another_one_is_not_held_up() -> None:
     assert take(revoked, by_root(1), b"a") is not None
 
 
-def test_forged_ones_use_up_the_rate_of_who_hands_them_in() -> None:
+def test_forged_ones_use_up_the_rate_of_their_origin() -> None:
     revoked = Revocations(ROOTS)
     verified = 0
     for number in range(200):

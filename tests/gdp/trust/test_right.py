@@ -23,6 +23,6 @@ def test_rights_that_cannot_be_delegated_are_malformed(wire: list[Value]) -> Non
 
 
 @pytest.mark.parametrize("rights", [set(), {Right.ATTACH}])
-def test_nobody_gives_none_or_its_own_place_away(rights: set[Right]) -> None:
+def test_no_node_delegates_an_empty_right_or_its_own_location(rights: set[Right]) -> None:
     with pytest.raises(LocalError):
         rights_to_wire(rights)

@@ -102,7 +102,7 @@ def take_back(policy: Policy, key: SigningKey, signer: Subject, fingerprint: byt
 
 
 def test_a_member_names_no_founder() -> None:
-    """The URI of a successor counts in a root only: a member who had it could take a name of another key."""
+    """The URI of a successor counts in a root only: a member with it could take a name of another key."""
     forged = NodeKeys.generate(Role.PROXY, "forged")
     assert Membership.from_wire(forged.join(HEIR, DAY).membership, HEIR.root, NOW).key == forged.key.public
 
@@ -148,7 +148,7 @@ def test_a_successor_of_an_owner_delegates_its_names() -> None:
     verifier().verify(advertisement(chain=given.chain), NOW)
 
 
-def test_two_successions_leave_room_for_two_links() -> None:
+def test_two_successions_leave_space_for_two_links() -> None:
     second = heir(heir())
     given = second.delegate(card(GATEWAY), CAMERA_METADATA, [Right.PUBLISH], [0], DAY, may_delegate=True)
     assert len(given.chain) == 3

@@ -1,4 +1,4 @@
-"""Claims: what is believed, and why the rest is not."""
+"""Verification of advertisements: accepted ones, and reasons for the refusal of others."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def refusal(wire: bytes, at: AdvertisementVerifier | None = None, unix_s: float 
 
 
 def forged(change: Callable[[dict[str, object]], object], signer: Name = ROBOT.name) -> bytes:
-    """Return the good claim with a changed body, signed again by the robot."""
+    """Return the good advertisement with a changed body, signed again by the robot."""
     body = UnverifiedAdvertisement.from_statement(parse(GOOD)).to_fields()
     change(body)
     return sign(StatementType.ADVERTISE, body, signer, ROBOT.key)
@@ -69,7 +69,7 @@ def test_a_good_advertisement_says_what_it_said() -> None:
     assert (found.lease_s, found.is_global, found.wire) == (60.0, True, GOOD)
 
 
-def test_a_advertisement_is_believed_again_from_its_own_bytes() -> None:
+def test_an_advertisement_is_accepted_again_from_its_own_bytes() -> None:
     at = verifier()
     assert at.verify(at.verify(GOOD, NOW).wire, NOW) == at.verify(GOOD, NOW)
 
@@ -89,7 +89,7 @@ def test_a_node_does_not_attach_under_another_name_of_its_own() -> None:
     assert refusal(advertisement(right=Right.ATTACH, subject=own, chain=[])) is DropReason.NOT_DELEGATED
 
 
-def test_nobody_attaches_under_a_delegated_name() -> None:
+def test_no_node_attaches_under_a_delegated_name() -> None:
     assert refusal(advertisement(right=Right.ATTACH)) is DropReason.NOT_DELEGATED
 
 
@@ -179,12 +179,12 @@ def test_a_member_of_a_trusted_domain_is_believed() -> None:
     assert at.verify(advertisement(STRANGER), NOW).domain == CLOUD.root.domain
 
 
-def test_a_advertisement_under_anothers_membership_is_refused() -> None:
+def test_an_advertisement_under_anothers_membership_is_refused() -> None:
     body = UnverifiedAdvertisement.from_statement(parse(advertisement(GATEWAY))).to_fields()
     assert refusal(sign(StatementType.ADVERTISE, body, ROBOT.name, ROBOT.key)) is DropReason.BAD_CERTIFICATE
 
 
-def test_a_advertisement_signed_by_another_is_refused() -> None:
+def test_an_advertisement_signed_by_another_is_refused() -> None:
     body = UnverifiedAdvertisement.from_statement(parse(GOOD)).to_fields()
     assert refusal(sign(StatementType.ADVERTISE, body, ROBOT.name, GATEWAY.key)) is DropReason.BAD_SIGNATURE
 
@@ -231,7 +231,7 @@ def test_a_lease_out_of_bounds_is_not_asked_for(lease_s: float) -> None:
 
 
 @pytest.mark.parametrize("field", ["name", "digest", "owner", "right", "seq", "inc", "lease", "member", "chain", "rt"])
-def test_a_advertisement_that_lacks_a_field_is_malformed(field: str) -> None:
+def test_an_advertisement_that_lacks_a_field_is_malformed(field: str) -> None:
     assert refusal(forged(lambda body: body.pop(field))) is DropReason.MALFORMED
 
 
@@ -256,7 +256,7 @@ def test_arbitrary_evidence_is_refused_with_a_reason(field: str, evidence: bytes
     refusal(forged(lambda body: body.update({field: [evidence] if field == "chain" else evidence})))
 
 
-def test_a_advertisement_holds_no_longer_than_its_evidence() -> None:
+def test_an_advertisement_holds_no_longer_than_its_evidence() -> None:
     assert verifier().verify(GOOD, NOW).valid_until_unix_s == UNTIL
     assert (
         verifier().verify(advertisement(chain=[adcert(validity=HOUR)]), NOW).valid_until_unix_s == HOUR.not_after_unix_s
@@ -345,6 +345,6 @@ def test_a_refreshed_advertisement_costs_one_signature_check(monkeypatch: pytest
 
     monkeypatch.setattr(PublicKey, "_verify", counted)
     at.verify(first, NOW)
-    assert checks[0] == 4  # membership, claim, RtCert, AdCert
+    assert checks[0] == 4  # membership, advertisement, RtCert, AdCert
     at.verify(second, NOW)
     assert checks[0] == 5

@@ -38,7 +38,7 @@ CAMERA = LAB.subject(CAMERA_METADATA)
 
 
 def card(node: Identity = ROBOT) -> NodeDescriptor:
-    """Return a node's card, verified."""
+    """Return a node's descriptor, verified."""
     return NodeDescriptor.from_wire(NodeDescriptor.make(node))
 
 
@@ -67,7 +67,7 @@ def advertisement(
     sequence: int = 1,
     lease_s: float = 60.0,
 ) -> bytes:
-    """Return a claim; by default the robot's, to publish the camera, and it holds."""
+    """Return a valid advertisement; by default the robot's, to publish the camera."""
     return sign_advertisement(
         node,
         right,
@@ -82,5 +82,5 @@ def advertisement(
 
 
 def verifier(*, allow_unowned: bool = False) -> AdvertisementVerifier:
-    """Return a verifier of the school that trusts nobody else and remembers nothing yet."""
+    """Return a verifier of the school that trusts no other domain and remembers nothing yet."""
     return AdvertisementVerifier(Policy(SCHOOL.root), allow_unowned=allow_unowned)

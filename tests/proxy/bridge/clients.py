@@ -1,4 +1,4 @@
-"""Local servers that answer when a test says so, and local clients that note what came of their calls."""
+"""Local servers that respond on command of a test, and local clients that record the results of their calls."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["Client", "LocalServer"]
 
 @dataclass(slots=True)
 class LocalServer:
-    """A node that serves; ``answer`` is what it says at once, None: it waits for the test."""
+    """Serving node; ``answer`` is its immediate response, None: it waits for the test."""
 
     graph: FakeGraph
     name: str = "/switch"
@@ -36,7 +36,7 @@ class LocalServer:
 
 @dataclass(slots=True)
 class Client:
-    """A node that calls."""
+    """Calling node."""
 
     graph: FakeGraph
     name: str = "/switch"
@@ -52,7 +52,7 @@ class Client:
 
     @property
     def outcomes(self) -> list[bytes | str]:
-        """Return what came, call by call."""
+        """Return the results, call by call."""
         return [outcome for outcomes in self.got.values() for outcome in outcomes]
 
     def sees_server(self) -> bool:

@@ -1,4 +1,4 @@
-"""What the machines of these tests know of types, and messages of some of them in either ROS's wire form."""
+"""Types known to the machines of these tests, and messages of some of them in either ROS's wire form."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ _TOPICS: Final = {
 
 @cache
 def channel(type_name: str, ros: RosVersion = 2) -> Channel:
-    """Return how a machine with the standard types of a ROS knows one of them."""
+    """Return the knowledge of a machine with the standard types of a ROS about one of them."""
     store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_JAZZY)
     text, md5 = store.generate_msgdef(type_name, ros)
     digest = md5 if ros == 1 else type_hash(type_name, text, "msg")
@@ -70,7 +70,7 @@ def custom(type_name: str, text: str, ros: RosVersion = 2) -> Channel:
 
 @cache
 def channels(ros: RosVersion = 2) -> dict[str, Channel]:
-    """Return the types that a machine knows if nothing else is said."""
+    """Return the types that a machine knows by default."""
     known = {name: channel(name, ros) for name in (STRING, IMAGE, "std_msgs/msg/Int32")}
     return known if ros == 1 else known | {name: custom(name, text) for name, text in _TOPICS.items()}
 
@@ -88,7 +88,7 @@ def service(type_name: str, request: str, response: str, ros: RosVersion = 2) ->
 
 @cache
 def services(ros: RosVersion = 2) -> dict[str, Service]:
-    """Return the service types that a machine knows if nothing else is said."""
+    """Return the service types that a machine knows by default."""
     both = (SET_BOOL, TRIGGER)
     return {name: service(name, *texts, ros) for name, texts in _SERVICES.items() if ros == 2 or name in both}
 

@@ -1,7 +1,7 @@
-"""Machines with a ROS graph, a proxy and its bridge each, on the ring of five in memory, whose clock jumps.
+"""Machines with a ROS graph, a proxy and its bridge each, on the simulated ring of five, whose clock jumps.
 
-Place: shell, without I/O. A bridge is driven as the proxy's loop does it: after what its graph or the overlay brought,
-and when its own timer is due; not more often.
+A bridge is driven like in the proxy's loop: after events of its graph or the overlay, and when its own timer is due;
+not more often.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _RIGHTS: Final[dict[tuple[Kind, bool], Right]] = {
 
 
 class Granted(DelegationStore):
-    """Delegations that lie in no file."""
+    """Delegations without a file."""
 
     def __init__(self, directory: Path, topics: Sequence[Topic]) -> None:
         self.directory = directory
@@ -59,7 +59,7 @@ class Granted(DelegationStore):
 
 @dataclass(slots=True, eq=False)
 class Machine:
-    """One machine: its graph, and the proxy in it."""
+    """Machine with a graph and a proxy in it."""
 
     label: str
     member: Participant
@@ -82,12 +82,12 @@ class Machine:
 
     @property
     def faults(self) -> dict[str, int]:
-        """Return the faults that there were."""
+        """Return the faults that occurred."""
         return {label: count for label, count in self.site.faults.counts.items() if count}
 
     @property
     def carried(self) -> set[tuple[str, bool]]:
-        """Return the local names that are carried, and whether out of here."""
+        """Return the local names that are carried, and whether they leave this machine."""
         return {(flow_spec.local, flow_spec.is_exposed) for flow_spec, _ in self.bridge.flows}
 
     @property
@@ -97,14 +97,14 @@ class Machine:
         return publisher
 
     def is_read(self, readers: int = 1) -> bool:
-        """Return whether everything that it publishes has so many readers."""
+        """Return whether everything that it publishes has this many readers."""
         streams = self.member.publishers()
         return bool(streams) and all(stream.readers == readers for stream in streams)
 
 
 @dataclass(slots=True, eq=False)
 class Ear:
-    """A local subscriber, and what it heard."""
+    """Local subscriber, and its messages."""
 
     graph: FakeGraph
     topic: str
@@ -119,12 +119,12 @@ class Ear:
 
     @property
     def texts(self) -> list[str]:
-        """Return what it heard, as texts."""
+        """Return its messages, as texts."""
         return [known.text_of(raw, self.graph.ros) for raw in self.heard]
 
 
 class Sites:
-    """The network, and the machines at its edge.
+    """Network, and the machines at its edge.
 
     Args:
         folder: an empty one, for the files that rules name.
@@ -176,7 +176,7 @@ class Sites:
         return machine
 
     def restart(self, machine: Machine) -> Machine:
-        """Start a machine's proxy anew with nothing remembered; its graph stays."""
+        """Restart a machine's proxy without its memory; its graph stays."""
         self.kill(machine)
         self.world.restart_member(machine.label)
         assert self.world.settle()
@@ -185,35 +185,35 @@ class Sites:
         return again
 
     def leave(self, machine: Machine) -> None:
-        """End a proxy as its command does, with a goodbye."""
+        """End a proxy like its command, with a goodbye."""
         machine.bridge.close()
         machine.member.leave()
         self.world.network.touch(machine.label)
         for endpoint in machine.endpoints:
-            endpoint.remove_entity()
+            endpoint.shut_down()
         self.machines.remove(machine)
 
     def kill(self, machine: Machine) -> None:
         """End a proxy without a goodbye to the overlay."""
         for endpoint in machine.endpoints:
-            endpoint.remove_entity()
+            endpoint.shut_down()
         self.machines.remove(machine)
         self.world.network.stop(machine.label)
 
     def name(self, label: str) -> Name:
-        """Return the name of a member, there already or not."""
+        """Return the name of a member, whether it exists already or not."""
         domain = self.world.topology.domain_of(label.partition("/")[0]).label
         return self.world.identity(Role.PROXY, label, domain).name
 
     def config(self, expose: Sequence[str], imports: Sequence[str], *graphs: RosVersion) -> ProxyConfig:
-        """Return a configuration, as read from a file; of one ROS 2 graph if nothing else is said."""
+        """Return a configuration, as read from a file; by default of one ROS 2 graph."""
         text = "ros: [" + ", ".join(_GRAPHS[ros] for ros in graphs or (2,)) + "]\n"
         text += f"expose:\n{rules(*expose)}" if expose else ""
         text += f"import:\n{rules(*imports)}" if imports else ""
         return proxy(self._folder, text)
 
     def held(self, member: Participant, config: ProxyConfig, holds: Sequence[Metadata] | None = None) -> Granted:
-        """Return delegations for what the rules name in full, or for ``holds``."""
+        """Return delegations for the full names in the rules, or for ``holds``."""
         given: dict[Name, tuple[Metadata, set[Right]]] = {}
         for is_exposed, listed in ((True, config.expose), (False, config.imports)):
             for rule in listed:
@@ -230,17 +230,17 @@ class Sites:
         imports: Sequence[str] = (),
         holds: Sequence[Metadata] | None = None,
     ) -> None:
-        """Give a proxy other rules, and all delegations anew."""
+        """Give a proxy other rules, and reissue all delegations."""
         config = self.config(expose, imports, machine.graph.ros)
         machine.bridge.reload(config, self.held(machine.member, config, holds))
         machine.tick_at_s = 0.0
 
     def run(self, duration_s: float, until: Callable[[], bool] | None = None) -> bool:
-        """Let time go on; return whether ``until`` came true (True without one)."""
+        """Advance time; return whether ``until`` came true (True without one)."""
         return self.world.network.run(duration_s, until)
 
     def every(self, period_s: float, count: int, act: Callable[[int], None]) -> None:
-        """Do something again and again, from now on, with its number."""
+        """Repeat an action from now on, with its number."""
         for number in range(count):
             self.world.network.call(number * period_s, partial(act, number))
 
@@ -268,7 +268,7 @@ class Sites:
 
 
 def named(name: str, type_name: str = known.STRING, kind: str = "topic") -> Metadata:
-    """Return what a delegation is about."""
+    """Return the subject of a delegation."""
     return Metadata({"kind": kind, "name": name, "type": type_name})
 
 

@@ -1,4 +1,4 @@
-"""Actions from end to end: goals of any length, feedback to everyone, cancel, result."""
+"""Actions from end to end: goals of any length, feedback to all clients, cancel, result."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def result(*values: int) -> bytes:
 
 @dataclass(slots=True)
 class ActionServer:
-    """A node that serves an action; goals are accepted at once, results come when a test says so."""
+    """Node that serves an action; it accepts goals at once, and sends results on command of a test."""
 
     graph: FakeGraph
     goals: LocalServer = field(init=False)
@@ -69,7 +69,7 @@ class ActionServer:
 
 
 class ActionClient:
-    """A node that sends goals."""
+    """Node that sends goals."""
 
     def __init__(self, graph: FakeGraph) -> None:
         self.goals, self.cancels, self.results = (

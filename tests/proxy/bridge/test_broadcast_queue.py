@@ -1,4 +1,4 @@
-"""What waits for room on the stream to all servers goes in its order, and a request no longer than its call."""
+"""Queue of the stream to all servers: it keeps its order, and a request waits no longer than its call."""
 
 from __future__ import annotations
 

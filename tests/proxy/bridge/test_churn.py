@@ -1,4 +1,4 @@
-"""Ten thousand appearances and disappearances leave a proxy as it was."""
+"""Ten thousand appearances and disappearances, after which a proxy is unchanged."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
 CHATTER = f"name: /chatter, type: {STRING}"
 SWITCH = f"kind: service, name: /switch, type: {SET_BOOL}"
 TIMES = 10_000
-WARM = 300  # times, until all is in use
+WARM = 300  # repetitions, until all is in use
 SPARE = 100  # objects, of some hundred thousand
 
 
@@ -36,7 +36,7 @@ def objects() -> int:
 
 
 def look(sites: Sites, machine: Machine) -> None:
-    """Let the proxy see what its graph now is, without waiting for the overlay."""
+    """Let the proxy poll its present graph, without waiting for the overlay."""
     now_s = sites.now_s
     machine.bridge.work(now_s)
     machine.member.flush(now_s)
@@ -44,7 +44,7 @@ def look(sites: Sites, machine: Machine) -> None:
 
 
 def assert_it_stays(sites: Sites, machine: Machine, once: Callable[[], None], warm: int = WARM) -> None:
-    """Do it ten thousand times, and compare what is there with what was."""
+    """Repeat an action ten thousand times, and compare the state after with the state before."""
 
     def repeat(times: int) -> None:
         for number in range(times):
@@ -114,7 +114,7 @@ def test_servers_that_come_and_go(sites: Sites) -> None:
 
 
 def test_topics_of_ever_new_names_under_a_pattern(sites: Sites, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.ERROR, "proxy.bridge.faults")  # it would keep them all
+    caplog.set_level(logging.ERROR, "proxy.bridge.faults")  # otherwise it would keep them all
     robot = sites.add(ROBOT, expose=["name: /many/*"], holds=[])
     count = iter(range(1_000_000))
 

@@ -1,3 +1,5 @@
+"""Counters of a bridge by direction."""
+
 from __future__ import annotations
 
 from proxy.bridge.counters import Traffic

@@ -1,3 +1,5 @@
+"""Faults of a bridge: each is counted, the first of its kind is logged."""
+
 from __future__ import annotations
 
 import pytest
@@ -5,7 +7,7 @@ import pytest
 from proxy.bridge.faults import Fault, Faults
 
 
-def test_each_is_counted_and_the_first_of_its_kind_told(caplog: pytest.LogCaptureFixture) -> None:
+def test_each_is_counted_and_the_first_of_its_kind_reported(caplog: pytest.LogCaptureFixture) -> None:
     faults = Faults()
     for detail in ("first", "second"):
         faults.report("/chatter", Fault.TOO_LARGE, detail)
@@ -19,7 +21,7 @@ def test_each_is_counted_and_the_first_of_its_kind_told(caplog: pytest.LogCaptur
     assert (faults.counts["too-large"], faults.counts["too-fast"], faults.total) == (3, 1, 4)
 
 
-def test_what_was_over_is_told_again(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_cleared_fault_is_reported_again(caplog: pytest.LogCaptureFixture) -> None:
     faults = Faults()
     faults.report("/chatter", Fault.QOS, "first")
     faults.clear("/chatter", Fault.QOS)

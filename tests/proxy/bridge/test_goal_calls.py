@@ -1,4 +1,4 @@
-"""Which call under way is about which goal."""
+"""Relation of calls in flight to goals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who speaks for a goal that several servers work on."""
+"""Choice of the server that reports a goal on which several servers work."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_goal_of_another_machines_client_has_one_speaker_too() -> None:
     assert [goals.may_feed(server, feedback(ONE)) for server in (B, A, B)] == [True, False, True]
 
 
-def test_heartbeats_of_several_servers_come_as_one_message_each_goal_by_its_speaker() -> None:
+def test_goal_statuses_of_several_servers_come_as_one_message_each_goal_by_its_speaker() -> None:
     goals = Goals()
     goals.accepted(ONE, A)
     goals.accepted(TWO, B)

@@ -1,4 +1,4 @@
-"""Far peers with every right, and graphs that refuse: whatever they do, the proxy goes on and says so."""
+"""Remote peers with every right, and graphs that refuse: the proxy continues and reports every fault."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def sites(tmp_path: Path) -> Sites:
 
 
 def listening(sites: Sites) -> tuple[Machine, Machine, Ear]:
-    """Return a machine whose publisher may be made to say anything, the one that reads it, and a listener there."""
+    """Return a machine whose publisher may send anything, the machine that reads it, and a listener there."""
     robot, server = sites.add(ROBOT, expose=[CHATTER]), sites.add(SERVER, imports=[CHATTER])
     ear = Ear(server.graph, "/chatter")
     robot.graph.publish("/talker", "/chatter", STRING)
@@ -71,7 +71,7 @@ def test_a_far_depth_without_bound_is_bounded_here(sites: Sites) -> None:
     ],
     ids=["type", "no definition", "definition", "nonsense", "itself", "ROS 1 without", "ROS 1 nonsense"],
 )
-def test_a_description_that_does_not_fit_is_told_and_the_topic_goes_on_with_one_that_does(
+def test_a_description_that_does_not_fit_is_reported_and_the_topic_goes_on_with_one_that_does(
     sites: Sites, channel: Channel
 ) -> None:
     robot, server, ear = listening(sites)
@@ -124,7 +124,7 @@ def test_answers_and_news_that_are_none_do_not_stop_a_client(sites: Sites, wire:
     ],
     ids=["nonsense", "two parts", "another type", "another request", "another response"],
 )
-def test_a_server_that_says_it_is_something_else_is_told_and_opens_nothing(sites: Sites, description: bytes) -> None:
+def test_a_server_that_describes_itself_falsely_is_reported_and_opens_nothing(sites: Sites, description: bytes) -> None:
     server, client = sites.add(SERVER), sites.add(ROBOT, imports=[SWITCH])
     held = sites.held(server.member, sites.config([SWITCH], []))
     server.member.serve(next(iter(held)), description)
@@ -148,7 +148,7 @@ def test_a_client_that_says_it_is_something_else_is_refused_with_a_reason(sites:
     assert local.asked == 0
 
 
-def test_a_graph_that_refuses_a_publisher_is_told_once_until_it_takes_it(
+def test_a_graph_that_refuses_a_publisher_is_reported_once_until_it_accepts_it(
     sites: Sites, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     robot, server = sites.add(ROBOT, expose=[CHATTER, OTHER]), sites.add(SERVER)

@@ -1,4 +1,4 @@
-"""Loops and twins: nothing circulates, nothing is delivered twice, whoever leads."""
+"""Loops and doubled bridges: nothing circulates and nothing is delivered twice, whichever bridge leads."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def graph() -> FakeGraph:
 
 
 def streams(*machines: Machine) -> list[Machine]:
-    """Return those that publish on the overlay."""
+    """Return the proxies that publish on the overlay."""
     return [machine for machine in machines if machine.member.publishers()]
 
 
@@ -108,7 +108,7 @@ def test_two_proxies_on_each_graph_that_expose_and_import_the_same_topic(sites: 
     assert carried(*machines) == 40
 
 
-def test_a_proxy_that_exposes_beside_one_that_imports_does_not_send_back_what_came(
+def test_a_proxy_that_exposes_next_to_one_that_imports_does_not_send_messages_back(
     sites: Sites, caplog: pytest.LogCaptureFixture
 ) -> None:
     shared = graph()
@@ -124,11 +124,12 @@ def test_a_proxy_that_exposes_beside_one_that_imports_does_not_send_back_what_ca
     assert "near" in ears[0].texts
     assert "far" in ears[1].texts
     assert all(len(ear.texts) == len(set(ear.texts)) for ear in ears)
-    assert len([text for text in caplog.messages if text.startswith("/chatter: rival: ")]) == 1  # one way stays shut
+    # one direction stays closed
+    assert len([text for text in caplog.messages if text.startswith("/chatter: rival: ")]) == 1
 
 
 @pytest.mark.parametrize("is_killed", [False, True], ids=["goes", "dies"])
-def test_the_converter_takes_over_within_a_second_when_the_leading_proxy(sites: Sites, *, is_killed: bool) -> None:
+def test_the_other_bridge_takes_over_within_a_second_when_the_leading_proxy(sites: Sites, *, is_killed: bool) -> None:
     shared = graph()
     twins = sites.add(ROBOT, expose=[CHATTER], graph=shared), sites.add(CONVERTER, expose=[CHATTER], graph=shared)
     server = sites.add(SERVER, imports=[CHATTER])
@@ -165,7 +166,7 @@ def test_a_proxy_of_higher_rank_that_comes_later_takes_over_without_a_message_tw
     assert len(ear.texts) >= 90
 
 
-def test_twins_of_a_service_serve_it_once(sites: Sites) -> None:
+def test_two_bridges_of_a_service_serve_it_once(sites: Sites) -> None:
     shared, rule = graph(), f"kind: service, name: /switch, type: {known.SET_BOOL}"
     local = LocalServer(shared, answer=lambda _: switched("yes"))
     twins = sites.add(SERVER, expose=[rule], graph=shared), sites.add(FAR_CONVERTER, expose=[rule], graph=shared)
@@ -178,7 +179,7 @@ def test_twins_of_a_service_serve_it_once(sites: Sites) -> None:
     assert (local.asked, caller.outcomes) == (1, [switched("yes")])
 
 
-def test_twins_that_import_a_service_call_it_once_and_the_other_takes_over(sites: Sites) -> None:
+def test_two_bridges_that_import_a_service_call_it_once_and_the_other_takes_over(sites: Sites) -> None:
     shared, rule = graph(), f"kind: service, name: /switch, type: {known.SET_BOOL}"
     far = sites.add(SERVER, expose=[rule])
     local = LocalServer(far.graph, answer=lambda _: switched("yes"))

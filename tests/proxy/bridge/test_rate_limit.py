@@ -1,3 +1,5 @@
+"""Rate limit of a rule."""
+
 from __future__ import annotations
 
 from itertools import pairwise

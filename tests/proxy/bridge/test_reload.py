@@ -1,4 +1,4 @@
-"""Rules and delegations read anew while messages flow."""
+"""Reload of rules and delegations while messages flow."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Servers and clients that misbehave within their rights, or die at a bad moment, as the bridge meets them."""
+"""Servers and clients that misbehave within their rights, or die at a bad moment, as seen by the bridge."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_a_goal_may_take_as_long_as_it_likes(sites: Sites) -> None:
     assert [serving_of(machine).get_timer() for machine in machines] == [None] * len(servers)
 
 
-def test_a_client_that_has_too_much_under_way_is_told_so(sites: Sites) -> None:
+def test_a_client_with_too_many_calls_in_flight_gets_an_error(sites: Sites) -> None:
     machine, _, _, caller = called(sites)
     with pytest.MonkeyPatch.context() as patch:
 

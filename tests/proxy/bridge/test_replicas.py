@@ -1,4 +1,4 @@
-"""Services and actions of several servers: every call ends once, whoever of them dies, and the others are told."""
+"""Services and actions of several servers: every call ends once, whichever server dies, and the others are informed."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def sites(tmp_path: Path) -> Sites:
 
 
 def heard_by(client: Machine, servers: int) -> Callable[[], bool]:
-    """Return what tells whether a client's proxy may ask so many servers."""
+    """Return a condition: a client's proxy may call this many servers."""
     flow = client.bridge.flows[0][1]
     assert isinstance(flow, ImportedService)
     return lambda: all(len(calls.servers) == servers for calls in flow._calls)
@@ -63,7 +63,7 @@ def replicas(
 
 
 def flow(sites: Sites, caller: Client, period_s: float, count: int) -> None:
-    """Let a client call again and again."""
+    """Let a client call repeatedly."""
 
     def call(number: int) -> None:
         caller.call(switch(on=number % 2 == 1))
@@ -100,7 +100,7 @@ def test_a_call_under_way_is_answered_by_a_server_that_arrives_after_all_it_was_
     assert sites.run(1, lambda: caller.outcomes == [switched("still")])
 
 
-def test_a_late_first_copy_is_hedged_and_then_told_to_stop(sites: Sites) -> None:
+def test_a_late_first_copy_is_hedged_and_then_cancelled(sites: Sites) -> None:
     trigger = f"{SWITCH}, stop: /switch/stop, at_once: 1"
     machines, locals_, _, caller = replicas(sites, 2, expose=trigger, mode="mode: hedged, budget: 1")
     stops = [LocalServer(machine.graph, "/switch/stop", TRIGGER, lambda _: CDR + b"\1") for machine in machines]
@@ -241,7 +241,7 @@ def test_a_goal_goes_to_all_and_the_losers_is_cancelled(sites: Sites) -> None:
 
 def test_feedback_comes_from_one_server_and_when_that_dies_from_another_as_does_the_result(sites: Sites) -> None:
     machines, servers, client, caller = actions(sites)
-    servers[1].goals.answer = None  # so that the first is the one whose acceptance counts
+    servers[1].goals.answer = None  # so that the acceptance of the first one counts
     accepted(sites, servers, caller)
     servers[1].goals.waiting[0][1](ACCEPTED)
     sites.run(0.5)

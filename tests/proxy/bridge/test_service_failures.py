@@ -1,4 +1,4 @@
-"""Calls that cannot be served: each fails once, with its reason, and no later one is the worse for it."""
+"""Calls that cannot be served: each fails once, with its reason, and no later call suffers."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def test_an_answer_that_overtakes_an_earlier_calls_goes_to_its_own(sites: Sites)
     assert list(caller.got.values()) == [[switched("1")], [switched("0")]]
 
 
-def test_a_client_proxy_that_starts_anew_calls_again_and_gets_nothing_of_its_former_life(sites: Sites) -> None:
+def test_a_restarted_client_proxy_calls_again_and_gets_nothing_of_its_former_incarnation(sites: Sites) -> None:
     _, client, local, caller = pair(sites)
     caller.call(switch(on=True))
     assert sites.run(1, lambda: local.asked == 1)
@@ -168,7 +168,7 @@ def test_a_client_proxy_that_starts_anew_calls_again_and_gets_nothing_of_its_for
     assert caller.got == {0: [], 1: [switched("for the new one")]}
 
 
-def test_a_server_proxy_that_starts_anew_serves_again(sites: Sites) -> None:
+def test_a_restarted_server_proxy_serves_again(sites: Sites) -> None:
     server, _, local, caller = pair(sites)
     local.answer = lambda _: switched("yes")
     sites.restart(server)

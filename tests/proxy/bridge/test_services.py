@@ -1,4 +1,4 @@
-"""Services from end to end: each call is answered once, with its own answer, or fails with a reason."""
+"""Services from end to end: each call gets its own response once, or fails with a reason."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def test_a_service_type_that_the_client_does_not_know_comes_with_its_definition(
     assert sites.run(1, lambda: caller.outcomes == [known.string("hello")])
 
 
-def test_services_that_differ_are_told_with_the_first_difference_and_there_is_no_virtual_server(
+def test_services_that_differ_are_reported_with_the_first_difference_and_there_is_no_virtual_server(
     sites: Sites, caplog: pytest.LogCaptureFixture
 ) -> None:
     rule = f"kind: service, name: /echo, type: {ECHO}"

@@ -1,4 +1,4 @@
-"""A service that keeps state, on several machines: all that live agree, whoever was killed, and no request is lost."""
+"""Service with state on several machines: all live replicas agree after any kill, and no request is lost."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def sites(tmp_path: Path) -> Sites:
 
 @dataclass(slots=True)
 class Counter:
-    """A node that counts what it is asked, and answers how far it is; its parameter ``state`` is the count."""
+    """Node that counts its requests and responds with the count; its parameter ``state`` is the count."""
 
     graph: FakeGraph
     tells: bool = True
@@ -46,7 +46,7 @@ class Counter:
                 self.servers.append(self.graph.serve("/counter", f"/counter/{part}", type_name, ask))
 
     def die(self) -> None:
-        """Leave the graph, and what is under way without an answer."""
+        """Leave the graph, without a response to calls in flight."""
         self.is_stuck = True
         for server in self.servers:
             server.close()
@@ -90,7 +90,7 @@ def start(sites: Sites, place: str, *, tells: bool = True) -> tuple[Machine, Cou
 
 
 def follow(client: Machine, count: int) -> Callable[[], bool]:
-    """Return what tells whether so many servers follow a client's log."""
+    """Return a condition: this many servers follow a client's log."""
 
     def do() -> bool:
         keepers = [flow._sequencer for _, flow in client.bridge.flows if isinstance(flow, ImportedService)]

@@ -1,4 +1,4 @@
-"""The parameter ``state``, as rclpy writes and reads it."""
+"""Parameter ``state``, as rclpy writes and reads it."""
 
 from __future__ import annotations
 

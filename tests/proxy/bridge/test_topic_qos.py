@@ -1,4 +1,4 @@
-"""QoS from end to end: what a publisher promises reaches far readers, and what nobody can promise is told."""
+"""QoS from end to end: a publisher's promises reach remote readers, and impossible ones are reported."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def pair(sites: Sites, more: str = "") -> tuple[Machine, Machine]:
 
 
 def offered(machine: Machine) -> Qos:
-    """Return what the virtual publisher offers."""
+    """Return the offer of the virtual publisher."""
     (qos,) = (each.qos for each in machine.graph.publications if each.end.name == "/chatter")
     return qos
 
@@ -88,7 +88,7 @@ def test_a_rule_may_say_otherwise_than_the_publisher(sites: Sites) -> None:
     sites.world.leads[SERVER].loss = 0.3
     sites.every(0.01, 50, lambda number: talker.publish(string(str(number))))
     sites.run(5)
-    assert 0 < len(ear.heard) < 50  # none of what was lost is repaired
+    assert 0 < len(ear.heard) < 50  # no lost message is repaired
 
 
 def test_a_latched_message_reaches_who_joins_later_on_the_far_side(sites: Sites) -> None:
@@ -114,7 +114,7 @@ def test_a_latched_topic_reaches_the_same_reader_again_after_it_left(sites: Site
     assert again.texts == ["map"]
 
 
-def test_what_two_publishers_latched_reaches_a_late_reassembler_from_both(sites: Sites) -> None:
+def test_what_two_publishers_latched_reaches_a_late_joiner_from_both(sites: Sites) -> None:
     robot, server = pair(sites)
     talkers = [robot.graph.publish(f"/talker{n}", "/chatter", STRING, LATCHED) for n in range(2)]
     sites.run(1)
@@ -140,10 +140,10 @@ def test_what_a_later_publisher_latches_pushes_nothing_of_the_first_out(sites: S
     assert ear.texts == ["first"] * 3 + ["later"]  # again from a publisher that keeps more, and from the first itself
     second = Ear(server.graph, "/chatter", qos=LATCHED, node="/second")
     sites.run(1)
-    assert second.texts == ["first", "first", "later"]  # the first one's is kept, and was said again to be kept
+    assert second.texts == ["first", "first", "later"]  # the first one's is kept, and was announced again as kept
 
 
-def test_what_publishers_on_two_machines_latched_reaches_a_late_reassembler_from_both(sites: Sites) -> None:
+def test_what_publishers_on_two_machines_latched_reaches_a_late_joiner_from_both(sites: Sites) -> None:
     robot, server = pair(sites)
     third = sites.add("nuc2/third", expose=[CHATTER])
     for machine, text in ((robot, "robot"), (third, "third")):
@@ -251,7 +251,7 @@ def test_a_reader_that_requests_more_than_the_source_offers_hears_what_is_new(si
     [replace(default(), deadline=(1, 0)), replace(default(), liveliness="manual_by_topic")],
     ids=["deadline", "liveliness"],
 )
-def test_what_no_network_can_promise_is_told_once_and_the_others_hear(
+def test_promises_beyond_any_network_are_reported_once_and_the_others_receive(
     sites: Sites, qos: Qos, caplog: pytest.LogCaptureFixture
 ) -> None:
     robot, server = pair(sites)
@@ -259,7 +259,7 @@ def test_what_no_network_can_promise_is_told_once_and_the_others_hear(
     ear, talker = Ear(server.graph, "/chatter"), robot.graph.publish("/talker", "/chatter", STRING)
     assert sites.run(3, robot.is_read)
     for n in range(5):
-        Ear(server.graph, f"/unrelated{n}")  # the graph changes, and is looked at anew
+        Ear(server.graph, f"/unrelated{n}")  # the graph changes, and is checked again
         sites.run(0.2)
     talker.publish(string("hello"))
     assert sites.run(1, lambda: ear.texts == ["hello"])

@@ -1,11 +1,11 @@
-"""What a receiver measures."""
+"""Measurements of a receiver."""
 
 from __future__ import annotations
 
 from proxy.bridge.topic_stats import TopicStats, percentile
 
 
-def test_a_stats_tells_the_usual_way_and_all_ways_that_were_seen() -> None:
+def test_topic_stats_report_the_usual_path_and_all_paths_that_were_seen() -> None:
     stats = TopicStats("/t", "std_msgs/msg/String")
     for hops in (5, 5, 2, 5):
         stats.add(1.0, 3, hops)

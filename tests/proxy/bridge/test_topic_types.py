@@ -1,4 +1,4 @@
-"""Types from end to end: encodings, ROS 1 and ROS 2, custom types, and what cannot be understood on the far side."""
+"""Types from end to end: encodings, ROS 1 and ROS 2, custom types, and types unknown on the far side."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def sites(tmp_path: Path) -> Sites:
 
 
 def graph(ros: RosVersion = 2, pose: str | None = None) -> FakeGraph:
-    """Return a graph that knows the custom type so, or not at all."""
+    """Return a graph with this definition of the custom type, or without it."""
     types = known.channels(ros)
     return FakeGraph(ros, types if pose is None else types | {CUSTOM: custom(CUSTOM, pose, ros)})
 
@@ -94,7 +94,7 @@ def test_a_custom_type_crosses_to_the_other_ros_which_does_not_know_it(sites: Si
     assert sites.run(1, lambda: ear.heard == [bytes(range(8))])
 
 
-def test_definitions_that_differ_are_told_once_with_the_first_difference_and_the_rest_flows(
+def test_definitions_that_differ_are_reported_once_with_the_first_difference_and_the_rest_flows(
     sites: Sites, caplog: pytest.LogCaptureFixture
 ) -> None:
     robot = sites.add(ROBOT, expose=[POSE, CHATTER], graph=graph(2, "int32 x\nint32 y\n"))
@@ -113,7 +113,7 @@ def test_definitions_that_differ_are_told_once_with_the_first_difference_and_the
     assert [stats.refused for stats in server.bridge.stats if stats.topic == "/pose"] == [3]
 
 
-def test_definitions_that_differ_between_ros_1_and_ros_2_are_told(
+def test_definitions_that_differ_between_ros_1_and_ros_2_are_reported(
     sites: Sites, caplog: pytest.LogCaptureFixture
 ) -> None:
     robot = sites.add(ROBOT, expose=[POSE], graph=graph(1, "int32 x\nint32 y\n"))
@@ -126,7 +126,7 @@ def test_definitions_that_differ_between_ros_1_and_ros_2_are_told(
     assert any("y: int32 there, int64 here" in text for text in caplog.messages)
 
 
-def test_a_type_that_the_other_ros_cannot_have_is_told(sites: Sites, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_type_that_the_other_ros_cannot_have_is_reported(sites: Sites, caplog: pytest.LogCaptureFixture) -> None:
     robot = sites.add(ROBOT, expose=[POSE], graph=graph(2, "wstring name\n"))
     server = sites.add(SERVER, imports=[POSE], graph=graph(1))
     Ear(server.graph, "/pose", CUSTOM)
@@ -139,7 +139,7 @@ def test_a_type_that_the_other_ros_cannot_have_is_told(sites: Sites, caplog: pyt
     assert "name: wstring has no form in ROS 1" in told
 
 
-def test_a_type_that_its_own_machine_does_not_know_is_told_and_the_rest_flows(
+def test_a_type_that_its_own_machine_does_not_know_is_reported_and_the_rest_flows(
     sites: Sites, caplog: pytest.LogCaptureFixture
 ) -> None:
     robot = sites.add(ROBOT, expose=[POSE, CHATTER])
@@ -152,7 +152,7 @@ def test_a_type_that_its_own_machine_does_not_know_is_told_and_the_rest_flows(
     assert caplog.messages == [f"/pose: unknown-type: {CUSTOM}: not installed"]
 
 
-def test_a_local_type_that_is_not_the_rules_is_told(sites: Sites, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_local_type_that_is_not_the_rules_is_reported(sites: Sites, caplog: pytest.LogCaptureFixture) -> None:
     robot = sites.add(ROBOT, expose=[CHATTER])
     robot.graph.publish("/talker", "/chatter", IMAGE)
     sites.run(2)
@@ -160,7 +160,7 @@ def test_a_local_type_that_is_not_the_rules_is_told(sites: Sites, caplog: pytest
     assert caplog.messages == [f"/chatter: other-type: local nodes use {IMAGE}; the rule says {STRING}"]
 
 
-def test_several_types_on_one_name_are_told_and_the_rules_type_crosses(
+def test_several_types_on_one_name_are_reported_and_the_rules_type_crosses(
     sites: Sites, caplog: pytest.LogCaptureFixture
 ) -> None:
     robot, server = sites.add(ROBOT, expose=[CHATTER]), sites.add(SERVER, imports=[CHATTER])
@@ -174,7 +174,7 @@ def test_several_types_on_one_name_are_told_and_the_rules_type_crosses(
     assert STRING in told
 
 
-def test_a_local_reader_of_another_type_hears_nothing_and_is_told_of(
+def test_a_local_reader_of_another_type_receives_nothing_and_is_reported(
     sites: Sites, caplog: pytest.LogCaptureFixture
 ) -> None:
     robot, server = sites.add(ROBOT, expose=[CHATTER]), sites.add(SERVER, imports=[CHATTER])

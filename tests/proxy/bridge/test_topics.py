@@ -1,4 +1,4 @@
-"""Topics from one graph to another: who comes and goes, what reaches whom, and what stays local."""
+"""Topics from one graph to another: participants that come and go, reachability, and local names that stay local."""
 
 from __future__ import annotations
 
@@ -210,7 +210,7 @@ def test_the_limits_of_an_import_hold_where_it_is(sites: Sites) -> None:
     assert server.site.traffic.thinned == 200 - len(thinned.heard)
 
 
-def test_a_message_above_the_rules_limit_is_told_once_and_the_rest_flows(
+def test_a_message_above_the_rules_limit_is_reported_once_and_the_rest_flows(
     sites: Sites, caplog: pytest.LogCaptureFixture
 ) -> None:
     robot, _, talker, ear = flowing(sites, f"{CHATTER}, max_bytes: 100")
@@ -222,7 +222,7 @@ def test_a_message_above_the_rules_limit_is_told_once_and_the_rest_flows(
     assert told.startswith("/chatter: too-large: ")
 
 
-def test_a_talker_faster_than_the_path_is_told_once_and_goes_on_later(
+def test_a_talker_faster_than_the_path_is_reported_once_and_goes_on_later(
     sites: Sites, caplog: pytest.LogCaptureFixture
 ) -> None:
     robot, server, talker, ear = flowing(sites, f"{CHATTER}, encoding: cdr")

@@ -1,4 +1,4 @@
-"""Messages whose senders are not described yet wait within bounds, each client on its own account."""
+"""Queue of messages whose senders are not described yet: bounded, with a quota for each client."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_a_clients_messages_wait_in_their_order_and_are_taken_once() -> None:
     assert (early.poll_messages(A), len(early)) == ([], 1)
 
 
-def test_a_client_leaves_room_for_the_next() -> None:
+def test_a_client_leaves_capacity_for_the_next() -> None:
     early = UndescribedRequests(max_bytes=80)
     assert [early.add(message(A, 40)), early.add(message(A, 1)), early.add(message(B, 20))] == [True, False, True]
     early.poll_messages(A)
@@ -36,7 +36,7 @@ def test_a_client_has_so_many_at_most() -> None:
     assert (sum(added), early.add(message(B, 0))) == (EARLY_MAX, True)
 
 
-def test_what_waits_of_clients_that_are_gone_is_counted_and_its_room_is_free() -> None:
+def test_waiting_requests_of_clients_that_are_gone_are_counted_and_their_space_is_free() -> None:
     early = UndescribedRequests(max_bytes=80)
     early.add(message(A, 40))
     early.add(message(B, 20))

@@ -1,4 +1,4 @@
-"""What is said of rules beside what is live and what is held."""
+"""Explanation of rules with the live graph and the stored delegations."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ LATCHED = Qos("keep_last", 1, "reliable", "transient_local", (0, 0), (0, 0), "au
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """A delegation, as far as an explanation looks at it."""
+    """Delegation with the fields that an explanation uses."""
 
     metadata: Metadata | None
     rights: frozenset[Right]
@@ -89,7 +89,7 @@ def test_a_type_that_is_not_stated_is_the_one_found(place: Path) -> None:
     assert (match.type_name, match.is_held, match.faults) == (IMAGE, True, ())
 
 
-def test_what_nobody_publishes_yet_is_said_to_be_so(place: Path) -> None:
+def test_a_topic_without_a_publisher_is_described_as_such(place: Path) -> None:
     match = only(place, "expose", f"name: /image, type: {IMAGE}", [end(Role.SUBSCRIBES)], given(Right.PUBLISH))
     assert (match.nodes, match.faults, match.notes) == ((), (), ("nothing here publishes it now",))
     (finding,) = findings(place, "expose", ["name: /camera/*"])
@@ -264,7 +264,7 @@ def test_the_table_shows_names_and_what_there_is_to_say(place: Path) -> None:
 
 
 def _understood(words: str) -> None:
-    """Read a command line of ``gdp`` as the command would, without running it."""
+    """Parse a command line of ``gdp`` like the command, without running it."""
     command = typer.main.get_command(gdp.app)
     program, group, *rest = shlex.split(words)
     command.commands[program].commands[group].make_context(group, rest)  # type: ignore[attr-defined]

@@ -1,4 +1,4 @@
-"""Which delegations rules need: of two machines, from what is stated, held and live."""
+"""Delegations that rules need: on two machines, from statements, stored ones and the live graph."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_an_action_gets_its_type_from_what_is_live(folder: Path) -> None:
     assert _of(arm, desk) == [[("serve", *fold)], [("call", *fold)]]
 
 
-def test_nobody_may_publish_what_only_another_machine_has(folder: Path) -> None:
+def test_no_machine_may_publish_a_topic_that_only_another_machine_has(folder: Path) -> None:
     one = Machine(_config(folder, f"name: /camera/left, type: {IMAGE}"))
     other = Machine(_config(folder, "name: /camera/**"))
     assert _of(one, other) == [[("publish", "/camera/left", IMAGE)], []]

@@ -1,4 +1,4 @@
-"""``gdp-delegate``, as a person calls it."""
+"""``gdp-delegate``, as called by a person."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_a_right_that_comes_later_leaves_rights_and_epochs_of_before() -> None:
     assert (now.rights, sorted(now.grants)) == (frozenset({Right.READ, Right.PUBLISH}), [0, 1, 2])
 
 
-def test_one_that_has_run_out_is_made_anew() -> None:
+def test_an_expired_one_is_issued_again() -> None:
     rule = ProxyConfig.load(Path("robot/proxy.yaml")).expose[0]
     metadata, card = rule.overlay_metadata, Path("robot/proxy/node.card")
     old = delegate(Path("owner"), card, metadata, [Right.PUBLISH], days=1, unix_s=1e9)
@@ -79,7 +79,7 @@ def test_one_that_has_run_out_is_made_anew() -> None:
     assert "+ publish" in _run(*_BOTH)[0]
 
 
-def test_the_private_keys_of_a_proxy_need_not_be_at_hand() -> None:
+def test_the_private_keys_of_a_proxy_need_not_be_present() -> None:
     Path("server/proxy/node.key").unlink()
     Path("server/proxy/kem.key").unlink()
     assert "+ read" in _run(*_BOTH)[1]

@@ -1,4 +1,4 @@
-"""proxy.yaml as people write it; its rules are tested in test_rules."""
+"""proxy.yaml, as people write it; its rules are tested in test_rules."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_a_recording_is_of_what_is_imported(place: Path) -> None:
         (("owner: owner.pub", "qos: 1, owner: owner.pub"), "81: qos: unknown key; expected one of"),
     ],
 )
-def test_a_wrong_rule_is_told_with_its_place(place: Path, change: tuple[str, str], complaint: str) -> None:
+def test_a_wrong_rule_is_reported_with_its_position(place: Path, change: tuple[str, str], complaint: str) -> None:
     told = refusal(place, "expose:\n" + RULE.replace(*change))
     assert told.removeprefix("proxy.yaml:6:").replace("expose[0].", "").startswith(complaint)
 
@@ -125,7 +125,7 @@ def test_what_a_graph_leaves_open_is_read_from_the_environment(place: Path, monk
     assert [end.where for end in stated] == [(2, 1), (1, "http://lab:1")]
 
 
-def test_a_wrong_domain_in_the_environment_is_told(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wrong_domain_in_the_environment_is_reported(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", "robot")
     told = refusal(place, "ros: {endpoint: ros2}\n")
     assert told == "proxy.yaml:5:6: ros: the environment's ROS_DOMAIN_ID is 'robot', not a number from 0 to 232"
@@ -154,7 +154,7 @@ def test_a_wrong_domain_in_the_environment_is_told(place: Path, monkeypatch: pyt
         ("[{endpoint: ros1}, {endpoint: ros1}]", "25: ros[1]: ros[0] is the same graph"),
     ],
 )
-def test_a_wrong_graph_is_told_with_its_place(place: Path, text: str, complaint: str) -> None:
+def test_a_wrong_graph_is_reported_with_its_position(place: Path, text: str, complaint: str) -> None:
     assert refusal(place, f"ros: {text}\n") == f"proxy.yaml:5:{complaint}"
 
 
@@ -188,7 +188,7 @@ def test_one_name_may_be_used_in_two_graphs_if_it_is_two_names_elsewhere(place: 
     assert len(proxy(place, f"{THREE}expose:\n{rules(*texts)}").expose) == 2
 
 
-def test_every_error_of_a_file_is_told_in_its_order(place: Path) -> None:
+def test_every_error_of_a_file_is_reported_in_its_order(place: Path) -> None:
     told = refusals(place, f"{THREE}expose:\n{rules('name: /a', 'name: /b, domain: 3')}record: {{path: x.mcap}}\n")
     assert [line.split(":")[1] for line in told] == ["7", "8", "9"]
 

@@ -1,4 +1,4 @@
-"""Drop-in rules of a proxy: which files are read, in which order, and how errors point into them."""
+"""Drop-in rules of a proxy: the files that are read, their order, and errors that point into them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ OWNER_FROM_DROP_IN = "../../owner/owner.pub"
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """A proxy's configuration without a rule, and an empty drop-in directory."""
+    """Configuration of a proxy without a rule, and an empty drop-in directory."""
     found = open_site(None, tmp_path / "state").robots[0]
     drop_in_directory(found).mkdir()
     return found

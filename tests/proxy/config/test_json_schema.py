@@ -1,4 +1,4 @@
-"""The schema of proxy.yaml: what an editor knows of it."""
+"""JSON schema of proxy.yaml, for editors."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Peers of endpoint ``dds``, each in a process of its own: a node of rclpy, and a second ``DdsEndpoint``.
+"""Peers of endpoint ``dds``, each in a child process: a node of rclpy, and a second ``DdsEndpoint``.
 
-Commands come as lines of JSON and news go the same way, so that a test waits for what it asked for. A peer ends with
+Commands come as lines of JSON and news go the same way, so that a test waits for the answer it requested. A peer ends
 its input. All traffic stays on the loopback device.
 """
 
@@ -34,12 +34,12 @@ PATIENCE_S = 20.0
 
 
 def digest(raw: bytes) -> str:
-    """Return what tells two messages apart in few characters."""
+    """Return a digest that distinguishes two messages in few characters."""
     return hashlib.sha256(raw).hexdigest()[:16]
 
 
 class Peer:
-    """A peer's process, seen from a test."""
+    """Process of a peer, seen from a test."""
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
         self.process = process
@@ -56,7 +56,7 @@ class Peer:
         self._in.flush()
 
     def ask(self, do: str, **what: object) -> dict[str, object]:
-        """Give a command and return its answer; what else comes goes to ``heard``."""
+        """Give a command and return its response; other news go to ``heard``."""
         self.tell(do, **what)
         while True:
             news = self.read()
@@ -87,11 +87,11 @@ class Peer:
         self.process.kill()
 
     def wait_heard(self, topic: str, count: int) -> list[object]:
-        """Return the digests of what was heard on a topic, as soon as there is so much."""
+        """Return the digests of the messages received on a topic, as soon as there are this many."""
         return [news["digest"] for news in self.wait_news("heard", topic, count)]
 
     def wait_news(self, kind: str, value: object, count: int) -> list[dict[str, object]]:
-        """Return the news of a kind, as soon as there is so much; a value of None fits any."""
+        """Return the news of a kind, as soon as there are this many; a value of None fits any."""
         while True:
             found = [news for news in self.heard if kind in news and value in (None, news[kind])]
             if len(found) >= count:
@@ -100,13 +100,13 @@ class Peer:
 
 
 class Ears:
-    """An endpoint of a test, and how to wait for something at it."""
+    """Endpoint of a test, with waits for its conditions."""
 
     def __init__(self, endpoint: DdsEndpoint) -> None:
         self.endpoint = endpoint
 
     def wait(self, holds: Callable[[list[Event]], bool]) -> list[Event]:
-        """Take events until something holds of them."""
+        """Poll events until a condition on them holds."""
         events, until_s = list[Event](), time.monotonic() + PATIENCE_S
         while not holds(events):
             assert time.monotonic() < until_s, (events, self.endpoint.graph())
@@ -115,7 +115,7 @@ class Ears:
         return events
 
     def wait_end(self, role: Role, name: str) -> GraphEntity:
-        """Return an end, as soon as it is in the graph."""
+        """Return a graph entity, as soon as it is in the graph."""
         found: list[GraphEntity] = []
 
         def is_there(_: list[Event]) -> bool:
@@ -277,7 +277,7 @@ def _dds_peer(domain: int) -> None:
             endpoint.close(handles.pop(name))
         elif do == "graph":
             _say(answer="graph", ends=[[end.name, end.role.value, end.node] for end in endpoint.graph()])
-    endpoint.remove_entity()
+    endpoint.shut_down()
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A ROS 1 master on loopback with real rospy nodes, and an endpoint whose events are awaited, never slept for."""
+"""ROS 1 master on loopback with real rospy nodes, and an endpoint whose events are awaited, never slept for."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def need_ros1() -> str:
 
 
 class Peer:
-    """A process running rospy code; it says ``ready`` first, and its lines are read with patience."""
+    """Process of rospy code; it prints ``ready`` first, and its lines are read with a timeout."""
 
     def __init__(self, code: str, environment: dict[str, str]) -> None:
         self.process = subprocess.Popen(
@@ -93,7 +93,7 @@ class Peer:
 
 
 class Ear:
-    """An endpoint and what it said."""
+    """Endpoint and its events."""
 
     def __init__(self, endpoint: Ros1Endpoint) -> None:
         self.endpoint = endpoint
@@ -105,7 +105,7 @@ class Ear:
             left_s = until_s - time.monotonic()
             if left_s <= 0:
                 raise AssertionError(f"it did not come; events: {str(self.events)[-2000:]}, {self.endpoint.graph()}")
-            # What is counted, not told (subscribers), wakes too, but a look now and then costs nothing.
+            # A change that is counted but not reported (subscribers) wakes too, but a check now and then costs nothing.
             select.select([self.endpoint], [], [], min(left_s, 0.5))
             self.events += self.endpoint.poll_events()
 
@@ -128,7 +128,7 @@ class Ear:
 
 
 class Net:
-    """A master and its peers."""
+    """Master and its peers."""
 
     def __init__(self, folder: str, logs: Path) -> None:
         with socket.socket() as probe:
@@ -160,7 +160,7 @@ class Net:
             with socket.socket() as probe:
                 if probe.connect_ex(("127.0.0.1", self.port)) == 0:
                     return
-            time.sleep(0.02)  # a port that opens tells nobody
+            time.sleep(0.02)  # a port that opens causes no event
         raise AssertionError("the master did not come up")
 
     def stop_master(self) -> None:
@@ -189,7 +189,7 @@ class Net:
     def leave(self) -> None:
         """End the peers and endpoints."""
         for endpoint in self.endpoints:
-            endpoint.remove_entity()
+            endpoint.shut_down()
         self.endpoints.clear()
         self.end_peers()
 
@@ -201,7 +201,7 @@ class Net:
 
 @contextmanager
 def ros1_net(logs: Path) -> Iterator[Net]:
-    """A master that runs; everything is stopped at the end."""
+    """Running master; everything is stopped at the end."""
     folder = need_ros1()
     net = Net(folder, logs)
     earlier = os.environ.get("ROS_IP")

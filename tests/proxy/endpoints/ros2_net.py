@@ -1,4 +1,4 @@
-"""A ROS 2 domain on loopback for one test: an endpoint of ours, and real rclpy peers in processes of their own."""
+"""ROS 2 domain on loopback for one test: an endpoint of ours, and real rclpy peers in child processes."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ CONFINED = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "FASTDDS_BUILTIN_TRANS
 
 
 class Peer:
-    """A real node elsewhere; see ``ros2_peer`` for what it can be told.
+    """Real node elsewhere; ``ros2_peer`` lists its commands.
 
     Args:
         words: in front of the command, such as those of ``nsenter``.
-        environment: beside that of this process.
+        environment: in addition to that of this process.
     """
 
     def __init__(self, name: str, words: Sequence[str] = (), environment: Mapping[str, str] = CONFINED) -> None:
@@ -84,14 +84,14 @@ class Peer:
 
 
 class Ears:
-    """Takes an endpoint's events and keeps them."""
+    """Poller that keeps an endpoint's events."""
 
     def __init__(self, endpoint: Ros2Endpoint) -> None:
         self.endpoint = endpoint
         self.events: list[Event] = []
 
     def until(self, is_met: Callable[[], object], what: str = "") -> None:
-        """Take events until a condition holds."""
+        """Poll events until a condition holds."""
         end = time.monotonic() + PATIENCE_S
         while not is_met():
             assert time.monotonic() < end, f"{what} did not happen; {self.events[-5:]}"
@@ -99,7 +99,7 @@ class Ears:
             self.events += self.endpoint.poll_events()
 
     def for_s(self, seconds: float) -> None:
-        """Take events for a time: for what must not happen."""
+        """Poll events for a time: for events that must not happen."""
         end = time.monotonic() + seconds
         while (rest := end - time.monotonic()) > 0:
             select.select([self.endpoint], [], [], rest)
@@ -139,7 +139,7 @@ def needs(*packages: str) -> None:
 
 @contextmanager
 def endpoint_of_ours(node: str = NODE) -> Iterator[Ears]:
-    """An endpoint in the domain."""
+    """Endpoint in the domain."""
     with pytest.MonkeyPatch.context() as patch:
         for name, value in CONFINED.items():
             patch.setenv(name, value)
@@ -147,12 +147,12 @@ def endpoint_of_ours(node: str = NODE) -> Iterator[Ears]:
         try:
             yield Ears(endpoint)
         finally:
-            endpoint.remove_entity()
+            endpoint.shut_down()
 
 
 @contextmanager
 def peer_of(name: str, words: Sequence[str] = (), environment: Mapping[str, str] = CONFINED) -> Iterator[Peer]:
-    """A real node in the domain."""
+    """Real node in the domain."""
     peer = Peer(name, words, environment)
     try:
         yield peer

@@ -1,4 +1,4 @@
-"""A real rclpy node in a process of its own, told what to do line by line; run as a script, it knows nothing of us.
+"""Real rclpy node in a child process, controlled line by line; run as a script, it imports nothing of ours.
 
 Each command is one line of Python with these names: ``node``, ``publish``, ``listen``, ``serve``, ``client``,
 ``heard``; the answer is one line of JSON.
@@ -56,7 +56,7 @@ def main() -> None:
         try:
             result = eval(line, names) if not line.startswith("!") else exec(line[1:].replace("\\n", "\n"), names)
             print(json.dumps(result, default=repr), flush=True)
-        except Exception as error:  # whatever it is, the test is told
+        except Exception as error:  # the test gets every error, whatever its type
             print(json.dumps(f"ERROR {error!r}"), flush=True)
     executor.shutdown()
     thread.join(5)

@@ -1,4 +1,4 @@
-"""How ROS 2 writes itself in DDS, and who is there; no network."""
+"""DDS names and participants of ROS 2; no network."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_what_is_no_node_information_is_read_as_none_or_as_some(raw: bytes) -> N
     assert found is None or isinstance(found, NodeInfo)
 
 
-def test_the_ends_of_a_ros_participant_show_once_it_told_their_node() -> None:
+def test_the_entities_of_a_ros_participant_show_once_it_announced_their_node() -> None:
     survey = GraphCache()
     peer = Peer(WRITER, Named(Role.PUBLISHES, "/a", "std_msgs/msg/String"), "", default(), b"")
     survey.joined(1, WRITER)

@@ -33,7 +33,7 @@ def ears(domain: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Ears]:
     monkeypatch.setenv("CYCLONEDDS_URI", CYCLONE)
     endpoint = DdsEndpoint(domain, "gdp_proxy_0123456789ab")
     yield Ears(endpoint)
-    endpoint.remove_entity()
+    endpoint.shut_down()
 
 
 @pytest.fixture
@@ -95,7 +95,7 @@ def test_a_call_fails_when_its_server_leaves(ears: Ears, robot: Peer) -> None:
     assert CallFailed(handle, 42, "no server") in ears.endpoint.poll_events()
 
 
-def test_the_response_of_a_dropped_call_is_nobodys(ears: Ears, robot: Peer) -> None:
+def test_the_response_of_a_dropped_call_is_ignored(ears: Ears, robot: Peer) -> None:
     robot.tell("serve", topic="/set", type=SET)
     ears.wait_end(Role.SERVES, "/set")
     handle = ears.endpoint.create_client("/set", SET)

@@ -43,7 +43,7 @@ def ears(domain: int) -> Iterator[Ears]:
         patch.setenv("CYCLONEDDS_URI", CYCLONE)
         endpoint = DdsEndpoint(domain, "gdp_proxy_0123456789ab")
     yield Ears(endpoint)
-    endpoint.remove_entity()
+    endpoint.shut_down()
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +106,7 @@ def test_an_image_goes_both_ways_unchanged(ears: Ears, robot: Peer) -> None:
     assert robot.wait_heard("/back", 1) == [sent["digest"]]
 
 
-def test_a_late_reassembler_gets_what_was_latched(ears: Ears, robot: Peer) -> None:
+def test_a_late_joiner_gets_what_was_latched(ears: Ears, robot: Peer) -> None:
     channel = Channel("/map", STRING, 2, STRING_HASH, qos=(default(latched=True, depth=2),))
     handle = ears.endpoint.advertise(channel)
     for text in (b"first", b"hello", b"world"):
@@ -123,7 +123,7 @@ def test_a_subscription_of_rclpy_is_seen_with_what_it_requests(ears: Ears, robot
     assert (end.qos.reliability, end.qos.durability, unmatched(end.qos)) == ("reliable", "transient_local", "")
 
 
-def test_a_closed_subscription_is_told_of_no_more(ears: Ears, robot: Peer) -> None:
+def test_a_closed_subscription_gets_no_more_events(ears: Ears, robot: Peer) -> None:
     robot.tell("advertise", topic="/closed", type=STRING, latched=True)
     robot.tell("publish", topic="/closed", hex=HELLO.hex())
     end = ears.wait_end(Role.PUBLISHES, "/closed")
@@ -134,7 +134,7 @@ def test_a_closed_subscription_is_told_of_no_more(ears: Ears, robot: Peer) -> No
     assert {each.handle for each in events if not isinstance(each, GraphChanged)} == {second}
 
 
-def test_a_reader_that_stands_still_holds_up_nobody(ears: Ears, domain: int) -> None:
+def test_a_stalled_reader_delays_no_other(ears: Ears, domain: int) -> None:
     image = "sensor_msgs/msg/Image"
     with peer("rclpy", domain) as second:
         second.ask("subscribe", topic="/still", type=image)
@@ -155,7 +155,7 @@ def test_an_end_that_leaves_is_gone_from_the_graph(ears: Ears, domain: int) -> N
         ears.wait(lambda _: not any(end.name == "/short" for end in ears.endpoint.graph()))
 
 
-def test_a_type_that_nobody_knows_here_is_heard_as_bytes(ears: Ears, robot: Peer) -> None:
+def test_an_unknown_type_is_received_as_bytes(ears: Ears, robot: Peer) -> None:
     pytest.importorskip("test_msgs", reason="test_msgs is not installed")
     robot.tell("advertise", topic="/odd", type="test_msgs/msg/Empty", latched=True)
     end = ears.wait_end(Role.PUBLISHES, "/odd")

@@ -1,4 +1,4 @@
-"""What generated classes say of themselves is what ROS 2 itself says: the hashes beside the installed interfaces."""
+"""Definitions from generated classes, compared with ROS 2's own: the hashes next to the installed interfaces."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from tests.proxy.endpoints.ros2_net import needs
 
 needs("std_msgs", "sensor_msgs", "nav_msgs", "std_srvs", "test_msgs")
 
-SHARE = Path(sys.prefix) / "share"  # where the wheels put what a ROS installation has below its own prefix
+SHARE = Path(sys.prefix) / "share"  # location of the wheels' files that a ROS installation has below its own prefix
 PACKAGES = ("std_msgs", "sensor_msgs", "nav_msgs", "geometry_msgs", "std_srvs", "test_msgs", "action_msgs")
 
 
 def hashes_of(package: str) -> dict[str, str]:
-    """What rosidl wrote when it generated the package; actions themselves have no class with fields."""
+    """Return the hashes that rosidl wrote when it generated the package; actions have no class with fields."""
     files = sorted((SHARE / package).glob("*/*.json"))
     if not files:
         pytest.skip(f"the descriptions of {package} are not below {SHARE}")

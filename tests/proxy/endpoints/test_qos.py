@@ -1,3 +1,5 @@
+"""QoS profiles: requested, offered and combined ones."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -13,7 +15,7 @@ EASY = default(reliable=False)
 
 
 def match(offered: Qos, wanted: Qos) -> bool:
-    """Return whether DDS 1.4, section 2.2.3, lets these two talk, as far as promises without times go."""
+    """Return whether DDS 1.4, section 2.2.3, lets these two match, for all policies without times."""
     reliable = wanted.reliability != "reliable" or offered.reliability == "reliable"
     return reliable and (wanted.durability != "transient_local" or offered.durability == "transient_local")
 

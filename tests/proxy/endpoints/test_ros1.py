@@ -101,7 +101,7 @@ def test_what_is_published_is_heard_byte_for_byte_from_our_node(net: Net, ear: E
     ear.until(lambda: ear.endpoint.subscribers(handle) == 0)
 
 
-def test_a_late_reassembler_gets_the_kept_messages_of_a_latched_publisher_each_once(net: Net, ear: Ear) -> None:
+def test_a_late_joiner_gets_the_kept_messages_of_a_latched_publisher_each_once(net: Net, ear: Ear) -> None:
     handle = ear.endpoint.advertise(channel("/map", latched=True, depth=3))
     for number in range(5):
         ear.endpoint.publish(handle, string(str(number)))
@@ -124,7 +124,7 @@ def test_a_late_subscription_hears_the_latched_message_of_each_of_two_publishers
     assert ear.of(TypeResolved)[-1].channel.callerid is None
 
 
-def test_two_latched_publishers_of_ours_on_one_topic_both_reach_a_late_reassembler(net: Net, ear: Ear) -> None:
+def test_two_latched_publishers_of_ours_on_one_topic_both_reach_a_late_joiner(net: Net, ear: Ear) -> None:
     first = ear.endpoint.advertise(channel("/tf_static", latched=True))
     second = ear.endpoint.advertise(channel("/tf_static", latched=True))
     ear.endpoint.publish(first, string("a"))

@@ -1,4 +1,4 @@
-"""The wire between the proxy and its rospy process."""
+"""IPC between the proxy and its rospy process."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_frames_of_any_size_arrive_whole_and_in_order(sizes: list[int]) -> None:
 
 def test_a_full_link_drops_the_oldest_message_of_that_topic_only(pair: Pair) -> None:
     sender, receiver, behind = pair
-    assert sender.send(Kind.HEARD, 1, 0, bytes(400_000))  # part of it is on its way
+    assert sender.send(Kind.HEARD, 1, 0, bytes(400_000))  # part of it is in flight
     assert behind == [1]
     for number in range(1, 10):
         assert sender.send(Kind.HEARD, 2, number, bytes(100))
@@ -68,7 +68,7 @@ def test_a_full_link_drops_the_oldest_message_of_that_topic_only(pair: Pair) -> 
     assert frames[-1].kind is Kind.CLOSE
 
 
-def test_a_request_that_finds_no_room_is_not_taken(pair: Pair) -> None:
+def test_a_request_beyond_the_capacity_is_not_taken(pair: Pair) -> None:
     sender, receiver, _ = pair
     assert sender.send(Kind.CALL, 1, 1, bytes(900_000))
     assert sender.send(Kind.CALL, 1, 2, bytes(300_000))
@@ -86,7 +86,7 @@ def test_nothing_is_remembered_of_what_was_sent(pair: Pair) -> None:
     assert (sender.is_behind, sender._waiting_bytes, dict(sender._topics)) == (False, 0, {})
 
 
-def test_the_end_is_told_after_the_last_frame(pair: Pair) -> None:
+def test_the_end_is_reported_after_the_last_frame(pair: Pair) -> None:
     sender, receiver, _ = pair
     sender.send(Kind.ENDING, payload=b"why")
     sender.close()

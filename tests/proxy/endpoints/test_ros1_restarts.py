@@ -1,4 +1,4 @@
-"""A master that is absent, dies or comes back, and a rospy process that is killed."""
+"""Master that is absent, dies or comes back, and a rospy process that is killed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def net(tmp_path: Path) -> Iterator[Net]:
 
 
 def is_all_there(net: Net, ear: Ear, hears: int, tells: int, serves: int, dial: int) -> None:
-    """Everything that four handles promise, with new peers."""
+    """Check all functions of four handles, with new peers."""
     ear.events.clear()
     net.peer(TALKER.format(node="talker", topic="/in", latch=True))
     assert ear.wait(MessageReceived, 1, hears)[0].raw == string("first of talker")
@@ -121,6 +121,6 @@ def test_the_rospy_process_ends_with_the_proxy(net: Net) -> None:
     other.wait_end("/out")
     net.endpoints.remove(ear.endpoint)
     process = ear.endpoint._process
-    ear.endpoint.remove_entity()
+    ear.endpoint.shut_down()
     assert process.returncode == 0
     other.wait_end("/out", gone=True)

@@ -202,7 +202,7 @@ def test_a_service_type_that_is_not_installed_is_served_by_its_definitions(net: 
     assert (opaque.hash, opaque.request.definition) == (SET_BOOL_MD5, "")
 
 
-def test_rounds_of_serving_and_client_entity_leave_no_descriptor_and_no_thread(net: Net, ear: Ear) -> None:
+def test_rounds_of_serving_and_calling_leave_no_descriptor_and_no_thread(net: Net, ear: Ear) -> None:
     net.peer(SERVER)
     pid = ear.endpoint._process.pid
 

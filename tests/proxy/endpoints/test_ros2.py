@@ -36,7 +36,7 @@ def ears() -> Iterator[Ears]:
 
 
 def text(word: str) -> bytes:
-    """A std_msgs/String in CDR, padded to four bytes as Fast CDR does."""
+    """Return a std_msgs/String in CDR, padded to four bytes like Fast CDR."""
     body = len(word.encode() + b"\0").to_bytes(4, "little") + word.encode() + b"\0"
     return b"\0\1\0\0" + body + bytes(-len(body) % 4)
 
@@ -86,7 +86,7 @@ def test_the_virtual_node_shows_with_its_topics_types_and_qos(ears: Ears, peer: 
         channel.hash,
         "TRANSIENT_LOCAL",
     ]
-    # nothing but what was asked for, as far as rclpy allows
+    # only requested events, as far as rclpy allows
     own = peer.tell(f"node.get_service_names_and_types_by_node({NODE!r}, '/')")
     assert own == []
 
@@ -106,7 +106,7 @@ def test_the_graph_shows_ends_that_come_and_go_and_never_our_own(ears: Ears, pee
     assert not {end.name for end in ears.endpoint.graph()} & {"/rosout", "/parameter_events"}
 
 
-def test_a_late_reassembler_gets_what_a_latched_channel_kept(ears: Ears, peer: Peer) -> None:
+def test_a_late_joiner_gets_what_a_latched_channel_kept(ears: Ears, peer: Peer) -> None:
     channel = ears.endpoint.channel("/map", STRING)
     handle = ears.endpoint.advertise(replace(channel, qos=(replace(LATCHED, depth=2),)))
     for word in ("one", "two", "three"):

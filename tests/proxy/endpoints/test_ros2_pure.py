@@ -1,4 +1,4 @@
-"""The parts of the ros2 endpoint that only think: profiles, verdicts, and telling one's own messages apart."""
+"""Sans-I/O parts of the ros2 endpoint: profiles, QoS checks, and recognition of own messages."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_every_way_to_say_infinite_is_left_unsaid(infinite: tuple[int, int]) -> 
     assert filled(replace(RELIABLE, deadline=infinite, lifespan=infinite, lease=infinite)) == RELIABLE
 
 
-def test_a_ack_names_the_node_and_what_differs() -> None:
+def test_a_qos_report_names_the_node_and_the_difference() -> None:
     end = GraphEntity(Role.PUBLISHES, "/a", "std_msgs/msg/String", "/talker", "01", STRING.hash, RELIABLE)
     assert incompatibility(Role.SUBSCRIBES, STRING, RELIABLE, frozenset({end})) == ""
     other = replace(end, hash="RIHS01_" + "b" * 64)
@@ -69,7 +69,7 @@ def test_as_many_copies_are_taken_out_as_were_published() -> None:
     own = LoopbackFilter()
     own.add(b"\0\1\0\0same", 0.0)
     own.add(b"\0\1\0\0same", 0.1)
-    assert own.is_loopback(b"\0\1\0\3same", 0.2)  # the encapsulation may say how much padding there is
+    assert own.is_loopback(b"\0\1\0\3same", 0.2)  # the encapsulation may state how much padding there is
     assert not own.is_loopback(b"\0\1\0\0other", 0.2)
     assert own.is_loopback(b"\0\1\0\0same", 0.3)
     assert not own.is_loopback(b"\0\1\0\0same", 0.3)

@@ -46,7 +46,7 @@ def answer_of(success: bool, message: str) -> bytes:
 
 
 def read(raw: bytes) -> tuple[bool, str]:
-    """Fast CDR leaves padding as it finds it, so bytes cannot be compared."""
+    """Compare without padding: Fast CDR leaves its bytes as they are in memory."""
     from rclpy.serialization import deserialize_message
     from std_srvs.srv import SetBool
 
@@ -96,7 +96,7 @@ def test_fifty_calls_at_once_each_get_their_own_answer(ears: Ears, peer: Peer) -
         assert deserialize_message(outcome.raw, BasicTypes.Response).int32_value == call
 
 
-def test_a_dropped_call_is_nobodys(ears: Ears, peer: Peer) -> None:
+def test_the_response_of_a_dropped_call_is_ignored(ears: Ears, peer: Peer) -> None:
     peer.tell("!s3 = node.create_service(SetBool, '/s3', answer)")
     ears.until(lambda: served(ears, "/s3"), "the server in the graph")
     handle = ears.endpoint.create_client("/s3", SET_BOOL)

@@ -1,4 +1,4 @@
-"""A proxy that is asked to leave does so when it has answered what it had, and within ten seconds in any case."""
+"""Proxy with a request to leave: it finishes its calls and ends, within ten seconds in any case."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SWITCH = f"kind: service, name: /switch, type: {SET_BOOL}, timeout_s: 60"
 
 @dataclass(slots=True)
 class Steps:
-    """A loop in virtual time."""
+    """Main loop in virtual time."""
 
     sites: Sites
     is_stopped: bool = False
@@ -30,7 +30,7 @@ class Steps:
 
 
 def leave(sites: Sites, machine: Machine) -> float:
-    """Let a machine's loop run after a SIGUSR1; return how many seconds it took to end."""
+    """Run a machine's loop after a SIGUSR1; return how many seconds it took to end."""
     began_s = sites.now_s
     node = SimpleNamespace(
         member=machine.member,
@@ -53,7 +53,7 @@ def sites(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Sites:
 
 
 def called(sites: Sites) -> tuple[Machine, LocalServer, Client]:
-    """Return a server's machine, its local server with a call under way, and the client."""
+    """Return a server's machine, its local server with a call in flight, and the client."""
     server, client = sites.add(SERVER, expose=[SWITCH]), sites.add(ROBOT, imports=[SWITCH])
     local, caller = LocalServer(server.graph), Client(client.graph)
     assert sites.run(3, caller.sees_server)

@@ -1,4 +1,4 @@
-"""Where the shared recordings lie, for the tests that need them."""
+"""Paths of the shared recordings, for the tests that need them."""
 
 from __future__ import annotations
 

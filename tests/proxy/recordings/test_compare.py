@@ -1,3 +1,5 @@
+"""Comparison of two recordings: identical, lost, doubled and changed messages."""
+
 from __future__ import annotations
 
 import struct
@@ -15,7 +17,7 @@ TYPE = "std_msgs/msg/UInt8"
 
 
 def message(value: int, rubbish: int = 0) -> bytes:
-    """A byte and a double, with whatever the recorder left between them."""
+    """Return a byte and a double, with the recorder's bytes between them."""
     return b"\x00\x01\x00\x00" + bytes([value]) + bytes([rubbish]) * 7 + struct.pack("<d", value)
 
 

@@ -1,4 +1,4 @@
-"""Recordings as endpoints of a bridge: what is replayed on one machine is recorded on another."""
+"""Recordings as endpoints of a bridge: messages replayed on one machine are recorded on another."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ CHATTER = f"name: /chatter, type: {STRING}, encoding: cdr"
 
 
 class FullWriter:
-    """A recording on a full disk."""
+    """Recording on a full disk."""
 
     path = Path("full.mcap")
     ros: RosVersion = 2

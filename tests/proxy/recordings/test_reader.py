@@ -1,3 +1,5 @@
+"""Reader of recordings: whole, truncated, damaged and refused files."""
+
 from __future__ import annotations
 
 import shutil
@@ -93,7 +95,7 @@ def test_a_storage_file_alone_is_read_as_its_folder_is() -> None:
     ]
 
 
-def test_remote_clients_and_latching_are_kept_in_ros_1(tmp_path: Path) -> None:
+def test_caller_ids_and_latching_are_kept_in_ros_1(tmp_path: Path) -> None:
     channels = [string(1, callerid="/a", latched=True), string(1, callerid="/b"), string(1, callerid=None)]
     with BagWriter(tmp_path / "a.bag", 1) as bag:
         for channel in channels:
@@ -251,7 +253,7 @@ def test_a_journal_that_was_never_folded_in_is_read(tmp_path: Path) -> None:
     assert unread == ""
 
 
-def test_a_journal_without_its_index_is_read_and_nothing_is_written_beside_it(tmp_path: Path) -> None:
+def test_a_journal_without_its_index_is_read_and_nothing_is_written_next_to_it(tmp_path: Path) -> None:
     shutil.copy(recording("rosbag2_test") / "rosbag2_test_0.db3", tmp_path / "a.db3")
     before = len(read(tmp_path / "a.db3")[0])
     db = sqlite3.connect(tmp_path / "a.db3")
@@ -281,7 +283,7 @@ def test_damage_inside_a_whole_file_is_reported_and_not_raised(tmp_path: Path) -
     assert f"after {len(messages)} of {len(sent)} messages" in unread
 
 
-# --- what cannot be read
+# --- unreadable recordings
 
 
 def test_an_unreadable_recording_is_named_with_the_reason() -> None:
@@ -377,7 +379,7 @@ def test_a_channel_about_which_little_is_known_can_be_recorded(tmp_path: Path) -
         assert [message.raw for message in read(tmp_path / name)[0]] == [b"\x00\x01\x00\x00\x05"]
 
 
-def test_a_stamp_that_a_bag_cannot_hold_is_the_remote_clients_fault(tmp_path: Path) -> None:
+def test_a_stamp_that_a_bag_cannot_hold_is_the_callers_fault(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "a.bag", 1) as bag:
         handle = bag.add(string(1))
         with pytest.raises(LocalError, match="stamp"):

@@ -1,3 +1,5 @@
+"""Channel descriptions and their wire form."""
+
 from __future__ import annotations
 
 import cbor2
@@ -25,7 +27,7 @@ def test_an_unknown_caller_is_not_an_empty_one() -> None:
         assert Channel.from_wire(channel.to_wire()).callerid == callerid
 
 
-def test_a_definition_too_long_for_a_reader_is_the_remote_clients_fault() -> None:
+def test_a_definition_too_long_for_a_reader_is_the_callers_fault() -> None:
     with pytest.raises(LocalError, match="/big"):
         Channel("/big", "a/msg/B", 2, definition="x" * 2_000_000, definition_format="msg").to_wire()
 

@@ -1,3 +1,5 @@
+"""Message converter between ROS 1 and ROS 2."""
+
 from __future__ import annotations
 
 import struct
@@ -75,7 +77,7 @@ def difference(there: Channel, here: Channel) -> str:
     return str(refusal.value)
 
 
-# --- what differs without meaning anything
+# --- differences without meaning
 
 
 def test_a_header_loses_its_sequence_number_and_gains_a_zero() -> None:
@@ -176,7 +178,7 @@ def test_what_is_beyond_a_bound_is_refused_and_what_is_within_is_not(loose: str,
     assert to_ros1(tight, loose, to_ros2(loose, loose, raw)) == raw
 
 
-def test_channels_of_one_ros_and_of_equal_form_hand_on_the_same_bytes() -> None:
+def test_channels_of_one_ros_and_of_equal_form_forward_the_same_bytes() -> None:
     for ros in (1, 2):
         one, other = channel("string<=2 a\n", ros), channel("string a\n", ros)
         raw = b"whatever"
@@ -196,7 +198,7 @@ def test_an_equal_hash_stands_for_definitions_that_are_not_there() -> None:
     assert "no definition" in difference(Channel("/t", "a/msg/B", 2), Channel("/t", "a/msg/B", 2))
 
 
-# --- what differs and matters
+# --- differences that matter
 
 
 @pytest.mark.parametrize(
@@ -294,7 +296,7 @@ def test_fields_that_differ_in_case_alone_have_no_form_in_ros_2() -> None:
         translated_channel(channel("int32 k\nint32 K\n", 1), 2)
 
 
-def test_no_definition_has_no_converter() -> None:
+def test_a_channel_without_a_definition_has_no_translation() -> None:
     with pytest.raises(DefinitionError, match="no definition"):
         translated_channel(Channel("/t", "a/msg/B", 1), 2)
 
@@ -310,7 +312,7 @@ def test_latched_is_transient_local_in_ros_2() -> None:
     assert translated_channel(channel("", 1), 2).qos == ()
 
 
-def test_in_its_own_ros_a_channel_is_its_own_converter() -> None:
+def test_in_its_own_ros_a_channel_needs_no_translation() -> None:
     about = channel("string data\n", 2)
     assert translated_channel(about, 2) is about
 
@@ -350,5 +352,5 @@ def test_an_altered_message_is_converted_or_refused(at: int, value: int) -> None
 
 
 def _empty_size() -> int:
-    """Return how long the message is whose bytes are all zero."""
+    """Return the length of the message whose bytes are all zero."""
     return next(size for size in range(500) if refusal(EITHER[0], bytes(size)) is None)

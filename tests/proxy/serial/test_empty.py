@@ -1,3 +1,5 @@
+"""Empty messages of any type, and responses with a reason."""
+
 from __future__ import annotations
 
 import json

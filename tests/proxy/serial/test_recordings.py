@@ -1,3 +1,5 @@
+"""Serializer on every message of the shared recordings."""
+
 from __future__ import annotations
 
 from typing import get_args

@@ -1,3 +1,5 @@
+"""Message definitions: parsed forms, bounds and refused texts."""
+
 from __future__ import annotations
 
 import pytest
@@ -73,7 +75,7 @@ def test_a_type_that_is_not_there_is_refused() -> None:
         fields("C c\n")
 
 
-def test_a_text_that_is_no_definition_is_told_apart() -> None:
+def test_a_text_that_is_no_definition_is_recognised() -> None:
     with pytest.raises(UnparsedError):
         fields("int32 a\n---\nint32 b\n")
     with pytest.raises(UnparsedError):

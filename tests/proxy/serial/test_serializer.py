@@ -1,3 +1,5 @@
+"""Serializer of ROS messages: numbers, text, layout, and hostile bytes."""
+
 from __future__ import annotations
 
 import json
@@ -195,7 +197,7 @@ def test_a_wide_string_is_readable_in_json() -> None:
 
 
 def mixed_message(seed: int) -> tuple[Channel, bytes]:
-    """A message of every kind of field, written by rosbags: the oracle for layout and padding."""
+    """Message of every kind of field, written by rosbags: the oracle for layout and padding."""
     random = np.random.default_rng(seed)
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(MIXED, "a/msg/B"))
@@ -294,7 +296,7 @@ def test_the_sequence_number_of_a_ros_1_header_survives(encoding: Encoding) -> N
     assert Serializer(about, encoding).opaque == ""
 
 
-# --- what cannot be taken apart
+# --- bytes that cannot be decoded
 
 
 @pytest.mark.parametrize("encoding", EVERY)
@@ -328,7 +330,7 @@ def test_a_count_of_empty_items_costs_no_memory() -> None:
     assert json.loads(Serializer(about, "json").encode(raw)).keys() == {"$raw"}
 
 
-# --- what a peer may send
+# --- messages of a peer
 
 
 def refusal(about: Channel, body: bytes, encoding: Encoding) -> DropReason | None:
@@ -401,7 +403,7 @@ def test_a_typed_array_of_another_kind_or_length_is_refused() -> None:
         assert refusal(about, cbor2.dumps({"a": cbor2.CBORTag(tag, raw)}), "cbor") is DropReason.MALFORMED
 
 
-def test_a_few_bytes_that_advertisement_many_records_without_fields_are_not_read() -> None:
+def test_a_few_bytes_that_announce_many_records_without_fields_are_not_read() -> None:
     channel = known.custom("a/msg/Nothings", f"a/Nothing[] nothings\n{RULE}MSG: a/Nothing\n", 1)
     serializer = Serializer(channel, "json")
     assert json.loads(serializer.encode(struct.pack("<I", 200))) == {"nothings": [{}] * 200}

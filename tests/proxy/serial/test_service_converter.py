@@ -1,3 +1,5 @@
+"""Service converter between ROS 1 and ROS 2, and the MD5 sums of installed types."""
+
 from __future__ import annotations
 
 import json
@@ -18,9 +20,9 @@ from proxy.serial.service_converter import ServiceConverter, translated_service
 
 LITTLE = b"\x00\x01\x00\x00"
 SET_BOOL = "09fb03525b03e7ea1fd3992bafd87e16"
-INTERPRETER = Path("/usr/bin/python3")  # where Debian puts ROS 1
+INTERPRETER = Path("/usr/bin/python3")  # Debian's path of ROS 1
 
-# Prints what the installed ROS 1 knows: {type: [md5, text]} and {type: [md5, request text, response text]}.
+# Prints the types of the installed ROS 1: {type: [md5, text]} and {type: [md5, request text, response text]}.
 LIST = """
 import importlib, inspect, json
 found = {"msg": {}, "srv": {}}
@@ -152,6 +154,6 @@ def test_a_half_may_use_other_types() -> None:
     )
 
 
-def test_in_its_own_ros_a_service_is_its_own_converter() -> None:
+def test_in_its_own_ros_a_service_needs_no_translation() -> None:
     about = service("a/srv/B", "", "")
     assert translated_service(about, 1) is about

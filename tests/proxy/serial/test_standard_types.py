@@ -1,3 +1,5 @@
+"""Standard types of both ROS versions: definitions and hashes."""
+
 from __future__ import annotations
 
 from proxy.serial.standard_types import standard_definition, type_hash

@@ -1,3 +1,5 @@
+"""Message converter on every message of the shared recordings."""
+
 from __future__ import annotations
 
 import json

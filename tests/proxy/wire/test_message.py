@@ -1,4 +1,4 @@
-"""Parcels and their description: they come back as they were, and arbitrary bytes are refused."""
+"""Envelopes of ROS messages and their description: they read back as written, and arbitrary bytes are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Words about a log: what is written is read back, and arbitrary bytes are read or refused."""
+"""Messages of replication: each reads back as written, and arbitrary bytes are read or refused."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ LOG = LogId(3, 0xFFFF_FFFF)
         SnapshotRequest(LOG),
     ],
 )
-def test_a_keepers_word_travels(word: SequencerMessage) -> None:
+def test_a_sequencer_message_survives_the_wire(word: SequencerMessage) -> None:
     assert is_word(to_wire(word))
     assert sequencer_message(to_wire(word)) == word
 

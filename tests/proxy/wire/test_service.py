@@ -1,3 +1,5 @@
+"""Service protocol between proxies: round trips and refusals."""
+
 from __future__ import annotations
 
 import contextlib

@@ -1,4 +1,4 @@
-"""The demonstration's two nodes, real ones, in a graph of their own on this machine."""
+"""Two real nodes of the demonstration, in a graph of their own on this machine."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_wrong_answer_is_counted() -> None:
     assert (line["wrong"], line["under_way"], line["median_ms"]) == (1, 1, 1.0)
 
 
-def test_the_longest_silence_since_the_line_before_is_told() -> None:
+def test_the_longest_silence_since_the_line_before_is_reported() -> None:
     stats = Tally()
     for now_s in (5.0, 5.5, 5.6):
         stats.answered(True, Tallied(success=True, message="a"), 0.001, now_s)
@@ -58,7 +58,7 @@ def test_the_longest_silence_since_the_line_before_is_told() -> None:
 
 
 class Tallied:
-    """An answer."""
+    """Response of a service."""
 
     def __init__(self, *, success: bool, message: str) -> None:
         self.success = success

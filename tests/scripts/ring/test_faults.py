@@ -1,4 +1,4 @@
-"""Faults as a person writes them: read, compared with the topology, and refused where nothing could arrive."""
+"""Faults, as a person writes them: parsed, compared with the topology, and refused if no delivery were possible."""
 
 from __future__ import annotations
 

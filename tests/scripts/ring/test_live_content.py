@@ -1,4 +1,4 @@
-"""What live nodes say, in messages shaped like those of either ROS."""
+"""Content of live nodes' messages, in the shape of either ROS."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ NOW_NS = 1_700_000_000_123_456_789
 
 
 class _Shown:
-    """A message of either ROS, by its fields in order."""
+    """Message of either ROS, by its fields in order."""
 
     def __init__(self, ros: int, **fields: object) -> None:
         self.__dict__.update(fields)
@@ -78,7 +78,7 @@ def test_a_listener_reads_when_a_message_was_said(talk: Talk, ros: int) -> None:
     assert mark.number == (1 if talk.latched else 5)
 
 
-def test_a_greeting_is_known_as_one() -> None:
+def test_a_message_is_read_as_its_mark() -> None:
     for talk in TALKS:
         if not talk.latched:
             assert talk.read(said(talk, 0)) == Mark(0, NOW_NS)

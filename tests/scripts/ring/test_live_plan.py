@@ -1,4 +1,4 @@
-"""What a live run consists of, and the files that its proxies accept."""
+"""Parts of a live run, and the files that its proxies accept."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_each_kind_of_live_run_has_its_graphs(live: Live, versions: tuple[int, i
 
 
 @pytest.mark.parametrize("run", ["000000", "ffffff", "c6da61"])
-def test_the_domain_of_a_run_is_one_whose_ports_are_nobody_elses(run: str) -> None:
+def test_the_domain_of_a_run_is_one_whose_ports_no_other_domain_uses(run: str) -> None:
     domains = [graph.domain for graph in graphs_of("ros2", run)]
     assert len(set(domains)) == 2
     assert all(0 < domain <= DOMAIN_MAX and 7_400 + 250 * (domain + 1) < 32_768 for domain in domains)

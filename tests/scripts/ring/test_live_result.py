@@ -1,4 +1,4 @@
-"""What is made of the reports of live nodes."""
+"""Result of the reports of live nodes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Processes that play live nodes: how a session follows them to their reports."""
+"""Session with processes that play live nodes, from their start to their reports."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def play(run: Run, talker: str = TALKER, lamp: str = LAMP, listener: str = LISTE
     return asyncio.run(main())
 
 
-def test_every_node_is_told_to_go_and_asked_for_its_report(run: Run) -> None:
+def test_every_node_gets_the_start_command_and_is_asked_for_its_report(run: Run) -> None:
     heard = play(run)
     assert [talker.texts("sent") for talker in heard.talkers] == [["aa", "bb"]]
     assert (heard.lamp.count("served"), heard.caller.count("answered")) == (1, 1)

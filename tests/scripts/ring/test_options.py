@@ -1,4 +1,4 @@
-"""What may be asked of the ring."""
+"""Options of the ring."""
 
 from __future__ import annotations
 

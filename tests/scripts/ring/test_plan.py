@@ -1,4 +1,4 @@
-"""The files of a ring are what its commands accept."""
+"""Files of a ring, which its commands accept."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Processes that play the two ends: what the ring makes of what they say, and of how they end."""
+"""Processes that play the two ends: the ring's treatment of their output and their exits."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ RECEIVER = HEAD + RECEIVER
 
 
 class Nothing:
-    """An overlay in which nothing fails."""
+    """Overlay without failures."""
 
     async def cut(self, cut: object) -> None: ...
     async def heal(self, cut: object) -> None: ...
@@ -98,12 +98,12 @@ def test_an_end_that_ends_badly_is_a_complaint(run: Run) -> None:
     assert report.complaints == ("the sender ended with code 1", "the receiver ended with code 3")
 
 
-def test_a_sender_that_dies_in_the_middle_is_told_with_its_last_lines(run: Run) -> None:
+def test_a_sender_that_dies_in_the_middle_is_reported_with_its_last_lines(run: Run) -> None:
     with pytest.raises(ChildError, match=r"(?s)sender ended with code 1 in the middle\n    a boom"):
         play(run, HEAD + "say(event='ready'); sys.exit('a boom')", RECEIVER)
 
 
-def test_a_process_that_never_gets_ready_is_told_with_its_last_lines(run: Run) -> None:
+def test_a_process_that_never_gets_ready_is_reported_with_its_last_lines(run: Run) -> None:
     with pytest.raises(ChildError, match=r"(?s)receiver ended with code 1 before it said 'ready'\n    no such key"):
         play(run, SENDER, "import sys; sys.exit('no such key')")
 
@@ -126,7 +126,7 @@ def test_a_line_of_a_megabyte_is_read(run: Run) -> None:
     assert len(play(run, SENDER, long).topics[0].text("topic")) == 1_000_001
 
 
-def test_a_child_that_does_not_answer_in_time_is_told(run: Run, tmp_path: Path) -> None:
+def test_a_child_that_does_not_answer_in_time_is_reported(run: Run, tmp_path: Path) -> None:
     async def impatient(children: Children) -> Report:
         child: Child = children.start("mute", [sys.executable, "-c", "import signal; signal.pause()"])
         await child.wait_for("ready", 0.05)

@@ -1,4 +1,4 @@
-"""What passes, what does not, and how it is written."""
+"""Result of the ring: passed or failed, and its printed form."""
 
 from __future__ import annotations
 

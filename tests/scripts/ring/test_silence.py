@@ -1,4 +1,4 @@
-"""Which flows stand still while something is due to them."""
+"""Silent flows to which messages are due."""
 
 from __future__ import annotations
 

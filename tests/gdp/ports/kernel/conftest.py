@@ -1,4 +1,4 @@
-"""A program in the kernel, where that is allowed."""
+"""Program in the kernel, where that is permitted."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _REASON = _why_not()
 
 @pytest.fixture(scope="module", params=[False, True], ids=["for good", "leased"])
 def loaded(request: pytest.FixtureRequest) -> Iterator[LoadedProgram]:
-    """The program with room for a hundred entries; leased, it is valid for longer than a test takes."""
+    """Program with space for a hundred entries; leased, it is valid for longer than a test takes."""
     if _REASON:
         pytest.skip(_REASON)
     made = LoadedProgram(100, leased=request.param)
@@ -34,7 +34,7 @@ def loaded(request: pytest.FixtureRequest) -> Iterator[LoadedProgram]:
 
 @pytest.fixture
 def small() -> Iterator[LoadedProgram]:
-    """The program with room for three entries."""
+    """Program with space for three entries."""
     if _REASON:
         pytest.skip(_REASON)
     made = LoadedProgram(3)

@@ -1,4 +1,4 @@
-"""Instructions against the words of RFC 9669, and against what ``bpf_asm`` style listings show for them."""
+"""Assembler: its instructions compared with RFC 9669, and its listings in ``bpf_asm`` style."""
 
 from __future__ import annotations
 

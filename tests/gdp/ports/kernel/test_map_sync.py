@@ -1,4 +1,4 @@
-"""The kernel's map against the table, after any changes."""
+"""Kernel's map, compared with the table after any changes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def name(number: int) -> bytes:
 
 
 def in_kernel(loaded: LoadedProgram, key: bytes) -> Hops | None:
-    """Return what the program would find for a key."""
+    """Return the value that the program would find for a key."""
     value = loaded.entries.get(key.ljust(64, b"\0"))
     if value is None:
         return None
@@ -123,9 +123,7 @@ def test_an_entry_that_changes_its_way_keeps_its_counts(small: LoadedProgram, ho
     assert mirror.counts(1) == before != {}
 
 
-def test_a_full_map_is_asked_no_more_for_room_by_each_name(
-    small: LoadedProgram, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_map_is_not_retried_for_each_name(small: LoadedProgram, monkeypatch: pytest.MonkeyPatch) -> None:
     table, mirror = watched(small)
     held = [name(number) for number in (1, 2, 3)]
     table.install_many([(key, ONE_HOP) for key in held], 1.0)

@@ -1,8 +1,8 @@
-"""The program against ``decide`` and ``rewrite``, by ``BPF_PROG_TEST_RUN``: nothing is sent, no device is needed.
+"""Forwarder program, compared with ``decide`` and ``rewrite`` by ``BPF_PROG_TEST_RUN``, without traffic or devices.
 
-The kernel lets a test frame come in on the loopback device, whose address is zero; so the frames here are addressed to
-zero, which no verdict depends on. What an entry with several hops becomes is tested on real devices, since the program
-sends the copies itself.
+The kernel lets a test frame come in on the loopback device, whose address is zero. The frames here are therefore
+addressed to zero, on which no decision depends. Entries with several hops are tested on real devices, because the
+program sends the copies itself.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ TO_US = bytes(6)  # the loopback's address
 LEFT_TO_PYTHON = {DropReason.TRUNCATED, DropReason.BAD_ETHERTYPE, DropReason.BAD_VERSION, DropReason.HOPS_EXPIRED}
 LEFT_TO_PYTHON |= {DropReason.TOO_BIG}
 DESTINATION = slice(ETHER_BYTES + DESTINATION_AT, ETHER_BYTES + SOURCE_AT)  # left to Python with an entry for no source
-UNTOLD = 9  # a port that the kernel was never told of
+UNTOLD = 9  # a port that the kernel does not know
 TO_UNTOLD = (UNTOLD, bytes(12))
 
 
 @dataclass(frozen=True)
 class Step:
-    """What the program did with one frame, and what it counted."""
+    """Action of the program on one frame, and its counters."""
 
     ack: int
     frame: bytes
@@ -62,7 +62,7 @@ class Step:
 
 
 def forwards(loaded: LoadedProgram, entries: Mapping[bytes, Hops], mtus: Mapping[int, int] = MTUS) -> Table:
-    """Let the program forward by these entries; ports have no device, for nothing is sent here."""
+    """Set the program's entries; ports have no device, because nothing is sent here."""
     table = Table()
     for port in range(UNTOLD):
         loaded.set_port(port, 1 if port in mtus else 0, mtus.get(port, 0), 0)
@@ -92,7 +92,7 @@ def step(loaded: LoadedProgram, given: bytes) -> Step:
 
 
 def check(done: Step, given: bytes, entries: Mapping[bytes, Hops]) -> None:
-    """Whether the program did what ``decide`` and ``rewrite`` say, or left it to them for a reason that it may."""
+    """Check that the program did the same as ``decide`` and ``rewrite``, or punted for a permitted reason."""
     said = decide(given, entries, MTUS)
     if done.ack == UP:
         reasons = {said.reason} if isinstance(said, Drop) else set(said.lost) if isinstance(said, Forward) else set()
@@ -145,7 +145,7 @@ NEAR = st.integers(-3, 3)
 
 @st.composite
 def frames(draw: st.DrawFn) -> bytes:
-    """Frames near every bound that a verdict depends on."""
+    """Frames near every bound on which a decision depends."""
     size = draw(st.sampled_from([0, 1, 600, MTUS[2] - HEADER_BYTES, MTUS[1] - HEADER_BYTES])) + draw(NEAR)
     payload = bytes(max(size, 0))
     whole = frame(
@@ -167,7 +167,7 @@ def frames(draw: st.DrawFn) -> bytes:
 
 @settings(deadline=None)
 @given(given=st.lists(frames(), min_size=1, max_size=8), entries=TABLES)
-def test_generated_frames_and_tables_get_the_ack_of_the_reference(
+def test_generated_frames_and_tables_get_the_decision_of_the_reference(
     loaded: LoadedProgram, given: list[bytes], entries: dict[bytes, Hops]
 ) -> None:
     table = forwards(loaded, entries)

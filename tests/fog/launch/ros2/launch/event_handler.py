@@ -1,4 +1,4 @@
-"""What events are handled by."""
+"""Base of event handlers."""
 
 
 class BaseEventHandler:

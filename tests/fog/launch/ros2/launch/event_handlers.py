@@ -1,4 +1,4 @@
-"""What happens when a launch ends."""
+"""Handler of a launch's end."""
 
 from launch.event_handler import BaseEventHandler
 from launch.events import Shutdown

@@ -1,4 +1,4 @@
-"""The event that ends a launch."""
+"""Event that ends a launch."""
 
 from launch.core import Event
 

@@ -1,4 +1,4 @@
-"""What is launched; visiting it gives its entities."""
+"""Description of a launch; visiting it returns its entities."""
 
 from launch.core import LaunchDescriptionEntity
 

@@ -1,1 +1,1 @@
-"""Stand-in for ``ros2cli`` 0.32.2; commands and verbs are found by the entry points of what is installed."""
+"""Stand-in for ``ros2cli`` 0.32.2; the entry points of installed packages supply commands and verbs."""

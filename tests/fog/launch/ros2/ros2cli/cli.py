@@ -1,4 +1,4 @@
-"""The command ``ros2``."""
+"""Command ``ros2``."""
 
 import argparse
 

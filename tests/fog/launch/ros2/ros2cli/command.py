@@ -1,4 +1,4 @@
-"""Commands and their sub-commands; arguments are known a step at a time, so each parser is asked twice."""
+"""Commands and their sub-commands; arguments become known step by step, so each parser runs twice."""
 
 from importlib import metadata
 

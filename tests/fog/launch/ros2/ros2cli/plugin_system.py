@@ -1,4 +1,4 @@
-"""The version that plug-ins are made for."""
+"""Version for which plug-ins are made."""
 
 PLUGIN_SYSTEM_VERSION = "0.1"
 

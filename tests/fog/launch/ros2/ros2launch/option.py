@@ -1,4 +1,4 @@
-"""What ``ros2 launch`` asks before it loads a launch file."""
+"""Questions of ``ros2 launch`` before it loads a launch file."""
 
 from ros2cli.plugin_system import PLUGIN_SYSTEM_VERSION, satisfies_version
 

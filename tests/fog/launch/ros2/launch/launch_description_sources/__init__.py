@@ -1,4 +1,4 @@
-"""Where launch descriptions come from."""
+"""Sources of launch descriptions."""
 
 from launch.launch_description_sources.python_launch_file_utilities import (
     get_launch_description_from_python_launch_file,

@@ -1,4 +1,4 @@
-"""Runs launch files."""
+"""Loader of launch files."""
 
 from importlib.machinery import SourceFileLoader
 from importlib.util import module_from_spec, spec_from_loader

@@ -1,4 +1,4 @@
-"""The node action: its command line grows while substitutions are performed, and dictionaries become files."""
+"""Node action: its command line grows while substitutions are performed, and dictionaries become files."""
 
 import tempfile
 from pathlib import Path
@@ -10,7 +10,7 @@ from launch.utilities import normalize_to_list_of_substitutions, perform_substit
 
 
 def _evaluated(context, value):
-    """Lists become tuples, as launch_ros makes them, and values of launch arguments are read as YAML."""
+    """Turn lists into tuples and read values of launch arguments as YAML, like launch_ros."""
     if isinstance(value, dict):
         return {key: _evaluated(context, each) for key, each in value.items()}
     if isinstance(value, list | tuple):
@@ -21,7 +21,7 @@ def _evaluated(context, value):
 
 
 def _flat(parameters, group=""):
-    """Groups become names with dots, as launch_ros writes them."""
+    """Turn groups into names with dots, like launch_ros."""
     found = {}
     for key, value in parameters.items():
         found |= _flat(value, f"{group}{key}.") if isinstance(value, dict) else {f"{group}{key}": value}
