@@ -95,7 +95,7 @@ def tells(proxy: Proxy, name: str, fault: str) -> str:
     until(lambda: proxy.warnings(name), f"{fault} of {name}")
     warnings = proxy.warnings(name)
     assert [warning.partition(": ")[0] for warning in warnings] == [fault], warnings
-    assert proxy.bridge.faults(fault) > 0
+    assert proxy.faults(fault) > 0
     return warnings[0].removeprefix(fault + ": ")
 
 
@@ -161,7 +161,7 @@ def test_a_publisher_that_is_faster_than_the_path(pair: Pair, a: Peer, b: Peer) 
 
 def failures(proxy: Proxy) -> int:
     """Return how many calls of local clients failed, on either side's timeout."""
-    return sum(map(proxy.bridge.faults, ("refused", "timed-out", "no-server")))
+    return sum(map(proxy.faults, ("refused", "timed-out", "no-server")))
 
 
 @pytest.mark.parametrize("kill", [False, True])

@@ -154,7 +154,7 @@ class Forge:
         channels = getattr(machine, "_channels", None)
         if channels is None or to == ZERO:
             return None
-        if not channels.answer(to, wire):
+        if not channels.send_response(to, wire):
             channels.ask(to, wire, self._stage.world.network.now.mono_s)
         frames: list[bytes] = []
         for each in channels.take():
