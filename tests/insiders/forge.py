@@ -157,7 +157,7 @@ class Forge:
         if not channels.send_response(to, wire):
             channels.ask(to, wire, self._stage.world.network.now.mono_s)
         frames: list[bytes] = []
-        for each in channels.take():
+        for each in channels.records_to_send():
             kind = Kind.RIB_ANSWER if each.is_answer else Kind.RIB_REQUEST
             frames += self._splitters[persona.node].split(kind, each.wire, 1_500, each.to)
         self._old.append(wire)
