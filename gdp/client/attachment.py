@@ -360,7 +360,7 @@ class Attachment:
         fields = statement.fields
         member = self._policy.verify_membership(fields.bytes_("c"), now.unix_s)
         if member.name != statement.signer or (member.name != switch.name and member.role is not Role.RIB):
-            raise StatementError(DropReason.BAD_CERTIFICATE, "a verdict from nobody who may judge")
+            raise StatementError(DropReason.BAD_CERTIFICATE, "an AdvertiseAck from a node that may not give it")
         statement.verify(member.key)
         if statement.type is StatementType.ANSWER:
             return statement

@@ -259,14 +259,14 @@ class RawPlane(NetdevPlane):
         """Decide on one frame in a slot with the reference, and act on the decision."""
         batch, drops = self._batch, self._counters.drops
         at = slot * batch.slot_bytes
-        ack = decide(batch.pool[at : at + ETHER_BYTES + size], entries, self._mtus, sides, port)
-        if isinstance(ack, Drop):
-            drops[ack.reason] += 1
-        elif isinstance(ack, Forward):
-            for reason in ack.lost:
+        decision = decide(batch.pool[at : at + ETHER_BYTES + size], entries, self._mtus, sides, port)
+        if isinstance(decision, Drop):
+            drops[decision.reason] += 1
+        elif isinstance(decision, Forward):
+            for reason in decision.lost:
                 drops[reason] += 1
             batch.pool[at + ETHER_BYTES + HOPS_AT] -= 1
-            self._send(sinks, ack.hops, slot, 1)
+            self._send(sinks, decision.hops, slot, 1)
         else:
             self._arrivals.append(self._arrival(port, at, size))
 

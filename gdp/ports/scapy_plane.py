@@ -124,14 +124,14 @@ class ScapyPlane(NetdevPlane):
         if self._entries is None:
             self._punt(index, frame)
             return
-        ack = decide(frame, self._entries, self._mtus, self._sides, index)
-        if isinstance(ack, Drop):
-            counters.drops[ack.reason] += 1
-        elif isinstance(ack, Forward):
-            for reason in ack.lost:
+        decision = decide(frame, self._entries, self._mtus, self._sides, index)
+        if isinstance(decision, Drop):
+            counters.drops[decision.reason] += 1
+        elif isinstance(decision, Forward):
+            for reason in decision.lost:
                 counters.drops[reason] += 1
             packet[GDP].hops_left -= 1
-            for port, macs in ack.hops:
+            for port, macs in decision.hops:
                 packet[Ether].dst, packet[Ether].src = str2mac(macs[:MAC_BYTES]), str2mac(macs[MAC_BYTES:])
                 counters.forwarded += self._send(port, packet)
         else:

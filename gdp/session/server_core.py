@@ -33,7 +33,7 @@ class ServerCore:
 
     Attributes:
         turns: requests for handlers, in order; a driver removes them.
-        best_effort_queue: number of responses that could not be sent, because their client had gone.
+        unsent: number of responses that could not be sent, because their client had gone.
 
     Raises:
         LocalError: no delegation, or the name is in use in this session.
@@ -50,7 +50,7 @@ class ServerCore:
         self._check_at_s: float | None = None  # when clients are checked next; None: no call is active
         self._is_leaving = False
         self.turns: deque[Turn[bytes]] = deque()
-        self.best_effort_queue = 0
+        self.unsent = 0
 
     @property
     def clients(self) -> int:
@@ -153,7 +153,7 @@ class ServerCore:
         try:
             self._member.respond(self._name, client, wire)
         except LocalError:
-            self.best_effort_queue += 1  # the client has gone; if it repeats the request, it gets the stored response
+            self.unsent += 1  # the client has gone; if it repeats the request, it gets the stored response
 
     def _check_clients(self, now_s: float) -> None:
         """Drop the calls of clients that have gone."""

@@ -274,13 +274,13 @@ class SimNetwork:
             return
         if node.table is not None:
             mtus = {port: sim_link.mtu for port, (sim_link, _, _) in node.ports.items() if sim_link.is_up}
-            ack = decide(frame, node.table.entries, mtus, node.table.sides, end.port)
-            if isinstance(ack, Drop):
-                self.drops[ack.reason] += 1
+            decision = decide(frame, node.table.entries, mtus, node.table.sides, end.port)
+            if isinstance(decision, Drop):
+                self.drops[decision.reason] += 1
                 return
-            if isinstance(ack, Forward):
-                self.drops.update(ack.lost)
-                for port, macs in ack.hops:
+            if isinstance(decision, Forward):
+                self.drops.update(decision.lost)
+                for port, macs in decision.hops:
                     self._send(node.ports[port], rewrite(frame, macs))
                 return
         node.machine.receive([ReceivedFrame(end.port, frame[6:12], frame[ETHER_BYTES:])], self.now)

@@ -22,7 +22,7 @@ from gdp.frame.codec import DESTINATION_AT, ETHER_BYTES, HEADER_BYTES, HOPS_AT, 
 from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, VERSION
 from gdp.switch.table import MACS_BYTES, Hop, Hops, is_side
 
-__all__ = ["PUNT", "Drop", "Forward", "Punt", "Verdict", "decide", "rewrite"]
+__all__ = ["PUNT", "Decision", "Drop", "Forward", "Punt", "decide", "rewrite"]
 
 _NO_SIDES: Final[Mapping[bytes, int]] = {}
 _ETHERTYPE: Final = ETHERTYPE.to_bytes(2, "big")
@@ -49,7 +49,7 @@ class Forward(NamedTuple):
     lost: tuple[DropReason, ...] = ()
 
 
-Verdict = Drop | Punt | Forward
+Decision = Drop | Punt | Forward
 PUNT: Final = Punt()
 
 
@@ -59,7 +59,7 @@ def decide(
     mtus: Mapping[int, int],
     sides: Mapping[bytes, int] = _NO_SIDES,
     port: int = 0,
-) -> Verdict:
+) -> Decision:
     """Return the decision for a frame. Any bytes get a decision; nothing is raised.
 
     Args:

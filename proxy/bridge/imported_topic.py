@@ -16,6 +16,7 @@ from gdp.errors import LocalError, RemoteError
 from gdp.message.loss import Losses
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.decoder import MessageDecoder
+from proxy.bridge.decoder_cache import DecoderCache
 from proxy.bridge.desired_flows import FlowSpec
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault
@@ -24,7 +25,6 @@ from proxy.bridge.rate_limit import RateLimiter
 from proxy.bridge.topic_stats import SAMPLES_MAX, TopicStats
 from proxy.endpoints.endpoint import EndpointError, Event, GraphEntity
 from proxy.endpoints.qos import unmatched
-from proxy.node.metrics_sources import Sources
 from proxy.serial.schema import DefinitionError
 from proxy.wire.message import RosMessage, TopicDescription
 
@@ -52,7 +52,7 @@ class ImportedTopic:
         self._flow_spec = flow_spec
         self._topic = topic
         self._unmatched: Set[str] = frozenset()  # keys of readers whose QoS cannot be met
-        self._sources = Sources[tuple[_Decoded, ...]]()
+        self._sources = DecoderCache[tuple[_Decoded, ...]]()
         self._is_joined = False
         self._past_losses = Losses()  # losses of earlier subscriptions
         self._pace = RateLimiter(flow_spec.rule.max_hz)

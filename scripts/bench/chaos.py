@@ -129,7 +129,7 @@ class Chaos:
         self._watch(time.monotonic() + AFTER_S)
         self.waited_share = (_waited_s() - waited_s) / (time.monotonic() - begun_s)
 
-    def ack(self, limit_s: float) -> list[str]:
+    def broken_promises(self, limit_s: float) -> list[str]:
         """Return what broke, in words."""
         last_ns, end_ns = self.moments[-1][0] if self.moments else self.begun_ns, time.monotonic_ns()
         found = [f"{who} ended by itself" for who in self._overlay.died()]
@@ -329,7 +329,7 @@ def run_seed(runs: RunRegistry, seed: int, options: argparse.Namespace) -> list[
         progress(f"everything is delivered after {time.monotonic() - begun_s:.1f} s; {len(faults)} faults")
         try:
             chaos.run()
-            broke = chaos.ack(options.limit_s)
+            broke = chaos.broken_promises(options.limit_s)
         except FailedError as error:
             broke = [str(error)]
         _show(seed, chaos)

@@ -122,4 +122,4 @@ def _tell(outcome: Outcome, console: Console, *, as_json: bool) -> None:
         json.dump(told, sys.stdout, indent=1)
         sys.stdout.write("\n")
     else:
-        console.print(outcome.ack, style="bold red" if outcome.counts.failed else "bold green", highlight=False)
+        console.print(outcome.summary, style="bold red" if outcome.counts.failed else "bold green", highlight=False)

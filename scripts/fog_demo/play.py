@@ -64,7 +64,7 @@ class Outcome:
     complaints: list[str] = field(default_factory=list)
 
     @property
-    def ack(self) -> str:
+    def summary(self) -> str:
         """Return the last line of the output."""
         return f"{self.counts.failed} failed of {self.counts.requests} requests"
 

@@ -32,7 +32,7 @@ from ring.options import LIVE_S, Live, Options, RingPlane
 from ring.progress import ProgressReporter
 from ring.result import Result
 from ring.run import DEMO_S, Ring, make_demo
-from ring.table import ack, table
+from ring.table import summary, table
 
 __all__ = ["main", "spelled_out"]
 
@@ -222,7 +222,7 @@ def _show(result: Result) -> None:
     if not output.is_terminal:
         output = Console(width=_WIDE)
     output.print(table(result))
-    output.print(ack(result), highlight=False, soft_wrap=True)
+    output.print(summary(result), highlight=False, soft_wrap=True)
 
 
 def _write(options: Options, result: Result, recording: Path | None = None) -> None:

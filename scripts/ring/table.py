@@ -10,7 +10,7 @@ from rich.table import Table
 
 from ring.result import Journey, Result, TopicResult
 
-__all__ = ["ack", "hops_in_words", "table"]
+__all__ = ["hops_in_words", "summary", "table"]
 
 _EDGE_SWITCHES = 2
 
@@ -39,7 +39,7 @@ def table(result: Result) -> Table:
     return drawn
 
 
-def ack(result: Result) -> str:
+def summary(result: Result) -> str:
     """Return the last line, with markup."""
     if result.passed:
         topics = [row for row in result.topics if not row.is_service]

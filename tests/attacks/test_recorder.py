@@ -15,12 +15,12 @@ from gdp.message.loss import Losses
 from gdp.names import Name
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.counters import Traffic
+from proxy.bridge.decoder_cache import DecoderCache
 from proxy.bridge.desired_flows import FlowSpec
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault, Faults
 from proxy.bridge.imported_topic import ImportedTopic
 from proxy.config.config import Rule
-from proxy.node.metrics_sources import Sources
 from proxy.recordings.endpoint import RecordingEndpoint
 from proxy.recordings.writer import BagWriter
 from proxy.serial.channel import Channel, Qos, RosVersion
@@ -126,7 +126,7 @@ def test_a26_a_description_that_comes_again_after_it_was_forgotten_has_its_old_c
 
 
 def test_a26_descriptions_are_bounded_by_their_bytes_and_the_least_used_goes() -> None:
-    sources = Sources[int](count_max=100, bytes_max=100_000, each_max=4)
+    sources = DecoderCache[int](count_max=100, bytes_max=100_000, each_max=4)
     for number in range(200):
         sources.put(bytes([number]), bytes(20_000), number)
         assert sources.held_bytes <= 100_000

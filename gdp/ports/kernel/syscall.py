@@ -117,7 +117,7 @@ class Run:
         priority: priority of the frame after the program.
     """
 
-    ack: int
+    retval: int
     frame: bytes
     each_ns: int
     priority: int
@@ -237,8 +237,8 @@ def run(program: int, frame: bytes, repeat: int = 1) -> Run:
     frames = struct.pack("=IIIIQQI", program, 0, len(data), len(out), address(data), address(out), repeat)
     attributes = bytearray(frames + struct.pack("=IIIQQ16x", 0, 0, len(skb), 0, address(skb)))
     bpf(Command.PROG_TEST_RUN, attributes, "run the program")
-    _, ack, _, size, _, _, _, each_ns = struct.unpack_from("=IiIIQQII", attributes)
-    return Run(ack, bytes(out[:size]), each_ns, struct.unpack_from("=I", skb, _PRIORITY_AT)[0])
+    _, retval, _, size, _, _, _, each_ns = struct.unpack_from("=IiIIQQII", attributes)
+    return Run(retval, bytes(out[:size]), each_ns, struct.unpack_from("=I", skb, _PRIORITY_AT)[0])
 
 
 def objects(next_id: Command, open_by_id: Command) -> Iterator[int]:

@@ -80,7 +80,7 @@ def answers(letters: list[OutgoingStatement]) -> list[Response]:
     return [Response.from_fields(each.fields) for each in found if each.type is StatementType.ANSWER]
 
 
-def verdicts(letters: list[OutgoingStatement]) -> list[AdvertiseAck]:
+def acks(letters: list[OutgoingStatement]) -> list[AdvertiseAck]:
     found = [parse(outgoing.statement) for outgoing in letters]
     return [AdvertiseAck.from_fields(each.fields) for each in found if each.type is StatementType.ADVERTISE_ACK]
 
@@ -145,7 +145,7 @@ def altered(change: dict[str, object]) -> bytes:
 
 def test_a_good_advertisement_is_accepted_and_its_relay_informed() -> None:
     at_rib = rib()
-    (ack,) = verdicts(tell(at_rib, advertisement(sequence=4)))
+    (ack,) = acks(tell(at_rib, advertisement(sequence=4)))
     assert (ack.name, ack.advertiser, ack.refused, ack.sequence) == (NAME, ROBOT.name, None, 4)
     assert (at_rib.names, at_rib.accepted, at_rib.refusals) == (1, 1, {})
 
@@ -171,7 +171,7 @@ REFUSED = {
 def test_an_advertisement_that_does_not_hold_is_refused_with_its_reason(why: str) -> None:
     wire, reason = REFUSED[why]
     at_rib = rib()
-    told = verdicts(tell(at_rib, wire))
+    told = acks(tell(at_rib, wire))
     assert at_rib.refusals == {reason: 1}
     assert at_rib.names == 0
     assert {each.refused for each in told} <= {reason}
@@ -189,14 +189,14 @@ def test_an_altered_advertisement_is_refused(at_byte: int) -> None:
 def test_an_older_advertisement_played_back_is_stale_and_the_refusal_says_what_to_pass() -> None:
     at_rib = rib()
     tell(at_rib, advertisement(sequence=9))
-    (ack,) = verdicts(tell(at_rib, advertisement(sequence=8)))
+    (ack,) = acks(tell(at_rib, advertisement(sequence=8)))
     assert (ack.refused, ack.sequence) == (DropReason.STALE, 9)
 
 
 def test_the_same_advertisement_again_is_no_news_and_no_harm() -> None:
     at_rib, wire = rib(), advertisement()
     tell(at_rib, wire)
-    (ack,) = verdicts(tell(at_rib, wire))
+    (ack,) = acks(tell(at_rib, wire))
     assert (ack.refused, at_rib.names) == (None, 1)
 
 
@@ -229,7 +229,7 @@ def test_a_proxy_relays_nothing() -> None:
 
 def test_a_switch_of_a_trusted_domain_relays_global_names_which_stand_in_its_own_domain() -> None:
     at_rib = rib()
-    (ack,) = verdicts(tell(at_rib, foreign_advertisement(), CLOUD_SWITCH))
+    (ack,) = acks(tell(at_rib, foreign_advertisement(), CLOUD_SWITCH))
     assert ack.refused is None
     (answer,) = answers(ask(at_rib))
     assert (answer.domain, answer.transit) == (CLOUD.root.domain, (SCHOOL.root.domain,))
@@ -238,7 +238,7 @@ def test_a_switch_of_a_trusted_domain_relays_global_names_which_stand_in_its_own
 
 def test_a_local_name_of_another_domain_is_refused() -> None:
     at_rib = rib()
-    (ack,) = verdicts(tell(at_rib, foreign_advertisement(is_global=False), CLOUD_SWITCH))
+    (ack,) = acks(tell(at_rib, foreign_advertisement(is_global=False), CLOUD_SWITCH))
     assert (ack.refused, at_rib.names) == (DropReason.WRONG_DOMAIN, 0)
 
 
@@ -272,9 +272,9 @@ def test_a_sender_has_a_quota_of_names() -> None:
     at_rib = rib(names_per_sender=1)
     tell(at_rib, advertisement())
     own = Subject.of(Metadata({"kind": "topic", "name": "/own"}), ROBOT.key.public.compressed)
-    (ack,) = verdicts(tell(at_rib, advertisement(subject=own, chain=[])))
+    (ack,) = acks(tell(at_rib, advertisement(subject=own, chain=[])))
     assert ack.refused is DropReason.QUOTA
-    assert verdicts(tell(at_rib, advertisement(sequence=2)))[0].refused is None
+    assert acks(tell(at_rib, advertisement(sequence=2)))[0].refused is None
 
 
 def test_advertising_and_withdrawing_in_turn_does_not_pass_the_quota() -> None:
@@ -294,14 +294,12 @@ def test_a_node_leaves_capacity_for_the_other_nodes_of_its_switch() -> None:
     assert at_rib.names == 15
     rtcert = RtCert.make(GATEWAY, SWITCH.name, DAY)
     others = Subject.of(Metadata({"kind": "topic", "name": "/others"}), GATEWAY.key.public.compressed)
-    assert (
-        verdicts(tell(at_rib, advertisement(node=GATEWAY, subject=others, chain=[], rtcert=rtcert)))[0].refused is None
-    )
+    assert acks(tell(at_rib, advertisement(node=GATEWAY, subject=others, chain=[], rtcert=rtcert)))[0].refused is None
 
 
 def test_an_operator_may_bound_leases_further() -> None:
     at_rib = rib(lease_max_s=30.0)
-    (ack,) = verdicts(tell(at_rib, advertisement(lease_s=60.0)))
+    (ack,) = acks(tell(at_rib, advertisement(lease_s=60.0)))
     assert ack.refused is DropReason.LEASE_BOUNDS
 
 
@@ -326,7 +324,7 @@ def test_an_ack_is_shorter_than_the_relay_that_it_answers() -> None:
 def test_a_withdrawn_name_gets_a_negative_response() -> None:
     at_rib = rib()
     tell(at_rib, advertisement(sequence=3))
-    assert verdicts(tell(at_rib, withdrawal(4)))[0].refused is None
+    assert acks(tell(at_rib, withdrawal(4)))[0].refused is None
     (answer,) = answers(ask(at_rib))
     assert (answer.is_nobody, answer.lease_s) == (True, NEGATIVE_LEASE_S)
 
@@ -449,7 +447,7 @@ def test_a_switch_that_relays_an_old_advertisement_of_a_node_that_moved_hears_wh
     at_rib = rib()
     tell(at_rib, advertisement(rtcert=RtCert.make(ROBOT, OTHER_SWITCH.name, DAY), sequence=2), OTHER_SWITCH)
     letters = tell(at_rib, advertisement())
-    assert [each.refused for each in verdicts(letters)] == [DropReason.STALE]
+    assert [each.refused for each in acks(letters)] == [DropReason.STALE]
     assert [parse(each.advertisement).fields.uint("seq") for each in answers(letters)] == [2]
 
 

@@ -219,7 +219,7 @@ def _pid_of_server(folder: Path, port: int) -> int:
     raise AssertionError(f"no server on port {port}")
 
 
-def verdicts(letters: list[OutgoingStatement]) -> list[AdvertiseAck]:
+def acks(letters: list[OutgoingStatement]) -> list[AdvertiseAck]:
     found = [parse(outgoing.statement) for outgoing in letters]
     return [AdvertiseAck.from_fields(each.fields) for each in found if each.type is StatementType.ADVERTISE_ACK]
 

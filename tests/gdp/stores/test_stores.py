@@ -42,11 +42,11 @@ from tests.gdp.stores.sites import (
     Pair,
     Site,
     SnapshotPair,
+    acks,
     answers,
     cluster,
     frozen_server,
     kill_server,
-    verdicts,
 )
 
 FORGOTTEN_S = EVIDENCE_S + int(CLOCK_SKEW_S) + 1  # after this no node accepts the advertisement any more
@@ -82,7 +82,7 @@ def pair(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Pair]:
 
 class TestEveryStore:
     def test_what_one_rib_took_the_other_answers(self, pair: Pair) -> None:
-        assert verdicts(pair.give(pair.one, pair.site.relay("/a", 1)))[0].refused is None
+        assert acks(pair.give(pair.one, pair.site.relay("/a", 1)))[0].refused is None
         pair.sync()
         (answer,) = answers(pair.give(pair.two, pair.site.query("/a")))
         assert (answer.advertiser, answer.domain) == (pair.site.robot.name, pair.site.authority.root.domain)
@@ -97,7 +97,7 @@ class TestEveryStore:
     def test_an_older_advertisement_is_stale_whichever_rib_it_comes_to(self, pair: Pair) -> None:
         pair.give(pair.one, pair.site.relay("/a", 5))
         pair.sync()
-        (ack,) = verdicts(pair.give(pair.two, pair.site.relay("/a", 4)))
+        (ack,) = acks(pair.give(pair.two, pair.site.relay("/a", 4)))
         assert (ack.refused, ack.sequence) == (DropReason.STALE, 5)
 
     def test_a_withdrawal_holds_at_both(self, pair: Pair) -> None:
@@ -106,7 +106,7 @@ class TestEveryStore:
         pair.give(pair.one, pair.site.withdrawal("/a", 2))
         pair.sync()
         assert [each.is_nobody for each in answers(pair.give(pair.two, pair.site.query("/a")))] == [True]
-        assert [each.refused for each in verdicts(pair.give(pair.two, pair.site.relay("/a", 1)))] != [None]
+        assert [each.refused for each in acks(pair.give(pair.two, pair.site.relay("/a", 1)))] != [None]
 
     def test_a_lease_ends_at_both(self, pair: Pair) -> None:
         pair.give(pair.one, pair.site.relay("/a", 1, lease_s=5.0))
@@ -142,9 +142,7 @@ def test_a_peer_forgets_no_withdrawal_sooner_than_what_it_knows_of_the_advertise
     assert entry is not None
     pair.two.load([replace(entry, until_unix_s=int(pair.site.unix_s) + 10)], pair.site.now())
     pair.two.handle_timer(pair.site.now(11.0))
-    assert [each.refused for each in verdicts(pair.give(pair.two, pair.site.relay("/a", 1), 11.0))] == [
-        DropReason.STALE
-    ]
+    assert [each.refused for each in acks(pair.give(pair.two, pair.site.relay("/a", 1), 11.0))] == [DropReason.STALE]
 
 
 def test_a_snapshot_keeps_no_withdrawal_for_longer_than_the_rib(tmp_path: Path) -> None:
@@ -167,9 +165,9 @@ def test_of_two_writes_at_once_the_newer_wins_and_the_other_is_not_confirmed(ser
     pair = ClusterPair(Site(), config_of(servers))
     for rib in (pair.one, pair.two):
         pair.give(rib, pair.site.query("/a"))  # both agree that no node advertises it
-    assert verdicts(pair.give(pair.one, pair.site.relay("/a", 9)))[0].refused is None
-    assert verdicts(pair.give(pair.two, pair.site.relay("/a", 8))) == []
-    (ack,) = verdicts(pair.give(pair.two, pair.site.relay("/a", 8)))
+    assert acks(pair.give(pair.one, pair.site.relay("/a", 9)))[0].refused is None
+    assert acks(pair.give(pair.two, pair.site.relay("/a", 8))) == []
+    (ack,) = acks(pair.give(pair.two, pair.site.relay("/a", 8)))
     assert (ack.refused, ack.sequence) == (DropReason.STALE, 9)
     pair.close()
 
@@ -217,7 +215,7 @@ def test_names_outlive_a_primary(servers: Path) -> None:
     while not (found := answers(pair.give(pair.two, pair.site.query("/a")))) and time.monotonic() < deadline_s:
         time.sleep(0.05)  # the servers promote the replica asynchronously
     assert [each.is_nobody for each in found] == [False]
-    while not verdicts(pair.give(pair.one, pair.site.relay("/a", 2))):
+    while not acks(pair.give(pair.one, pair.site.relay("/a", 2))):
         assert time.monotonic() < deadline_s
         time.sleep(0.05)
     pair.close()

@@ -13,14 +13,14 @@ from tests.fixtures_forwarding import CASES, ENTRIES, MTUS, ONE, TO_WIDE, Case, 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_each_fixture_gets_its_decision(case: Case) -> None:
-    ack = decide(case.frame, ENTRIES, MTUS)
-    assert isinstance(ack, Punt) == case.punted
-    if isinstance(ack, Drop):
-        assert (ack.reason,) == case.drops
+    decision = decide(case.frame, ENTRIES, MTUS)
+    assert isinstance(decision, Punt) == case.punted
+    if isinstance(decision, Drop):
+        assert (decision.reason,) == case.drops
         assert not case.out
-    if isinstance(ack, Forward):
-        assert ack.lost == case.drops
-        assert {port: rewrite(case.frame, macs) for port, macs in ack.hops} == case.out
+    if isinstance(decision, Forward):
+        assert decision.lost == case.drops
+        assert {port: rewrite(case.frame, macs) for port, macs in decision.hops} == case.out
 
 
 def test_another_ethertype_is_dropped() -> None:
@@ -36,8 +36,8 @@ def test_arbitrary_bytes_get_a_decision(data: bytes) -> None:
 @given(st.binary(min_size=6, max_size=6), st.integers(0, 255), st.integers(0, 255), st.binary(max_size=40))
 def test_only_a_frame_with_hops_to_spare_is_forwarded(mac: bytes, kind: int, hops_left: int, payload: bytes) -> None:
     before = mac + frame(ONE, payload, kind=kind, hops_left=hops_left)[6:]
-    ack = decide(before, ENTRIES, MTUS)
-    assert isinstance(ack, Forward) == (kind < 0x80 and hops_left > 1)
+    decision = decide(before, ENTRIES, MTUS)
+    assert isinstance(decision, Forward) == (kind < 0x80 and hops_left > 1)
 
 
 @pytest.mark.parametrize("kind", [bytes, bytearray, memoryview])

@@ -11,7 +11,7 @@ from ring.events import Event
 from ring.live_result import Heard, rows
 from ring.options import Options
 from ring.result import Result
-from ring.table import ack, table
+from ring.table import summary, table
 
 CHATTER = {"topic": "/chatter", "type": "std_msgs/msg/String"}
 LATENCY = {"median": 3.0, "p99": 9.0, "max": 9.5}
@@ -63,5 +63,5 @@ def test_the_table_tells_topics_and_services_apart() -> None:
     told = io.StringIO()
     Console(file=told, width=200).print(table(result()))
     assert "live ros2" in told.getvalue()
-    assert ack(result()).endswith("3 messages on 1 topics, all identical; 3 calls, all answered.")
+    assert summary(result()).endswith("3 messages on 1 topics, all identical; 3 calls, all answered.")
     assert [row["kind"] for row in result().to_json()["topics"]] == ["topic", "service"]  # type: ignore[attr-defined]

@@ -12,7 +12,7 @@ from proxy.recordings.compare import TopicComparison
 from ring.events import Event
 from ring.options import Options
 from ring.result import Journey, Result, put_together
-from ring.table import ack, hops_in_words, table
+from ring.table import hops_in_words, summary, table
 
 GOOD = TopicComparison(
     topic="/imu",
@@ -77,7 +77,7 @@ def test_a_complaint_about_an_end_keeps_a_run_from_passing() -> None:
 def test_a_recording_that_ends_in_the_middle_passes_with_a_note() -> None:
     short = result(unread="about 3 messages")
     assert short.passed
-    assert "Not all could be read: about 3 messages" in ack(short)
+    assert "Not all could be read: about 3 messages" in summary(short)
 
 
 def test_json_has_a_row_for_each_topic() -> None:

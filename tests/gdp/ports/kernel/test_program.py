@@ -54,7 +54,7 @@ TO_UNTOLD = (UNTOLD, bytes(12))
 class Step:
     """Action of the program on one frame, and its counters."""
 
-    ack: int
+    retval: int
     frame: bytes
     drops: dict[DropReason, int]
     taken: int
@@ -83,7 +83,7 @@ def step(loaded: LoadedProgram, given: bytes) -> Step:
     after = loaded.counters()
     drops = {reason: after.drops[reason] - before.drops[reason] for reason in DropReason}
     return Step(
-        run.ack,
+        run.retval,
         run.frame,
         {reason: count for reason, count in drops.items() if count},
         after.frames_in - before.frames_in,
@@ -94,17 +94,17 @@ def step(loaded: LoadedProgram, given: bytes) -> Step:
 def check(done: Step, given: bytes, entries: Mapping[bytes, Hops]) -> None:
     """Check that the program did the same as ``decide`` and ``rewrite``, or punted for a permitted reason."""
     said = decide(given, entries, MTUS)
-    if done.ack == UP:
+    if done.retval == UP:
         reasons = {said.reason} if isinstance(said, Drop) else set(said.lost) if isinstance(said, Forward) else set()
         assert isinstance(said, Punt) or reasons & LEFT_TO_PYTHON or given[DESTINATION] + bytes(32) in entries
         assert (done.frame, done.drops, done.taken, done.copies) == (given, {}, 0, 0)
-    elif done.ack == DROP:
+    elif done.retval == DROP:
         lost = (said.reason,) if isinstance(said, Drop) else said.lost if isinstance(said, Forward) else ()
         assert not isinstance(said, Forward) or not said.hops
         assert done.drops == {lost[0]: 1}
         assert (done.taken, done.copies) == (1, 0)
     else:
-        assert done.ack == REDIRECT
+        assert done.retval == REDIRECT
         assert isinstance(said, Forward)
         ((_, macs),) = said.hops
         assert done.frame == rewrite(given, macs)
@@ -127,13 +127,13 @@ def test_each_fixture_of_one_hop_becomes_what_the_reference_says(case: Case, loa
 def test_the_ordinary_is_not_left_to_python(loaded: LoadedProgram) -> None:
     table = forwards(loaded, SINGLE)
     try:
-        verdicts = [
-            step(loaded, TO_US + each[6:]).ack
+        retvals = [
+            step(loaded, TO_US + each[6:]).retval
             for each in (frame(ONE), frame(SPLIT, source=OTHER_SOURCE), frame(GONE, source=OTHER_SOURCE))
         ]
     finally:
         clear(table)
-    assert verdicts == [REDIRECT, REDIRECT, DROP]
+    assert retvals == [REDIRECT, REDIRECT, DROP]
 
 
 NAMES = st.sampled_from([ONE, SPLIT, GONE, ANYBODY])
@@ -195,7 +195,7 @@ def test_what_comes_from_a_side_where_its_publisher_is_not_is_dropped_there(load
                 is_ours = port in ports or (port > 63 and 63 in ports) or (port == 63 and max(ports) > 63)
                 assert (lost == 0) == is_ours
                 assert (said == Drop(DropReason.WRONG_SIDE)) != is_ours
-                assert is_ours or run.ack == DROP
+                assert is_ours or run.retval == DROP
         table.install(key, hops, 1.0)
         assert loaded.counters().drops[DropReason.WRONG_SIDE] == after.drops[DropReason.WRONG_SIDE]
         syscall.run(loaded.program_of(1), given)
@@ -211,15 +211,15 @@ def test_only_what_is_urgent_gets_a_priority(loaded: LoadedProgram) -> None:
         urgent = syscall.run(loaded.program_of(0), TO_US + frame(ONE, flags=Flag.URGENT)[6:])
     finally:
         clear(table)
-    assert (plain.ack, plain.priority) == (REDIRECT, 0)
-    assert (urgent.ack, urgent.priority) == (REDIRECT, 6)
+    assert (plain.retval, plain.priority) == (REDIRECT, 0)
+    assert (urgent.retval, urgent.priority) == (REDIRECT, 6)
 
 
 def test_what_another_station_should_get_is_left_alone(loaded: LoadedProgram) -> None:
     table = forwards(loaded, SINGLE)
     try:
-        assert step(loaded, bytes([2, 0, 0, 0, 0, 9]) + frame(ONE)[6:]).ack == UP
-        assert step(loaded, b"\xff" * 6 + frame(ONE)[6:]).ack == UP
+        assert step(loaded, bytes([2, 0, 0, 0, 0, 9]) + frame(ONE)[6:]).retval == UP
+        assert step(loaded, b"\xff" * 6 + frame(ONE)[6:]).retval == UP
     finally:
         clear(table)
 
@@ -229,9 +229,9 @@ def test_a_lease_that_ended_leaves_everything_to_python(loaded: LoadedProgram) -
     given = TO_US + frame(ONE)[6:]
     try:
         loaded.renew(-1)
-        assert step(loaded, given).ack == (UP if loaded.is_leased else REDIRECT)
+        assert step(loaded, given).retval == (UP if loaded.is_leased else REDIRECT)
         loaded.renew(3_600)
-        assert step(loaded, given).ack == REDIRECT
+        assert step(loaded, given).retval == REDIRECT
     finally:
         clear(table)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter, OrderedDict
 from typing import Final, Generic, TypeVar
 
-__all__ = ["Sources"]
+__all__ = ["DecoderCache"]
 
 _COUNT_MAX: Final = 1_024
 _BYTES_MAX: Final = 16 << 20  # of descriptions
@@ -19,7 +19,7 @@ _OVERHEAD_BYTES: Final = 2_048
 _Ready = TypeVar("_Ready")
 
 
-class Sources(Generic[_Ready]):
+class DecoderCache(Generic[_Ready]):
     """Entries by publisher and description; None is the entry of a description that was refused.
 
     Args:
