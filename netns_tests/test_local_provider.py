@@ -221,13 +221,13 @@ def test_what_is_just_being_made_cannot_be_given_back(provider: LocalProvider, f
 _CREATOR = """
 import os, signal, sys
 from pathlib import Path
-from fog.providers.local import begin, provider
+from fog.providers.local import provider, spawn
 from netns_tests.local_site import plain_gateway, spec, ticking
 
 site = provider.LocalProvider(Path(sys.argv[1]), plain_gateway)
 site.open_network()
 if sys.argv[2] == "during":
-    begin.os.write = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+    spawn.os.write = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
 site.create(spec("m1"), ticking())
 os.kill(os.getpid(), signal.SIGKILL)
 """
