@@ -1,8 +1,4 @@
-"""Publisher of 30 images a second, and a subscriber that shows their arrival.
-
-python examples/camera.py send robot/proxy
-python examples/camera.py show server/proxy
-"""
+"""Publisher of 30 images a second, and a subscriber that shows their arrival: camera.py send|show NODE."""
 
 import asyncio
 import os
