@@ -406,7 +406,7 @@ def _own(folder: Path, identifier: str) -> Site:
         make_owner(authority.owner)
     robot = folder / "robot"
     if not (robot / "boot.json").exists():  # this file is written last
-        _install_anew(robot, authority, devices)
+        _install_again(robot, authority, devices)
     return Site(
         id=identifier,
         state=folder,
@@ -420,7 +420,7 @@ def _own(folder: Path, identifier: str) -> Site:
     )
 
 
-def _install_anew(robot: Path, authority: Authority, devices: RobotDevices) -> None:
+def _install_again(robot: Path, authority: Authority, devices: RobotDevices) -> None:
     """Write the files of the robot's side, and overwrite those of an interrupted attempt."""
     shutil.rmtree(robot, ignore_errors=True)
     for folder in ("proxy/delegations", "watch/delegations", "revocations"):

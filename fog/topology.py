@@ -43,20 +43,20 @@ class Gateway(Section):
     regions: Annotated[tuple[str, ...], Unique] = ()
     children: tuple[Gateway, ...] = ()
 
-    def walk(self) -> Iterator[Gateway]:
+    def traverse(self) -> Iterator[Gateway]:
         """Yield this gateway and all gateways behind it, each before its children."""
         yield self
         for child in self.children:
-            yield from child.walk()
+            yield from child.traverse()
 
     def serving(self, region: str) -> Gateway:
         """Return the gateway of the machines of a region."""
-        return next((each for each in self.walk() if region in each.regions), self)
+        return next((each for each in self.traverse() if region in each.regions), self)
 
     @model_validator(mode="after")
     def _each_stands_once(self) -> Gateway:
-        labels = [each.gateway for each in self.walk()]
-        regions = [region for each in self.walk() for region in each.regions]
+        labels = [each.gateway for each in self.traverse()]
+        regions = [region for each in self.traverse() for region in each.regions]
         for kind, found in (("gateway", labels), ("region", regions)):
             for index, word in enumerate(found):
                 if word in found[:index]:

@@ -61,11 +61,11 @@ def main() -> None:
     for line in sys.stdin:
         try:
             is_statement = line.startswith("!")
-            code = compile(line[is_statement:].replace("\\n", "\n"), "told", "exec" if is_statement else "eval")
+            code = compile(line[is_statement:].replace("\\n", "\n"), "sent", "exec" if is_statement else "eval")
             print(json.dumps(eval(code, names), default=list), flush=True)
         except Exception as error:  # the test gets every error, whatever its type
             print(json.dumps(f"ERROR {error!r}"), flush=True)
-    rospy.signal_shutdown("told to")
+    rospy.signal_shutdown("asked to")
 
 
 if __name__ == "__main__":

@@ -155,8 +155,8 @@ class Domain:
         keys = self._folder / f"{role.value}-{label}"
         make_node(keys, role, label, self._folder / "domain")
         files = {f"{role.value}/{path.name}": path.read_bytes() for path in keys.iterdir()}
-        told = {"identity": role.value, "domain": {"root": f"{role.value}/root.crt"}, **content}
-        return {**files, f"{role.value}.yaml": yaml.safe_dump(told).encode()}
+        reported = {"identity": role.value, "domain": {"root": f"{role.value}/root.crt"}, **content}
+        return {**files, f"{role.value}.yaml": yaml.safe_dump(reported).encode()}
 
     def _start(self, role: str, files: Mapping[str, bytes]) -> None:
         home = self._folder / "robot"

@@ -27,10 +27,10 @@ def bench(name: str, *options: str) -> str:
 
 
 def test_no_request_fails_while_two_of_three_replicas_are_killed_and_come_back() -> None:
-    told = bench("replicas.py", "--only", "killed", "--rounds", "1", "--requests", "800", "--rate", "200")
-    assert told.count("target ≤ 0.00, measured 0.00, met") == 3, told
+    reported = bench("replicas.py", "--only", "killed", "--rounds", "1", "--requests", "800", "--rate", "200")
+    assert reported.count("target ≤ 0.00, measured 0.00, met") == 3, reported
 
 
 def test_replicas_are_compared_with_a_single_server() -> None:
-    told = bench("replicas.py", "--only", "hedged", "--rounds", "1", "--requests", "60")
-    assert "two replicas, the second if late" in told
+    reported = bench("replicas.py", "--only", "hedged", "--rounds", "1", "--requests", "60")
+    assert "two replicas, the second if late" in reported

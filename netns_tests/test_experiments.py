@@ -42,26 +42,26 @@ def run(name: str, out: Path) -> dict[str, Any]:
     )
     assert ran.returncode == 0, ran.stderr
     assert {each.name for each in out.iterdir()} == {f"{name}.{kind}" for kind in ("json", "md", "png")}
-    told = json.loads(ran.stdout)
-    assert isinstance(told, dict)
-    return told
+    reported = json.loads(ran.stdout)
+    assert isinstance(reported, dict)
+    return reported
 
 
 @pytest.mark.parametrize("name", ["fig5", "fig6", "fig7", "fig9"])
 def test_an_experiment_runs_to_its_page_without_a_failed_request(name: str, tmp_path: Path) -> None:
     if name == "fig5" and not (ROOT.parent / "shared" / "data" / "planning").is_dir():
         pytest.skip("no ../shared/data/planning here")
-    told = run(name, tmp_path)
-    assert all(is_right for group in told["groups"].values() for *_, is_right in group), told["groups"]
+    reported = run(name, tmp_path)
+    assert all(is_right for group in reported["groups"].values() for *_, is_right in group), reported["groups"]
     if name == "fig9":
-        found = {each["what"]: each["measured"] for each in told["findings"]}
+        found = {each["what"]: each["measured"] for each in reported["findings"]}
         assert found["kills"] >= 1
         assert found["failed requests"] == found["answers too many"] == 0
 
 
 def test_machines_stop_and_go_on_and_every_request_is_counted(tmp_path: Path) -> None:
-    told = run("outages", tmp_path)
-    assert {name: len(group) for name, group in told["groups"].items()} == {"one machine": 60, "two machines": 60}
+    reported = run("outages", tmp_path)
+    assert {name: len(group) for name, group in reported["groups"].items()} == {"one machine": 60, "two machines": 60}
 
 
 @pytest.mark.skipif(not (ROOT.parent / "shared" / "data" / "rgbd").is_dir(), reason="no ../shared/data/rgbd here")

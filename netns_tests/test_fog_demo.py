@@ -50,12 +50,12 @@ def test_no_request_fails_while_one_machine_is_preempted_and_the_other_one_kille
     options = ("--calm", 0.5, "--notice", 4, "--json")
     ended = subprocess.run(command(*options), capture_output=True, text=True, timeout=_PATIENCE_S, check=False)
     assert ended.returncode == 0, ended.stderr
-    told = json.loads(ended.stdout)
-    assert told["failed"] == 0
-    assert told["requests"] > 100
-    happened = {(each["machine"], each["what"]) for each in told["events"]}
+    reported = json.loads(ended.stdout)
+    assert reported["failed"] == 0
+    assert reported["requests"] > 100
+    happened = {(each["machine"], each["what"]) for each in reported["events"]}
     assert {("m1", "notice"), ("m2", "taken"), ("m3", "serving"), ("m4", "serving")} <= happened
-    assert {"m1", "m2"} & told["by_machine"].keys()
+    assert {"m1", "m2"} & reported["by_machine"].keys()
 
 
 def test_what_a_killed_demonstration_left_is_taken_down_by_the_next_one() -> None:
@@ -69,6 +69,6 @@ def test_what_a_killed_demonstration_left_is_taken_down_by_the_next_one() -> Non
 
 
 def test_help_shows_an_example() -> None:
-    told = subprocess.run(command("--help"), capture_output=True, text=True, timeout=_PATIENCE_S, check=True).stdout
-    assert "sudo scripts/fog_demo.sh" in told
-    assert "FILE" not in told.splitlines()[1]
+    reported = subprocess.run(command("--help"), capture_output=True, text=True, timeout=_PATIENCE_S, check=True).stdout
+    assert "sudo scripts/fog_demo.sh" in reported
+    assert "FILE" not in reported.splitlines()[1]

@@ -21,7 +21,7 @@ from gdp.client.rib_host import RibHost
 from gdp.control.settings import NodeSettings
 from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Role
-from gdp.crypto.envelope import SIGNATURE_BYTES, part_room
+from gdp.crypto.envelope import SIGNATURE_BYTES, fragment_capacity
 from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.validity import Validity
@@ -119,11 +119,11 @@ class Lab:
         self.until(is_enough)
         return got
 
-    def resize(self, mtu: int, ifnames: Sequence[str], told: int) -> None:
+    def resize(self, mtu: int, ifnames: Sequence[str], reported: int) -> None:
         """Change devices; return when the publisher has received the new size."""
         for ifname in ifnames:
             self.space.ip("set", ifname, "mtu", str(mtu))
-        self.until(lambda: self.heard[-1] == told)
+        self.until(lambda: self.heard[-1] == reported)
 
     def crosses_in(self, message: bytes) -> tuple[int, int]:
         """Send a message; return its largest frame on the middle link, without Ethernet header, and how many."""
@@ -207,7 +207,7 @@ def test_a_megabyte_crosses_in_frames_that_follow_the_link_while_it_runs(lab: La
         seen.append(lab.crosses_in(os.urandom(MEGABYTE)))
     for mtu, (largest, count) in zip((USUAL, JUMBO, WIDEST, 1_200, MTU_MIN_BYTES, USUAL), seen, strict=True):
         assert largest == mtu
-        assert count >= -(-(MEGABYTE + SIGNATURE_BYTES) // part_room(mtu))
+        assert count >= -(-(MEGABYTE + SIGNATURE_BYTES) // fragment_capacity(mtu))
     assert lab.drops() == 0
 
 

@@ -83,7 +83,7 @@ def test_a_cut_link_loses_its_carrier_at_both_ends_and_gets_it_back(run: Run) ->
     assert "UP" not in links(namespaces, "nuc2")["nuc3"][2].strip("<>").split(",")
     assert "NO-CARRIER" in links(namespaces, "nuc3")["nuc2"][2]
     assert "NO-CARRIER" not in links(namespaces, "nuc3")["nuc4"][2]
-    namespaces.mend("nuc2", "nuc3")
+    namespaces.restore_link("nuc2", "nuc3")
     assert "NO-CARRIER" not in links(namespaces, "nuc3")["nuc2"][2]
 
 

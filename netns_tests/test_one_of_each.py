@@ -168,7 +168,7 @@ def test_a_switch_reports_that_its_link_is_down_and_then_that_no_neighbour_answe
     switch.says("WARNING", "waiting: link down on eth0")
     switch.says("WARNING", "waiting: no RIB of this domain can be reached")
     space.ip("set", "far0", "up")
-    switch.says("WARNING", "waiting: no neighbour on eth0: nobody answers there")
+    switch.says("WARNING", "waiting: no neighbour on eth0: no answer there")
     assert sum("link down" in line for line in switch.said) == 1
 
 

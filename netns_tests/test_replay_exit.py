@@ -30,7 +30,7 @@ def test_gdp_replay_exits_1_for_a_reliable_topic_without_a_reader_and_0_once_it_
             assert code == 1
             (topic,) = unread["unconfirmed"]
             assert (topic["topic"], topic["messages"], topic["confirmed"]) == ("/camera/image", 100, 0)
-            assert (topic["why"], topic["reasons"]) == ("nobody reads it", {"no-reader": 100})
+            assert (topic["why"], topic["reasons"]) == ("no reader", {"no-reader": 100})
             assert (unread["total"], unread["sent"], unread["confirmed"]) == (100, 100, 0)
             terminals.start(*recorder)
             code, read = _replay(machines)

@@ -86,8 +86,8 @@ def test_kept_nodes_continue_and_the_ring_comes_down_on_command() -> None:
     try:
         inside = ["ip", "netns", "exec", f"gdp-{run}-nuc1", "rostopic", "echo", "-n", "2", "/chatter"]
         if os.getuid() == 0 and Path(f"/run/netns/gdp-{run}-nuc1").exists() and Path("/usr/bin/rostopic").exists():
-            told = subprocess.run(inside, capture_output=True, text=True, timeout=30, check=True)
-            assert told.stdout.count("hello") == 2
+            reported = subprocess.run(inside, capture_output=True, text=True, timeout=30, check=True)
+            assert reported.stdout.count("hello") == 2
         assert run not in RunRegistry().sweep()
     finally:
         ring("--down")

@@ -143,4 +143,4 @@ except gdp.AttachError as error:
     print(error)
 """
     (said,) = run(lab, code)
-    assert said == "not attached within 1 s: no neighbour on lonely0: nobody answers there"
+    assert said == "not attached within 1 s: no neighbour on lonely0: no answer there"

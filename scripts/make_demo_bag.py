@@ -24,7 +24,7 @@ from proxy.serial.channel import Channel, Qos, RosVersion
 START_NS: Final = 1_700_000_000_000_000_000
 WIDTH, HEIGHT = 640, 480
 TEXTURE: Final = 1024  # pixels a side; repeats
-ROOM_M: Final = (8.0, 6.0)
+HALL_M: Final = (8.0, 6.0)
 RADIUS_M, SPEED_M_S = 1.5, 0.6
 BEAMS: Final = 720
 RANGE_M: Final = (0.12, 6.5)
@@ -63,11 +63,11 @@ def scene() -> NDArray[np.uint8]:
                     + far[here] * y * x
                 ) // (patch * patch)
                 total[row * patch : (row + 1) * patch, column * patch : (column + 1) * patch] += weight * smooth
-    floor = total // 7
+    ground = total // 7
     ticks = np.arange(TEXTURE) % 128 < 3  # tile joints
-    floor[ticks] //= 3
-    floor[:, ticks] //= 3
-    return floor.astype(np.uint8)
+    ground[ticks] //= 3
+    ground[:, ticks] //= 3
+    return ground.astype(np.uint8)
 
 
 class Drive:
@@ -79,7 +79,7 @@ class Drive:
         if ros == 1:  # the one type that rosbags does not bring
             transforms = "geometry_msgs/TransformStamped[] transforms\n"
             self.store.register(get_types_from_msg(transforms, "tf2_msgs/msg/TFMessage"))
-        self.floor = np.tile(scene(), (2, 2, 1))
+        self.ground = np.tile(scene(), (2, 2, 1))
         self.seq = 0
 
     def make(self, type_name: str, **fields: object) -> object:
@@ -166,13 +166,13 @@ class Drive:
 
     def map(self, at_ns: int) -> object:
         """Return the occupancy grid of the walls."""
-        columns, rows = (round(side / MAP_CELL_M) for side in ROOM_M)
+        columns, rows = (round(side / MAP_CELL_M) for side in HALL_M)
         cells = np.zeros((rows, columns), np.int8)
         cells[0] = cells[-1] = cells[:, 0] = cells[:, -1] = 100
         cells[rows // 3 : rows // 2, -1] = -1  # the door: unknown
         origin = self.make(
             "geometry_msgs/msg/Pose",
-            position=self.make("geometry_msgs/msg/Point", x=-ROOM_M[0] / 2, y=-ROOM_M[1] / 2, z=0.0),
+            position=self.make("geometry_msgs/msg/Point", x=-HALL_M[0] / 2, y=-HALL_M[1] / 2, z=0.0),
             orientation=self.quaternion(0.0),
         )
         header = self.header(at_ns, "map")
@@ -190,7 +190,7 @@ class Drive:
         """Return the image of the camera: RGB, ``HEIGHT`` x ``WIDTH`` pixels."""
         x, y, _ = self.pose_at(at_ns)
         left, top = (round(256 * value) % TEXTURE for value in (x, y))
-        view = self.floor[top : top + HEIGHT, left : left + WIDTH]
+        view = self.ground[top : top + HEIGHT, left : left + WIDTH]
         return self.make(
             "sensor_msgs/msg/Image",
             header=self.header(at_ns, "camera"),
@@ -207,8 +207,8 @@ class Drive:
         x, y, heading = self.pose_at(at_ns)
         angles = -math.pi + np.arange(BEAMS) * (2 * math.pi / BEAMS)
         ahead, aside = np.cos(angles + heading), np.sin(angles + heading)
-        to_x = np.where(ahead > 0, ROOM_M[0] / 2 - x, -ROOM_M[0] / 2 - x) / np.where(ahead == 0, 1e-9, ahead)
-        to_y = np.where(aside > 0, ROOM_M[1] / 2 - y, -ROOM_M[1] / 2 - y) / np.where(aside == 0, 1e-9, aside)
+        to_x = np.where(ahead > 0, HALL_M[0] / 2 - x, -HALL_M[0] / 2 - x) / np.where(ahead == 0, 1e-9, ahead)
+        to_y = np.where(aside > 0, HALL_M[1] / 2 - y, -HALL_M[1] / 2 - y) / np.where(aside == 0, 1e-9, aside)
         ranges = np.round(np.minimum(to_x, to_y), 3).astype(np.float32)
         door = (to_x < to_y) & (ahead > 0) & (np.abs(y + to_x * aside) < 0.5)
         ranges[door] = np.inf  # nothing to see

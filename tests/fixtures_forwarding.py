@@ -19,7 +19,7 @@ IN_MAC, WIDE_MAC, NARROW_MAC = (bytes([2, 0, 0, 0, port, 1]) for port in (IN, WI
 PEER_MACS = {port: bytes([2, 0, 0, 0, port, 2]) for port in (IN, WIDE, NARROW)}
 
 SOURCE, OTHER_SOURCE = bytes([0x50]) * 32, bytes([0x51]) * 32
-ONE, BOTH, SPLIT, GONE, HALF, NOBODY, DEAD, ANYBODY = (bytes([0xD0 + n]) * 32 for n in range(8))
+ONE, BOTH, SPLIT, GONE, HALF, UNKNOWN, DEAD, ANYBODY = (bytes([0xD0 + n]) * 32 for n in range(8))
 RESCUED, READY, CUT_OFF, TREE = (bytes([0xE0 + n]) * 32 for n in range(4))
 NO_SOURCE = bytes(32)
 
@@ -117,13 +117,13 @@ CASES = [
     Case("an alternate that is too narrow", frame(RESCUED, bytes(701 - 96)), drops=(DropReason.TOO_BIG,)),
     Case("an alternate that is down too", frame(CUT_OFF), drops=(DropReason.PORT_DOWN,)),
     Case("an alternate goes round no more often", frame(RESCUED, hops_left=1), drops=(DropReason.HOPS_EXPIRED,)),
-    Case("a miss", frame(NOBODY), punted=True),
+    Case("a miss", frame(UNKNOWN), punted=True),
     Case("a neighbour's word", frame(ONE, kind=Kind.HELLO), punted=True),
     Case("a neighbour's unknown word", frame(ONE, kind=0xFF, hops_left=0), punted=True),
     Case("a neighbour's word whose length is wrong", frame(ONE, kind=0x80, length=60_000), punted=True),
     Case("one hop left", frame(ONE, hops_left=1), drops=(DropReason.HOPS_EXPIRED,)),
     Case("no hops left", frame(ONE, hops_left=0), drops=(DropReason.HOPS_EXPIRED,)),
-    Case("a miss with one hop left", frame(NOBODY, hops_left=1), drops=(DropReason.HOPS_EXPIRED,)),
+    Case("a miss with one hop left", frame(UNKNOWN, hops_left=1), drops=(DropReason.HOPS_EXPIRED,)),
     Case("a payload that is not there", frame(ONE, length=8), drops=(DropReason.TRUNCATED,)),
     Case("half a header", frame(ONE)[:61], drops=(DropReason.TRUNCATED,)),
     Case("one byte short of a header", frame(ONE, b"")[:-1], drops=(DropReason.TRUNCATED,)),

@@ -120,10 +120,12 @@ def test_source_files_that_a_page_names_exist() -> None:
 
 
 def _constant(dotted: str) -> float:
-    room, _, name = dotted.rpartition(".")
-    if not room:
+    capacity, _, name = dotted.rpartition(".")
+    if not capacity:
         return getattr(limits, name)
-    return getattr(importlib.import_module(room if room.startswith(("proxy.", "ring.")) else f"gdp.{room}"), name)
+    return getattr(
+        importlib.import_module(capacity if capacity.startswith(("proxy.", "ring.")) else f"gdp.{capacity}"), name
+    )
 
 
 def test_limits_that_a_page_states_are_the_limits() -> None:

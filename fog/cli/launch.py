@@ -74,7 +74,7 @@ def launch(
     """Start a launch file's cluster; when its replicas serve, run the robot's nodes until they end or Ctrl-C.
 
     With the robot's nodes the cluster ends, unless it is kept. A cluster of that name that is up takes the new plan.
-    What robot's nodes with output="log" print goes to a file in the state folder, which is told.
+    What robot's nodes with output="log" print goes to a file in the state folder, which is printed.
 
     \b
     Examples:
@@ -168,12 +168,12 @@ def follow(site: Site, journal: Journal, plan: ClusterPlan, after: int, patience
     serve = "replicas serve" if is_watched else "machines up (not watched)"
 
     def news() -> tuple[int, str]:
-        last, told = after, trouble
+        last, reported = after, trouble
         for entry in journal.events(plan.name, after=after):
             _tell(entry, console, as_json=as_json)
             last = entry.id
-            told = entry.detail if entry.what in ("trouble", "refused", "failed") else told
-        return last, told
+            reported = entry.detail if entry.what in ("trouble", "refused", "failed") else reported
+        return last, reported
 
     with console.status("") as spinner:
         while True:

@@ -282,7 +282,9 @@ def _latencies(texts: list[str]) -> dict[str, float]:
 
 
 def _sources(provider: str) -> tuple[str, ...]:
-    return aws_prices().sources if provider == "aws" else ("pretend prices, to try things out: nobody pays them",)
+    return (
+        aws_prices().sources if provider == "aws" else ("pretend prices, to try things out: no provider charges them",)
+    )
 
 
 def _chance(chance: float) -> tuple[str, str]:

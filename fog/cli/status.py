@@ -186,11 +186,11 @@ def _follow(journal: Journal, name: str, after: int, *, as_json: bool) -> NoRetu
 
 def _as_json(look: Callable[[], dict[str, object]], *, follow: bool) -> None:
     """Print the state as a line of JSON; with ``follow`` again after each change except of time and cost."""
-    told: object = None
+    reported: object = None
     while True:
         now = look()
-        if (state := _lasting(now)) != told:
-            told = state
+        if (state := _lasting(now)) != reported:
+            reported = state
             print_json(now)
             sys.stdout.flush()
         if not follow:

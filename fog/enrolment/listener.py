@@ -137,7 +137,7 @@ class Listener:
                 self._selector.register(self._listening, selectors.EVENT_READ)
             if now_s >= self._flush_s:
                 self._flush_s = now_s + _FLUSH_S
-                with _told("audit log"):
+                with _reported("audit log"):
                     self._responder.flush()
 
     def _timeout_s(self) -> float:
@@ -193,7 +193,7 @@ class Listener:
         connection.request += data
         answer: bytes | None = b""
         if data:
-            with _told("request"):
+            with _reported("request"):
                 answer = self._answer_to(connection)
         if answer is None:
             return
@@ -235,7 +235,7 @@ class Listener:
 
 
 @contextmanager
-def _told(what: str) -> Iterator[None]:
+def _reported(what: str) -> Iterator[None]:
     """Log an error and keep the thread alive; the machine sends its request again."""
     try:
         yield

@@ -188,10 +188,10 @@ def _verified(identifier: bytes, kept: Kept, asked: Request) -> list[SubjectInfo
 
 
 def _keys_digest(asked: Request, holders: list[SubjectInfo]) -> bytes:
-    told = hashlib.sha256()
+    reported = hashlib.sha256()
     for application, holder in zip(asked.applications, holders, strict=True):
-        told.update(holder.key.compressed + application.kem.wire)
-    return told.digest()
+        reported.update(holder.key.compressed + application.kem.wire)
+    return reported.digest()
 
 
 def _remember(kept: OrderedDict[bytes, _T], identifier: bytes, value: _T) -> None:

@@ -286,5 +286,5 @@ def _seats(text: str) -> tuple[PlannedSeat, ...]:
 def _papers(text: str | None) -> IssuedCredentials | None:
     if text is None:
         return None
-    told = json.loads(text)
-    return IssuedCredentials(told["proxy"], told["until_unix_s"], tuple(told["fingerprints"]))
+    document = json.loads(text)
+    return IssuedCredentials(document["proxy"], document["until_unix_s"], tuple(document["fingerprints"]))

@@ -71,7 +71,7 @@ class MachineAgent:
             if fallen.done():
                 self._leave(fallen.result())
             elif ended.done():
-                self._leave("was told to end")
+                self._leave("was asked to end")
             else:
                 self._leave("drained")
                 await self._drain(end)

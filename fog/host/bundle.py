@@ -34,8 +34,8 @@ def pack(boot: MachineBundle) -> dict[str, bytes]:
     names = [program.name for program in boot.programs]
     if len(set(names)) < len(names) or not all(name.replace("-", "").replace("_", "").isalnum() for name in names):
         raise LocalError(f"boot: programs need different names of letters, digits, '-' and '_': {', '.join(names)}")
-    told = {"programs": [asdict(program) for program in boot.programs]}
-    return {**boot.files, BOOT_FILE: json.dumps(told, indent=1).encode()}
+    document = {"programs": [asdict(program) for program in boot.programs]}
+    return {**boot.files, BOOT_FILE: json.dumps(document, indent=1).encode()}
 
 
 def unpack(files: Mapping[str, bytes]) -> MachineBundle:
@@ -57,8 +57,8 @@ def read_programs(content: bytes) -> tuple[Program, ...]:
         LocalError: the content is invalid.
     """
     try:
-        told = json.loads(content)["programs"]
-        programs = tuple(Program(**{**each, "argv": tuple(each["argv"])}) for each in told)
+        document = json.loads(content)["programs"]
+        programs = tuple(Program(**{**each, "argv": tuple(each["argv"])}) for each in document)
         for program in programs:
             _refuse_what_cannot_start(program)
     except json.JSONDecodeError as error:

@@ -50,7 +50,7 @@ def machine(
     with failing_clearly():
         host = MachineAgent(home.resolve())
         if await_go and not sys.stdin.readline():
-            log.warning("nobody says go, so nobody has a record of this machine")
+            log.warning("no start command came, so no record of this machine exists")
             raise typer.Exit(1)
         if (home / TICKET_FILE).exists():
             from fog.host.enrolment import enrol  # later starts do not need these imports

@@ -98,7 +98,7 @@ def _ask(ticket: Ticket, applications: list[Application], patience_s: float) -> 
                     log.warning("not enrolled yet reason=%s", said)
                 reason = said
         if time.monotonic() + pause_s >= end_s:
-            raise LocalError(f"nobody let this machine enrol within {patience_s:.0f} s: {reason}")
+            raise LocalError(f"this machine was not enrolled within {patience_s:.0f} s: {reason}")
         time.sleep(pause_s)  # no event reports that the launcher is reachable again
         pause_s = min(2 * pause_s, _PAUSE_MAX_S)
 

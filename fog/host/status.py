@@ -58,8 +58,8 @@ class Status:
     def read(cls, home: Path) -> Status | None:
         """Return the last status; None: no readable status."""
         try:
-            told = json.loads((home / STATUS_FILE).read_bytes())
-            programs = {name: ProgramStatus(**each) for name, each in told["programs"].items()}
-            return cls(MachineState(told["state"]), told["changed_unix_s"], programs, told["reason"])
+            document = json.loads((home / STATUS_FILE).read_bytes())
+            programs = {name: ProgramStatus(**each) for name, each in document["programs"].items()}
+            return cls(MachineState(document["state"]), document["changed_unix_s"], programs, document["reason"])
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
             return None

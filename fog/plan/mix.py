@@ -64,8 +64,8 @@ def cheapest_mix(kinds: Sequence[Kind], target: float, have: Sequence[float] = (
     if not 0 < target < 1:
         raise LocalError(f"target {target:g}: expected a number between 0 and 1")
     already = joint(have)
-    floor = max(0, least - len(have))
-    most = [max(floor, _alone(kind, target, already)) for kind in kinds]
+    minimum = max(0, least - len(have))
+    most = [max(minimum, _alone(kind, target, already)) for kind in kinds]
     if math.prod(each + 1 for each in most) > _MOST_MIXES:
         raise LocalError(f"up to {most} machines of {len(kinds)} kinds: ask for fewer kinds, or for less")
     mixes = (
@@ -75,7 +75,7 @@ def cheapest_mix(kinds: Sequence[Kind], target: float, have: Sequence[float] = (
             sum(kind.usd_per_hour * count for kind, count in zip(kinds, more, strict=True)),
         )
         for more in itertools.product(*(range(each + 1) for each in most))
-        if sum(more) >= floor
+        if sum(more) >= minimum
     )
     enough = (mix for mix in mixes if mix.chance <= target * (1 + 1e-9))
     return min(enough, key=lambda mix: (round(mix.usd_per_hour, 9), sum(mix.more), mix.chance))

@@ -149,7 +149,7 @@ class MachineActions:
             if machine.state is MachineState.GONE:
                 self._swept.add(machine.id)
             else:
-                self._journal.tell(now_s, cluster, name, "orphan", "nobody wants it: given back")
+                self._journal.tell(now_s, cluster, name, "orphan", "no cluster wants it: returned")
             self.release(plan, name, machine.id, is_lost=name in lost)
 
     def _launch(self, plan: ClusterPlan, wanted: MachineRequest, records: list[Record], now_s: float) -> None:

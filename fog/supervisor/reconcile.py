@@ -72,7 +72,7 @@ def decide(
     now_s: float,
     patience: Timeouts,
     *,
-    told: bool = True,
+    liveness_known: bool = True,
     excused: Collection[str] = (),
 ) -> list[Action]:
     """Return the actions that bring a cluster closer to its desired state.
@@ -80,7 +80,7 @@ def decide(
     Args:
         wanted: one request per machine; empty: all machines are released at once.
         records: of the cluster; machines that are gone are ignored.
-        told: whether the overlay reports which machines serve; if not, a machine that is up counts as serving.
+        liveness_known: the overlay reports which machines serve; otherwise a machine that is up counts as serving.
         excused: names of machines that are unreachable for an external reason, and are kept.
     """
     there = [record for record in records if not record.is_gone]
@@ -90,7 +90,9 @@ def decide(
             for each in there
             if not each.is_released or now_s - (each.released_unix_s or now_s) >= patience.release_s
         ]
-    view = _View(now_s, patience, told, any(_serves(each, told=told) for each in there), excused)
+    view = _View(
+        now_s, patience, liveness_known, any(_serves(each, liveness_known=liveness_known) for each in there), excused
+    )
     actions: list[Action] = []
     fit: list[Record] = []  # kept if wanted
     leaving: list[Record] = []  # serve until others do, or until their time ends
@@ -119,8 +121,8 @@ def decide(
     return actions
 
 
-def _serves(record: Record, *, told: bool) -> bool:
-    return record.is_serving if told else record.is_serving or record.up_unix_s is not None
+def _serves(record: Record, *, liveness_known: bool) -> bool:
+    return record.is_serving if liveness_known else record.is_serving or record.up_unix_s is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,12 +131,12 @@ class _View:
 
     now_s: float
     patience: Timeouts
-    told: bool
+    liveness_known: bool
     is_any_serving: bool
     excused: Collection[str]
 
     def serves(self, record: Record) -> bool:
-        return _serves(record, told=self.told)
+        return _serves(record, liveness_known=self.liveness_known)
 
     def is_old(self, record: Record) -> bool:
         return record.papers.until_unix_s - self.patience.credential_renewal_s <= self.now_s
@@ -154,7 +156,7 @@ class _View:
         if record.drained_unix_s is not None:
             is_done = now_s - record.drained_unix_s >= limit.drain_s
             return Release(record.name, record.reason) if is_done else None
-        if not self.told:
+        if not self.liveness_known:
             return None
         if record.served_unix_s is None:
             is_late = now_s - record.asked_unix_s >= limit.boot_s

@@ -143,8 +143,8 @@ class Supervisor:
         for each in self._journal.clusters():
             name = each.plan.name
             if each.is_up and not self._events.has_trouble(name):
-                told = f"{now_s - begun_unix_s:.2f} s after the supervisor's start"
-                self._journal.tell(now_s, name, "", "reconciled", told, since_unix_s=begun_unix_s)
+                liveness_known = f"{now_s - begun_unix_s:.2f} s after the supervisor's start"
+                self._journal.tell(now_s, name, "", "reconciled", liveness_known, since_unix_s=begun_unix_s)
 
     def _reconcile_cluster(self, cluster: Cluster) -> None:
         plan = cluster.plan
@@ -162,8 +162,8 @@ class Supervisor:
             self.wake()
             return
         wanted = plan.machines if cluster.is_up else ()
-        told = not names or heard is not None
-        for action in decide(wanted, records, now_s, self._patience, told=told, excused=excused):
+        liveness_known = not names or heard is not None
+        for action in decide(wanted, records, now_s, self._patience, liveness_known=liveness_known, excused=excused):
             self._actions.apply(plan, action, records, now_s)
         if is_new and not self._robots.has(plan):
             self._robots.grant(plan)

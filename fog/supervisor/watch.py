@@ -71,14 +71,14 @@ class Watch:
 
     def _keep(self) -> None:
         """Run the participant, and restart it after errors: the robot's switch may start later, or restart."""
-        told = ""
+        reported = ""
         while not self._ended.is_set():
             try:
                 self._look()
             except (GdpError, OSError) as error:
-                if str(error) != told:
+                if str(error) != reported:
                     log.warning("the overlay cannot be asked reason=%s", error)
-                    told = str(error)
+                    reported = str(error)
             finally:
                 self._tell(None)  # earlier results are no longer valid
             self._ended.wait(_AGAIN_S)
@@ -104,10 +104,10 @@ class Watch:
                 elif attached_s is None:
                     attached_s = time.monotonic()
                 peers = {name.to_text(): frozenset(each.to_text() for each in member.peers(name)) for name in called}
-                is_told = attached_s is not None and (
+                is_reported = attached_s is not None and (
                     all(peers.values()) or time.monotonic() - attached_s >= _SETTLED_S
                 )
-                self._tell(peers if is_told else None)
+                self._tell(peers if is_reported else None)
             member.leave()
             runtime.send()
         finally:

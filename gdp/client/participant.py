@@ -366,7 +366,7 @@ class Participant:
         if right not in topic.delegation.rights or not topic.secrets:
             raise LocalError(f"no delegation to {right.value} {topic.name.short}")
         if not is_free:
-            raise LocalError(f"{topic.name.short} is in use already: no {right.value} beside it")
+            raise LocalError(f"{topic.name.short} is in use already: {right.value} is refused for it")
 
     def _advertisement(self, topic: Topic, right: Right, *, is_global: bool) -> None:
         delegation = topic.delegation

@@ -160,9 +160,9 @@ class Publisher:
         """Return how many fragments were sent again."""
         return self._window.retransmissions
 
-    def has_room(self) -> bool:
+    def has_space(self) -> bool:
         """Return whether a message may be published without evicting an unacknowledged one."""
-        return self._queue.has_room()
+        return self._queue.has_space()
 
     def is_acknowledged(self) -> bool:
         """Return whether every reader has confirmed everything, those that may return included."""

@@ -18,7 +18,7 @@ from typing import Final
 
 from gdp.client.best_effort_queue import BestEffortQueue, Carried
 from gdp.client.key_epochs import KeyEpochs
-from gdp.crypto.envelope import SIGNATURE_BYTES, Sealed, part_room
+from gdp.crypto.envelope import SIGNATURE_BYTES, Sealed, fragment_capacity
 from gdp.errors import DropReason
 from gdp.frame.kinds import Flag
 from gdp.limits import SEQUENCE_BYTES, WINDOW_BYTES
@@ -74,9 +74,9 @@ class SendQueue:
         """Return whether nothing waits outside the window."""
         return not (self._deferred or self._gathered or self._best_effort)
 
-    def has_room(self) -> bool:
+    def has_space(self) -> bool:
         """Return whether a message may be added without evicting an unacknowledged one."""
-        return self._window.has_room() and self._gathered.held_bytes < WINDOW_BYTES
+        return self._window.has_space() and self._gathered.held_bytes < WINDOW_BYTES
 
     @property
     def oldest(self) -> int:
@@ -126,7 +126,7 @@ class SendQueue:
             LocalError: above the limits.
         """
         self.seal_deferred()
-        if self.depth or not self._gathered.is_small(message, self._bundle_room()):
+        if self.depth or not self._gathered.is_small(message, self._bundle_capacity()):
             self.seal_gathered()
             self._seal_message(message, self.ledger.last + 1)
             self.ledger.next()
@@ -208,18 +208,18 @@ class SendQueue:
     def _has_best_effort_queue(self) -> bool:
         return self._window.sent[0] < self.next_number if self.is_acknowledged else bool(self._best_effort)
 
-    def _bundle_room(self) -> int:
+    def _bundle_capacity(self) -> int:
         """Return the largest bundle in bytes.
 
         On a best-effort topic it is one frame, because the loss of one fragment loses the whole bundle.
         """
         if self.is_acknowledged or self.mtu is None:
             return self.bundle_bytes
-        return min(self.bundle_bytes, part_room(self.mtu) - SIGNATURE_BYTES - SEQUENCE_BYTES)
+        return min(self.bundle_bytes, fragment_capacity(self.mtu) - SIGNATURE_BYTES - SEQUENCE_BYTES)
 
     def _seal_next(self) -> None:
         """Seal the part of the gathered messages that fits into one bundle."""
-        first, together = self._gathered.first, self._gathered.poll_batch(self._bundle_room())
+        first, together = self._gathered.first, self._gathered.poll_batch(self._bundle_capacity())
         self._seal_message(together[0] if len(together) == 1 else pack(together), first, len(together))
 
     def _seal_message(self, body: bytes, sequence: int, messages: int = 1) -> None:

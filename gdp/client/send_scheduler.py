@@ -10,10 +10,10 @@ from typing import Final
 
 from gdp.client.publisher import Publisher
 
-__all__ = ["BYTES_AT_ONCE", "BYTES_BESIDE_URGENT", "SendScheduler"]
+__all__ = ["BYTES_AT_ONCE", "BYTES_WITH_URGENT", "SendScheduler"]
 
 BYTES_AT_ONCE: Final = 96 << 10  # of ordinary frames, before any other publisher has its turn
-BYTES_BESIDE_URGENT: Final = 64 << 10  # ... with an urgent topic, whose frames may have to wait for this amount
+BYTES_WITH_URGENT: Final = 64 << 10  # ... with an urgent topic, whose frames may have to wait for this amount
 
 
 class SendScheduler:
@@ -35,7 +35,7 @@ class SendScheduler:
     def add(self, publisher: Publisher) -> None:
         """Note that a publisher may have frames; one that already waits for its turn keeps its position."""
         if publisher.is_urgent:
-            self._at_once = BYTES_BESIDE_URGENT
+            self._at_once = BYTES_WITH_URGENT
             self._urgent[publisher] = None
         else:
             self._ordinary[publisher] = None

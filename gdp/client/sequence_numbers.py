@@ -32,7 +32,7 @@ class SequenceRegistry:
 
     def __init__(self, maximum: int = SEQUENCE_REGISTRY_MAX) -> None:
         self._of: OrderedDict[Name, SequenceState] = OrderedDict()
-        self._floor = FIRST
+        self._minimum = FIRST
         self._maximum = maximum
 
     def __len__(self) -> int:
@@ -44,8 +44,8 @@ class SequenceRegistry:
         self._of.move_to_end(topic)
         if len(self._of) > self._maximum:
             gone = self._of.popitem(last=False)[1]
-            self._floor = SequenceState(*map(max, self._floor, gone))
+            self._minimum = SequenceState(*map(max, self._minimum, gone))
 
     def of(self, topic: Name) -> SequenceState:
         """Return the numbers above which a publisher of a topic begins now."""
-        return self._of.get(topic, self._floor)
+        return self._of.get(topic, self._minimum)

@@ -92,7 +92,7 @@ class UnicastStreams:
         reader = party.life
         stream = self._streams.get(reader.name)
         if stream is None:
-            self._make_room()
+            self._free_space()
             past = self._sequence_registry.of(self._name_of(reader))
             stream = self._streams[reader.name] = UnicastStream(
                 service=self._service,
@@ -139,7 +139,7 @@ class UnicastStreams:
     def _name_of(self, reader: PeerIncarnation) -> Name:
         return private_name(self._service, PeerIncarnation(self._writer.name, self._writer.incarnation), reader)
 
-    def _make_room(self) -> None:
+    def _free_space(self) -> None:
         if len(self._streams) < STREAMS_MAX:
             return
         silent = next((stream.reader for stream in self if not stream.readers), None)

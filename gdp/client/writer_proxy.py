@@ -340,12 +340,12 @@ class WriterProxy:
         sent_number, sent_part = self._sent
         end = max(self._data.highest + 1, sent_number + (sent_part > 0))
         for number in self._data.window.unfinished(self._order.expected, end):
-            room = NACKS_PER_REPORT - len(missing)
-            if room <= 0:
+            capacity = NACKS_PER_REPORT - len(missing)
+            if capacity <= 0:
                 break
-            ranges = self._data.missing(number, room, to_end=number < sent_number)
+            ranges = self._data.missing(number, capacity, to_end=number < sent_number)
             if not ranges and number == sent_number:
-                ranges = _below(self._data.missing(number, room, to_end=True), sent_part)
+                ranges = _below(self._data.missing(number, capacity, to_end=True), sent_part)
             missing += [MissingRange(number, *each) for each in ranges]
         return tuple(missing)
 

@@ -56,8 +56,8 @@ class ControlFragmenter:
         Raises:
             LocalError: a statement above the limit.
         """
-        room = (mtu if destination == ZERO else min(mtu, _FAR_MTU)) - HEADER_BYTES
-        chunks = [statement[at : at + room] for at in range(0, len(statement), room)] or [b""]
+        capacity = (mtu if destination == ZERO else min(mtu, _FAR_MTU)) - HEADER_BYTES
+        chunks = [statement[at : at + capacity] for at in range(0, len(statement), capacity)] or [b""]
         if len(statement) > CONTROL_MAX_BYTES + RECORD_OVERHEAD_BYTES or len(chunks) > CONTROL_PARTS_MAX:
             raise LocalError(f"a statement of {len(statement)} bytes is above the limit")
         self._number += 1

@@ -94,16 +94,16 @@ class LinkState:
 
     def fitted(self, membership: bytes) -> LinkState:
         """Return the part of it that fits one statement with the signer's certificate: RIBs and links first."""
-        room = CONTROL_MAX_BYTES - _HEAD_BYTES - len(membership)
-        ribs = _cut(self.ribs[:RIBS_MAX], [each.cost_bytes for each in self.ribs], room // 2)
-        room -= sum(each.cost_bytes for each in ribs)
-        links = _cut(self.links[:LINKS_MAX], [_LINK_BYTES] * len(self.links), room)
-        room -= _LINK_BYTES * len(links)
-        refused = _cut(self.refused[:RIBS_MAX], [_NAME_BYTES] * len(self.refused), room)
-        room -= _NAME_BYTES * len(refused)
-        inside = _cut(self.inside[:LINKS_MAX], [_LINK_BYTES] * len(self.inside), room)
-        room -= _LINK_BYTES * len(inside)
-        members = _cut(self.members[:MEMBERS_MAX], [_NAME_BYTES] * len(self.members), room)
+        capacity = CONTROL_MAX_BYTES - _HEAD_BYTES - len(membership)
+        ribs = _cut(self.ribs[:RIBS_MAX], [each.cost_bytes for each in self.ribs], capacity // 2)
+        capacity -= sum(each.cost_bytes for each in ribs)
+        links = _cut(self.links[:LINKS_MAX], [_LINK_BYTES] * len(self.links), capacity)
+        capacity -= _LINK_BYTES * len(links)
+        refused = _cut(self.refused[:RIBS_MAX], [_NAME_BYTES] * len(self.refused), capacity)
+        capacity -= _NAME_BYTES * len(refused)
+        inside = _cut(self.inside[:LINKS_MAX], [_LINK_BYTES] * len(self.inside), capacity)
+        capacity -= _LINK_BYTES * len(inside)
+        members = _cut(self.members[:MEMBERS_MAX], [_NAME_BYTES] * len(self.members), capacity)
         return replace(
             self, links=links, inside=inside, ribs=ribs, members=members, refused=refused,
             is_partial=len(members) < len(self.members),
@@ -159,12 +159,12 @@ class LinkState:
         )
 
 
-def _cut(items: tuple[_T, ...], costs: list[int], room: int) -> tuple[_T, ...]:
+def _cut(items: tuple[_T, ...], costs: list[int], capacity: int) -> tuple[_T, ...]:
     """Return the first items, as far as their costs fit."""
     kept: list[_T] = []
     for item, cost in zip(items, costs, strict=False):
-        room -= cost
-        if room < 0:
+        capacity -= cost
+        if capacity < 0:
             break
         kept.append(item)
     return tuple(kept)

@@ -227,7 +227,7 @@ class HelloProtocol:
     Attributes:
         rivals: nodes that share an identity with another one, at our ports.
         clashes: how often we received notice of another node with our own identity.
-        clash_told_by: the neighbour that reported it last.
+        clash_reporter: the neighbour that reported it last.
     """
 
     def __init__(
@@ -269,11 +269,11 @@ class HelloProtocol:
         self._replies: list[OutgoingFrames] = []
         self._reply_at_s = float("inf")
         self._has_moved = False  # there is a new address
-        self._told_addresses: dict[int, frozenset[bytes]] = {}
+        self._reported_addresses: dict[int, frozenset[bytes]] = {}
         self._reassembler = ControlReassembler()  # of neighbours' hellos
         self._strangers_reassembler = ControlReassembler()
         self.clashes = 0
-        self.clash_told_by: Name | None = None
+        self.clash_reporter: Name | None = None
         self._clash_since_s = self._clash_s = float("-inf")
         self.ports: dict[int, HelloPort] = {}
 
@@ -347,8 +347,8 @@ class HelloProtocol:
         changed = {}
         for index, port in self.ports.items():
             macs = frozenset(port.addresses)
-            if macs != self._told_addresses.get(index, frozenset()):
-                changed[index] = self._told_addresses[index] = macs
+            if macs != self._reported_addresses.get(index, frozenset()):
+                changed[index] = self._reported_addresses[index] = macs
         return changed
 
     def all_up(self) -> list[Neighbour]:
@@ -412,7 +412,7 @@ class HelloProtocol:
         self.conflicts.accept(member.name, hello.life)
         is_two_way = port.echo in hello.heard
         known = port.neighbours.get(member.name)
-        self._make_room(port, known, is_two_way=is_two_way)
+        self._free_space(port, known, is_two_way=is_two_way)
         if known is None:
             known = port.neighbours[member.name] = Neighbour(
                 member.name, member.role, member.domain, member.key, port.index, arrival.mac, 0, b"", 0, b"", 0.0
@@ -516,7 +516,7 @@ class HelloProtocol:
             raise
 
     @staticmethod
-    def _make_room(port: HelloPort, known: Neighbour | None, *, is_two_way: bool) -> None:
+    def _free_space(port: HelloPort, known: Neighbour | None, *, is_two_way: bool) -> None:
         """Ensure that an entry is free: neighbours keep theirs, the oldest candidate is evicted for the next one.
 
         Raises:
@@ -618,7 +618,7 @@ class HelloProtocol:
             self._next_s = None
             self.ports[port].hurry(now_s)
 
-    def note_clash(self, told_by: Name, now_s: float, *, is_proven: bool = False) -> None:
+    def note_clash(self, reporter: Name, now_s: float, *, is_proven: bool = False) -> None:
         """Note that another node has our own identity.
 
         Args:
@@ -629,7 +629,7 @@ class HelloProtocol:
         self._clash_s = now_s
         if is_proven or now_s >= self._clash_since_s + _CLASH_S:
             self.clashes += 1
-            self.clash_told_by = told_by
+            self.clash_reporter = reporter
 
     def _note_clash(self, port: HelloPort, neighbour: Neighbour, hello: Hello, now_s: float) -> None:
         """Note what a neighbour's hello states about our identity."""

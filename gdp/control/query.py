@@ -72,7 +72,7 @@ class Response:
     sequence: int = 0
 
     @property
-    def is_nobody(self) -> bool:
+    def is_negative(self) -> bool:
         """Return whether no node advertises the name."""
         return not self.advertisement and self.advertiser == self.name
 

@@ -28,7 +28,7 @@ FETCH_PREFIXES_MAX: Final = 16
 FETCH_KEYS_MAX: Final = 64
 INVENTORY_MAX: Final = 128  # items of 73 bytes: 9.3 KiB
 ENTRIES_MAX: Final = 64
-_ROOM_BYTES: Final = CONTROL_MAX_BYTES - 4_096  # excludes a membership, which has at most 4 KiB
+_CAPACITY_BYTES: Final = CONTROL_MAX_BYTES - 4_096  # excludes a membership, which has at most 4 KiB
 _ENTRY_COST_BYTES: Final = 180  # keys, names and heads of one entry, in addition to its byte strings
 _KEY_BYTES: Final = 2 * NAME_BYTES
 
@@ -232,9 +232,9 @@ def batches(entries: Sequence[Entry]) -> Iterator[tuple[Entry, ...]]:
     size = 0
     for entry in entries:
         cost = entry.cost_bytes
-        if cost > _ROOM_BYTES:
+        if cost > _CAPACITY_BYTES:
             continue
-        if group and (size + cost > _ROOM_BYTES or len(group) >= ENTRIES_MAX):
+        if group and (size + cost > _CAPACITY_BYTES or len(group) >= ENTRIES_MAX):
             yield tuple(group)
             group, size = [], 0
         group.append(entry)

@@ -195,14 +195,14 @@ class RevocationSync:
         if own is None:
             return
         groups: list[tuple[int, ...]] = []
-        room = 0
+        capacity = 0
         for bucket in (at for at in range(BUCKETS) if own[at] != said.hashes[at]):
             size = len(self._revoked.ids(said.domain, bucket))
-            if not groups or size > room:
+            if not groups or size > capacity:
                 groups.append(())
-                room = IDS_MAX
+                capacity = IDS_MAX
             groups[-1] = (*groups[-1], bucket)
-            room -= size
+            capacity -= size
         self._ask(peer, said.domain, groups, now_s)
 
     def _ask(self, peer: _Peer, domain: Name, groups: list[tuple[int, ...]], now_s: float) -> None:

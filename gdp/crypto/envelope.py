@@ -49,7 +49,7 @@ __all__ = [
     "Sealer",
     "Signer",
     "digest_of",
-    "part_room",
+    "fragment_capacity",
     "salt_of",
     "seal_key",
 ]
@@ -112,12 +112,12 @@ def salt_of(frame: bytes) -> bytes:
     return frame[HEADER_BYTES:_BODY_AT]
 
 
-def part_room(mtu: int) -> int:
+def fragment_capacity(mtu: int) -> int:
     """Return the plaintext bytes that one part carries where links take ``mtu`` bytes after the Ethernet header."""
-    room = min(mtu, FRAME_MAX_BYTES) - HEADER_BYTES - SEAL_BYTES
-    if room <= SIGNATURE_BYTES:
+    capacity = min(mtu, FRAME_MAX_BYTES) - HEADER_BYTES - SEAL_BYTES
+    if capacity <= SIGNATURE_BYTES:
         raise LocalError(f"an MTU of {mtu} bytes carries no sealed part")
-    return room
+    return capacity
 
 
 def digest_of(header: Header, salt: bytes) -> hashlib._Hash:
@@ -184,22 +184,22 @@ class Sealer:
         if number <= self._last_number:
             raise LocalError(f"message number {number} was sealed before")
         size = len(message) if isinstance(message, bytes) else message.message_bytes
-        room = part_room(mtu)
-        parts = -(-(size + SIGNATURE_BYTES) // room)
+        capacity = fragment_capacity(mtu)
+        parts = -(-(size + SIGNATURE_BYTES) // capacity)
         if size > MESSAGE_MAX_BYTES + SEQUENCE_BYTES or parts > PARTS_MAX:
             raise LocalError(f"a message of {size} bytes in {parts} parts is above the limit")
         self._last_number = number
         epoch, kind, incarnation, destination, source = self._fixed
         header = Header(kind, flags, HOPS_MAX, epoch, 0, number, 0, parts, incarnation, destination, source)
         salt = self._random_bytes(SALT_BYTES)
-        return Sealed(self._keys.of(salt), salt, self._signer, header, message, room)
+        return Sealed(self._keys.of(salt), salt, self._signer, header, message, capacity)
 
 
 class Sealed(Sequence[bytes]):
     """The frames of one message, sealed in order and on request; always the same bytes."""
 
     def __init__(
-        self, aead: AESGCM, salt: bytes, signer: Signer, header: Header, message: bytes | Sealed, room: int
+        self, aead: AESGCM, salt: bytes, signer: Signer, header: Header, message: bytes | Sealed, capacity: int
     ) -> None:
         self._aead = aead
         self._salt = salt
@@ -213,7 +213,7 @@ class Sealed(Sequence[bytes]):
         else:
             self._message, self.message_bytes = memoryview(b""), message.message_bytes
             self._origin = message._origin or message
-        self._room = room
+        self._capacity = capacity
         self._running = digest_of(header, salt)
         self._frames: list[bytes] = []
         self.size_bytes = self.message_bytes + header.parts * (HEADER_BYTES + SEAL_BYTES) + SIGNATURE_BYTES
@@ -237,7 +237,7 @@ class Sealed(Sequence[bytes]):
     @property
     def largest(self) -> int:
         """Return the bytes of the largest frame, sealed or not."""
-        return self.size_bytes if self._header.parts == 1 else self._room + HEADER_BYTES + SEAL_BYTES
+        return self.size_bytes if self._header.parts == 1 else self._capacity + HEADER_BYTES + SEAL_BYTES
 
     def message(self) -> bytes:
         """Return the plaintext, to be sealed again under another number."""
@@ -267,18 +267,18 @@ class Sealed(Sequence[bytes]):
 
     def _seal_full(self, end: int) -> None:
         """Seal the parts before ``end``, all of full length, on the fast path."""
-        first, room, message = len(self._frames), self._room, self._message
+        first, capacity, message = len(self._frames), self._capacity, self._message
         encrypt, update, append = self._encrypt, self._running.update, self._frames.append
-        headers = HeaderBatch(self._header._replace(length=room + SEAL_BYTES), first, end - first, self._salt)
-        begins = range(first * room, end * room, room)
+        headers = HeaderBatch(self._header._replace(length=capacity + SEAL_BYTES), first, end - first, self._salt)
+        begins = range(first * capacity, end * capacity, capacity)
         for begin, (header,), (additional,), (nonce,) in zip(begins, *headers.each(), strict=True):
-            sealed = encrypt(nonce, message[begin : begin + room], additional)
+            sealed = encrypt(nonce, message[begin : begin + capacity], additional)
             update(sealed)
             append(header + sealed)
 
     def _seal_one(self, part: int) -> None:
-        header, room = self._header, self._room
-        plain = self._message[part * room : (part + 1) * room]
+        header, capacity = self._header, self._capacity
+        plain = self._message[part * capacity : (part + 1) * capacity]
         is_last = part == header.parts - 1
         length = len(plain) + SEAL_BYTES + (SIGNATURE_BYTES if is_last else 0)
         kind, flags, hops_left, epoch, _, number, _, parts, incarnation, to, source = header

@@ -63,9 +63,9 @@ class Gathered:
         return len(self._messages)
 
     @staticmethod
-    def is_small(message: bytes, room: int) -> bool:
-        """Return whether several messages of this size fit into a bundle of ``room`` bytes."""
-        return _SMALL * (len(message) + _LENGTH.size) <= room
+    def is_small(message: bytes, capacity: int) -> bool:
+        """Return whether several messages of this size fit into a bundle of ``capacity`` bytes."""
+        return _SMALL * (len(message) + _LENGTH.size) <= capacity
 
     def add(self, sequence: int, message: bytes) -> None:
         """Add a message."""
@@ -74,12 +74,12 @@ class Gathered:
         self._messages.append(message)
         self.held_bytes += len(message) + _ALONE_BYTES
 
-    def poll_batch(self, room: int) -> list[bytes]:
-        """Remove and return the oldest message, and those after it that fit into ``room`` bytes of wire form."""
+    def poll_batch(self, capacity: int) -> list[bytes]:
+        """Remove and return the oldest message, and those after it that fit into ``capacity`` bytes of wire form."""
         together: list[bytes] = []
         while self._messages:
-            room -= len(self._messages[0]) + _LENGTH.size
-            if together and room < 0:
+            capacity -= len(self._messages[0]) + _LENGTH.size
+            if together and capacity < 0:
                 break
             together.append(self._messages.popleft())
             self.held_bytes -= len(together[-1]) + _ALONE_BYTES

@@ -200,7 +200,7 @@ class Reassembler:
             return None
         if header.parts == 1:
             return self._take_whole(header, salt, plain, sealed, signature)
-        if message is None and not self._make_room(number):
+        if message is None and not self._free_space(number):
             self.drops[DropReason.MEMORY_FULL] += 1
             return None
         if message is None or not is_same:
@@ -312,7 +312,7 @@ class Reassembler:
         self._unfinished_bytes -= size
         self._budget.release(self._source, size)
 
-    def _make_room(self, number: int) -> bool:
+    def _free_space(self, number: int) -> bool:
         """Return whether one more message may begin; the highest number is evicted for a lower one."""
         if len(self._unfinished) < JOIN_MESSAGES_MAX:
             return True

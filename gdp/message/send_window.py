@@ -10,7 +10,7 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Positions count bytes 
 The window joins four parts: ``history_cache.py`` (what can be sent again), ``flow_control.py`` (how much may be under
 way), ``retransmission.py`` (what is sent again) and ``acknowledgement.py`` (what readers have).
 
-A suspended reader is silent, and may have moved. It blocks neither the congestion window nor ``has_room``. What it
+A suspended reader is silent, and may have moved. It blocks neither the congestion window nor ``has_space``. What it
 lacks stays cached as long as the budget allows. When it reports again it gets repairs, and becomes active once it has
 caught up.
 """
@@ -37,7 +37,7 @@ class SendWindow:
     Args:
         history_depth: messages that stay for late joiners, acknowledged or not.
         first_number: lowest message number that ``add`` will get.
-        budget_bytes: size of the cache. When it is full, ``has_room`` is false; beyond twice that ``add`` evicts the
+        budget_bytes: size of the cache. When it is full, ``has_space`` is false; beyond twice that ``add`` evicts the
             oldest.
         lag_s: how long a reader may block the window while others have acknowledged.
 
@@ -101,7 +101,7 @@ class SendWindow:
         """Return how many readers are suspended."""
         return len(self._readers.suspended)
 
-    def has_room(self) -> bool:
+    def has_space(self) -> bool:
         """Return whether ``add`` would evict no message that a reader waits for."""
         is_idle = bool(self._readers.suspended) and not self._readers.active
         return is_idle or self._cache.end_at - self._acked_at() < self._budget_bytes

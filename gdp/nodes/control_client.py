@@ -35,7 +35,7 @@ __all__ = [
 ]
 
 _RECEIVE_BYTES: Final = 1 << 16
-_NOBODY: Final = (errno.ENOENT, errno.ECONNREFUSED, errno.ENOTDIR)
+_ABSENT: Final = (errno.ENOENT, errno.ECONNREFUSED, errno.ENOTDIR)
 
 
 class NotRunningError(LocalError):
@@ -88,7 +88,7 @@ def request_control(path: Path, command: Command, timeout_s: float) -> Iterator[
     except TimeoutError as error:
         raise LocalError(f"{path}: no response within {timeout_s:g} s") from error
     except OSError as error:
-        if error.errno in _NOBODY:
+        if error.errno in _ABSENT:
             raise NotRunningError(f"{path}: no process serves this control socket; start the node first") from error
         raise LocalError(f"{path}: {error.strerror}; run the command as the user of the node") from error
 

@@ -85,10 +85,10 @@ class NodeLog:
             log.error(
                 "another node with this identity asked for its place at switch %s and was refused", conflict.short
             )
-        told_by = self._hello_protocol.clash_told_by
-        if told_by is not None and told_by != self._known_clash:
-            self._known_clash = told_by
-            log.error("another node with this identity is alive, says switch %s; the older one stays", told_by.short)
+        reporter = self._hello_protocol.clash_reporter
+        if reporter is not None and reporter != self._known_clash:
+            self._known_clash = reporter
+            log.error("another node with this identity is alive, says switch %s; the older one stays", reporter.short)
         for wait in self._wait_log.update(self._waits(now.mono_s), now.mono_s):
             text = self._text(wait)
             log.log(logging.ERROR if wait.reason is WaitReason.IN_USE else logging.WARNING, "waiting: %s", text)
@@ -131,7 +131,7 @@ class NodeLog:
             case WaitReason.LINK_DOWN:
                 return f"there is no device {ifname}" if self._is_absent(wait.port) else f"link down on {ifname}"
             case WaitReason.NO_NEIGHBOUR:
-                return f"no neighbour on {ifname}: nobody answers there"
+                return f"no neighbour on {ifname}: no answer there"
             case WaitReason.STRANGER:
                 return _refusal(ifname, wait)
             case WaitReason.ONE_WAY:

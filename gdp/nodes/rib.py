@@ -131,7 +131,7 @@ def _sources(host: RibHost, plane: Plane, node_log: NodeLog) -> Sources:
         table_entries=lambda: rib.names,
         rib_answers=lambda: {
             "found": rib.answers,
-            "nobody": rib.negative_answers,
+            "negative": rib.negative_answers,
             "accepted": rib.accepted,
         },
         rib_refusals=lambda: {reason.label: count for reason, count in list(rib.refusals.items())},

@@ -59,7 +59,7 @@ from gdp.trust.verifier import AdvertisementVerifier
 __all__ = ["OutgoingStatement", "RibCore", "RibSettings"]
 
 _ADVISED_S: Final = 30.0  # how long members that received a response also receive moves
-_UNTOLD_S: Final = 1.0  # ... where there are too many for that
+_UNREPORTED_S: Final = 1.0  # ... where there are too many for that
 _NAMES_OF_ISSUER_MAX: Final = 256  # names whose watchers receive a revocation by an issuer that is not the names' owner
 _QUESTION_BYTES: Final = 1_024  # cost of a query, forwarded upstream or answered in the negative
 _ANSWER_BYTES: Final = 1_024  # cost of a response without the advertisement in it
@@ -465,7 +465,7 @@ class RibCore:
         if is_below and self._above.want(query.name, asker, query.watch_s, now.mono_s, is_known=bool(routes)):
             self._ask_above(query.name, self._above.watch_s(query.name))
         elif not routes and not self._above.is_waiting(query.name):
-            self._answer_nobody(query.name, member.name)
+            self._answer_negative(query.name, member.name)
 
     def _watch(self, query: Query, asker: Asker, now_s: float) -> None:
         """Add a watch for an asker; above the watch limit it still gets a response, and will send its query again."""
@@ -488,12 +488,12 @@ class RibCore:
         try:
             self._holders.add(route.name, to, now_s + lease_s)
         except StatementError:
-            lease_s = min(lease_s, _UNTOLD_S)
+            lease_s = min(lease_s, _UNREPORTED_S)
         answer = Response(route.name, route.advertiser, route.advertisement, route.domain, route.transit, lease_s)
         self.answers += 1
         self._send(answer, to.name, (route.name, route.advertiser))
 
-    def _answer_nobody(self, name: Name, to: Name) -> None:
+    def _answer_negative(self, name: Name, to: Name) -> None:
         if self._replication is not None and self._replication.is_cold(self._now_s):
             return  # a peer may know; the asker repeats its query, here or at that peer
         self._deny(name, to)
@@ -513,12 +513,12 @@ class RibCore:
 
     def _tell(self, route: Route, known: Route | Withdrawn | None, now_s: float, askers: Sequence[Asker] = ()) -> None:
         """Send a route to ``askers``, to watchers, and after a move to holders and the sender of the old location."""
-        told = dict.fromkeys((*askers, *self._watches.watchers(route.name, now_s)))
+        reported = dict.fromkeys((*askers, *self._watches.watchers(route.name, now_s)))
         if isinstance(known, Route) and known.place != route.place:
-            told |= dict.fromkeys(self._holders.watchers(route.name, now_s))
+            reported |= dict.fromkeys(self._holders.watchers(route.name, now_s))
             if known.sender != route.sender:
-                told |= self._sender_of(known)
-        for asker in told:
+                reported |= self._sender_of(known)
+        for asker in reported:
             if self._may_tell(route, asker):
                 self._answer(route, asker, now_s)
 
@@ -529,10 +529,12 @@ class RibCore:
 
     def _tell_gone(self, route: Route, now_s: float, by: Name | None = None) -> None:
         """Notify a name's watchers, holders and sender that a route is gone, except ``by``, which knows."""
-        told = dict.fromkeys((*self._watches.watchers(route.name, now_s), *self._holders.watchers(route.name, now_s)))
+        reported = dict.fromkeys(
+            (*self._watches.watchers(route.name, now_s), *self._holders.watchers(route.name, now_s))
+        )
         if by not in (None, route.sender):
-            told |= self._sender_of(route)
-        for asker in told:
+            reported |= self._sender_of(route)
+        for asker in reported:
             if self._may_tell(route, asker):
                 gone = Response(route.name, route.advertiser, b"", route.domain, (), 0.0, route.sequence)
                 self._send(gone, asker.name)
@@ -548,7 +550,7 @@ class RibCore:
             self._ask_above(name, watch_s)
         for name, askers in given_up:
             for asker in askers:
-                self._answer_nobody(name, asker.name)
+                self._answer_negative(name, asker.name)
         self._probe(now_s, PROBE_S)
 
     def _probe(self, now_s: float, quiet_s: float) -> None:
@@ -602,11 +604,11 @@ class RibCore:
         fields = statement.fields
         member = self._upper_member(statement, now)
         answer = Response.from_fields(fields)
-        if answer.is_nobody:
+        if answer.is_negative:
             askers = self._above.answered(answer.name, now.mono_s)
             if not self._store.routes(answer.name):
                 for asker in askers:
-                    self._answer_nobody(answer.name, asker.name)
+                    self._answer_negative(answer.name, asker.name)
             return
         known = self._store.get(answer.name, answer.advertiser)
         if not answer.advertisement:
@@ -660,19 +662,21 @@ class RibCore:
             return
         who, about = revocation.issuer.name.to_text(), revocation.fingerprint.hex()
         self._audit.note(Action.REVOKED, "certificate", who=who, about=about)
-        told: dict[Asker, None] = {}
+        reported: dict[Asker, None] = {}
         closed = self._revocations.closed(revocation, now)
         # switches flood revocations of roots everywhere
         if not self._policy.revoked.is_root(revocation.issuer.owner_key):
             for name in dict.fromkeys((revocation.issuer.name, *(route.name for route in closed))):
-                told |= self._concerned_by(name, now.mono_s)
-            if not told:  # the issuer signs in its own name: an owner's successor, or a delegate
+                reported |= self._concerned_by(name, now.mono_s)
+            if not reported:  # the issuer signs in its own name: an owner's successor, or a delegate
                 others = self._store.resting_on(revocation.issuer.owner_key)
                 for name in list(dict.fromkeys(route.name for route in others))[:_NAMES_OF_ISSUER_MAX]:
-                    told |= self._concerned_by(name, now.mono_s)
-            ribs = self._above_and_beside(origin)
+                    reported |= self._concerned_by(name, now.mono_s)
+            ribs = self._upstream_and_peers(origin)
             self._send_revocations([statement.wire], ribs, Kind.RIB_REQUEST)
-            self._send_revocations([statement.wire], [each.name for each in told if each.name not in (origin, *ribs)])
+            self._send_revocations(
+                [statement.wire], [each.name for each in reported if each.name not in (origin, *ribs)]
+            )
         for route in closed:
             self._store.withdraw(route.name, route.advertiser)
             self._tell_gone(route, now.mono_s)
@@ -688,12 +692,12 @@ class RibCore:
 
     def _concerned_by(self, name: Name, now_s: float) -> dict[Asker, None]:
         """Return the nodes that advertised, hold or watch a name."""
-        told = dict.fromkeys((*self._watches.watchers(name, now_s), *self._holders.watchers(name, now_s)))
+        reported = dict.fromkeys((*self._watches.watchers(name, now_s), *self._holders.watchers(name, now_s)))
         for route in self._store.routes(name):
-            told |= self._sender_of(route)
-        return told
+            reported |= self._sender_of(route)
+        return reported
 
-    def _above_and_beside(self, origin: Name) -> list[Name]:
+    def _upstream_and_peers(self, origin: Name) -> list[Name]:
         """Return the RIBs that receive every revocation: the tier above, and peers."""
         if self._upstream.has(origin):
             return list(self._settings.peers)

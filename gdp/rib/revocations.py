@@ -24,8 +24,8 @@ from gdp.trust.verifier import AdvertisementVerifier
 __all__ = ["RibRevocations"]
 
 _PASSED_PER_S, _PASSED_BURST = 8.0, 128.0  # forwarded to the tier above, of one sender
-_TOLD_PER_S, _TOLD_BURST = 64.0, 2_048.0  # to one asker, of what it lacks
-_TOLD_ABOUT_MAX: Final = 1_024  # in one response
+_SENT_PER_S, _SENT_BURST = 64.0, 2_048.0  # to one asker, of what it lacks
+_SENT_ABOUT_MAX: Final = 1_024  # in one response
 
 
 class RibRevocations:
@@ -41,7 +41,7 @@ class RibRevocations:
         self._store = store
         self._is_watched = is_watched
         self._passed = TokenBuckets(_PASSED_PER_S, _PASSED_BURST)
-        self._told = TokenBuckets(_TOLD_PER_S, _TOLD_BURST)
+        self._reported = TokenBuckets(_SENT_PER_S, _SENT_BURST)
 
     def receive_revocation(self, statement: Statement, origin: Name, now: Timestamps) -> Revocation | None:
         """Handle a revocation; return it if it is news.
@@ -80,8 +80,8 @@ class RibRevocations:
         """Return the revocations about a name that an asker lacks, given the digest of what it has."""
         if digest == self._revoked.digest_about(name):
             return []
-        wires = self._revoked.about(name)[:_TOLD_ABOUT_MAX]
-        return [wire for wire in wires if self._told.spend(asker, now_s)]
+        wires = self._revoked.about(name)[:_SENT_ABOUT_MAX]
+        return [wire for wire in wires if self._reported.spend(asker, now_s)]
 
     def behind(self, fingerprints: list[tuple[bytes, bytes]]) -> list[bytes]:
         """Return the statements that revoked these certificates, each a fingerprint and a key that may revoke it."""

@@ -28,7 +28,7 @@ __all__ = ["Apply", "Doing", "Fetch", "Follower", "Load", "Refuse", "Say"]
 
 HELD_MAX: Final = 1_024  # how far ahead of its server it accepts entries
 HELD_MAX_BYTES: Final = 64 << 20
-UNKEPT: Final = "this service takes requests in order, and follows nobody's yet"
+UNKEPT: Final = "this service takes requests in order, and follows no sequencer yet"
 
 
 class Apply(NamedTuple):
@@ -92,7 +92,7 @@ class Follower:
         self._sequencer: Name | None = None
         self._held: dict[int, tuple[int, bytes]] = {}  # index -> call and request; of this log, not applied yet
         self._held_bytes = 0
-        self._gap_told = -1
+        self._reported_gap = -1
         self._follow: AttachReplica | None = None  # with a snapshot that waits, or is being loaded
         self._asked_state = False
         self._effects: list[Effect] = []
@@ -140,8 +140,8 @@ class Follower:
         self._held_bytes += len(request)
         self._go_on()
         reach = self._reach()
-        if index > reach and self._gap_told != reach:
-            self._gap_told = reach
+        if index > reach and self._reported_gap != reach:
+            self._reported_gap = reach
             self._say(client)
 
     def applied(self) -> None:
@@ -157,7 +157,7 @@ class Follower:
         self._lose()
         self._go_on()
 
-    def told(self, state: bytes | None) -> None:
+    def receive_state(self, state: bytes | None) -> None:
         """Handle the server's state; None: it has none."""
         self._end(Doing.TELLING)
         self._asked_state = False
@@ -228,7 +228,7 @@ class Follower:
             self.doing = Doing.APPLYING
             call, request = self._held[self._index + 1]
             # An entry whose client is gone is applied as well, without a response.
-            self._effects.append(Apply(self._sequencer or _NOBODY, call, request))
+            self._effects.append(Apply(self._sequencer or _ABSENT, call, request))
 
     def _stand(self, log: LogId, index: int) -> None:
         """Set the log and the position in it; held entries of this log stay."""
@@ -251,7 +251,7 @@ class Follower:
         now = self._index + 1
         self._held = {now: self._held[now]} if self.doing is Doing.APPLYING else {}
         self._held_bytes = sum(len(request) for _, request in self._held.values())
-        self._gap_told = -1
+        self._reported_gap = -1
 
     def _end(self, doing: Doing) -> None:
         assert self.doing is doing, f"{self.doing} ended as {doing}"
@@ -269,4 +269,4 @@ class Follower:
         self._effects.append(Say(client, said))
 
 
-_NOBODY: Final = Name(bytes(32))
+_ABSENT: Final = Name(bytes(32))

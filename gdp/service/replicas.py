@@ -32,7 +32,7 @@ class Replica:
     sent: int = 0
     why_not: str = ""
 
-    def begin_anew(self) -> None:
+    def start_over(self) -> None:
         """Reset the replica to follow nothing; a report of another sequencer stays until a newer report."""
         self.follows, self.is_offered, self.quiet_until_s = False, False, 0.0
         if self.position is not None and self.position.kept_by is None:

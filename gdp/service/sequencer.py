@@ -49,8 +49,8 @@ A = TypeVar("A")
 GENERATION_MAX: Final = 1 << 63  # no log gets this far; the next generation must still fit into 64 bits
 AGAIN_S: Final = 0.25  # between probes of a replica that does not follow
 SILENT_S: Final = 10.0  # for a replica that has a snapshot to load
-_UNLIKE: Final = "its state differs from the others', and theirs cannot be told to it"
-_UNKNOWN: Final = "what state its server is in is not known; start it anew"
+_UNLIKE: Final = "its state differs from the others', and theirs cannot be sent to it"
+_UNKNOWN: Final = "what state its server is in is not known; restart it"
 
 
 Effect: TypeAlias = "Ask | ReplicaCommand"
@@ -97,7 +97,7 @@ class Sequencer(Generic[A]):
         self._base = (NO_LOG, 0)  # position of a replica at which the log begins
         self._is_keeping = False
         for replica in self._replicas.values():
-            replica.begin_anew()
+            replica.start_over()
 
     def __len__(self) -> int:
         return len(self._calls)
@@ -145,7 +145,7 @@ class Sequencer(Generic[A]):
         if self._entries.is_full:
             raise LocalError(f"the log is full: {len(self._entries)} requests, and no state that stands for them")
         if self._entries.last + 1 >> LIFE_BITS:
-            raise LocalError("the log is at its end; start this proxy anew")
+            raise LocalError("the log is at its end; restart this proxy")
         number = self._calls.begin(now_s, timeout_s, answered, failed)
         self._replication.append(number, write(number), now_s)
         self._request_snapshot_if_wanted(now_s)

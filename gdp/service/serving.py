@@ -122,8 +122,8 @@ class Serving(Generic[R]):
             LocalError: this client's calls or waiting bytes have reached its share.
         """
         client, size = asked.client, len(request)
-        room, room_bytes = self._limit - len(self._calls), self._waiting_max_bytes - self._waiting_bytes.total()
-        if self._shares[client] >= room or self._waiting_bytes[client] + size > room_bytes:
+        capacity, free_bytes = self._limit - len(self._calls), self._waiting_max_bytes - self._waiting_bytes.total()
+        if self._shares[client] >= capacity or self._waiting_bytes[client] + size > free_bytes:
             raise LocalError(f"{self._shares[client]} requests of this client are under way: no more at once")
         after = after if after in self._numbers else None
         number = self._calls.add_call(now_s, patience_s, _Served(asked, request, size, after))

@@ -92,9 +92,9 @@ class AsyncPublisher:
         if len(payload) > PAYLOAD_MAX_BYTES:
             raise LocalError(f"{label}: {len(payload)} bytes; at most {PAYLOAD_MAX_BYTES} fit into one message")
         publisher = self._publisher
-        if self._is_reliable and not publisher.has_room():
+        if self._is_reliable and not publisher.has_space():
             deadline_s = _deadline_s(timeout_s)
-            if not await self._driver.wait(lambda: publisher.has_room() or not publisher.is_wanted, deadline_s):
+            if not await self._driver.wait(lambda: publisher.has_space() or not publisher.is_wanted, deadline_s):
                 raise SessionTimeoutError(
                     f"{label}: the window was full for {timeout_s:g} s, since a reader confirms too slowly;"
                     " publish less, or with reliable=False"

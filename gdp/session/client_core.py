@@ -226,7 +226,7 @@ class ClientCore:
                         self._for_all.append((dispatch, effect))
                     for server in servers or ():
                         self._send_to(dispatch, server, effect, now_s)
-        while self._for_all and self._publisher.has_room():
+        while self._for_all and self._publisher.has_space():
             dispatch, effect = self._for_all.popleft()
             if isinstance(effect, Ask) and effect.call not in dispatch:
                 continue  # it ended in the meantime

@@ -116,8 +116,8 @@ class Publisher:
             raise ClosedError(f"the publisher of {self._label} is closed; open a new one with session.publisher()")
         if len(payload) > PAYLOAD_MAX_BYTES:
             raise LocalError(f"{self._label}: {len(payload)} bytes; at most {PAYLOAD_MAX_BYTES} fit into one message")
-        if self._is_reliable and not self._publisher.has_room():
-            self._wait_for_room(timeout_s)
+        if self._is_reliable and not self._publisher.has_space():
+            self._wait_for_space(timeout_s)
         self._driver.publish(self._publisher, message_to_wire(time.time_ns(), payload))
 
     def wait_for_readers(self, count: int = 1, timeout_s: float | None = None) -> None:
@@ -158,10 +158,10 @@ class Publisher:
     def _label(self) -> str:
         return self._session.core.label(self._topic)
 
-    def _wait_for_room(self, timeout_s: float | None) -> None:
+    def _wait_for_space(self, timeout_s: float | None) -> None:
         publisher = self._publisher
         if not self._driver.wait(
-            lambda: publisher.has_room() or not publisher.is_wanted, _deadline_s(self._driver, timeout_s)
+            lambda: publisher.has_space() or not publisher.is_wanted, _deadline_s(self._driver, timeout_s)
         ):
             raise SessionTimeoutError(
                 f"{self._label}: the window was full for {timeout_s:g} s, since a reader confirms too slowly;"

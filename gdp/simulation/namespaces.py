@@ -69,7 +69,7 @@ class Namespaces:
         """Take the link between two switches down; both ends lose their carrier at once."""
         self._set_link(a, b, "down")
 
-    def mend(self, a: str, b: str) -> None:
+    def restore_link(self, a: str, b: str) -> None:
         """Bring a cut link back up."""
         self._set_link(a, b, "up")
 

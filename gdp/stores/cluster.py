@@ -83,7 +83,7 @@ class ClusterStore:
         self._now = Timestamps(0.0, 0.0)
         self._cache: OrderedDict[Name, dict[Name, Route]] = OrderedDict()
         self._contexts: OrderedDict[bytes, bytes] = OrderedDict()  # by hash tag and id
-        self._floors: OrderedDict[Key, Withdrawn] = OrderedDict()  # newer sequence numbers that the cluster reported
+        self._minimums: OrderedDict[Key, Withdrawn] = OrderedDict()  # newer sequence numbers that the cluster reported
         self._writes: list[_Write] = []
         self._ends: list[tuple[float, Name, Name]] = []
         self._owners: dict[Name, dict[int, float]] = {}  # ends of leases, by sender and by advertiser
@@ -112,12 +112,12 @@ class ClusterStore:
     def get(self, name: Name, advertiser: Name) -> Route | Withdrawn | None:
         """Return the route or withdrawal of one advertiser of a name, None if there is none."""
         route = self._of(name).get(advertiser)
-        return route if route is not None else self._floors.get((name, advertiser))
+        return route if route is not None else self._minimums.get((name, advertiser))
 
     def put(self, route: Route) -> None:
         """Add or replace a route; ``commit`` reports whether the cluster accepted it."""
         self._of(route.name)[route.advertiser] = route
-        self._floors.pop((route.name, route.advertiser), None)
+        self._minimums.pop((route.name, route.advertiser), None)
         heapq.heappush(self._ends, (route.expires_s, route.name, route.advertiser))
         for owner in (route.sender, route.advertiser):
             self._owners.setdefault(owner, {})[hash((route.name, route.advertiser))] = route.expires_s
@@ -141,7 +141,7 @@ class ClusterStore:
         )
         if route is None or not route.is_from_above:
             self._writes.append(_Write((name, advertiser), withdrawn.sequence, tag, command))
-        self._set_floor((name, advertiser), withdrawn)
+        self._set_minimum((name, advertiser), withdrawn)
         return route
 
     def commit(self) -> list[Key]:
@@ -162,7 +162,7 @@ class ClusterStore:
             self._cache.pop(write.key[0], None)
             if isinstance(reply, list) and _code(reply) == _NEWER:
                 held = int.from_bytes(reply[1], "big")
-                self._set_floor(write.key, Withdrawn(write.key[1], held, int(self._now.unix_s) + 1))
+                self._set_minimum(write.key, Withdrawn(write.key[1], held, int(self._now.unix_s) + 1))
             else:
                 self.refusals[DropReason.UNAVAILABLE] += 1
         return refused
@@ -234,10 +234,10 @@ class ClusterStore:
         for route in routes.values():
             heapq.heappush(self._ends, (route.expires_s, route.name, route.advertiser))
 
-    def _set_floor(self, key: Key, withdrawn: Withdrawn) -> None:
-        self._floors[key] = withdrawn
-        while len(self._floors) > CACHE_MAX:
-            self._floors.popitem(last=False)
+    def _set_minimum(self, key: Key, withdrawn: Withdrawn) -> None:
+        self._minimums[key] = withdrawn
+        while len(self._minimums) > CACHE_MAX:
+            self._minimums.popitem(last=False)
 
     def _forget_all(self, found: dict[Name, list[Route]]) -> None:
         for name, routes in self._cache.items():

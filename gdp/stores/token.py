@@ -128,7 +128,7 @@ def open_token_key(text: str, file: Path) -> TokenKey:
     try:  # before the confinement of rights: a library may read files at its first signature
         made.public.verify(made.sign(_TRIAL), _TRIAL)
     except StatementError as error:
-        raise LocalError(f"the public key beside the token's private key is another key's: {text}") from error
+        raise LocalError(f"the public key of the token does not match its private key: {text}") from error
     return made
 
 
@@ -214,10 +214,10 @@ def _public_key(uri: TokenUri, key: _PrivateKey) -> PublicKey:
     """Return the public key that the token stores with the private one, under the same id or label."""
     library = _library()
     names = library.Attribute
-    beside = {names.ID: key.id} if key.id else {names.LABEL: key.label}
-    found = list(key.session.get_objects({**beside, names.CLASS: library.ObjectClass.PUBLIC_KEY}))
+    neighbouring = {names.ID: key.id} if key.id else {names.LABEL: key.label}
+    found = list(key.session.get_objects({**neighbouring, names.CLASS: library.ObjectClass.PUBLIC_KEY}))
     if len(found) != 1:
-        raise LocalError(f"{len(found)} public keys lie beside the private key in the token, not one: {uri.label!r}")
+        raise LocalError(f"{len(found)} public keys match the private key in the token, not one: {uri.label!r}")
     encoded = bytes(found[0][names.EC_POINT])
     try:  # some tokens wrap the point in an OCTET STRING, as specified; others do not
         point = ec.EllipticCurvePublicKey.from_encoded_point(ec.SECP256R1(), encoded[-_POINT_BYTES:])

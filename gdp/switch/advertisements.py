@@ -42,17 +42,17 @@ __all__ = ["AdvertisementHandler"]
 
 _SESSIONS_MAX: Final = 4_096  # more than the neighbours that a switch has
 _INCARNATION_BYTES: Final = 8  # at the end of an instance id
-_TOLD_S: Final = 1.0
+_REPORT_INTERVAL_S: Final = 1.0
 
 
 class _Session:
     """The advertisements that came in one session of a node."""
 
-    __slots__ = ("first", "told_s", "window")
+    __slots__ = ("first", "reported_s", "window")
 
     def __init__(self, first: int) -> None:
         self.first = first
-        self.told_s = float("-inf")  # when the node last received a report that it is behind
+        self.reported_s = float("-inf")  # when the node last received a report that it is behind
         self.window = ReplayWindow(ADVERTISEMENTS_WINDOW)
 
 
@@ -162,10 +162,10 @@ class AdvertisementHandler:
         if advertisement.sequence < session.first or session.window.is_finished(advertisement.sequence):
             if (
                 advertisement.sequence <= session.window.top - ADVERTISEMENTS_WINDOW
-                and now_s >= session.told_s + _TOLD_S
+                and now_s >= session.reported_s + _REPORT_INTERVAL_S
             ):
                 # The advertisement may be the node's own; the node sends nothing newer unless it receives this report.
-                session.told_s = now_s
+                session.reported_s = now_s
                 self._judge(neighbour, advertisement.name, DropReason.STALE, session.window.top)
             raise StatementError(DropReason.REPLAYED, "a claim")
         session.window.finish(advertisement.sequence)
@@ -208,7 +208,7 @@ class AdvertisementHandler:
         statement.verify(neighbour.key)
         name = fields.name("n")
         if fields.uint("s") <= self._sequence_of(name, neighbour):
-            raise StatementError(DropReason.STALE, "a withdrawal of what was claimed anew")
+            raise StatementError(DropReason.STALE, "a withdrawal of what was advertised again")
         right = Right.from_wire(fields.text("right"))
         if right in HEARS and self._multicast.remove_reader(name, (neighbour.port, neighbour.mac)):
             self._resolver.unwatch(name)

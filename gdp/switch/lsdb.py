@@ -39,13 +39,13 @@ class _Past:
 
     until_s: float
     lives: dict[bytes, int] = field(default_factory=dict)
-    floor: int = -1  # minimum for all incarnations that are not listed
+    minimum: int = -1  # minimum for all incarnations that are not listed
 
     def note(self, life: bytes, sequence: int, until_s: float) -> None:
         self.until_s = until_s
         self.lives[life] = max(sequence, self.lives.pop(life, -1))
         if len(self.lives) > _LIVES_MAX:
-            self.floor = max(self.floor, self.lives.pop(next(iter(self.lives))))
+            self.minimum = max(self.minimum, self.lives.pop(next(iter(self.lives))))
 
 
 class LinkStateDatabase:
@@ -73,7 +73,7 @@ class LinkStateDatabase:
     def is_past(self, origin: Name, scope: Scope, sequence: int, life: bytes) -> bool:
         """Return whether a link state was removed or replaced before."""
         past = self._past.get((origin, scope))
-        return past is not None and sequence <= past.lives.get(life, past.floor)
+        return past is not None and sequence <= past.lives.get(life, past.minimum)
 
     def sequence_of(self, origin: Name, scope: Scope) -> int:
         """Return the newest sequence number known, or 0."""

@@ -51,7 +51,7 @@ class NameCache:
         self._confirm_s = lease_s / 2
         self._places: dict[Name, dict[Name, Location]] = {}
         self._names_of: dict[Name, set[Name]] = {}  # what each advertiser advertises, of ``_places``
-        self._nobody: dict[Name, float] = {}
+        self._negative: dict[Name, float] = {}
         self._expire_at_s = float("inf")  # no lease ends before
         self.serves_stale = False
 
@@ -79,11 +79,11 @@ class NameCache:
 
     def is_negative(self, name: Name, now_s: float) -> bool:
         """Return whether the RIB recently sent a negative response for the name."""
-        return self._nobody.get(name, 0.0) > now_s
+        return self._negative.get(name, 0.0) > now_s
 
     def put(self, place: Location) -> Location | None:
         """Store a location; return what was known of this advertiser before."""
-        self._nobody.pop(place.name, None)
+        self._negative.pop(place.name, None)
         known = self._places.setdefault(place.name, {})
         before = known.get(place.advertiser)
         known[place.advertiser] = place
@@ -107,7 +107,7 @@ class NameCache:
         """Replace the entries of a name by a negative entry, for ``NEGATIVE_LEASE_S``."""
         for advertiser in list(self._places.get(name, ())):
             self.remove(name, advertiser)
-        self._nobody[name] = now_s + NEGATIVE_LEASE_S
+        self._negative[name] = now_s + NEGATIVE_LEASE_S
         self._expire_at_s = min(self._expire_at_s, now_s + NEGATIVE_LEASE_S)
 
     def serve_stale(self, stale: bool, now_s: float) -> None:
@@ -132,8 +132,8 @@ class NameCache:
         gone = [place for place in self.all() if self._ends_s(place) <= now_s]
         for place in gone:
             self.remove(place.name, place.advertiser)
-        for name in [name for name, until_s in self._nobody.items() if until_s <= now_s]:
-            del self._nobody[name]
+        for name in [name for name, until_s in self._negative.items() if until_s <= now_s]:
+            del self._negative[name]
         self._look_ahead()
         return gone
 
@@ -143,7 +143,7 @@ class NameCache:
 
     def _look_ahead(self) -> None:
         ends = [self._ends_s(place) for known in self._places.values() for place in known.values()]
-        self._expire_at_s = min([*ends, *self._nobody.values()], default=float("inf"))
+        self._expire_at_s = min([*ends, *self._negative.values()], default=float("inf"))
 
     def _ends_s(self, place: Location) -> float:
         return max(place.expires_s, place.stale_until_s) if self.serves_stale else place.expires_s

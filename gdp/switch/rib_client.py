@@ -203,7 +203,7 @@ class RibClient:
             return
         statement.expect(StatementType.ANSWER)
         answer = Response.from_fields(fields)
-        if answer.is_nobody:
+        if answer.is_negative:
             self._receive_negative(answer.name, now.mono_s)
         elif not answer.advertisement:
             self._locations.receive_removal(answer, now.mono_s)
@@ -225,7 +225,7 @@ class RibClient:
 
     def _check_asked(self, statement: Statement, member: Membership, now_s: float) -> None:
         if member.name != statement.signer or not self._was_asked(member, now_s):
-            raise StatementError(DropReason.WRONG_DOMAIN, "an answer from nobody who was asked")
+            raise StatementError(DropReason.WRONG_DOMAIN, "an answer from a node that was not asked")
         statement.verify(member.key)
 
     def verify_answer(self, statement: Statement, now: Timestamps) -> Location:
@@ -237,7 +237,7 @@ class RibClient:
         fields = statement.expect(StatementType.ANSWER)
         member = self._policy.verify_membership(fields.bytes_("c"), now.unix_s)
         if member.name != statement.signer or not (member.role.is_switch or member.role is Role.RIB):
-            raise StatementError(DropReason.BAD_CERTIFICATE, "an answer from nobody who may give one")
+            raise StatementError(DropReason.BAD_CERTIFICATE, "an answer from a node without the right to give it")
         statement.verify(member.key)
         answer = Response.from_fields(fields)
         if not answer.advertisement:

@@ -138,7 +138,7 @@ class Chain:
     links: tuple[AdCert, ...]
 
     @classmethod
-    def walk(
+    def traverse(
         cls,
         wires: Sequence[bytes],
         subject: Subject,

@@ -110,7 +110,7 @@ class Delegation:
             raise StatementError(DropReason.NOT_FOR_US, "a delegation to another node")
         if not self.chain and self.subject.owner_key != identity.key.public.compressed:
             raise StatementError(DropReason.NOT_DELEGATED, "no delegation from the owner")
-        chain = Chain.walk(self.chain, self.subject, identity.subject, AdCertCache(CHAIN_MAX))
+        chain = Chain.traverse(self.chain, self.subject, identity.subject, AdCertCache(CHAIN_MAX))
         for right in self.rights:
             chain.check(right, unix_s)
 
@@ -121,7 +121,7 @@ class Delegation:
             StatementError: a grant is not valid, or is not for this node and name.
             LocalError: a library without the KEM.
         """
-        chain = Chain.walk(self.chain, self.subject, identity.subject, AdCertCache(CHAIN_MAX))
+        chain = Chain.traverse(self.chain, self.subject, identity.subject, AdCertCache(CHAIN_MAX))
         givers = [link.delegate_key for link in chain.links[:-1]]
         opened = {epoch: open_grant(identity, wire, givers) for epoch, wire in self.grants.items()}
         for epoch, grant in opened.items():

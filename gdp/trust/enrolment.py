@@ -117,13 +117,13 @@ class Ticket:
 
     def to_json(self) -> bytes:
         """Return the JSON that ``from_json`` reads."""
-        told = {
+        document = {
             "addresses": self.addresses,
             "responder": base64.b64encode(self.responder.wire).decode(),
             "token": self.token.hex(),
             "seats": [{**asdict(each), "role": each.role.value} for each in self.seats],
         }
-        return json.dumps(told, indent=1).encode()
+        return json.dumps(document, indent=1).encode()
 
     @classmethod
     def from_json(cls, data: bytes) -> Ticket:
@@ -133,11 +133,11 @@ class Ticket:
             LocalError: not a ticket.
         """
         try:
-            told = json.loads(data)
-            responder = KemPublicKey.from_wire(base64.b64decode(told["responder"], validate=True))
-            seats = tuple(Seat(each["folder"], Role(each["role"]), each["label"]) for each in told["seats"])
-            token = bytes.fromhex(told["token"])
-            addresses = tuple(map(str, told["addresses"]))
+            document = json.loads(data)
+            responder = KemPublicKey.from_wire(base64.b64decode(document["responder"], validate=True))
+            seats = tuple(Seat(each["folder"], Role(each["role"]), each["label"]) for each in document["seats"])
+            token = bytes.fromhex(document["token"])
+            addresses = tuple(map(str, document["addresses"]))
             ticket = cls(addresses, responder, token, seats)
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError, StatementError) as error:
             raise LocalError(f"not a ticket for an enrolment: {type(error).__name__}") from error

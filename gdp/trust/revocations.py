@@ -329,7 +329,7 @@ class Revocations:
             origin = OPERATOR if OPERATOR in (origin, known.origin) else known.origin
             self._remove(issuer_key, fingerprint)
         elif origin != OPERATOR:
-            self._make_room(issuer_key, origin)
+            self._free_space(issuer_key, origin)
         owned = _Owned(revocation.issuer.name, revocation.until_unix_s, statement.wire, origin)
         self._put_owned(issuer_key, fingerprint, owned)
 
@@ -347,7 +347,7 @@ class Revocations:
         share[issuer_key] = share.get(issuer_key, 0) + 1
         self._owned += 1
 
-    def _make_room(self, issuer_key: bytes, origin: bytes) -> None:
+    def _free_space(self, issuer_key: bytes, origin: bytes) -> None:
         """Make space for one more revocation of an owner.
 
         Raises:

@@ -117,7 +117,7 @@ class AdvertisementVerifier:
         if body.right is Right.ATTACH and subject.name != member.name:
             raise StatementError(DropReason.NOT_DELEGATED, "a node attaches under its own name only")
         if body.chain:
-            return Chain.walk(body.chain, subject, member.subject, self._adcerts)
+            return Chain.traverse(body.chain, subject, member.subject, self._adcerts)
         owns = subject.owner_key == member.key.compressed or (not subject.owner_key and self._allow_unowned)
         if not owns:
             raise StatementError(DropReason.NOT_DELEGATED, "no delegation from the owner")

@@ -76,9 +76,9 @@ class ExposedTopic:
         if self._channels:
             self._describe(self._channels)
 
-    def has_room(self) -> bool:
+    def has_space(self) -> bool:
         """Return whether a message may be published without dropping one that a reader still lacks."""
-        return self.publisher is None or self.publisher.has_room()
+        return self.publisher is None or self.publisher.has_space()
 
     def handle_event(self, event: Event, now_s: float) -> None:
         """Process an event of the subscription."""
@@ -145,7 +145,7 @@ class ExposedTopic:
             publisher.skip(LossReason.NO_READER)
             self._count(event)
             return
-        if not publisher.has_room():
+        if not publisher.has_space():
             self._site.faults.report(
                 self._flow_spec.local, Fault.TOO_FAST, "messages come faster than readers confirm them"
             )

@@ -19,8 +19,8 @@ __all__ = ["Fault", "Faults"]
 
 log = logging.getLogger(__name__)
 
-_TOLD_MAX: Final = 4_096
-_COUNT_TOLD: Final = 1_000  # the first count that is logged
+_COUNTS_MAX: Final = 4_096
+_COUNT_LOGGED: Final = 1_000  # the first count that is logged
 
 
 class Fault(str, Enum):
@@ -45,22 +45,22 @@ class Faults:
 
     def __init__(self) -> None:
         self._counts: Counter[Fault] = Counter()
-        self._told: dict[tuple[str, Fault], int] = {}
+        self._reported: dict[tuple[str, Fault], int] = {}
 
     def report(self, what: str, fault: Fault, detail: str) -> None:
         """Count a fault; warn of the first of its kind about ``what``, a local name."""
         self._counts[fault] += 1
-        count = self._told[what, fault] = self._told.get((what, fault), 0) + 1
-        if len(self._told) > _TOLD_MAX:
-            del self._told[next(iter(self._told))]
+        count = self._reported[what, fault] = self._reported.get((what, fault), 0) + 1
+        if len(self._reported) > _COUNTS_MAX:
+            del self._reported[next(iter(self._reported))]
         if count == 1:
             log.warning("%s: %s: %s", printable(what), fault.value, printable(detail))
-        elif count >= _COUNT_TOLD and str(count).strip("0") == "1":
+        elif count >= _COUNT_LOGGED and str(count).strip("0") == "1":
             log.warning("%s: %s: %d times by now", printable(what), fault.value, count)
 
     def clear(self, what: str, fault: Fault) -> None:
         """Record that a fault is over: the next one is logged again."""
-        self._told.pop((what, fault), None)
+        self._reported.pop((what, fault), None)
 
     @property
     def counts(self) -> Mapping[str, int]:

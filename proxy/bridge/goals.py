@@ -83,7 +83,7 @@ class Goals:
         self._ours: OrderedDict[bytes, None] = OrderedDict()
         self._named: dict[Name, OrderedDict[bytes, None]] = {}  # by server
         self._named_count = 0
-        self._told = _write({})
+        self._reported = _write({})
 
     def sent(self, goal: bytes, request: bytes) -> None:
         """Record that a client here sends a goal; the request is kept for servers that join later."""
@@ -197,9 +197,9 @@ class Goals:
 
     def _news(self) -> bytes | None:
         raw = _write({goal: known.status for goal, known in self._goals.items() if known.status is not None})
-        if raw == self._told:
+        if raw == self._reported:
             return None
-        self._told = raw
+        self._reported = raw
         return raw
 
 

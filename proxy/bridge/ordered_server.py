@@ -148,7 +148,7 @@ class OrderedServer:
             elif len(state) > STATE_MAX_BYTES:
                 self._complain(f"its state has {len(state)} bytes; at most {STATE_MAX_BYTES} can travel")
                 state = None
-            self._follower.told(state)
+            self._follower.receive_state(state)
         else:
             why_not = was_set(event.raw) if isinstance(event, ResponseReceived) else event.reason
             if why_not:

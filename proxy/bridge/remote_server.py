@@ -69,7 +69,7 @@ class RemoteServer:
             MessageDecoder.ready(our.request, ours.encoding, their.request, their.ros)  # raises with the reason
         return server
 
-    def said_anew(self, description: bytes) -> RemoteServer | None:
+    def described_again(self, description: bytes) -> RemoteServer | None:
         """Return the same server with a new leaving flag; None where the description differs otherwise."""
         if self.exchange is None:
             return None

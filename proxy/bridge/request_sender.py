@@ -50,7 +50,7 @@ class RequestSender:
     @property
     def is_ready(self) -> bool:
         """Return whether a waiting effect can be sent now."""
-        return bool(self._for_all) and self._publisher.has_room()
+        return bool(self._for_all) and self._publisher.has_space()
 
     def note_goal(self, part: int, call: int, goal: bytes) -> None:
         """Record the goal of a call."""

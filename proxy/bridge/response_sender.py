@@ -85,7 +85,7 @@ class ResponseSender:
             self._site.traffic.unread += 1
             publisher.skip(LossReason.NO_READER)
             return
-        if not publisher.has_room():
+        if not publisher.has_space():
             self._site.faults.report(what, Fault.TOO_FAST, "news come faster than clients confirm them")
             publisher.skip(LossReason.WINDOW_OVERFLOW)
             return

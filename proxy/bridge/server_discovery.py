@@ -85,7 +85,7 @@ class ServerDiscovery:
             ):
                 continue
             same = (
-                server.said_anew(writer_proxy.description)
+                server.described_again(writer_proxy.description)
                 if writer_proxy and writer_proxy.incarnation == server.incarnation
                 else None
             )

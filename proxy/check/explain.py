@@ -45,7 +45,7 @@ class _Side:
     role: Role
     right: str
     does: str  # role of a local node
-    nobody: str
+    negative: str
 
 
 _SIDES: Final[dict[tuple[Direction, bool], _Side]] = {  # the flag: whether it is about a topic
@@ -168,7 +168,7 @@ class _Look:
 
     def _match_notes(self, ends: Sequence[GraphEntity], others: Sequence[str], type_name: str) -> Iterator[str]:
         if self._is_live and not ends and not others:
-            yield self._side.nobody
+            yield self._side.negative
         if not type_name:
             yield "its type is not known yet"
         if self._direction == "expose" and self._rule.wants_reliable:

@@ -112,7 +112,7 @@ def _held(delegations: Iterable[Delegation], card: NodeDescriptor, need: Require
     for delegation in delegations:
         if delegation.name == need.name:
             try:
-                chain = Chain.walk(delegation.chain, delegation.subject, card.subject, AdCertCache(CHAIN_MAX))
+                chain = Chain.traverse(delegation.chain, delegation.subject, card.subject, AdCertCache(CHAIN_MAX))
                 for right in delegation.rights:
                     chain.check(right, time.time())
             except StatementError:

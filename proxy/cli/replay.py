@@ -111,7 +111,7 @@ def _replay(
         if json:
             emit("ready", name=node.member.name.to_text())
         for topic in replay.wait_for_readers(wait_s):
-            log.warning("nobody reads topic=%s", topic)
+            log.warning("no reader topic=%s", topic)
         is_whole = replay.run() and replay.finish()
         report()
         unconfirmed = replay.unconfirmed()

@@ -92,7 +92,8 @@ class ProxyConfig(Section):
         description="Microseconds to look for more frames before sleeping, where most waits were shorter. 0: never.",
     )
     control_socket: NewFile | None = Field(
-        default=None, description="Socket for `gdp reload`, `status` and `drain`. Default: beside the locks of nodes."
+        default=None,
+        description="Socket for `gdp reload`, `status` and `drain`. Default: in the folder of the locks of nodes.",
     )
     sandbox: bool = Field(
         default=True, description="Whether the process gives away the rights that it needs no more once it is up."

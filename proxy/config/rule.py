@@ -205,8 +205,8 @@ class Rule(Section):
     )
     stop: str | None = Field(
         default=None,
-        description="Services, under `expose`: a local `std_srvs/srv/Trigger` that is called when nobody waits any more"
-        " for what the server works on; needs `at_once: 1`. `null`: it works on.",
+        description="Services, under `expose`: a local `std_srvs/srv/Trigger` that is called when no caller waits"
+        " any more for what the server works on; needs `at_once: 1`. `null`: it works on.",
         json_schema_extra={"pattern": f"^{NAME_FORM}$", "maxLength": NAME_MAX_CHARS},
     )
     at_once: int | None = Field(

@@ -24,7 +24,7 @@ STALL_S: Final = 20.0  # after this time without any acknowledgement, readers ar
 TICK_S: Final = 0.5
 
 _WHY: Final = {
-    LossReason.NO_READER: "published while nobody read it",
+    LossReason.NO_READER: "published without a reader",
     LossReason.GIVEN_UP: "given up for a reader that fell silent or behind",
     LossReason.WINDOW_OVERFLOW: "pushed out of the full window",
     LossReason.TOO_LARGE: "above the rule's max_bytes",
@@ -149,7 +149,7 @@ class Replay:
             if self._rate > 0:
                 self._step_until(begun_s + (message.stamp_ns - first_ns) / 1e9 / self._rate)
             flow = self._flows[message.handle]
-            while not flow.has_room() and not runtime.is_stopped:
+            while not flow.has_space() and not runtime.is_stopped:
                 self._step(None)
             if runtime.is_stopped:
                 return False
@@ -195,7 +195,7 @@ class Replay:
 def _why(publisher: Publisher) -> str:
     """Return why some of a publisher's messages were not confirmed, as far as it is known."""
     if not publisher.is_wanted and publisher.losses.counts.keys() <= {LossReason.NO_READER}:
-        return "nobody reads it"
+        return "no reader"
     known = [f"{count} {_WHY[reason]}" for reason, count in publisher.losses.counts.items() if reason in _WHY]
     rest = publisher.messages - publisher.acknowledged - publisher.losses.total
     if rest > 0:

@@ -56,7 +56,7 @@ def scan(path: Path) -> ScannedSource:
         file.seek(0)
         if file.read(len(MAGIC)) != MAGIC:
             raise SalvageError("not an MCAP file")
-        reason = found.walk(file, size)
+        reason = found.traverse(file, size)
     if not found.channels:
         raise SalvageError(reason or "no channel in it")
     source = ScannedSource(path, found.channels, found.chunks, found.places)
@@ -74,7 +74,7 @@ class _Found:
         self._schemas: dict[int, tuple[str, DefinitionFormat, str]] = {}
         self._index: dict[int, int] = {}  # channel id to index
 
-    def walk(self, file: BinaryIO, size: int) -> str:
+    def traverse(self, file: BinaryIO, size: int) -> str:
         """Read every record; return why it ended early, empty where it did not."""
         while True:
             at = file.tell()
@@ -108,7 +108,7 @@ class _Found:
         data = unpack(compression, record[at : at + size], unpacked_size)
         if len(data) < unpacked_size:
             self.stats.missing_bytes = unpacked_size - len(data)
-        self.stats.walked_bytes += len(data)
+        self.stats.scanned_bytes += len(data)
         self.chunks.append(Chunk(start + at, size, compression, unpacked_size))
         at = 0
         while at + _RECORD.size <= len(data):

@@ -40,7 +40,7 @@ def scan(path: Path) -> ScannedSource:
         file.seek(0)
         if file.read(len(MAGIC)) != MAGIC:
             raise SalvageError("not a ROS 1 bag of format 2.0")
-        reason = found.walk(file, size)
+        reason = found.traverse(file, size)
     if not found.channels:
         raise SalvageError(reason or "no connection in it")
     source = ScannedSource(path, found.channels, found.chunks, found.places)
@@ -56,7 +56,7 @@ class _Found:
         self.stats = Tally()
         self._index: dict[int, int] = {}  # connection id to index
 
-    def walk(self, file: BinaryIO, size: int) -> str:
+    def traverse(self, file: BinaryIO, size: int) -> str:
         """Read every record; return why it ended early, empty where it did not."""
         while True:
             at = file.tell()
@@ -71,7 +71,7 @@ class _Found:
                 if code == _BAG:
                     (index_at,) = _LENGTH.unpack(header.get(b"index_pos", bytes(8)))
                     self.stats.missing_bytes = max(0, index_at - size)
-                    self.stats.walked_bytes = size
+                    self.stats.scanned_bytes = size
                 elif code == _CHUNK:
                     self._chunk(header, data, start)
                 elif len(data) == length:

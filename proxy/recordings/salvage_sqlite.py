@@ -93,7 +93,7 @@ class SqliteSource:
         self._order: list[tuple[int, int, int]] = []  # stamp, row, topic id
         self._stats = Tally()
         self._stats.missing_bytes = _missing_bytes(path)
-        self._stats.walked_bytes = path.stat().st_size
+        self._stats.scanned_bytes = path.stat().st_size
         self._copy, file = _whole_pages(path) if self._stats.missing_bytes else _with_index(path)
         mode = "mode=ro" if _journal(file).exists() else "immutable=1"
         flags = apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI

@@ -71,14 +71,14 @@ class Tally:
 
     def __init__(self) -> None:
         self.messages = 0
-        self.walked_bytes = 0  # bytes that held them
+        self.scanned_bytes = 0  # bytes that held them
         self.missing_bytes = 0  # bytes that should have followed, as far as the file states, in the same measure
 
     def text(self, reason: str) -> str:
         """Return the reason with the number found and the estimate of the missing ones."""
         text = f"{reason}; {self.messages} messages were found"
         if self.missing_bytes and self.messages:
-            lost = max(1, round(self.missing_bytes * self.messages / max(1, self.walked_bytes)))
+            lost = max(1, round(self.missing_bytes * self.messages / max(1, self.scanned_bytes)))
             text += f", up to about {lost} more are lost"
         return text
 

@@ -79,8 +79,8 @@ class BagWriter:
         """
         if channel.ros != self._ros:
             raise LocalError(f"{channel.topic} is of ROS {channel.ros}, the recording of ROS {self._ros}")
-        told_by = _told_by(channel)
-        if told_by not in self._handles:
+        reporter = _reporter(channel)
+        if reporter not in self._handles:
             size = self._definitions_bytes + definition_bytes(channel.definition)
             if len(self._connections) >= _CONNECTIONS_MAX or size > _DEFINITIONS_MAX_BYTES:
                 raise LocalError(f"{channel.topic} cannot be recorded: the recording has too many channels")
@@ -89,8 +89,8 @@ class BagWriter:
             except (WriterError1, WriterError2, AssertionError) as error:
                 raise LocalError(f"{channel.topic} cannot be recorded: {error}") from error
             self._definitions_bytes = size
-            self._handles[told_by] = len(self._connections) - 1
-        return self._handles[told_by]
+            self._handles[reporter] = len(self._connections) - 1
+        return self._handles[reporter]
 
     def write(self, handle: int, stamp_ns: int, raw: bytes) -> None:
         """Record one message.
@@ -183,7 +183,7 @@ class BagWriter:
         raise LocalError(f"{self.path} is closed")
 
 
-def _told_by(channel: Channel) -> tuple[object, ...]:
+def _reporter(channel: Channel) -> tuple[object, ...]:
     if channel.ros == 2:  # the hash and the definition belong to the type, not to the channel
         return channel.topic, channel.type_name, channel.qos
     definition = digest_of(channel.definition)

@@ -28,7 +28,7 @@ from gdp.frame.kinds import ETHERTYPE
 __all__ = ["Baseline", "Bridge", "Direct", "IPv4", "Plane"]
 
 _IPV4: Final = 0x0800
-_NOBODY: Final = "02:67:64:70:ff:ff"
+_ABSENT: Final = "02:67:64:70:ff:ff"
 _BRIDGE: Final = "bridge"
 _IP_SETTINGS: Final = Path("/proc/sys/net/ipv4")
 
@@ -216,7 +216,7 @@ def _route(chain: Chain, node: str, at: int) -> None:
             (right, f"10.99.{at + 1}.1", f"10.99.{at + 1}.2", range(at + 2, last + 1)),
         ):
             is_end = device in (chain.nodes[0], chain.nodes[-1])
-            mac = _NOBODY if is_end else chain.mac(device, node).hex(":")
+            mac = _ABSENT if is_end else chain.mac(device, node).hex(":")
             ipr.addr("add", index=index[device], address=own, prefixlen=24)
             ipr.neigh("add", dst=other, lladdr=mac, ifindex=index[device], state="permanent")
             for link in ways:

@@ -113,7 +113,7 @@ def send(end: End, settings: Settings) -> None:
             publisher.bundle_bytes = 0
     tune_memory()
     if not end.runtime.run(lambda: all(each.readers for each in publishers), time.monotonic() + _PATIENCE_S):
-        raise TimeoutError("nobody reads: the overlay did not come up")
+        raise TimeoutError("no reader: the overlay did not come up")
     sender = _Sender(end, publishers, float(settings["seconds"]))
     if rate := float(settings["rate"]):
         sender.at_rate(rate)

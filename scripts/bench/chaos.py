@@ -57,7 +57,7 @@ LIMIT_S: Final = 5.0
 REVOKED_S: Final = 3.0
 SETTLE_S: Final = 60.0
 LOOK_S: Final = 0.1
-TOLD_S: Final = 0.25  # shorter silences are not reported
+REPORTED_S: Final = 0.25  # shorter silences are not reported
 CALL_S: Final = 5.0
 LOG_LINES: Final = 12
 _CLUSTER_EVERY: Final = 3  # one in so many seeds gets a cluster
@@ -153,7 +153,7 @@ class Chaos:
     def silences(self) -> list[tuple[str, Silence]]:
         """Return the silences of the run, each with the last event before it."""
         found = []
-        for silence in self._all_silences(self.begun_ns, time.monotonic_ns(), TOLD_S):
+        for silence in self._all_silences(self.begun_ns, time.monotonic_ns(), REPORTED_S):
             before = [each for each in self.moments if each[0] <= silence.begin_ns + round(1e9)]
             _, fault, begins = before[-1] if before else (0, None, True)
             over = "" if begins else ", over"
@@ -233,12 +233,12 @@ class Chaos:
     def _end(self, fault: Fault) -> None:
         overlay, kind, targets = self._overlay, fault.kind, fault.targets
         if kind is FaultKind.CUT:
-            overlay.mend(*targets)
+            overlay.restore_link(*targets)
         elif kind in FRAMES:
             overlay.calm(*targets)
         elif kind is FaultKind.PARTITION:
             for link in targets[1:]:
-                overlay.mend(*link.split("-"))
+                overlay.restore_link(*link.split("-"))
         elif kind in (FaultKind.KILL_SWITCH, FaultKind.KILL_RIB, FaultKind.KILL_MEMBER):
             overlay.restart(targets[0])
             self._await(targets[0])
@@ -375,7 +375,7 @@ def _show(seed: int, chaos: Chaos) -> None:
     counts: defaultdict[str, int] = defaultdict(int)
     for _, fault, begins in chaos.moments:
         counts[fault.kind.value + ("" if begins else ", over")] += 1
-    table = Table(title=f"seed {seed}: silences above {TOLD_S:g} s while connected, s", title_justify="left")
+    table = Table(title=f"seed {seed}: silences above {REPORTED_S:g} s while connected, s", title_justify="left")
     for heading in ("last event before", "events", "silences", "p50", "max"):
         table.add_column(heading, justify="left" if heading == "last event before" else "right")
     for what in sorted(counts | dict.fromkeys(by, 0)):
@@ -385,11 +385,11 @@ def _show(seed: int, chaos: Chaos) -> None:
             table.add_row(what, str(counts[what]), str(len(seconds)), *figures)
     calls, answered, failed = chaos.books.calls()
     delivered = sum(len(each) for each in chaos.books.arrivals_ns.values())
-    told = sum(chaos.books.told.values())
+    reported_losses = sum(chaos.books.reported_losses.values())
     console = Console(width=120)
     console.print(table)
     called = f"{calls} calls: {answered} answered, {failed} failed"
-    console.print(f"{delivered} messages delivered, {told} told lost; {called}")
+    console.print(f"{delivered} messages delivered, {reported_losses} reported lost; {called}")
     waited = f"{chaos.waited_share:.0%} of the time some process on this machine waited for a processor"
     console.print(f"the schedule was {chaos.late_s:.1f} s late in the end; {waited}")
     console.print(f"{chaos.noticed()} times a RIB said that its snapshot is not written")

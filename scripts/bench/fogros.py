@@ -63,10 +63,10 @@ class Trip:
         """
         del round_number
         is_direct, prefix = self.encoding is None, prefix_of(self.task, self.encoding or "cdr")
-        told = {"task": self.task.name, "prefix": prefix, "seconds": self.seconds}
-        with row.node(RIGHT, MODULE, "cloud", direct=is_direct, **told) as cloud:
+        reported = {"task": self.task.name, "prefix": prefix, "seconds": self.seconds}
+        with row.node(RIGHT, MODULE, "cloud", direct=is_direct, **reported) as cloud:
             cloud.read(READY_S)
-            with row.node(LEFT, MODULE, "robot", direct=is_direct, **told) as robot:
+            with row.node(LEFT, MODULE, "robot", direct=is_direct, **reported) as robot:
                 begun = robot.read(READY_S)
                 cpu_s = row.proxies_cpu_s()
                 said = {**begun, **robot.read(self.seconds + _DONE_S)}

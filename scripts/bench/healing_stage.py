@@ -70,9 +70,17 @@ class Cluster:
             self._site = open_site(None, self._run.directory / STATE)
             self._journal = undo.enter_context(closing(Journal(self._site.journal)))
             self._runs = local_provider(self._site).runs
-            told = ["-m", "fog_demo.caller", "--ros-args", "-p", f"rate_hz:={rate_hz}", "-p", f"report_s:={_REPORT_S}"]
-            told += ["-p", f"depth:={_DEPTH}"]
-            self._caller = undo.enter_context(self._start("caller", told))
+            reported = [
+                "-m",
+                "fog_demo.caller",
+                "--ros-args",
+                "-p",
+                f"rate_hz:={rate_hz}",
+                "-p",
+                f"report_s:={_REPORT_S}",
+            ]
+            reported += ["-p", f"depth:={_DEPTH}"]
+            self._caller = undo.enter_context(self._start("caller", reported))
             end_s = time.monotonic() + _PATIENCE_S
             while not self._caller.read(_PATIENCE_S)["answered"]:
                 if time.monotonic() > end_s:
@@ -191,8 +199,8 @@ class Cluster:
         return Started(self._run, what, self._command, arguments)
 
     def _command(self, argv: Sequence[str]) -> list[str]:
-        told = [f"{name}={value}" for name, value in ENVIRONMENT.items()]
-        return self._spaces.command(_ROBOT, ["env", *told, *argv])
+        reported = [f"{name}={value}" for name, value in ENVIRONMENT.items()]
+        return self._spaces.command(_ROBOT, ["env", *reported, *argv])
 
     def _until(self, found: Callable[[], T | None], what: str) -> T:
         """Poll until a state is reached that sends no event."""

@@ -47,7 +47,7 @@ PLANES: Final = ("kernel", "raw")
 LINKS: Final = {"free": "free links", "shaped": f"{SHAPED_BITS_S // 1_000_000} Mbit/s"}
 IDLE: Final = "idle"
 FLOODS: Final = {  # whose images, and how
-    IDLE: ("nobody", ""),
+    IDLE: ("none", ""),
     "own images": ("a", "reliable"),
     "own images, best effort": ("a", "best-effort"),
     "another's images": ("c", "reliable"),
@@ -130,9 +130,9 @@ def targets_of(over: Rounds, cases: Sequence[str]) -> list[Target]:
     floods = [flood for flood in FLOODS if flood != IDLE]
     targets = [over.target(f"{case}: {flood}, {OF_BOUND}", flood, case, OF_BOUND, 1.0, at_most=True)
              for case in cases for flood in floods]  # fmt: skip
-    told = [over.ratio(f"{case}: {flood} / {IDLE}, p99", flood, IDLE, case, P99, None)
+    reported = [over.ratio(f"{case}: {flood} / {IDLE}, p99", flood, IDLE, case, P99, None)
             for case in cases for flood in floods]  # fmt: skip
-    return targets + told
+    return targets + reported
 
 
 def panels_of(over: Rounds, cases: Sequence[str]) -> list[Panel]:
@@ -150,7 +150,7 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
     over, cases = recorder.rounds, [case_of(plane, link) for plane, link in rows]
     return Outcome(
         "priority",
-        "A tick of 100 bytes at 100 Hz beside images, over three switches",
+        "A tick of 100 bytes at 100 Hz with images, over three switches",
         over,
         targets_of(over, cases),
         {

@@ -172,7 +172,7 @@ class Flood:
         """Keep something to send in the queue."""
         if self.publisher is None:
             return
-        if self.publisher.has_room() if self._is_reliable else self.publisher.is_acknowledged():
+        if self.publisher.has_space() if self._is_reliable else self.publisher.is_acknowledged():
             self.publisher.publish(self._image)
 
 
@@ -185,7 +185,7 @@ def tick(end: End, settings: Mapping[str, str | float]) -> None:
     flood = Flood(end, str(settings["flood"]))
     tune_memory()
     if not end.runtime.run(lambda: control.readers > 0 and flood.is_ready, time.monotonic() + _PATIENCE_S):
-        raise TimeoutError("nobody reads: the overlay did not come up")
+        raise TimeoutError("no reader: the overlay did not come up")
     seconds = float(settings["seconds"])
     ticks = Ticks(end, control, round(seconds / TICK_S))
     latest_s = time.monotonic() + seconds + _PATIENCE_S
@@ -204,7 +204,7 @@ def flood(end: End, settings: Mapping[str, str | float]) -> None:
     images = Flood(end, str(settings["flood"]))
     with end.runtime.signals():
         if not end.runtime.run(lambda: images.is_ready, time.monotonic() + _PATIENCE_S):
-            raise TimeoutError("nobody reads: the overlay did not come up")
+            raise TimeoutError("no reader: the overlay did not come up")
         say(event="ready")
         while not end.runtime.is_stopped:
             images.go_on()

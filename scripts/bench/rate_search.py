@@ -86,16 +86,16 @@ def highest(attempt: Callable[[float | None], Try], guess: float | None) -> Try 
             low = tried
         else:
             high = rate
-        floor = low.asked if low and low.asked else 0.0
-        if high <= floor * _CLOSE:
+        minimum = low.asked if low and low.asked else 0.0
+        if high <= minimum * _CLOSE:
             break
         step *= _STEP  # growing strides, because the guess may be far off
-        rate = _next(floor, high, step)
+        rate = _next(minimum, high, step)
     return low
 
 
-def _next(floor: float, high: float, step: float) -> float:
+def _next(minimum: float, high: float, step: float) -> float:
     """Return the next rate to try: outside an open bracket, else in its middle."""
-    if not floor:
+    if not minimum:
         return high / step
-    return floor * step if high == float("inf") else (floor + high) / 2
+    return minimum * step if high == float("inf") else (minimum + high) / 2

@@ -151,8 +151,8 @@ class Bench:
         """Call three replicas while two of them are killed repeatedly."""
         served = [Served("/number", TYPE, _MACHINES, imports={"timeout_s": _CALL_S})]
         with self._field(served) as here, Kills(here, self._draw) as kills:
-            told = {"lanes": _LANES, "rate": self._rate, "counts_answers": True}
-            said = _ask(here, ["/number"], count, told)
+            reported = {"lanes": _LANES, "rate": self._rate, "counts_answers": True}
+            said = _ask(here, ["/number"], count, reported)
         figures = {column: _number(said, key) for column, key in COUNTS.items()}
         figures |= {COUNT: count, KILLS: kills.count, **_latencies(_times(said, "/number"))}
         self._add(KILLED, THREE, figures)
@@ -239,8 +239,8 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
         bench.over,
         targets_of(bench.over),
         {
-            "rounds": _told(rounds),
-            "requests of a round": _told(counts),
+            "rounds": _reported(rounds),
+            "requests of a round": _reported(counts),
             "requests a second while killed": options.rate,
             "seed": options.seed,
         },
@@ -248,15 +248,15 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
     )
 
 
-def _ask(here: Field, services: Sequence[str], count: int, told: Mapping[str, object]) -> Said:
+def _ask(here: Field, services: Sequence[str], count: int, reported: Mapping[str, object]) -> Said:
     """Return the final report of the robot's client."""
-    own = {"services": " ".join(services), "count": count, "patience_s": _CALL_S, **told}
+    own = {"services": " ".join(services), "count": count, "patience_s": _CALL_S, **reported}
     with here.client(ROBOT, "ask", _END, **own) as client:
         client.read(READY_S)
-        told_s = time.monotonic()
+        reported_s = time.monotonic()
         while (said := client.read(2 * _CALL_S))["event"] == "asked":
-            if time.monotonic() - told_s >= _TELL_S:
-                told_s = time.monotonic()
+            if time.monotonic() - reported_s >= _TELL_S:
+                reported_s = time.monotonic()
                 progress(f"    {said['ended']} of {count}, failed: {said['failed']}")
     return said
 
@@ -282,15 +282,15 @@ def _latencies(times_s: Sequence[float]) -> dict[str, float | None]:
     return {column: 1e3 * percentile(times_s, share) for column, share in ((MEDIAN, 0.5), (P99, 0.99), (P999, 0.999))}
 
 
-def _told(numbers: Mapping[str, int]) -> str:
+def _reported(numbers: Mapping[str, int]) -> str:
     return ", ".join(f"{each} {number}" for each, number in numbers.items())
 
 
 if __name__ == "__main__":
     parser = command_line(__doc__, quick={"rounds": 1}, has_record=True, has_plot=True)
     parser.add_argument("--only", action="append", choices=list(CASES), help="this part; may be repeated")
-    parser.add_argument("--rounds", type=int, help=f"of each part (default: {_told(ROUNDS)})")
-    parser.add_argument("--requests", type=int, help=f"of a round (default: {_told(REQUESTS)})")
+    parser.add_argument("--rounds", type=int, help=f"of each part (default: {_reported(ROUNDS)})")
+    parser.add_argument("--requests", type=int, help=f"of a round (default: {_reported(REQUESTS)})")
     parser.add_argument("--rate", type=float, default=RATE, help="of 'killed', a second (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=7, help="of the deaths (default: %(default)s)")
     run_bench(parser, measure)

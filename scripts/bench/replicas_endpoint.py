@@ -36,7 +36,7 @@ _FILL: Final = "x" * 79  # 4 encapsulation, 4 count, 4 length, 80 text with its 
 _DEPTH: Final = 1_000
 _EVENTS: Final = 10_000
 _TICK_S: Final = 0.001
-_TOLD_S: Final = 1.0
+_REPORT_INTERVAL_S: Final = 1.0
 _WARM_UP: Final = 50
 _PATIENCE_S: Final = 30.0
 _THREADS: Final = 8
@@ -143,18 +143,18 @@ def ask(end: End, settings: Settings) -> None:
     warm = _warm_up(end, clients, names)
     heard = _count_answers(end, clients) if settings.get("counts_answers") else None
     asking, begun_s = _Asking(clients), time.monotonic()
-    told_s = due_s = begun_s
+    reported_s = due_s = begun_s
     say(event="begins")
 
     def step() -> None:
-        nonlocal due_s, told_s
+        nonlocal due_s, reported_s
         now_s = time.monotonic()
         while asking.sent < count and len(asking) < lanes and due_s <= now_s:
             due_s = max(due_s, now_s - patience_s) + gap_s
             asking.begin(names[asking.sent % len(names)], _nothing)
         asking.give_up(patience_s)
-        if now_s - told_s >= _TOLD_S:
-            told_s = now_s
+        if now_s - reported_s >= _REPORT_INTERVAL_S:
+            reported_s = now_s
             say(event="asked", ended=asking.ended, failed=asking.failed)
         if asking.ended >= count:
             end.finish()
@@ -194,7 +194,7 @@ def _warm_up(end: End, clients: dict[str, Client], names: list[str]) -> Counter[
 
 
 def _linger(end: End) -> None:
-    timer = end.node.create_timer(_TOLD_S, end.finish)
+    timer = end.node.create_timer(_REPORT_INTERVAL_S, end.finish)
     end.run()
     timer.cancel()
 

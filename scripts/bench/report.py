@@ -154,10 +154,10 @@ class Rounds:
         Args:
             other_case: the other's case, where it is not the same.
         """
-        beside = other_case or case
-        pairs = zip(self.column(one, case, column), self.column(other, beside, column), strict=False)
+        neighbouring = other_case or case
+        pairs = zip(self.column(one, case, column), self.column(other, neighbouring, column), strict=False)
         ratios = [None if a is None or not b else a / b for a, b in pairs]
-        return _target(what, asked, at_most, ratios, self._why_not(one, case) or self._why_not(other, beside))
+        return _target(what, asked, at_most, ratios, self._why_not(one, case) or self._why_not(other, neighbouring))
 
     def difference(
         self,
@@ -172,10 +172,10 @@ class Rounds:
         at_most: bool = True,
     ) -> Target:
         """Return a bound on ``one - other``, round by round."""
-        beside = other_case or case
-        pairs = zip(self.column(one, case, column), self.column(other, beside, column), strict=False)
+        neighbouring = other_case or case
+        pairs = zip(self.column(one, case, column), self.column(other, neighbouring, column), strict=False)
         gaps = [None if a is None or b is None else a - b for a, b in pairs]
-        return _target(what, asked, at_most, gaps, self._why_not(one, case) or self._why_not(other, beside))
+        return _target(what, asked, at_most, gaps, self._why_not(one, case) or self._why_not(other, neighbouring))
 
     def _why_not(self, contender: str, case: str) -> str:
         if contender in self.reasons:

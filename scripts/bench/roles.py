@@ -96,20 +96,20 @@ def end(ifname: str, **_: Any) -> None:
     gc.freeze()
     gc.disable()
     while True:
-        told: dict[str, Any] = command()
-        ethertype = told.get("ethertype", 0)
-        frame = bytes.fromhex(told.get("frame", ""))
-        if told["do"] == "send":
-            names = spread_names(told["names"], told["of"]) if told["names"] else []
+        order: dict[str, Any] = command()
+        ethertype = order.get("ethertype", 0)
+        frame = bytes.fromhex(order.get("frame", ""))
+        if order["do"] == "send":
+            names = spread_names(order["names"], order["of"]) if order["names"] else []
             frames = spread_frames(frame, NAME_AT, names) if names else [frame]
-            answer(send(ifname, frames, told["rate"], told["seconds"])._asdict())
-        elif told["do"] == "count":
+            answer(send(ifname, frames, order["rate"], order["seconds"])._asdict())
+        elif order["do"] == "count":
             seen = count_frames(ifname, ethertype, ready, expected)
             answer(seen._asdict())
-        elif told["do"] == "ping":
-            answer({"rtt_us": ping(ifname, ethertype, frame, told["pings"], poll=told["poll"])})
-        elif told["do"] == "answer":
-            answer({"answered": answer_pings(ifname, ethertype, frame, told["pings"], ready, poll=told["poll"])})
+        elif order["do"] == "ping":
+            answer({"rtt_us": ping(ifname, ethertype, frame, order["pings"], poll=order["poll"])})
+        elif order["do"] == "answer":
+            answer({"answered": answer_pings(ifname, ethertype, frame, order["pings"], ready, poll=order["poll"])})
 
 
 def expected() -> int | None:

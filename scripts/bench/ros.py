@@ -84,10 +84,10 @@ class Stream:
         seconds = self.first_s if round_number == 1 else self.seconds
         every_s, is_direct = EVERY_S[self.kind], self.encoding is None
         topics = topics_of(self.kind, self.encoding or "cdr")
-        told = {"kind": self.kind, "topics": topics, "count": round(seconds / every_s), "every_s": every_s}
+        reported = {"kind": self.kind, "topics": topics, "count": round(seconds / every_s), "every_s": every_s}
         with (
-            row.node(RIGHT, MODULE, "listen", direct=is_direct, **told) as listener,
-            row.node(LEFT, MODULE, "talk", direct=is_direct, **told) as talker,
+            row.node(RIGHT, MODULE, "listen", direct=is_direct, **reported) as listener,
+            row.node(LEFT, MODULE, "talk", direct=is_direct, **reported) as talker,
         ):
             listener.read(READY_S)
             cpu_s = row.proxies_cpu_s()

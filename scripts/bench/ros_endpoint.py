@@ -43,13 +43,13 @@ class End:
         self._executor = BestExecutor()
         self._executor.add_node(self.node)
         self._done: Future[None] = Future()
-        self._is_told_to_go = False
+        self._may_start = False
         signal.signal(signal.SIGUSR1, self._go)
 
     @property
-    def is_told_to_go(self) -> bool:
+    def may_start(self) -> bool:
         """Return whether a SIGUSR1 came: the other endpoint receives, the measurement may begin."""
-        return self._is_told_to_go
+        return self._may_start
 
     def finish(self) -> None:
         """End ``run``; call it from within ``run``."""
@@ -68,7 +68,7 @@ class End:
 
     def _go(self, number: int, frame: FrameType | None) -> None:
         del number, frame
-        self._is_told_to_go = True
+        self._may_start = True
 
 
 def reliable(depth: int = 10) -> QoSProfile:

@@ -69,8 +69,8 @@ class Carried:
 
     def rule(self, owner: Path) -> dict[str, object]:
         """Return its rule in either proxy's configuration."""
-        told = {"name": self.name, "kind": self.kind, "type": self.type_name, "encoding": self.encoding}
-        return {**told, "owner": str(owner)}
+        reported = {"name": self.name, "kind": self.kind, "type": self.type_name, "encoding": self.encoding}
+        return {**reported, "owner": str(owner)}
 
 
 class Row:

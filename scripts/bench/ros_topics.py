@@ -86,12 +86,12 @@ def talk(end: End, settings: Settings) -> None:
     steps: Iterator[int] = iter(range(1, count + 1))
 
     def greet() -> None:
-        if not end.is_told_to_go:
+        if not end.may_start:
             for publisher in publishers:
                 publisher.publish(source.fill(0))
 
     def tick() -> None:
-        if not end.is_told_to_go:
+        if not end.may_start:
             return
         number = next(steps, None)
         if number is None:

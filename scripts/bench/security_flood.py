@@ -270,25 +270,25 @@ def _flooding(run: Run, overlay: Overlay, kind: str, rate: float, seconds: float
     if kind not in _HOSTILE:
         path = run.directory / f"{kind}.frames"
         path.write_bytes(b"".join(struct.pack("!I", len(frame)) + frame for frame in hellos(kind, overlay)))
-        told: dict[str, object] = {
+        reported: dict[str, object] = {
             "iface": _VICTIM, "frames": str(path), "rate": rate, "seconds": seconds,
             "source": _address_of(overlay) if spoof else "",
         }  # fmt: skip
-        argv = ["-m", "faults.hello_flood", json.dumps(told)]
+        argv = ["-m", "faults.hello_flood", json.dumps(reported)]
         with Started(run, f"flood {kind}", partial(overlay.spaces.command, _NEAR), argv) as flood:
             flood.read(30)
             yield flood
         return
     who = _HOSTILE[kind]
     role, _, node = who.partition(" ")
-    told = {"what": kind, "frames": _FRAMES, "rate": rate, "seconds": seconds}
+    reported = {"what": kind, "frames": _FRAMES, "rate": rate, "seconds": seconds}
     if role == "switch":
-        told["config"] = str(overlay.directory / f"switch-{node}.yaml")
+        reported["config"] = str(overlay.directory / f"switch-{node}.yaml")
     else:
-        told |= {"config": str(overlay.directory / f"end-{node}.yaml"), "reads": FLOW.topic, "publishes": OWN.topic}
+        reported |= {"config": str(overlay.directory / f"end-{node}.yaml"), "reads": FLOW.topic, "publishes": OWN.topic}
     overlay.kill(who)
     try:
-        argv = ["-m", "faults.hostile", json.dumps(told)]
+        argv = ["-m", "faults.hostile", json.dumps(reported)]
         with Started(run, f"flood {kind}", partial(overlay.spaces.command, node), argv) as flood:
             flood.read(_HOSTILE_READY_S)
             os.kill(flood.pid, signal.SIGUSR1)

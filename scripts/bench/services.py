@@ -65,12 +65,12 @@ class Series:
         """
         del round_number
         is_direct, service = self.encoding is None, service_of(self.encoding or "cdr")
-        told = {"service": service, "seconds": self.seconds, "clients": CLIENTS, "rate": RATE}
-        told["count"] = round(RATE * self.seconds)
-        with row.node(RIGHT, MODULE, "serve", direct=is_direct, **told) as server:
+        reported = {"service": service, "seconds": self.seconds, "clients": CLIENTS, "rate": RATE}
+        reported["count"] = round(RATE * self.seconds)
+        with row.node(RIGHT, MODULE, "serve", direct=is_direct, **reported) as server:
             server.read(READY_S)
             role = "call" if self.case == ONE else "load"
-            with row.node(LEFT, MODULE, role, direct=is_direct, **told) as client:
+            with row.node(LEFT, MODULE, role, direct=is_direct, **reported) as client:
                 client.read(READY_S)
                 cpu_s = row.proxies_cpu_s()
                 said = client.read(self.seconds + _DONE_S)

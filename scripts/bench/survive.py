@@ -60,7 +60,7 @@ class Measured:
         silence_s: from the event on.
         return_s: the same after the event is undone.
         new_name_s: until a name that is new after the event was read.
-        told_lost: losses of the steady flow that R got a report of.
+        reported_lost: losses of the steady flow that R got a report of.
         never: events after which the flow did not come back in time; their silence is at least the patience.
     """
 
@@ -69,7 +69,7 @@ class Measured:
     new_name_s: list[float] = field(default_factory=list)
     published: int = 0
     lost: int = 0
-    told_lost: int = 0
+    reported_lost: int = 0
     doubled: int = 0
     never: int = 0
 
@@ -82,7 +82,7 @@ class Flowing:
         self.arrivals_ns: list[int] = []
         self.numbers: Counter[tuple[int, int]] = Counter()  # (incarnation, number) of the steady flow
         self.published: set[tuple[int, int]] = set()
-        self.told_lost = 0
+        self.reported_lost = 0
         self.first_of: dict[int, int] = {}  # channel -> when its first message came
 
     def look(self) -> None:
@@ -100,7 +100,7 @@ class Flowing:
                     self.arrivals_ns.append(each.at_ns)
                     self.numbers[each.life, each.number] += 1
             elif each.kind == Kind.LOST and each.channel == 0:
-                self.told_lost += each.number
+                self.reported_lost += each.number
             elif each.kind == Kind.WRONG:
                 raise FailedError(f"R had a message of channel {each.other} on channel {each.channel}")
         for each in self._records("P"):
@@ -166,7 +166,7 @@ def measure(runs: RunRegistry, row: Row, rounds: int, options: argparse.Namespac
         sent = set(flow.published)
         _watch(flow, LAST_S)
         found.lost, found.doubled = flow.count(sent)
-        found.published, found.told_lost = len(sent), flow.told_lost
+        found.published, found.reported_lost = len(sent), flow.reported_lost
     return found
 
 
@@ -213,7 +213,7 @@ def _new_name_s(overlay: Overlay, flow: Flowing, at: int) -> float:
 def show(measured: dict[str, Measured], options: argparse.Namespace) -> None:
     """Print the table."""
     table = Table(title=f"Silence of a flow of {options.hz:g} messages/s, ms", title_justify="left")
-    counts = ("lost", "told", "doubled", "no return")
+    counts = ("lost", "reported", "doubled", "no return")
     for heading in ("event", "to reach", "events", "p50", "p99", "max", "met", "undone: max", *counts):
         table.add_column(heading, justify="left" if heading == "event" else "right")
     for name, each in measured.items():
@@ -233,7 +233,7 @@ def _figures(seconds: list[float], target_s: float | None, undone: str) -> list[
 
 
 def _counts(each: Measured) -> list[str]:
-    return [str(each.lost), str(each.told_lost), str(each.doubled), str(each.never)]
+    return [str(each.lost), str(each.reported_lost), str(each.doubled), str(each.never)]
 
 
 def _max_text(seconds: list[float]) -> str:

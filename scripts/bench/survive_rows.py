@@ -154,7 +154,7 @@ def _cut(**ways: str) -> dict[str, Callable[[Overlay, int], None]]:
         "s4",
         ways,
         lambda overlay, link: overlay.cut(*link.split("-")),
-        lambda overlay, link: overlay.mend(*link.split("-")),
+        lambda overlay, link: overlay.restore_link(*link.split("-")),
     ).both()
 
 

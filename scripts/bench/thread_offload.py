@@ -29,7 +29,7 @@ from report import Rounds, progress, show, write_json
 from gdp.crypto.keys import SigningKey
 
 IMAGE_BYTES = 921_600
-ROOM_BYTES = 1_388  # plaintext in a part at MTU 1500
+CAPACITY_BYTES = 1_388  # plaintext in a part at MTU 1500
 CHUNK_PARTS = 64
 ADDITIONAL = bytes(95)
 LARGE = secrets.token_bytes(8 << 20)
@@ -40,8 +40,8 @@ Hash = Callable[[list[bytes]], None]
 def seal(aead: AESGCM, image: memoryview, take: Hash) -> None:
     """Encrypt part by part, passing each chunk of parts to ``take``."""
     chunk: list[bytes] = []
-    for number, begin in enumerate(range(0, len(image), ROOM_BYTES)):
-        part = aead.encrypt(number.to_bytes(12, "big"), image[begin : begin + ROOM_BYTES], ADDITIONAL)
+    for number, begin in enumerate(range(0, len(image), CAPACITY_BYTES)):
+        part = aead.encrypt(number.to_bytes(12, "big"), image[begin : begin + CAPACITY_BYTES], ADDITIONAL)
         chunk.append(part)
         if len(chunk) == CHUNK_PARTS:
             take(chunk)
@@ -60,7 +60,7 @@ def in_place(aead: AESGCM, image: memoryview) -> None:
     seal(aead, image, take)
 
 
-def beside(worker: ThreadPoolExecutor, aead: AESGCM, image: memoryview) -> None:
+def neighbouring(worker: ThreadPoolExecutor, aead: AESGCM, image: memoryview) -> None:
     """Seal an image in this thread and hash it in another."""
     running = hashlib.sha256()
     under_way: list[Future[None]] = []
@@ -111,7 +111,7 @@ def main() -> None:
             progress(f"round {number + 1}/{options.rounds}")
             for who, seal_by, verify_by in (
                 ("in place", partial(in_place, aead, image), verify),
-                ("thread", partial(beside, worker, aead, image), lambda: worker.submit(verify).result()),
+                ("thread", partial(neighbouring, worker, aead, image), lambda: worker.submit(verify).result()),
             ):
                 over.add(who, "an image sealed", "ms", median_ms(seal_by, options.count))
                 over.add(who, "a message verified", "ms", median_ms(verify_by, 10 * options.count))
@@ -123,7 +123,7 @@ def main() -> None:
         over.ratio("thread / in place, verify", "thread", "in place", "a message verified", "ms", None),
     ]
     settings = {"rounds": options.rounds, "count": options.count}
-    show("hashing and verifying beside", state, settings, over, targets)
+    show("hashing and verifying meanwhile", state, settings, over, targets)
     if options.json is not None:
         write_json(options.json, "overlap", state, settings, over, targets)
 

@@ -43,10 +43,10 @@ class Worker:
 
     def __init__(self, spaces: Namespaces, node: str, role: str, *, cpu: int | None = None, **settings: Value) -> None:
         roles = Worker.roles
-        told = json.dumps({"role": role, "cpu": cpu, **settings})
+        reported = json.dumps({"role": role, "cpu": cpu, **settings})
         self._role = role
         self._process = subprocess.Popen(
-            spaces.command(node, [sys.executable, str(roles), told]),
+            spaces.command(node, [sys.executable, str(roles), reported]),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

@@ -123,8 +123,8 @@ class Report:
         parts += [_table(("", *_COLUMNS), self.rows())]
         parts += [_table(("figure", "here", "target", "", "paper"), [each.cells() for each in self.findings])]
         parts += ["\n".join(f"- {note}" for note in self.notes)]
-        told = "; ".join(f"{key}: {value}" for key, value in self.settings.items())
-        return "\n\n".join([*parts, f"Measured on {state}. {told}."]) + "\n"
+        reported = "; ".join(f"{key}: {value}" for key, value in self.settings.items())
+        return "\n\n".join([*parts, f"Measured on {state}. {reported}."]) + "\n"
 
 
 @contextmanager
@@ -160,9 +160,9 @@ class Asking:
         """Yield each sample as it comes; raises FailedError if none comes in time."""
         self._client.read(_BEGIN_S)
         while "sample" in (said := self._client.read(max(2 * self._series.patience_s, _SILENT_S))):
-            told = said["sample"]
-            if isinstance(told, dict):
-                yield Sample(**told)
+            reported = said["sample"]
+            if isinstance(reported, dict):
+                yield Sample(**reported)
         twice, heard = said["twice"], said["heard"]
         self.twice, self.heard = (each if isinstance(each, int) else None for each in (twice, heard))
 

@@ -63,8 +63,8 @@ class Served:
 
     def rule(self, owner: Path, further: Mapping[str, object]) -> dict[str, object]:
         """Return a rule for it."""
-        told = {"name": self.name, "kind": "service", "type": self.type_name, "encoding": "cdr"}
-        return {**told, "owner": str(owner), **further}
+        reported = {"name": self.name, "kind": "service", "type": self.type_name, "encoding": "cdr"}
+        return {**reported, "owner": str(owner), **further}
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,10 +88,10 @@ class Server:
 
     def begin(self) -> None:
         """Start both."""
-        told = {**self._work.settings, "machine": self.label}
+        reported = {**self._work.settings, "machine": self.label}
         self._running = [
             self._place.process(self.label, "proxy", ["-m", "proxy.cli.proxy", "--config", self._config]),
-            self._place.process(self.label, "node", [str(self._work.program), self._work.role, json.dumps(told)]),
+            self._place.process(self.label, "node", [str(self._work.program), self._work.role, json.dumps(reported)]),
         ]
 
     def wait(self) -> None:

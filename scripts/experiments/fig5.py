@@ -98,10 +98,10 @@ def main(
         _check(counts, planner, meshes)
     groups: dict[str, list[Sample]] = {}
     findings: list[Finding] = []
-    told = {"folder": str(meshes), "problems": " ".join(counts), "planner": planner, "patience_s": timeout}
+    reported = {"folder": str(meshes), "problems": " ".join(counts), "planner": planner, "patience_s": timeout}
     options = _STOP if stop else {}
     if counts:
-        with field_of(*_fleet("plan", dict.fromkeys(_MACHINES, told), options, timeout + _SLACK_S)) as here:
+        with field_of(*_fleet("plan", dict.fromkeys(_MACHINES, reported), options, timeout + _SLACK_S)) as here:
             for name, count in counts.items():
                 found = _ask(here, name, count, patience_s=timeout + _SLACK_S)
                 what = f"{name}, computed"
@@ -223,7 +223,7 @@ def _lists(count: int, problems: Collection[str]) -> dict[str, tuple[list[float]
 
 
 def _notes(counts: Mapping[str, int], timeout_s: float, planner: str) -> list[str]:
-    told = ", ".join(f"{count} of {name}" for name, count in counts.items())
+    reported = ", ".join(f"{count} of {name}" for name, count in counts.items())
     runs = ", ".join(f"{len(each)} of {name}" for name, each in load().items())
     return [
         f"The paper ran 100 trials with a timeout of {LIMIT_S:g} s. The trials of waits are as many; recorded runs"
@@ -234,7 +234,7 @@ def _notes(counts: Mapping[str, int], timeout_s: float, planner: str) -> list[st
         "Waits of Home and Twistycool are shortened, so that a hundred trials take minutes. The network's time is"
         " not: it"
         " weighs more here than in the paper (last figure of each).",
-        f"Computed trials: {told or 'none in this run'}, timeout {timeout_s:g} s. Of fewer than a hundred trials"
+        f"Computed trials: {reported or 'none in this run'}, timeout {timeout_s:g} s. Of fewer than a hundred trials"
         " the p99 is"
         " the slowest one. A problem without a solution counts with its timeout, as failed."
         " The replicas share two cores"

@@ -92,10 +92,10 @@ def plan_grasp(depth: NDArray[np.float32], mask: NDArray[np.uint8], focal: float
             np.rint(at[1] + _CLEARANCE_PIXELS * axis).astype(int),
             np.rint(at[0] - _CLEARANCE_PIXELS * axis).astype(int),
         )
-        room = np.minimum(
+        capacity = np.minimum(
             *(clearance[e[:, 0].clip(0, mask.shape[0] - 1), e[:, 1].clip(0, mask.shape[1] - 1)] for e in ends)
         )
-        quality = np.where(fits, cosines * (1 - off) * np.minimum(room / _CLEARANCE_PIXELS, 1), -1.0)
+        quality = np.where(fits, cosines * (1 - off) * np.minimum(capacity / _CLEARANCE_PIXELS, 1), -1.0)
         top = int(quality.argmax())
         if quality[top] > (best.quality if best else 0):
             angle_rad = math.atan2(axis[top, 0], axis[top, 1])

@@ -94,11 +94,11 @@ def main(
     with clean_exit():
         for name in names:
             state = machine_state()
-            told = tasks.setdefault(name, {})
+            reported = tasks.setdefault(name, {})
             if part != "alone":
-                told["network"] = _network(name, 1 if quick else rounds, quick=quick) | {"machine": asdict(state)}
+                reported["network"] = _network(name, 1 if quick else rounds, quick=quick) | {"machine": asdict(state)}
             if part != "network":
-                told["alone"] = _alone(name, quick=quick) | {"machine": asdict(state)}
+                reported["alone"] = _alone(name, quick=quick) | {"machine": asdict(state)}
     document = {"experiment": "offload", "slower": SLOWER, "tasks": tasks}
     page = page_of(document)
     print(json.dumps(document) if as_json else page)
@@ -125,9 +125,9 @@ def _network(name: str, rounds: int, *, quick: bool) -> dict[str, object]:
         for at in range(1, rounds + 1):
             for who, middleware in BASELINES.items():
                 progress(f"{name}, round {at} of {rounds}: {who}")
-                told = {"task": name, "prefix": prefix, "middleware": middleware, "domain": DIRECT_DOMAIN}
-                told |= {"at_once": at_once, "count": at_once + computed}
-                size = _trip(row, found[who], told, at_once, direct=who != OVERLAY)
+                reported = {"task": name, "prefix": prefix, "middleware": middleware, "domain": DIRECT_DOMAIN}
+                reported |= {"at_once": at_once, "count": at_once + computed}
+                size = _trip(row, found[who], reported, at_once, direct=who != OVERLAY)
     return {
         "request_bytes": size,
         "rounds": rounds,
@@ -137,12 +137,12 @@ def _network(name: str, rounds: int, *, quick: bool) -> dict[str, object]:
     }
 
 
-def _trip(row: Row, found: Measured, told: Mapping[str, object], at_once: int, *, direct: bool) -> int:
+def _trip(row: Row, found: Measured, reported: Mapping[str, object], at_once: int, *, direct: bool) -> int:
     """Run one series between a robot and a server; return the size of a request, in bytes."""
     there_s = []
-    with row.process(RIGHT, "cloud", [_END, "cloud", json.dumps(told)], direct=direct) as cloud:
+    with row.process(RIGHT, "cloud", [_END, "cloud", json.dumps(reported)], direct=direct) as cloud:
         cloud.read(READY_S)
-        with row.process(LEFT, "robot", [_END, "robot", json.dumps(told)], direct=direct) as robot:
+        with row.process(LEFT, "robot", [_END, "robot", json.dumps(reported)], direct=direct) as robot:
             size = int(str(robot.read(READY_S)["request_bytes"]))
             while "number" in (said := robot.read(_ANSWER_S)):
                 number, asked_s, answered_s = (

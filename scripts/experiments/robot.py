@@ -105,7 +105,7 @@ class _Client:
                 del self.under_way[number]
                 self._note(Sample(name, begun_s, now_s - begun_s, "", 0.0, is_right=False))
 
-    def begin_anew(self) -> None:
+    def start_over(self) -> None:
         """Reset the count: the calls until now were the warm-up."""
         self.give_up(0.0)
         self.sent = self.ended = 0
@@ -117,9 +117,9 @@ class _Client:
             say(sample=asdict(sample))
 
 
-def ask(node: Node, executor: SingleThreadedExecutor, told: Mapping[str, object]) -> None:
+def ask(node: Node, executor: SingleThreadedExecutor, reported: Mapping[str, object]) -> None:
     """Call so often, and print what came of each call, in a line of its own."""
-    series = Series(**told)  # type: ignore[arg-type]
+    series = Series(**reported)  # type: ignore[arg-type]
     client = _Client(node, TASKS[series.task](series.problem), series.services)
     answers = client.count_answers() if series.counts_answers else None
     done: Future[None] = Future()
@@ -131,7 +131,7 @@ def ask(node: Node, executor: SingleThreadedExecutor, told: Mapping[str, object]
         first: Future[None] = Future()
         client.ask(partial(first.set_result, None))
         executor.spin_until_future_complete(first, timeout_sec=series.patience_s)
-    client.begin_anew()
+    client.start_over()
     if answers is not None:
         executor.spin_until_future_complete(Future(), timeout_sec=_LINGER_S)
         answers.clear()
@@ -156,9 +156,9 @@ def ask(node: Node, executor: SingleThreadedExecutor, told: Mapping[str, object]
     say(event="over", heard=heard, twice=None if answers is None or heard is None else heard - len(answers))
 
 
-def busy(node: Node, executor: SingleThreadedExecutor, told: Mapping[str, object]) -> None:
+def busy(node: Node, executor: SingleThreadedExecutor, reported: Mapping[str, object]) -> None:
     """Run as the second client, until killed."""
-    contention = Contention(**told)  # type: ignore[arg-type]
+    contention = Contention(**reported)  # type: ignore[arg-type]
     client = _Client(node, TASKS[contention.task](""), [contention.service])
     client.wait_for_servers()
     begun_s = time.monotonic()

@@ -77,7 +77,7 @@ class _Looking:
         self._view = view
         self.counts = Counts()
         self.events: list[Entry] = []
-        self._told_s = 0.0
+        self._reported_s = 0.0
 
     async def run(self) -> None:
         """Poll repeatedly."""
@@ -107,8 +107,8 @@ class _Looking:
 
     def _take(self, event: Event) -> None:
         now_s, before, answered = time.monotonic(), self.counts, event.count("answered")
-        rate = (answered - before.answered) / (now_s - self._told_s) if self._told_s else 0.0
-        self._told_s = now_s
+        rate = (answered - before.answered) / (now_s - self._reported_s) if self._reported_s else 0.0
+        self._reported_s = now_s
         left = event.count("under_way") if event.fields.get("done") else 0
         won = sorted((name, int(str(count))) for name, count in event.part("by_machine").fields.items())
         self.counts = Counts(

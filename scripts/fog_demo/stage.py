@@ -107,8 +107,8 @@ class Stage:
 
     def start_caller(self, rate_hz: float) -> Child:
         """Start the robot's node: it calls ``/echo`` at this rate until SIGINT."""
-        told = ["-p", f"rate_hz:={rate_hz}", "-p", "report_s:=0.5"]
-        return self._start(ROBOT, "caller", ["-m", "fog_demo.caller", "--ros-args", *told])
+        reported = ["-p", f"rate_hz:={rate_hz}", "-p", "report_s:=0.5"]
+        return self._start(ROBOT, "caller", ["-m", "fog_demo.caller", "--ros-args", *reported])
 
     def _start(self, node: str, role: str, arguments: list[str], *, heard: bool = True) -> Child:
         return self.children.start_in(self._namespaces, node, role, arguments, heard=heard, environment=ENVIRONMENT)
@@ -196,5 +196,5 @@ def end_all_of(run: Run) -> None:
 def fog_command(run: Run, words: Sequence[str]) -> list[str]:
     """Return Python's arguments to run ``fog`` in a run's folder."""
     site = run.directory / SITE
-    told = ["--site", str(site)] if site.exists() else []
-    return ["-m", "fog.cli.app", *words, *told, "--state", str(run.directory / STATE)]
+    reported = ["--site", str(site)] if site.exists() else []
+    return ["-m", "fog.cli.app", *words, *reported, "--state", str(run.directory / STATE)]

@@ -65,7 +65,7 @@ class View:
     def __init__(self, console: Console) -> None:
         self._console = console
         self._begun_s = time.monotonic()
-        self._told_s = self._begun_s
+        self._reported_s = self._begun_s
         self._events: deque[Entry] = deque(maxlen=_EVENTS)
         self._live = Live(console=console, auto_refresh=False, transient=False) if console.is_terminal else None
 
@@ -95,8 +95,8 @@ class View:
             if not self._live.is_started:
                 self._live.start()
             self._live.update(self._page(machines, counts), refresh=True)
-        elif time.monotonic() - self._told_s >= _PLAIN_EVERY_S:
-            self._told_s = time.monotonic()
+        elif time.monotonic() - self._reported_s >= _PLAIN_EVERY_S:
+            self._reported_s = time.monotonic()
             there = ", ".join(f"{each.name} {each.spec.offer.region} {stage(each)}" for each in machines)
             self._console.print(Text("         ") + counts.line() + Text(f"   machines: {there}"), soft_wrap=True)
 

@@ -55,8 +55,8 @@ class Children:
         environment: Mapping[str, str] | None = None,
     ) -> Child:
         """Start Python with these arguments in the namespace of a switch; ``environment`` extends the present one."""
-        told = ["env", *(f"{name}={value}" for name, value in environment.items())] if environment else []
-        argv = namespaces.command(node, [*told, sys.executable, *arguments], dies_with_us=not self._kept)
+        prefix = ["env", *(f"{name}={value}" for name, value in environment.items())] if environment else []
+        argv = namespaces.command(node, [*prefix, sys.executable, *arguments], dies_with_us=not self._kept)
         return self.start(f"{role} {node}", argv, heard=heard)
 
     async def ready(self, children: Sequence[Child]) -> list[Event]:

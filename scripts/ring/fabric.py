@@ -111,7 +111,7 @@ class Overlay:
         Raises:
             LocalError: the kernel refuses.
         """
-        await asyncio.to_thread(self.namespaces.mend, cut.a, cut.b)
+        await asyncio.to_thread(self.namespaces.restore_link, cut.a, cut.b)
 
     async def kill(self, kill: Kill) -> None:
         """Kill a switch, or the RIBs of a domain."""

@@ -72,7 +72,7 @@ def _of(topic: str, events: Sequence[Event]) -> Event:
     for event in events:
         if event.text("topic") == topic:
             return event
-    raise LocalError(f"nobody reported on {topic}")
+    raise LocalError(f"no report on {topic}")
 
 
 def _with_latency(carried: Event, listener: Event) -> Event:

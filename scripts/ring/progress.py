@@ -61,9 +61,9 @@ class ProgressReporter:
         self._console = console
         self._bar: Progress | None = None
         self._task = TaskID(0)
-        self._told = Traffic()
-        self._told_s = time.monotonic()
-        self._began_s = self._told_s
+        self._reported = Traffic()
+        self._reported_s = time.monotonic()
+        self._began_s = self._reported_s
 
     def __enter__(self) -> ProgressReporter:
         return self
@@ -78,7 +78,7 @@ class ProgressReporter:
 
     def begin_traffic(self, total: int) -> None:
         """Begin the report of ``total`` messages."""
-        self._told, self._told_s = Traffic(total), time.monotonic()
+        self._reported, self._reported_s = Traffic(total), time.monotonic()
         if self._console.is_terminal:
             columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.fields[words]}"))
             self._bar = Progress(*columns, console=self._console, transient=True)
@@ -87,14 +87,16 @@ class ProgressReporter:
 
     def traffic(self, now: Traffic) -> None:
         """Report the traffic so far; plain lines come at most every two seconds."""
-        elapsed_s = time.monotonic() - self._told_s
+        elapsed_s = time.monotonic() - self._reported_s
         if self._bar is not None:
             if elapsed_s >= 0.4:  # both sides report twice a second; a rate over a shorter time would fluctuate
-                self._bar.update(self._task, completed=now.received, words=now.words(now.rate(self._told, elapsed_s)))
-                self._told, self._told_s = now, time.monotonic()
+                self._bar.update(
+                    self._task, completed=now.received, words=now.words(now.rate(self._reported, elapsed_s))
+                )
+                self._reported, self._reported_s = now, time.monotonic()
         elif elapsed_s >= _PLAIN_EVERY_S:
-            self.step(f"{now.received}/{now.total}  {now.words(now.rate(self._told, elapsed_s))}")
-            self._told, self._told_s = now, time.monotonic()
+            self.step(f"{now.received}/{now.total}  {now.words(now.rate(self._reported, elapsed_s))}")
+            self._reported, self._reported_s = now, time.monotonic()
 
     def end_traffic(self) -> None:
         """Remove the bar."""

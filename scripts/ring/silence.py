@@ -8,9 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-__all__ = ["TOLD_FROM_S", "Silence"]
+__all__ = ["REPORTED_FROM_S", "Silence"]
 
-TOLD_FROM_S: Final = 1.5  # both ends report twice a second
+REPORTED_FROM_S: Final = 1.5  # both ends report twice a second
 
 
 @dataclass(slots=True)
@@ -52,10 +52,10 @@ class Silence:
             flow.received, flow.since_s = count, now_s
 
     def silent(self, now_s: float) -> list[tuple[str, float]]:
-        """Return the flows that have been silent for ``TOLD_FROM_S`` or longer, with seconds, longest first."""
+        """Return the flows that have been silent for ``REPORTED_FROM_S`` or longer, with seconds, longest first."""
         found = [
             (name, now_s - flow.since_s)
             for name, flow in self._flows.items()
-            if flow.is_behind and now_s - flow.since_s >= TOLD_FROM_S
+            if flow.is_behind and now_s - flow.since_s >= REPORTED_FROM_S
         ]
         return sorted(found, key=lambda each: -each[1])

@@ -86,13 +86,13 @@ def test_an_old_negative_response_delays_no_message() -> None:
     for _ in range(3):
         world.network.inject("nuc5", port, frame, mac_of(world, "nuc5", port))
         world.network.run(1)
-    nobody = of_rib(tap)
-    assert nobody
+    negative = of_rib(tap)
+    assert negative
     flow.collect()
     before = len(flow.got[SERVER])
     drops = world.switches["nuc5"].drops()[DropReason.REPLAYED]
     for number in range(20):
-        for each in nobody:
+        for each in negative:
             world.network.inject("nuc5", 0, each, mac_of(world, "nuc5"))
         flow.publish(b"message %d" % number)
         world.network.run(0.05)

@@ -96,27 +96,27 @@ def test_a52_no_provider_tells_a_machine_a_private_key(
     boot = desk.boot(shares_host=provider == "local")
     if provider == "local":
         install(tmp_path / "home", boot)
-        told = b"\n".join(path.read_bytes() for path in (tmp_path / "home").rglob("*") if path.is_file())
+        reported = b"\n".join(path.read_bytes() for path in (tmp_path / "home").rglob("*") if path.is_file())
     elif provider == "aws":
-        told = gzip.decompress(user_data(pack(boot), Setup()))
+        reported = gzip.decompress(user_data(pack(boot), Setup()))
     else:
-        told = shell_script(pack(boot), Setup()).encode()
-        told += b"\n".join(file.content for file in placed(pack(boot), Setup()))
+        reported = shell_script(pack(boot), Setup()).encode()
+        reported += b"\n".join(file.content for file in placed(pack(boot), Setup()))
     assert drawn == []
-    assert b"PRIVATE KEY" not in told
-    assert b"GDP SECRET" not in told
+    assert b"PRIVATE KEY" not in reported
+    assert b"GDP SECRET" not in reported
     assert not [path for path in boot.files if path.endswith((".key", ".delegation", ".csr", ".crt"))]
-    assert not [each for each in launchers_secrets(desk) if each in told]
+    assert not [each for each in launchers_secrets(desk) if each in reported]
 
 
 def test_a52_ec2_receives_no_private_key(desk: Desk, cloud: Cloud, aws: AwsProvider) -> None:
-    told = cloud.user_data(aws.create(spec("enrolled"), desk.boot(shares_host=False)))
-    paths = [each["path"] for each in told["write_files"]]
+    reported = cloud.user_data(aws.create(spec("enrolled"), desk.boot(shares_host=False)))
+    paths = [each["path"] for each in reported["write_files"]]
     assert f"/var/lib/fog/{TICKET_FILE}" in paths
     assert not [path for path in paths if path.endswith(".key")]
     contents = [
         base64.b64decode(each["content"]) if "encoding" in each else each["content"].encode()
-        for each in told["write_files"]
+        for each in reported["write_files"]
     ]
     assert not [each for each in contents if b"PRIVATE KEY" in each]
     assert not [each for each in launchers_secrets(desk) if any(each in content for content in contents)]
@@ -481,7 +481,7 @@ def test_a52_a_machine_enrols_in_a_flood_of_wrong_tokens(desk: Desk, tmp_path: P
 # actions of the supervisor
 
 
-class Told(Memory):
+class Recorded(Memory):
     """Provider that keeps its arguments."""
 
     def __init__(self) -> None:
@@ -505,7 +505,7 @@ def tickets(site: Site) -> Iterator[Tickets]:
 def test_a52_a_machine_whose_token_is_used_again_is_named_revoked_and_replaced(
     site: Site, journal: Journal, tickets: Tickets
 ) -> None:
-    provider, responder = Told(), Responder(tickets, site.authority)
+    provider, responder = Recorded(), Responder(tickets, site.authority)
     ours = supervisor(site, journal, provider)
     journal.want(replace(PLAN, machines=PLAN.machines[:1]), time.time())
     work(ours, lambda: "m1" in provider.boots and journal.machines("c")[0].id)
@@ -526,7 +526,7 @@ def test_a52_a_machine_whose_token_is_used_again_is_named_revoked_and_replaced(
 def test_a52_a_machine_that_enrols_when_it_is_no_longer_wanted_is_revoked(
     site: Site, journal: Journal, tickets: Tickets
 ) -> None:
-    provider, responder = Told(), Responder(tickets, site.authority)
+    provider, responder = Recorded(), Responder(tickets, site.authority)
     ours = supervisor(site, journal, provider)
     journal.want(replace(PLAN, machines=PLAN.machines[:1]), time.time())
     work(ours, lambda: "m1" in provider.boots and journal.machines("c")[0].id)
@@ -542,7 +542,7 @@ def test_a52_a_machine_that_enrols_when_it_is_no_longer_wanted_is_revoked(
 def test_a52_what_happened_while_no_supervisor_lived_is_acted_on_by_the_next(
     site: Site, journal: Journal, tickets: Tickets
 ) -> None:
-    provider = Told()
+    provider = Recorded()
     first = supervisor(site, journal, provider)
     journal.want(replace(PLAN, machines=PLAN.machines[:1]), time.time())
     work(first, lambda: "m1" in provider.boots and journal.machines("c")[0].id)

@@ -14,7 +14,7 @@ from gdp.nodes.config import ClusterConfig
 from gdp.stores.files import private, read_private, write_all
 from gdp.stores.issue import make_domain
 from gdp.stores.keyring import load_domain
-from tests.attacks.owners import NOBODY, give_away
+from tests.attacks.owners import UNKNOWN, give_away
 
 
 def key(folder: Path) -> Path:
@@ -71,8 +71,8 @@ def test_a48_a_pipe_in_place_of_a_private_key_holds_nothing_up(tmp_path: Path) -
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root trusts who called sudo")
 def test_a48_root_by_sudo_reads_the_keys_of_who_called_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = key(tmp_path / "lab")
-    os.chown(path, NOBODY, NOBODY)
-    monkeypatch.setenv("SUDO_UID", str(NOBODY))
+    os.chown(path, UNKNOWN, UNKNOWN)
+    monkeypatch.setenv("SUDO_UID", str(UNKNOWN))
     assert read_private(path) == b"secret"
 
 

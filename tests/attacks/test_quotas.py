@@ -40,7 +40,7 @@ RIB = NodeKeys.generate(Role.RIB, "rib").join(SCHOOL, DAY)
 CLOUD_SWITCH = NodeKeys.generate(Role.SWITCH, "nuc4").join(CLOUD, DAY)
 CLOUD_PROXY = NodeKeys.generate(Role.PROXY, "elsewhere").join(CLOUD, DAY)
 START = Timestamps(0.0, NOW)
-ROOM = 64  # limit of branches, in a test of how they are shared
+LIMIT = 64  # limit of branches, in a test of how they are shared
 
 
 def rib(**settings: int) -> RibCore:
@@ -224,19 +224,19 @@ def test_a17_a18_frames_to_invented_names_cause_queries_within_a_budget_and_dela
 
 
 def test_a65_one_neighbours_branches_leave_capacity_for_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gdp.switch.multicast.TREES_MAX", ROOM)
+    monkeypatch.setattr("gdp.switch.multicast.TREES_MAX", LIMIT)
     world = ring()
     multicast = world.switches["nuc1"].multicast
     own = world.switches["nuc1"].name
     domain = world.authorities["school"].root.domain
     greedy, modest = (each for each in world.switches["nuc1"].hello_protocol.all_up() if each.role is Role.SWITCH)
     through = frozenset(world.policy("school").transit)
-    for number in range(1, ROOM // 2 + 1):
+    for number in range(1, LIMIT // 2 + 1):
         topic = Name(number.to_bytes(32, "big"))
         join = Join(topic, own, own, domain, through, 1_400, 7.0, b"claim", b"", number)
         multicast.join(join, greedy, world.network.now.mono_s)
     with pytest.raises(StatementError, match="quota"):
         multicast.join(replace(join, topic=Name(b"s" * 32)), greedy, world.network.now.mono_s)
-    assert len(multicast.trees) == ROOM // 2
+    assert len(multicast.trees) == LIMIT // 2
     multicast.join(replace(join, topic=Name(b"t" * 32)), modest, world.network.now.mono_s)
-    assert len(multicast.trees) == ROOM // 2 + 1
+    assert len(multicast.trees) == LIMIT // 2 + 1

@@ -85,7 +85,7 @@ def attempt(name, act):
 
 attempt("recording", path.read_bytes)
 attempt("scratch", lambda: (scratch / "x").write_bytes(b"x"))
-attempt("beside", lambda: path.with_name("secret").read_bytes())
+attempt("sibling", lambda: path.with_name("secret").read_bytes())
 attempt("write", lambda: path.with_name("new").write_bytes(b"x"))
 attempt("alter", lambda: path.open("r+b"))
 attempt("mode", lambda: os.chmod(path, 0o777))
@@ -137,7 +137,7 @@ def test_b01_a_decoder_has_no_more_memory_and_disk_than_its_limit(found: dict[st
     assert found[act] in ("MemoryError", "OSError")
 
 
-@pytest.mark.parametrize("act", ["beside", "write", "alter", "remove", "execute", "environment"])
+@pytest.mark.parametrize("act", ["sibling", "write", "alter", "remove", "execute", "environment"])
 def test_b01_a_decoder_that_was_taken_over_reaches_no_other_file(found: dict[str, str], act: str) -> None:
     if not landlock.abi():
         pytest.skip("this kernel has no Landlock")

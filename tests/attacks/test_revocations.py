@@ -96,7 +96,7 @@ def test_a03_inventions_of_one_member_keep_no_owners_revocation_out(matters: boo
     for switch in ("nuc1", "nuc5"):
         fingerprint = parse(flow.topic.delegation.chain[-1]).fingerprint
         assert world.switches[switch]._policy.revoked.has(fingerprint, world.owner.key.public.compressed)
-    flow.outlive(nobody=True)
+    flow.outlive(negative=True)
 
 
 def test_a04_a_switch_that_restarts_does_not_believe_a_revoked_member(tmp_path: Path) -> None:
@@ -126,7 +126,7 @@ def test_a04_a_switch_that_restarts_does_not_believe_a_revoked_member(tmp_path: 
     assert flow.member.name not in {each.name for each in restarted.hello_protocol.all_up()}
     assert restarted.drops()[DropReason.REVOKED] > 0
     assert restarted.attached.get(flow.topic.name, flow.member.name) is None
-    flow.outlive(nobody=True)
+    flow.outlive(negative=True)
 
 
 def test_a04_a_restarted_switch_learns_from_its_neighbour_whatever_junk_came_in_between() -> None:
@@ -144,7 +144,7 @@ def test_a04_a_restarted_switch_learns_from_its_neighbour_whatever_junk_came_in_
     world.network.run(5)
     assert flow.member.name not in {each.name for each in restarted.hello_protocol.all_up()}
     assert restarted.attached.get(flow.topic.name, flow.member.name) is None
-    flow.outlive(nobody=True)
+    flow.outlive(negative=True)
 
 
 def test_a05_a_junk_revocation_has_nothing_verified_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -316,7 +316,7 @@ def test_a_reader_of_a_topic_whose_switch_restarted_is_refused_by_what_its_rib_k
     world.restart_switch("nuc5")
     world.network.run(10)
     assert world.switches["nuc5"].multicast.readers(flow.topic.name) == []
-    flow.outlive(nobody=True)
+    flow.outlive(negative=True)
 
 
 def test_what_was_revoked_before_it_was_used_is_refused_within_a_minute() -> None:

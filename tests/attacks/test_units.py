@@ -169,13 +169,13 @@ def test_a53_the_machines_own_programs_stay_who_they_are(home: Path, monkeypatch
 
 
 def test_a53_a_user_that_is_not_there_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(NODE_USER, "nobody-of-this-name")
+    monkeypatch.setenv(NODE_USER, "no-user-of-this-name")
 
     async def live() -> None:
         with contextlib.closing(BoundedLog(tmp_path / "log")) as log:
             ManagedProcess(Program("node", ("true",), is_users=True), tmp_path, log, lambda: None)
 
-    with pytest.raises(OSError, match="nobody-of-this-name"):
+    with pytest.raises(OSError, match="no-user-of-this-name"):
         asyncio.run(live())
 
 

@@ -17,7 +17,7 @@ TREE = {
 
 
 def test_each_gateway_comes_before_those_behind_it() -> None:
-    assert [each.gateway for each in Gateway.model_validate(TREE).walk()] == ["edge", "west", "far", "east"]
+    assert [each.gateway for each in Gateway.model_validate(TREE).traverse()] == ["edge", "west", "far", "east"]
 
 
 @pytest.mark.parametrize(("region", "gateway"), [("us-west-1", "west"), ("ap-1", "far"), ("mars-1", "edge")])
@@ -26,7 +26,7 @@ def test_a_region_is_served_by_the_gateway_that_names_it_or_by_the_first(region:
 
 
 def test_without_a_topology_one_gateway_serves_all() -> None:
-    assert list(AUTOMATIC.walk()) == [AUTOMATIC.serving("anywhere")]
+    assert list(AUTOMATIC.traverse()) == [AUTOMATIC.serving("anywhere")]
 
 
 @pytest.mark.parametrize(

@@ -63,8 +63,10 @@ def guided(decoder: Decoder, seconds: float, seed: int) -> Outcome:
         outcome.executions, outcome.refused, outcome.foreign, *rest = _NUMBERS.unpack_from(shared)
         outcome.slowest_ms, outcome.memory_ratio = rest
         for path in sorted((folder / "findings").glob("*.json")):
-            told = json.loads(path.read_text())
-            outcome.findings[told["place"]] = Finding(bytes.fromhex(told["data"]), told["error"], told["excess"])
+            reported = json.loads(path.read_text())
+            outcome.findings[reported["place"]] = Finding(
+                bytes.fromhex(reported["data"]), reported["error"], reported["excess"]
+            )
         if status != 0:
             log = (folder / "log").read_text(errors="replace")[-400:]
             crash = next(iter(folder.glob("crash-*")), None)
@@ -149,5 +151,5 @@ class _Tried:
         """Record a finding, the first of each position."""
         path = self._folder / (hashlib.sha256(place.encode()).hexdigest()[:16] + ".json")
         if not path.exists():
-            told = {"data": finding.data.hex(), "error": finding.error, "excess": finding.is_excess}
-            path.write_text(json.dumps({"place": place, **told}))
+            reported = {"data": finding.data.hex(), "error": finding.error, "excess": finding.is_excess}
+            path.write_text(json.dumps({"place": place, **reported}))

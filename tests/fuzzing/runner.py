@@ -39,7 +39,7 @@ __all__ = [
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 CORPUS: Final = ROOT / "tests" / "corpus"
-_ROOMS: Final = tuple(str(ROOT / room) for room in ("gdp", "proxy", "fog"))
+_PACKAGES: Final = tuple(str(ROOT / capacity) for capacity in ("gdp", "proxy", "fog"))
 _TRACE_EVERY: Final = 8
 _MEMORY_EVERY: Final = 16
 _MEMORY_LEAST_BYTES: Final = 4 << 10  # a shorter input counts as one of this length
@@ -208,7 +208,7 @@ def _traced(outcome: Outcome, data: bytes, seen: set[_Step]) -> bool:
 
     def trace(frame: FrameType, event: str, arg: Any) -> Any:
         code = frame.f_code
-        if not code.co_filename.startswith(_ROOMS):
+        if not code.co_filename.startswith(_PACKAGES):
             return None
         before = 0
 

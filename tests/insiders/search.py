@@ -108,11 +108,11 @@ def _found(trial: Trial, error: Exception) -> Found:
     is_exception = not isinstance(error, BrokenError)
     place = f"{type(error).__name__} {Path(last.filename).name}:{last.lineno}" if is_exception else _kind(str(error))
     at = trial.at
-    told = at if at is None or isinstance(at, str) else f"{at.what} of {at.persona.node} to {at.place.node}"
+    reported = at if at is None or isinstance(at, str) else f"{at.what} of {at.persona.node} to {at.place.node}"
     said = sum(trial.figures.count.values())
     text = "".join(traceback.format_exception(error)[-4:]) if is_exception else str(error)
     return Found(Plan(trial.plan.seed, trial.plan.acts, trial.plan.words[: said + 200], trial.plan.is_stormy),
-                 place, text, f"{told}, after {said}", is_exception)  # fmt: skip
+                 place, text, f"{reported}, after {said}", is_exception)  # fmt: skip
 
 
 def _kind(text: str) -> str:

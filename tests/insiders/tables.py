@@ -27,7 +27,7 @@ LIMITS: Final[Mapping[str, int]] = {
 }
 _CONTAINERS: Final = (dict, list, set, frozenset, deque)
 _DEEP_ITEMS: Final = 64  # items of one container that are examined
-_ROOMS: Final = "gdp."
+_PACKAGES: Final = "gdp."
 
 
 def sizes(machine: object) -> Counter[str]:
@@ -44,7 +44,7 @@ def sizes(machine: object) -> Counter[str]:
             if len(value) > found[where]:
                 found[where] = len(value)
             waiting += [(where, each) for each in _first(value)]
-        elif type(value).__module__.startswith(_ROOMS) and not isinstance(value, type | bytes | int | str | tuple):
+        elif type(value).__module__.startswith(_PACKAGES) and not isinstance(value, type | bytes | int | str | tuple):
             name = type(value).__name__
             waiting += [(f"{name}.{key}", each) for key, each in _attributes(value)]
     return found

@@ -265,7 +265,7 @@ class Trial:
         cables = list(world.cables.values()) + list(world.leads.values())
         world.network.set_link(rng.choice(cables), up=False)
 
-    def _mend_sim_link(self, rng: random.Random) -> None:
+    def _restore_sim_link(self, rng: random.Random) -> None:
         world = self.stage.world
         down = [each for each in [*world.cables.values(), *world.leads.values()] if not each.is_up]
         if down:
@@ -327,8 +327,8 @@ _CALM_ACTS: Final[tuple[_Act, ...]] = (
 _ACTS: Final[tuple[_Act, ...]] = (
     *_CALM_ACTS,
     Trial._cut_sim_link,
-    Trial._mend_sim_link,
-    Trial._mend_sim_link,
+    Trial._restore_sim_link,
+    Trial._restore_sim_link,
     Trial._restart_any,
 )
 

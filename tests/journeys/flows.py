@@ -77,13 +77,13 @@ class Flow:
         self.collect()
         return [each.hops for each in self.got[label]]
 
-    def outlive(self, *labels: str, nobody: bool = False, leases: float = 3.25) -> None:
+    def outlive(self, *labels: str, negative: bool = False, leases: float = 3.25) -> None:
         """Publish at a steady rate until three leases are over; each of these readers, or all, gets all of it in order.
 
-        Other readers that were there get none of it; ``nobody``: no reader does.
+        Other readers that were there get none of it; ``negative``: no reader does.
         """
         self.collect()
-        world, expected = self.world, () if nobody else labels or tuple(self.got)
+        world, expected = self.world, () if negative else labels or tuple(self.got)
         before = {label: len(got) for label, got in self.got.items()}
         count = ceil(leases * world.lease_s / STEP_S)
         sent = [b"outlives %d" % number for number in range(count)]

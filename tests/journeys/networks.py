@@ -282,12 +282,12 @@ class Trial:
     def _check(self, flow: Flow, label: str, count: int) -> None:
         numbers = [int.from_bytes(each.message[:4], "big") for each in flow.got[label]]
         fate = self.fate(flow.source, label)
-        told = f"{flow.source} to {label}, {fate.value}: {len(numbers)} of {count}, the last of them {numbers[-1:]}"
-        assert numbers == sorted(set(numbers)), f"doubled or out of order: {told}"
+        reported = f"{flow.source} to {label}, {fate.value}: {len(numbers)} of {count}, the last of them {numbers[-1:]}"
+        assert numbers == sorted(set(numbers)), f"doubled or out of order: {reported}"
         if fate is Fate.ALL:
-            assert numbers == list(range(count)), told
+            assert numbers == list(range(count)), reported
         elif fate is Fate.NONE:
-            assert max(numbers, default=0) * PERIOD_S <= self._faults_end_s() + PERIOD_S, told
+            assert max(numbers, default=0) * PERIOD_S <= self._faults_end_s() + PERIOD_S, reported
 
     def _check_late(self) -> None:
         """Check that members that join after the faults find their names, if every RIB still exists for them."""

@@ -240,12 +240,12 @@ def test_frames_of_strangers_add_up_at_every_switch(books: Books) -> None:
     mac = books.network._nodes[A].ports[0][1].mac
     wrong = {
         "expires": frame[:HOPS_AT] + b"\x03" + frame[HOPS_AT + 1 :],
-        "to nobody": frame[:32] + os.urandom(32) + frame[64:],
-        "of nobody": frame[:64] + os.urandom(32) + frame[96:],
+        "to unknown": frame[:32] + os.urandom(32) + frame[64:],
+        "of unknown": frame[:64] + os.urandom(32) + frame[96:],
         "altered": frame[:-1] + bytes([frame[-1] ^ 1]),
         "again": frame,
         "too short": frame[:-20],
-        "to nobody, at the end": frame[:HOPS_AT] + b"\x01" + frame[HOPS_AT + 1 : 32] + os.urandom(32) + frame[64:],
+        "to unknown, at the end": frame[:HOPS_AT] + b"\x01" + frame[HOPS_AT + 1 : 32] + os.urandom(32) + frame[64:],
     }
     for each in wrong.values():
         for sender in (mac, b"\x02evil\x00"):

@@ -25,9 +25,9 @@ def test_switch_and_rib_note_the_names_that_they_accept_once() -> None:
     flow, switches, ribs = audited()
     name, node = flow.topic.name.to_text(), flow.member.name.to_text()
     for policies in (switches, ribs):
-        told = [each for policy in policies for each in lines(policy) if (each.about, each.who) == (name, node)]
-        assert told
-        assert {(each.action, each.what) for each in told} == {("accepted", "name")}
+        reported = [each for policy in policies for each in lines(policy) if (each.about, each.who) == (name, node)]
+        assert reported
+        assert {(each.action, each.what) for each in reported} == {("accepted", "name")}
     flow.outlive()
     assert not [each for policy in (*switches, *ribs) for each in lines(policy) if each.about == name]
 
@@ -42,6 +42,6 @@ def test_a_revocation_is_noted_where_it_is_taken() -> None:
     world.network.touch("nuc1")
     world.network.run(5)
     for policy in switches:
-        (told,) = [each for each in lines(policy) if each.action == "revoked"]
-        assert (told.who, told.about) == (root.root.domain.to_text(), member.fingerprint.hex())
-    flow.outlive(nobody=True)
+        (reported,) = [each for each in lines(policy) if each.action == "revoked"]
+        assert (reported.who, reported.about) == (root.root.domain.to_text(), member.fingerprint.hex())
+    flow.outlive(negative=True)

@@ -106,4 +106,4 @@ def test_a_reader_that_leaves_takes_its_backup_along() -> None:
     world.network.touch(R)
     world.network.run(1.0)
     assert all(not switch.multicast.trees.of_topic(topic) for switch in world.switches.values())
-    flow.outlive(nobody=True)
+    flow.outlive(negative=True)

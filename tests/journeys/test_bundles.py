@@ -89,7 +89,7 @@ def test_a_writer_proxy_that_was_closed_says_nothing_after_its_goodbye() -> None
     network.run(5)
     assert tap.count(Kind.ACKNACK) == 0
     assert [writer_proxy.get_timer() for writer_proxy in writer_proxies] == [float("inf")]
-    flow.outlive(nobody=True)
+    flow.outlive(negative=True)
 
 
 def _noted(asked: list[Publisher], publisher: Publisher, *_: object) -> None:

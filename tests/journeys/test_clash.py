@@ -124,7 +124,7 @@ def test_at_one_switch_the_older_of_two_nodes_keeps_its_location_and_both_are_in
     assert not converter.attachment.is_attached
     flow.outlive()
     older = world.members[ROBOT].attachment
-    assert older.hello_protocol.clash_told_by == world.switches["nuc1"].name
+    assert older.hello_protocol.clash_reporter == world.switches["nuc1"].name
     assert converter.attachment.hello_protocol.clashes > 0
     world.network.stop(ROBOT)
     assert world.network.run(DEAD_S + 2, lambda: converter.attachment.is_attached)

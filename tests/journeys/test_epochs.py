@@ -69,4 +69,4 @@ def test_a_reader_without_the_new_epoch_reads_no_more() -> None:
     flow.publish(b"under two")
     flow.world.network.run(5)
     assert not flow.has(SERVER, 1)
-    flow.outlive(nobody=True)
+    flow.outlive(negative=True)

@@ -153,7 +153,7 @@ def test_a_tree_without_readers_is_taken_down() -> None:
     world.network.touch(SERVER)
     world.network.run(JOIN_LEASE_S + 1)
     assert not any(switch.multicast.trees.all() for switch in world.switches.values())
-    flow.outlive(nobody=True)
+    flow.outlive(negative=True)
 
 
 def test_loss_on_every_link_costs_no_message() -> None:

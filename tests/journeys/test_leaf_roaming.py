@@ -19,7 +19,7 @@ def corridor() -> Simulation:
     """Return a row of switches; a robot's leaf hangs on the first one: desk (RIB) -- hall -- lift, leaf at hall."""
     topology = Topology(
         links=(Link("desk", "hall"), Link("hall", "lift"), Link("hall", "leaf")),
-        domains=(DomainPlan("house", ("desk", "hall", "lift", "leaf")),),
+        domains=(DomainPlan("building", ("desk", "hall", "lift", "leaf")),),
         attachments=(
             Attachment("desk", "rib", "rib"), Attachment("desk", "proxy", "operator"),
             Attachment("lift", "proxy", "screen"), Attachment("leaf", "proxy", "robot"),

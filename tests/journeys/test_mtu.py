@@ -142,12 +142,12 @@ def test_a_reader_behind_a_narrow_link_shrinks_all_frames_while_it_is_there() ->
     before = largest(flow)
     flow.read_by("nuc3/narrow")
     assert network.run(2, lambda: flow.is_read_by(2))
-    beside = largest(flow)
+    neighbouring = largest(flow)
     world.members["nuc3/narrow"].leave()
     network.touch("nuc3/narrow")
     del flow.got["nuc3/narrow"]
     network.run(NEWS_S)
-    assert (before, beside, largest(flow)) == (JUMBO, 1_000, JUMBO)
+    assert (before, neighbouring, largest(flow)) == (JUMBO, 1_000, JUMBO)
     assert too_big(flow) == 0
     flow.outlive()
 

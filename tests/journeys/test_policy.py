@@ -58,7 +58,7 @@ def test_nothing_passes_where_no_allowed_way_is_left() -> None:
     flow.stream(20, 0.01)
     world.network.run(5)
     assert (flow.numbers(SERVER), tap.count(Kind.DATA)) == ([], 0)
-    flow.outlive(nobody=True)
+    flow.outlive(negative=True)
 
 
 def test_the_allowed_way_is_taken_again_when_it_is_back() -> None:
@@ -116,7 +116,7 @@ def test_a_local_topic_is_not_found_from_another_domain() -> None:
     world.network.run(5)
     assert flow.publisher.readers == 0
     assert not world.ribs["backbone"].rib._store.routes(flow.topic.name)
-    flow.outlive(nobody=True)
+    flow.outlive(negative=True)
 
 
 def test_a_local_topic_is_found_within_its_domain() -> None:

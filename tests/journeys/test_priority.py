@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gdp.client.send_scheduler import BYTES_BESIDE_URGENT
+from gdp.client.send_scheduler import BYTES_WITH_URGENT
 from gdp.frame.codec import decode
 from gdp.frame.kinds import Flag, Kind
 from tests.journeys.flows import ROBOT, SERVER, advertise, flowing, ring
@@ -57,7 +57,7 @@ def test_an_urgent_message_waits_for_no_more_than_a_chunk_of_a_best_effort_image
     member = world.members[ROBOT]
     images.publisher.publish(IMAGE)
     member.flush(world.network.now.mono_s)
-    assert sum(len(frame) for each in member.frames_to_send() for frame in each.frames) <= BYTES_BESIDE_URGENT
+    assert sum(len(frame) for each in member.frames_to_send() for frame in each.frames) <= BYTES_WITH_URGENT
     urgent.publisher.publish(b"stop")
     headers = [decode(frame) for each in member.frames_to_send() for frame in each.frames]
     assert {header.destination for header in headers} == {urgent.topic.name}

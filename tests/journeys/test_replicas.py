@@ -145,7 +145,7 @@ def test_requests_to_a_former_life_of_a_server_do_not_reach_the_new_one() -> Non
     ask(client, one, b"to the first life")
     assert work(world, one, until_s=1, have=1)
     world.network.stop(one.label)
-    ask(client, one, b"to nobody")
+    ask(client, one, b"to unknown")
     world.network.run(0.1)
     world.restart_member(one.label)
     one.got.clear()

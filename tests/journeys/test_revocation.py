@@ -72,7 +72,7 @@ def test_a_revocation_closes_a_flow_in_all_of_three_tiers(end: str, at: str) -> 
         stored = [host.rib._store.routes(flow.topic.name) for host in world.ribs.values()]
         assert not any(stored)
     assert not any(switch.multicast.trees.all() for switch in world.switches.values())
-    flow.outlive(nobody=True)
+    flow.outlive(negative=True)
 
 
 def revoke(world: Simulation, delegation: Delegation) -> None:
@@ -92,7 +92,7 @@ def test_a_publisher_whose_delegation_is_revoked_is_gone_from_every_tier() -> No
     assert {label: host.rib.names for label, host in world.ribs.items()} == {k: n - 1 for k, n in before.items()}
     assert not world.members[SERVER].writer_proxies_of(flow.topic.name)
     assert not any(switch.multicast.trees.all() for switch in world.switches.values())
-    flow.outlive(nobody=True)
+    flow.outlive(negative=True)
 
 
 def test_messages_of_a_revoked_publisher_reach_no_reader() -> None:
@@ -102,7 +102,7 @@ def test_messages_of_a_revoked_publisher_reach_no_reader() -> None:
     flow.publish(b"too late")
     flow.world.network.run(1)
     assert not flow.has(SERVER, 1)
-    flow.outlive(nobody=True)
+    flow.outlive(negative=True)
 
 
 def test_a_revoked_publisher_that_advertises_again_is_refused() -> None:
@@ -112,7 +112,7 @@ def test_a_revoked_publisher_that_advertises_again_is_refused() -> None:
     world.network.run(30)
     assert world.switches["nuc1"].drops()[DropReason.REVOKED] > 0
     assert not any(host.rib.names > 2 for host in world.ribs.values())
-    flow.outlive(nobody=True)
+    flow.outlive(negative=True)
 
 
 def test_a_reader_whose_delegation_is_revoked_gets_no_frame_more() -> None:
@@ -127,7 +127,7 @@ def test_a_reader_whose_delegation_is_revoked_gets_no_frame_more() -> None:
     world.network.run(5)
     assert tap.count(Kind.DATA) == 0
     assert not flow.has(SERVER, 1)
-    flow.outlive(nobody=True)
+    flow.outlive(negative=True)
 
 
 def test_another_reader_behind_the_same_link_reads_on_without_a_gap() -> None:
@@ -157,7 +157,7 @@ def test_a_revoked_member_is_cut_off_by_its_switch() -> None:
     world.network.run(1.5)  # a hello, and the silence that follows it
     assert world.ribs["backbone"].rib.names == 1
     assert flow.member.name not in {each.name for each in world.switches["nuc1"].hello_protocol.all_up()}
-    flow.outlive(nobody=True)
+    flow.outlive(negative=True)
 
 
 def test_a_switch_that_was_away_learns_what_was_revoked_meanwhile() -> None:
@@ -170,7 +170,7 @@ def test_a_switch_that_was_away_learns_what_was_revoked_meanwhile() -> None:
     world.network.run(5)
     assert world.switches["nuc1"].drops()[DropReason.REVOKED] > 0
     assert not world.switches["nuc1"].attached.get(flow.topic.name, flow.member.name)
-    flow.outlive(nobody=True)
+    flow.outlive(negative=True)
 
 
 @pytest.mark.parametrize("revoked", [0, 1])

@@ -113,12 +113,12 @@ def test_a_message_that_is_not_answered_ends_the_measurement() -> None:
 
 
 def test_an_absent_far_end_is_an_error_and_not_an_endless_wait(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Nobody(Echo):
+    class Silent(Echo):
         def send(self, message: bytes) -> None:
             monkeypatch.setattr(time, "monotonic", lambda: float("inf"))
 
     with pytest.raises(TimeoutError, match="never answered"):
-        exchange(Nobody(), LOAD, {})
+        exchange(Silent(), LOAD, {})
 
 
 def test_cpu_of_this_process_is_counted_where_it_is_named() -> None:
@@ -129,11 +129,11 @@ def test_cpu_of_this_process_is_counted_where_it_is_named() -> None:
                 pass
             super().send(message)
 
-    (found,) = exchange(Busy(), Load((100,), 2), {"sender": [os.getpid()], "nobody": []})
+    (found,) = exchange(Busy(), Load((100,), 2), {"sender": [os.getpid()], "none": []})
     cpu = found["cpu_s"]
     assert isinstance(cpu, dict)
     assert cpu["sender"] >= 0.0005
-    assert cpu["nobody"] == 0
+    assert cpu["none"] == 0
 
 
 def test_an_answer_has_sixteen_bytes() -> None:

@@ -63,9 +63,9 @@ def test_who_is_not_here_leaves_a_reason_in_place_of_a_figure() -> None:
 
 
 def test_a_figure_without_a_bound_is_only_printed() -> None:
-    target = rounds(ours=[1.0], theirs=[4.0]).ratio("beside", "ours", "theirs", CASE, COLUMN, None)
+    target = rounds(ours=[1.0], theirs=[4.0]).ratio("peer", "ours", "theirs", CASE, COLUMN, None)
     assert target.met is None
-    assert str(target) == "beside: measured 0.25"
+    assert str(target) == "peer: measured 0.25"
 
 
 @pytest.mark.parametrize(("share", "value"), [(0.5, 50), (0.99, 99), (1.0, 100), (0.0, 1)])

@@ -22,9 +22,9 @@ meshes = pathlib.Path(sys.argv[1])
 easy = Problem.load(meshes, "Easy")
 way = easy.solve("RRTConnect", 100.0, lambda: False).way
 asked = iter([False, True])
-told = Problem.load(meshes, "Twistycool").solve("RRTConnect", 100.0, lambda: next(asked, True)).way
+stopped = Problem.load(meshes, "Twistycool").solve("RRTConnect", 100.0, lambda: next(asked, True)).way
 ends = {"start": list(easy.start), "goal": list(easy.goal)}
-print(json.dumps({"way": [list(each) for each in way], **ends, "told": told}))
+print(json.dumps({"way": [list(each) for each in way], **ends, "stopped": stopped}))
 """
 DATA = ROOT.parent / "shared" / "data"
 MESHES = DATA / "planning"
@@ -119,7 +119,7 @@ def test_a_planner_finds_a_path_and_stops_on_command() -> None:
     said = json.loads(done.stdout)
     assert said["way"][0][:3] == pytest.approx(said["start"])
     assert said["way"][-1][:3] == pytest.approx(said["goal"])
-    assert said["told"] is None
+    assert said["stopped"] is None
 
 
 @needs_frames

@@ -161,7 +161,7 @@ def books(*arrived: Record, sent: int = 0) -> Books:
 
 def test_a_message_that_is_missing_and_was_not_reported_is_found() -> None:
     found = books(*(delivered(n) for n in (2, 3, 5)), sent=5).incomplete(lambda *_: True, SECOND_NS)
-    assert found == ["/t at R (life 1): 1 messages missing, 0 told"]
+    assert found == ["/t at R (life 1): 1 messages missing, 0 reported"]
 
 
 def test_a_loss_that_was_reported_exactly_is_accepted() -> None:

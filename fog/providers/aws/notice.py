@@ -81,8 +81,8 @@ class Metadata:
     def _ask(self, method: str, path: str, headers: dict[str, str]) -> str:
         request = Request(f"{self._url}/latest/{path}", headers=headers, method=method)
         try:
-            with self._open(request, timeout=_ANSWER_S) as told:
-                return str(told.read().decode())
+            with self._open(request, timeout=_ANSWER_S) as document:
+                return str(document.read().decode())
         except HTTPError as error:
             error.close()
             raise

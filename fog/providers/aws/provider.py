@@ -148,8 +148,8 @@ class AwsProvider:
         """
         region, instance = _split(machine)
         with asking(f"{region}: console of {instance}"):
-            told = self._clients[region].get_console_output(InstanceId=instance).get("Output", "")
-        return lines_of(told.splitlines(), program, lines)
+            reported = self._clients[region].get_console_output(InstanceId=instance).get("Output", "")
+        return lines_of(reported.splitlines(), program, lines)
 
     def shell(self, machine: str) -> list[str]:
         """Return an ssh command line.
@@ -161,7 +161,7 @@ class AwsProvider:
         region, instance = _split(machine)
         ssh = self._config.ssh
         if ssh is None:
-            raise LocalError("aws: nobody may log in: set `aws.ssh` (key_pair, sources) before machines are made")
+            raise LocalError("aws: no login is allowed: set `aws.ssh` (key_pair, sources) before machines are made")
         with asking(f"{region}: address of {instance}"):
             found = _instances(self._clients[region], filters({"instance-id": instance}))
         address = next((each.get("PublicIpAddress") or each.get("PrivateIpAddress") for each in found), None)

@@ -43,15 +43,15 @@ class DelayLine:
     def __init__(self, delay_ns: int, most_bytes: int = _WAITING_BYTES) -> None:
         self.dropped = 0
         self._delay_ns = delay_ns
-        self._room_bytes = most_bytes
+        self._free_bytes = most_bytes
         self._waiting: deque[tuple[int, int, bytes]] = deque()
 
     def put(self, arrived_ns: int, side: int, frame: bytes) -> None:
         """Queue a frame that arrived on a side."""
-        if len(frame) > self._room_bytes:
+        if len(frame) > self._free_bytes:
             self.dropped += 1
             return
-        self._room_bytes -= len(frame)
+        self._free_bytes -= len(frame)
         self._waiting.append((arrived_ns + self._delay_ns, 1 - side, frame))
 
     def poll_frames(self, now_ns: int) -> list[tuple[int, bytes]]:
@@ -59,7 +59,7 @@ class DelayLine:
         due = []
         while self._waiting and self._waiting[0][0] <= now_ns:
             _, side, frame = self._waiting.popleft()
-            self._room_bytes += len(frame)
+            self._free_bytes += len(frame)
             due.append((side, frame))
         return due
 

@@ -49,9 +49,9 @@ class MachineFile:
     def read(cls, directory: Path) -> MachineFile | None:
         """Return the record; None: the folder has no record of a machine (yet)."""
         try:
-            told = json.loads((directory / _FILE).read_bytes())
-            offer = told["spec"]["offer"]
+            document = json.loads((directory / _FILE).read_bytes())
+            offer = document["spec"]["offer"]
             offer = Offer(**{**offer, "hardware": Hardware(**offer["hardware"])})
-            return cls(**{**told, "spec": MachineSpec(**{**told["spec"], "offer": offer})})
+            return cls(**{**document, "spec": MachineSpec(**{**document["spec"], "offer": offer})})
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
             return None

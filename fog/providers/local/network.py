@@ -101,7 +101,7 @@ class Network:
         if standing.topology != self._topology:
             raise LocalError("the gateways that stand have another topology; 'fog down --all' first")
         run = self._runs.resume(standing.record.run)
-        for gateway in self._topology.walk():
+        for gateway in self._topology.traverse():
             if not gateway.replica and not standing.is_up(gateway.gateway):
                 log.warning("gateway started again gateway=%s", gateway.gateway)
                 self._start(run, standing, gateway)
@@ -132,11 +132,11 @@ class Network:
     def _find(self) -> _Standing | None:
         for record in self._runs.all():
             try:
-                told = (Path(record.files[0]) / _FILE).read_bytes()
+                document = (Path(record.files[0]) / _FILE).read_bytes()
             except OSError:
                 continue
             try:
-                topology = Gateway.model_validate_json(told)
+                topology = Gateway.model_validate_json(document)
             except ValueError as error:  # pydantic's error is a ValueError
                 raise StoreError(f"{record.files[0]}/{_FILE}: not the network that fog wrote: {error}") from error
             return _Standing(record, topology)
@@ -149,7 +149,7 @@ class Network:
         try:
             (run.directory / _FILE).write_text(self._topology.model_dump_json(), encoding="utf-8")
             standing = _Standing(run.record, self._topology)
-            gateways = list(self._topology.walk())
+            gateways = list(self._topology.traverse())
             for gateway in gateways:
                 space = standing.space(gateway.gateway)
                 run.plan_namespace(space)

@@ -79,7 +79,7 @@ class LocalProvider:
         self._directory = directory
         self._runs = RunRegistry(directory)
         self._network = Network(self._runs, topology, gateway_boot, uplink, robot)
-        named = [region for gateway in topology.walk() for region in gateway.regions]
+        named = [region for gateway in topology.traverse() for region in gateway.regions]
         self._regions = tuple(dict.fromkeys((*LOCAL_REGIONS, *named, *regions)))
 
     # the network
@@ -140,7 +140,7 @@ class LocalProvider:
     def describe(self, cluster: str) -> list[Machine]:
         """Return the machines of a cluster as they are now."""
         now_unix_s = time.time()
-        told = []
+        reported = []
         for each in list_machines(self._runs, cluster):
             machine = each.describe()
             if machine.state is MachineState.GONE:
@@ -149,8 +149,8 @@ class LocalProvider:
             elif machine.leaves_at_unix_s is not None and machine.leaves_at_unix_s < now_unix_s:
                 kill(self._runs, each.id)  # a stopped machine cannot end itself
                 machine = replace(machine, state=MachineState.GONE)
-            told.append(machine)
-        return told
+            reported.append(machine)
+        return reported
 
     def terminate(self, ids: Sequence[str]) -> None:
         """End machines and remove all their resources."""

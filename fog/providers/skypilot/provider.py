@@ -106,9 +106,9 @@ class SkyPilotProvider:
             LocalError: the labels of a machine were changed.
         """
         with self._asking(f"machines of {cluster}"):
-            told = self._sky.get(self._sky.status(refresh=self._sky.StatusRefreshMode.AUTO))
+            reported = self._sky.get(self._sky.status(refresh=self._sky.StatusRefreshMode.AUTO))
             requests = self._sky.api_status()  # unfinished requests
-        found = [machine for each in told if (machine := machine_of(each, cluster))]
+        found = [machine for each in reported if (machine := machine_of(each, cluster))]
         return found + being_made(requests, cluster, [each.id for each in found])
 
     def terminate(self, ids: Sequence[str]) -> None:
@@ -142,8 +142,8 @@ class SkyPilotProvider:
             LocalError: there is no such machine.
         """
         with self._asking(f"log of {machine}"):
-            told = self._sky.tail_logs(machine, None, follow=False, preload_content=False)
-            return lines_of((line for line in told if line), program, lines)
+            reported = self._sky.tail_logs(machine, None, follow=False, preload_content=False)
+            return lines_of((line for line in reported if line), program, lines)
 
     def shell(self, machine: str) -> list[str]:
         """Return an ssh command line; SkyPilot writes its configuration to ``~/.ssh`` of the launching user."""

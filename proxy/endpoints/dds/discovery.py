@@ -51,7 +51,7 @@ class Discovery:
             self._open(BuiltinTopicDcpsSubscription, ddspy_take_endpoint, self._end(is_writer=False)),
         ]
         profile = requested(default(latched=True, depth=_INFO_DEPTH), user_data(INFO_HASH))
-        node.read(INFO_TOPIC, INFO_TYPE, profile, self._told)
+        node.read(INFO_TOPIC, INFO_TYPE, profile, self._reported)
 
     def close(self) -> None:
         """Stop discovery."""
@@ -110,11 +110,11 @@ class Discovery:
 
         return make
 
-    def _told(self, samples: list[Sample]) -> None:
+    def _reported(self, samples: list[Sample]) -> None:
         for sample in samples:
             info = read_info(sample.raw)
             if info is not None:
-                self._survey.told(info)
+                self._survey.receive_node_info(info)
                 self._node.write_gids(info.gid_bytes)
         self._changed()
 

@@ -78,7 +78,7 @@ class GraphCache:
             self._nodes.pop(prefix, None)
             self._graph = None
 
-    def told(self, info: NodeInfo) -> None:
+    def receive_node_info(self, info: NodeInfo) -> None:
         """Record the nodes of a participant's entities."""
         self._nodes[info.participant[:_PREFIX]] = dict(info.nodes)
         self._graph = None

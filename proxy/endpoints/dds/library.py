@@ -81,9 +81,9 @@ def count_writers(reader: int) -> int:
 
 def matched_readers(writer: int) -> Sequence[int]:
     """Return the instance handles of a writer's matched readers."""
-    room = count_readers(writer)
-    found = (ct.c_uint64 * room)()
-    return found[: min(max(int(_readers(writer, found, room)), 0), room)] if room else ()
+    capacity = count_readers(writer)
+    found = (ct.c_uint64 * capacity)()
+    return found[: min(max(int(_readers(writer, found, capacity)), 0), capacity)] if capacity else ()
 
 
 def matches(entity: int, status: int) -> None:

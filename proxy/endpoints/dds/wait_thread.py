@@ -36,7 +36,7 @@ class WaitThread:
         self._set = WaitSet(participant._ref)
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._queue = deque[News]()
-        self._room = threading.Event()
+        self._capacity = threading.Event()
         self._drains: dict[int, Drain] = {}
         self._numbers = count(1)
         self._is_closing = False
@@ -77,7 +77,7 @@ class WaitThread:
             return
         for _ in range(len(self._queue)):
             self._queue.popleft()()
-            self._room.set()
+            self._capacity.set()
         if self._queue:
             self.tell()
 
@@ -85,7 +85,7 @@ class WaitThread:
         """End the thread and free everything."""
         self._is_closing = True
         self._stop.set(True)
-        self._room.set()
+        self._capacity.set()
         self._thread.join()
         self._set.delete()
         os.close(self._wake)
@@ -113,6 +113,6 @@ class WaitThread:
         self._queue.append(news)
         if len(self._queue) == 1:
             self.tell()
-        self._room.clear()
+        self._capacity.clear()
         if len(self._queue) >= _QUEUE_MAX and not self._is_closing:
-            self._room.wait()
+            self._capacity.wait()

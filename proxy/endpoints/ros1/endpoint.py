@@ -246,7 +246,7 @@ class Ros1Endpoint:
                 env=environment,
                 start_new_session=True,  # Ctrl-C goes to the proxy, which then closes the link
             )
-        self._link = IpcLink(ours, self._watch_room)
+        self._link = IpcLink(ours, self._watch_space)
         self._epoll.register(ours, select.EPOLLIN)
         for handle, held in self._held.items():
             self._establish(handle, held)
@@ -274,7 +274,7 @@ class Ros1Endpoint:
         self._failures = 0 if time.monotonic() - self._started_s > _SOUND_S else self._failures + 1
         self._start(min(0.25 * 2 ** (self._failures - 1), _DELAY_MAX_S) if self._failures else 0.0)
 
-    def _watch_room(self) -> None:
+    def _watch_space(self) -> None:
         self._epoll.modify(self._link, select.EPOLLIN | select.EPOLLOUT)
 
     def _pump(self) -> None:

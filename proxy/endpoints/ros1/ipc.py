@@ -128,7 +128,7 @@ class IpcLink:
                 views = self._write(views)
                 if not views:
                     return True
-            elif not self._make_room(kind, handle, len(payload)):
+            elif not self._free_space(kind, handle, len(payload)):
                 return False
             is_whole = len(views) == 2 and len(views[0]) == _HEAD.size
             waiting = _Waiting(views, handle if is_whole and kind in _MESSAGES else None)
@@ -229,7 +229,7 @@ class IpcLink:
                 views[0] = views[0][sent:]
         return []
 
-    def _make_room(self, kind: Kind, handle: int, size: int) -> bool:
+    def _free_space(self, kind: Kind, handle: int, size: int) -> bool:
         if self._waiting_bytes + size <= self._budget_bytes:
             return True
         if kind not in _MESSAGES:

@@ -94,7 +94,7 @@ class _Transport(xmlrpc.client.Transport):
     def parse_response(self, response: http.client.HTTPResponse) -> tuple[Any, ...]:
         """Read a response uninterpreted, unpacked and at most ``_ANSWER_MAX_BYTES`` long."""
         if response.getheader("Content-Encoding", ""):
-            raise MasterError("an answer in an encoding that nobody asked for")
+            raise MasterError("an answer in an encoding that was not asked for")
         parser, target = self.getparser()
         left = _ANSWER_MAX_BYTES
         while data := response.read(_PIECE_BYTES):

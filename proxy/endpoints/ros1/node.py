@@ -187,15 +187,15 @@ class Node:
 
     def _await_master(self) -> None:
         master = Master(self._master, self._id)
-        is_told = False
+        is_reported = False
         while not self._stopped.is_set():
             try:
                 master.ask(("getPid",))
                 return
             except MasterError as error:
-                if not is_told:
+                if not is_reported:
                     self._silent(str(error))
-                is_told = True
+                is_reported = True
             self._stopped.wait(_RETRY_S)
 
     def _join(self, handle: int) -> None:

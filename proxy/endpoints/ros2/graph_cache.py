@@ -95,10 +95,10 @@ class GraphCache:
         return known
 
     def _asked(self, topic: str) -> Iterator[GraphEntity]:
-        yield from self._told(Role.PUBLISHES, topic, self._node.get_publishers_info_by_topic(topic))
-        yield from self._told(Role.SUBSCRIBES, topic, self._node.get_subscriptions_info_by_topic(topic))
+        yield from self._reported(Role.PUBLISHES, topic, self._node.get_publishers_info_by_topic(topic))
+        yield from self._reported(Role.SUBSCRIBES, topic, self._node.get_subscriptions_info_by_topic(topic))
 
-    def _told(self, role: Role, topic: str, ends: list[TopicEnd]) -> Iterator[GraphEntity]:
+    def _reported(self, role: Role, topic: str, ends: list[TopicEnd]) -> Iterator[GraphEntity]:
         for end in ends:
             if end.node_name == self._own:
                 continue

@@ -97,8 +97,10 @@ class Books:
         self._plan = plan
         # by channel, reader, the reader's incarnation, the publisher's incarnation
         self.accounts: defaultdict[tuple[int, str, int, int], Account] = defaultdict(Account)
-        self.told: defaultdict[tuple[int, str, int], int] = defaultdict(int)  # by channel, reader, its incarnation
-        self.told_between: defaultdict[tuple[int, str, int], int] = defaultdict(
+        self.reported_losses: defaultdict[tuple[int, str, int], int] = defaultdict(
+            int
+        )  # by channel, reader, its incarnation
+        self.reported_between: defaultdict[tuple[int, str, int], int] = defaultdict(
             int
         )  # the same, of before that incarnation
         self.published: defaultdict[tuple[int, int], list[int]] = defaultdict(list)  # channel, incarnation -> moments
@@ -123,8 +125,8 @@ class Books:
                 self.published[each.channel, life].append(each.at_ns)
             elif each.kind == Kind.LOST:
                 is_between = each.other == LossReason.READER_RESTARTED
-                told = self.told_between if is_between else self.told
-                told[each.channel, member, life] += each.number
+                reported_losses = self.reported_between if is_between else self.reported_losses
+                reported_losses[each.channel, member, life] += each.number
             elif each.kind == Kind.WRONG:
                 self.wrong.append(f"{member} had, on channel {each.channel}, a message for channel {each.other}")
             elif each.kind in (Kind.CALLED, Kind.ANSWERED, Kind.FAILED):
@@ -178,15 +180,15 @@ class Books:
                 head = account.first - 1 if is_later else 0
                 least += account.missing(sent if is_last else account.last)
                 most += account.missing(max(sent, account.last)) + head
-            between = self.told_between[channel, reader, life]
+            between = self.reported_between[channel, reader, life]
             gap = sum(self._gap(channel, reader, life, source_life) for source_life, _ in accounts)
             tail = self._tail(channel, reader, life)
             if between and not gap <= between <= gap + tail + math.ceil(flow.hz * UNCONFIRMED_S):
-                found.append(f"{who}: {gap} messages missing since its former life, {between} told")
-            told = self.told[channel, reader, life]
-            if not least <= told <= most:
+                found.append(f"{who}: {gap} messages missing since its former life, {between} reported")
+            reported_losses = self.reported_losses[channel, reader, life]
+            if not least <= reported_losses <= most:
                 lack = f"{least}" if least == most else f"{least} to {most}"
-                found.append(f"{who}: {lack} messages missing, {told} told")
+                found.append(f"{who}: {lack} messages missing, {reported_losses} reported")
         return found
 
     def _gap(self, channel: int, reader: str, life: int, source_life: int) -> int:

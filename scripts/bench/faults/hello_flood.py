@@ -32,31 +32,31 @@ _ADDRESSES: Final = 10_000
 
 def main() -> None:
     """Send until the time is over."""
-    told = json.loads(sys.argv[1])
-    data, frames = Path(told["frames"]).read_bytes(), []
+    settings = json.loads(sys.argv[1])
+    data, frames = Path(settings["frames"]).read_bytes(), []
     while data:
         (size,) = struct.unpack_from("!I", data)
         frames.append(data[4 : 4 + size])
         data = data[4 + size :]
     random.shuffle(frames)
-    sources = [bytes.fromhex(told["source"])] if told["source"] else []
+    sources = [bytes.fromhex(settings["source"])] if settings["source"] else []
     sources = sources or [b"\x06" + os.urandom(5) for _ in range(_ADDRESSES)]
-    sink, drops = open_port(told["iface"]), [0] * DROP_COUNTERS
+    sink, drops = open_port(settings["iface"]), [0] * DROP_COUNTERS
     attach_drop_all_filter(sink)
     batch, at, sent = make_batch(2_000), 0, 0
     say(ready=True)
     begun_s = time.monotonic()
-    while (now_s := time.monotonic()) < begun_s + told["seconds"]:
-        due = int((now_s - begun_s) * told["rate"]) - at
+    while (now_s := time.monotonic()) < begun_s + settings["seconds"]:
+        due = int((now_s - begun_s) * settings["rate"]) - at
         if due < _BATCH:
-            time.sleep(_BATCH / told["rate"])
+            time.sleep(_BATCH / settings["rate"])
             continue
         for _ in range(min(due // _BATCH, 8)):
             chosen = [frames[(at + each) % len(frames)] for each in range(_BATCH)]
             sent += batch.send(sink, chosen, _BROADCAST + sources[(at // _BATCH) % len(sources)], drops)
             at += _BATCH
-        if due > told["rate"] / 100:
-            begun_s += (due - _BATCH) / told["rate"]  # frames that could not be sent in time are skipped
+        if due > settings["rate"] / 100:
+            begun_s += (due - _BATCH) / settings["rate"]  # frames that could not be sent in time are skipped
     say(sent=sent, seconds=time.monotonic() - begun_s)
 
 

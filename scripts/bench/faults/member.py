@@ -62,13 +62,13 @@ class Source:
     """Publishes one topic at an even rate."""
 
     def __init__(
-        self, station: Station, told: dict[str, Any], token: bytes, who: tuple[int, int], out: RecordWriter
+        self, station: Station, settings: dict[str, Any], token: bytes, who: tuple[int, int], out: RecordWriter
     ) -> None:
-        self._channel, (self._index, self._life) = told["channel"], who
-        self._publisher = station.advertise(told["name"], reliable=told["reliable"])
+        self._channel, (self._index, self._life) = settings["channel"], who
+        self._publisher = station.advertise(settings["name"], reliable=settings["reliable"])
         self._token, self._out = token, out
-        self._filler = bytes(max(told["size"] - _HEAD.size, 0))
-        self._every_s = 1.0 / told["hz"]
+        self._filler = bytes(max(settings["size"] - _HEAD.size, 0))
+        self._every_s = 1.0 / settings["hz"]
         self.due_s = time.monotonic() + random.random() * self._every_s
         self._number = 0
         self._readers = -1
@@ -92,12 +92,12 @@ class Source:
 class Caller:
     """Caller of one service at an even rate: all replicas receive the request, the first response counts."""
 
-    def __init__(self, station: Station, told: dict[str, Any], token: bytes, life: int, out: RecordWriter) -> None:
+    def __init__(self, station: Station, settings: dict[str, Any], token: bytes, life: int, out: RecordWriter) -> None:
         self._station, self._token, self._out, self._life = station, token, out, life
-        self._channel, self._timeout_s = told["channel"], told["timeout_s"]
-        self._stream, self._name = station.call(told["name"]), station.name_of(told["name"])
+        self._channel, self._timeout_s = settings["channel"], settings["timeout_s"]
+        self._stream, self._name = station.call(settings["name"]), station.name_of(settings["name"])
         self._dispatch: Dispatch[int] = Dispatch(start=random.getrandbits(62))
-        self._every_s = 1.0 / told["hz"]
+        self._every_s = 1.0 / settings["hz"]
         self.due_s = time.monotonic() + random.random() * self._every_s
         self._count = 0
 
@@ -170,7 +170,7 @@ class Reading:
 
     def __init__(self, channel: int, token: bytes, out: RecordWriter) -> None:
         self._channel, self._token, self._out = channel, token, out
-        self._told = Counter[LossReason]()
+        self._reported_counts = Counter[LossReason]()
         self._look_at_s = 0.0
 
     def look(self, station: Station, name: Name, now_s: float) -> None:
@@ -178,10 +178,10 @@ class Reading:
         if now_s < self._look_at_s:
             return
         self._look_at_s = now_s + _LOOK_S
-        told = Counter(station.member.losses_of(name).counts)
-        for reason, number in (told - self._told).items():
+        settings = Counter(station.member.losses_of(name).counts)
+        for reason, number in (settings - self._reported_counts).items():
             self._out.add(Kind.LOST, self._channel, 0, reason, number, time.monotonic_ns())
-        self._told = told
+        self._reported_counts = settings
 
     def take(self, message: Message, now_s: float) -> None:
         """Record a message; one of another channel counts as wrong."""
@@ -214,10 +214,10 @@ class Serving:
 class Churning:
     """Topic that is subscribed or published, and left, repeatedly."""
 
-    def __init__(self, station: Station, told: dict[str, Any], begin: Callable[[dict[str, Any]], None]) -> None:
-        self._station, self._told, self._begin = station, told, begin
-        self._name = station.name_of(told["name"])
-        self._every_s = 1.0 / told["hz"]
+    def __init__(self, station: Station, settings: dict[str, Any], begin: Callable[[dict[str, Any]], None]) -> None:
+        self._station, self._reported_counts, self._begin = station, settings, begin
+        self._name = station.name_of(settings["name"])
+        self._every_s = 1.0 / settings["hz"]
         self.due_s = time.monotonic() + random.random() * self._every_s
         self._is_taken_up = False
 
@@ -227,8 +227,8 @@ class Churning:
             return
         self.due_s = max(self.due_s + self._every_s, now_s)
         if not self._is_taken_up:
-            self._begin(self._told)
-        elif self._told["publishes"]:
+            self._begin(self._reported_counts)
+        elif self._reported_counts["publishes"]:
             self._station.member.withdraw(self._name)
         else:
             self._station.member.unsubscribe(self._name)
@@ -237,22 +237,22 @@ class Churning:
 
 def main() -> None:
     """Run as a member until ended."""
-    told: dict[str, Any] = json.loads(sys.argv[1])
-    out, life = RecordWriter(Path(told["records"])), told["life"]
-    tokens = {int(channel): bytes.fromhex(token) for channel, token in told["tokens"].items()}
-    station = Station(Path(told["config"]), 0.0)
+    settings: dict[str, Any] = json.loads(sys.argv[1])
+    out, life = RecordWriter(Path(settings["records"])), settings["life"]
+    tokens = {int(channel): bytes.fromhex(token) for channel, token in settings["tokens"].items()}
+    station = Station(Path(settings["config"]), 0.0)
     takers: dict[Name, Reading | Serving | Caller] = {}
-    for each in told["read"]:
+    for each in settings["read"]:
         takers[station.subscribe(each["name"])] = Reading(each["channel"], tokens[each["channel"]], out)
-    for each in told["serve"]:
+    for each in settings["serve"]:
         name = station.serve(each["name"])
         takers[name] = Serving(station, name, tokens[each["channel"]])
-    remote_clients = [Caller(station, each, tokens[each["channel"]], life, out) for each in told["call"]]
-    for each, caller in zip(told["call"], remote_clients, strict=True):
+    remote_clients = [Caller(station, each, tokens[each["channel"]], life, out) for each in settings["call"]]
+    for each, caller in zip(settings["call"], remote_clients, strict=True):
         takers[station.name_of(each["name"])] = caller
-    who = told["index"], life
-    sources = [Source(station, each, tokens[each["channel"]], who, out) for each in told["publish"]]
-    spare, churned = iter(told["spare"]), count(1)
+    who = settings["index"], life
+    sources = [Source(station, each, tokens[each["channel"]], who, out) for each in settings["publish"]]
+    spare, churned = iter(settings["spare"]), count(1)
 
     def begin_churn(each: dict[str, Any]) -> None:
         if each["publishes"]:
@@ -261,7 +261,7 @@ def main() -> None:
         else:
             takers[station.subscribe(each["name"])] = Reading(each["channel"], tokens[each["channel"]], out)
 
-    churn = [Churning(station, each, begin_churn) for each in told["churn"]]
+    churn = [Churning(station, each, begin_churn) for each in settings["churn"]]
 
     def begin_spare(*_: object) -> None:
         """Start the next spare flow."""

@@ -144,7 +144,7 @@ class Overlay:
         elif role == "rib":
             argv = ["gdp.cli.rib", "--json", "--config", str(self._rib_file(node))]
         else:
-            argv = ["faults.member", json.dumps(self._told(node, life))]
+            argv = ["faults.member", json.dumps(self._settings(node, life))]
         clock = self._clocks.get(who)
         argv = ["-m", *argv] if clock is None else ["-m", "faults.clock", str(clock.path), *argv]
         self._processes[who] = Started(self._run, f"{who} {life}", partial(self.spaces.command, node), argv)
@@ -254,9 +254,9 @@ class Overlay:
             if self.is_running(f"switch {node}"):
                 self.signal(f"switch {node}", signal.SIGHUP)
 
-    def mend(self, a: str, b: str) -> None:
+    def restore_link(self, a: str, b: str) -> None:
         """Restore a link."""
-        self.spaces.mend(a, b)
+        self.spaces.restore_link(a, b)
 
     def disturb(self, a: str, b: str, faults: FrameFaults) -> None:
         """Apply faults to the frames of a link, both ways."""
@@ -323,28 +323,28 @@ class Overlay:
         path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
         return path
 
-    def _told(self, member: str, life: int) -> dict[str, object]:
+    def _settings(self, member: str, life: int) -> dict[str, object]:
         """Return the settings of a member process: its identity, and its flows and services."""
         parts = ("publish", "read", "serve", "call", "spare", "churn")
-        told: dict[str, list[dict[str, object]]] = {part: [] for part in parts}
+        settings: dict[str, list[dict[str, object]]] = {part: [] for part in parts}
         for channel, what in self.plan.channels(member):
             if isinstance(what, Service):
                 part = {"channel": channel, "name": what.name, "hz": what.hz, "timeout_s": what.timeout_s}
-                told["serve" if member in what.servers else "call"].append(part)
+                settings["serve" if member in what.servers else "call"].append(part)
             else:
-                told["publish" if member == what.publisher else "read"].append(_flow_part(channel, what))
+                settings["publish" if member == what.publisher else "read"].append(_flow_part(channel, what))
         for channel, flow in self.plan.spares(member):
-            told["spare"].append({**_flow_part(channel, flow), "publishes": member == flow.publisher})
+            settings["spare"].append({**_flow_part(channel, flow), "publishes": member == flow.publisher})
         for channel, churn in self.plan.churns(member):
             part = {"channel": channel, "name": churn.topic, "hz": self._churn_hz, "publishes": churn.publishes}
-            told["churn"].append(part)
+            settings["churn"].append(part)
         return {
             "config": str(self.directory / f"end-{member}.yaml"),
             "records": str(self._record_file(member, life)),
             "index": self.plan.members.index(member),
             "life": life,
             "tokens": {channel: self._token(channel).hex() for channel, _ in self._parts(member)},
-            **told,
+            **settings,
         }
 
     def _record_file(self, member: str, life: int) -> Path:

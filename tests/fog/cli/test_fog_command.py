@@ -65,9 +65,9 @@ def test_where_nothing_is_up_that_is_said(fog: Run) -> None:
 
 def test_machines_and_their_stage_are_reported(fog: Run, journal: Journal) -> None:
     up(journal)
-    told = json.loads(fog("status", "--json").output)
-    assert (told["wanted"], told["serving"]) == (2, 1)
-    assert [(each["name"], each["stage"]) for each in told["members"]] == [("m1", "serving"), ("m2", "booting")]
+    reported = json.loads(fog("status", "--json").output)
+    assert (reported["wanted"], reported["serving"]) == (2, 1)
+    assert [(each["name"], each["stage"]) for each in reported["members"]] == [("m1", "serving"), ("m2", "booting")]
     assert "serving" in fog("status").output
 
 
@@ -77,8 +77,8 @@ def test_the_machine_that_is_the_gateway_is_reported(fog: Run, journal: Journal)
         journal.put(each, time.time())
     gone = replace(serving("m3"), gateway="edge").ended(Outcome.TAKEN, "killed", time.time())
     journal.put(gone, time.time())
-    told = json.loads(fog("status", "--all", "--json").output)
-    assert [each["gateway"] for each in told["members"]] == ["edge", None, None]
+    reported = json.loads(fog("status", "--all", "--json").output)
+    assert [each["gateway"] for each in reported["members"]] == ["edge", None, None]
     (line,) = (each for each in fog("status").output.splitlines() if each.startswith("m1"))
     assert line.split()[:3] == ["m1", "serving", "edge"]
 
@@ -87,8 +87,8 @@ def test_the_machine_that_is_the_gateway_is_reported(fog: Run, journal: Journal)
 def test_a_dry_run_says_which_gateway_a_machine_is_behind(fog: Run, kind: str) -> None:
     words = ["launch", str(ROOT / "examples" / "echo.launch.py"), "--dry-run", "--gateway", kind]
     is_replica = kind == "replica"
-    told = json.loads(fog(*words, "--json").output)
-    assert {each["gateway"]["replica"] for each in told["machines"]} == {is_replica}
+    reported = json.loads(fog(*words, "--json").output)
+    assert {each["gateway"]["replica"] for each in reported["machines"]} == {is_replica}
     assert ("gateway gateway: one of these machines" in fog(*words).output) is is_replica
 
 
@@ -103,9 +103,9 @@ def test_where_a_file_states_the_site_no_option_does(fog: Run, tmp_path: Path) -
 
 def test_cost_is_price_by_time(fog: Run, journal: Journal) -> None:
     up(journal)
-    (told,) = json.loads(fog("cost", "--json").output)
-    assert told["usd_ever"] == pytest.approx(2 * 0.1 * 0.5, rel=0.02)
-    assert told["usd_per_hour"] == pytest.approx(0.2)
+    (reported,) = json.loads(fog("cost", "--json").output)
+    assert reported["usd_ever"] == pytest.approx(2 * 0.1 * 0.5, rel=0.02)
+    assert reported["usd_per_hour"] == pytest.approx(0.2)
 
 
 def test_events_are_printed_as_lines_of_json(fog: Run, journal: Journal) -> None:
@@ -124,8 +124,8 @@ def test_the_last_replica_is_not_scaled_away(fog: Run, journal: Journal) -> None
 def test_a_dry_run_shows_the_price_and_changes_nothing(fog: Run, journal: Journal) -> None:
     up(journal)
     assert json.loads(fog("scale", "up", "--dry-run", "--json").output)["usd_per_hour"] > 0
-    told = json.loads(fog("launch", str(ROOT / "examples" / "echo.launch.py"), "--dry-run", "--json").output)
-    assert (len(told["machines"]), told["usd_per_hour"] > 0) == (2, True)
+    reported = json.loads(fog("launch", str(ROOT / "examples" / "echo.launch.py"), "--dry-run", "--json").output)
+    assert (len(reported["machines"]), reported["usd_per_hour"] > 0) == (2, True)
     assert [each.plan.name for each in journal.clusters()] == ["c"]
 
 
@@ -167,8 +167,8 @@ def test_a_regions_latency_is_shown(fog: Run, journal: Journal, tmp_path: Path) 
     (tmp_path / "fog.yaml").write_text(
         f"domain: {site.authority.domain}\nowner: {site.authority.owner}\nlatency_ms: {{east: 12, west: 80.5}}\n"
     )
-    told = json.loads(fog("status", "--json").output)
-    assert [each["latency_ms"] for each in told["members"]] == [12, 80.5]
+    reported = json.loads(fog("status", "--json").output)
+    assert [each["latency_ms"] for each in reported["members"]] == [12, 80.5]
     assert "80.5" in fog("status").output
 
 

@@ -100,7 +100,7 @@ def test_a_machine_asks_until_its_launcher_is_there(desk: Desk, tmp_path: Path) 
 
 def test_a_machine_gives_up_without_an_answer(desk: Desk, tmp_path: Path) -> None:
     install(tmp_path / "home", desk.boot())
-    with pytest.raises(LocalError, match=r"nobody let this machine enrol.*socket"):
+    with pytest.raises(LocalError, match=r"this machine was not enrolled.*socket"):
         enrol(tmp_path / "home", patience_s=0.1)
 
 

@@ -22,7 +22,7 @@ from fog.machine import MachineBundle, MachineState, Program
 _PATIENCE_S = 20.0
 SAYS_READY = "import signal, sys, time; print('now ready'); "
 WAITS = SAYS_READY + "time.sleep(1000)"
-TELLS = "signal.signal({}, lambda *_: (open('told', 'a').write('{} '), sys.exit())); "
+TELLS = "signal.signal({}, lambda *_: (open('signalled', 'a').write('{} '), sys.exit())); "
 
 Start = Callable[..., "subprocess.Popen[str]"]
 
@@ -90,8 +90,8 @@ def test_programs_are_ended_in_the_reverse_order(start: Start, tmp_path: Path) -
     until(tmp_path, running)
     host.terminate()
     said, _ = host.communicate(timeout=_PATIENCE_S)
-    assert (tmp_path / "told").read_text() == "b a "
-    assert said == "machine ends: was told to end\n"
+    assert (tmp_path / "signalled").read_text() == "b a "
+    assert said == "machine ends: was asked to end\n"
     last = Status.read(tmp_path)
     assert last is not None
     assert last.state is MachineState.GONE
@@ -127,7 +127,7 @@ def test_a_drained_machine_lets_its_proxy_finish_before_the_rest_ends(start: Sta
     until(tmp_path, running)
     host.send_signal(signal.SIGUSR1)
     host.wait(timeout=_PATIENCE_S)
-    assert (tmp_path / "told").read_text() == "proxy node switch "
+    assert (tmp_path / "signalled").read_text() == "proxy node switch "
     status = Status.read(tmp_path)
     assert status is not None
     assert status.reason == "drained"

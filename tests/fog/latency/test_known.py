@@ -44,8 +44,8 @@ def test_what_is_known_says_where_it_comes_from(tmp_path: Path, probes: Probes) 
     known = Latencies(tmp_path, CONFIG, {"stated": 7.0}, probes)
     assert known.of(["near"], 1_000.0)["near"].source == "not measured yet: tcp://127.0.0.1:1"
     known.refresh(["near", "far", "stated"], 1_000.0)
-    told = {name: (each.ms, each.source) for name, each in known.of(["near", "far", "stated"], 1_030.0).items()}
-    assert told == {
+    reported = {name: (each.ms, each.source) for name, each in known.of(["near", "far", "stated"], 1_030.0).items()}
+    assert reported == {
         "near": (1.5, "measured 30s ago, tcp://127.0.0.1:1"),
         "far": (None, "unreachable 30s ago: udp://far.example:7: Connection refused"),
         "stated": (7.0, "latency_ms of fog.yaml"),

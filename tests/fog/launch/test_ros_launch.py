@@ -101,9 +101,9 @@ def launched(
 def test_the_robots_nodes_start_when_the_cluster_serves_and_it_ends_with_them(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    told = launched(monkeypatch, tmp_path)
-    assert told.lines == ["launch", "robot", "down"]
-    assert (told.code, told.left) == (0, [])
+    reported = launched(monkeypatch, tmp_path)
+    assert reported.lines == ["launch", "robot", "down"]
+    assert (reported.code, reported.left) == (0, [])
 
 
 def test_lists_of_parameters_reach_the_cloud(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -119,8 +119,8 @@ def test_a_kept_cluster_outlives_its_launch(monkeypatch: pytest.MonkeyPatch, tmp
 def test_a_cluster_that_does_not_start_ends_the_launch_with_its_reason(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    told = launched(monkeypatch, tmp_path, code=3)
-    assert (told.lines, told.code) == (["launch", "down"], 1)
+    reported = launched(monkeypatch, tmp_path, code=3)
+    assert (reported.lines, reported.code) == (["launch", "down"], 1)
     said = "".join(capfd.readouterr())
     assert "[launch]: Caught exception in launch" in said
     assert "cluster e did not start: no machine is to be had" in said
@@ -145,8 +145,8 @@ def test_a_cluster_that_something_else_is_to_launch_is_left_to_it(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     body = "cluster = CLUSTER; return LaunchDescription([robot, OpaqueFunction(function=lambda _: [cluster])])"
-    told = launched(monkeypatch, tmp_path, body)
-    assert (sorted(told.lines), told.code) == (["down", "launch", "robot"], 0)
+    reported = launched(monkeypatch, tmp_path, body)
+    assert (sorted(reported.lines), reported.code) == (["down", "launch", "robot"], 0)
 
 
 def test_a_second_launch_file_of_the_same_process_is_watched_as_well(
@@ -154,8 +154,8 @@ def test_a_second_launch_file_of_the_same_process_is_watched_as_well(
 ) -> None:
     for name in ("first", "second"):
         (folder := tmp_path / name).mkdir()
-        told = launched(monkeypatch, folder, "CLUSTER; return LaunchDescription([robot])")
-        assert told.lines == ["launch", "robot", "down"]
+        reported = launched(monkeypatch, folder, "CLUSTER; return LaunchDescription([robot])")
+        assert reported.lines == ["launch", "robot", "down"]
 
 
 def test_a_launch_file_that_imports_too_late_to_be_watched_is_refused(

@@ -61,7 +61,7 @@ def main() -> None:
     def dry_run(**changes: str) -> str:
         return outcome(lambda: provider.dry_run(replace(spec, offer=replace(spec.offer, **changes)), boot))
 
-    told = {
+    reported = {
         "enabled": list(enabled.values()),
         "offers": [asdict(each) for each in offers],
         "gpu": [each.type_name for each in provider.offers(Hardware.from_text("T4"), spot=False)],
@@ -72,7 +72,7 @@ def main() -> None:
         "machines": outcome(lambda: provider.describe("a-demo")),
         "terminate": outcome(lambda: provider.terminate(["fog-a-demo-m1"])),
     }
-    sys.__stdout__.write(f"\n{json.dumps(told)}\n")  # type: ignore[union-attr]
+    sys.__stdout__.write(f"\n{json.dumps(reported)}\n")  # type: ignore[union-attr]
 
 
 if __name__ == "__main__":

@@ -55,8 +55,8 @@ class Cloud:
 
     def user_data(self, machine: str) -> dict:
         region, instance = machine.split("/")
-        told = self.client(region).describe_instance_attribute(InstanceId=instance, Attribute="userData")
-        return yaml.safe_load(gzip.decompress(base64.b64decode(told["UserData"]["Value"])))
+        reported = self.client(region).describe_instance_attribute(InstanceId=instance, Attribute="userData")
+        return yaml.safe_load(gzip.decompress(base64.b64decode(reported["UserData"]["Value"])))
 
 
 def config(**settings: object) -> AwsConfig:
@@ -143,8 +143,8 @@ def test_a_clusters_name_may_come_again(cloud: Cloud, aws: AwsProvider) -> None:
 
 
 def test_a_machine_gets_its_boot_and_the_watcher(cloud: Cloud, aws: AwsProvider) -> None:
-    told = cloud.user_data(aws.create(spec("boot"), BOOT))
-    written = {each["path"]: each for each in told["write_files"]}
+    reported = cloud.user_data(aws.create(spec("boot"), BOOT))
+    written = {each["path"]: each for each in reported["write_files"]}
     assert written["/var/lib/fog/proxy.yaml"] == {
         "path": "/var/lib/fog/proxy.yaml",
         "permissions": "0600",
@@ -228,7 +228,7 @@ def test_where_the_market_may_not_be_asked_the_catalogue_holds(
 
 
 @pytest.mark.parametrize(
-    ("code", "expected", "told"),
+    ("code", "expected", "reported"),
     [
         ("InsufficientInstanceCapacity", StoreError, "to be had there now"),
         ("SpotMaxPriceTooLow", StoreError, "spot price"),
@@ -243,10 +243,10 @@ def test_a_refusal_says_what_may_be_done(
     monkeypatch: pytest.MonkeyPatch,
     code: str,
     expected: type[Exception],
-    told: str,
+    reported: str,
 ) -> None:
     cloud.refuse(monkeypatch, code)
-    with pytest.raises(expected, match=told):
+    with pytest.raises(expected, match=reported):
         aws.create(spec("refused"), BOOT)
 
 
@@ -254,8 +254,8 @@ def test_an_ec2_that_is_not_there_may_be_asked_again(cloud: Cloud, monkeypatch: 
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
     monkeypatch.setattr("fog.providers.aws.clients._ATTEMPTS", 1)
     away = provider()
-    with pytest.raises(StoreError, match="machines of nobody"):
-        away.describe("nobody")
+    with pytest.raises(StoreError, match="machines of unknown"):
+        away.describe("unknown")
     away.close()
 
 
@@ -264,7 +264,7 @@ def test_missing_credentials_are_named(cloud: Cloud, monkeypatch: pytest.MonkeyP
     monkeypatch.delenv("AWS_SECRET_ACCESS_KEY")
     stranger = provider()
     with pytest.raises(LocalError, match="credentials"):
-        stranger.describe("nobody")
+        stranger.describe("unknown")
     stranger.close()
 
 
@@ -286,8 +286,8 @@ def test_without_chosen_regions_all_of_the_account_are_taken(cloud: Cloud) -> No
 def test_a_programs_lines_are_found_in_the_console(
     cloud: Cloud, aws: AwsProvider, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told = "[1.0] switch[7]: up\n[1.1] proxy[8]: up\n[1.2] kernel: up\n[1.3] fog-machine[5]: ends\n"
-    monkeypatch.setattr("moto.ec2.responses.general.SAMPLE_CONSOLE_OUTPUT", told)
+    reported = "[1.0] switch[7]: up\n[1.1] proxy[8]: up\n[1.2] kernel: up\n[1.3] fog-machine[5]: ends\n"
+    monkeypatch.setattr("moto.ec2.responses.general.SAMPLE_CONSOLE_OUTPUT", reported)
     made = aws.create(spec("console"), BOOT)
     assert aws.log(made, "switch", 5) == "[1.0] switch[7]: up"
     assert aws.log(made, "", 5) == "[1.3] fog-machine[5]: ends"

@@ -24,13 +24,13 @@ DRAIN = "/latest/meta-data/tags/instance/fog-drain"
 LEAVES_AT = 1_505_722_920.0  # 2017-09-18T08:22:00Z
 MACHINE = """
 import json, signal, subprocess, sys
-told = {signal.SIGUSR1, signal.SIGUSR2}
-signal.pthread_sigmask(signal.SIG_BLOCK, told)  # before there is any other thread, which might take one
+watched = {signal.SIGUSR1, signal.SIGUSR2}
+signal.pthread_sigmask(signal.SIG_BLOCK, watched)  # before there is any other thread, which might take one
 program = subprocess.Popen(sys.argv[1:], stdout=subprocess.PIPE, text=True)
-signals = sorted(signal.Signals(signal.sigwait(told)).name for _ in told)
+signals = sorted(signal.Signals(signal.sigwait(watched)).name for _ in watched)
 program.terminate()
 words, _ = program.communicate()
-print(json.dumps({"signals": signals, "exit": program.returncode, "told": words.splitlines()}))
+print(json.dumps({"signals": signals, "exit": program.returncode, "printed": words.splitlines()}))
 """
 
 
@@ -39,7 +39,7 @@ class Service(ThreadingHTTPServer):
 
     def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), Answer)
-        self.told: dict[str, str] = {}
+        self.reported: dict[str, str] = {}
         self.token = "first"
         self.tokens_given = 0
 
@@ -59,8 +59,8 @@ class Answer(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         if self.headers["X-aws-ec2-metadata-token"] != self.server.token:
             self.reply(401, "")
-        elif self.path in self.server.told:
-            self.reply(200, self.server.told[self.path])
+        elif self.path in self.server.reported:
+            self.reply(200, self.server.reported[self.path])
         else:
             self.reply(404, "")
 
@@ -97,7 +97,7 @@ class Seen:
 
 
 def interrupt(service: Service) -> None:
-    service.told[ACTION] = json.dumps({"action": "terminate", "time": "2017-09-18T08:22:00Z"})
+    service.reported[ACTION] = json.dumps({"action": "terminate", "time": "2017-09-18T08:22:00Z"})
 
 
 def test_a_machine_that_may_stay_hears_nothing(service: Service) -> None:
@@ -118,7 +118,7 @@ def test_a_notice_is_reported_at_once_and_the_machine_drains_in_time(service: Se
 
 def test_the_owners_tag_drains_at_once(service: Service) -> None:
     seen = Seen(service)
-    service.told[DRAIN] = "1"
+    service.reported[DRAIN] = "1"
     assert seen.watch.look(0.0)
     assert (seen.notices, seen.drains) == ([], 1)
 
@@ -136,7 +136,7 @@ def test_an_expired_token_is_replaced(service: Service) -> None:
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"time": 3}', '{"time": "soon"}', "\u00e4"])
 def test_nonsense_is_an_error_that_may_pass(service: Service, text: str) -> None:
     seen = Seen(service)
-    service.told[ACTION] = text
+    service.reported[ACTION] = text
     with pytest.raises(OSError, match=r"makes no sense|metadata"):
         seen.watch.look(0.0)
     interrupt(service)
@@ -152,13 +152,13 @@ def test_the_program_tells_the_machine_and_waits_to_be_ended(service: Service, t
     assert json.loads(done.stdout) == {
         "signals": ["SIGUSR1", "SIGUSR2"],  # the moment is long past
         "exit": 0,
-        "told": ["EC2 takes this machine at 1505722920", "the machine drains"],
+        "printed": ["EC2 takes this machine at 1505722920", "the machine drains"],
     }
     assert read_notice(tmp_path) == LEAVES_AT
 
 
 def test_a_machine_ends_well_when_its_owner_drains_it(service: Service, tmp_path: Path) -> None:
-    service.told[DRAIN] = "1"
+    service.reported[DRAIN] = "1"
     home = tmp_path / "machine"
     watcher = replace(WATCHER, argv=(*WATCHER.argv, "--url", service.url, "--poll-s", "0.01"))
     install(home, MachineBundle({}, (watcher,)))

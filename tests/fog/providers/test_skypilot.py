@@ -279,17 +279,20 @@ def test_the_real_package_takes_our_tasks_in_a_dry_run(home: Path) -> None:
     finally:
         server.stop()
     assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout.splitlines()[-1])
-    assert told["enabled"] == [["AWS"]]
-    assert [(each["region"], each["usd_per_hour"]) for each in told["offers"]] == [("aws/us-west-2", 0.2), (EAST, 0.25)]
-    assert told["offers"][0]["hardware"] == {"cpus": 16, "memory_gib": 64.0, "gpu": "", "gpus": 0}
-    assert (told["gpu"], told["none"]) == (["g4dn.xlarge"], [])
-    assert told["dry run"] == "None"
-    assert told["no such type"].startswith("LocalError")
-    assert "nope.large" in told["no such type"]
-    assert told["no such region"].startswith("LocalError")
-    assert "nowhere" in told["no such region"]
-    assert (told["machines"], told["terminate"]) == ("[]", "None")
+    reported = json.loads(done.stdout.splitlines()[-1])
+    assert reported["enabled"] == [["AWS"]]
+    assert [(each["region"], each["usd_per_hour"]) for each in reported["offers"]] == [
+        ("aws/us-west-2", 0.2),
+        (EAST, 0.25),
+    ]
+    assert reported["offers"][0]["hardware"] == {"cpus": 16, "memory_gib": 64.0, "gpu": "", "gpus": 0}
+    assert (reported["gpu"], reported["none"]) == (["g4dn.xlarge"], [])
+    assert reported["dry run"] == "None"
+    assert reported["no such type"].startswith("LocalError")
+    assert "nope.large" in reported["no such type"]
+    assert reported["no such region"].startswith("LocalError")
+    assert "nowhere" in reported["no such region"]
+    assert (reported["machines"], reported["terminate"]) == ("[]", "None")
 
 
 def test_names_too_long_for_a_label_are_refused() -> None:

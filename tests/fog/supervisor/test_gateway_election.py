@@ -72,7 +72,7 @@ def test_the_fittest_machine_becomes_the_gateway(group: list[Record], name: str,
         [silent(gateway(serving("m1")), NOW_S - 20), serving("m2")],
     ],
     ids=[
-        "nobody",
+        "no candidate",
         "gone",
         "alone",
         "not made",

@@ -57,7 +57,7 @@ def test_where_none_is_heard_the_way_is_suspected_before_the_machines() -> None:
 
 def test_nothing_is_decided_while_the_overlay_cannot_be_queried() -> None:
     silent = replace(serving("m1"), unreachable_unix_s=NOW_S - 50.0)
-    assert decide((SPOT,), [silent], NOW_S, PATIENCE, told=False) == []
+    assert decide((SPOT,), [silent], NOW_S, PATIENCE, liveness_known=False) == []
 
 
 def test_a_machine_that_never_serves_is_given_up() -> None:

@@ -42,7 +42,7 @@ class Memory:
     def create(self, spec: MachineSpec, boot: MachineBundle) -> str:
         if self.refuses:
             self.refuses -= 1
-            raise StoreError("no room")
+            raise StoreError("no capacity")
         self.machines[spec.name] = Machine(f"id-{spec.name}", spec, MachineState.RUNNING, time.time())
         return f"id-{spec.name}"
 
@@ -192,7 +192,7 @@ def test_a_refusal_is_reported_and_tried_elsewhere(site: Site, journal: Journal)
     journal.want(PLAN, time.time())
     work(ours, lambda: len(serving(journal)) == 2)
     ours.close()
-    assert next(each for each in journal.events("c") if each.what == "refused").detail == "no room"
+    assert next(each for each in journal.events("c") if each.what == "refused").detail == "no capacity"
 
 
 def test_a_spent_budget_ends_a_cluster(site: Site, journal: Journal) -> None:
@@ -259,8 +259,8 @@ def test_after_its_start_a_supervisor_says_when_all_was_looked_at(site: Site, jo
     begun_s = time.time() - 1.5
     ours.reconciled(begun_s)
     ours.close()
-    told = journal.events("c")[-1]
-    assert (told.what, told.since_unix_s, told.detail[:3]) == ("reconciled", begun_s, "1.5")
+    reported = journal.events("c")[-1]
+    assert (reported.what, reported.since_unix_s, reported.detail[:3]) == ("reconciled", begun_s, "1.5")
 
 
 def test_a_region_that_is_nearer_is_taken_and_said(site: Site, journal: Journal) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from gdp.client.publisher import Publisher
 from gdp.client.sequence_numbers import SequenceState
-from gdp.crypto.envelope import SIGNATURE_BYTES, Sealer, part_room
+from gdp.crypto.envelope import SIGNATURE_BYTES, Sealer, fragment_capacity
 from gdp.errors import DropReason, LocalError
 from gdp.frame.codec import Header, decode
 from gdp.frame.kinds import Flag, Kind
@@ -64,7 +64,7 @@ def test_a_message_alone_is_sealed_alone_and_at_once() -> None:
 
 
 def test_a_bundle_is_bounded_and_that_of_a_best_effort_topic_is_one_frame() -> None:
-    for reliable, bound in ((True, -(-(BUNDLE_BYTES + SIGNATURE_BYTES) // part_room(1_500))), (False, 1)):
+    for reliable, bound in ((True, -(-(BUNDLE_BYTES + SIGNATURE_BYTES) // fragment_capacity(1_500))), (False, 1)):
         pipe, _ = live(publisher_of(reliable=reliable))
         publish(pipe.publisher, SMALL)
         pipe.run(1.0)
@@ -143,11 +143,11 @@ def test_undelivered_messages_are_bounded_in_memory_and_evictions_are_counted_in
         assert count * len(message) < 4 * WINDOW_BYTES
         publish(publisher, [message] * 50)
         count += 50
-    assert not publisher.has_room() or not reliable
+    assert not publisher.has_space() or not reliable
     end.loss = 0.0
     pipe.run(60.0, publisher.is_acknowledged)
     assert len(end.delivered) + publisher.drops[DropReason.MEMORY_FULL] == count == publisher.messages
-    assert publisher.has_room()
+    assert publisher.has_space()
 
 
 @pytest.mark.parametrize("reliable", [True, False])

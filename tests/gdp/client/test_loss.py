@@ -91,7 +91,7 @@ def test_a_suspended_reader_delays_no_other_and_gets_what_it_lacks_when_it_retur
     pipe.run(READER_LEASE_S + 1.0)
     for _ in range(60):
         pipe.publish([bytes(100_000)])
-        assert pipe.publisher.has_room()
+        assert pipe.publisher.has_space()
     assert pipe.run(3.0, lambda: len(stays.delivered) == 60)
     silence(moves, is_silent=False)
     assert pipe.run(10.0, lambda: len(moves.delivered) == 60)
@@ -124,7 +124,7 @@ def test_what_a_full_window_pushes_out_of_a_suspended_reader_is_lost_and_named()
     pipe.run(READER_LEASE_S + 1.0)
     for _ in range(50):
         pipe.publish([bytes(1 << 20)])
-        assert pipe.publisher.has_room()
+        assert pipe.publisher.has_space()
     gone = pipe.publisher.drops[DropReason.MEMORY_FULL]
     assert WINDOW_BYTES // (1 << 20) - 4 < 50 - gone < WINDOW_BYTES // (1 << 20)  # frames have headers, too
     silence(end, is_silent=False)

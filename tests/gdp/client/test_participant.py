@@ -17,7 +17,7 @@ from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, advertise, flowing, r
 ROUNDS = 10_000
 
 
-def again(flow: Flow, *, reliable: bool = True, depth: int = 0, description: bytes = b"described anew") -> None:
+def again(flow: Flow, *, reliable: bool = True, depth: int = 0, description: bytes = b"described again") -> None:
     """Advertise a withdrawn topic again."""
     flow.publisher = flow.member.advertise(flow.topic, description, reliable=reliable, depth=depth)
     flow.world.network.touch(flow.source)
@@ -49,7 +49,7 @@ def test_a_topic_may_come_back_as_something_else() -> None:
     assert flow.world.network.run(5, lambda: flow.has(SERVER, 3))
     assert [each.message for each in flow.got[SERVER]] == [b"reliable", b"2", b"3"]
     (writer_proxy,) = flow.world.members[SERVER].writer_proxies_of(flow.topic.name)
-    assert writer_proxy.description == b"described anew"
+    assert writer_proxy.description == b"described again"
 
 
 def test_messages_of_a_withdrawn_name_reach_no_reader() -> None:

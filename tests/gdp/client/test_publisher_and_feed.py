@@ -70,7 +70,7 @@ def test_a_best_effort_topic_never_waits_for_what_is_lost() -> None:
 
 def test_without_a_reader_nothing_is_sealed_and_the_loss_is_counted() -> None:
     publisher = publisher_of()
-    assert publisher.publish(b"nobody") is None
+    assert publisher.publish(b"no reader") is None
     assert publisher.poll_frames(0.0) == []
     assert publisher.drops[DropReason.NO_READER] == 1
 
@@ -243,7 +243,7 @@ def test_nothing_of_the_plaintext_stands_in_any_frame() -> None:
     pipe = Pipe(publisher_of())
     end = pipe.join(b"a", loss=0.1)
     pipe.run(1.0, lambda: end.writer_proxy.state is WriterProxyState.LIVE)
-    secret_text = b"the robot stands in room 217 "
+    secret_text = b"the robot stands in hall 217 "
     pipe.publish([secret_text * 300])
     assert pipe.run(30.0, pipe.publisher.is_acknowledged)
     seen = b"\0".join(pipe.seen)

@@ -102,5 +102,5 @@ def test_what_is_taken_has_no_reason() -> None:
 
 
 def test_a_response_that_names_the_name_itself_without_an_advertisement_is_negative() -> None:
-    assert Response(A, A, b"", C, (), 2.0).is_nobody
-    assert not Response(A, B, b"", C, (), 0.0).is_nobody
+    assert Response(A, A, b"", C, (), 2.0).is_negative
+    assert not Response(A, B, b"", C, (), 0.0).is_negative

@@ -19,7 +19,7 @@ from gdp.crypto.envelope import (
     MessageKeys,
     Opener,
     Sealer,
-    part_room,
+    fragment_capacity,
     seal_key,
 )
 from gdp.crypto.keys import PublicKey, SigningKey
@@ -112,7 +112,7 @@ def test_what_was_sealed_opens_and_no_frame_passes_the_mtu(message: bytes, mtu: 
 
 @pytest.mark.parametrize("beyond", [-1, 0, 1])
 def test_the_signature_gets_a_part_of_its_own_only_where_it_must(beyond: int) -> None:
-    fits = part_room(MTU) - SIGNATURE_BYTES
+    fits = fragment_capacity(MTU) - SIGNATURE_BYTES
     frames = seal(1, bytes(fits + beyond))
     assert len(frames) == (2 if beyond > 0 else 1)
     assert [bool(decode(frame).flags & Flag.LAST) for frame in frames] == [False] * (len(frames) - 1) + [True]

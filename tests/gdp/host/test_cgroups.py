@@ -59,11 +59,11 @@ def test_a_bound_on_memory_holds(group: Cgroup) -> None:
 
 def test_bounds_are_set_and_taken_off(group: Cgroup) -> None:
     small = (0.025, {"1000 40000", "1000"})  # a longer period, because the kernel takes no quota below 1 ms
-    for cpus, told in ((0.5, {"10000 20000", "10000"}), small, (None, {"max 20000", "-1"})):
+    for cpus, reported in ((0.5, {"10000 20000", "10000"}), small, (None, {"max 20000", "-1"})):
         group.limit_cpu(cpus)
         files = [path for folder in found(group.name) for path in folder.glob("cpu.[mc]*")]
         values = {path.read_text().strip() for path in files if path.name in ("cpu.max", "cpu.cfs_quota_us")}
-        assert values <= told
+        assert values <= reported
         assert values
 
 

@@ -208,9 +208,9 @@ def test_a_full_window_says_so_and_lets_the_oldest_go_at_twice_its_budget() -> N
     window = SendWindow(budget_bytes=10 * PART)
     window.add_reader(A, 1, 0.0)
     for number in range(1, 11):
-        assert window.has_room()
+        assert window.has_space()
         put(window, number, message(number, 1))
-    assert not window.has_room()
+    assert not window.has_space()
     for number in range(11, 26):
         put(window, number, message(number, 1))
     assert window.evicted == 5

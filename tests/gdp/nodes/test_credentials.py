@@ -67,7 +67,7 @@ def test_another_nodes_certificate_is_refused(site: Site, tmp_path: Path, caplog
     assert not caplog.records, "it may be half of a change"
     site.look()
     site.look()
-    assert [each.levelno for each in caplog.records] == [logging.ERROR], "told once"
+    assert [each.levelno for each in caplog.records] == [logging.ERROR], "logged once"
     assert site.identity.member is before
 
 

@@ -69,8 +69,8 @@ def test_an_expired_one_is_reported_and_left_out(
 ) -> None:
     give(tmp_path, OTHER, [Right.READ], ago_s=5 * 86_400)
     assert [topic.name for topic in held(tmp_path, robot)] == [name(tmp_path, CHATTER)]
-    (told,) = caplog.messages
-    assert told.startswith("delegation left out of=/other reason=")
+    (reported,) = caplog.messages
+    assert reported.startswith("delegation left out of=/other reason=")
 
 
 def test_one_of_another_node_is_reported_and_left_out(

@@ -95,7 +95,7 @@ def answer_from_above(
     return to.statements_to_send()
 
 
-def nobody_above(to: RibCore, now: Timestamps = START) -> list[OutgoingStatement]:
+def negative_upstream(to: RibCore, now: Timestamps = START) -> list[OutgoingStatement]:
     answer = Response(NAME, NAME, b"", CLOUD.root.domain, (), 2.0)
     to.receive(answer.to_wire(UPPER.name, UPPER.key, UPPER.membership), UPPER.name, now)
     return to.statements_to_send()
@@ -171,10 +171,10 @@ REFUSED = {
 def test_an_advertisement_that_does_not_hold_is_refused_with_its_reason(why: str) -> None:
     wire, reason = REFUSED[why]
     at_rib = rib()
-    told = acks(tell(at_rib, wire))
+    reported = acks(tell(at_rib, wire))
     assert at_rib.refusals == {reason: 1}
     assert at_rib.names == 0
-    assert {each.refused for each in told} <= {reason}
+    assert {each.refused for each in reported} <= {reason}
 
 
 @pytest.mark.parametrize("at_byte", range(0, 900, 31))
@@ -326,7 +326,7 @@ def test_a_withdrawn_name_gets_a_negative_response() -> None:
     tell(at_rib, advertisement(sequence=3))
     assert acks(tell(at_rib, withdrawal(4)))[0].refused is None
     (answer,) = answers(ask(at_rib))
-    assert (answer.is_nobody, answer.lease_s) == (True, NEGATIVE_LEASE_S)
+    assert (answer.is_negative, answer.lease_s) == (True, NEGATIVE_LEASE_S)
 
 
 def test_a_withdrawn_advertisement_played_back_stays_withdrawn() -> None:
@@ -396,7 +396,7 @@ def test_a_question_signed_by_another_key_gets_no_answer() -> None:
 def test_a_switch_of_another_domain_hears_of_global_names_only() -> None:
     at_rib = rib()
     tell(at_rib, local_advertisement())
-    assert [each.is_nobody for each in answers(ask(at_rib, CLOUD_SWITCH, watch_s=20.0))] == [True]
+    assert [each.is_negative for each in answers(ask(at_rib, CLOUD_SWITCH, watch_s=20.0))] == [True]
     assert [outgoing.to for outgoing in tell(at_rib, local_advertisement(2))] == [SWITCH.name]
     assert CLOUD_SWITCH.name in [
         outgoing.to for outgoing in tell(at_rib, advertisement(sequence=3)) if answers([outgoing])
@@ -405,7 +405,7 @@ def test_a_switch_of_another_domain_hears_of_global_names_only() -> None:
 
 def test_a_watcher_is_informed_of_new_and_of_removed_routes() -> None:
     at_rib = rib()
-    assert answers(ask(at_rib, watch_s=20.0))[0].is_nobody
+    assert answers(ask(at_rib, watch_s=20.0))[0].is_negative
     found = answers(tell(at_rib, advertisement(), OTHER_SWITCH)) or answers(tell(at_rib, advertisement()))
     assert [each.advertisement != b"" for each in found] == [True]
     (gone,) = answers(tell(at_rib, withdrawal(2)))
@@ -484,8 +484,8 @@ def test_a_local_name_stays() -> None:
 def test_a_local_name_is_announced_to_the_own_domain_only() -> None:
     at_rib = rib()
     tell(at_rib, local_advertisement())
-    assert [each.is_nobody for each in answers(ask(at_rib))] == [False]
-    assert [each.is_nobody for each in answers(ask(at_rib, UPPER))] == [True]
+    assert [each.is_negative for each in answers(ask(at_rib))] == [False]
+    assert [each.is_negative for each in answers(ask(at_rib, UPPER))] == [True]
 
 
 def test_a_withdrawal_of_a_global_name_climbs() -> None:
@@ -507,7 +507,7 @@ def test_many_askers_cost_one_question_above_and_all_are_answered() -> None:
     at_rib = rib(UPPER.name)
     assert len(ask(at_rib)) == 1
     assert ask(at_rib, OTHER_SWITCH) == []
-    assert {outgoing.to for outgoing in nobody_above(at_rib)} == {SWITCH.name, OTHER_SWITCH.name}
+    assert {outgoing.to for outgoing in negative_upstream(at_rib)} == {SWITCH.name, OTHER_SWITCH.name}
 
 
 def test_an_asker_hears_of_every_advertiser_that_the_tier_above_knows() -> None:
@@ -521,7 +521,7 @@ def test_an_asker_hears_of_every_advertiser_that_the_tier_above_knows() -> None:
 def test_a_tier_above_that_is_silent_is_asked_again_and_then_answered_for() -> None:
     at_rib = rib(UPPER.name)
     ask(at_rib)
-    told: list[Response] = []
+    reported: list[Response] = []
     again = 0
     for _ in range(10):
         due_s = at_rib.get_timer()
@@ -530,10 +530,10 @@ def test_a_tier_above_that_is_silent_is_asked_again_and_then_answered_for() -> N
         at_rib.handle_timer(at(due_s))
         letters = at_rib.statements_to_send()
         again += sum(outgoing.to == UPPER.name for outgoing in letters)
-        told += answers([outgoing for outgoing in letters if outgoing.to == SWITCH.name])
+        reported += answers([outgoing for outgoing in letters if outgoing.to == SWITCH.name])
         following = at_rib.get_timer()
         assert following is None or following > due_s
-    assert [each.is_nobody for each in told] == [True]
+    assert [each.is_negative for each in reported] == [True]
     assert again >= 3
     assert at_rib.get_timer() is None
 
@@ -551,7 +551,7 @@ def test_news_that_another_is_gone_answers_no_open_question() -> None:
     at_rib = rib(UPPER.name)
     ask(at_rib)
     assert answer_from_above(at_rib, b"") == []
-    assert [each.is_nobody for each in answers(nobody_above(at_rib))] == [True]
+    assert [each.is_negative for each in answers(negative_upstream(at_rib))] == [True]
 
 
 def test_an_answer_from_no_tier_above_is_refused() -> None:

@@ -98,7 +98,7 @@ def test_one_that_goes_and_comes_back_is_asked_each_call_once() -> None:
     call = begin(dispatch, 0.0)
     dispatch.poll_effects()
     for now_s in (1.0, 2.0):
-        dispatch.gone(BAD, now_s, "it describes itself anew")
+        dispatch.gone(BAD, now_s, "it describes itself again")
         dispatch.came(BAD, now_s)
     dispatch.came(SLOW, 3.0)
     assert dispatch.poll_effects() == [Ask(call, b"request", (SLOW,))]

@@ -176,7 +176,7 @@ class World:
             self.way(server, job.client, "back").append((job.call, job.request))
             replica.follower.applied()
         elif isinstance(job, Fetch):
-            replica.follower.told(b",".join(replica.done))
+            replica.follower.receive_state(b",".join(replica.done))
         else:
             replica.done = [each for each in job.state.split(b",") if each]
             replica.follower.loaded(is_done=True)

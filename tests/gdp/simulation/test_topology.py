@@ -76,7 +76,7 @@ TWO = DomainPlan("d", (A, B))
         ((Link(A, B, mtu=65_522),), (TWO,), ()),
         ((), (TWO, DomainPlan("e", (B,))), ()),
         ((), (TWO, DomainPlan("d", ("c",))), ()),
-        ((), (DomainPlan("d", (A,), upper="nobody"),), ()),
+        ((), (DomainPlan("d", (A,), upper="unknown"),), ()),
         ((), (DomainPlan("d", (A,), upper="d"),), ()),
         ((), (DomainPlan("d", ("a_very_long_name",)),), ()),
         ((), (TWO,), (Attachment("z", "rib", "rib"),)),

@@ -127,19 +127,19 @@ class MemoryPair(Pair):
         super().__init__(site, (MemoryStore(), MemoryStore()), tuple(identity.name for identity in site.ribs))
 
     def sync(self, later_s: float = 0.0) -> list[OutgoingStatement]:
-        told = self.take(self.two)
+        reported = self.take(self.two)
         now = self.site.now(later_s)
         by_name = {identity.name: rib for identity, rib in zip(self.site.ribs, (self.one, self.two), strict=True)}
         for rib in by_name.values():
             rib.connected(now)
             rib.handle_timer(now)
-            told += self.take(rib)
+            reported += self.take(rib)
         while self.sent:
             outgoing = self.sent.pop(0)
             sender = parse(outgoing.statement).signer
             by_name[outgoing.to].receive(outgoing.statement, sender, now)
-            told += self.take(by_name[outgoing.to])
-        return told
+            reported += self.take(by_name[outgoing.to])
+        return reported
 
 
 class SnapshotPair(Pair):

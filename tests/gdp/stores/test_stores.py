@@ -105,7 +105,7 @@ class TestEveryStore:
         pair.sync()
         pair.give(pair.one, pair.site.withdrawal("/a", 2))
         pair.sync()
-        assert [each.is_nobody for each in answers(pair.give(pair.two, pair.site.query("/a")))] == [True]
+        assert [each.is_negative for each in answers(pair.give(pair.two, pair.site.query("/a")))] == [True]
         assert [each.refused for each in acks(pair.give(pair.two, pair.site.relay("/a", 1)))] != [None]
 
     def test_a_lease_ends_at_both(self, pair: Pair) -> None:
@@ -115,7 +115,7 @@ class TestEveryStore:
         for rib in (pair.one, pair.two):
             rib.handle_timer(pair.site.now(5.1))
             pair.take(rib)
-        assert [each.is_nobody for each in answers(pair.give(pair.two, pair.site.query("/a"), 5.1))] == [True]
+        assert [each.is_negative for each in answers(pair.give(pair.two, pair.site.query("/a"), 5.1))] == [True]
 
 
 def test_peers_forget_a_withdrawal_when_the_advertisement_can_be_proven_no_more() -> None:
@@ -214,7 +214,7 @@ def test_names_outlive_a_primary(servers: Path) -> None:
     deadline_s = time.monotonic() + 60
     while not (found := answers(pair.give(pair.two, pair.site.query("/a")))) and time.monotonic() < deadline_s:
         time.sleep(0.05)  # the servers promote the replica asynchronously
-    assert [each.is_nobody for each in found] == [False]
+    assert [each.is_negative for each in found] == [False]
     while not acks(pair.give(pair.one, pair.site.relay("/a", 2))):
         assert time.monotonic() < deadline_s
         time.sleep(0.05)

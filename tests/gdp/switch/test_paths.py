@@ -191,7 +191,7 @@ def test_a_neighbour_of_another_domain_is_no_alternate() -> None:
     assert found.to_switch(name("x"), AWAY, ALL) == Path(name("t"), 10, None)
 
 
-def beside_a_leaf(me: str, bd: int = 100, dear: int = 1) -> Paths:
+def next_to_a_leaf(me: str, bd: int = 100, dear: int = 1) -> Paths:
     """Return the paths of ``me``, with alternates: a and d are joined by b, and by the leaf (``dear`` from a)."""
     found = paths(
         me,
@@ -205,7 +205,7 @@ def beside_a_leaf(me: str, bd: int = 100, dear: int = 1) -> Paths:
 
 
 def test_a_way_leads_to_a_leaf_and_never_through_one() -> None:
-    found = beside_a_leaf("a")
+    found = next_to_a_leaf("a")
     assert found.to_switch(name("d"), HOME, ALL) == Path(name("b"), 110)
     assert found.to_switch(name("leaf"), HOME, ALL) == Path(name("leaf"), 1)
     assert found.to_rib(name("rib"), ALL) == (Path(name("b"), 110), name("d"))
@@ -213,13 +213,13 @@ def test_a_way_leads_to_a_leaf_and_never_through_one() -> None:
 
 
 def test_a_leaf_is_an_alternate_to_itself_only() -> None:
-    found = beside_a_leaf("a", 10, dear=500)
+    found = next_to_a_leaf("a", 10, dear=500)
     assert found.to_switch(name("leaf"), HOME, ALL) == Path(name("b"), 21, name("leaf"))
     assert found.to_switch(name("d"), HOME, ALL) == Path(name("b"), 20, None)
 
 
 def test_a_leaf_itself_takes_either_neighbour_for_nothing_comes_back_through_it() -> None:
-    found = beside_a_leaf("leaf")
+    found = next_to_a_leaf("leaf")
     assert found.to_switch(name("b"), HOME, ALL) == Path(name("a"), 11, name("d"))
     assert found.to_switch(name("d"), HOME, ALL) == Path(name("d"), 1, name("a"))
     assert found.distance_from(name("leaf"), name("d"), HOME, ALL) is None
@@ -238,7 +238,7 @@ def test_what_only_leaves_join_is_severed_and_no_member() -> None:
     assert found.members() == {name("a"), name("leaf")}
     assert found.leads_through_leaf(name("d"), HOME)
     assert found.leads_through_leaf(name("e"), AWAY)
-    assert not found.leads_through_leaf(name("nobody"), HOME)
+    assert not found.leads_through_leaf(name("unknown"), HOME)
     assert found.borders() == {}
 
 

@@ -152,7 +152,7 @@ def test_two_successions_leave_space_for_two_links() -> None:
     second = heir(heir())
     given = second.delegate(card(GATEWAY), CAMERA_METADATA, [Right.PUBLISH], [0], DAY, may_delegate=True)
     assert len(given.chain) == 3
-    assert len(Chain.walk(given.chain, CAMERA, GATEWAY.subject, AdCertCache(4)).links) == 3
+    assert len(Chain.traverse(given.chain, CAMERA, GATEWAY.subject, AdCertCache(4)).links) == 3
     with pytest.raises(LocalError, match="chain"):
         heir(heir(second)).delegate(card(), CAMERA_METADATA, [Right.PUBLISH], [0], DAY)
 
@@ -182,7 +182,7 @@ def test_a_grant_by_somebody_who_may_not_delegate_is_refused() -> None:
 def test_a_successor_takes_back_what_it_gave() -> None:
     successor = heir()
     given = successor.delegate(card(), CAMERA_METADATA, [Right.PUBLISH], [0], DAY)
-    chain = Chain.walk(given.chain, CAMERA, ROBOT.subject, AdCertCache(4))
+    chain = Chain.traverse(given.chain, CAMERA, ROBOT.subject, AdCertCache(4))
     policy = Policy(SCHOOL.root)
     assert successor.signer == successor_subject(successor.key.public)
     take_back(policy, successor.key, successor.signer, chain.links[-1].fingerprint)

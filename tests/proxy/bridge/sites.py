@@ -254,8 +254,8 @@ class Sites:
         return Machine(label, member, graphs[0], endpoints, site, bridge)
 
     def _topic(self, member: Participant, metadata: Metadata, rights: set[Right]) -> Topic:
-        told = {key: str(value) for key, value in metadata.items() if key != "name"}
-        return self.world.topic(str(metadata["name"]), member, rights, **told)
+        reported = {key: str(value) for key, value in metadata.items() if key != "name"}
+        return self.world.topic(str(metadata["name"]), member, rights, **reported)
 
     def _look(self) -> None:
         for machine in self.machines:

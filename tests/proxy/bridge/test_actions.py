@@ -116,10 +116,10 @@ def test_feedback_reaches_every_client_on_every_machine_once(sites: Sites) -> No
     assert sites.run(3, others[1].sees_server)
     caller.goals.call(goal(1, 10))
     assert sites.run(1, lambda: caller.goals.outcomes == [ACCEPTED])
-    told = [sequence(1, *range(count)) for count in range(20)]
-    sites.every(0.1, 20, lambda number: local.feedback.publish(told[number]))
+    reported = [sequence(1, *range(count)) for count in range(20)]
+    sites.every(0.1, 20, lambda number: local.feedback.publish(reported[number]))
     sites.run(4)
-    assert [each.feedback.heard for each in (caller, *others)] == [told] * 3
+    assert [each.feedback.heard for each in (caller, *others)] == [reported] * 3
 
 
 def test_a_goal_is_cancelled(sites: Sites) -> None:

@@ -38,4 +38,4 @@ def test_ever_new_names_do_not_fill_the_memory() -> None:
     faults = Faults()
     for number in range(5_000):
         faults.report(f"/t{number}", Fault.NO_DELEGATION, "")
-    assert (faults.total, len(faults._told)) == (5_000, 4_096)
+    assert (faults.total, len(faults._reported)) == (5_000, 4_096)

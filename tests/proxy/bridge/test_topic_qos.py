@@ -263,6 +263,6 @@ def test_promises_beyond_any_network_are_reported_once_and_the_others_receive(
         sites.run(0.2)
     talker.publish(string("hello"))
     assert sites.run(1, lambda: ear.texts == ["hello"])
-    (told,) = caplog.messages
-    assert told.startswith("/chatter: qos: /strict will get nothing: it requests ")
+    (warning,) = caplog.messages
+    assert warning.startswith("/chatter: qos: /strict will get nothing: it requests ")
     assert server.faults["qos"] == 1

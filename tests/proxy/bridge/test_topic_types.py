@@ -107,9 +107,9 @@ def test_definitions_that_differ_are_reported_once_with_the_first_difference_and
     other.publish(string("hello"))
     assert sites.run(1, lambda: texts.texts == ["hello"])
     assert poses.heard == []
-    (told,) = caplog.messages
-    assert told.startswith("/pose: other-type: ")
-    assert "y: int32 there, float64 here" in told
+    (reported,) = caplog.messages
+    assert reported.startswith("/pose: other-type: ")
+    assert "y: int32 there, float64 here" in reported
     assert [stats.refused for stats in server.bridge.stats if stats.topic == "/pose"] == [3]
 
 
@@ -134,9 +134,9 @@ def test_a_type_that_the_other_ros_cannot_have_is_reported(sites: Sites, caplog:
     assert sites.run(3, robot.is_read)
     talker.publish(b"\0\1\0\0" + bytes(4))
     sites.run(1)
-    (told,) = caplog.messages
-    assert "/pose" in told
-    assert "name: wstring has no form in ROS 1" in told
+    (reported,) = caplog.messages
+    assert "/pose" in reported
+    assert "name: wstring has no form in ROS 1" in reported
 
 
 def test_a_type_that_its_own_machine_does_not_know_is_reported_and_the_rest_flows(
@@ -169,9 +169,9 @@ def test_several_types_on_one_name_are_reported_and_the_rules_type_crosses(
     assert sites.run(3, robot.is_read)
     talker.publish(string("hello"))
     assert sites.run(1, lambda: ear.texts == ["hello"])
-    (told,) = caplog.messages
-    assert IMAGE in told
-    assert STRING in told
+    (reported,) = caplog.messages
+    assert IMAGE in reported
+    assert STRING in reported
 
 
 def test_a_local_reader_of_another_type_receives_nothing_and_is_reported(
@@ -195,8 +195,8 @@ def test_a_body_that_does_not_fit_its_definition_is_counted_and_the_rest_flows(
         talker.publish(raw)
     assert sites.run(1, lambda: ear.texts == ["hello"])
     assert server.faults == {"malformed": 2}
-    (told,) = caplog.messages
-    assert told.startswith("/chatter: malformed: ")
+    (reported,) = caplog.messages
+    assert reported.startswith("/chatter: malformed: ")
 
 
 def test_what_far_peers_may_send_never_stops_a_proxy(sites: Sites) -> None:

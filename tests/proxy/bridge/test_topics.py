@@ -218,8 +218,8 @@ def test_a_message_above_the_rules_limit_is_reported_once_and_the_rest_flows(
         talker.publish(string(text))
     assert sites.run(1, lambda: ear.texts == ["small"])
     assert robot.faults == {"too-large": 2}
-    (told,) = caplog.messages
-    assert told.startswith("/chatter: too-large: ")
+    (reported,) = caplog.messages
+    assert reported.startswith("/chatter: too-large: ")
 
 
 def test_a_talker_faster_than_the_path_is_reported_once_and_goes_on_later(

@@ -137,9 +137,9 @@ def test_without_a_delegation_the_command_that_makes_one_is_shown(place: Path) -
 
 
 def test_metadata_that_no_option_states_are_shown_as_they_are(place: Path) -> None:
-    (fault,) = only(place, "expose", f"name: /image, type: {IMAGE}, metadata: {{floor: 3}}").faults
+    (fault,) = only(place, "expose", f"name: /image, type: {IMAGE}, metadata: {{minimum: 3}}").faults
     assert "makes one for these metadata" in fault
-    assert "'floor': 3" in fault
+    assert "'storey': 3" in fault
 
 
 @pytest.mark.parametrize(
@@ -254,11 +254,11 @@ def test_a_finding_has_a_json_form(place: Path) -> None:
 
 
 def test_the_table_shows_names_and_what_there_is_to_say(place: Path) -> None:
-    told = io.StringIO()
+    reported = io.StringIO()
     given_rules = [f"name: /image, type: {IMAGE}", "name: /camera/*"]
     found = findings(place, "expose", given_rules, [end(Role.PUBLISHES)], given(Right.PUBLISH))
-    Console(file=told, width=160).print(table(found))
-    shown = told.getvalue()
+    Console(file=reported, width=160).print(table(found))
+    shown = reported.getvalue()
     assert found[0].matches[0].overlay.short in shown  # type: ignore[union-attr]
     assert "expose /camera/*: nothing here matches it yet" in shown
 

@@ -86,8 +86,8 @@ def test_a_recording_is_of_what_is_imported(place: Path) -> None:
     ],
 )
 def test_a_wrong_rule_is_reported_with_its_position(place: Path, change: tuple[str, str], complaint: str) -> None:
-    told = refusal(place, "expose:\n" + RULE.replace(*change))
-    assert told.removeprefix("proxy.yaml:6:").replace("expose[0].", "").startswith(complaint)
+    reported = refusal(place, "expose:\n" + RULE.replace(*change))
+    assert reported.removeprefix("proxy.yaml:6:").replace("expose[0].", "").startswith(complaint)
 
 
 def test_a_private_key_is_not_an_owner(place: Path) -> None:
@@ -127,8 +127,8 @@ def test_what_a_graph_leaves_open_is_read_from_the_environment(place: Path, monk
 
 def test_a_wrong_domain_in_the_environment_is_reported(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", "robot")
-    told = refusal(place, "ros: {endpoint: ros2}\n")
-    assert told == "proxy.yaml:5:6: ros: the environment's ROS_DOMAIN_ID is 'robot', not a number from 0 to 232"
+    reported = refusal(place, "ros: {endpoint: ros2}\n")
+    assert reported == "proxy.yaml:5:6: ros: the environment's ROS_DOMAIN_ID is 'robot', not a number from 0 to 232"
 
 
 @pytest.mark.parametrize(
@@ -179,8 +179,8 @@ def test_a_rule_says_which_graph_it_is_about(place: Path, more: str, index: int)
     ],
 )
 def test_a_rule_that_fits_no_graph_or_several_is_refused(place: Path, more: str, complaint: str) -> None:
-    told = refusal(place, f"{THREE}import:\n{rules(f'name: /a{more}')}")
-    assert told == f"proxy.yaml:7:5: import[0]: {complaint}"
+    reported = refusal(place, f"{THREE}import:\n{rules(f'name: /a{more}')}")
+    assert reported == f"proxy.yaml:7:5: import[0]: {complaint}"
 
 
 def test_one_name_may_be_used_in_two_graphs_if_it_is_two_names_elsewhere(place: Path) -> None:
@@ -189,8 +189,8 @@ def test_one_name_may_be_used_in_two_graphs_if_it_is_two_names_elsewhere(place: 
 
 
 def test_every_error_of_a_file_is_reported_in_its_order(place: Path) -> None:
-    told = refusals(place, f"{THREE}expose:\n{rules('name: /a', 'name: /b, domain: 3')}record: {{path: x.mcap}}\n")
-    assert [line.split(":")[1] for line in told] == ["7", "8", "9"]
+    reported = refusals(place, f"{THREE}expose:\n{rules('name: /a', 'name: /b, domain: 3')}record: {{path: x.mcap}}\n")
+    assert [line.split(":")[1] for line in reported] == ["7", "8", "9"]
 
 
 @pytest.mark.parametrize(

@@ -189,8 +189,8 @@ def _rclpy_peer() -> None:
     publishers, keep = {}, []
 
     def kind(name: str) -> type:
-        package, room, short = name.split("/")
-        found = getattr(importlib.import_module(f"{package}.{room}"), short)
+        package, capacity, short = name.split("/")
+        found = getattr(importlib.import_module(f"{package}.{capacity}"), short)
         assert isinstance(found, type)
         return found
 

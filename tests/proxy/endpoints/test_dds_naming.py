@@ -71,7 +71,7 @@ def test_the_entities_of_a_ros_participant_show_once_it_announced_their_node() -
     survey.joined(1, WRITER)
     survey.found(2, peer)
     assert not survey.graph()
-    survey.told(NodeInfo(WRITER, {WRITER: "/camera"}, 16))
+    survey.receive_node_info(NodeInfo(WRITER, {WRITER: "/camera"}, 16))
     assert [(end.node, end.key) for end in survey.graph()] == [("/camera", WRITER.hex())]
     survey.lost(2)
     assert not survey.graph()

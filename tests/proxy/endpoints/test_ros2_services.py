@@ -69,13 +69,13 @@ def test_the_first_call_of_a_new_client_is_answered(ears: Ears, peer: Peer) -> N
 
 
 def test_a_call_without_a_server_fails_at_once(ears: Ears) -> None:
-    handle = ears.endpoint.create_client("/nobody", SET_BOOL)
+    handle = ears.endpoint.create_client("/absent", SET_BOOL)
     ears.endpoint.call(handle, 1, TRUE)
-    assert list(ears.endpoint.poll_events())[-1] == CallFailed(handle, 1, "no server of /nobody")
+    assert list(ears.endpoint.poll_events())[-1] == CallFailed(handle, 1, "no server of /absent")
 
 
 def test_bytes_that_are_no_request_fail(ears: Ears, peer: Peer) -> None:
-    handle = ears.endpoint.create_client("/nobody", "rcl_interfaces/srv/GetParameters")
+    handle = ears.endpoint.create_client("/absent", "rcl_interfaces/srv/GetParameters")
     ears.endpoint.call(handle, 1, b"\0\1\0\0\xff\xff\xff\xff")
     assert "cannot be read" in str(ears.outcome(handle, 1))
 

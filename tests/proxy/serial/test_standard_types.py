@@ -9,7 +9,7 @@ def test_a_type_of_humble_has_its_definition() -> None:
     definition = standard_definition("std_msgs/msg/Header")
     assert definition is not None
     assert "string frame_id" in definition
-    assert standard_definition("nobody/msg/Knows") is None
+    assert standard_definition("unknown/msg/Type") is None
 
 
 def test_the_hash_is_the_one_that_ros_2_publishes() -> None:

@@ -60,8 +60,8 @@ def test_a_call_that_went_otherwise_is_a_fault(said: dict[str, int], fault: str)
 
 
 def test_the_table_tells_topics_and_services_apart() -> None:
-    told = io.StringIO()
-    Console(file=told, width=200).print(table(result()))
-    assert "live ros2" in told.getvalue()
+    reported = io.StringIO()
+    Console(file=reported, width=200).print(table(result()))
+    assert "live ros2" in reported.getvalue()
     assert summary(result()).endswith("3 messages on 1 topics, all identical; 3 calls, all answered.")
     assert [row["kind"] for row in result().to_json()["topics"]] == ["topic", "service"]  # type: ignore[attr-defined]

@@ -50,8 +50,8 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
     started.end()
 
 
-def play(run: Run, sender: str, receiver: str, told: io.StringIO | None = None) -> Report:
-    reporter = ProgressReporter(Console(file=told or io.StringIO(), width=120))
+def play(run: Run, sender: str, receiver: str, reported: io.StringIO | None = None) -> Report:
+    reporter = ProgressReporter(Console(file=reported or io.StringIO(), width=120))
 
     async def both(children: Children) -> Report:
         far = children.start("receiver", [sys.executable, "-c", receiver])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ring.silence import TOLD_FROM_S, Silence
+from ring.silence import REPORTED_FROM_S, Silence
 
 
 def test_a_flow_that_has_everything_is_not_silent() -> None:
@@ -18,7 +18,7 @@ def test_a_flow_that_is_owed_something_is_silent_from_when_it_was_sent() -> None
     silence.received("/a", 5, 0.1)
     silence.sent("/a", 6, 20.0)
     silence.sent("/a", 9, 21.0)
-    assert silence.silent(20.0 + TOLD_FROM_S - 0.1) == []
+    assert silence.silent(20.0 + REPORTED_FROM_S - 0.1) == []
     assert silence.silent(24.0) == [("/a", 4.0)]
     assert silence.behind == 4
 

@@ -46,8 +46,8 @@ TO_US = bytes(6)  # the loopback's address
 LEFT_TO_PYTHON = {DropReason.TRUNCATED, DropReason.BAD_ETHERTYPE, DropReason.BAD_VERSION, DropReason.HOPS_EXPIRED}
 LEFT_TO_PYTHON |= {DropReason.TOO_BIG}
 DESTINATION = slice(ETHER_BYTES + DESTINATION_AT, ETHER_BYTES + SOURCE_AT)  # left to Python with an entry for no source
-UNTOLD = 9  # a port that the kernel does not know
-TO_UNTOLD = (UNTOLD, bytes(12))
+UNKNOWN_PORT = 9  # a port that the kernel does not know
+TO_UNKNOWN_PORT = (UNKNOWN_PORT, bytes(12))
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Step:
 def forwards(loaded: LoadedProgram, entries: Mapping[bytes, Hops], mtus: Mapping[int, int] = MTUS) -> Table:
     """Set the program's entries; ports have no device, because nothing is sent here."""
     table = Table()
-    for port in range(UNTOLD):
+    for port in range(UNKNOWN_PORT):
         loaded.set_port(port, 1 if port in mtus else 0, mtus.get(port, 0), 0)
     for key in list(entries):
         table.install(key, entries[key], 1.0)
@@ -138,7 +138,7 @@ def test_the_ordinary_is_not_left_to_python(loaded: LoadedProgram) -> None:
 
 NAMES = st.sampled_from([ONE, SPLIT, GONE, ANYBODY])
 SOURCES = st.sampled_from([SOURCE, OTHER_SOURCE, bytes(32)])
-HOPS = st.sampled_from([NOWHERE, (TO_WIDE,), (TO_NARROW,), (TO_ABSENT,), (TO_UNTOLD,)])
+HOPS = st.sampled_from([NOWHERE, (TO_WIDE,), (TO_NARROW,), (TO_ABSENT,), (TO_UNKNOWN_PORT,)])
 TABLES = st.dictionaries(NAMES | st.builds(bytes.__add__, NAMES, SOURCES), HOPS, max_size=8)
 NEAR = st.integers(-3, 3)
 
