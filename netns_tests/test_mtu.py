@@ -172,7 +172,9 @@ class Lab:
 
 
 def settings() -> NodeSettings:
-    return NodeSettings(secrets.randbits(64), int(time.time() * 1_000), secrets.token_bytes)
+    return NodeSettings(
+        incarnation=secrets.randbits(64), first_sequence=int(time.time() * 1_000), random_bytes=secrets.token_bytes
+    )
 
 
 def frames_of(tap: socket.socket) -> Iterator[bytes]:

@@ -68,7 +68,11 @@ def main(service: str, identity_at: str, root: str, device: str, role: str, *loa
     policy = Policy(load_root(Path(root)), [])
     (topic,) = DelegationStore(Path(identity_at) / DELEGATIONS, identity)
     assert topic.name.to_text() == service
-    member = Participant(identity, policy, NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes))
+    member = Participant(
+        identity,
+        policy,
+        NodeSettings(incarnation=incarnation(), first_sequence=wall_clock_ms(), random_bytes=secrets.token_bytes),
+    )
     plane = RawPlane([device])
     runtime = Runtime(member, plane)
     if role == "serve":

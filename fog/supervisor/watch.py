@@ -86,7 +86,11 @@ class Watch:
     def _look(self) -> None:
         domain = Domain(root=self._identity / ROOT_CERTIFICATE, transit=None)
         identity, policy = load_member(self._identity, domain, Role.PROXY)
-        member = Participant(identity, policy, NodeSettings(incarnation(), wall_clock_ms(), fresh_bytes))
+        member = Participant(
+            identity,
+            policy,
+            NodeSettings(incarnation=incarnation(), first_sequence=wall_clock_ms(), random_bytes=fresh_bytes),
+        )
         plane = RawPlane([self._iface])
         try:
             runtime = Runtime(member, plane)

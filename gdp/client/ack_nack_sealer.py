@@ -127,8 +127,18 @@ class AckNackSealer:
         return [self._note_sealer(key, epoch, Kind.INTRODUCTION).seal(reader.introduction())]
 
     def _note_sealer(self, key: bytes, epoch: int, kind: Kind) -> ControlSealer:
-        reader, to = self._reader, (self._publisher, self._topic, self._incarnation)
-        return ControlSealer(key, epoch, kind, reader.name, reader.incarnation, *to, reader.note_numbers)
+        reader = self._reader
+        return ControlSealer(
+            key=key,
+            epoch=epoch,
+            kind=kind,
+            source=reader.name,
+            incarnation=reader.incarnation,
+            destination=self._publisher,
+            topic=self._topic,
+            destination_incarnation=self._incarnation,
+            numbers=reader.note_numbers,
+        )
 
     def _epoch_to_try(self) -> int:
         """Return the newest epoch, and in turn the others, because the writer may not have the newest yet."""

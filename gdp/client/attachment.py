@@ -58,7 +58,7 @@ _RTCERTS_MAX: Final = 32
 _RTCERT_BEFORE_S: Final = 4_500
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class PendingAdvertisement:
     """A name that this node advertises, and the state of its acknowledgement."""
 
@@ -155,7 +155,9 @@ class Attachment:
 
     def advertisement(self, subject: Subject, right: Right, chain: tuple[bytes, ...], *, is_global: bool) -> None:
         """Advertise a name from now on."""
-        self._advertisements[subject.name, right] = PendingAdvertisement(subject, right, chain, is_global)
+        self._advertisements[subject.name, right] = PendingAdvertisement(
+            subject=subject, right=right, chain=chain, is_global=is_global
+        )
 
     def renew(self, name: Name, chain: tuple[bytes, ...]) -> None:
         """Replace the delegation of an advertised name by a newer one, and advertise it at once."""

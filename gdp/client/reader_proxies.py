@@ -83,7 +83,7 @@ class _Life:
         return body
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class ReaderProxy:
     """One reader, in one incarnation of its process.
 
@@ -207,7 +207,9 @@ class ReaderProxies:
         """Make a known node a reader, in place of a former incarnation of it."""
         former = self._readers.get(name) or self._suspended.pop(name, None)
         life, confirmed = self._lives[name, incarnation], former.sequence if former else 0
-        reading = self._readers[name] = ReaderProxy(incarnation, life, now_s, confirmed=confirmed)
+        reading = self._readers[name] = ReaderProxy(
+            incarnation=incarnation, life=life, heard_s=now_s, confirmed=confirmed
+        )
         return reading
 
     def forget(self, name: bytes) -> bool:

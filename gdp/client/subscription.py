@@ -67,7 +67,7 @@ class Topic:
         return self.delegation.name
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Subscription:
     """One name that is read, the right of its peers, and its writer proxies.
 
@@ -165,7 +165,7 @@ class Subscriptions:
 
     def add(self, topic: Topic, right: Right) -> None:
         """Read a name from now on."""
-        self._by_name[topic.name] = Subscription(topic, right)
+        self._by_name[topic.name] = Subscription(topic=topic, right=right)
 
     def remove(self, name: Name) -> list[WriterProxy]:
         """Stop reading a name; return the writer proxies to close."""

@@ -75,7 +75,7 @@ class Outgoing(NamedTuple):
     is_answer: bool = False
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Channel:
     id: bytes
     out_key: RecordKey
@@ -254,7 +254,7 @@ class Channels:
         self._verified(statement, now)
         id_ = fields.bytes_("i", _ID_BYTES)
         keys = _keys(offer.key, fields, offer.fingerprint, statement.fingerprint)
-        asked.channel, asked.offer = _Channel(id_, keys[0], keys[1], now.mono_s), None
+        asked.channel, asked.offer = _Channel(id=id_, out_key=keys[0], in_key=keys[1], begun_s=now.mono_s), None
         waiting, asked.waiting = list(asked.waiting), deque(maxlen=_WAITING_MAX)
         for wire, until_s in waiting:
             if until_s > now.mono_s:
@@ -292,7 +292,7 @@ class Channels:
         keys = _keys(key, fields, fingerprint, parse(accept).fingerprint)
         asker = self._askers.setdefault(statement.signer, _Asker())
         self._askers.move_to_end(statement.signer)
-        asker.offers[fingerprint] = _Channel(id_, keys[1], keys[0], now.mono_s, accept=accept)
+        asker.offers[fingerprint] = _Channel(id=id_, out_key=keys[1], in_key=keys[0], begun_s=now.mono_s, accept=accept)
         if len(asker.offers) > _OFFERS_PER_PEER:
             asker.offers.popitem(last=False)
         if len(self._askers) > _PEERS_MAX:

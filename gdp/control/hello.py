@@ -78,7 +78,7 @@ def echo_of(nonce: bytes, name: Name) -> bytes:
     return hashlib.sha256(b"gdp echo\0" + nonce + name).digest()[:ECHO_BYTES]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Hello:
     """One hello on one port.
 
@@ -136,18 +136,18 @@ class Hello:
             StatementError: MALFORMED.
         """
         return cls(
-            fields.bytes_("n", NONCE_BYTES),
-            fields.uint("s"),
-            tuple(fields.byte_strings("h", HEARD_MAX, ECHO_BYTES)),
-            fields.uint("m", FRAME_MAX_BYTES),
-            fields.bytes_("d", DIGEST_BYTES),
-            fields.bytes_("c"),
-            _timing(fields),
-            fields.bytes_("x", EXCHANGE_KEY_BYTES) if fields.get("x") != b"" else b"",
-            fields.bytes_("b", LIFE_BYTES),
-            tuple(fields.byte_strings("u", CONFLICTS_MAX, ECHO_BYTES)),
-            tuple(fields.byte_strings("r", RTCERTS_MAX)),
-            tuple(
+            nonce=fields.bytes_("n", NONCE_BYTES),
+            sequence=fields.uint("s"),
+            heard=tuple(fields.byte_strings("h", HEARD_MAX, ECHO_BYTES)),
+            mtu=fields.uint("m", FRAME_MAX_BYTES),
+            digest=fields.bytes_("d", DIGEST_BYTES),
+            membership=fields.bytes_("c"),
+            timing=_timing(fields),
+            exchange_key=fields.bytes_("x", EXCHANGE_KEY_BYTES) if fields.get("x") != b"" else b"",
+            life=fields.bytes_("b", LIFE_BYTES),
+            conflicts=tuple(fields.byte_strings("u", CONFLICTS_MAX, ECHO_BYTES)),
+            rtcerts=tuple(fields.byte_strings("r", RTCERTS_MAX)),
+            cookies=tuple(
                 (each[:NONCE_BYTES], each[NONCE_BYTES:])
                 for each in fields.byte_strings("y", COOKIES_MAX, NONCE_BYTES + COOKIE_BYTES)
             ),

@@ -19,7 +19,7 @@ from gdp.names import ZERO, Name
 __all__ = ["Join"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Join:
     """Join of one tree: a topic from one publisher.
 
@@ -82,18 +82,18 @@ class Join:
             StatementError: MALFORMED.
         """
         return cls(
-            fields.name("n"),
-            fields.name("p"),
-            fields.name("w"),
-            fields.name("d"),
-            frozenset(fields.names("x", TRANSIT_MAX)),
-            fields.uint("m", FRAME_MAX_BYTES),
-            fields.number("l", 0, LEASE_MAX_S),
-            fields.bytes_("e"),
-            fields.bytes_("i", ECHO_BYTES),
-            fields.uint("s"),
-            fields.uint("v"),
-            fields.optional_name("b"),
-            fields.bytes_("o", NONCE_BYTES),
-            fields.bytes_("c"),
+            topic=fields.name("n"),
+            publisher=fields.name("p"),
+            switch=fields.name("w"),
+            domain=fields.name("d"),
+            allowed=frozenset(fields.names("x", TRANSIT_MAX)),
+            mtu=fields.uint("m", FRAME_MAX_BYTES),
+            lease_s=fields.number("l", 0, LEASE_MAX_S),
+            evidence=fields.bytes_("e"),
+            session=fields.bytes_("i", ECHO_BYTES),
+            sequence=fields.uint("s"),
+            version=fields.uint("v"),
+            backup_for=fields.optional_name("b"),
+            sender_session=fields.bytes_("o", NONCE_BYTES),
+            proof=fields.bytes_("c"),
         )

@@ -102,7 +102,7 @@ class Slowness:
         return self._late_s * math.pow(2.0, (self._at_s - now_s) / _FORGET_S)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class KeepaliveSession:
     """Keepalive session with one neighbour, valid while both ends' sessions last.
 
@@ -153,7 +153,15 @@ class KeepaliveSession:
             return None
         out_key, in_key = key.agree(far_key, _PURPOSE + ends[0] + ends[1], _PURPOSE + ends[1] + ends[0])
         detect_s = in_interval_s * far.multiplier
-        return cls(out_key, in_key, out_interval_s, in_interval_s, detect_s, received, now_s)
+        return cls(
+            out_key=out_key,
+            in_key=in_key,
+            out_interval_s=out_interval_s,
+            in_interval_s=in_interval_s,
+            detect_s=detect_s,
+            received=received,
+            send_at_s=now_s,
+        )
 
     def seal(
         self,

@@ -74,7 +74,7 @@ class AttachedRib(NamedTuple):
         return _RIB_BYTES + len(self.membership) + len(self.rtcert)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LinkState:
     """Link state of one switch in one scope."""
 
@@ -143,19 +143,19 @@ class LinkState:
         if scope not in ("domain", "border"):
             raise StatementError(DropReason.MALFORMED, "scope")
         return cls(
-            origin,
-            domain,
-            Scope(scope),
-            fields.uint("s"),
-            tuple(each for each in _adjacencies(fields, "l") if not is_leaf or each.domain == domain),
-            _adjacencies(fields, "i"),
-            _ribs(fields),
-            tuple(fields.names("m", MEMBERS_MAX)),
-            fields.bytes_("b", LIFE_BYTES),
-            tuple(fields.names("u", RIBS_MAX)),
-            fields.flag("z"),
-            fields.uint("e"),
-            is_leaf,
+            origin=origin,
+            domain=domain,
+            scope=Scope(scope),
+            sequence=fields.uint("s"),
+            links=tuple(each for each in _adjacencies(fields, "l") if not is_leaf or each.domain == domain),
+            inside=_adjacencies(fields, "i"),
+            ribs=_ribs(fields),
+            members=tuple(fields.names("m", MEMBERS_MAX)),
+            life=fields.bytes_("b", LIFE_BYTES),
+            refused=tuple(fields.names("u", RIBS_MAX)),
+            is_partial=fields.flag("z"),
+            said_unix_s=fields.uint("e"),
+            is_leaf=is_leaf,
         )
 
 

@@ -92,7 +92,7 @@ _TOGETHER: Final = 0.125  # of an interval: keepalives due within it leave at on
 Change = tuple[Neighbour, NeighbourState]
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class HelloPort:
     """A port as the control plane sees it."""
 
@@ -321,9 +321,17 @@ class HelloProtocol:
             lost = [] if port is None else self._lose(port, list(port.neighbours.values()), NeighbourEvent.LINK_LOST)
             nonce, key = self._session()
             self.ports[index] = HelloPort(
-                self._identity.name, index, mac, own_mtu, cost, nonce, key, Admission(now_s), hello_at_s=now_s,
+                owner=self._identity.name,
+                index=index,
+                mac=mac,
+                own_mtu=own_mtu,
+                cost=cost,
+                nonce=nonce,
+                exchange_key=key,
+                admission=Admission(now_s),
+                hello_at_s=now_s,
                 addresses={} if port is None else port.addresses,
-            )  # fmt: skip
+            )
             return lost
         if (port.own_mtu, port.cost) == (own_mtu, cost):
             return []
@@ -415,7 +423,17 @@ class HelloProtocol:
         self._free_space(port, known, is_two_way=is_two_way)
         if known is None:
             known = port.neighbours[member.name] = Neighbour(
-                member.name, member.role, member.domain, member.key, port.index, arrival.mac, 0, b"", 0, b"", 0.0
+                name=member.name,
+                role=member.role,
+                domain=member.domain,
+                key=member.key,
+                port=port.index,
+                mac=arrival.mac,
+                mtu=0,
+                nonce=b"",
+                sequence=0,
+                digest=b"",
+                heard_s=0.0,
             )
         is_new_session = known.nonce != hello.nonce
         if is_two_way:
@@ -795,13 +813,23 @@ class HelloProtocol:
         heard = port.heard()
         identity, timing = self._identity, self._timings.get(port.index, self._timing)
         hello = Hello(
-            port.nonce, port.sequence, heard, port.own_mtu, self._digest_for(port), identity.membership,
-            timing, port.exchange_key.public, self._life, self.conflicts.on(port.index, now_s), self._rtcerts_on(port),
-            tuple(
+            nonce=port.nonce,
+            sequence=port.sequence,
+            heard=heard,
+            mtu=port.own_mtu,
+            digest=self._digest_for(port),
+            membership=identity.membership,
+            timing=timing,
+            exchange_key=port.exchange_key.public,
+            life=self._life,
+            conflicts=self.conflicts.on(port.index, now_s),
+            rtcerts=self._rtcerts_on(port),
+            cookies=tuple(
                 (each.nonce, seal_cookie(each.cookie, port.nonce, port.sequence))
-                for each in port.neighbours.values() if each.cookie
+                for each in port.neighbours.values()
+                if each.cookie
             ),
-        )  # fmt: skip
+        )
         return self._fragmenter.split(Kind.HELLO, hello.to_wire(identity.name, identity.key), port.hello_mtu)
 
     def _rtcerts_on(self, port: HelloPort) -> tuple[bytes, ...]:

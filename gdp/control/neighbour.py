@@ -58,7 +58,7 @@ TRANSITIONS: Final[dict[tuple[NeighbourState, NeighbourEvent], NeighbourState]] 
 }
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Neighbour:
     """The node at the other end of a port, as its verified hellos describe it."""
 

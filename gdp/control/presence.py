@@ -32,7 +32,7 @@ _REFUSED_ABOVE_S: Final = 10.0
 _CHECKS_MAX: Final = 1_024
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Presence:
     """A RIB's query about a node that is attached to a switch, or the switch's response.
 
@@ -71,11 +71,17 @@ class Presence:
         Raises:
             StatementError: MALFORMED.
         """
-        names = fields.name("n"), fields.uint("i"), fields.name("w")
-        return cls(*names, fields.uint("s"), not fields.flag("q"), fields.flag("y"))
+        return cls(
+            node=fields.name("n"),
+            incarnation=fields.uint("i"),
+            other=fields.name("w"),
+            question=fields.uint("s"),
+            is_answer=not fields.flag("q"),
+            is_there=fields.flag("y"),
+        )
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Check:
     incarnation: int
     switch: Name
@@ -118,7 +124,7 @@ class IdentityChecks:
         self._checks.pop(node, None)
         if len(self._checks) >= _CHECKS_MAX:
             del self._checks[next(iter(self._checks))]
-        self._checks[node] = _Check(incarnation, switch, question, now_s)
+        self._checks[node] = _Check(incarnation=incarnation, switch=switch, question=question, asked_s=now_s)
         return True
 
     def refused_above(self, node: Name, incarnation: int, now_s: float) -> None:

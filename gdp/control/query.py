@@ -49,7 +49,7 @@ class Query:
         return cls(fields.name("n"), fields.number("w", 0, LEASE_MAX_S), revoked)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Response:
     """One advertiser of a name, or none.
 
@@ -98,11 +98,11 @@ class Response:
             StatementError: MALFORMED.
         """
         return cls(
-            fields.name("n"),
-            fields.name("a"),
-            fields.bytes_("q"),
-            fields.name("d"),
-            tuple(fields.names("x", TRANSIT_MAX)),
-            fields.number("l", 0, LEASE_MAX_S),
-            fields.uint("s"),
+            name=fields.name("n"),
+            advertiser=fields.name("a"),
+            advertisement=fields.bytes_("q"),
+            domain=fields.name("d"),
+            transit=tuple(fields.names("x", TRANSIT_MAX)),
+            lease_s=fields.number("l", 0, LEASE_MAX_S),
+            sequence=fields.uint("s"),
         )

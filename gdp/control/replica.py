@@ -137,7 +137,7 @@ class Inventory:
         return cls(tuple(_item(line) for line in lines), fields.flag("z"))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Entry:
     """An advertisement or a withdrawal as one RIB sends it to another.
 
@@ -186,15 +186,15 @@ class Entry:
             StatementError: MALFORMED.
         """
         return cls(
-            fields.bytes_("q"),
-            fields.bytes_("m"),
-            fields.name("w"),
-            fields.name("d"),
-            fields.name("v"),
-            tuple(fields.names("x", TRANSIT_MAX)),
-            fields.number("l", 0, LEASE_MAX_S),
-            fields.flag("u"),
-            fields.uint("t"),
+            statement=fields.bytes_("q"),
+            membership=fields.bytes_("m"),
+            sender=fields.name("w"),
+            domain=fields.name("d"),
+            via=fields.name("v"),
+            transit=tuple(fields.names("x", TRANSIT_MAX)),
+            lease_s=fields.number("l", 0, LEASE_MAX_S),
+            is_from_above=fields.flag("u"),
+            until_unix_s=fields.uint("t"),
         )
 
     @property

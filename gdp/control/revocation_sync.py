@@ -53,7 +53,7 @@ _NAMES_MAX: Final = 1_024
 Say = Callable[[Neighbour, bytes], None]
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Peer:
     neighbour: Neighbour
     summary_at_s: float
@@ -98,7 +98,7 @@ class RevocationSync:
     def neighbour_up(self, neighbour: Neighbour, now_s: float) -> None:
         """Schedule digests for a neighbour that has come up, or has restarted."""
         at_s = max(now_s, self._said_s.get(neighbour.name, float("-inf")) + _SOON_S)
-        self._peers[neighbour.port, neighbour.name] = _Peer(neighbour, at_s)
+        self._peers[neighbour.port, neighbour.name] = _Peer(neighbour=neighbour, summary_at_s=at_s)
 
     def neighbour_lost(self, neighbour: Neighbour) -> None:
         """Forget a neighbour that is gone."""

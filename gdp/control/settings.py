@@ -14,7 +14,7 @@ from gdp.limits import ADVERTISEMENT_LEASE_S, DEAD_S, DETECT_MULTIPLIER, HELLO_S
 __all__ = ["NodeSettings"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class NodeSettings:
     """Start settings of a switch, a RIB or a participant.
 

@@ -42,7 +42,7 @@ class Role(str, Enum):
         return self in (Role.SWITCH, Role.LEAF)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Root:
     """A trust domain's own certificate; its signature, its name and its format have been checked.
 
@@ -126,7 +126,7 @@ class Root:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Membership:
     """A node's certificate whose root signature was verified. Time and revocation are checked at each use."""
 
@@ -179,7 +179,7 @@ def issuer_label(wire: bytes) -> str:
     return label if label.isprintable() else ""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Unverified:
     """A membership whose name is right, but whose issuer has not been verified yet."""
 

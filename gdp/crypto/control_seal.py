@@ -80,6 +80,7 @@ class ControlSealer:
 
     def __init__(
         self,
+        *,
         key: bytes,
         epoch: int,
         kind: int,

@@ -150,6 +150,7 @@ class Sealer:
 
     def __init__(
         self,
+        *,
         secret: bytes,
         epoch: int,
         kind: int,
@@ -158,7 +159,6 @@ class Sealer:
         destination: bytes,
         signer: Signer,
         random_bytes: Callable[[int], bytes],
-        *,
         address: bytes | None = None,
     ) -> None:
         self._keys = MessageKeys(seal_key(secret, kind, source, incarnation, destination))
@@ -192,14 +192,16 @@ class Sealer:
         epoch, kind, incarnation, destination, source = self._fixed
         header = Header(kind, flags, HOPS_MAX, epoch, 0, number, 0, parts, incarnation, destination, source)
         salt = self._random_bytes(SALT_BYTES)
-        return Sealed(self._keys.of(salt), salt, self._signer, header, message, capacity)
+        return Sealed(
+            aead=self._keys.of(salt), salt=salt, signer=self._signer, header=header, message=message, capacity=capacity
+        )
 
 
 class Sealed(Sequence[bytes]):
     """The frames of one message, sealed in order and on request; always the same bytes."""
 
     def __init__(
-        self, aead: AESGCM, salt: bytes, signer: Signer, header: Header, message: bytes | Sealed, capacity: int
+        self, *, aead: AESGCM, salt: bytes, signer: Signer, header: Header, message: bytes | Sealed, capacity: int
     ) -> None:
         self._aead = aead
         self._salt = salt

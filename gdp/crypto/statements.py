@@ -69,7 +69,7 @@ _SIGNED_HEAD: Final = b"\x84\x6aSignature1"  # Sig_structure; RFC 9052, section 
 _NO_EXTERNAL_DATA: Final = b"\x40"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Statement:
     """A parsed statement, UNVERIFIED until ``verify`` returns.
 

@@ -89,7 +89,7 @@ class SubjectInfo:
     retires_unix_s: int | None = None  # of a root that succeeds another: until when that one is trusted
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Certificate:
     """A certificate of this profile; its signature, time and issuer are not checked."""
 

@@ -50,7 +50,7 @@ def _uid_map() -> list[str]:
     return Path("/proc/self/uid_map").read_text(encoding="ascii").split()
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Record:
     """Resources of one run.
 
@@ -186,7 +186,7 @@ class RunRegistry:
         """Begin a run with a new id and an empty scratch directory (in the directory for temporary files)."""
         run = secrets.token_hex(_ID_BYTES)
         directory = Path(tempfile.gettempdir()) / f"gdp-{run}"
-        record = Record(run, boot_id(), Process.of(os.getpid()), files=[str(directory)])
+        record = Record(run=run, boot=boot_id(), owner=Process.of(os.getpid()), files=[str(directory)])
         return Run(record, self._directory / f"{run}.json", directory)
 
     def all(self) -> list[Record]:

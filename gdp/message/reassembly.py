@@ -60,7 +60,7 @@ class VerifiesDigest(Protocol):
         """Verify a signature; raise a ``RemoteError`` if it is invalid."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ReassembledMessage:
     """A complete message, opened and verified."""
 
@@ -77,7 +77,7 @@ class _Hash(Protocol):
     def digest(self) -> bytes: ...
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _PartialMessage:
     parts: int
     salt: bytes
@@ -223,7 +223,12 @@ class Reassembler:
         self.window.finish(number)
         head, message = plain[: self._head_bytes], plain[self._head_bytes :]
         return ReassembledMessage(
-            number, header.flags & _SHARED_FLAGS, message, 1, max(HOPS_MAX - header.hops_left, 0), head
+            number=number,
+            flags=header.flags & _SHARED_FLAGS,
+            message=message,
+            parts=1,
+            hops=max(HOPS_MAX - header.hops_left, 0),
+            head=head,
         )
 
     def _start(self, header: Header, salt: bytes, opener: OpensParts, now_s: float) -> _PartialMessage:
@@ -231,7 +236,15 @@ class Reassembler:
         if header.number in self._unfinished:
             self.drops[DropReason.BAD_PARTS] += 1
             self._drop(header.number)
-        return _PartialMessage(header.parts, salt, header.epoch, opener, digest_of(header, salt), now_s, header)
+        return _PartialMessage(
+            parts=header.parts,
+            salt=salt,
+            epoch=header.epoch,
+            opener=opener,
+            running=digest_of(header, salt),
+            touched_s=now_s,
+            header=header,
+        )
 
     def _keep(
         self, message: _PartialMessage, header: Header, plain: bytes, sealed: bytes, signature: bytes, now_s: float
@@ -278,7 +291,12 @@ class Reassembler:
         first, size = message.plain[0], self._head_bytes
         whole = b"".join([first[size:], *(message.plain[part] for part in range(1, message.parts))])
         return ReassembledMessage(
-            number, header.flags & _SHARED_FLAGS, whole, message.parts, message.hops, first[:size]
+            number=number,
+            flags=header.flags & _SHARED_FLAGS,
+            message=whole,
+            parts=message.parts,
+            hops=message.hops,
+            head=first[:size],
         )
 
     def _is_signed(self, signature: bytes, running: _Hash) -> bool:

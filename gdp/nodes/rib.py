@@ -60,7 +60,9 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
         watches=quotas.watches,
         lease_max_s=quotas.lease_max_s,
     )
-    attachment = NodeSettings(incarnation(), wall_clock_ms(), fresh_bytes, lease_s=config.lease_s)
+    attachment = NodeSettings(
+        incarnation=incarnation(), first_sequence=wall_clock_ms(), random_bytes=fresh_bytes, lease_s=config.lease_s
+    )
     with contextlib.ExitStack() as stack:
         stack.enter_context(run_alone("RIB", identity.name))
         folder = audit_folder(config.audit)

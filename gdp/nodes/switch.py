@@ -62,14 +62,14 @@ def run_switch(
     refuse_loopback(ifaces := [port.iface for port in config.ports])
     table = Table()
     settings = NodeSettings(
-        incarnation(),
-        wall_clock_ms(),
-        fresh_bytes,
-        config.hello_s,
-        config.dead_s,
-        config.lease_s,
-        config.keepalive_ms,
-        config.detect_multiplier,
+        incarnation=incarnation(),
+        first_sequence=wall_clock_ms(),
+        random_bytes=fresh_bytes,
+        hello_s=config.hello_s,
+        dead_s=config.dead_s,
+        lease_s=config.lease_s,
+        keepalive_ms=config.keepalive_ms,
+        detect_multiplier=config.detect_multiplier,
     )
     switch = SwitchCore(identity, policy, table, settings)
     with contextlib.ExitStack() as stack:

@@ -316,7 +316,7 @@ class RibCore:
             return
         number = int(now.unix_s * 1_000)
         if self.identities.must_ask(advertisement.node, older, held.switch, number, now.mono_s):
-            question = Presence(advertisement.node, older, advertisement.switch, number)
+            question = Presence(node=advertisement.node, incarnation=older, other=advertisement.switch, question=number)
             wire = question.to_wire(self._identity.name, self._identity.key, self._identity.membership)
             self._letters.append(OutgoingStatement(held.switch, Kind.RIB_ANSWER, wire))
         raise StatementError(DropReason.IN_USE, "another node with this identity")
@@ -489,7 +489,14 @@ class RibCore:
             self._holders.add(route.name, to, now_s + lease_s)
         except StatementError:
             lease_s = min(lease_s, _UNREPORTED_S)
-        answer = Response(route.name, route.advertiser, route.advertisement, route.domain, route.transit, lease_s)
+        answer = Response(
+            name=route.name,
+            advertiser=route.advertiser,
+            advertisement=route.advertisement,
+            domain=route.domain,
+            transit=route.transit,
+            lease_s=lease_s,
+        )
         self.answers += 1
         self._send(answer, to.name, (route.name, route.advertiser))
 
@@ -500,7 +507,17 @@ class RibCore:
 
     def _deny(self, name: Name, to: Name) -> None:
         self.negative_answers += 1
-        self._send(Response(name, name, b"", self._policy.own, (), NEGATIVE_LEASE_S), to)
+        self._send(
+            Response(
+                name=name,
+                advertiser=name,
+                advertisement=b"",
+                domain=self._policy.own,
+                transit=(),
+                lease_s=NEGATIVE_LEASE_S,
+            ),
+            to,
+        )
 
     def _send(self, answer: Response, to: Name, about: Key | None = None) -> None:
         wire = answer.to_wire(self._identity.name, self._identity.key, self._identity.membership)
@@ -536,7 +553,15 @@ class RibCore:
             reported |= self._sender_of(route)
         for asker in reported:
             if self._may_tell(route, asker):
-                gone = Response(route.name, route.advertiser, b"", route.domain, (), 0.0, route.sequence)
+                gone = Response(
+                    name=route.name,
+                    advertiser=route.advertiser,
+                    advertisement=b"",
+                    domain=route.domain,
+                    transit=(),
+                    lease_s=0.0,
+                    sequence=route.sequence,
+                )
                 self._send(gone, asker.name)
 
     # -- the tier above
@@ -731,15 +756,27 @@ class RibCore:
         if isinstance(known, Route) and known.expires_s > now_s:
             lease_s = min(known.expires_s - now_s, LEASE_MAX_S)
             return Entry(
-                known.advertisement, b"", known.sender, known.domain, known.via, known.transit, lease_s,
-                known.is_from_above,
-            )  # fmt: skip
+                statement=known.advertisement,
+                membership=b"",
+                sender=known.sender,
+                domain=known.domain,
+                via=known.via,
+                transit=known.transit,
+                lease_s=lease_s,
+                is_from_above=known.is_from_above,
+            )
         if isinstance(known, Withdrawn) and known.proof:
-            own = self._policy.own
             return Entry(
-                known.proof, known.membership, known.sender, own, own, (), 0.0,
-                is_from_above=False, until_unix_s=known.valid_until_unix_s,
-            )  # fmt: skip
+                statement=known.proof,
+                membership=known.membership,
+                sender=known.sender,
+                domain=self._policy.own,
+                via=self._policy.own,
+                transit=(),
+                lease_s=0.0,
+                is_from_above=False,
+                until_unix_s=known.valid_until_unix_s,
+            )
         return None
 
     def _take_peer_message(self, statement: Statement, now: Timestamps) -> None:

@@ -70,7 +70,7 @@ class Stop(NamedTuple):
 Effect: TypeAlias = "Ask | Stop"
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(slots=True, eq=False, kw_only=True)
 class _Call(Generic[A]):
     answered: Callable[[A], None]
     failed: Callable[[Failure, str], None]
@@ -166,7 +166,7 @@ class Dispatch(Generic[A]):
             raise LocalError("no server is there")
         if self._held_bytes >= self._held_max_bytes:
             raise LocalError(f"requests of {self._held_bytes} bytes are under way: no more at once")
-        call = _Call(answered, failed, now_s)
+        call = _Call(answered=answered, failed=failed, begun_s=now_s)
         number = self._calls.add_call(now_s, timeout_s, call)
         call.request = write(number)
         self._held_bytes += len(call.request)

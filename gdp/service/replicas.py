@@ -13,7 +13,7 @@ from gdp.service.replication_messages import ReplicaStatus
 __all__ = ["Replica", "Replicas"]
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(slots=True, eq=False, kw_only=True)
 class Replica:
     """One replica.
 

@@ -154,7 +154,7 @@ class Sequencer(Generic[A]):
     def came(self, server: Name, now_s: float) -> None:
         """Add a replica."""
         if server not in self._replicas:
-            self._replicas[server] = Replica(0.0)
+            self._replicas[server] = Replica(quiet_until_s=0.0)
             self._election.restart(now_s)
             self._look(now_s)
 

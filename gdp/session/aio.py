@@ -400,7 +400,7 @@ class AsyncSession:
             DelegationError: the node may not call it.
         """
         self.driver.check()
-        call = Call(bytes(request), timeout_s, replication_of(replication))
+        call = Call(payload=bytes(request), timeout_s=timeout_s, replication=replication_of(replication))
         if len(call.payload) > PAYLOAD_MAX_BYTES:
             raise LocalError(f"the request has {len(call.payload)} bytes; at most {PAYLOAD_MAX_BYTES} can be sent")
         self.core.call(self.core.resolve(name, Right.CALL), call, time.monotonic())

@@ -26,7 +26,7 @@ _FOLLOW_S: Final = 0.05  # between two checks of the present servers, while call
 _GONE: Final = "the server has gone"
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(slots=True, eq=False, kw_only=True)
 class Call:
     """One call.
 

@@ -38,7 +38,7 @@ _open_names: Final = set[Name]()  # identities in use by this process: record lo
 _open_lock: Final = threading.Lock()
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class SessionNode:
     """The node that a driver runs; ``close`` releases all its resources."""
 
@@ -81,7 +81,9 @@ def open_node(config: SessionConfig) -> SessionNode:
         LocalError: keys, delegations or the device differ from the settings, or this node already runs.
     """
     identity, policy = load_member(config.identity, config.domain, Role.PROXY)
-    settings = NodeSettings(incarnation(), wall_clock_ms(), fresh_bytes, lease_s=config.lease_s)
+    settings = NodeSettings(
+        incarnation=incarnation(), first_sequence=wall_clock_ms(), random_bytes=fresh_bytes, lease_s=config.lease_s
+    )
     member = Participant(identity, policy, settings)
     directory = config.delegation_directory
     topics = DelegationStore(directory, identity)
@@ -105,7 +107,16 @@ def open_node(config: SessionConfig) -> SessionNode:
         runtime.every(LOOK_S, node_log.look)
         runtime.every(LOOK_S, Credentials(config.identity, config.domain, identity, policy).look)
         revocations.start(runtime)
-        return SessionNode(config, identity, member, runtime, plane, node_log, core, stack.pop_all())
+        return SessionNode(
+            config=config,
+            identity=identity,
+            member=member,
+            runtime=runtime,
+            plane=plane,
+            node_log=node_log,
+            core=core,
+            _stack=stack.pop_all(),
+        )
 
 
 def _own(name: Name) -> Callable[[], None]:

@@ -488,7 +488,7 @@ class Session:
             CallError: every server refused, or its handler raised.
             DelegationError: the node may not call it.
         """
-        call = Call(bytes(request), timeout_s, replication_of(replication))
+        call = Call(payload=bytes(request), timeout_s=timeout_s, replication=replication_of(replication))
         if len(call.payload) > PAYLOAD_MAX_BYTES:
             raise LocalError(f"the request has {len(call.payload)} bytes; at most {PAYLOAD_MAX_BYTES} can be sent")
         topic = self.core.resolve(name, Right.CALL)

@@ -53,7 +53,7 @@ class _End:
     mac: bytes
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Node:
     machine: ProtocolCore
     table: Table | None
@@ -98,7 +98,7 @@ class SimNetwork:
 
     def add(self, name: str, machine: ProtocolCore, table: Table | None = None) -> None:
         """Add a node; with a table it forwards what the table decides."""
-        self._nodes[name] = _Node(machine, table)
+        self._nodes[name] = _Node(machine=machine, table=table)
 
     def connect(self, a: str, b: str, sim_link: SimLink | None = None, cost: int = 10) -> SimLink:
         """Join two nodes by a link; return the link, which may be changed while time runs."""
@@ -150,7 +150,7 @@ class SimNetwork:
     def replace(self, name: str, machine: ProtocolCore, table: Table | None = None) -> None:
         """Restart a node without any state, on the same links."""
         before = self._nodes[name]
-        node = self._nodes[name] = _Node(machine, table, before.ports, before.costs)
+        node = self._nodes[name] = _Node(machine=machine, table=table, ports=before.ports, costs=before.costs)
         for port, (sim_link, own, _) in node.ports.items():
             machine.add_port(port, own.mac, sim_link.mtu, node.costs[port], self.now)
             if not sim_link.is_up:

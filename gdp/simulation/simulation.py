@@ -35,7 +35,7 @@ __all__ = ["Simulation"]
 _YEAR_S = 365 * 86_400
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Simulation:
     """A running network in memory.
 
@@ -213,11 +213,11 @@ class Simulation:
     def _settings(self) -> NodeSettings:
         self._incarnation += 1
         return NodeSettings(
-            self._incarnation,
-            int(self.network.now.unix_s * 1000),
-            self.network.random_bytes,
-            self.hello_s,
-            self.dead_s,
-            self.lease_s,
-            self.keepalive_ms,
+            incarnation=self._incarnation,
+            first_sequence=int(self.network.now.unix_s * 1000),
+            random_bytes=self.network.random_bytes,
+            hello_s=self.hello_s,
+            dead_s=self.dead_s,
+            lease_s=self.lease_s,
+            keepalive_ms=self.keepalive_ms,
         )

@@ -262,16 +262,16 @@ class Flooding:
         self._said[scope] = said
         self._sequence += 1
         state = LinkState(
-            self._identity.name,
-            self._domain,
-            scope,
-            self._sequence,
-            links,
-            inside,
-            ribs,
-            members,
-            self._life,
-            refused,
+            origin=self._identity.name,
+            domain=self._domain,
+            scope=scope,
+            sequence=self._sequence,
+            links=links,
+            inside=inside,
+            ribs=ribs,
+            members=members,
+            life=self._life,
+            refused=refused,
             said_unix_s=max(int(now_s + self._unix_ahead_s), 0),
             is_leaf=self._is_leaf,
         ).fitted(self._identity.membership)

@@ -155,6 +155,11 @@ class LocationUpdates:
     def _as_answer(self, place: Location, now_s: float) -> bytes:
         lease_s = max(place.expires_s - now_s, 0.0)
         answer = Response(
-            place.name, place.advertiser, place.advertisement, place.domain, tuple(sorted(place.transit)), lease_s
+            name=place.name,
+            advertiser=place.advertiser,
+            advertisement=place.advertisement,
+            domain=place.domain,
+            transit=tuple(sorted(place.transit)),
+            lease_s=lease_s,
         )
         return answer.to_wire(self._identity.name, self._identity.key, self._identity.membership)

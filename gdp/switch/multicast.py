@@ -536,20 +536,20 @@ class MulticastTrees:
         own_session, its_echo = sessions
         self._sequence += 1
         join = Join(
-            tree.topic,
-            tree.publisher,
-            tree.switch,
-            tree.domain,
-            tree.allowed,
-            mtu,
-            lease_s,
-            evidence,
-            its_echo,
-            self._sequence,
-            tree.version,
-            backup_for,
-            own_session,
-            tree.proof if lease_s else b"",
+            topic=tree.topic,
+            publisher=tree.publisher,
+            switch=tree.switch,
+            domain=tree.domain,
+            allowed=tree.allowed,
+            mtu=mtu,
+            lease_s=lease_s,
+            evidence=evidence,
+            session=its_echo,
+            sequence=self._sequence,
+            version=tree.version,
+            backup_for=backup_for,
+            sender_session=own_session,
+            proof=tree.proof if lease_s else b"",
         )
         kind = Kind.JOIN if lease_s else Kind.LEAVE
         self._outbox.say_at(*above, kind, join.to_wire(self._identity.name, self._identity.key))

@@ -27,7 +27,7 @@ _SCAN_S: Final = 0.01  # between two scans for queries that are due again
 _NEVER_S: Final = float("inf")
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Query:
     due_s: float  # ``_NEVER_S`` while it waits for the window
     since_s: float
@@ -73,7 +73,7 @@ class NameQueries:
         query = self._queries.get(name)
         if query is None:
             if len(self._queries) - self._watches < QUERIES_MAX:
-                self._queries[name] = _Query(_NEVER_S, now_s, owner)
+                self._queries[name] = _Query(due_s=_NEVER_S, since_s=now_s, owner=owner)
                 self._window.put(owner, name)
         elif query.is_answered:
             query.is_answered, query.tries, query.due_s = False, 0, now_s
@@ -83,7 +83,7 @@ class NameQueries:
         """Query a name at once and watch it for attached readers, who proved their right: no bound applies."""
         query = self._queries.get(name)
         if query is None:
-            query = self._queries[name] = _Query(_NEVER_S, now_s)
+            query = self._queries[name] = _Query(due_s=_NEVER_S, since_s=now_s)
         if not query.is_watch:
             self._window.cancel(query.owner, name)
             query.is_watch = True
@@ -111,7 +111,7 @@ class NameQueries:
         if query is None:
             if len(self._queries) - self._watches >= USED_NAMES_MAX:
                 return
-            query = self._queries[name] = _Query(now_s, now_s)
+            query = self._queries[name] = _Query(due_s=now_s, since_s=now_s)
             self._due_s = min(self._due_s, now_s)
         query.used_until_s = now_s + self._use_watch_s
 

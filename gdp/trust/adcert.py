@@ -29,7 +29,7 @@ from gdp.trust.right import Right, rights_from_fields, rights_to_wire
 __all__ = ["AdCert", "AdCertCache", "Chain"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class AdCert:
     """One link of a chain.
 

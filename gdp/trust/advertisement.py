@@ -31,7 +31,7 @@ __all__ = ["Advertisement", "UnverifiedAdvertisement", "sign_advertisement"]
 _MS = 1_000
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Advertisement:
     """A verified advertisement; only ``AdvertisementVerifier`` makes one.
 
@@ -102,7 +102,7 @@ class Advertisement:
         return frozenset((self.member.fingerprint, self.rtcert.fingerprint, *links))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class UnverifiedAdvertisement:
     """The content of an advertisement, parsed but not verified."""
 

@@ -37,7 +37,7 @@ class Action(str, Enum):
     ENDED = "ended"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class AuditLine:
     """One line of an audit log.
 
@@ -88,7 +88,7 @@ class AuditLine:
         return hashlib.sha256(self.to_line()).hexdigest()
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Event:
     action: Action
     what: str
@@ -125,12 +125,14 @@ class AuditTrail:
             return
         if self._allowance >= 1.0:
             self._allowance -= 1.0
-            self._lines.append(_Event(action, what, who, about, reason, count))
+            self._lines.append(_Event(action=action, what=what, who=who, about=about, reason=reason, count=count))
             return
         kind = (action, what, reason)
         if kind not in self._counts and len(self._counts) >= _KINDS_MAX:
             kind = (action, _OTHERS, "")
-        counted = self._counts.setdefault(kind, _Event(kind[0], kind[1], who, about, kind[2], 0))
+        counted = self._counts.setdefault(
+            kind, _Event(action=kind[0], what=kind[1], who=who, about=about, reason=kind[2], count=0)
+        )
         counted.who, counted.about = who, about
         counted.count += count
 
@@ -155,7 +157,15 @@ class AuditTrail:
         for each in events:
             seq += 1
             line = AuditLine(
-                seq, int(unix_s), each.action.value, each.what, each.who, each.about, each.reason, each.count, previous
+                seq=seq,
+                at_unix_s=int(unix_s),
+                action=each.action.value,
+                what=each.what,
+                who=each.who,
+                about=each.about,
+                reason=each.reason,
+                count=each.count,
+                previous=previous,
             )
             lines.append(line)
             previous = line.hash

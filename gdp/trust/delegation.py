@@ -30,7 +30,7 @@ EPOCHS_MAX: Final = 256  # in one file
 _FORMAT: Final = "gdp-delegation-1"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Delegation:
     """The rights of a node on a name, and their proofs.
 

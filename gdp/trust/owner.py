@@ -84,7 +84,9 @@ class Owner:
         chain, issuer = self._links(subject)
         to, rights = successor_subject(successor), frozenset(Right) - {Right.ATTACH}
         link = AdCert.make(self.key, issuer, subject, to, rights, validity, may_delegate=True)
-        return Delegation(subject, to.name, rights, (*chain, link), MappingProxyType({}))
+        return Delegation(
+            subject=subject, node=to.name, rights=rights, chain=(*chain, link), grants=MappingProxyType({})
+        )
 
     def _links(self, subject: Subject) -> tuple[tuple[bytes, ...], Name]:
         """Return the links from a name's key to this one, and the issuer of the next link."""
@@ -133,7 +135,14 @@ class Owner:
             epoch: make_grant(self.key, self.master, subject, epoch, to.name, recipient.kem)
             for epoch in sorted(set(epochs))
         }
-        return Delegation(subject, to.name, frozenset(rights), (*chain, link), MappingProxyType(grants), metadata)
+        return Delegation(
+            subject=subject,
+            node=to.name,
+            rights=frozenset(rights),
+            chain=(*chain, link),
+            grants=MappingProxyType(grants),
+            metadata=metadata,
+        )
 
     def revoke(self, subject: Subject, fingerprint: bytes, until_unix_s: int) -> bytes:
         """Return the revocation of an AdCert on one of this owner's names; a successor may revoke what it issued.

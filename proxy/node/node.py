@@ -153,7 +153,9 @@ def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[Pro
         LocalError: keys, delegations or the device are not as configured, or this proxy already runs.
     """
     identity, policy = load_member(config.identity, config.domain, Role.PROXY)
-    settings = NodeSettings(incarnation(), wall_clock_ms(), fresh_bytes, lease_s=config.lease_s)
+    settings = NodeSettings(
+        incarnation=incarnation(), first_sequence=wall_clock_ms(), random_bytes=fresh_bytes, lease_s=config.lease_s
+    )
     member = Participant(identity, policy, settings)
     with contextlib.ExitStack() as stack:
         stack.enter_context(run_alone("proxy", identity.name))

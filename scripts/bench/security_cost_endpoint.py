@@ -8,7 +8,6 @@ verified.
 
 from __future__ import annotations
 
-import inspect
 import json
 import secrets
 import sys
@@ -45,9 +44,16 @@ def mean_us(work: Callable[[int], object], numbers: Iterable[int]) -> float:
 def of_messages(size: int) -> dict[str, Callable[[], float]]:
     """Return the measurements of sealing and opening."""
     secret, source, topic, key = secrets.token_bytes(32), bytes(32), bytes(range(32)), SigningKey.generate()
-    is_salted = "random_bytes" in inspect.signature(Sealer).parameters  # not before messages had salts
-    salts = (membership.fresh_bytes,) if is_salted else ()
-    sealer = Sealer(secret, 1, Kind.DATA, source, 1, topic, key, *salts)
+    sealer = Sealer(
+        secret=secret,
+        epoch=1,
+        kind=Kind.DATA,
+        source=source,
+        incarnation=1,
+        destination=topic,
+        signer=key,
+        random_bytes=membership.fresh_bytes,
+    )
     opener, public, message = Opener(secret, Kind.DATA, source, 1, topic), key.public, secrets.token_bytes(size)
     numbers, digest = count(1), secrets.token_bytes(32)
     signature = key.sign_digest(digest)  # the cost to verify one is the same for all

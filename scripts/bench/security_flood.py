@@ -148,9 +148,15 @@ def hellos(kind: str, overlay: Overlay) -> list[bytes]:
 
 def _hello(member: Identity, key: SigningKey | None) -> list[bytes]:
     hello = Hello(
-        secrets.token_bytes(NONCE_BYTES), 1, (secrets.token_bytes(ECHO_BYTES),), _MTU, bytes(8), member.membership,
-        exchange_key=secrets.token_bytes(32), life=secrets.token_bytes(LIFE_BYTES),
-    )  # fmt: skip
+        nonce=secrets.token_bytes(NONCE_BYTES),
+        sequence=1,
+        heard=(secrets.token_bytes(ECHO_BYTES),),
+        mtu=_MTU,
+        digest=bytes(8),
+        membership=member.membership,
+        exchange_key=secrets.token_bytes(32),
+        life=secrets.token_bytes(LIFE_BYTES),
+    )
     wire = hello.to_wire(member.name, key or member.key)
     return ControlFragmenter(member.name, secrets.randbits(64)).split(Kind.HELLO, wire, _MTU)
 

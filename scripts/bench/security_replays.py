@@ -208,7 +208,7 @@ class Domain:
     def __post_init__(self) -> None:
         self.rng = random.Random(self.seed)
         self.world = world = Simulation(
-            _TOPOLOGY, self.seed, hello_s=1.0, dead_s=3.6, lease_s=_LEASE_S, keepalive_ms=500
+            topology=_TOPOLOGY, seed=self.seed, hello_s=1.0, dead_s=3.6, lease_s=_LEASE_S, keepalive_ms=500
         )
         assert isinstance(world.network, RecordingNetwork)
         self.network = world.network

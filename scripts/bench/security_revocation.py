@@ -192,7 +192,7 @@ def _on_disk(revoked: Revocations, authority: CertificateAuthority, unix_s: floa
 def _newcomer(count: int) -> dict[str, float]:
     """Return the cost until a neighbour that comes up and knows none keeps all, and again ten more."""
     topology = Topology((Link("s1", "s2"),), (DomainPlan("lab", ("s1", "s2")),), ())
-    world = Simulation(topology, keepalive_ms=1_000, dead_s=10.0, hello_s=1.0)
+    world = Simulation(topology=topology, keepalive_ms=1_000, dead_s=10.0, hello_s=1.0)
     first, second = world.topology.nodes
     domain = world.topology.domain_of(first).label
     authority = world.authorities[domain]

@@ -52,7 +52,7 @@ class Rotation:
     """Ring, its topics, and the epochs that have begun."""
 
     def __init__(self, loss: float) -> None:
-        self.world = Simulation(ring5(), seed=5)
+        self.world = Simulation(topology=ring5(), seed=5)
         self.world.add_member("nuc3/desk", "nuc3")
         if not self.world.settle():
             raise SystemExit("the ring does not come up")

@@ -61,7 +61,9 @@ class Memory:
     """Three switches, a RIB and two members on a network in memory."""
 
     def __init__(self) -> None:
-        self._world = Simulation(chain(3), seed=1, hello_s=20.0, dead_s=70.0)  # hellos cost most of the time otherwise
+        self._world = Simulation(
+            topology=chain(3), seed=1, hello_s=20.0, dead_s=70.0
+        )  # hellos cost most of the time otherwise
         if not self._world.settle():
             raise FailedError("the network in memory did not settle")
         self._names = 0

@@ -36,7 +36,21 @@ def test_x05_a_join_to_another_member_that_said_our_nonce_is_not_taken() -> None
     # Statement that ``one`` signs for Mallory, as MulticastTrees does: its session is the nonce of Mallory's hellos.
     session = one.ports[0].nonce
     domain = B.member.domain
-    join = Join(B.name, B.name, B.name, domain, frozenset(), 1_500, 5.0, b"", theirs.echo, 1, 0, ZERO, session)
+    join = Join(
+        topic=B.name,
+        publisher=B.name,
+        switch=B.name,
+        domain=domain,
+        allowed=frozenset(),
+        mtu=1_500,
+        lease_s=5.0,
+        evidence=b"",
+        session=theirs.echo,
+        sequence=1,
+        version=0,
+        backup_for=ZERO,
+        sender_session=session,
+    )
     wire = join.to_wire(A.name, A.key)
     with pytest.raises(StatementError):
         two.ports[0].receive_join(Join.from_fields(parse(wire).fields), two.ports[0].neighbours[A.name])

@@ -36,7 +36,9 @@ def mac_of(label: object) -> bytes:
 def said(
     identity: Identity, nonce: bytes, sequence: int = 1, heard: tuple[bytes, ...] = (), key: Identity | None = None
 ) -> bytes:
-    hello = Hello(nonce, sequence, heard, 1_500, bytes(8), identity.membership)
+    hello = Hello(
+        nonce=nonce, sequence=sequence, heard=heard, mtu=1_500, digest=bytes(8), membership=identity.membership
+    )
     return hello.to_wire(identity.name, (key or identity).key)
 
 
@@ -175,7 +177,15 @@ def test_a41_a_cookie_counts_for_one_address_one_session_and_one_hello() -> None
 
     def shown(sequence: int, tag_sequence: int, asker: bytes = port.nonce) -> Hello:
         tag = admission.seal_cookie(cookie, nonce, tag_sequence)
-        return Hello(nonce, sequence, (), 1_500, bytes(8), b"", cookies=((asker, tag),))
+        return Hello(
+            nonce=nonce,
+            sequence=sequence,
+            heard=(),
+            mtu=1_500,
+            digest=bytes(8),
+            membership=b"",
+            cookies=((asker, tag),),
+        )
 
     assert cookies.proves(shown(1, 1), port.nonce, mac, 11.0)
     assert cookies.proves(shown(2, 2), port.nonce, mac, 129.0)  # the secret before the present one
@@ -255,7 +265,15 @@ def test_a22_a_hello_of_an_earlier_life_played_at_another_port_lets_no_neighbour
     one.add_port(1, b"\x02\x01\x01\x00\x00\x00", 1_500, 10, link.now_s)
     link.ends[1]._life = bytes(15) + b"\x02"
     link.run(6.0)
-    old = Hello(b"n" * 8, 9, (), 1_500, bytes(8), B.membership, life=bytes(15) + b"\x01").to_wire(B.name, B.key)
+    old = Hello(
+        nonce=b"n" * 8,
+        sequence=9,
+        heard=(),
+        mtu=1_500,
+        digest=bytes(8),
+        membership=B.membership,
+        life=bytes(15) + b"\x01",
+    ).to_wire(B.name, B.key)
     one.receive(hello_in(old, 1, mac_of(1)), parse(old), at(link.now_s))
     one.drop_silent(link.now_s)
     (known,) = (each for each in one.ports[0].neighbours.values())
@@ -269,7 +287,15 @@ def test_a20_a_second_node_of_an_identity_without_proof_draws_no_more_than_it_se
         each.sent = 0
     received = 0
     for number in range(16):  # later incarnations of the neighbour, at another address
-        hello = Hello(number.to_bytes(8, "big"), 1, (), 1_500, bytes(8), B.membership, life=bytes(15) + b"\x09")
+        hello = Hello(
+            nonce=number.to_bytes(8, "big"),
+            sequence=1,
+            heard=(),
+            mtu=1_500,
+            digest=bytes(8),
+            membership=B.membership,
+            life=bytes(15) + b"\x09",
+        )
         received += link.inject(hello.to_wire(B.name, B.key), mac_of(number))
         link.run(1.0)
     calm.run(16.0)

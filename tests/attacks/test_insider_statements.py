@@ -18,7 +18,13 @@ def test_a_hello_of_an_older_life_from_another_address_ends_no_switch() -> None:
     world.network.connect("nuc1", "nuc1/insider").is_up = False  # a second port of the same node
     port = max(nuc1.hello_protocol.ports)
     hello = Hello(
-        b"a nonce!", 1, (nuc1.hello_protocol.ports[port].echo,), 1_500, bytes(8), insider.membership, Timing(0, 0, 1)
+        nonce=b"a nonce!",
+        sequence=1,
+        heard=(nuc1.hello_protocol.ports[port].echo,),
+        mtu=1_500,
+        digest=bytes(8),
+        membership=insider.membership,
+        timing=Timing(0, 0, 1),
     )
     frame = control(Kind.HELLO, hello.to_wire(insider.name, insider.key), source=insider.name)
     world.network.inject("nuc1", port, frame)

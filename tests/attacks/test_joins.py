@@ -40,9 +40,20 @@ def test_x03_a_join_that_leads_elsewhere_moves_no_tree(proof: str) -> None:
     lie = next(each.name for each in world.switches.values() if each.name not in (home.name, tree.switch))
     shown = {"none": b"", "of the true place": tree.proof, "of another topic": identity.membership}[proof]
     join = Join(
-        tree.topic, tree.publisher, lie, tree.domain, tree.allowed, 1_500, 7.0, tree.evidence,
-        home.hello_protocol.ports[liar.port].echo, 1 << 60, version + 1_000, sender_session=liar.nonce, proof=shown,
-    )  # fmt: skip
+        topic=tree.topic,
+        publisher=tree.publisher,
+        switch=lie,
+        domain=tree.domain,
+        allowed=tree.allowed,
+        mtu=1_500,
+        lease_s=7.0,
+        evidence=tree.evidence,
+        session=home.hello_protocol.ports[liar.port].echo,
+        sequence=1 << 60,
+        version=version + 1_000,
+        sender_session=liar.nonce,
+        proof=shown,
+    )
     before = counted(world)
     frames = world.switches["nuc1"]._fragmenter.split(Kind.JOIN, join.to_wire(identity.name, identity.key), 1_500)
     for frame in frames:
@@ -61,10 +72,20 @@ def test_x03_a_genuine_advertisement_of_the_publisher_says_where_it_is_only_unde
     (label,) = (each for each, machine in world.switches.items() if machine is home)
     version = tree.version
     join = Join(
-        tree.topic, tree.publisher, tree.switch, tree.domain, tree.allowed, 1_500, 7.0, tree.evidence,
-        home.hello_protocol.ports[liar.port].echo, 1 << 60, version + (1 << 40),
-        sender_session=liar.nonce, proof=tree.proof,
-    )  # fmt: skip
+        topic=tree.topic,
+        publisher=tree.publisher,
+        switch=tree.switch,
+        domain=tree.domain,
+        allowed=tree.allowed,
+        mtu=1_500,
+        lease_s=7.0,
+        evidence=tree.evidence,
+        session=home.hello_protocol.ports[liar.port].echo,
+        sequence=1 << 60,
+        version=version + (1 << 40),
+        sender_session=liar.nonce,
+        proof=tree.proof,
+    )
     for frame in world.switches["nuc1"]._fragmenter.split(Kind.JOIN, join.to_wire(identity.name, identity.key), 1_500):
         world.network.inject(label, liar.port, frame, liar.mac)
     assert tree.version == version

@@ -52,7 +52,7 @@ def detour(*, far: bool = False) -> Simulation:
             *([Attachment("right", "rib", "rib")] if far else []),
         ),
     )  # fmt: skip
-    world = Simulation(topology, lease_s=LEASE_S, leaves=("leaf",))
+    world = Simulation(topology=topology, lease_s=LEASE_S, leaves=("leaf",))
     assert world.settle()
     return world
 
@@ -167,9 +167,20 @@ def test_l04_a_leaf_that_joins_for_a_reader_elsewhere_gets_no_copies() -> None:
     neighbour = left.hello_protocol.neighbour(1, leaf.name)
     assert neighbour is not None
     join = Join(
-        tree.topic, tree.publisher, left.name, left._policy.own, tree.allowed, 1_500, 5.0, tree.evidence,
-        left.hello_protocol.ports[1].echo, 1 << 50, tree.version, sender_session=neighbour.nonce, proof=tree.proof,
-    )  # fmt: skip
+        topic=tree.topic,
+        publisher=tree.publisher,
+        switch=left.name,
+        domain=left._policy.own,
+        allowed=tree.allowed,
+        mtu=1_500,
+        lease_s=5.0,
+        evidence=tree.evidence,
+        session=left.hello_protocol.ports[1].echo,
+        sequence=1 << 50,
+        version=tree.version,
+        sender_session=neighbour.nonce,
+        proof=tree.proof,
+    )
     tap = Tap("left", "leaf")
     world.network.taps.append(tap)
     for frame in world.switches["leaf"]._fragmenter.split(Kind.JOIN, join.to_wire(leaf.name, leaf.key), 1_500):
@@ -205,7 +216,7 @@ def test_l05_a_leaf_is_no_border_and_no_neighbour_of_another_domain() -> None:
 def test_l06_a_leaf_hosts_no_rib_that_its_own_root_does_not_name(signed_by: str) -> None:
     world = detour(far=True)
     leaf, left = world.identities["leaf"], world.switches["left"]
-    keys = Simulation(world.topology).identities["rib:home"] if signed_by == "a stranger's root" else None
+    keys = Simulation(topology=world.topology).identities["rib:home"] if signed_by == "a stranger's root" else None
     rib = keys or world.identities["rib:away"]
     validity = Validity.lasting(world.network.now.unix_s, 600)
     proof = RtCert.make(rib, leaf.name, validity)  # the RIB's owner and the machine's tenant are one
@@ -257,7 +268,7 @@ def test_two_leaves_that_are_joined_reach_each_others_nodes_and_pass_nothing_on(
             Attachment("hub", "rib", "rib"), Attachment("hub", "proxy", "desk"), Attachment("one", "proxy", "first"),
         ),
     )  # fmt: skip
-    world = Simulation(topology, lease_s=LEASE_S, leaves=("one", "two"))
+    world = Simulation(topology=topology, lease_s=LEASE_S, leaves=("one", "two"))
     assert world.settle()
     assert first_to(world, "one", "two") == "two"
     assert first_to(world, "hub", "two") is None

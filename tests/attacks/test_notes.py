@@ -48,8 +48,17 @@ def by_the_secret_alone(pipe: Pipe, end: End, number: int, report: AckNack) -> b
     """Return the control datagram that proved a reader when the topic's secret alone was sufficient."""
     source, reader = pipe.source, end.reader
     key = seal_key(SECRETS[1], Kind.ACKNACK, reader.name, reader.incarnation, source.name)
-    to = source.name, TOPIC, source.incarnation
-    made = ControlSealer(key, 1, Kind.ACKNACK, reader.name, reader.incarnation, *to, iter([number]))
+    made = ControlSealer(
+        key=key,
+        epoch=1,
+        kind=Kind.ACKNACK,
+        source=reader.name,
+        incarnation=reader.incarnation,
+        destination=source.name,
+        topic=TOPIC,
+        destination_incarnation=source.incarnation,
+        numbers=iter([number]),
+    )
     return made.seal(report.to_wire())
 
 

@@ -98,9 +98,15 @@ def test_a07_link_states_of_one_origin_are_flooded_at_a_pace(monkeypatch: pytest
     world.network.taps.append(tap)
     for number in range(200):
         state = LinkState(
-            liar.name, liar.root.domain, Scope.BORDER, sequence + number, (), (), (),
+            origin=liar.name,
+            domain=liar.root.domain,
+            scope=Scope.BORDER,
+            sequence=sequence + number,
+            links=(),
+            inside=(),
+            ribs=(),
             said_unix_s=int(world.network.now.unix_s),
-        )  # fmt: skip
+        )
         frames = ControlFragmenter(liar.name, 1 << 40).split(
             Kind.LINK_STATE, state.to_wire(liar.key, liar.membership), 1_400
         )
@@ -233,7 +239,18 @@ def test_a65_one_neighbours_branches_leave_capacity_for_the_others(monkeypatch: 
     through = frozenset(world.policy("school").transit)
     for number in range(1, LIMIT // 2 + 1):
         topic = Name(number.to_bytes(32, "big"))
-        join = Join(topic, own, own, domain, through, 1_400, 7.0, b"claim", b"", number)
+        join = Join(
+            topic=topic,
+            publisher=own,
+            switch=own,
+            domain=domain,
+            allowed=through,
+            mtu=1_400,
+            lease_s=7.0,
+            evidence=b"claim",
+            session=b"",
+            sequence=number,
+        )
         multicast.join(join, greedy, world.network.now.mono_s)
     with pytest.raises(StatementError, match="quota"):
         multicast.join(replace(join, topic=Name(b"s" * 32)), greedy, world.network.now.mono_s)

@@ -29,7 +29,16 @@ class Stream:
         )
 
     def frames(self, number: int, message: bytes, signer: Signer = WRITER) -> list[bytes]:
-        sealer = Sealer(SECRET, 1, Kind.DATA, self.source, INCARNATION, self.topic, signer, urandom)
+        sealer = Sealer(
+            secret=SECRET,
+            epoch=1,
+            kind=Kind.DATA,
+            source=self.source,
+            incarnation=INCARNATION,
+            destination=self.topic,
+            signer=signer,
+            random_bytes=urandom,
+        )
         return list(sealer.seal(number, 0, message, MTU))
 
     def give(self, frames: list[bytes]) -> list[ReassembledMessage]:
@@ -91,6 +100,15 @@ def test_a58_the_largest_message_of_a_lone_source_fits_and_so_do_three() -> None
     assert MESSAGE_MAX_BYTES * 1.3 < JOIN_TOTAL_BYTES / 3 <= JOIN_SOURCE_BYTES
     stream = Stream(ReassemblyQuota(), b"a" * 32)
     message = bytes(MESSAGE_MAX_BYTES)
-    sealer = Sealer(SECRET, 1, Kind.DATA, stream.source, INCARNATION, stream.topic, WRITER, urandom)
+    sealer = Sealer(
+        secret=SECRET,
+        epoch=1,
+        kind=Kind.DATA,
+        source=stream.source,
+        incarnation=INCARNATION,
+        destination=stream.topic,
+        signer=WRITER,
+        random_bytes=urandom,
+    )
     (joined,) = stream.give(list(sealer.seal(1, 0, message, 9_000)))
     assert len(joined.message) == MESSAGE_MAX_BYTES

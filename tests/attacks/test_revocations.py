@@ -239,7 +239,14 @@ def test_a06_fresh_hellos_draw_no_more_bytes_than_they_cost(echoes: bool) -> Non
     for _ in range(40):
         link = world.switches["nuc1"].hello_protocol.ports[port]
         nonce = b"fresh" + next(numbers).to_bytes(3, "big")
-        hello = Hello(nonce, 1, (link.echo,) if echoes else (), 1_500, bytes(8), identity.membership)
+        hello = Hello(
+            nonce=nonce,
+            sequence=1,
+            heard=(link.echo,) if echoes else (),
+            mtu=1_500,
+            digest=bytes(8),
+            membership=identity.membership,
+        )
         for frame in world.members[label].attachment.fragmenter.split(
             Kind.HELLO, hello.to_wire(identity.name, identity.key), 1_500
         ):

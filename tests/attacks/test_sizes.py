@@ -72,9 +72,15 @@ def test_a70_a_link_state_of_a_rib_called_zero_is_malformed() -> None:
     flow = flowing(world)
     liar = world.identities["nuc2"]
     state = LinkState(
-        liar.name, liar.root.domain, Scope.BORDER, int(world.network.now.unix_s * 1_000) + 1, (), (),
-        (AttachedRib(ZERO, liar.root.domain, bytes(8)),), said_unix_s=int(world.network.now.unix_s),
-    )  # fmt: skip
+        origin=liar.name,
+        domain=liar.root.domain,
+        scope=Scope.BORDER,
+        sequence=int(world.network.now.unix_s * 1_000) + 1,
+        links=(),
+        inside=(),
+        ribs=(AttachedRib(ZERO, liar.root.domain, bytes(8)),),
+        said_unix_s=int(world.network.now.unix_s),
+    )
     world.network.inject(
         "nuc1", 0, control(Kind.LINK_STATE, state.to_wire(liar.key, liar.membership)), mac_of(world, "nuc1")
     )
@@ -106,9 +112,16 @@ def test_a64_a_link_state_of_more_than_fits_is_cut_and_ends_no_switch() -> None:
     proof = {"membership": bytes(700), "rtcert": bytes(300)}
     ribs = tuple(AttachedRib(name, nuc1.root.domain, bytes(8), **proof) for name in names(RIBS_MAX))
     state = LinkState(
-        nuc1.name, nuc1.root.domain, Scope.BORDER, 1, links, links, ribs, tuple(names(MEMBERS_MAX)),
+        origin=nuc1.name,
+        domain=nuc1.root.domain,
+        scope=Scope.BORDER,
+        sequence=1,
+        links=links,
+        inside=links,
+        ribs=ribs,
+        members=tuple(names(MEMBERS_MAX)),
         refused=tuple(names(RIBS_MAX)),
-    ).fitted(nuc1.membership)  # fmt: skip
+    ).fitted(nuc1.membership)
     wire = state.to_wire(nuc1.key, nuc1.membership)
     assert len(wire) <= CONTROL_MAX_BYTES
     read = LinkState.from_fields(parse(wire).fields, nuc1.name, nuc1.root.domain)

@@ -24,7 +24,19 @@ def xor(a: bytes, b: bytes) -> bytes:
 
 
 def test_a32_copies_of_a_publisher_do_not_repeat_a_nonce() -> None:
-    copies = [Sealer(SECRET, 1, Kind.DATA, SOURCE, INCARNATION, TOPIC, WRITER, urandom) for _ in range(2)]
+    copies = [
+        Sealer(
+            secret=SECRET,
+            epoch=1,
+            kind=Kind.DATA,
+            source=SOURCE,
+            incarnation=INCARNATION,
+            destination=TOPIC,
+            signer=WRITER,
+            random_bytes=urandom,
+        )
+        for _ in range(2)
+    ]
     for number in range(1, 100):
         bodies = [
             copy.seal(number, 0, message, 1_500)[0][HEADER_BYTES + SALT_BYTES : -SIGNATURE_BYTES - 16]
@@ -36,7 +48,14 @@ def test_a32_copies_of_a_publisher_do_not_repeat_a_nonce() -> None:
 def test_a32_what_was_drawn_before_the_snapshot_seals_nothing_after_it() -> None:
     drawn: list[bytes] = []
     sealer = Sealer(
-        SECRET, 1, Kind.DATA, SOURCE, INCARNATION, TOPIC, WRITER, lambda size: drawn.append(urandom(size)) or drawn[-1]
+        secret=SECRET,
+        epoch=1,
+        kind=Kind.DATA,
+        source=SOURCE,
+        incarnation=INCARNATION,
+        destination=TOPIC,
+        signer=WRITER,
+        random_bytes=lambda size: drawn.append(urandom(size)) or drawn[-1],
     )
     for number in range(1, 5):
         assert len(drawn) == number - 1
@@ -46,7 +65,17 @@ def test_a32_what_was_drawn_before_the_snapshot_seals_nothing_after_it() -> None
 
 def test_a32_copies_of_a_reader_that_use_one_number_give_no_plaintext_away() -> None:
     made = [
-        ControlSealer(b"k" * 32, 1, Kind.ACKNACK, SOURCE, 5, TOPIC, TOPIC, 9, count(7)).seal(body)
+        ControlSealer(
+            key=b"k" * 32,
+            epoch=1,
+            kind=Kind.ACKNACK,
+            source=SOURCE,
+            incarnation=5,
+            destination=TOPIC,
+            topic=TOPIC,
+            destination_incarnation=9,
+            numbers=count(7),
+        ).seal(body)
         for body in (ONE, OTHER)
     ]
     bodies = [note[HEADER_BYTES + NAME_BYTES : -16] for note in made]

@@ -55,11 +55,25 @@ __all__ = ["DECODERS"]
 _A: Final = Name(b"a" * 32)
 _NODE: Final = ROBOT
 _HEIR: Final = SCHOOL.succeed(LAB.key, DAY, NOW)
-_AUDIT: Final = AuditLine(1, NOW, "accepted", "name", "ab", "cd", "", 1, BEGIN).to_line()
-_ENTRY: Final = Entry(b"claim", b"cert", _A, _A, _A, (_A,), 9.0, is_from_above=False)
+_AUDIT: Final = AuditLine(
+    seq=1, at_unix_s=NOW, action="accepted", what="name", who="ab", about="cd", reason="", count=1, previous=BEGIN
+).to_line()
+_ENTRY: Final = Entry(
+    statement=b"claim",
+    membership=b"cert",
+    sender=_A,
+    domain=_A,
+    via=_A,
+    transit=(_A,),
+    lease_s=9.0,
+    is_from_above=False,
+)
 _READS: Final[dict[str, tuple[bytes, Callable[[Fields], object]]]] = {
     **{name.replace(" ", "-"): (wire, read) for name, (wire, _, read) in BODIES.items()},
-    "presence": (Presence(_A, 1, _A, 7).to_wire(_NODE.name, _NODE.key, b"cert"), Presence.from_fields),
+    "presence": (
+        Presence(node=_A, incarnation=1, other=_A, question=7).to_wire(_NODE.name, _NODE.key, b"cert"),
+        Presence.from_fields,
+    ),
     "digest": (Digest(b"", bytes(8), is_last=True).to_wire(_NODE.name, _NODE.key, b"cert"), Digest.from_fields),
     "fetch": (Fetch((b"a",), ((_A, _A),)).to_wire(_NODE.name, _NODE.key, b"cert"), Fetch.from_fields),
     "inventory": (
@@ -121,7 +135,17 @@ def _note(data: bytes) -> object:
 
 
 def _note_seed() -> bytes:
-    return ControlSealer(_KEY, 1, Kind.ACKNACK, SOURCE, 5, TOPIC, TOPIC, 9, count(1)).seal(b"body")
+    return ControlSealer(
+        key=_KEY,
+        epoch=1,
+        kind=Kind.ACKNACK,
+        source=SOURCE,
+        incarnation=5,
+        destination=TOPIC,
+        topic=TOPIC,
+        destination_incarnation=9,
+        numbers=count(1),
+    ).seal(b"body")
 
 
 def _introduction() -> bytes:

@@ -706,7 +706,16 @@ class Forge:
         own = next((each for each in members if each.name == identity.name), None)
         incarnation = 1 if own is None else own.attachment._incarnation
         number = self._number(rng) if rng.random() < 0.2 else next(self._numbers)
-        sealer = Sealer(secret, epoch, kind, identity.name, incarnation, topic, identity.key, rng.randbytes)
+        sealer = Sealer(
+            secret=secret,
+            epoch=epoch,
+            kind=kind,
+            source=identity.name,
+            incarnation=incarnation,
+            destination=topic,
+            signer=identity.key,
+            random_bytes=rng.randbytes,
+        )
         flags = rng.choice((0, Flag.RELIABLE, Flag.RELIABLE | Flag.LATCHED, Flag.BUNDLE | Flag.RELIABLE, 0xFE))
         try:
             frames = list(sealer.seal(min(number, _U64 - 1), int(flags), body, 1_400))

@@ -144,8 +144,8 @@ class Stage:
 
     def __post_init__(self) -> None:
         self.world = world = Simulation(
-            _TOPOLOGY,
-            self.seed,
+            topology=_TOPOLOGY,
+            seed=self.seed,
             hello_s=1.0,
             dead_s=3.6,
             lease_s=_LEASE_S,

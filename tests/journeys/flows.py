@@ -125,7 +125,7 @@ def ring(
     seed: int = 1, transits: Mapping[str, tuple[str, ...]] | None = None, *, lease_s: float = LEASE_S
 ) -> Simulation:
     """Return the ring of five, with every member attached."""
-    world = Simulation(ring5(), seed, transits=transits, lease_s=lease_s)
+    world = Simulation(topology=ring5(), seed=seed, transits=transits, lease_s=lease_s)
     assert world.settle()
     return world
 

@@ -200,8 +200,8 @@ class Trial:
         self.topology = self.plan.topology()
         slower = max(1.0, len(self.topology.nodes) / _FAST_SWITCHES)
         self.world = Simulation(
-            self.topology,
-            self.plan.seed,
+            topology=self.topology,
+            seed=self.plan.seed,
             hello_s=HELLO_S * slower,
             dead_s=DEAD_S * slower,
             lease_s=LEASE_S,

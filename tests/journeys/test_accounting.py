@@ -115,7 +115,7 @@ class Books:
 
     def __init__(self, others: Counter[DropReason]) -> None:
         self._others = others
-        self.world = Simulation(chain(5))
+        self.world = Simulation(topology=chain(5))
         assert self.world.settle()
         self.flow = flowing(self.world, source=A, readers=(B,), reliable=False)
         self.network = self.world.network

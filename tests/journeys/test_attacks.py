@@ -306,9 +306,18 @@ def test_a_join_without_evidence_installs_nothing() -> None:
     session = nuc1.hello_protocol.ports[0].echo
     domains = frozenset(nuc1._policy.transit)
     join = Join(
-        secret, world.members[ROBOT].name, nuc1.name, nuc1._policy.own, domains, 1_500, 5.0, b"", session, 1 << 60,
+        topic=secret,
+        publisher=world.members[ROBOT].name,
+        switch=nuc1.name,
+        domain=nuc1._policy.own,
+        allowed=domains,
+        mtu=1_500,
+        lease_s=5.0,
+        evidence=b"",
+        session=session,
+        sequence=1 << 60,
         sender_session=nuc1.hello_protocol.neighbour(0, nuc2.name).nonce,
-    )  # fmt: skip
+    )
     world.network.inject("nuc1", 0, control(Kind.JOIN, join.to_wire(nuc2.name, nuc2.key)), mac_of(world, "nuc1"))
     assert nuc1.multicast.trees.of_topic(secret) == []
     assert nuc1.drops()[DropReason.MALFORMED] == 1
@@ -324,9 +333,18 @@ def test_a_join_with_evidence_of_another_topic_installs_nothing() -> None:
     secret, session = Name(b"t" * 32), nuc1.hello_protocol.ports[0].echo
     domains = frozenset(nuc1._policy.transit)
     join = Join(
-        secret, world.members[ROBOT].name, nuc1.name, nuc1._policy.own, domains, 1_500, 5.0, evidence, session, 1 << 60,
+        topic=secret,
+        publisher=world.members[ROBOT].name,
+        switch=nuc1.name,
+        domain=nuc1._policy.own,
+        allowed=domains,
+        mtu=1_500,
+        lease_s=5.0,
+        evidence=evidence,
+        session=session,
+        sequence=1 << 60,
         sender_session=nuc1.hello_protocol.neighbour(0, nuc2.name).nonce,
-    )  # fmt: skip
+    )
     world.network.inject("nuc1", 0, control(Kind.JOIN, join.to_wire(nuc2.name, nuc2.key)), mac_of(world, "nuc1"))
     assert nuc1.multicast.trees.of_topic(secret) == []
     assert nuc1.drops()[DropReason.NOT_DELEGATED] == 1
@@ -366,7 +384,9 @@ def test_an_answer_from_no_rib_of_ones_own_is_not_believed(role: Role, domain: s
     liar = world.identity(role, "liar", domain)
     nuc1 = world.switches["nuc1"]
     name = flow.topic.name
-    answer = Response(name, name, b"", liar.root.domain, (), 2.0).to_wire(liar.name, liar.key, liar.membership)
+    answer = Response(
+        name=name, advertiser=name, advertisement=b"", domain=liar.root.domain, transit=(), lease_s=2.0
+    ).to_wire(liar.name, liar.key, liar.membership)
     header = Header(Kind.RIB_ANSWER, Flag.LAST, HOPS_MAX, 0, len(answer), 1, 0, 1, 9, nuc1.name, liar.name)
     world.network.inject("nuc1", 0, encode(header) + answer, mac_of(world, "nuc1"))
     assert nuc1.drops()[DropReason.WRONG_DOMAIN] == 1

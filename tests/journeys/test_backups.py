@@ -26,7 +26,7 @@ def square(mtu: int = 1_500) -> Simulation:
             Attachment("s1", "proxy", "here"),
         ),
     )
-    world = Simulation(topology, lease_s=LEASE_S)
+    world = Simulation(topology=topology, lease_s=LEASE_S)
     assert world.settle()
     return world
 

@@ -178,7 +178,7 @@ def test_frames_that_overtake_each_other_arrive_in_order() -> None:
 
 
 def test_the_network_settles_with_loss_from_the_beginning() -> None:
-    world = Simulation(ring5(), lease_s=LEASE_S)
+    world = Simulation(topology=ring5(), lease_s=LEASE_S)
     for sim_link in world.cables.values():
         sim_link.loss = 0.1
     assert world.settle(30)

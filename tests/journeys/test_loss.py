@@ -15,7 +15,7 @@ EVERY_S = 0.25
 
 
 def flow_of(*, reliable: bool = True) -> Flow:
-    world = Simulation(chain(2))
+    world = Simulation(topology=chain(2))
     assert world.settle()
     flow = flowing(world, source=SOURCE, readers=(READER,), reliable=reliable)
     world.network.run(1)
@@ -124,7 +124,7 @@ def test_reading_again_on_purpose_is_no_loss() -> None:
 
 
 def test_a_latched_topic_without_earlier_readers_has_lost_nothing_for_its_first_reader() -> None:
-    world = Simulation(chain(2))
+    world = Simulation(topology=chain(2))
     assert world.settle()
     flow = advertise(world, source=SOURCE, depth=2)
     for number in range(5):

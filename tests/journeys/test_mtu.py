@@ -43,7 +43,7 @@ def wide(topology: Topology, mtu: int = JUMBO, **links: int) -> Simulation:
     """Return a network of wide links, except those given as ``a_b=mtu``."""
     narrow = {frozenset(ends.split("_")): size for ends, size in links.items()}
     made = tuple(replace(link, mtu=narrow.get(link.ends(), mtu)) for link in topology.links)
-    world = Simulation(replace(topology, links=made), lead_mtu=mtu, lease_s=LEASE_S)
+    world = Simulation(topology=replace(topology, links=made), lead_mtu=mtu, lease_s=LEASE_S)
     assert world.settle()
     return world
 

@@ -75,7 +75,7 @@ def test_the_allowed_way_is_taken_again_when_it_is_back() -> None:
 
 @pytest.mark.momentary("hellos have no lease of a name")
 def test_a_border_of_an_untrusted_domain_is_no_neighbour() -> None:
-    world = Simulation(ring5(), trusts=WITHOUT_BACKBONE)
+    world = Simulation(topology=ring5(), trusts=WITHOUT_BACKBONE)
     world.network.run(3)
     border = world.switches["nuc2"]
     assert {n.name for n in border.hello_protocol.all_up()} == {

@@ -24,7 +24,7 @@ SERVERS = ("s3/a", "s3/b", "s3/c")
 
 def cluster(*labels: str, lease_s: float = LEASE_S) -> tuple[Simulation, Party, list[Party]]:
     """Return a client and servers that answer nothing at the other end of a chain, matched with each other."""
-    world = Simulation(chain(3), lease_s=lease_s)
+    world = Simulation(topology=chain(3), lease_s=lease_s)
     for label in labels:
         world.add_member(label, "s3")
     assert world.settle()
@@ -95,7 +95,7 @@ def test_a_request_to_one_server_reaches_that_one_alone_and_at_once() -> None:
 @pytest.mark.parametrize("first", [Right.SERVE, Right.CALL])
 @pytest.mark.parametrize("lossy", [False, True])
 def test_a_request_to_a_server_that_has_just_become_a_peer_is_not_lost(first: Right, *, lossy: bool) -> None:
-    world = Simulation(chain(3), lease_s=LEASE_S)
+    world = Simulation(topology=chain(3), lease_s=LEASE_S)
     assert world.settle()
     if lossy:
         for sim_link in world.cables.values():
@@ -291,7 +291,7 @@ def test_a_restarted_server_is_a_peer_again_as_soon_as_it_is_there() -> None:
 def test_the_clients_link_carries_one_copy_of_a_request_whatever_the_number_of_servers(replicas: int) -> None:
     names = [f"r{number}" for number in range(replicas)]
     world = Simulation(
-        Topology(
+        topology=Topology(
             links=(Link("robot", "gateway"), *(Link("gateway", name) for name in names)),
             domains=(DomainPlan("one", ("robot", "gateway", *names)),),
             attachments=(
@@ -327,7 +327,7 @@ def test_a_new_server_is_a_peer_at_once_though_its_advertisements_and_questions_
         domains=(DomainPlan("d", ("r", "g", "m1", "m2")),),
         attachments=(Attachment("r", "rib", "rib"),),
     )
-    world = Simulation(star, seed=seed)
+    world = Simulation(topology=star, seed=seed)
     for sim_link in world.cables.values():
         sim_link.jitter_s = 0.003
     for label in ("r/proxy", "r/watch", "m1/old"):

@@ -30,7 +30,7 @@ def three_tiers() -> Simulation:
             Attachment("r1", "proxy", "server"),
         ),
     )
-    world = Simulation(topology, lease_s=LEASE_S)
+    world = Simulation(topology=topology, lease_s=LEASE_S)
     assert world.settle()
     return world
 

@@ -19,7 +19,7 @@ def doubled() -> Simulation:
     """Return the ring with two RIBs in each domain."""
     ring = ring5()
     second = (Attachment("nuc1", "rib", "rib2"), Attachment("nuc3", "rib", "rib2"), Attachment("nuc5", "rib", "rib2"))
-    world = Simulation(replace(ring, attachments=ring.attachments + second))
+    world = Simulation(topology=replace(ring, attachments=ring.attachments + second))
     assert world.settle()
     return world
 

@@ -72,7 +72,7 @@ class Behind:
 
 def world_with_a_slow_one(frames_s: float) -> tuple[Simulation, Behind]:
     """Return three switches, a source with a local reader, a far reader, and a slow one on the path."""
-    world = Simulation(chain(3), lease_s=LEASE_S)
+    world = Simulation(topology=chain(3), lease_s=LEASE_S)
     world.add_member(NEAR, "s1")
     slow = Behind(world.add_member(SLOW, "s2"), frames_s)
     world.network.replace(SLOW, slow)

@@ -68,7 +68,7 @@ A, C = "a1/robot", "c2/server"
 
 def sites(lease_s: float = LEASE_S) -> Simulation:
     """Return the sites, settled."""
-    world = Simulation(three_sites(), lease_s=lease_s)
+    world = Simulation(topology=three_sites(), lease_s=lease_s)
     assert world.settle()
     return world
 
@@ -150,7 +150,7 @@ def test_a_transit_domain_needs_no_rib_of_its_own() -> None:
             Attachment("b1", "proxy", "server"),
         ),
     )
-    world = Simulation(topology)
+    world = Simulation(topology=topology)
     assert world.settle()
     world.network.run(9)
     flow = flowing(world, source="a1/robot", readers=("b1/server",))
@@ -199,7 +199,7 @@ def test_a_switch_at_the_border_of_a_domain_that_never_rests_stays_in_its_own() 
         (DomainPlan("a", ("a1", "a2", "a3")), DomainPlan("b", ("b1", "b2", "b3"), upper="a")),
         (Attachment("a1", "rib", "rib"), Attachment("b1", "rib", "rib")),
     )
-    world = Simulation(plan, lease_s=LEASE_S)
+    world = Simulation(topology=plan, lease_s=LEASE_S)
     world.network.run(5)
     ribs = {world.ribs[domain].name for domain in ("a", "b")}
     for _ in range(9):  # at each change of the border, and no message in a3's own part of the domain

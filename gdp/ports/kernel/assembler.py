@@ -45,7 +45,7 @@ _CALL, _EXIT, _WIDE, _BIG_ENDIAN = 0x85, 0x95, 0x18, 0xDC
 _MAP: Final = 1  # BPF_PSEUDO_MAP_FD
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Step:
     opcode: int
     destination: int = 0
@@ -90,44 +90,54 @@ class Assembler:
 
     def from_big_endian(self, to: Reg, bits: int) -> None:
         """Convert a big-endian value that was loaded from a frame into a number."""
-        self._steps.append(_Step(_BIG_ENDIAN, to, value=bits))
+        self._steps.append(_Step(opcode=_BIG_ENDIAN, destination=to, value=bits))
 
     def load(self, to: Reg, base: Reg, offset: int, size: int) -> None:
         """Read ``size`` bytes at ``base + offset``."""
-        self._steps.append(_Step(_LOAD | _IN_MEMORY | _SIZES[size], to, base, offset))
+        self._steps.append(_Step(opcode=_LOAD | _IN_MEMORY | _SIZES[size], destination=to, source=base, offset=offset))
 
     def store(self, base: Reg, offset: int, value: Reg | int, size: int) -> None:
         """Write ``size`` bytes at ``base + offset``."""
         if isinstance(value, Reg):
-            self._steps.append(_Step(_STORE | _IN_MEMORY | _SIZES[size], base, value, offset))
+            self._steps.append(
+                _Step(opcode=_STORE | _IN_MEMORY | _SIZES[size], destination=base, source=value, offset=offset)
+            )
         else:
-            self._steps.append(_Step(_STORE_VALUE | _IN_MEMORY | _SIZES[size], base, 0, offset, value))
+            self._steps.append(
+                _Step(
+                    opcode=_STORE_VALUE | _IN_MEMORY | _SIZES[size],
+                    destination=base,
+                    source=0,
+                    offset=offset,
+                    value=value,
+                )
+            )
 
     def load_map(self, to: Reg, descriptor: int) -> None:
         """Load a map as an argument of the next call."""
-        self._steps += [_Step(_WIDE, to, _MAP, value=descriptor), _Step(0)]
+        self._steps += [_Step(opcode=_WIDE, destination=to, source=_MAP, value=descriptor), _Step(opcode=0)]
 
     def jump(self, label: str) -> None:
         """Jump forward to a label."""
-        self._steps.append(_Step(_JUMP, label=label))
+        self._steps.append(_Step(opcode=_JUMP, label=label))
 
     def jump_if(self, left: Reg, condition: str, right: Reg | int, label: str) -> None:
         """Jump to a label if ``left condition right``; ``&`` tests for a common bit."""
         opcode = _JUMP | _CONDITIONS[condition]
         if isinstance(right, Reg):
-            self._steps.append(_Step(opcode | _FROM_REGISTER, left, right, label=label))
+            self._steps.append(_Step(opcode=opcode | _FROM_REGISTER, destination=left, source=right, label=label))
         else:
-            self._steps.append(_Step(opcode, left, value=right, label=label))
+            self._steps.append(_Step(opcode=opcode, destination=left, value=right, label=label))
 
     def call(self, helper: int) -> None:
         """Call a helper of the kernel; R1 to R5 are lost."""
-        self._steps.append(_Step(_CALL, value=helper))
+        self._steps.append(_Step(opcode=_CALL, value=helper))
 
     def leave(self, result: int | None = None) -> None:
         """End the program with a result, or with the value of R0."""
         if result is not None:
             self.move(Reg.R0, result)
-        self._steps.append(_Step(_EXIT))
+        self._steps.append(_Step(opcode=_EXIT))
 
     def assemble(self) -> bytes:
         """Return the program in host byte order.
@@ -139,9 +149,9 @@ class Assembler:
 
     def _compute(self, operation: int, to: Reg, value: Reg | int) -> None:
         if isinstance(value, Reg):
-            self._steps.append(_Step(_ALU64 | operation | _FROM_REGISTER, to, value))
+            self._steps.append(_Step(opcode=_ALU64 | operation | _FROM_REGISTER, destination=to, source=value))
         else:
-            self._steps.append(_Step(_ALU64 | operation, to, value=value))
+            self._steps.append(_Step(opcode=_ALU64 | operation, destination=to, value=value))
 
     def _encoded(self, at: int, step: _Step) -> bytes:
         offset = step.offset

@@ -61,7 +61,9 @@ class HostileSwitch:
     def __init__(self, reported: dict[str, Any]) -> None:
         config = SwitchConfig.load(Path(reported["config"]))
         self._identity, policy = load_member(config.identity, config.domain, Role.SWITCH)
-        settings = NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes)
+        settings = NodeSettings(
+            incarnation=incarnation(), first_sequence=wall_clock_ms(), random_bytes=secrets.token_bytes
+        )
         table = Table()
         self._switch = SwitchCore(self._identity, policy, table, settings)
         self._fragmenter = ControlFragmenter(self._identity.name, secrets.randbits(64))
@@ -135,9 +137,15 @@ class HostileProxy:
         """Yield the first part of one large message after the other."""
         member, (epoch, secret) = self._end.member, next(iter(self._own.secrets.items()))
         sealer = Sealer(
-            secret, epoch, Kind.DATA, member.name, member.attachment._incarnation, self._own.name,
-            member._identity.key, os.urandom,
-        )  # fmt: skip
+            secret=secret,
+            epoch=epoch,
+            kind=Kind.DATA,
+            source=member.name,
+            incarnation=member.attachment._incarnation,
+            destination=self._own.name,
+            signer=member._identity.key,
+            random_bytes=os.urandom,
+        )
         first = 1 << 40  # a number above all that it published
         for number in count(first):
             yield sealer.seal(number, Flag.RELIABLE, number.to_bytes(8, "big") + bytes(_MESSAGE_BYTES), _MTU)[0]

@@ -110,7 +110,11 @@ class InternalEndpoint:
     def __init__(self, config: Path, spin_s: float) -> None:
         settings = RibConfig.load(config)  # identity, domain and iface are all that an endpoint needs
         identity, policy = load_member(settings.identity, settings.domain, Role.PROXY)
-        self._member = Participant(identity, policy, NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes))
+        self._member = Participant(
+            identity,
+            policy,
+            NodeSettings(incarnation=incarnation(), first_sequence=wall_clock_ms(), random_bytes=secrets.token_bytes),
+        )
         self._runtime = Runtime(self._member, RawPlane([settings.iface]), spin_s=spin_s)
         self._publishers: dict[str, Publisher] = {}
         self._topics: dict[str, Topic] = {}

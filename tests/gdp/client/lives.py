@@ -87,5 +87,14 @@ class Notes:
 
     def _sealer(self, key: bytes, epoch: int, kind: Kind, life: int) -> ControlSealer:
         publisher = self._publisher
-        to = publisher.name, self._topic, publisher.incarnation
-        return ControlSealer(key, epoch, kind, self._name, life, *to, self._reader.note_numbers)
+        return ControlSealer(
+            key=key,
+            epoch=epoch,
+            kind=kind,
+            source=self._name,
+            incarnation=life,
+            destination=publisher.name,
+            topic=self._topic,
+            destination_incarnation=publisher.incarnation,
+            numbers=self._reader.note_numbers,
+        )

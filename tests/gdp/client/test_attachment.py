@@ -40,7 +40,7 @@ def test_a_refused_advertisement_is_acknowledged_with_the_reason() -> None:
 @pytest.mark.parametrize("reason", list(DropReason))
 def test_every_reason_counts_as_a_judgement(reason: DropReason) -> None:
     assert PendingAdvertisement(
-        Subject(bytes(32), b""), Right.READ, (), is_global=False, refused=reason
+        subject=Subject(bytes(32), b""), right=Right.READ, chain=(), is_global=False, refused=reason
     ).is_acknowledged
 
 
@@ -100,7 +100,7 @@ def test_who_falls_silent_is_gone_when_its_lease_ends() -> None:
 
 @pytest.mark.parametrize("lease_s", [2.0, 60.0])
 def test_the_lease_is_what_the_settings_say(lease_s: float) -> None:
-    world = Simulation(ring5(), lease_s=lease_s)
+    world = Simulation(topology=ring5(), lease_s=lease_s)
     assert world.settle()
     world.network.run(lease_s + 1)
     assert world.ribs["school"].rib.names == 1  # it was renewed

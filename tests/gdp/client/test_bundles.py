@@ -173,7 +173,16 @@ def test_bundles_that_no_longer_fit_the_path_are_bundles_under_their_new_numbers
 @pytest.mark.parametrize("body", [b"", pack([b"x"]) + b"y", pack([b"x" * 9])[:-1]], ids=["empty", "trailing", "cut"])
 def test_a_bundle_that_is_not_exact_is_counted_and_nothing_of_it_delivered(body: bytes) -> None:
     pipe, (end,) = live(publisher_of())
-    sealer = Sealer(SECRETS[1], 1, Kind.DATA, Name(b"p" * 32), 1, TOPIC, WRITER, urandom)
+    sealer = Sealer(
+        secret=SECRETS[1],
+        epoch=1,
+        kind=Kind.DATA,
+        source=Name(b"p" * 32),
+        incarnation=1,
+        destination=TOPIC,
+        signer=WRITER,
+        random_bytes=urandom,
+    )
     for number, message, flags in ((1, body, Flag.RELIABLE | Flag.BUNDLE), (2, b"next", Flag.RELIABLE)):
         for frame in sealer.seal(number, int(flags), sequenced(number, message), 1_500):
             end.writer_proxy.receive(decode(frame), frame, pipe.now_s)

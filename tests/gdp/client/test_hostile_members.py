@@ -28,7 +28,16 @@ def forge(
     number: int, message: bytes, *, kind: Kind = Kind.DATA, signer: Signer = MALLORY, mtu: int = 1500
 ) -> list[bytes]:
     """Return messages that a reader can make: fragments that open, under a signature that is not the writer's."""
-    sealer = Sealer(SECRETS[1], 1, kind, PUBLISHER, 1, TOPIC, signer, urandom)
+    sealer = Sealer(
+        secret=SECRETS[1],
+        epoch=1,
+        kind=kind,
+        source=PUBLISHER,
+        incarnation=1,
+        destination=TOPIC,
+        signer=signer,
+        random_bytes=urandom,
+    )
     return list(sealer.seal(number, Flag.RELIABLE, message, mtu))
 
 
@@ -86,7 +95,16 @@ def test_absurd_numbers_before_the_first_status_do_not_stop_a_writer_proxy() -> 
 def test_messages_that_come_before_the_first_status_are_kept_within_bounds() -> None:
     pipe = Pipe(publisher_of())
     end = pipe.join(b"a")
-    sealer = Sealer(SECRETS[1], 1, Kind.DATA, PUBLISHER, 1, TOPIC, WRITER, urandom)
+    sealer = Sealer(
+        secret=SECRETS[1],
+        epoch=1,
+        kind=Kind.DATA,
+        source=PUBLISHER,
+        incarnation=1,
+        destination=TOPIC,
+        signer=WRITER,
+        random_bytes=urandom,
+    )
     for number in range(1, 80):
         give(pipe, end, list(sealer.seal(number, Flag.RELIABLE, sequenced(number, bytes(1 << 20)), 65_000)))
         assert end.budget.held_bytes <= JOIN_SOURCE_BYTES
@@ -97,7 +115,16 @@ def test_messages_that_come_before_the_first_status_are_kept_within_bounds() -> 
 
 def test_messages_behind_a_gap_that_is_never_filled_are_kept_within_bounds() -> None:
     pipe, end = live()
-    sealer = Sealer(SECRETS[1], 1, Kind.DATA, PUBLISHER, 1, TOPIC, WRITER, urandom)
+    sealer = Sealer(
+        secret=SECRETS[1],
+        epoch=1,
+        kind=Kind.DATA,
+        source=PUBLISHER,
+        incarnation=1,
+        destination=TOPIC,
+        signer=WRITER,
+        random_bytes=urandom,
+    )
     for number in range(2, 80):
         give(pipe, end, list(sealer.seal(number, Flag.RELIABLE, sequenced(number, bytes(1 << 20)), 65_000)))
         assert end.budget.held_bytes <= JOIN_TOTAL_BYTES
@@ -131,7 +158,16 @@ def test_a_message_whose_number_has_no_next_is_refused_and_ends_no_reader(reliab
     status = Heartbeat((1 << 64) - 2, (1 << 64) - 1, 0, {}, b"").to_wire()
     give(pipe, end, forge(500, status, kind=Kind.HEARTBEAT, signer=WRITER))
     for number in ((1 << 64) - 2, (1 << 64) - 1):
-        sealer = Sealer(SECRETS[1], 1, Kind.DATA, PUBLISHER, 1, TOPIC, WRITER, urandom)
+        sealer = Sealer(
+            secret=SECRETS[1],
+            epoch=1,
+            kind=Kind.DATA,
+            source=PUBLISHER,
+            incarnation=1,
+            destination=TOPIC,
+            signer=WRITER,
+            random_bytes=urandom,
+        )
         give(pipe, end, list(sealer.seal(number, reliable, sequenced(number, b"last"), 1_500)))
     assert end.writer_proxy.control_to_send(pipe.now_s) != []
     assert end.writer_proxy.drops[DropReason.MALFORMED] == 1
@@ -194,7 +230,16 @@ def test_more_names_than_the_publisher_takes_are_refused() -> None:
 def test_what_an_outsider_sends_leaves_nothing_behind() -> None:
     pipe, end = live()
     strange = {1: b"?" * 32}
-    sealer = Sealer(strange[1], 1, Kind.DATA, PUBLISHER, 1, TOPIC, MALLORY, urandom)
+    sealer = Sealer(
+        secret=strange[1],
+        epoch=1,
+        kind=Kind.DATA,
+        source=PUBLISHER,
+        incarnation=1,
+        destination=TOPIC,
+        signer=MALLORY,
+        random_bytes=urandom,
+    )
     held = end.budget.held_bytes
     for number in range(1, 200):
         give(pipe, end, list(sealer.seal(number, Flag.RELIABLE, bytes(3_000), 1500)))

@@ -229,11 +229,29 @@ def test_an_older_epoch_still_opens_and_an_unknown_one_is_counted() -> None:
     pipe.publish([b"old key"])
     pipe.run(1.0)
     assert end.messages == [b"old key"]
-    sealer = Sealer(b"2" * 32, 2, Kind.DATA, Name(b"p" * 32), 1, TOPIC, WRITER, urandom)
+    sealer = Sealer(
+        secret=b"2" * 32,
+        epoch=2,
+        kind=Kind.DATA,
+        source=Name(b"p" * 32),
+        incarnation=1,
+        destination=TOPIC,
+        signer=WRITER,
+        random_bytes=urandom,
+    )
     (frame,) = list(sealer.seal(2, Flag.RELIABLE, sequenced(2, b"new key"), 1500))
     end.writer_proxy.receive(decode(frame), frame, pipe.now_s)
     assert [each.message for each in end.writer_proxy.poll_delivered()] == [b"new key"]
-    sealer = Sealer(b"3" * 32, 3, Kind.DATA, Name(b"p" * 32), 1, TOPIC, WRITER, urandom)
+    sealer = Sealer(
+        secret=b"3" * 32,
+        epoch=3,
+        kind=Kind.DATA,
+        source=Name(b"p" * 32),
+        incarnation=1,
+        destination=TOPIC,
+        signer=WRITER,
+        random_bytes=urandom,
+    )
     (frame,) = list(sealer.seal(3, Flag.RELIABLE, sequenced(3, b"strange key"), 1500))
     end.writer_proxy.receive(decode(frame), frame, pipe.now_s)
     assert end.writer_proxy.drops[DropReason.UNKNOWN_EPOCH] == 1

@@ -22,11 +22,24 @@ from tests.gdp.control.members import node
 
 NODE = node("n")
 A, B, C = Name(b"a" * 32), Name(b"b" * 32), Name(b"c" * 32)
-HELLO = Hello(b"n" * 8, 7, (b"h" * 16,), 1_500, b"d" * 8, b"cert")
-JOIN = Join(A, B, C, A, frozenset({A, B}), 1_400, 7.0, b"evidence", b"s" * 16, 99)
+HELLO = Hello(nonce=b"n" * 8, sequence=7, heard=(b"h" * 16,), mtu=1_500, digest=b"d" * 8, membership=b"cert")
+JOIN = Join(
+    topic=A,
+    publisher=B,
+    switch=C,
+    domain=A,
+    allowed=frozenset({A, B}),
+    mtu=1_400,
+    lease_s=7.0,
+    evidence=b"evidence",
+    session=b"s" * 16,
+    sequence=99,
+)
 LINKS, INSIDE, RIBS = (Adjacency(B, A, 10, 1_500),), (Adjacency(C, A, 3, 1),), (AttachedRib(C, A, bytes(8)),)
-STATE = LinkState(NODE.name, A, Scope.BORDER, 5, LINKS, INSIDE, RIBS, (A, B))
-ANSWER = Response(A, B, b"claim", C, (A, B), 30.0)
+STATE = LinkState(
+    origin=NODE.name, domain=A, scope=Scope.BORDER, sequence=5, links=LINKS, inside=INSIDE, ribs=RIBS, members=(A, B)
+)
+ANSWER = Response(name=A, advertiser=B, advertisement=b"claim", domain=C, transit=(A, B), lease_s=30.0)
 REVOKED = Revoked(b"s" * 16, 7, ((A, 3, b"d" * 8), (B, 0, bytes(8))))
 BUCKETS = Revoked(b"s" * 16, 8, (), A, tuple(bytes([at]) * 8 for at in range(256)))
 LACKING = Lacking(b"s" * 16, 9, A, (1, 200), (b"i" * 8, b"j" * 8))
@@ -102,5 +115,5 @@ def test_what_is_taken_has_no_reason() -> None:
 
 
 def test_a_response_that_names_the_name_itself_without_an_advertisement_is_negative() -> None:
-    assert Response(A, A, b"", C, (), 2.0).is_negative
-    assert not Response(A, B, b"", C, (), 0.0).is_negative
+    assert Response(name=A, advertiser=A, advertisement=b"", domain=C, transit=(), lease_s=2.0).is_negative
+    assert not Response(name=A, advertiser=B, advertisement=b"", domain=C, transit=(), lease_s=0.0).is_negative

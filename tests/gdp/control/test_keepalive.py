@@ -295,7 +295,7 @@ def test_a_key_that_makes_a_secret_everybody_knows_is_refused() -> None:
 
 @pytest.mark.parametrize("timing", [[70, 70], [70, 70, 0], [70, 70, 256], [-1, 70, 3], [70, 60_001, 3], [70, "x", 3]])
 def test_a_timing_out_of_bounds_is_refused(timing: list[object]) -> None:
-    hello = Hello(b"n" * 8, 1, (), 1_500, bytes(8), B.membership)
+    hello = Hello(nonce=b"n" * 8, sequence=1, heard=(), mtu=1_500, digest=bytes(8), membership=B.membership)
     object.__setattr__(hello, "timing", timing)
     statement = parse(hello.to_wire(B.name, B.key))
     with pytest.raises(StatementError) as caught:
@@ -304,7 +304,16 @@ def test_a_timing_out_of_bounds_is_refused(timing: list[object]) -> None:
 
 
 def test_a_hello_with_timing_and_key_comes_back_as_it_was() -> None:
-    hello = Hello(b"n" * 8, 1, (), 1_500, bytes(8), B.membership, FAST, b"k" * 32)
+    hello = Hello(
+        nonce=b"n" * 8,
+        sequence=1,
+        heard=(),
+        mtu=1_500,
+        digest=bytes(8),
+        membership=B.membership,
+        timing=FAST,
+        exchange_key=b"k" * 32,
+    )
     assert Hello.from_fields(parse(hello.to_wire(B.name, B.key)).fields) == hello
 
 

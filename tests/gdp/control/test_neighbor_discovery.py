@@ -70,7 +70,9 @@ def pair() -> tuple[HelloProtocol, HelloProtocol, list[bytes]]:
 
 
 def forged(identity: Identity = B, sequence: int = 1, heard: tuple[bytes, ...] = (), nonce: bytes = b"n" * 8) -> bytes:
-    hello = Hello(nonce, sequence, heard, 1_500, bytes(8), identity.membership)
+    hello = Hello(
+        nonce=nonce, sequence=sequence, heard=heard, mtu=1_500, digest=bytes(8), membership=identity.membership
+    )
     return hello.to_wire(identity.name, identity.key)
 
 
@@ -201,13 +203,17 @@ def test_a_neighbour_whose_certificate_runs_out_falls_silent() -> None:
 
 
 def test_a_hello_under_anothers_certificate_is_refused() -> None:
-    wire = Hello(b"n" * 8, 1, (), 1_500, bytes(8), B.membership).to_wire(A.name, A.key)
+    wire = Hello(nonce=b"n" * 8, sequence=1, heard=(), mtu=1_500, digest=bytes(8), membership=B.membership).to_wire(
+        A.name, A.key
+    )
     assert refusal(hello_protocol(node("c"), 1), wire) is DropReason.BAD_CERTIFICATE
 
 
 def test_a_hello_signed_by_another_key_is_refused_and_leaves_nothing() -> None:
     one = hello_protocol(A, 1)
-    wire = Hello(b"n" * 8, 1, (), 1_500, bytes(8), B.membership).to_wire(B.name, node("x").key)
+    wire = Hello(nonce=b"n" * 8, sequence=1, heard=(), mtu=1_500, digest=bytes(8), membership=B.membership).to_wire(
+        B.name, node("x").key
+    )
     assert refusal(one, wire) is DropReason.BAD_SIGNATURE
     assert one.ports[0].neighbours == {}
 
@@ -270,7 +276,7 @@ def test_a_link_grows_when_both_ends_have_whichever_is_first(first: int) -> None
 def test_hellos_fit_the_narrowest_end_that_was_heard() -> None:
     one = hello_protocol(A, 1)
     resize(one, 65_000, 0.0)
-    hello = Hello(b"n" * 8, 1, (), 576, bytes(8), B.membership)
+    hello = Hello(nonce=b"n" * 8, sequence=1, heard=(), mtu=576, digest=bytes(8), membership=B.membership)
     hear(one, hello.to_wire(B.name, B.key), 0.0)
     frames = [frame for transmit in one.hellos_to_send(0.1) for frame in transmit.frames]
     assert len(frames) > 1
@@ -279,14 +285,16 @@ def test_hellos_fit_the_narrowest_end_that_was_heard() -> None:
 
 def test_a_neighbour_that_announces_to_take_nothing_is_taken_for_the_narrowest_there_may_be() -> None:
     one = hello_protocol(A, 1)
-    hello = Hello(b"n" * 8, 1, (one.ports[0].echo,), 0, bytes(8), B.membership)
+    hello = Hello(
+        nonce=b"n" * 8, sequence=1, heard=(one.ports[0].echo,), mtu=0, digest=bytes(8), membership=B.membership
+    )
     hear(one, hello.to_wire(B.name, B.key), 0.0)
     assert one.ports[0].mtu == 576
 
 
 def test_who_was_only_heard_makes_no_link_narrow() -> None:
     one = hello_protocol(A, 1)
-    hello = Hello(b"n" * 8, 1, (), 576, bytes(8), B.membership)
+    hello = Hello(nonce=b"n" * 8, sequence=1, heard=(), mtu=576, digest=bytes(8), membership=B.membership)
     hear(one, hello.to_wire(B.name, B.key), 0.0)
     assert one.ports[0].mtu == 1_500
 
@@ -330,13 +338,37 @@ def test_a_hello_protocol_never_wants_to_be_called_in_the_past() -> None:
 
 
 def neighbour_of(label: bytes, nonce: bytes = b"n" * 8) -> Neighbour:
-    return Neighbour(Name(label * 32), Role.SWITCH, SCHOOL.root.domain, A.key.public, 0, b"", 1_500, nonce, 0, b"", 0.0)
+    return Neighbour(
+        name=Name(label * 32),
+        role=Role.SWITCH,
+        domain=SCHOOL.root.domain,
+        key=A.key.public,
+        port=0,
+        mac=b"",
+        mtu=1_500,
+        nonce=nonce,
+        sequence=0,
+        digest=b"",
+        heard_s=0.0,
+    )
 
 
 def is_taken(
     port: HelloPort, session: bytes, neighbour: Neighbour, sequence: int, sender_session: bytes = b"n" * 8
 ) -> bool:
-    join = Join(ZERO, ZERO, ZERO, ZERO, frozenset(), 1_500, 1.0, b"", session, sequence, sender_session=sender_session)
+    join = Join(
+        topic=ZERO,
+        publisher=ZERO,
+        switch=ZERO,
+        domain=ZERO,
+        allowed=frozenset(),
+        mtu=1_500,
+        lease_s=1.0,
+        evidence=b"",
+        session=session,
+        sequence=sequence,
+        sender_session=sender_session,
+    )
     try:
         port.receive_join(join, neighbour)
     except StatementError as error:

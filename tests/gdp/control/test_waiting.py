@@ -22,7 +22,9 @@ NO_RIB = Wait(WaitReason.NO_RIB)
 
 
 def attachment() -> Attachment:
-    return Attachment(node("robot", Role.PROXY), POLICY, NodeSettings(1, 1, Nonces(1)))
+    return Attachment(
+        node("robot", Role.PROXY), POLICY, NodeSettings(incarnation=1, first_sequence=1, random_bytes=Nonces(1))
+    )
 
 
 def reasons(of: Attachment, now_s: float = 0.0) -> list[WaitReason]:

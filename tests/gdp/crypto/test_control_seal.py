@@ -21,7 +21,17 @@ KEY = note_key(SHARED, SECRET, Kind.ACKNACK, READER, 5, PUBLISHER, 9, TOPIC)
 
 
 def sealer(topic: bytes = TOPIC, first: int = 1) -> ControlSealer:
-    return ControlSealer(KEY, 1, Kind.ACKNACK, READER, 5, PUBLISHER, topic, 9, count(first))
+    return ControlSealer(
+        key=KEY,
+        epoch=1,
+        kind=Kind.ACKNACK,
+        source=READER,
+        incarnation=5,
+        destination=PUBLISHER,
+        topic=topic,
+        destination_incarnation=9,
+        numbers=count(first),
+    )
 
 
 def opener(topic: bytes = TOPIC, incarnation: int = 9) -> ControlOpener:
@@ -54,7 +64,15 @@ def test_a_published_note_is_sealed_again_to_the_byte() -> None:
         assert key.hex() == note["key"]
         numbers = count(int(note["number"]))
         made = ControlSealer(
-            key, note["epoch"], note["kind"], source, incarnation, destination, topic, to_incarnation, numbers
+            key=key,
+            epoch=note["epoch"],
+            kind=note["kind"],
+            source=source,
+            incarnation=incarnation,
+            destination=destination,
+            topic=topic,
+            destination_incarnation=to_incarnation,
+            numbers=numbers,
         )
         assert made.seal(bytes.fromhex(note["body"])).hex() == note["frame"]
 
@@ -98,7 +116,20 @@ def test_whatever_differs_makes_another_key() -> None:
 
 def test_two_sealers_that_share_numbers_make_no_nonce_twice() -> None:
     numbers = count(1)
-    two = [ControlSealer(KEY, 1, Kind.ACKNACK, READER, 5, PUBLISHER, topic, 9, numbers) for topic in (TOPIC, b"u" * 32)]
+    two = [
+        ControlSealer(
+            key=KEY,
+            epoch=1,
+            kind=Kind.ACKNACK,
+            source=READER,
+            incarnation=5,
+            destination=PUBLISHER,
+            topic=topic,
+            destination_incarnation=9,
+            numbers=numbers,
+        )
+        for topic in (TOPIC, b"u" * 32)
+    ]
     assert len({decode(each.seal(b"x")).number for _ in range(5) for each in two}) == 10
 
 

@@ -64,7 +64,16 @@ def test_a_published_message_is_sealed_again_to_the_byte_up_to_its_signature(vec
     source, destination, epoch = of(vector, "source"), of(vector, "destination"), number(vector, "epoch")
     signer = SigningKey.from_pem(FILE["writer"]["private"].encode())
     salt = of(vector, "salt")
-    sealer = Sealer(of(vector, "secret"), epoch, kind, source, incarnation, destination, signer, lambda _: salt)
+    sealer = Sealer(
+        secret=of(vector, "secret"),
+        epoch=epoch,
+        kind=kind,
+        source=source,
+        incarnation=incarnation,
+        destination=destination,
+        signer=signer,
+        random_bytes=lambda _: salt,
+    )
     published = [bytes.fromhex(each) for each in texts(vector, "frames")]
     message = of(vector, "message")
     frames = list(sealer.seal(number(vector, "number"), number(vector, "flags"), message, number(vector, "mtu")))
@@ -167,7 +176,16 @@ def test_another_source_incarnation_kind_destination_or_secret_is_another_key() 
 
 
 def test_a_number_is_sealed_once() -> None:
-    sealer = Sealer(SECRET, 1, Kind.DATA, SOURCE, INCARNATION, TOPIC, WRITER, urandom)
+    sealer = Sealer(
+        secret=SECRET,
+        epoch=1,
+        kind=Kind.DATA,
+        source=SOURCE,
+        incarnation=INCARNATION,
+        destination=TOPIC,
+        signer=WRITER,
+        random_bytes=urandom,
+    )
     list(sealer.seal(5, 0, b"x", MTU))
     for again in (5, 4):
         with pytest.raises(LocalError):
@@ -175,7 +193,16 @@ def test_a_number_is_sealed_once() -> None:
 
 
 def test_what_is_above_the_limits_is_refused_before_a_number_is_spent() -> None:
-    sealer = Sealer(SECRET, 1, Kind.DATA, SOURCE, INCARNATION, TOPIC, WRITER, urandom)
+    sealer = Sealer(
+        secret=SECRET,
+        epoch=1,
+        kind=Kind.DATA,
+        source=SOURCE,
+        incarnation=INCARNATION,
+        destination=TOPIC,
+        signer=WRITER,
+        random_bytes=urandom,
+    )
     with pytest.raises(LocalError):
         list(sealer.seal(1, 0, bytes(MESSAGE_MAX_BYTES + SEQUENCE_BYTES + 1), FRAME_MAX_BYTES))
     with pytest.raises(LocalError):
@@ -189,7 +216,19 @@ def test_message_keys_are_those_of_xaes_256_gcm() -> None:
 
 
 def test_two_copies_of_one_sealer_share_no_key_under_one_number() -> None:
-    copies = [Sealer(SECRET, 1, Kind.DATA, SOURCE, INCARNATION, TOPIC, WRITER, urandom) for _ in range(2)]
+    copies = [
+        Sealer(
+            secret=SECRET,
+            epoch=1,
+            kind=Kind.DATA,
+            source=SOURCE,
+            incarnation=INCARNATION,
+            destination=TOPIC,
+            signer=WRITER,
+            random_bytes=urandom,
+        )
+        for _ in range(2)
+    ]
     (first,), (second,) = (list(each.seal(1, 0, b"a message", MTU)) for each in copies)
     salt = slice(HEADER_BYTES, HEADER_BYTES + SALT_BYTES)
     assert first[: salt.start] == second[: salt.start]

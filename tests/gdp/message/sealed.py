@@ -25,7 +25,18 @@ MTU = 300  # a fragment carries 188 bytes
 def seal(
     number: int, message: bytes, *, signer: Signer = WRITER, mtu: int = MTU, secret: bytes = SECRET
 ) -> list[bytes]:
-    return list(Sealer(secret, 1, Kind.DATA, SOURCE, INCARNATION, TOPIC, signer, urandom).seal(number, 0, message, mtu))
+    return list(
+        Sealer(
+            secret=secret,
+            epoch=1,
+            kind=Kind.DATA,
+            source=SOURCE,
+            incarnation=INCARNATION,
+            destination=TOPIC,
+            signer=signer,
+            random_bytes=urandom,
+        ).seal(number, 0, message, mtu)
+    )
 
 
 def opener_of(epoch: int) -> Opener:

@@ -90,13 +90,21 @@ def answer_from_above(
 ) -> list[OutgoingStatement]:
     node = parse(pending_advertisement).signer if pending_advertisement else ROBOT.name
     gone = 0 if pending_advertisement else UnverifiedAdvertisement.from_statement(parse(advertisement())).sequence
-    answer = Response(NAME, node, pending_advertisement, CLOUD.root.domain, (CLOUD.root.domain,), 30.0, gone)
+    answer = Response(
+        name=NAME,
+        advertiser=node,
+        advertisement=pending_advertisement,
+        domain=CLOUD.root.domain,
+        transit=(CLOUD.root.domain,),
+        lease_s=30.0,
+        sequence=gone,
+    )
     to.receive(answer.to_wire(by.name, by.key, by.membership), by.name, now)
     return to.statements_to_send()
 
 
 def negative_upstream(to: RibCore, now: Timestamps = START) -> list[OutgoingStatement]:
-    answer = Response(NAME, NAME, b"", CLOUD.root.domain, (), 2.0)
+    answer = Response(name=NAME, advertiser=NAME, advertisement=b"", domain=CLOUD.root.domain, transit=(), lease_s=2.0)
     to.receive(answer.to_wire(UPPER.name, UPPER.key, UPPER.membership), UPPER.name, now)
     return to.statements_to_send()
 

@@ -73,7 +73,7 @@ class Simulated:
 
     def __init__(self, rights: Rights) -> None:
         attachments = (Attachment("s", "rib", "rib0"), *(Attachment("s", "proxy", label) for label in rights))
-        self.world = Simulation(Topology((), (DomainPlan("lab", ("s",)),), attachments))
+        self.world = Simulation(topology=Topology((), (DomainPlan("lab", ("s",)),), attachments))
         self.cores: dict[str, SessionCore] = {}
         self.sessions: dict[str, Session] = {}
         starts = iter(range(1, 1 << 30, 1 << 20))

@@ -27,7 +27,7 @@ def serve(net: Simulated, label: str, at_once: int | None = None) -> ServerCore:
 
 def begin(net: Simulated, timeout_s: float | None = 5.0, replication: str | int = "all", payload: bytes = b"x") -> Call:
     core = net.cores["robot"]
-    call = Call(payload, timeout_s, replication_of(replication))
+    call = Call(payload=payload, timeout_s=timeout_s, replication=replication_of(replication))
     core.call(core.resolve("plan", Right.CALL), call, net.now_s)
     net.send("robot")
     return call

@@ -35,7 +35,17 @@ def state(
     """Return a link state."""
     attached = tuple(AttachedRib(name(rib), domain, bytes(8)) for rib in ribs)
     listed = tuple(name(member) for member in members)
-    return LinkState(name(origin), domain, scope, sequence, links, inside, attached, listed, is_leaf=is_leaf)
+    return LinkState(
+        origin=name(origin),
+        domain=domain,
+        scope=scope,
+        sequence=sequence,
+        links=links,
+        inside=inside,
+        ribs=attached,
+        members=listed,
+        is_leaf=is_leaf,
+    )
 
 
 def known(*states: LinkState) -> LinkStateDatabase:

@@ -48,7 +48,15 @@ def test_borders_are_known_everywhere() -> None:
 def test_an_inside_state_that_leaves_its_domain_is_refused() -> None:
     world = ring()
     nuc2 = world.identities["nuc2"]
-    state = LinkState(nuc2.name, nuc2.root.domain, Scope.DOMAIN, 1_810_000_000_000, (), (), ())
+    state = LinkState(
+        origin=nuc2.name,
+        domain=nuc2.root.domain,
+        scope=Scope.DOMAIN,
+        sequence=1_810_000_000_000,
+        links=(),
+        inside=(),
+        ribs=(),
+    )
     say(world, state, "nuc2", "nuc3")
     assert world.switches["nuc3"].drops()[DropReason.WRONG_DOMAIN] == 1
     assert bytes(nuc2.name) not in origins(world, "nuc3", Scope.DOMAIN)
@@ -58,7 +66,14 @@ def test_ones_own_state_of_an_earlier_life_is_outdone() -> None:
     world = ring()
     nuc1 = world.identities["nuc1"]
     ahead = 1_810_000_000_000
-    say(world, LinkState(nuc1.name, nuc1.root.domain, Scope.DOMAIN, ahead, (), (), ()), "nuc1", "nuc1")
+    say(
+        world,
+        LinkState(
+            origin=nuc1.name, domain=nuc1.root.domain, scope=Scope.DOMAIN, sequence=ahead, links=(), inside=(), ribs=()
+        ),
+        "nuc1",
+        "nuc1",
+    )
     known = world.switches["nuc2"]._flooding.link_states
     assert known.sequence_of(nuc1.name, Scope.DOMAIN) > ahead
     assert any(each.links for each in known.states(Scope.DOMAIN) if each.origin == nuc1.name)
@@ -68,7 +83,14 @@ def test_a_state_played_back_changes_nothing_and_goes_no_further() -> None:
     world = ring()
     nuc2 = world.identities["nuc2"]
     before = world.switches["nuc1"]._flooding.link_states.version
-    say(world, LinkState(nuc2.name, nuc2.root.domain, Scope.DOMAIN, 1, (), (), ()), "nuc2", "nuc1")
+    say(
+        world,
+        LinkState(
+            origin=nuc2.name, domain=nuc2.root.domain, scope=Scope.DOMAIN, sequence=1, links=(), inside=(), ribs=()
+        ),
+        "nuc2",
+        "nuc1",
+    )
     assert world.switches["nuc1"]._flooding.link_states.version == before
 
 

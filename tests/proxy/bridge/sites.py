@@ -131,7 +131,7 @@ class Sites:
     """
 
     def __init__(self, folder: Path, seed: int = 1) -> None:
-        self.world = Simulation(ring5(), seed, keepalive_ms=500)
+        self.world = Simulation(topology=ring5(), seed=seed, keepalive_ms=500)
         self.world.owner = Owner(OWNER, bytes(range(32)))
         self.machines: list[Machine] = []
         self._folder = folder
