@@ -14,7 +14,7 @@ from fog.launch.description import LaunchConfiguration, Node, Parameters, Text, 
 from fog.launch.parameter_yaml import BYTES_MAX, read_parameters
 from fog.launch.ros_args import named, parameters_of_file, parameters_of_map, remapped
 from gdp.errors import LocalError
-from gdp.stores.bounded import read_at_most
+from gdp.stores.files import read_at_most
 
 __all__ = ["cloud_node", "parameter_rule", "parameters_in"]
 

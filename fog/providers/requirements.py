@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import LocalError
-from gdp.stores.bounded import read_at_most
+from gdp.stores.files import read_at_most
 
 __all__ = ["FILE_MAX_BYTES", "pinned", "read_requirements"]
 

@@ -53,7 +53,6 @@ class Publisher:
     Attributes:
         published: called when frames are ready to be polled, and when the publisher closes.
         has_more: the last ``poll_frames`` reached its limit.
-        payload_bytes: size of the messages that were published to a reader.
 
     Raises:
         LocalError: there is no secret.
@@ -78,7 +77,6 @@ class Publisher:
         self.is_urgent = urgent
         self.has_more = False
         self.published: Callable[[Publisher], None] = lambda _: None
-        self.payload_bytes = 0
         self._keys = KeyEpochs(topic, source, secrets, address)
         self._window = SendWindow(history_depth=depth, first_number=past.next_number, lag_s=patience.lag_s)
         self._queue = SendQueue(
@@ -244,7 +242,6 @@ class Publisher:
                 self.skip(LossReason.NO_READER)
             return None
         self._queue.add(message, gather_bytes=WINDOW_BYTES if self._readers else BUNDLE_BYTES)
-        self.payload_bytes += len(message)
         self.published(self)
         return self.messages
 

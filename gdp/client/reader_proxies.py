@@ -129,10 +129,6 @@ class ReaderProxies:
     def __iter__(self) -> Iterator[bytes]:
         return iter(list(self._readers))
 
-    def readings(self) -> Iterator[ReaderProxy]:
-        """Return all active ones."""
-        return iter(self._readers.values())
-
     def names(self) -> list[bytes]:
         """Return the names of all, suspended ones included."""
         return [*self._readers, *self._suspended]

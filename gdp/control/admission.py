@@ -17,15 +17,15 @@ covers the tag.
 from __future__ import annotations
 
 import hmac
-from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
 from gdp.control.hello import COOKIE_BYTES, NONCE_BYTES, Hello
 from gdp.errors import DropReason, FrameError, StatementError
+from gdp.token_bucket import TokenBucket, TokenBuckets
 
-__all__ = ["Admission", "Cookies", "TokenBucket", "cookie_payload", "read_cookie", "seal_cookie"]
+__all__ = ["Admission", "Cookies", "cookie_payload", "read_cookie", "seal_cookie"]
 
 _DIGEST: Final = "sha256"
 _SECRET_BYTES: Final = 32
@@ -42,34 +42,6 @@ COOKIES: Final = (100.0, 100.0)
 REFUSALS: Final = (100.0, 200.0)  # a higher rate of refusals is a flood, too
 _LOADED_S: Final = 10.0  # after the strangers' bucket became empty
 _ADDRESSES_MAX: Final = 256
-
-
-class TokenBucket:
-    """Token bucket of at most ``rate`` per second on average and ``burst`` at once.
-
-    Source: RFC 2697, section 3, with one rate.
-    """
-
-    __slots__ = ("_at_s", "_burst", "_rate", "_tokens")
-
-    def __init__(self, rate: float, burst: float, now_s: float) -> None:
-        self._rate = rate
-        self._burst = self._tokens = burst
-        self._at_s = now_s
-
-    def has(self, now_s: float) -> bool:
-        """Return whether there is a token."""
-        if now_s > self._at_s:
-            self._tokens = min(self._tokens + (now_s - self._at_s) * self._rate, self._burst)
-            self._at_s = now_s
-        return self._tokens >= 1.0
-
-    def spend(self, now_s: float) -> bool:
-        """Take a token; return whether there was one."""
-        is_there = self.has(now_s)
-        if is_there:
-            self._tokens -= 1.0
-        return is_there
 
 
 class Cookies:
@@ -152,20 +124,13 @@ class Admission:
         flooded_until_s: hellos are refused unverified until then; a neighbour's may be among them.
     """
 
-    begun_s: float
     loaded_until_s: float = float("-inf")
     flooded_until_s: float = float("-inf")
-    _strangers: TokenBucket = field(init=False)
-    _proven: TokenBucket = field(init=False)
-    _cookies: TokenBucket = field(init=False)
-    _refusals: TokenBucket = field(init=False)
-    _addresses: OrderedDict[bytes, TokenBucket] = field(default_factory=OrderedDict)
-
-    def __post_init__(self) -> None:
-        self._strangers = TokenBucket(*STRANGER_HELLOS, self.begun_s)
-        self._proven = TokenBucket(*PROVEN_HELLOS, self.begun_s)
-        self._cookies = TokenBucket(*COOKIES, self.begun_s)
-        self._refusals = TokenBucket(*REFUSALS, self.begun_s)
+    _strangers: TokenBucket = field(default_factory=lambda: TokenBucket(*STRANGER_HELLOS))
+    _proven: TokenBucket = field(default_factory=lambda: TokenBucket(*PROVEN_HELLOS))
+    _cookies: TokenBucket = field(default_factory=lambda: TokenBucket(*COOKIES))
+    _refusals: TokenBucket = field(default_factory=lambda: TokenBucket(*REFUSALS))
+    _addresses: TokenBuckets = field(default_factory=lambda: TokenBuckets(*ADDRESS_HELLOS, _ADDRESSES_MAX))
 
     def is_loaded(self, now_s: float) -> bool:
         """Return whether more hellos arrive than are verified without a cookie."""
@@ -177,8 +142,7 @@ class Admission:
         Raises:
             FrameError: RATE_LIMITED.
         """
-        bucket = self._addresses.get(mac)
-        if bucket is not None and not bucket.has(now_s):
+        if self._addresses.left(mac, now_s) < 1:
             self.refused(now_s)
             raise FrameError(DropReason.RATE_LIMITED, "hellos of one address")
 
@@ -206,7 +170,7 @@ class Admission:
         Raises:
             StatementError: RATE_LIMITED, or COOKIE_REQUIRED.
         """
-        if not self._address(mac, now_s).spend(now_s):
+        if not self._addresses.spend(mac, now_s):
             self.refused(now_s)
             raise StatementError(DropReason.RATE_LIMITED, "hellos of one address")
         if not self.is_loaded(now_s):
@@ -226,12 +190,3 @@ class Admission:
 
     def _load(self, now_s: float) -> None:
         self.loaded_until_s = self.flooded_until_s = now_s + _LOADED_S
-
-    def _address(self, mac: bytes, now_s: float) -> TokenBucket:
-        bucket = self._addresses.get(mac)
-        if bucket is None:
-            bucket = self._addresses[mac] = TokenBucket(*ADDRESS_HELLOS, now_s)
-            if len(self._addresses) > _ADDRESSES_MAX:
-                self._addresses.popitem(last=False)
-        self._addresses.move_to_end(mac)
-        return bucket

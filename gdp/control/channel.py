@@ -31,9 +31,9 @@ from gdp.crypto.statements import Statement, StatementType, parse, sign
 from gdp.errors import DropReason, FrameError, StatementError
 from gdp.limits import CONTROL_MAX_BYTES, RECORD_OVERHEAD_BYTES
 from gdp.message.replay import ReplayWindow
-from gdp.message.token_bucket import TokenBucket
 from gdp.names import Name
 from gdp.sansio import Timestamps
+from gdp.token_bucket import TokenBucket
 from gdp.trust.domain import Policy
 
 __all__ = ["Channels", "Opened", "Outgoing"]

@@ -29,7 +29,6 @@ from gdp.control.admission import (
     NEIGHBOUR_HELLOS,
     Admission,
     Cookies,
-    TokenBucket,
     cookie_payload,
     read_cookie,
     seal_cookie,
@@ -63,6 +62,7 @@ from gdp.limits import DEAD_S, HELLO_IDLE, HELLO_S, MTU_MIN_BYTES
 from gdp.message.replay import ReplayWindow
 from gdp.names import Name
 from gdp.sansio import BROADCAST, OutgoingFrames, ReceivedFrame, Timestamps
+from gdp.token_bucket import TokenBucket
 from gdp.trust.domain import Policy
 from gdp.trust.rtcert import RtCertCache
 
@@ -328,7 +328,7 @@ class HelloProtocol:
                 cost=cost,
                 nonce=nonce,
                 exchange_key=key,
-                admission=Admission(now_s),
+                admission=Admission(),
                 hello_at_s=now_s,
                 addresses={} if port is None else port.addresses,
             )
@@ -517,7 +517,7 @@ class HelloProtocol:
         member = known.member if known is not None else None
         seen = arrival.mac, hello.membership
         if known is not None and member is not None and known.is_proven and (known.mac, member.wire) == seen:
-            known.hellos = known.hellos or TokenBucket(*NEIGHBOUR_HELLOS, now_s)
+            known.hellos = known.hellos or TokenBucket(*NEIGHBOUR_HELLOS)
             port.admission.admit_neighbour(known.hellos, now_s)
             return
         try:

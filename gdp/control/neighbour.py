@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
-from gdp.control.admission import TokenBucket
 from gdp.control.hello import LIFE_BYTES, echo_of
 from gdp.control.keepalive import KeepaliveSession
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.keys import PublicKey
 from gdp.names import Name
+from gdp.token_bucket import TokenBucket
 
 __all__ = ["TRANSITIONS", "Neighbour", "NeighbourEvent", "NeighbourState"]
 

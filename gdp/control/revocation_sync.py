@@ -31,8 +31,8 @@ from gdp.crypto.statements import Statement, StatementType
 from gdp.errors import DropReason, StatementError
 from gdp.names import Name
 from gdp.sansio import Timestamps
+from gdp.token_bucket import TokenBuckets
 from gdp.trust.revocations import BUCKETS, KeptKey, Revocations
-from gdp.trust.token_buckets import TokenBuckets
 
 __all__ = ["AGAIN_S", "PER_S", "RevocationSync"]
 

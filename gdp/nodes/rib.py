@@ -19,7 +19,6 @@ from gdp.nodes.config import RibConfig
 from gdp.nodes.control_client import control_path
 from gdp.nodes.control_socket import ControlHandlers
 from gdp.nodes.control_status import node_status
-from gdp.nodes.counts import count_list
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
@@ -32,7 +31,7 @@ from gdp.nodes.uplink import open_uplink
 from gdp.ports.plane import Plane
 from gdp.rib.core import RibCore, RibSettings
 from gdp.stores.audit_log import AuditLog
-from gdp.telemetry.sources import Sources
+from gdp.telemetry.sources import Sources, count_list
 from gdp.trust.domain import Policy
 
 __all__ = ["run_rib"]

@@ -23,7 +23,6 @@ __all__ = [
     "ExistingFile",
     "Ifname",
     "Metrics",
-    "NameText",
     "NewFile",
     "RequiredName",
     "Section",
@@ -126,7 +125,6 @@ Directory = Annotated[Relative, AfterValidator(_directory)]
 NewFile = Annotated[Relative, AfterValidator(_writable_place)]
 Unique = AfterValidator(_unique)
 Ifname = Annotated[str, AfterValidator(_ifname)]
-NameText = Annotated[Name | None, BeforeValidator(read_name)]
 RequiredName = Annotated[Name, BeforeValidator(read_name)]
 
 

@@ -19,7 +19,6 @@ from gdp.nodes.config import SwitchConfig
 from gdp.nodes.control_client import control_path
 from gdp.nodes.control_socket import ControlHandlers
 from gdp.nodes.control_status import node_status
-from gdp.nodes.counts import count_list
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.data_plane import Chosen, choose_plane
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
@@ -34,7 +33,7 @@ from gdp.ports.plane import MAC_BYTES, Plane
 from gdp.ports.rtnetlink import LinkMonitor
 from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table
-from gdp.telemetry.sources import Sources
+from gdp.telemetry.sources import Sources, count_list
 
 __all__ = ["run_switch"]
 

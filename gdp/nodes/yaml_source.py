@@ -16,7 +16,7 @@ from typing import Any, Final, TypeAlias
 import yaml
 
 from gdp.errors import ConfigError
-from gdp.stores.bounded import read_at_most
+from gdp.stores.files import read_at_most
 
 __all__ = ["LOADER", "ConfigFileError", "KeyPath", "Plain", "YamlSource", "read_yaml"]
 

@@ -27,7 +27,6 @@ from gdp.names import NAME_BYTES
 from gdp.ports.mmsg import SLOTS, MmsgPool, make_batch, put_one
 from gdp.ports.netdev import NetdevPlane
 from gdp.ports.plane import MAC_BYTES, Port, ReceivedFrame
-from gdp.ports.punt_quota import PuntQuota
 from gdp.ports.sockets import TrafficClass, attach_drop_all_filter, kernel_drops, open_port, tell_neighbours
 from gdp.switch.forwarder import Drop, Forward, decide
 from gdp.switch.table import NOWHERE, Hops, Table, is_side
@@ -59,6 +58,31 @@ def _lane_of(frame: bytes) -> TrafficClass:
     if frame[KIND_AT] >= CONTROL_FROM:
         return TrafficClass.CONTROL
     return TrafficClass.URGENT if frame[FLAGS_AT] & _URGENT else TrafficClass.ORDINARY
+
+
+class _PuntQuota:
+    """The remaining quota of one source of frames, beyond which its socket pauses.
+
+    Source: a leaky bucket as a meter (ITU-T I.371), charged after the fact, because a batch is read before its size is
+    known.
+
+    Args:
+        rate: frames a second.
+        burst: frames at once.
+    """
+
+    __slots__ = ("_at_s", "_burst", "_left", "_rate")
+
+    def __init__(self, rate: float, burst: float, now_s: float) -> None:
+        self._rate = rate
+        self._burst = self._left = burst
+        self._at_s = now_s
+
+    def charge(self, frames: int, now_s: float) -> float:
+        """Charge frames; return the seconds to pause, 0 while some quota is left."""
+        self._left = min(self._left + (now_s - self._at_s) * self._rate, self._burst) - frames
+        self._at_s = now_s
+        return max(-self._left, 0.0) / self._rate
 
 
 class RawPlane(NetdevPlane):
@@ -98,7 +122,7 @@ class RawPlane(NetdevPlane):
         else:
             ready = partial(self._forward_all, self._entries, self._sides, port.index, opened, sockets)
         if lane in (TrafficClass.HELLO, TrafficClass.GUEST):
-            ready = partial(self._take_some, opened, PuntQuota(*_GREETINGS, time.monotonic()), ready)
+            ready = partial(self._take_some, opened, _PuntQuota(*_GREETINGS, time.monotonic()), ready)
         self.watch(opened, ready, rank=rank)
         tell_neighbours(opened, lane, self._neighbours.get(port.index, ()))
 
@@ -133,7 +157,7 @@ class RawPlane(NetdevPlane):
         super().remove_port(index)
         self._neighbours.pop(index, None)
 
-    def _take_some(self, source: socket.socket, ration: PuntQuota, ready: Callable[[], None]) -> None:
+    def _take_some(self, source: socket.socket, ration: _PuntQuota, ready: Callable[[], None]) -> None:
         """Receive a batch; pause the socket if it exceeded its quota."""
         before = self._counters.frames_in
         ready()

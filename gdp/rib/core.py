@@ -38,7 +38,6 @@ from gdp.limits import (
     RIB_WATCHES_MAX,
     WITHDRAWAL_MAX_BYTES,
 )
-from gdp.message.token_bucket import Paces
 from gdp.names import Name
 from gdp.rib.digest_tree import DigestTree
 from gdp.rib.replication import Message, Replication
@@ -49,6 +48,7 @@ from gdp.rib.upstream_advertisements import PROBE_S, Passed, UpstreamAdvertiseme
 from gdp.rib.upstream_queries import UpstreamQueries
 from gdp.rib.watches import Asker, Watches
 from gdp.sansio import Timestamps
+from gdp.token_bucket import TokenBuckets
 from gdp.trust.adcert import AdCert
 from gdp.trust.advertisement import Advertisement, UnverifiedAdvertisement
 from gdp.trust.audit import Action
@@ -116,7 +116,7 @@ class RibCore:
         self._above = UpstreamQueries(is_top=not settings.upper)
         self._upstream = UpstreamAdvertisements(settings.upper)
         self._replication = self._replication_over(store.digests)
-        self._answer_paces = Paces(ANSWER_BYTES_PER_S, ANSWER_BYTES_BURST)
+        self._answer_paces = TokenBuckets(ANSWER_BYTES_PER_S, ANSWER_BYTES_BURST)
         self._now_s = 0.0  # of the last call
         self._letters: list[OutgoingStatement] = []
         self.boundary = ErrorBoundary()

@@ -83,7 +83,6 @@ class Replication:
         self._digest_at_s = float("-inf")
         self._started_s: float | None = None
         self._is_warm = not self._peers
-        self.fetched = 0
 
     @property
     def peers(self) -> tuple[Name, ...]:
@@ -119,7 +118,6 @@ class Replication:
         elif isinstance(message, Fetch):
             self._serve(message, sender, now_s)
         elif isinstance(message, Replicas):
-            self.fetched += len(message.entries)
             if message.is_last:
                 self._reply_ended(sender, peer, now_s)
             return message.entries

@@ -17,8 +17,8 @@ from gdp.names import Name
 from gdp.rib.route import Route
 from gdp.rib.store import Store
 from gdp.sansio import Timestamps
+from gdp.token_bucket import TokenBuckets
 from gdp.trust.revocation import Revocation
-from gdp.trust.token_buckets import TokenBuckets
 from gdp.trust.verifier import AdvertisementVerifier
 
 __all__ = ["RibRevocations"]

@@ -15,19 +15,28 @@ import stat
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import BinaryIO, Final
 
 from gdp.errors import LocalError
-from gdp.stores.bounded import read_at_most
 from gdp.stores.ownership import refuse_foreign_file, refuse_shared_folder
 
-__all__ = ["FILE_MAX_BYTES", "NewFile", "private", "public", "read_private", "read_public", "refuse_existing"]
-__all__ += ["write_all"]
+__all__ = [
+    "FILE_MAX_BYTES",
+    "NewFile",
+    "private",
+    "public",
+    "read_at_most",
+    "read_private",
+    "read_public",
+    "refuse_existing",
+    "write_all",
+]
 
 FILE_MAX_BYTES: Final = 1 << 20
 _PRIVATE_MODE: Final = 0o600
 _PUBLIC_MODE: Final = 0o644  # minus the umask
 _DIRECTORY_MODE: Final = 0o700
+_PIECE_BYTES: Final = 16 << 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +98,19 @@ def read_private(path: Path) -> bytes:
             to its directory, or as for ``read_public``.
     """
     return _read(path, is_private=True)
+
+
+def read_at_most(file: BinaryIO, limit: int) -> bytes:
+    """Return a file's bytes up to its end, or the first ``limit + 1`` bytes if it is longer.
+
+    It reads in pieces, so a short file costs no buffer of the limit's length.
+    """
+    pieces = []
+    left = limit + 1
+    while left and (piece := file.read(min(left, _PIECE_BYTES))):
+        pieces.append(piece)
+        left -= len(piece)
+    return b"".join(pieces)
 
 
 def refuse_existing(path: Path) -> None:

@@ -32,7 +32,6 @@ from gdp.errors import DropReason, FrameError, RemoteError, StatementError
 from gdp.frame.codec import HEADER_BYTES, Header, decode, encode
 from gdp.frame.kinds import CONTROL_FROM, Kind
 from gdp.limits import ADVERTISEMENTS_BURST, ADVERTISEMENTS_PER_S, HOPS_MAX, JOINS_BURST, JOINS_PER_S
-from gdp.message.token_bucket import Paces
 from gdp.names import Name
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
 from gdp.switch.advertisements import AdvertisementHandler
@@ -51,6 +50,7 @@ from gdp.switch.rib_client import RibClient
 from gdp.switch.spf_delay import SpfDelay
 from gdp.switch.table import Table
 from gdp.switch.unicast import Unicast
+from gdp.token_bucket import TokenBuckets
 from gdp.trust.domain import Policy
 from gdp.trust.right import HEARS, Right
 from gdp.trust.verifier import AdvertisementVerifier
@@ -131,8 +131,8 @@ class SwitchCore:
             relocations=self.relocations, held=self._held, outbox=self._outbox,
         )  # fmt: skip
         self.boundary = ErrorBoundary()
-        self._join_paces = Paces(JOINS_PER_S, JOINS_BURST)
-        self._advertisement_paces = Paces(ADVERTISEMENTS_PER_S, ADVERTISEMENTS_BURST)
+        self._join_paces = TokenBuckets(JOINS_PER_S, JOINS_BURST)
+        self._advertisement_paces = TokenBuckets(ADVERTISEMENTS_PER_S, ADVERTISEMENTS_BURST)
         self._drops: Counter[DropReason] = Counter()
         # when something other than the neighbour discovery is due; None: to be computed
         self._rest_due_s: float | None = None

@@ -24,12 +24,12 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement
 from gdp.errors import DropReason, StatementError
 from gdp.limits import LINK_STATE_AGE_MAX_S, LINK_STATE_REFRESH_S, LINK_STATES_BURST, LINK_STATES_PER_S
-from gdp.message.token_bucket import Paces
 from gdp.names import Name
 from gdp.sansio import Timestamps
 from gdp.switch.damping import Damping
 from gdp.switch.lsdb import LinkStateDatabase
 from gdp.switch.paths import Paths
+from gdp.token_bucket import TokenBuckets
 from gdp.trust.domain import Policy
 from gdp.trust.rtcert import RtCertCache
 
@@ -90,7 +90,7 @@ class Flooding:
         self.paths = Paths(identity.name, self._domain, self.link_states)
         self.damping = Damping()
         self._rtcerts = RtCertCache(_RTCERTS_REMEMBERED)
-        self._paces = Paces(LINK_STATES_PER_S, LINK_STATES_BURST)
+        self._paces = TokenBuckets(LINK_STATES_PER_S, LINK_STATES_BURST)
         self.drops: Counter[DropReason] = Counter()  # RIBs in link states that are rejected
         self._said: dict[Scope, tuple[object, ...]] = {}
         self._refresh_at_s: dict[Scope, float] = {}  # each by itself: news in one scope does not renew the other

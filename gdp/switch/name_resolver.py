@@ -26,11 +26,11 @@ from gdp.limits import (
     SWITCH_QUESTIONS_BURST,
     SWITCH_QUESTIONS_PER_S,
 )
-from gdp.message.token_bucket import Paces
 from gdp.names import Name
 from gdp.switch.name_cache import Location, NameCache
 from gdp.switch.name_queries import NameQueries
 from gdp.switch.pending_frames import PendingFrames
+from gdp.token_bucket import TokenBuckets
 from gdp.trust.right import Right
 
 __all__ = ["NameResolver", "Resolution"]
@@ -69,8 +69,8 @@ class NameResolver:
         self._queries = NameQueries(lease_s)
         self._pending = PendingFrames()
         self._rates = {
-            _FROM_NODE: Paces(QUESTIONS_PER_S, QUESTIONS_BURST),
-            _FROM_SWITCH: Paces(SWITCH_QUESTIONS_PER_S, SWITCH_QUESTIONS_BURST),
+            _FROM_NODE: TokenBuckets(QUESTIONS_PER_S, QUESTIONS_BURST),
+            _FROM_SWITCH: TokenBuckets(SWITCH_QUESTIONS_PER_S, SWITCH_QUESTIONS_BURST),
         }
         self._refused: Counter[DropReason] = Counter()
 

@@ -196,11 +196,6 @@ class Paths:
         self._refresh()
         return self._members
 
-    def carries_transit(self, switch: Name) -> bool:
-        """Return whether paths may lead through a switch: it is no leaf."""
-        self._refresh()
-        return switch not in self._leaves
-
     def severed(self) -> frozenset[Name]:
         """Return the switches of our domain that only leaves connect to this one: no path leads to them."""
         self._refresh()

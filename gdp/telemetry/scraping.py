@@ -18,6 +18,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
+from gdp.token_bucket import TokenBucket
+
 __all__ = ["CONNECTIONS_MAX", "CONNECTION_S", "REQUEST_MAX_BYTES", "ScrapeServer"]
 
 log = logging.getLogger(__name__)
@@ -31,24 +33,6 @@ _ACCEPTS_PER_S: Final = 500.0  # about 20 us each
 _ANSWERS_PER_S: Final = 20.0  # a few ms each; a scraper polls every few seconds
 _TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 _END: Final = (b"\r\n\r\n", b"\n\n")
-
-
-class _Pace:
-    """A token bucket: ``per_s`` tokens a second, and as many at once after a second of rest."""
-
-    def __init__(self, per_s: float) -> None:
-        self._per_s = per_s
-        self._tokens = per_s
-        self._seen_s = time.monotonic()
-
-    def spend(self, now_s: float) -> bool:
-        """Return whether a token is left, and take it."""
-        self._tokens = min(self._per_s, self._tokens + (now_s - self._seen_s) * self._per_s)
-        self._seen_s = now_s
-        if self._tokens < 1.0:
-            return False
-        self._tokens -= 1.0
-        return True
 
 
 @dataclass(slots=True)
@@ -74,7 +58,7 @@ class ScrapeServer:
 
     def __init__(self, port: int, text: Callable[[], bytes]) -> None:
         self._text = text
-        self._accepts, self._answers = _Pace(_ACCEPTS_PER_S), _Pace(_ANSWERS_PER_S)
+        self._accepts, self._answers = (TokenBucket(each, each) for each in (_ACCEPTS_PER_S, _ANSWERS_PER_S))
         self._connections: dict[int, _Connection] = {}
         self._resume_s: float | None = None  # when the server accepts connections again
         self._is_closed = False

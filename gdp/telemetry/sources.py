@@ -10,7 +10,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-__all__ = ["LATENCY_BOUNDS_S", "Counts", "EntryCounts", "Gauge", "Histogram", "Sources"]
+from gdp.errors import DropReason
+
+__all__ = ["LATENCY_BOUNDS_S", "Counts", "EntryCounts", "Gauge", "Histogram", "Sources", "count_list"]
 
 LATENCY_BOUNDS_S: Final = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 
@@ -83,3 +85,8 @@ class Sources:
     waiting: Counts | None = None
     clashes: Gauge | None = None
     latency: Callable[[], Histogram] | None = None
+
+
+def count_list(counts: Mapping[DropReason, int]) -> list[int]:
+    """Return counts by reason as a list in the order of the reasons."""
+    return [counts.get(reason, 0) for reason in DropReason]

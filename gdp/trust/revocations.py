@@ -31,8 +31,8 @@ from gdp.limits import (
 )
 from gdp.names import Name
 from gdp.sansio import Timestamps
+from gdp.token_bucket import TokenBuckets
 from gdp.trust.revocation import Revocation
-from gdp.trust.token_buckets import TokenBuckets
 
 __all__ = ["BUCKETS", "ID_BYTES", "OPERATOR", "Kept", "KeptKey", "Revocations", "hash_of"]
 

@@ -25,7 +25,6 @@ from gdp.names import Name
 from gdp.nodes.control_client import control_path
 from gdp.nodes.control_socket import ControlHandlers
 from gdp.nodes.control_status import node_status
-from gdp.nodes.counts import count_list
 from gdp.nodes.credentials import Credentials, watched_folders
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
@@ -36,7 +35,7 @@ from gdp.nodes.runtime import Runtime, now
 from gdp.nodes.single_instance import run_alone
 from gdp.nodes.uplink import open_uplink
 from gdp.ports.plane import Plane
-from gdp.telemetry.sources import Sources
+from gdp.telemetry.sources import Sources, count_list
 from proxy.bridge.counters import Traffic
 from proxy.bridge.faults import Faults
 from proxy.config.config import ProxyConfig, Record

@@ -64,7 +64,6 @@ class KernelMap:
     def __init__(self, kind: MapKind, key_bytes: int, value_bytes: int, max_entries: int, name: str) -> None:
         self.max_entries = max_entries
         self.name = name
-        self._key_bytes = key_bytes
         each = -(-value_bytes // 8) * 8
         self._value_bytes = each * possible_cpus() if kind is MapKind.PERCPU_ARRAY else value_bytes
         flags = _NO_PREALLOC if kind is MapKind.HASH else 0

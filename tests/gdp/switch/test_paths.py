@@ -209,7 +209,6 @@ def test_a_way_leads_to_a_leaf_and_never_through_one() -> None:
     assert found.to_switch(name("d"), HOME, ALL) == Path(name("b"), 110)
     assert found.to_switch(name("leaf"), HOME, ALL) == Path(name("leaf"), 1)
     assert found.to_rib(name("rib"), ALL) == (Path(name("b"), 110), name("d"))
-    assert not found.carries_transit(name("leaf"))
 
 
 def test_a_leaf_is_an_alternate_to_itself_only() -> None:
