@@ -11,18 +11,16 @@ Lines are written at once but not synced: a power failure may cost the last seco
 
 from __future__ import annotations
 
-import fcntl
 import os
 import time
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Final
 
 from gdp.errors import LocalError
-from gdp.stores.ownership import refuse_foreign_file, refuse_shared_folder
+from gdp.stores.files import cut_unfinished_line, open_locked
+from gdp.stores.ownership import refuse_shared_folder
 from gdp.trust.audit import BEGIN, Action, AuditLine, AuditTrail
 
 __all__ = ["FILES_MAX", "FILE_MAX_BYTES", "AuditLog", "Verified", "note_once", "verify_audit"]
@@ -78,7 +76,7 @@ class AuditLog:
         if not trail.is_due(mono_s):
             return
         path = self._folder / _CURRENT
-        with _locked(path, os.O_RDWR | os.O_CREAT) as file:
+        with open_locked(path, os.O_RDWR | os.O_CREAT) as file:
             seq, previous = self._end_of(path, file)
             lines = trail.poll_lines(mono_s, unix_s, seq, previous)
             file.write(b"".join(line.to_line() + b"\n" for line in lines))
@@ -89,17 +87,14 @@ class AuditLog:
 
     def _end_of(self, path: Path, file: BinaryIO) -> tuple[int, str]:
         """Return sequence and hash of the last whole line, and truncate the file after it."""
-        end = file.seek(0, os.SEEK_END)
-        begin = file.seek(max(end - 2 * _LINE_MAX_BYTES, 0))
-        tail = file.read()
-        whole = tail[: tail.rfind(b"\n") + 1]
-        file.truncate(file.seek(begin + len(whole)))
-        if whole:
-            return _end(path, whole)
-        if begin:
-            raise LocalError(f"{path}: its last line has no end")
-        older = sorted(self._folder.glob(_OLDER))
-        return _end(older[-1], older[-1].read_bytes()) if older else (0, BEGIN)
+        line = cut_unfinished_line(path, file, _LINE_MAX_BYTES)
+        if line is None:
+            older = sorted(self._folder.glob(_OLDER))
+            if not older:
+                return 0, BEGIN
+            path, line = older[-1], older[-1].read_bytes().splitlines(keepends=True)[-1]
+        read = _read(f"{path}: last line", line)
+        return read.seq, read.hash
 
     def _rotate(self, path: Path, file: BinaryIO) -> None:
         file.seek(0)
@@ -134,7 +129,7 @@ def verify_audit(folder: Path) -> Verified:
     events: Counter[tuple[str, str]] = Counter()
     count, first, seq, previous = 0, 0, 0, BEGIN
     for path in files:
-        with _locked(path, os.O_RDONLY) as file:
+        with open_locked(path, os.O_RDONLY) as file:
             for number, line in enumerate(file, 1):
                 if not line.endswith(b"\n") and path.name == _CURRENT:
                     break  # the next append drops it
@@ -146,24 +141,6 @@ def verify_audit(folder: Path) -> Verified:
                 count, first, seq, previous = count + 1, first or read.seq, read.seq, read.hash
                 events[read.action, read.what] += read.count
     return Verified(count, first, previous, events)
-
-
-@contextmanager
-def _locked(path: Path, flags: int) -> Iterator[BinaryIO]:
-    try:
-        handle = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)
-        with os.fdopen(handle, "r+b" if flags & os.O_RDWR else "rb") as file:
-            refuse_foreign_file(path, os.fstat(file.fileno()))
-            fcntl.flock(file, fcntl.LOCK_EX if flags & os.O_RDWR else fcntl.LOCK_SH)
-            yield file
-    except OSError as error:
-        raise LocalError(f"{path}: {error.strerror}") from error
-
-
-def _end(path: Path, whole: bytes) -> tuple[int, str]:
-    line = whole[whole.rfind(b"\n", 0, -1) + 1 :]
-    read = _read(f"{path}: last line", line)
-    return read.seq, read.hash
 
 
 def _read(where: str, line: bytes) -> AuditLine:

@@ -9,10 +9,12 @@ replaced it (``ownership``); a link in its place is not followed.
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import secrets
 import stat
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Final
@@ -23,6 +25,8 @@ from gdp.stores.ownership import refuse_foreign_file, refuse_shared_folder
 __all__ = [
     "FILE_MAX_BYTES",
     "NewFile",
+    "cut_unfinished_line",
+    "open_locked",
     "private",
     "public",
     "read_at_most",
@@ -98,6 +102,43 @@ def read_private(path: Path) -> bytes:
             to its directory, or as for ``read_public``.
     """
     return _read(path, is_private=True)
+
+
+@contextmanager
+def open_locked(path: Path, flags: int) -> Iterator[BinaryIO]:
+    """Open a private file of lines: locked against other writers for reading, against all others for writing.
+
+    Args:
+        flags: as for ``os.open``; with ``os.O_RDWR`` the file is opened for writing.
+
+    Raises:
+        LocalError: it is another user's, others may access it, or the system refuses.
+    """
+    is_writer = bool(flags & os.O_RDWR)
+    try:
+        handle = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, _PRIVATE_MODE)
+        with os.fdopen(handle, "r+b" if is_writer else "rb") as file:
+            refuse_foreign_file(path, os.fstat(file.fileno()))
+            fcntl.flock(file, fcntl.LOCK_EX if is_writer else fcntl.LOCK_SH)
+            yield file
+    except OSError as error:
+        raise LocalError(f"{path}: {error.strerror}") from error
+
+
+def cut_unfinished_line(path: Path, file: BinaryIO, line_max_bytes: int) -> bytes | None:
+    """Truncate a file after its last whole line, and return that line with its end; None if the file is empty.
+
+    Raises:
+        LocalError: the last line is longer than ``line_max_bytes``.
+    """
+    end = file.seek(0, os.SEEK_END)
+    begin = file.seek(max(end - 2 * line_max_bytes, 0))
+    tail = file.read()
+    whole = tail[: tail.rfind(b"\n") + 1]
+    file.truncate(file.seek(begin + len(whole)))
+    if not whole and begin:
+        raise LocalError(f"{path}: its last line has no end; restore the file from a copy")
+    return whole[whole.rfind(b"\n", 0, -1) + 1 :] or None
 
 
 def read_at_most(file: BinaryIO, limit: int) -> bytes:

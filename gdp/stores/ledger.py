@@ -9,19 +9,17 @@ and the next append drops it.
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import BinaryIO, Final
 
 from gdp.crypto.certificates import Membership
 from gdp.errors import LocalError
-from gdp.stores.ownership import refuse_foreign_file, refuse_shared_folder
+from gdp.stores.files import cut_unfinished_line, open_locked
+from gdp.stores.ownership import refuse_shared_folder
 
 __all__ = ["LEDGER", "Issued", "append_issued", "read_ledger"]
 
@@ -70,8 +68,8 @@ def append_issued(directory: Path, member: Membership, unix_s: float) -> None:
     """
     path = directory / LEDGER
     validity = member.validity
-    with _opened(path, os.O_RDWR | os.O_CREAT) as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+    with open_locked(path, os.O_RDWR | os.O_CREAT) as file:
+        refuse_shared_folder(directory)
         previous = _last_hash(path, file)
         line = Issued(
             at_unix_s=int(unix_s),
@@ -105,8 +103,8 @@ def read_ledger(directory: Path) -> list[Issued]:
         return []
     found: list[Issued] = []
     previous = _BEGIN
-    with _opened(path, os.O_RDONLY) as file:
-        fcntl.flock(file, fcntl.LOCK_SH)
+    with open_locked(path, os.O_RDONLY) as file:
+        refuse_shared_folder(directory)
         for number, line in enumerate(iter(lambda: file.readline(_LINE_MAX_BYTES), b""), 1):
             if not line.endswith(b"\n"):
                 break  # it was never handed out
@@ -118,30 +116,11 @@ def read_ledger(directory: Path) -> list[Issued]:
     return found
 
 
-@contextmanager
-def _opened(path: Path, flags: int) -> Iterator[BinaryIO]:
-    try:
-        handle = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)
-        with os.fdopen(handle, "r+b" if flags & os.O_RDWR else "rb") as file:
-            refuse_foreign_file(path, os.fstat(file.fileno()))
-            refuse_shared_folder(path.parent)
-            yield file
-    except OSError as error:
-        raise LocalError(f"{path}: {error.strerror}") from error
-
-
 def _last_hash(path: Path, file: BinaryIO) -> str:
     """Return the hash of the last whole line, and truncate the file after it."""
-    end = file.seek(0, os.SEEK_END)
-    begin = file.seek(max(end - 2 * _LINE_MAX_BYTES, 0))
-    tail = file.read()
-    whole = tail[: tail.rfind(b"\n") + 1]
-    file.truncate(file.seek(begin + len(whole)))
-    if not whole:
-        if begin:
-            raise LocalError(f"{path}: its last line has no end; restore the ledger from a copy")
+    line = cut_unfinished_line(path, file, _LINE_MAX_BYTES)
+    if line is None:
         return _BEGIN
-    line = whole[whole.rfind(b"\n", 0, -1) + 1 :]
     _parsed(f"{path}: last line", line)
     return _hash(line)
 
