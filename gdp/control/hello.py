@@ -130,11 +130,7 @@ class Hello:
 
     @classmethod
     def from_fields(cls, fields: Fields) -> Hello:
-        """Read a parsed statement's body.
-
-        Raises:
-            StatementError: MALFORMED.
-        """
+        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
         return cls(
             nonce=fields.bytes_("n", NONCE_BYTES),
             sequence=fields.uint("s"),

@@ -76,11 +76,7 @@ class Join:
 
     @classmethod
     def from_fields(cls, fields: Fields) -> Join:
-        """Read a parsed statement's body.
-
-        Raises:
-            StatementError: MALFORMED.
-        """
+        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
         return cls(
             topic=fields.name("n"),
             publisher=fields.name("p"),

@@ -66,11 +66,7 @@ class Presence:
 
     @classmethod
     def from_fields(cls, fields: Fields) -> Presence:
-        """Read a parsed statement's body.
-
-        Raises:
-            StatementError: MALFORMED.
-        """
+        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
         return cls(
             node=fields.name("n"),
             incarnation=fields.uint("i"),

@@ -40,11 +40,7 @@ class Query:
 
     @classmethod
     def from_fields(cls, fields: Fields) -> Query:
-        """Read a parsed statement's body.
-
-        Raises:
-            StatementError: MALFORMED.
-        """
+        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
         revoked = fields.bytes_("v", ID_BYTES) if "v" in fields and fields["v"] != b"" else None
         return cls(fields.name("n"), fields.number("w", 0, LEASE_MAX_S), revoked)
 
@@ -92,11 +88,7 @@ class Response:
 
     @classmethod
     def from_fields(cls, fields: Fields) -> Response:
-        """Read a parsed statement's body.
-
-        Raises:
-            StatementError: MALFORMED.
-        """
+        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
         return cls(
             name=fields.name("n"),
             advertiser=fields.name("a"),

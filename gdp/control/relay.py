@@ -47,11 +47,7 @@ class Relay:
 
     @classmethod
     def from_fields(cls, fields: Fields) -> Relay:
-        """Read a parsed statement's body.
-
-        Raises:
-            StatementError: MALFORMED.
-        """
+        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
         domain = fields.name("d") if fields.bytes_("d") else None
         return cls(fields.bytes_("q"), tuple(fields.names("x", TRANSIT_MAX)), fields.bytes_("c"), domain)
 

@@ -56,11 +56,7 @@ class Digest:
 
     @classmethod
     def from_fields(cls, fields: Fields) -> Digest:
-        """Read a parsed statement's body.
-
-        Raises:
-            StatementError: MALFORMED.
-        """
+        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
         digest = cls(_prefix(fields.bytes_("p")), fields.bytes_("h"), fields.flag("z"))
         if len(digest.hashes) not in (HASH_BYTES, FANOUT * HASH_BYTES):
             raise StatementError(DropReason.MALFORMED, "a digest of another length")
@@ -81,11 +77,7 @@ class Fetch:
 
     @classmethod
     def from_fields(cls, fields: Fields) -> Fetch:
-        """Read a parsed statement's body.
-
-        Raises:
-            StatementError: MALFORMED.
-        """
+        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
         prefixes = tuple(_prefix(each) for each in fields.byte_strings("p", FETCH_PREFIXES_MAX))
         keys = fields.byte_strings("k", FETCH_KEYS_MAX, _KEY_BYTES)
         return cls(prefixes, tuple((Name(key[:NAME_BYTES]), Name(key[NAME_BYTES:])) for key in keys))
@@ -128,11 +120,7 @@ class Inventory:
 
     @classmethod
     def from_fields(cls, fields: Fields) -> Inventory:
-        """Read a parsed statement's body.
-
-        Raises:
-            StatementError: MALFORMED.
-        """
+        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
         lines = fields.byte_strings("i", INVENTORY_MAX, _KEY_BYTES + 9)
         return cls(tuple(_item(line) for line in lines), fields.flag("z"))
 
@@ -180,11 +168,7 @@ class Entry:
 
     @classmethod
     def from_fields(cls, fields: Fields) -> Entry:
-        """Read the map.
-
-        Raises:
-            StatementError: MALFORMED.
-        """
+        """Read the map; a malformed one raises ``StatementError``."""
         return cls(
             statement=fields.bytes_("q"),
             membership=fields.bytes_("m"),
@@ -217,11 +201,7 @@ class Replicas:
 
     @classmethod
     def from_fields(cls, fields: Fields) -> Replicas:
-        """Read a parsed statement's body.
-
-        Raises:
-            StatementError: MALFORMED.
-        """
+        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
         entries = tuple(Entry.from_fields(each) for each in fields.maps("e", ENTRIES_MAX))
         return cls(entries, fields.flag("z"))
 

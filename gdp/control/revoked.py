@@ -53,11 +53,7 @@ class Revoked:
 
     @classmethod
     def from_fields(cls, fields: Fields) -> Revoked:
-        """Read a parsed statement's body.
-
-        Raises:
-            StatementError: MALFORMED.
-        """
+        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
         domain = fields.name("d") if fields.bytes_("d") else ZERO
         joined = fields.bytes_("h", 0 if domain == ZERO else BUCKETS * ID_BYTES)
         return cls(fields.bytes_("i", ECHO_BYTES), fields.uint("s"), _domains(fields), domain, _split(joined))
@@ -93,11 +89,7 @@ class Lacking:
 
     @classmethod
     def from_fields(cls, fields: Fields) -> Lacking:
-        """Read a parsed statement's body.
-
-        Raises:
-            StatementError: MALFORMED.
-        """
+        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
         buckets, ids = fields.bytes_("b"), fields.bytes_("k")
         if len(buckets) > BUCKETS or len(set(buckets)) < len(buckets) or len(ids) % ID_BYTES:
             raise StatementError(DropReason.MALFORMED, "what is lacking")

@@ -36,11 +36,7 @@ class Validity:
 
     @classmethod
     def from_fields(cls, fields: Fields) -> Validity:
-        """Read ``from`` and ``until`` of a statement's body.
-
-        Raises:
-            StatementError: MALFORMED.
-        """
+        """Read ``from`` and ``until`` of a statement's body; a malformed one raises ``StatementError``."""
         return cls(fields.uint("from"), fields.uint("until"))
 
     def to_fields(self) -> dict[str, object]:

@@ -9,20 +9,20 @@ import asyncio
 import logging
 import os
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Generator, Sequence
 from types import TracebackType
+from typing import TypeVar
 
 from gdp.client.participant import Topic
-from gdp.client.publisher import Publisher as MemberPublisher
 from gdp.errors import LocalError
-from gdp.names import Name
 from gdp.service.replication import Replication
-from gdp.session.client_core import Call
-from gdp.session.core import QUEUE_MESSAGES, Inbox, replication_of
-from gdp.session.errors import AttachError, ClosedError, SessionTimeoutError
+from gdp.session.core import QUEUE_MESSAGES
+from gdp.session.errors import ClosedError
 from gdp.session.loop_driver import LoopDriver
-from gdp.session.messages import DelegatedName, Message, NameLike, Request, Response
-from gdp.session.node import SessionNode, open_node
+from gdp.session.messages import Message, NameLike, Request, Response
+from gdp.session.node import open_node
+from gdp.session.opened import BasePublisher, BaseServer, BaseSession, BaseSubscription
 from gdp.session.server_core import ServerCore
 from gdp.session.session import (
     ATTACH_TIMEOUT_S,
@@ -34,49 +34,34 @@ from gdp.session.session import (
     is_urgent,
 )
 from gdp.session.settings import SessionConfig, settings_of
-from gdp.session.wire import PAYLOAD_MAX_BYTES, message_to_wire
+from gdp.session.wire import message_to_wire
 from gdp.trust.right import Right
 
 __all__ = ["AsyncPublisher", "AsyncServer", "AsyncSession", "AsyncSubscription", "open_session_async"]
 
 log = logging.getLogger(__name__)
 
+_C = TypeVar("_C")
 
-class AsyncPublisher:
+
+class _ClosedOnExit(ABC):
+    """Asynchronous context manager that closes itself."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the object. Idempotent."""
+
+    async def __aenter__(self: _C) -> _C:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class AsyncPublisher(BasePublisher[LoopDriver], _ClosedOnExit):
     """Publisher of one name; made by ``AsyncSession.publisher``. See ``Publisher`` for each method."""
-
-    def __init__(self, session: AsyncSession, topic: Topic, publisher: MemberPublisher, *, reliable: bool) -> None:
-        self._session = session
-        self._driver = session.driver
-        self._topic = topic
-        self._publisher = publisher
-        self._is_reliable = reliable
-        self._is_closed = False
-
-    @property
-    def name(self) -> Name:
-        """Return the 256-bit name."""
-        return self._topic.name
-
-    @property
-    def readers(self) -> int:
-        """Return the number of matched readers."""
-        return self._publisher.readers
-
-    @property
-    def confirmed(self) -> int:
-        """Return how many messages every reader has confirmed; without ``reliable``, how many were sent."""
-        return self._publisher.acknowledged
-
-    @property
-    def lost(self) -> int:
-        """Return how many messages some reader did not get, as far as this node knows."""
-        return self._publisher.losses.total
-
-    @property
-    def resent(self) -> int:
-        """Return how many fragments were retransmitted because a reader lacked them."""
-        return self._publisher.repairs
 
     async def put(self, payload: bytes, timeout_s: float | None = None) -> None:
         """Publish a message; a reliable publisher waits while its window is full.
@@ -86,20 +71,11 @@ class AsyncPublisher:
             LocalError: the payload is too large.
             ClosedError: the publisher or the session is closed.
         """
-        label = self._session.core.label(self._topic)
-        if self._is_closed:
-            raise ClosedError(f"the publisher of {label} is closed; open a new one with session.publisher()")
-        if len(payload) > PAYLOAD_MAX_BYTES:
-            raise LocalError(f"{label}: {len(payload)} bytes; at most {PAYLOAD_MAX_BYTES} fit into one message")
-        publisher = self._publisher
-        if self._is_reliable and not publisher.has_space():
-            deadline_s = _deadline_s(timeout_s)
-            if not await self._driver.wait(lambda: publisher.has_space() or not publisher.is_wanted, deadline_s):
-                raise SessionTimeoutError(
-                    f"{label}: the window was full for {timeout_s:g} s, since a reader confirms too slowly;"
-                    " publish less, or with reliable=False"
-                )
-        self._driver.publish(publisher, message_to_wire(time.time_ns(), payload))
+        self._check(payload)
+        must_wait = self._is_reliable and not self._publisher.has_space()
+        if must_wait and not await self._driver.wait(self._may_put, _deadline_s(timeout_s)):
+            raise self._window_full(timeout_s)
+        self._driver.publish(self._publisher, message_to_wire(time.time_ns(), payload))
 
     async def wait_for_readers(self, count: int = 1, timeout_s: float | None = None) -> None:
         """Wait until at least ``count`` readers are matched.
@@ -108,9 +84,7 @@ class AsyncPublisher:
             SessionTimeoutError: the readers did not appear in time.
         """
         if not await self._driver.wait(lambda: self._publisher.readers >= count, _deadline_s(timeout_s)):
-            label = self._session.core.label(self._topic)
-            hint = self._session.why_not(self.name, "start a program that subscribes to it")
-            raise SessionTimeoutError(f"{label}: {self.readers} of {count} reader(s) within {timeout_s:g} s{hint}")
+            raise self._too_few_readers(count, timeout_s)
 
     async def flush(self, timeout_s: float | None = None) -> None:
         """Wait until every reader has confirmed every message.
@@ -119,8 +93,7 @@ class AsyncPublisher:
             SessionTimeoutError: some reader did not confirm in time.
         """
         if not await self._driver.wait(self._publisher.is_acknowledged, _deadline_s(timeout_s)):
-            label = self._session.core.label(self._topic)
-            raise SessionTimeoutError(f"{label}: not every reader has confirmed within {timeout_s:g} s")
+            raise self._unconfirmed(timeout_s)
 
     def close(self) -> None:
         """Stop publishing; unconfirmed messages are lost, so ``flush`` first. Idempotent."""
@@ -130,45 +103,9 @@ class AsyncPublisher:
             self._session.core.member.withdraw(self.name)
             self._driver.schedule()
 
-    async def __aenter__(self) -> AsyncPublisher:
-        return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None
-    ) -> None:
-        self.close()
-
-
-class AsyncSubscription:
+class AsyncSubscription(BaseSubscription[LoopDriver], _ClosedOnExit):
     """Messages of one name as an asynchronous iterator; made by ``AsyncSession.subscribe``."""
-
-    def __init__(self, session: AsyncSession, topic: Topic, inbox: Inbox) -> None:
-        self._session = session
-        self._driver = session.driver
-        self._topic = topic
-        self._inbox = inbox
-        self._messages = inbox.messages
-        self._is_closed = False
-
-    @property
-    def name(self) -> Name:
-        """Return the 256-bit name."""
-        return self._topic.name
-
-    @property
-    def publishers(self) -> int:
-        """Return the number of matched publishers."""
-        return len(self._session.core.member.writer_proxies_of(self.name))
-
-    @property
-    def lost(self) -> int:
-        """Return how many messages were lost on their way to this node."""
-        return self._session.core.member.losses_of(self.name).total
-
-    @property
-    def dropped(self) -> int:
-        """Return how many messages this node dropped because the program received too few."""
-        return self._inbox.dropped
 
     async def receive(self, timeout_s: float | None = None) -> Message:
         """Return the next message; messages of one publisher come in order.
@@ -179,12 +116,10 @@ class AsyncSubscription:
         """
         deadline_s = _deadline_s(timeout_s)
         while not self._messages:
-            label = self._session.core.label(self._topic)
             if self._is_closed:
-                raise ClosedError(f"the subscription to {label} is closed; subscribe again")
-            if not await self._driver.wait(lambda: bool(self._messages) or self._is_closed, deadline_s):
-                hint = self._session.why_not(self.name, f"{self.publishers} publisher(s) are there")
-                raise SessionTimeoutError(f"{label}: no message within {timeout_s:g} s{hint}")
+                raise self._closed()
+            if not await self._driver.wait(self.is_ready, deadline_s):
+                raise self._no_message(timeout_s)
         return self._messages.popleft()
 
     def __aiter__(self) -> AsyncSubscription:
@@ -205,39 +140,17 @@ class AsyncSubscription:
             self._session.core.unsubscribe(self._inbox)
             self._driver.schedule()
 
-    async def __aenter__(self) -> AsyncSubscription:
-        return self
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None
-    ) -> None:
-        self.close()
-
 
 Handler = Callable[[Request], Awaitable[bytes]]
 
 
-class AsyncServer:
+class AsyncServer(BaseServer[LoopDriver]):
     """Server of one name with a coroutine function; made by ``AsyncSession.serve``."""
 
     def __init__(self, session: AsyncSession, topic: Topic, server: ServerCore, handler: Handler, workers: int) -> None:
-        self._session = session
-        self._driver = session.driver
-        self._topic = topic
-        self._core = server
+        super().__init__(session, topic, server)
         self._handler = handler
-        self._is_closed = False
         self._tasks = [asyncio.create_task(self._work()) for _ in range(workers)]
-
-    @property
-    def name(self) -> Name:
-        """Return the 256-bit name."""
-        return self._topic.name
-
-    @property
-    def clients(self) -> int:
-        """Return the number of clients."""
-        return self._core.clients
 
     async def close(self, linger_s: float = LINGER_S) -> None:
         """Stop serving: clients use other servers, and active requests finish. Idempotent."""
@@ -286,30 +199,8 @@ class AsyncServer:
             return f"{type(error).__name__}: {error}"
 
 
-class AsyncSession:
+class AsyncSession(BaseSession[LoopDriver]):
     """A node of the overlay in this process; made by ``gdp.open_async``. See ``Session`` for the options."""
-
-    def __init__(self, node: SessionNode, driver: LoopDriver) -> None:
-        self.core = node.core
-        self.driver = driver
-        self._node = node
-        self._opened: list[AsyncPublisher | AsyncSubscription | AsyncServer] = []
-        self._is_closed = False
-
-    @property
-    def name(self) -> Name:
-        """Return the node's own name."""
-        return self.core.member.name
-
-    @property
-    def delegations(self) -> list[DelegatedName]:
-        """Return the names that this node holds delegations for, with its rights."""
-        return self.core.delegations
-
-    @property
-    def is_attached(self) -> bool:
-        """Return whether a switch has accepted the node and its advertisements."""
-        return self.core.member.attachment.is_attached
 
     def publisher(
         self,
@@ -400,10 +291,8 @@ class AsyncSession:
             DelegationError: the node may not call it.
         """
         self.driver.check()
-        call = Call(payload=bytes(request), timeout_s=timeout_s, replication=replication_of(replication))
-        if len(call.payload) > PAYLOAD_MAX_BYTES:
-            raise LocalError(f"the request has {len(call.payload)} bytes; at most {PAYLOAD_MAX_BYTES} can be sent")
-        self.core.call(self.core.resolve(name, Right.CALL), call, time.monotonic())
+        topic, call = self._new_call(name, request, timeout_s, replication)
+        self.core.call(topic, call, time.monotonic())
         self.driver.schedule()
         await self.driver.wait(lambda: call.is_done, None)
         if call.response is None:
@@ -439,19 +328,7 @@ class AsyncSession:
             AttachError: no switch accepted it in time; the text states what the node waits for.
         """
         if not await self.driver.wait(lambda: self.is_attached, time.monotonic() + timeout_s):
-            raise AttachError(f"not attached within {timeout_s:g} s: {self._node.waiting_for()}")
-
-    def why_not(self, name: Name, otherwise: str) -> str:
-        """Return the end of an error's sentence: why no data flows on a name, as far as this node knows."""
-        if not self.is_attached:
-            return f"; the node is not attached: {self._node.waiting_for()}"
-        refused = self._node.refused(name)
-        return f"; the advertisement was refused: {refused}" if refused else f"; {otherwise}"
-
-    def forget(self, opened: AsyncPublisher | AsyncSubscription | AsyncServer) -> None:
-        """Remove an object from the session's list after it closed itself."""
-        if opened in self._opened:
-            self._opened.remove(opened)
+            raise self._not_attached(timeout_s)
 
     async def __aenter__(self) -> AsyncSession:
         return self
@@ -468,7 +345,7 @@ class AsyncSession:
             elif isinstance(opened, AsyncPublisher) and opened.readers:
                 await self.driver.wait(opened._publisher.is_acknowledged, deadline_s)
         for opened in list(self._opened):
-            if not isinstance(opened, AsyncServer):
+            if isinstance(opened, _ClosedOnExit):
                 opened.close()
         self.core.close(time.monotonic())
         self.driver.schedule()

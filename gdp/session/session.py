@@ -9,25 +9,24 @@ import logging
 import os
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
 from types import TracebackType
-from typing import Final, Literal, Protocol
+from typing import Final, Literal, TypeVar
 
 from gdp.client.participant import Topic
-from gdp.client.publisher import Publisher as MemberPublisher
 from gdp.errors import LocalError
-from gdp.names import Name
 from gdp.service.replication import Replication
-from gdp.session.client_core import Call
-from gdp.session.core import QUEUE_MESSAGES, Inbox, SessionCore, replication_of
+from gdp.session.core import QUEUE_MESSAGES
 from gdp.session.driver import Driver, ThreadDriver
-from gdp.session.errors import AttachError, ClosedError, SessionTimeoutError
-from gdp.session.messages import DelegatedName, Message, NameLike, Request, Response
+from gdp.session.errors import ClosedError, SessionTimeoutError
+from gdp.session.messages import Message, NameLike, Request, Response
 from gdp.session.node import SessionNode, open_node
+from gdp.session.opened import BasePublisher, BaseServer, BaseSession, BaseSubscription
 from gdp.session.server_core import ServerCore
 from gdp.session.settings import settings_of
-from gdp.session.wire import PAYLOAD_MAX_BYTES, message_to_wire
+from gdp.session.wire import message_to_wire
 from gdp.trust.right import Right
 
 __all__ = ["Publisher", "Server", "Session", "Subscription", "open_session"]
@@ -40,62 +39,25 @@ LINGER_S: Final = 1.0
 GOODBYE_S: Final = 0.2  # how long a leaving node continues, so that its goodbye is sent
 Priority = Literal["normal", "urgent"]
 
+_C = TypeVar("_C")
 
-class Node(Protocol):
-    """Interface of a node to its session."""
 
-    @property
-    def core(self) -> SessionCore:
-        """The core of the session."""
+class _ClosedOnExit(ABC):
+    """Context manager that closes itself."""
 
-    def waiting_for(self) -> str:
-        """Return what prevents the node from being attached."""
-
-    def refused(self, name: Name) -> str:
-        """Return why the overlay rejected an advertisement; empty if it did not."""
-
-    def reload(self) -> None:
-        """Read the delegations again."""
-
+    @abstractmethod
     def close(self) -> None:
-        """Close the device."""
+        """Close the object. Idempotent."""
+
+    def __enter__(self: _C) -> _C:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
 
 
-class Publisher:
+class Publisher(BasePublisher[Driver], _ClosedOnExit):
     """Publisher of one name; made by ``Session.publisher``."""
-
-    def __init__(self, session: Session, topic: Topic, publisher: MemberPublisher, *, reliable: bool) -> None:
-        self._session = session
-        self._driver = session.driver
-        self._topic = topic
-        self._publisher = publisher
-        self._is_reliable = reliable
-        self._is_closed = False
-
-    @property
-    def name(self) -> Name:
-        """Return the 256-bit name."""
-        return self._topic.name
-
-    @property
-    def readers(self) -> int:
-        """Return the number of matched readers."""
-        return self._publisher.readers
-
-    @property
-    def confirmed(self) -> int:
-        """Return how many messages every reader has confirmed; without ``reliable``, how many were sent."""
-        return self._publisher.acknowledged
-
-    @property
-    def lost(self) -> int:
-        """Return how many messages some reader did not get, as far as this node knows."""
-        return self._publisher.losses.total
-
-    @property
-    def resent(self) -> int:
-        """Return how many fragments were retransmitted because a reader lacked them."""
-        return self._publisher.repairs
 
     def put(self, payload: bytes, timeout_s: float | None = None) -> None:
         """Publish a message.
@@ -112,12 +74,10 @@ class Publisher:
             LocalError: the payload is too large, or not bytes.
             ClosedError: the publisher or the session is closed.
         """
-        if self._is_closed:
-            raise ClosedError(f"the publisher of {self._label} is closed; open a new one with session.publisher()")
-        if len(payload) > PAYLOAD_MAX_BYTES:
-            raise LocalError(f"{self._label}: {len(payload)} bytes; at most {PAYLOAD_MAX_BYTES} fit into one message")
-        if self._is_reliable and not self._publisher.has_space():
-            self._wait_for_space(timeout_s)
+        self._check(payload)
+        must_wait = self._is_reliable and not self._publisher.has_space()
+        if must_wait and not self._driver.wait(self._may_put, _deadline_s(self._driver, timeout_s)):
+            raise self._window_full(timeout_s)
         self._driver.publish(self._publisher, message_to_wire(time.time_ns(), payload))
 
     def wait_for_readers(self, count: int = 1, timeout_s: float | None = None) -> None:
@@ -127,10 +87,7 @@ class Publisher:
             SessionTimeoutError: the readers did not appear in time; the text gives the reason if it is known.
         """
         if not self._driver.wait(lambda: self._publisher.readers >= count, _deadline_s(self._driver, timeout_s)):
-            raise SessionTimeoutError(
-                f"{self._label}: {self.readers} of {count} reader(s) within {timeout_s:g} s"
-                f"{self._session.why_not(self.name, 'start a program that subscribes to it')}"
-            )
+            raise self._too_few_readers(count, timeout_s)
 
     def flush(self, timeout_s: float | None = None) -> None:
         """Wait until every reader has confirmed every message; without ``reliable``, until every message is sent.
@@ -139,7 +96,7 @@ class Publisher:
             SessionTimeoutError: that did not happen in time.
         """
         if not self._driver.wait(self._publisher.is_acknowledged, _deadline_s(self._driver, timeout_s)):
-            raise SessionTimeoutError(f"{self._label}: not every reader has confirmed within {timeout_s:g} s")
+            raise self._unconfirmed(timeout_s)
 
     def close(self) -> None:
         """Stop publishing; unconfirmed messages are lost, so ``flush`` first. Idempotent."""
@@ -148,57 +105,9 @@ class Publisher:
             self._session.forget(self)
             self._driver.run(partial(self._session.core.member.withdraw, self.name))
 
-    def __enter__(self) -> Publisher:
-        return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self.close()
-
-    @property
-    def _label(self) -> str:
-        return self._session.core.label(self._topic)
-
-    def _wait_for_space(self, timeout_s: float | None) -> None:
-        publisher = self._publisher
-        if not self._driver.wait(
-            lambda: publisher.has_space() or not publisher.is_wanted, _deadline_s(self._driver, timeout_s)
-        ):
-            raise SessionTimeoutError(
-                f"{self._label}: the window was full for {timeout_s:g} s, since a reader confirms too slowly;"
-                " publish less, or with reliable=False"
-            )
-
-
-class Subscription:
+class Subscription(BaseSubscription[Driver], _ClosedOnExit):
     """Messages of one name as an iterator that waits for the next; made by ``Session.subscribe``."""
-
-    def __init__(self, session: Session, topic: Topic, inbox: Inbox) -> None:
-        self._session = session
-        self._driver = session.driver
-        self._topic = topic
-        self._inbox = inbox
-        self._messages = inbox.messages
-        self._is_closed = False
-
-    @property
-    def name(self) -> Name:
-        """Return the 256-bit name."""
-        return self._topic.name
-
-    @property
-    def publishers(self) -> int:
-        """Return the number of matched publishers."""
-        return len(self._session.core.member.writer_proxies_of(self.name))
-
-    @property
-    def lost(self) -> int:
-        """Return how many messages were lost on their way to this node."""
-        return self._session.core.member.losses_of(self.name).total
-
-    @property
-    def dropped(self) -> int:
-        """Return how many messages this node dropped because the program received too few."""
-        return self._inbox.dropped
 
     def receive(self, timeout_s: float | None = None) -> Message:
         """Return the next message; messages of one publisher come in order.
@@ -218,15 +127,12 @@ class Subscription:
     def _wait(self, deadline_s: float | None, timeout_s: float | None) -> Message:
         while True:
             if not self._driver.wait(self.is_ready, deadline_s):
-                label = self._session.core.label(self._topic)
-                hint = self._session.why_not(self.name, f"{self.publishers} publisher(s) are there")
-                raise SessionTimeoutError(f"{label}: no message within {timeout_s:g} s{hint}")
+                raise self._no_message(timeout_s)
             try:
                 return self._messages.popleft()
             except IndexError:  # another thread received it, or the subscription was closed
                 if self._is_closed:
-                    label = self._session.core.label(self._topic)
-                    raise ClosedError(f"the subscription to {label} is closed; subscribe again") from None
+                    raise self._closed() from None
 
     def poll(self) -> Message | None:
         """Return the next message if one has arrived, else None; never waits."""
@@ -234,10 +140,6 @@ class Subscription:
             return self._messages.popleft()
         except IndexError:
             return None
-
-    def is_ready(self) -> bool:
-        """Return whether ``receive`` would return, or raise, at once."""
-        return bool(self._messages) or self._is_closed
 
     def __iter__(self) -> Iterator[Message]:
         return self
@@ -256,41 +158,21 @@ class Subscription:
             self._session.forget(self)
             self._driver.run(partial(self._session.core.unsubscribe, self._inbox))
 
-    def __enter__(self) -> Subscription:
-        return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self.close()
-
-
-class Server:
+class Server(BaseServer[Driver], _ClosedOnExit):
     """Server of one name with a handler; made by ``Session.serve``."""
 
     def __init__(
         self, session: Session, topic: Topic, server: ServerCore, handler: Callable[[Request], bytes], workers: int
     ) -> None:
-        self._session = session
-        self._driver = session.driver
-        self._topic = topic
-        self._core = server
+        super().__init__(session, topic, server)
         self._handler = handler
-        self._is_closed = False
         self._threads = [
             threading.Thread(target=self._work, name=f"gdp-serve-{topic.name.short}-{number}", daemon=True)
             for number in range(workers)
         ]
         for thread in self._threads:
             thread.start()
-
-    @property
-    def name(self) -> Name:
-        """Return the 256-bit name."""
-        return self._topic.name
-
-    @property
-    def clients(self) -> int:
-        """Return the number of clients."""
-        return self._core.clients
 
     def close(self, linger_s: float = LINGER_S) -> None:
         """Stop serving: direct clients to other servers, finish active requests, then withdraw. Idempotent.
@@ -313,12 +195,6 @@ class Server:
         except ClosedError:
             return
 
-    def __enter__(self) -> Server:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self.close()
-
     def _work(self) -> None:
         """Handle requests one after the other, as one of the workers."""
         turns = self._core.turns
@@ -335,34 +211,12 @@ class Server:
             return
 
 
-class Session:
+class Session(BaseSession[Driver]):
     """A node of the overlay in this process; made by ``gdp.open``.
 
     Use it as a context manager, or call ``close``: then readers get the published messages, and the overlay learns at
     once that the node has left.
     """
-
-    def __init__(self, node: Node, driver: Driver) -> None:
-        self.core = node.core
-        self.driver = driver
-        self._node = node
-        self._opened: list[Publisher | Subscription | Server] = []
-        self._is_closed = False
-
-    @property
-    def name(self) -> Name:
-        """Return the node's own name."""
-        return self.core.member.name
-
-    @property
-    def delegations(self) -> list[DelegatedName]:
-        """Return the names that this node holds delegations for, with its rights."""
-        return self.core.delegations
-
-    @property
-    def is_attached(self) -> bool:
-        """Return whether a switch has accepted the node and its advertisements."""
-        return self.core.member.attachment.is_attached
 
     def publisher(
         self,
@@ -488,10 +342,7 @@ class Session:
             CallError: every server refused, or its handler raised.
             DelegationError: the node may not call it.
         """
-        call = Call(payload=bytes(request), timeout_s=timeout_s, replication=replication_of(replication))
-        if len(call.payload) > PAYLOAD_MAX_BYTES:
-            raise LocalError(f"the request has {len(call.payload)} bytes; at most {PAYLOAD_MAX_BYTES} can be sent")
-        topic = self.core.resolve(name, Right.CALL)
+        topic, call = self._new_call(name, request, timeout_s, replication)
         self.driver.run(lambda: self.core.call(topic, call, self.driver.now_s()))
         self.driver.wait(lambda: call.is_done, None)
         if call.response is None:
@@ -536,19 +387,7 @@ class Session:
             AttachError: no switch accepted it in time; the text states what the node waits for.
         """
         if not self.driver.wait(lambda: self.is_attached, self.driver.now_s() + timeout_s):
-            raise AttachError(f"not attached within {timeout_s:g} s: {self._node.waiting_for()}")
-
-    def why_not(self, name: Name, otherwise: str) -> str:
-        """Return the end of an error's sentence: why no data flows on a name, as far as this node knows."""
-        if not self.is_attached:
-            return f"; the node is not attached: {self._node.waiting_for()}"
-        refused = self._node.refused(name)
-        return f"; the advertisement was refused: {refused}" if refused else f"; {otherwise}"
-
-    def forget(self, opened: Publisher | Subscription | Server) -> None:
-        """Remove an object from the session's list after it closed itself."""
-        if opened in self._opened:
-            self._opened.remove(opened)
+            raise self._not_attached(timeout_s)
 
     def _finish(self, deadline_s: float) -> None:
         publishers = [each for each in self._opened if isinstance(each, Publisher)]
@@ -559,7 +398,8 @@ class Session:
             if publisher.readers:
                 self.driver.wait(publisher._publisher.is_acknowledged, deadline_s)
         for opened in list(self._opened):
-            opened.close()
+            if isinstance(opened, _ClosedOnExit):
+                opened.close()
         self.driver.run(lambda: self.core.close(self.driver.now_s()))
         self.driver.wait(lambda: False, self.driver.now_s() + GOODBYE_S)
 

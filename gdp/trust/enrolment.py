@@ -185,11 +185,7 @@ class Request:
 
     @classmethod
     def from_wire(cls, wire: bytes) -> Request:
-        """Read the body of a request.
-
-        Raises:
-            StatementError: MALFORMED.
-        """
+        """Read the body of a request; a malformed one raises ``StatementError``."""
         fields = _map(wire, REQUEST_MAX_BYTES)
         asked = tuple(
             Application(
@@ -229,11 +225,7 @@ class EnrolmentResponse:
 
     @classmethod
     def from_wire(cls, wire: bytes) -> EnrolmentResponse:
-        """Read a response.
-
-        Raises:
-            StatementError: MALFORMED.
-        """
+        """Read a response; a malformed one raises ``StatementError``."""
         fields = _map(wire, ANSWER_MAX_BYTES)
         granted = tuple(
             Granted(each.bytes_("member"), tuple(each.byte_strings("delegations", _DELEGATIONS_MAX)))

@@ -55,11 +55,7 @@ def rights_to_wire(rights: Collection[Right]) -> list[str]:
 
 
 def rights_from_fields(fields: Fields, key: str) -> frozenset[Right]:
-    """Read a set of delegable rights.
-
-    Raises:
-        StatementError: MALFORMED.
-    """
+    """Read a set of delegable rights; a malformed one raises ``StatementError``."""
     rights = frozenset(Right.from_wire(text) for text in fields.texts(key, len(DELEGABLE)))
     if not rights or not rights <= DELEGABLE:
         raise StatementError(DropReason.MALFORMED, "rights that cannot be delegated")
