@@ -21,7 +21,6 @@ from gdp.control.fragments import ControlFragmenter, ControlReassembler
 from gdp.control.join import Join
 from gdp.control.neighbor_discovery import Change, HelloPort, HelloProtocol
 from gdp.control.neighbour import Neighbour, NeighbourState
-from gdp.control.query import Query
 from gdp.control.revocation_sync import RevocationSync
 from gdp.control.settings import NodeSettings
 from gdp.control.waiting import Wait, WaitReason, port_waits, stranger_waits
@@ -43,23 +42,20 @@ from gdp.switch.location_updates import LocationUpdates
 from gdp.switch.multicast import MulticastTrees
 from gdp.switch.name_resolver import NameResolver
 from gdp.switch.outbox import Outbox
+from gdp.switch.path_updates import PathUpdates
 from gdp.switch.presence import PresenceAnswers
 from gdp.switch.relocation import Relocations
 from gdp.switch.revocations import RevocationHandler
 from gdp.switch.rib_client import RibClient
-from gdp.switch.spf_delay import SpfDelay
 from gdp.switch.table import Table
 from gdp.switch.unicast import Unicast
 from gdp.token_bucket import TokenBuckets
 from gdp.trust.domain import Policy
-from gdp.trust.right import HEARS, Right
 from gdp.trust.verifier import AdvertisementVerifier
 
 __all__ = ["SwitchCore"]
 
-_PROTECT_S: Final = 0.1  # from new paths to their alternates, which are not urgent
-_CONFLICTS_S: Final = 1.0  # between two checks of identities that other switches refuse
-_CONTROL = frozenset(kind.value for kind in Kind if kind >= CONTROL_FROM)
+_CONTROL: Final = frozenset(kind.value for kind in Kind if kind >= CONTROL_FROM)
 
 
 class SwitchCore:
@@ -110,10 +106,6 @@ class SwitchCore:
             outbox=self._outbox,
         )  # fmt: skip
         self.relocations = Relocations(identity, policy, self.multicast, self.unicast, self._outbox)
-        self._seen_version = -1
-        self._spf_delay = SpfDelay()
-        self._protect_at_s: float | None = None  # when alternates are computed
-        self._followed_s = self._conflicts_sought_s = float("-inf")
         self._presence = PresenceAnswers(identity, self.hello_protocol, self.attached, self.unicast, self._outbox)
         self._channels = Channels(identity, policy, settings.random_bytes, accepts=False)
         self._locations = LocationUpdates(
@@ -124,6 +116,10 @@ class SwitchCore:
             identity=identity, policy=policy, paths=self._paths, attached=self.attached, resolver=self.resolver,
             multicast=self.multicast, unicast=self.unicast, relocations=self.relocations, evidence=self._evidence,
             locations=self._locations, outbox=self._outbox, presence=self._presence, channels=self._channels,
+        )  # fmt: skip
+        self._path_updates = PathUpdates(
+            me=identity.name, flooding=self._flooding, hello_protocol=self.hello_protocol, multicast=self.multicast,
+            unicast=self.unicast, rib_client=self.rib_client,
         )  # fmt: skip
         self._advertisements = AdvertisementHandler(
             identity=identity, verifier=self._verifier, attached=self.attached, resolver=self.resolver,
@@ -194,7 +190,7 @@ class SwitchCore:
         for change in changes:
             self._neighbour_changed(change, now.mono_s)
         if changes:
-            self._follow_links(now.mono_s)
+            self._path_updates.follow(now.mono_s)
 
     def port_changed(self, port: int, up: bool, now: Timestamps) -> None:
         """Handle a change of a port's link."""
@@ -202,7 +198,7 @@ class SwitchCore:
         self._flooding.look_at_clock(now)
         for change in self.hello_protocol.port_changed(port, up, now.mono_s):
             self._neighbour_changed(change, now.mono_s)
-        self._follow_links(now.mono_s)  # at once: frames over this link would be lost
+        self._path_updates.follow(now.mono_s)  # at once: frames over this link would be lost
 
     def receive(self, arrivals: Sequence[ReceivedFrame], now: Timestamps) -> None:
         """Handle frames that the data plane punted."""
@@ -225,7 +221,7 @@ class SwitchCore:
             self._rest_due_s = None
             self._presence.answer(now.mono_s)
             self._flooding.tell_of_conflicts(now.mono_s)
-            self._plan_follow(now.mono_s)
+            self._path_updates.plan(now.mono_s)
 
     def handle_timer(self, now: Timestamps) -> None:
         """Run the timers that are due."""
@@ -240,18 +236,7 @@ class SwitchCore:
             return  # most due timers are keepalives
         self._rest_due_s = None
         self._flooding.handle_timer(now_s)
-        if lost or (self._spf_delay.due_s is not None and self._spf_delay.due_s <= now_s):
-            self._follow_links(now_s)
-        else:
-            self._plan_follow(now_s)
-        if self._protect_at_s is not None and self._protect_at_s <= now_s:
-            self._protect_at_s = None
-            self._paths.has_alternates = True
-            self.unicast.refresh(now_s)
-        if self.unicast.is_refreshing:
-            self.unicast.refresh_more(now_s)
-        if now_s >= self._conflicts_sought_s + _CONFLICTS_S:
-            self._look_for_conflicts(now_s)
+        self._path_updates.handle_timer(now_s, has_lost=bool(lost))
         self._reassembler.drop_expired(now_s)
         self._locations.expire(now_s)
         for key in self.table.expire(now_s):
@@ -276,8 +261,7 @@ class SwitchCore:
     def _next_of_rest(self) -> float:
         """Return the monotonic second of the next timer outside neighbour discovery."""
         times = [
-            self._spf_delay.due_s,
-            self._protect_at_s,
+            self._path_updates.get_timer(),
             self._flooding.get_timer(),
             self.table.next_expiry(),
             self.multicast.get_timer(),
@@ -288,10 +272,6 @@ class SwitchCore:
         ]
         if self.rib_client.rib is not None:
             times.append(self._revoker.next_due_for_rib())
-        if self.unicast.is_refreshing:
-            times.append(self._followed_s)  # in the past: due at once
-        if self._paths.refused_elsewhere():
-            times.append(self._conflicts_sought_s + _CONFLICTS_S)
         if self.rib_client.rib is None:
             times.append(self.attached.next_expiry())
         return min(time for time in times if time is not None)
@@ -320,6 +300,9 @@ class SwitchCore:
         if self.rib_client.rib is not None:
             for wire in self._revoker.due_for_rib(self.rib_client.rib, now_s):
                 self.rib_client.relay(wire, now_s)
+
+    def _life_elsewhere(self, name: Name) -> bytes | None:
+        return self._paths.life_elsewhere(name)
 
     def _digest_for(self, port: HelloPort) -> bytes:
         return self._flooding.digest_for(port)
@@ -399,7 +382,7 @@ class SwitchCore:
         elif kind == Kind.REDIRECT:
             self._redirected(statement, now)
         elif kind == Kind.WHERE:
-            self._where(neighbour, statement, now)
+            self._locations.answer_query(neighbour, statement, now.mono_s)
         else:
             raise FrameError(DropReason.UNKNOWN_KIND, str(kind))
 
@@ -435,7 +418,8 @@ class SwitchCore:
                 elif header.kind == Kind.RIB_ANSWER:
                     self.rib_client.receive(statement, now, is_fresh=opened.is_fresh)
                 else:
-                    self._relocated(statement, now)
+                    place = self._evidence.from_relay(statement, now)
+                    self._locations.receive_relocation(place, statement.wire, now.mono_s)
         elif header.kind == Kind.ECHO_REQUEST:
             back = header._replace(
                 kind=Kind.ECHO_REPLY, hops_left=HOPS_MAX, destination=header.source, source=self.name,
@@ -462,7 +446,7 @@ class SwitchCore:
         if neighbour.state is NeighbourState.UP:
             self._sync.neighbour_up(neighbour, now_s)
             self.multicast.neighbour_up((neighbour.port, neighbour.mac), now_s)
-            self._seen_version = -1  # the neighbour may have another address now: the hops to it are computed again
+            self._path_updates.neighbour_came()
             if neighbour.role.is_switch:
                 self._flooding.sync(neighbour, now_s)
         elif before is NeighbourState.UP:
@@ -476,58 +460,10 @@ class SwitchCore:
                     self.attached.remove(attachment.advertisement.name, neighbour.name)
                     self.unicast.forget(attachment.advertisement.name)
 
-    def _plan_follow(self, now_s: float) -> None:
-        """Schedule the update after a link change, so that it covers the changes that follow closely.
-
-        Link states come in bursts (``spf_delay.py``).
-        """
-        if self._spf_delay.due_s is None and self._flooding.link_states.version != self._seen_version:
-            self._spf_delay.news(now_s)
-
-    def _follow_links(self, now_s: float) -> None:
-        """Update everything that depends on paths after a link change."""
-        self._spf_delay.computed()
-        version = self._flooding.link_states.version
-        if version == self._seen_version:
-            return
-        self._flooding.neighbour_changed(now_s)  # our domain's interior may have changed
-        self._seen_version = self._flooding.link_states.version
-        self._followed_s = now_s
-        self._paths.has_alternates, self._protect_at_s = False, now_s + _PROTECT_S
-        self.unicast.refresh(now_s)
-        self.multicast.reroute(now_s)
-        self.rib_client.links_changed(now_s)
-        self._look_for_conflicts(now_s)
-
-    def _life_elsewhere(self, name: Name) -> bytes | None:
-        role = Role.SWITCH if self._paths.is_switch(name) else Role.RIB
-        return self._paths.life_of(name, role)
-
-    def _look_for_conflicts(self, now_s: float) -> None:
-        """Drop RIBs with an older node's identity; notify nodes whose identity a younger node elsewhere copies."""
-        self._conflicts_sought_s = now_s
-        for neighbour in self.hello_protocol.all_up():
-            elsewhere = self._life_elsewhere(neighbour.name) if neighbour.role is Role.RIB else None
-            if elsewhere is not None and elsewhere < neighbour.life:
-                self.hello_protocol.let_go(neighbour, now_s)
-        for name in self._paths.refused_elsewhere():
-            self.hello_protocol.tell_conflicts(name, now_s)
-            if name == self.name:
-                self.hello_protocol.note_clash(name, now_s)
-
     def _send_link_state(self, neighbour: Neighbour, wire: bytes) -> None:
         self._outbox.say(neighbour, Kind.LINK_STATE, wire)
 
     # -- moved nodes
-
-    def _relocated(self, statement: Statement, now: Timestamps) -> None:
-        """Handle the new location of a node that was attached here; send its new switch the names that it reads."""
-        place = self._evidence.from_relay(statement, now)
-        if place.right in HEARS and self.multicast.reader_moved(place):
-            self.resolver.unwatch(place.name)
-        self._locations.acknowledge_relocation(place, now.mono_s)
-        if place.right is not Right.READ and self._locations.is_newer(place):
-            self._locations.receive(place, statement.wire, now.mono_s)
 
     def _redirected(self, statement: Statement, now: Timestamps) -> None:
         """Handle a redirect: a neighbour that received our frames for a node reports where that node is now."""
@@ -535,21 +471,7 @@ class SwitchCore:
             place = self._evidence.from_relay(statement, now)
         else:
             place = self.rib_client.verify_answer(statement, now)
-        if self._locations.is_newer(place):
-            is_known = self._locations.get(place.name, place.advertiser) is not None
-            has_moved = is_known or self.multicast.trees.get(place.name, place.advertiser) is not None
-            self._locations.receive(place, statement.wire, now.mono_s)
-            if has_moved:
-                self.relocations.moved(place, statement.wire, now.mono_s)
-
-    def _where(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
-        """Reply to a neighbour that receives our frames for a node with that node's location."""
-        query = Query.from_fields(statement.expect(StatementType.QUERY))
-        if not neighbour.role.is_switch or statement.signer != neighbour.name:
-            raise StatementError(DropReason.UNKNOWN_SENDER, "a question that a neighbouring switch did not ask")
-        statement.verify(neighbour.key)
-        for known in self._locations.proofs_of(query.name, now.mono_s):
-            self._outbox.say(neighbour, Kind.REDIRECT, known)
+        self._locations.receive_redirect(place, statement.wire, now.mono_s)
 
     # -- trees
 

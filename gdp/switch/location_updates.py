@@ -1,6 +1,6 @@
 """Location updates: verified statements come in; name cache, routes, trees and attached readers follow.
 
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds). The caller has verified every statement (``evidence.py``).
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). The caller has verified every location (``evidence.py``).
 """
 
 from __future__ import annotations
@@ -9,9 +9,11 @@ from dataclasses import replace
 from typing import Final
 
 from gdp.control.advertise_ack import AdvertiseAck
-from gdp.control.query import Response
+from gdp.control.neighbour import Neighbour
+from gdp.control.query import Query, Response
 from gdp.control.relay import relayed
 from gdp.crypto.identity import Identity
+from gdp.crypto.statements import Statement, StatementType
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
 from gdp.names import Name
@@ -103,6 +105,36 @@ class LocationUpdates:
                 self.send_to_reader(at, right, place, now_s)
         for name in (place.name, place.advertiser):
             self._unicast.release(name, now_s)
+
+    def receive_relocation(self, place: Location, statement: bytes, now_s: float) -> None:
+        """Handle the new location of a node that was attached here; send its new switch the names that it reads."""
+        if place.right in HEARS and self._multicast.reader_moved(place):
+            self._resolver.unwatch(place.name)
+        self.acknowledge_relocation(place, now_s)
+        if place.right is not Right.READ and self.is_newer(place):
+            self.receive(place, statement, now_s)
+
+    def receive_redirect(self, place: Location, statement: bytes, now_s: float) -> None:
+        """Handle the location of a node to which we sent frames by a neighbour that no longer has it."""
+        if self.is_newer(place):
+            is_known = self.get(place.name, place.advertiser) is not None
+            has_moved = is_known or self._multicast.trees.get(place.name, place.advertiser) is not None
+            self.receive(place, statement, now_s)
+            if has_moved:
+                self._relocations.moved(place, statement, now_s)
+
+    def answer_query(self, neighbour: Neighbour, statement: Statement, now_s: float) -> None:
+        """Reply to a neighbour that receives our frames for a node with that node's location.
+
+        Raises:
+            StatementError: the neighbour is no switch, or did not sign.
+        """
+        query = Query.from_fields(statement.expect(StatementType.QUERY))
+        if not neighbour.role.is_switch or statement.signer != neighbour.name:
+            raise StatementError(DropReason.UNKNOWN_SENDER, "a question that a neighbouring switch did not ask")
+        statement.verify(neighbour.key)
+        for known in self.proofs_of(query.name, now_s):
+            self._outbox.say(neighbour, Kind.REDIRECT, known)
 
     def receive_removal(self, answer: Response, now_s: float) -> None:
         """Remove an advertiser that has withdrawn.

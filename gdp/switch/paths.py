@@ -15,7 +15,6 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, NamedTuple
 
 from gdp.control.link_state import Adjacency, AttachedRib, LinkState, Scope
-from gdp.crypto.certificates import Role
 from gdp.names import Name
 from gdp.switch.lsdb import LinkStateDatabase
 
@@ -147,13 +146,12 @@ class Paths:
         reachable = [(way, host) for way, host in found if way is not None]
         return min(reachable, key=lambda each: each[0].distance, default=(None, None))
 
-    def life_of(self, name: Name, role: Role) -> bytes | None:
+    def life_elsewhere(self, name: Name) -> bytes | None:
         """Return the mark of the oldest incarnation in which other switches reach a switch or a RIB, or None."""
-        self._refresh()
-        if role is Role.RIB:
-            hosts = {host: rib.life for host, rib in self._ribs.get(name, {}).items() if host != self._me}
-        else:
+        if self.is_switch(name):
             hosts = {} if (life := self._lives.get(name)) is None else {name: life}
+        else:
+            hosts = {host: rib.life for host, rib in self._ribs.get(name, {}).items() if host != self._me}
         if not hosts:
             return None  # a proxy, for example: its hellos cause no computation
         everywhere = frozenset(self._domains.values())
