@@ -52,7 +52,11 @@ __all__ = ["Message", "Participant", "Topic"]
 
 
 class Participant:
-    """Protocol core of one participant."""
+    """Protocol core of one participant.
+
+    ``advertise``, ``serve``, ``call`` and ``subscribe`` raise ``LocalError`` without a delegation or a secret for the
+    name, or if the name is in use here.
+    """
 
     def __init__(self, identity: Identity, policy: Policy, settings: NodeSettings) -> None:
         self._identity = identity
@@ -111,11 +115,7 @@ class Participant:
         is_global: bool = True,
         urgent: bool = False,
     ) -> Publisher:
-        """Publish a topic from now on.
-
-        Raises:
-            LocalError: not delegated to this participant, or no secret for it.
-        """
+        """Publish a topic from now on."""
         self._check(topic, Right.PUBLISH, is_free=topic.name not in self._publications)
         publisher = self._publications.add(
             topic.name, topic.secrets, description, reliable=reliable, depth=depth, urgent=urgent
@@ -124,20 +124,13 @@ class Participant:
         return publisher
 
     def serve(self, topic: Topic, description: bytes, *, is_global: bool = True, urgent: bool = False) -> Publisher:
-        """Serve a name from now on; return the stream that all its clients receive. ``respond`` sends to one of them.
-
-        Raises:
-            LocalError: not delegated to this participant, no secret for it, or the name is in use here.
-        """
+        """Serve a name; return the stream that all its clients receive. ``respond`` sends to one of them."""
         return self._take_part(topic, Right.SERVE, description, is_global=is_global, urgent=urgent)
 
     def call(self, topic: Topic, description: bytes, *, is_global: bool = True, urgent: bool = False) -> Publisher:
         """Call a name from now on; return the stream of requests that all its servers receive. ``ask`` sends to one.
 
         A request that is published while ``peers`` is empty reaches no server.
-
-        Raises:
-            LocalError: not delegated to this participant, no secret for it, or the name is in use here.
         """
         return self._take_part(topic, Right.CALL, description, is_global=is_global, urgent=urgent)
 
@@ -198,11 +191,7 @@ class Participant:
         self.attachment.withdraw(name, right)
 
     def subscribe(self, topic: Topic) -> None:
-        """Read a topic from now on, from every publisher of it.
-
-        Raises:
-            LocalError: not delegated to this participant, or no secret for it.
-        """
+        """Read a topic from now on, from every publisher of it."""
         self._check(topic, Right.READ, is_free=self._subscriptions.get(topic.name) is None)
         self._subscriptions.add(topic, Right.READ)
         self._advertisement(topic, Right.READ, is_global=False)

@@ -31,7 +31,10 @@ _ECDSA_DIGEST: Final = ec.ECDSA(Prehashed(hashes.SHA256()))
 
 @dataclass(frozen=True, slots=True)
 class PublicKey:
-    """Public key; equal to another when the compressed bytes are. A verification costs about 70 us."""
+    """Public key; equal to another when the compressed bytes are.
+
+    A verification costs about 70 us. It raises ``StatementError`` (BAD_SIGNATURE) if the signature is not by this key.
+    """
 
     compressed: bytes
     point: ec.EllipticCurvePublicKey = field(repr=False, compare=False)
@@ -84,29 +87,17 @@ class PublicKey:
         return self.point.public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)
 
     def verify(self, signature: bytes, data: bytes) -> None:
-        """Return if ``signature`` (64 bytes, r || s) over SHA-256 of ``data`` is by this key.
-
-        Raises:
-            StatementError: BAD_SIGNATURE.
-        """
+        """Return if ``signature`` (64 bytes, r || s) over SHA-256 of ``data`` is by this key."""
         self._verify(_to_der(signature), data, _ECDSA)
 
     def verify_digest(self, signature: bytes, digest: bytes) -> None:
-        """Return if ``signature`` over a SHA-256 digest (32 bytes) is by this key.
-
-        Raises:
-            StatementError: BAD_SIGNATURE.
-        """
+        """Return if ``signature`` over a SHA-256 digest (32 bytes) is by this key."""
         if len(digest) != _HALF:
             raise LocalError("a SHA-256 digest has 32 bytes")
         self._verify(_to_der(signature), digest, _ECDSA_DIGEST)
 
     def verify_der(self, signature: bytes, data: bytes) -> None:
-        """Return if ``signature`` in DER, as X.509 carries it, over ``data`` is by this key.
-
-        Raises:
-            StatementError: BAD_SIGNATURE.
-        """
+        """Return if ``signature`` in DER, as X.509 carries it, over ``data`` is by this key."""
         self._verify(signature, data, _ECDSA)
 
     def _verify(self, signature: bytes, data: bytes, scheme: ec.ECDSA) -> None:

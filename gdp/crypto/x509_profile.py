@@ -1,6 +1,7 @@
 """X.509 profile of every certificate in the project, and the only module that parses X.509.
 
-Sans-I/O. Source: RFC 5280; ECDSA P-256 with SHA-256 throughout. Project data use standard fields::
+Sans-I/O. Source: RFC 5280; ECDSA P-256 with SHA-256 throughout. Readers raise ``StatementError`` (BAD_CERTIFICATE or
+WRONG_NAME) and never another exception, for any bytes. Project data use standard fields::
 
     subject   OU = role (switch | rib | proxy; "domain" in a root), CN = the label for people
     SAN       URI gdp:<64 hex, the name>   URI gdp-metadata:<64 hex, digest of the metadata>
@@ -111,20 +112,12 @@ def bad(detail: str) -> StatementError:
 
 
 def read(wire: bytes) -> Certificate:
-    """Read a certificate in DER or PEM; costs about 0.1 ms.
-
-    Raises:
-        StatementError: BAD_CERTIFICATE or WRONG_NAME; never another exception, for any bytes.
-    """
+    """Read a certificate in DER or PEM; costs about 0.1 ms."""
     return _strictly(wire, _certificate)
 
 
 def read_request(wire: bytes) -> SubjectInfo:
-    """Read a certificate request (PKCS #10) in DER or PEM; its own signature proves possession of the key.
-
-    Raises:
-        StatementError: BAD_CERTIFICATE or WRONG_NAME; never another exception, for any bytes.
-    """
+    """Read a certificate request (PKCS #10) in DER or PEM; its own signature proves possession of the key."""
     return _strictly(wire, _request)
 
 

@@ -34,7 +34,7 @@ _GONE: Final = (errno.ENOENT, errno.ENODEV)
 class Cgroup:
     """The group called ``name`` directly below each usable root.
 
-    The constructor makes no group; see ``make``.
+    The constructor makes no group; see ``make``. The other methods raise ``LocalError`` if the kernel refuses.
     """
 
     def __init__(self, name: str) -> None:
@@ -61,11 +61,7 @@ class Cgroup:
         return all(map(self._find, (("cpu.max", "cpu.cfs_quota_us"), ("memory.max", "memory.limit_in_bytes"))))
 
     def add(self, pid: int) -> None:
-        """Add a process; the processes that it starts later join the group, too.
-
-        Raises:
-            LocalError: the kernel refuses.
-        """
+        """Add a process; the processes that it starts later join the group, too."""
         for folder in self._standing():
             self._write(folder / "cgroup.procs", str(pid))
 
@@ -108,11 +104,7 @@ class Cgroup:
         return path is not None
 
     def kill(self) -> None:
-        """Kill every process of the group; no error if another process removes it in the meantime.
-
-        Raises:
-            LocalError: the kernel refuses.
-        """
+        """Kill every process of the group; no error if another process removes it in the meantime."""
         if (path := self._find(("cgroup.kill",))) is not None:
             try:
                 path.write_text("1", encoding="ascii")
@@ -126,11 +118,7 @@ class Cgroup:
                     os.kill(pid, signal.SIGKILL)
 
     def remove(self) -> None:
-        """Kill the remaining processes of the group, and remove it; no error if it is gone.
-
-        Raises:
-            LocalError: the kernel refuses.
-        """
+        """Kill the remaining processes of the group, and remove it; no error if it is gone."""
         end_s = time.monotonic() + _PATIENCE_S
         for folder in self._standing():
             while True:

@@ -1,6 +1,7 @@
 """Mounts of a run: file systems in memory, and the removal of any mount.
 
-I/O; mounting needs CAP_SYS_ADMIN in the user namespace that owns the mount namespace.
+I/O; mounting needs CAP_SYS_ADMIN in the user namespace that owns the mount namespace. If the kernel
+refuses, a call raises ``LocalError``.
 Source: mount(2), umount2(2), tmpfs(5).
 """
 
@@ -21,11 +22,7 @@ _NOTHING_THERE: Final = (errno.EINVAL, errno.ENOENT)
 
 
 def mount_tmpfs(path: Path, size_bytes: int) -> None:
-    """Make a folder and mount a file system of this size there.
-
-    Raises:
-        LocalError: the kernel refuses.
-    """
+    """Make a folder and mount a file system of this size there."""
     path.mkdir(mode=0o700)
     libc = ctypes.CDLL(None, use_errno=True)
     options = f"size={size_bytes},mode=0700".encode()
@@ -34,11 +31,7 @@ def mount_tmpfs(path: Path, size_bytes: int) -> None:
 
 
 def unmount(path: Path) -> None:
-    """Unmount ``path``; no error if nothing is mounted there, since mounts end with their mount namespace.
-
-    Raises:
-        LocalError: the kernel refuses.
-    """
+    """Unmount ``path``; no error if nothing is mounted there, since mounts end with their mount namespace."""
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.umount2(os.fsencode(path), _MNT_DETACH) != 0:
         reason = ctypes.get_errno()

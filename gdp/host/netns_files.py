@@ -1,6 +1,6 @@
 """Network namespaces held by files: creation, entry and release.
 
-I/O; needs CAP_SYS_ADMIN in the user namespace of the process.
+I/O; needs CAP_SYS_ADMIN in the user namespace of the process. If the kernel refuses, a call raises ``LocalError``.
 Source: network_namespaces(7), setns(2). A namespace is bound to a file, as in ip-netns(8). For root of the machine the
 file lies in ``/run/netns``, so that ``ip netns`` finds it. Inside a user namespace that folder may be missing or
 closed. Then the file lies in the run's own directory, and ``nsenter --net=FILE`` enters it.
@@ -29,11 +29,7 @@ T = TypeVar("T")
 
 
 def create(path: Path) -> None:
-    """Make a network namespace and bind it to the new file ``path``.
-
-    Raises:
-        LocalError: the kernel refuses.
-    """
+    """Make a network namespace and bind it to the new file ``path``."""
     from pyroute2 import netns  # takes 0.2 s to load, which callers that only need the file avoid
 
     try:
@@ -85,11 +81,7 @@ def processes_inside(paths: Collection[Path]) -> list[Process]:
 
 
 def release(path: Path) -> None:
-    """Unbind the namespace and delete its file; the kernel frees it with its last process. No error if it is gone.
-
-    Raises:
-        LocalError: the kernel refuses.
-    """
+    """Unbind the namespace and delete its file; the kernel frees it with its last process. No error if it is gone."""
     unmount(path)
     if path.parent != IP_NETNS_DIRECTORY:
         unmount(path.parent)  # ``create`` bound the folder onto itself, as ip-netns(8) does

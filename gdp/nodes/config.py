@@ -125,11 +125,7 @@ class SwitchConfig(Section):
 
     @classmethod
     def load(cls, path: Path) -> SwitchConfig:
-        """Read ``switch.yaml``.
-
-        Raises:
-            ConfigError: all errors of the file, each with line and column.
-        """
+        """Read ``switch.yaml``."""
         return load(cls, path)
 
     def with_ifaces(self, ifaces: Iterable[str]) -> SwitchConfig:
@@ -243,9 +239,5 @@ class RibConfig(Section):
 
     @classmethod
     def load(cls, path: Path) -> RibConfig:
-        """Read ``rib.yaml``.
-
-        Raises:
-            ConfigError: all errors of the file, each with line and column.
-        """
+        """Read ``rib.yaml``."""
         return load(cls, path)

@@ -81,11 +81,7 @@ class NetdevPlane(ABC):
 
     @abstractmethod
     def _open(self, port: Port) -> None:
-        """Open the port's device and watch it.
-
-        Raises:
-            LocalError: the device cannot be opened.
-        """
+        """Open the port's device and watch it; a device that cannot be opened raises ``LocalError``."""
 
     @abstractmethod
     def _shut(self, index: int) -> None:
@@ -95,11 +91,7 @@ class NetdevPlane(ABC):
     def _is_open(self, index: int) -> bool: ...
 
     def _widen(self, port: Port) -> None:
-        """Prepare an open device for larger frames; reopening it loses the frames that wait at its socket.
-
-        Raises:
-            LocalError: the device cannot be opened.
-        """
+        """Prepare an open device for larger frames; reopening it loses the frames that wait at its socket."""
         self._close_device(port.index)
         self._open(port)
 

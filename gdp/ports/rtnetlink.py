@@ -50,7 +50,7 @@ class LinkMonitor:
     """The links of this namespace, and notifications of their changes.
 
     Raises:
-        LocalError: the kernel has no such sockets (never on an ordinary Linux).
+        LocalError: the kernel has no such sockets (never on an ordinary Linux), or refuses a request of a method.
     """
 
     def __init__(self) -> None:
@@ -75,18 +75,11 @@ class LinkMonitor:
 
         A device with a carrier drops sent frames until the kernel activates it a little later. Since Linux 6.8 this
         request (and no other) waits for that, so ``up`` holds for the first frame.
-
-        Raises:
-            LocalError: the kernel refused the request.
         """
         return next((link for each in self._questions.link_named(ifname) for link in _links(each)), None)
 
     def all(self) -> list[Link]:
-        """Return every present device.
-
-        Raises:
-            LocalError: the kernel refused the request.
-        """
+        """Return every present device."""
         return [link for each in self._questions.links() for link in _links(each)]
 
     def poll(self) -> list[Link]:

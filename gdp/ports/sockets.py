@@ -1,6 +1,6 @@
 """AF_PACKET sockets with filters that accept only our frames.
 
-I/O; it opens and queries sockets, and keeps no state.
+I/O; it opens and queries sockets, and keeps no state. For a socket of another kind a call raises ``OSError``.
 Source: packet(7), socket(7), ``linux/filter.h`` (classic BPF, which needs no privilege beyond the raw socket itself).
 
 A short filter in the kernel decides what a port accepts, so a frame of another protocol costs Python nothing. Accepted
@@ -163,11 +163,7 @@ def steps_of(lane: TrafficClass, neighbours: Iterable[bytes] = ()) -> tuple[_Ste
 
 
 def tell_neighbours(opened: socket.socket, lane: TrafficClass, neighbours: Iterable[bytes]) -> None:
-    """Set the addresses of a port's neighbours in the filter of a socket.
-
-    Raises:
-        OSError: it is not a packet socket.
-    """
+    """Set the addresses of a port's neighbours in the filter of a socket."""
     _filter(opened, steps_of(lane, neighbours))
 
 
@@ -204,11 +200,7 @@ def open_port(ifname: str, lane: TrafficClass = TrafficClass.ALL, *, bypass_qdis
 
 
 def attach_ethertype_filter(opened: socket.socket, lane: TrafficClass = TrafficClass.ALL) -> None:
-    """Attach the filter of a lane, which the head of this module describes.
-
-    Raises:
-        OSError: it is not a packet socket.
-    """
+    """Attach the filter of a lane, which the head of this module describes."""
     _filter(opened, steps_of(lane))
     try:
         opened.setsockopt(_SOL_PACKET, _PACKET_IGNORE_OUTGOING, 1)
@@ -218,11 +210,7 @@ def attach_ethertype_filter(opened: socket.socket, lane: TrafficClass = TrafficC
 
 
 def attach_drop_all_filter(opened: socket.socket) -> None:
-    """Attach a filter that rejects every new frame; frames that already arrived can still be read.
-
-    Raises:
-        OSError: it is not a packet socket.
-    """
+    """Attach a filter that rejects every new frame; frames that already arrived can still be read."""
     _filter(opened, (_LEAVE,))
 
 

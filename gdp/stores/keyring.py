@@ -10,6 +10,10 @@ or in a token that the file names::
     node/     node.key*  kem.key*  node.json  node.csr                      before it belongs to a domain
               node.crt  root.crt  node.card                                 once it does
               delegations/<name>.delegation*                                one for each name that it may act on
+
+Each ``load_*`` raises ``LocalError`` for a file that is missing, invalid, or private and readable for others; the text
+names the file. Each ``save_*`` raises ``LocalError`` if a file exists already and ``force`` is not set, or if the
+system refuses.
 """
 
 from __future__ import annotations
@@ -96,40 +100,24 @@ def parsed(path: Path, read: Callable[[bytes], _T], data: bytes) -> _T:
 
 
 def load_root(path: Path) -> Root:
-    """Read a domain's root certificate, PEM or DER.
-
-    Raises:
-        LocalError: it is missing, or not a root; the text names the file.
-    """
+    """Read a domain's root certificate, PEM or DER."""
     return parsed(path, Root.from_wire, read_public(path))
 
 
 def load_public_key(path: Path) -> PublicKey:
-    """Read an owner's public key, PEM.
-
-    Raises:
-        LocalError: it is missing, or not a P-256 key; the text names the file.
-    """
+    """Read an owner's public key, PEM."""
     return parsed(path, PublicKey.from_pem, read_public(path))
 
 
 def load_card(path: Path) -> NodeDescriptor:
-    """Read a node descriptor (``node.card``).
-
-    Raises:
-        LocalError: it is missing, or not valid; the text names the file.
-    """
+    """Read a node descriptor (``node.card``)."""
     return parsed(path, NodeDescriptor.from_wire, read_public(path))
 
 
 def save_domain(
     directory: Path, authority: CertificateAuthority, *, passphrase: bytes | None = None, force: bool = False
 ) -> None:
-    """Write a domain's root key and certificate; the key under a passphrase, if one is given.
-
-    Raises:
-        LocalError: they exist already, or the system refuses.
-    """
+    """Write a domain's root key and certificate; the key under a passphrase, if one is given."""
     files = {
         ROOT_KEY: key_file(authority.key, passphrase),
         ROOT_CERTIFICATE: public(authority.root.to_pem()),
@@ -138,22 +126,14 @@ def save_domain(
 
 
 def load_domain(directory: Path) -> CertificateAuthority:
-    """Read a domain with its private key.
-
-    Raises:
-        LocalError: a file is missing, invalid, or readable for others.
-    """
+    """Read a domain with its private key."""
     key = read_signing_key(directory / ROOT_KEY)
     root = load_root(directory / ROOT_CERTIFICATE)
     return parsed(directory, lambda _: CertificateAuthority(key, root), b"")
 
 
 def save_owner(directory: Path, owner: Owner, *, passphrase: bytes | None = None, force: bool = False) -> None:
-    """Write an owner's keys, under a passphrase if one is given.
-
-    Raises:
-        LocalError: they exist already, or the system refuses.
-    """
+    """Write an owner's keys, under a passphrase if one is given."""
     files = {
         OWNER_KEY: key_file(owner.key, passphrase),
         OWNER_MASTER: secret_file(owner.master, passphrase),
@@ -163,11 +143,7 @@ def save_owner(directory: Path, owner: Owner, *, passphrase: bytes | None = None
 
 
 def load_owner(directory: Path) -> Owner:
-    """Read an owner.
-
-    Raises:
-        LocalError: a file is missing, invalid, or readable for others.
-    """
+    """Read an owner."""
     key = read_signing_key(directory / OWNER_KEY)
     public_path, path = directory / OWNER_PUBLIC, directory / OWNER_MASTER
     founder = load_public_key(public_path) if public_path.exists() else key.public
@@ -198,11 +174,7 @@ def save_node_keys(
 
 
 def load_node_keys(directory: Path) -> NodeKeys:
-    """Read a node's keys, whether it belongs to a domain or not.
-
-    Raises:
-        LocalError: a file is missing, invalid, or readable for others.
-    """
+    """Read a node's keys, whether it belongs to a domain or not."""
     path = directory / NODE_METADATA
     role, label, digest = parsed(path, _node_metadata, read_public(path))
     key = read_signing_key(directory / NODE_KEY)
@@ -211,11 +183,7 @@ def load_node_keys(directory: Path) -> NodeKeys:
 
 
 def save_identity(directory: Path, identity: Identity, *, force: bool = False) -> None:
-    """Add the credentials of a member to a node's keys: certificate, root and node descriptor.
-
-    Raises:
-        LocalError: they exist already, or the system refuses.
-    """
+    """Add the credentials of a member to a node's keys: certificate, root and node descriptor."""
     files = {
         ROOT_CERTIFICATE: public(identity.root.to_pem()),
         NODE_CERTIFICATE: public(to_pem(identity.membership)),
@@ -225,11 +193,7 @@ def save_identity(directory: Path, identity: Identity, *, force: bool = False) -
 
 
 def save_membership(directory: Path, member: Membership, root: Root) -> None:
-    """Replace a node's membership and root; the node descriptor stays, because only the node's key could renew it.
-
-    Raises:
-        LocalError: the system refuses.
-    """
+    """Replace a node's membership and root; the node descriptor stays, because only the node's key could renew it."""
     files = {ROOT_CERTIFICATE: public(root.to_pem()), NODE_CERTIFICATE: public(to_pem(member.wire))}
     write_all(directory, files, force=True)
 
@@ -240,9 +204,6 @@ def load_identity(directory: Path, unix_s: float) -> Identity:
     Args:
         directory: the node's.
         unix_s: wall clock; an expired membership is refused here rather than by every neighbour.
-
-    Raises:
-        LocalError: a file is missing, invalid, expired, or readable for others.
     """
     keys = load_node_keys(directory)
     root = load_root(directory / ROOT_CERTIFICATE)
@@ -258,9 +219,6 @@ def save_delegation(directory: Path, delegation: Delegation, *, force: bool = Fa
         directory: a node's ``delegations``, or another directory from which it is copied there.
         delegation: the delegation of an owner.
         force: replace an existing one.
-
-    Raises:
-        LocalError: it exists already, or the system refuses.
     """
     name = delegation.name.to_text() + _DELEGATION_SUFFIX
     write_all(directory, {name: private(delegation.to_wire())}, force=force)
@@ -268,20 +226,12 @@ def save_delegation(directory: Path, delegation: Delegation, *, force: bool = Fa
 
 
 def load_delegation(path: Path) -> Delegation:
-    """Read one delegation file.
-
-    Raises:
-        LocalError: it is missing, malformed, or readable for others; the text names the file.
-    """
+    """Read one delegation file."""
     return parsed(path, Delegation.from_wire, read_private(path))
 
 
 def load_delegations(directory: Path) -> list[Delegation]:
-    """Read all delegations of a directory, in the order of their names; none if the directory is missing.
-
-    Raises:
-        LocalError: one is malformed or readable for others; the text names the file.
-    """
+    """Read all delegations of a directory, in the order of their names; none if the directory is missing."""
     return [load_delegation(path) for path in sorted(directory.glob(f"[!.]*{_DELEGATION_SUFFIX}"))]
 
 

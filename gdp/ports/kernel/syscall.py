@@ -1,6 +1,7 @@
 """bpf(2) system call through ctypes: the only module that calls the kernel for programs, maps and links.
 
-I/O; it keeps no state. File descriptors are plain numbers, which the kernel opens close-on-exec.
+I/O; it keeps no state. File descriptors are plain numbers, which the kernel opens close-on-exec. A call that the kernel
+refuses raises ``BpfError``: the right is missing, or a descriptor is of another kind.
 Source: bpf(2); Linux, include/uapi/linux/bpf.h, ``union bpf_attr``. Omitted fields of an attribute are zero.
 """
 
@@ -187,11 +188,7 @@ def load_program(code: bytes, name: str, licence: bytes) -> int:
 
 
 def create_link(program: int, ifindex: int, attach_type: int) -> int:
-    """Attach a program to a device after the present ones; closing the returned descriptor detaches it.
-
-    Raises:
-        BpfError: the kernel refuses it.
-    """
+    """Attach a program to a device after the present ones; closing the returned descriptor detaches it."""
     attributes = bytearray(struct.pack("=IIII32x", program, ifindex, attach_type, 0))
     return bpf(Command.LINK_CREATE, attributes, f"attach to device {ifindex}")
 
@@ -242,11 +239,7 @@ def run(program: int, frame: bytes, repeat: int = 1) -> Run:
 
 
 def objects(next_id: Command, open_by_id: Command) -> Iterator[int]:
-    """Open every program (or link) of the system in turn; each is closed before the next one opens.
-
-    Raises:
-        BpfError: the process lacks the right.
-    """
+    """Open every program (or link) of the system in turn; each is closed before the next one opens."""
     at = 0
     while True:
         attributes = bytearray(struct.pack("=II8x", at, 0))
@@ -270,29 +263,17 @@ def objects(next_id: Command, open_by_id: Command) -> Iterator[int]:
 
 
 def program_name(program: int) -> str:
-    """Return the name that a program was loaded under.
-
-    Raises:
-        BpfError: the descriptor is not a program.
-    """
+    """Return the name that a program was loaded under."""
     return _info(program)[64:80].partition(b"\0")[0].decode(errors="replace")
 
 
 def program_id(program: int) -> int:
-    """Return the id of a program, constant while it is loaded.
-
-    Raises:
-        BpfError: the descriptor is not a program.
-    """
+    """Return the id of a program, constant while it is loaded."""
     return int(struct.unpack_from("=II", _info(program))[1])
 
 
 def link_program(link: int) -> int:
-    """Return the id of a link's program.
-
-    Raises:
-        BpfError: the descriptor is not a link.
-    """
+    """Return the id of a link's program."""
     return int(struct.unpack_from("=III", _info(link))[2])
 
 
