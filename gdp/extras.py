@@ -21,7 +21,6 @@ def require_extra(extra: str, modules: Iterable[str], user: str) -> None:
     """Check that the modules of an extra are installed, without importing them.
 
     Args:
-        modules: top-level module names.
         user: what needs them, for the error.
 
     Raises:

@@ -11,12 +11,7 @@ __all__ = ["TokenBucket", "TokenBuckets"]
 
 
 class TokenBucket:
-    """Tokens that refill at a rate, up to a burst; it starts full.
-
-    Args:
-        per_s: tokens per second.
-        burst: largest number of tokens.
-    """
+    """Tokens that refill at a rate, up to a burst; it starts full."""
 
     __slots__ = ("_burst", "_per_s", "_seen_s", "_tokens")
 
@@ -46,13 +41,7 @@ class TokenBucket:
 
 
 class TokenBuckets:
-    """Token buckets by owner; of too many, the one that was used longest ago is forgotten.
-
-    Args:
-        per_s: tokens per second.
-        burst: largest number of tokens of an owner.
-        maximum: largest number of buckets.
-    """
+    """Token buckets by owner; of too many, the one that was used longest ago is forgotten."""
 
     def __init__(self, per_s: float, burst: float, maximum: int = 4_096) -> None:
         self._per_s = per_s

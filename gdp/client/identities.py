@@ -37,7 +37,6 @@ class ReaderIdentity:
     """Identity of one incarnation of a reader; its writer proxies share it, since they share its datagram numbers.
 
     Args:
-        notes: keys for control datagrams.
         introduction: returns the wire form of the statement that proves the owner of the keys.
         note_numbers: numbers of the next control datagrams.
     """

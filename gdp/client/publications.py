@@ -32,7 +32,6 @@ class Publications:
     """All publishers of one participant.
 
     Args:
-        source: the participant.
         heard: returns another party of a service, if it is connected now.
     """
 

@@ -48,7 +48,6 @@ class SendQueue:
         flags: header flags of every frame.
         mtu: smallest on the path, in bytes after the Ethernet header; None: unknown.
         bundle_bytes: largest bundle; 0: each message has a seal of its own.
-        ledger: sequence numbers.
         moves: the latest renumberings.
         drops: messages dropped here, by reason.
     """

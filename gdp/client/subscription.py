@@ -131,11 +131,7 @@ class StreamChanges(NamedTuple):
 
 
 class Subscriptions:
-    """All subscriptions of one participant.
-
-    Args:
-        reader: the participant.
-    """
+    """All subscriptions of one participant."""
 
     def __init__(self, reader: ReaderIdentity, verifier: AdvertisementVerifier) -> None:
         self._reader = reader

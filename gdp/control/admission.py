@@ -45,11 +45,7 @@ _ADDRESSES_MAX: Final = 256
 
 
 class Cookies:
-    """Cookies of one node, made with a secret that changes.
-
-    Args:
-        random_bytes: source of secrets.
-    """
+    """Cookies of one node, made with a secret that changes."""
 
     def __init__(self, random_bytes: Callable[[int], bytes]) -> None:
         self._random_bytes = random_bytes

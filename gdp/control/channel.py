@@ -134,7 +134,6 @@ class Channels:
     """Channels of one node.
 
     Args:
-        random_bytes: source of keys and identifiers.
         accepts: whether others may open channels here.
     """
 

@@ -93,7 +93,7 @@ class Hello:
         exchange_key: X25519, for the key of keepalives; empty if the sender wants none.
         life: mark of the sender's incarnation, ``LIFE_BYTES``.
         rtcerts: of a RIB, one for each switch that it receives here: permission to attract its traffic.
-        rivals: echoes of those at this port whose identity another node has, too; those not in ``heard`` are refused.
+        conflicts: echoes of those here whose identity another node has, too; those not in ``heard`` are refused.
         cookies: for each receiver that required one, the nonce of its port and the tag that proves the cookie.
     """
 

@@ -111,7 +111,7 @@ class KeepaliveSession:
         in_interval_s: between those that the neighbour sends.
         detect_s: the neighbour is down after this time of silence.
         received: highest sequence number that came.
-        is_heard: one has come.
+        is_alive: one has come.
         hears_us: the neighbour reports that it receives ours.
     """
 

@@ -225,7 +225,7 @@ class HelloProtocol:
         rtcert_for: of a RIB, its RtCert for a switch; None of any other node.
 
     Attributes:
-        rivals: nodes that share an identity with another one, at our ports.
+        conflicts: nodes that share an identity with another one, at our ports.
         clashes: how often we received notice of another node with our own identity.
         clash_reporter: the neighbour that reported it last.
     """

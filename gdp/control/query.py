@@ -50,12 +50,10 @@ class Response:
     """One advertiser of a name, or none.
 
     Args:
-        name: the name that was queried.
-        advertiser: node that advertises it; equal to ``name`` with an empty ``claim`` when no node does.
-        claim: the advertiser's own signed advertisement, for the receiver to verify; empty: it ended, or there is none.
+        advertiser: node that advertises it; equal to ``name`` with an empty ``advertisement`` when no node does.
+        advertisement: signed by the advertiser, for the receiver to verify; empty: it ended, or there is none.
         domain: where it is attached.
         transit: domains through which that domain lets its traffic pass.
-        lease_s: validity of this response.
         sequence: of the newest advertisement that ended; a receiver that knows a newer one ignores this response.
     """
 

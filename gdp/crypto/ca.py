@@ -66,8 +66,6 @@ class CertificateAuthority:
         """Return the domain under another root key, which this one vouches for; the domain keeps its name.
 
         Args:
-            key: the successor's.
-            validity: of the successor.
             retires_unix_s: until when signatures of this key are valid for nodes that have the successor's root.
 
         Raises:
@@ -131,12 +129,6 @@ class CertificateAuthority:
 
 def request_membership(key: SigningKey, role: Role, label: str, digest: bytes) -> bytes:
     """Return a PKCS #10 request, PEM, by which a node requests its membership in a domain.
-
-    Args:
-        key: the node's own.
-        role: the requested role.
-        label: its name for people.
-        digest: that of the node's metadata.
 
     Raises:
         LocalError: the label is empty, too long or not printable.

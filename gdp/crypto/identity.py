@@ -27,10 +27,7 @@ class NodeKeys:
     """A node that belongs to no domain yet.
 
     Args:
-        role: the role to request.
-        label: its name for people.
         digest: of the metadata of its name.
-        key: signs its statements.
         kem: opens secrets that are sealed to it.
     """
 

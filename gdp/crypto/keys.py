@@ -108,11 +108,7 @@ class PublicKey:
 
 
 class SigningKey(ABC):
-    """A private key: in this process (``SoftwareKey``), or in a token that signs by itself.
-
-    Args:
-        public: the corresponding public key.
-    """
+    """A private key: in this process (``SoftwareKey``), or in a token that signs by itself."""
 
     __slots__ = ()
     public: PublicKey

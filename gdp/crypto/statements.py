@@ -74,12 +74,9 @@ class Statement:
     """A parsed statement, UNVERIFIED until ``verify`` returns.
 
     Args:
-        type: the statement type.
         signer: the name of the alleged signer; the verifier must know that name's key.
-        fields: the body.
         signature: r || s.
         signed_bytes: the Sig_structure.
-        wire: the whole, as received.
     """
 
     type: StatementType

@@ -11,11 +11,7 @@ __all__ = ["Shares"]
 
 
 class Shares:
-    """Shares of a capacity, by owner.
-
-    Args:
-        size: the whole capacity.
-    """
+    """Shares of a capacity, by owner."""
 
     __slots__ = ("_held", "_of", "_size")
 

@@ -55,8 +55,6 @@ class NodeAudit:
     """Writer of a trail to the audit log.
 
     Args:
-        folder: folder of the audit log.
-        trail: of the node's policy.
         drops: what the node dropped, by reason; counts only rise.
 
     Raises:

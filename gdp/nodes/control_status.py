@@ -18,7 +18,6 @@ def node_status(identity: Identity, sources: Sources, *, uptime_s: float, **more
 
     Args:
         sources: of its metrics; counters with labels become mappings.
-        uptime_s: seconds since the node started.
         more: fields of one kind of node.
     """
     counters: dict[str, object] = {}

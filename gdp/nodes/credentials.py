@@ -36,8 +36,6 @@ class Credentials:
     """The credential files of one node.
 
     Args:
-        directory: the node's.
-        domain: the roots' files.
         identity, policy: objects to renew.
     """
 

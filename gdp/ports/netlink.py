@@ -102,11 +102,7 @@ class DeviceInfo(NamedTuple):
 
 
 class _RefusedError(LocalError):
-    """The kernel replied with an error.
-
-    Attributes:
-        number: its errno.
-    """
+    """The kernel replied with an error."""
 
     def __init__(self, number: int) -> None:
         super().__init__(f"netlink question: {os.strerror(number)}")

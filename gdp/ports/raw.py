@@ -65,10 +65,6 @@ class _PuntQuota:
 
     Source: a leaky bucket as a meter (ITU-T I.371), charged after the fact, because a batch is read before its size is
     known.
-
-    Args:
-        rate: frames a second.
-        burst: frames at once.
     """
 
     __slots__ = ("_at_s", "_burst", "_left", "_rate")
@@ -89,8 +85,6 @@ class RawPlane(NetdevPlane):
     """``Plane`` over AF_PACKET.
 
     Args:
-        ifnames: devices to open at once.
-        table: entries to forward by; None punts every frame.
         bypass_qdisc: send past traffic control.
 
     Raises:

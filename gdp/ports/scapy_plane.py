@@ -40,10 +40,6 @@ _BURST: Final = 64  # frames of one port before the next port is read
 class ScapyPlane(NetdevPlane):
     """``Plane`` over one Scapy socket per port.
 
-    Args:
-        ifnames: devices to open at once.
-        table: entries to forward by; None punts every frame.
-
     Raises:
         LocalError: as ``add_port``.
     """

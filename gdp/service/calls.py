@@ -25,7 +25,6 @@ class Calls(Generic[T]):
     """Calls under way, each with its caller's context.
 
     Args:
-        limit: of calls at once.
         start: the first call's number, random in 64 bits: no number of an earlier incarnation recurs.
     """
 
@@ -49,7 +48,6 @@ class Calls(Generic[T]):
         """Add a call and return its number; no number recurs.
 
         Args:
-            now_s: the present moment.
             timeout_s: how long it may take; None: no limit.
             context: what ``end``, ``expired`` or ``fail_all`` returns.
 

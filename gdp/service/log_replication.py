@@ -23,7 +23,6 @@ class LogReplication:
     """Sends entries to replicas, and tracks how far each is.
 
     Args:
-        entries: the log.
         effects: messages to send are appended here.
 
     Attributes:

@@ -46,7 +46,6 @@ class Inbox:
 
     Attributes:
         messages: the waiting messages, the oldest first.
-        dropped: messages that were dropped because the program received too few.
     """
 
     def __init__(self, name: Name, limit: int) -> None:

@@ -58,8 +58,6 @@ class Namespaces:
         """Return the command line that runs ``argv`` in the namespace of a switch, under the same process id.
 
         Args:
-            node: the switch.
-            argv: program and arguments.
             dies_with_us: whether the kernel kills it when the thread that starts it ends in any way.
         """
         leash = ["setpriv", "--pdeathsig", "KILL", "--"] if dies_with_us else []

@@ -38,7 +38,6 @@ class Verified:
     """Result of a verification.
 
     Args:
-        lines: number of lines.
         first: sequence of the first line; above 1: rotation deleted earlier ones.
         last_hash: of the last line; a copy kept elsewhere proves later that no line was cut off.
         events: number of events by action and kind, counts included.

@@ -65,8 +65,6 @@ def write_all(directory: Path, files: Mapping[str, NewFile], *, force: bool = Fa
     """Write files into a directory, which is made (mode 0700) if it is missing.
 
     Args:
-        directory: target directory.
-        files: file name to content.
         force: replace existing files; otherwise nothing is written if one of them exists.
 
     Raises:

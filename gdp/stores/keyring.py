@@ -202,7 +202,6 @@ def load_identity(directory: Path, unix_s: float) -> Identity:
     """Read a node that belongs to a domain.
 
     Args:
-        directory: the node's.
         unix_s: wall clock; an expired membership is refused here rather than by every neighbour.
     """
     keys = load_node_keys(directory)
@@ -217,8 +216,6 @@ def save_delegation(directory: Path, delegation: Delegation, *, force: bool = Fa
 
     Args:
         directory: a node's ``delegations``, or another directory from which it is copied there.
-        delegation: the delegation of an owner.
-        force: replace an existing one.
     """
     name = delegation.name.to_text() + _DELEGATION_SUFFIX
     write_all(directory, {name: private(delegation.to_wire())}, force=force)

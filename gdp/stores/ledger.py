@@ -33,10 +33,8 @@ class Issued:
     """One signed membership.
 
     Args:
-        at_unix_s: when it was signed.
         name, domain: of the node and of the trust domain, 64 hex digits each.
         fingerprint: SHA-256 of the certificate, hex.
-        from_unix_s, until_unix_s: its validity.
         previous: SHA-256 of the line before, hex.
     """
 
@@ -57,10 +55,6 @@ class Issued:
 
 def append_issued(directory: Path, member: Membership, unix_s: float) -> None:
     """Record a membership; the record is on the disk when the call returns.
-
-    Args:
-        directory: of the domain.
-        unix_s: when it was signed.
 
     Raises:
         LocalError: the ledger is another user's, is inconsistent at its end, or cannot be written. The membership must

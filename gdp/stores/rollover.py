@@ -42,7 +42,6 @@ def begin_rollover(
     """Make a successor of a domain's root; the domain continues to issue with the present one.
 
     Args:
-        days: how long the successor is valid.
         overlap_days: how long the present root is trusted together with it.
         key: the successor's key, if it exists already, for example in a token.
         passphrase: guards the successor's key file.

@@ -46,12 +46,7 @@ class _PrivateKey(Protocol):
 
 @dataclass(slots=True)
 class TokenKey(SigningKey):
-    """A private key that its token uses for us; the token determines the cost of a signature.
-
-    Args:
-        uri: of the key.
-        public: its public key, from the token.
-    """
+    """A private key that its token uses for us; the token determines the cost of a signature."""
 
     uri: str
     public: PublicKey
@@ -100,7 +95,6 @@ def open_token_key(text: str, file: Path) -> TokenKey:
     """Open a key in a token.
 
     Args:
-        text: its URI.
         file: file that names it, for messages and the prompt of the PIN.
 
     Raises:

@@ -59,11 +59,7 @@ _CONTROL: Final = frozenset(kind.value for kind in Kind if kind >= CONTROL_FROM)
 
 
 class SwitchCore:
-    """Sans-I/O core of one switch.
-
-    Args:
-        table: the forwarding table that the data plane reads.
-    """
+    """Sans-I/O core of one switch."""
 
     def __init__(self, identity: Identity, policy: Policy, table: Table, settings: NodeSettings) -> None:
         self._identity = identity

@@ -64,7 +64,6 @@ def decide(
 
     Args:
         frame: from the Ethernet header on, padding included.
-        entries: the forwarding table.
         mtus: port index to MTU (bytes after the Ethernet header) of the ports that are up.
         sides: the table's masks of ports that frames may come from.
         port: index of the port that this frame came from.

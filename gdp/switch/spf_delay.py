@@ -56,7 +56,6 @@ class SpfDelay:
     """The SPF back-off of one switch.
 
     Attributes:
-        state: of the back-off.
         due_s: monotonic second at which paths are to be computed, or None.
     """
 

@@ -36,11 +36,7 @@ class AdCert:
     Args:
         subject: the name that it is about.
         issuer: its signer: the name itself stands for its owner, otherwise the node one link up.
-        delegate: the node that receives the rights.
         delegate_key: that node's key, 33 bytes.
-        rights: the rights of the node.
-        validity: when they are valid.
-        may_delegate: whether the node may delegate them further.
         fingerprint: SHA-256 of the signed part, for revocation.
     """
 
@@ -69,11 +65,7 @@ class AdCert:
         Args:
             key: the issuer's: the owner's key where ``issuer`` is the name itself.
             issuer: the subject's own name, or the node that is valid the link above.
-            subject: the name.
-            delegate: the node.
             rights: of publish, serve, call and read.
-            validity: when.
-            may_delegate: whether the node may issue further links.
 
         Raises:
             LocalError: rights that cannot be delegated.
@@ -172,8 +164,6 @@ class Chain:
         """Return if every link gives ``right`` at ``unix_s`` and none was revoked.
 
         Args:
-            right: what the node intends to do.
-            unix_s: wall clock.
             revoked: revocations by a link's issuer or by the owner; none if not given.
 
         Raises:

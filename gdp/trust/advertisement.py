@@ -37,8 +37,6 @@ class Advertisement:
 
     Args:
         subject: the name and what proves it.
-        right: what the node does with it.
-        member: the membership of the node.
         chain: the delegations from the owner; empty links where the node owns the name.
         rtcert: which switch may attract the traffic.
         sequence: a newer advertisement of the same node and name has a higher one.
@@ -181,8 +179,6 @@ def sign_advertisement(
     """Return a node's signed advertisement; costs about 50 us.
 
     Args:
-        identity: the node.
-        right: what it does with the name.
         subject: the name: a delegation's, or ``identity.subject`` for the node's own.
         rtcert: for the switch at which the node is attached; see ``RtCert.make``.
         sequence: higher than that of any earlier advertisement of the name by this node.

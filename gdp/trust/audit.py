@@ -140,8 +140,6 @@ class AuditTrail:
         """Return, once, the lines that are due.
 
         Args:
-            mono_s: monotonic seconds.
-            unix_s: wall clock.
             seq, previous: number and hash of the last line that was written; 0 and ``BEGIN`` where there is none.
         """
         if not self.is_due(mono_s):

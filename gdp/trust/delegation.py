@@ -35,9 +35,6 @@ class Delegation:
     """The rights of a node on a name, and their proofs.
 
     Args:
-        subject: the name.
-        node: the node that received it.
-        rights: the rights of the node.
         chain: AdCerts from the owner to the node, signed statements.
         grants: epoch to signed statement.
         metadata: the meaning of the name, if the issuer added it; its hash belongs to the name.

@@ -81,10 +81,6 @@ class Policy:
     def verify_membership(self, wire: bytes, unix_s: float) -> Membership:
         """Return the membership if a trusted domain issued it and it is valid now; costs 0.2 ms once, then 2 us.
 
-        Args:
-            wire: X.509, DER.
-            unix_s: wall clock.
-
         Raises:
             StatementError: BAD_CERTIFICATE, WRONG_NAME, WRONG_DOMAIN, EXPIRED or REVOKED.
         """

@@ -47,7 +47,6 @@ def topic_secret(owner_master: bytes, name: Name, epoch: int) -> bytes:
 
     Args:
         owner_master: 32 random bytes that never leave the owner.
-        name: the topic.
         epoch: 0 to ``EPOCH_MAX``.
 
     Raises:
@@ -66,10 +65,7 @@ def make_grant(
 
     Args:
         key: the owner's, or that of a delegate that may delegate the topic in the owner's place.
-        owner_master: the owner's.
-        subject: the topic.
         epoch: 0 to ``EPOCH_MAX``.
-        node: the recipient.
         kem: that node's public key, from its node descriptor.
 
     Raises:

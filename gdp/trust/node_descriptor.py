@@ -40,7 +40,6 @@ class NodeDescriptor:
         subject: the node's name and what proves it.
         kem: the key that secrets for it are sealed to.
         stranger: its certificate, whose issuer has not been verified.
-        wire: the signed statement.
     """
 
     subject: Subject

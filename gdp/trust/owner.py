@@ -75,7 +75,6 @@ class Owner:
         """Return the delegation by which a successor's key may delegate one name in place of this key.
 
         Args:
-            subject: the name.
             validity: how long it may; all its delegations end with it.
 
         Raises:

@@ -60,10 +60,6 @@ class AdvertisementVerifier:
     def verify(self, wire: bytes, unix_s: float) -> Advertisement:
         """Return the advertisement if all of it is valid now. The RIB decides whether its sequence is news.
 
-        Args:
-            wire: the signed statement.
-            unix_s: wall clock.
-
         Raises:
             StatementError: with the reason; never another exception, whatever the bytes.
         """

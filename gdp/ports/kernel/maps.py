@@ -53,7 +53,6 @@ class KernelMap:
 
     Args:
         kind: a hash starts empty and takes memory as it grows; an array is complete at once, and all zero.
-        key_bytes: size of one key.
         value_bytes: size of one value; for a per-CPU map, on one CPU.
         name: shown by diagnostic tools.
 

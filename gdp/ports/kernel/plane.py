@@ -38,8 +38,6 @@ class KernelPlane(RawPlane):
     """``Plane`` with a program on the ingress of every port.
 
     Args:
-        ifnames: devices to open at once.
-        table: entries to forward by; None punts every frame.
         entries_max: most entries that the kernel holds; Python forwards by the others.
         peer: redirect to the other end of a veth pair where that is correct.
         clsact: attach by filters even if the kernel has links.

@@ -81,11 +81,7 @@ class Command(IntEnum):
 
 
 class BpfError(LocalError):
-    """The kernel refused a call.
-
-    Attributes:
-        number: its errno.
-    """
+    """The kernel refused a call."""
 
     def __init__(self, number: int, tried: str) -> None:
         name = errno.errorcode.get(number, str(number))
