@@ -96,7 +96,7 @@ class Attachment:
         self.fragmenter = ControlFragmenter(identity.name, settings.incarnation)
         self.reassembler = ControlReassembler()
         is_rib = identity.member.role is Role.RIB
-        self.hello_protocol = HelloProtocol.of_node(
+        self.hello_protocol = HelloProtocol(
             identity, policy, self.fragmenter, settings, rtcert_for=self._rtcert_for if is_rib else None
         )
         self._advertisements: dict[tuple[Name, Right], PendingAdvertisement] = {}

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Final
 
@@ -37,20 +36,16 @@ from gdp.control.fragments import ControlFragmenter, ControlReassembler
 from gdp.control.hello import (
     DIGEST_BYTES,
     HELLO_MAX_BYTES,
-    LIFE_BYTES,
-    NO_KEEPALIVES,
     NONCE_BYTES,
     RTCERTS_MAX,
     Hello,
     Timing,
-    echo_of,
 )
+from gdp.control.hello_port import ANSWER_S, UNREACHABLE, HelloPort
 from gdp.control.identity_conflicts import IdentityConflicts
-from gdp.control.join import Join
 from gdp.control.keepalive import KeepaliveSession, Slowness
 from gdp.control.neighbour import TRANSITIONS, Neighbour, NeighbourEvent, NeighbourState
 from gdp.control.settings import NodeSettings
-from gdp.control.strangers import Strangers
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.exchange import EXCHANGE_KEY_BYTES, ExchangeKey
 from gdp.crypto.identity import Identity
@@ -58,29 +53,21 @@ from gdp.crypto.statements import Statement, StatementType
 from gdp.errors import DropReason, FrameError, StatementError
 from gdp.frame.codec import HEADER_BYTES, Header, decode
 from gdp.frame.kinds import Kind
-from gdp.limits import DEAD_S, HELLO_IDLE, HELLO_S, MTU_MIN_BYTES
-from gdp.message.replay import ReplayWindow
+from gdp.limits import HELLO_IDLE, MTU_MIN_BYTES
 from gdp.names import Name
 from gdp.sansio import BROADCAST, OutgoingFrames, ReceivedFrame, Timestamps
 from gdp.token_bucket import TokenBucket
 from gdp.trust.domain import Policy
 from gdp.trust.rtcert import RtCertCache
 
-__all__ = ["Change", "HelloPort", "HelloProtocol"]
+__all__ = ["Change", "HelloProtocol"]
 
 NEIGHBOURS_MAX: Final = 64  # on one port
 CANDIDATES_MAX: Final = 32  # on one port, that have not echoed our nonce; the one silent for longest is evicted
 PADDED_BYTES: Final = 1_400  # of a hello with its header; the answer of a node that does not know us is not longer
 _PARTS_MAX: Final = -(-HELLO_MAX_BYTES // (MTU_MIN_BYTES - HEADER_BYTES))
-_ADDRESSES_MAX: Final = 96  # of neighbours and former ones, whose frames the data plane keeps apart from strangers'
-_CREDIT_MAX_BYTES: Final = 16 << 10
-_UNREACHABLE: Final = (-1, -1)
 _NOTHING: Final[Mapping[int, frozenset[bytes]]] = MappingProxyType({})
 _RTCERTS_REMEMBERED: Final = 256
-_ENDED_MAX: Final = 1_024  # sessions of the far ends, remembered for one session of a port
-_JOINS_WINDOW: Final = 1_024  # how far joins may overtake each other
-_ANSWER_S: Final = 0.02  # a stranger's hello is answered at once, but not more often than this
-_EAGER_HELLOS: Final = 4  # after a change, so that a lost one causes no delay
 _HELLOS_MISSED: Final = 5  # idle hello intervals after which keepalives alone keep no neighbour up
 _RECHECK_S: Final = 1.0  # a membership may be revoked or expire while keepalives come
 _LATE_S: Final = 0.02  # later than this, the node itself was not scheduled in time
@@ -92,134 +79,10 @@ _TOGETHER: Final = 0.125  # of an interval: keepalives due within it leave at on
 Change = tuple[Neighbour, NeighbourState]
 
 
-@dataclass(slots=True, kw_only=True)
-class HelloPort:
-    """A port as the control plane sees it."""
-
-    owner: Name  # the node whose port it is
-    index: int
-    mac: bytes
-    own_mtu: int  # what our end accepts, in bytes after the Ethernet header
-    cost: int
-    nonce: bytes
-    exchange_key: ExchangeKey
-    admission: Admission
-    is_up: bool = True
-    sequence: int = 0
-    keepalive_sequence: int = 0
-    eager: int = _EAGER_HELLOS  # hellos until they become rare
-    hello_at_s: float = 0.0
-    answer_at_s: float = float("inf")  # of a hello to candidates, as far as ``credit_bytes`` allow
-    credit_bytes: int = 0  # received from them, and not answered yet
-    owes_answer: bool = False  # an answer waits for credit
-    said_s: float = float("-inf")
-    neighbours: dict[Name, Neighbour] = field(default_factory=dict)
-    ended: dict[tuple[Name, bytes], tuple[int, int]] = field(default_factory=dict)  # last numbers
-    # joins that were accepted, by session of the far end
-    joins: dict[bytes, ReplayWindow] = field(default_factory=dict)
-    said_mtus: dict[Name, int] = field(default_factory=dict)  # what each neighbour's end accepts
-    addresses: dict[bytes, None] = field(default_factory=dict)  # of neighbours, former ones too; the last proven last
-    strangers: Strangers = field(default_factory=Strangers)  # nodes whose hellos were refused
-
-    @property
-    def echo(self) -> bytes:
-        """Return how others refer to our present session."""
-        return echo_of(self.nonce, self.owner)
-
-    @property
-    def mtu(self) -> int:
-        """Return what our end and those of all neighbours that are up accept, in bytes after the Ethernet header."""
-        up = [n.mtu for n in self.neighbours.values() if n.state is NeighbourState.UP]
-        return min([self.own_mtu, *up])
-
-    @property
-    def hello_mtu(self) -> int:
-        """Return an MTU that every node heard so far accepts; a neighbour behind a narrow end must get our hellos."""
-        return min([self.own_mtu, *self.said_mtus.values()])
-
-    def last_of(self, name: Name, nonce: bytes) -> int:
-        """Return the last sequence number received in a neighbour's session, or -1."""
-        known = self.neighbours.get(name)
-        if known is not None and nonce in (known.nonce, known.candidate):
-            return known.sequence if known.nonce == nonce else known.candidate_sequence
-        return self.ended.get((name, nonce), _UNREACHABLE)[0]
-
-    @property
-    def is_idle(self) -> bool:
-        """Return whether keepalives pass both ways with all neighbours; candidates do not count."""
-        sessions = [each.keepalives for each in self.neighbours.values() if each.is_proven]
-        return bool(sessions) and all(each is not None and each.is_alive and each.hears_us for each in sessions)
-
-    def hurry(self, at_s: float) -> None:
-        """Send a hello at ``at_s`` or before, and then often for a while: its content has changed."""
-        self.hello_at_s, self.eager = min(self.hello_at_s, at_s), _EAGER_HELLOS
-
-    def schedule_hello(self, received_bytes: int, now_s: float) -> None:
-        """Send a hello to candidates soon, with at most as many bytes as came from candidates."""
-        self.credit_bytes = min(self.credit_bytes + received_bytes, _CREDIT_MAX_BYTES)
-        self.answer_at_s = min(self.answer_at_s, max(now_s, self.said_s + _ANSWER_S))
-
-    def note_address(self, mac: bytes) -> bool:
-        """Note that a neighbour has this address; return whether that is news."""
-        is_new = mac not in self.addresses
-        self.addresses.pop(mac, None)
-        self.addresses[mac] = None
-        if len(self.addresses) > _ADDRESSES_MAX:
-            del self.addresses[next(iter(self.addresses))]
-        return is_new
-
-    def candidates(self) -> list[Neighbour]:
-        """Return the nodes that were heard, and have not echoed our nonce."""
-        return [each for each in self.neighbours.values() if not each.is_proven]
-
-    def is_neighbour_at(self, mac: bytes) -> bool:
-        """Return whether a neighbour that is up has this address."""
-        return any(each.mac == mac and each.state is NeighbourState.UP for each in self.neighbours.values())
-
-    def heard(self) -> tuple[bytes, ...]:
-        """Return the echoes that a hello carries: neighbours first, then candidates, the newest first."""
-        proven = [each for each in self.neighbours.values() if each.is_proven]
-        others = sorted(self.candidates(), key=lambda each: each.heard_s, reverse=True)
-        restarts = [echo_of(each.candidate, each.name) for each in proven if each.candidate]
-        return *(each.echo for each in proven), *(each.echo for each in others), *restarts
-
-    def end(self, neighbour: Neighbour) -> None:
-        """Remember the last number of a proven session; an unproven one cannot bring a neighbour up again."""
-        if neighbour.is_proven:
-            session = neighbour.name, neighbour.nonce  # another member could also send a nonce alone
-            _, received = self.ended.pop(session, _UNREACHABLE)
-            if neighbour.keepalives is not None:
-                received = neighbour.keepalives.received
-            self.ended[session] = neighbour.sequence, received
-            if len(self.ended) > _ENDED_MAX:
-                del self.ended[next(iter(self.ended))]
-
-    def receive_join(self, join: Join, neighbour: Neighbour) -> None:
-        """Note a verified join or leave of a neighbour.
-
-        Raises:
-            StatementError: REPLAYED: it is of another session of either end, came before, or is below the replay
-                window.
-        """
-        if (join.session, join.sender_session) != (self.echo, neighbour.nonce):
-            raise StatementError(DropReason.REPLAYED, "a join of another session")
-        window = self.joins.get(neighbour.nonce)
-        if window is None:
-            if len(self.joins) >= _ENDED_MAX:
-                del self.joins[next(iter(self.joins))]
-            window = self.joins[neighbour.nonce] = ReplayWindow(_JOINS_WINDOW)
-        if window.is_finished(join.sequence):
-            raise StatementError(DropReason.REPLAYED, "join")
-        window.finish(join.sequence)
-
-
 class HelloProtocol:
     """Hello protocol of one node on all its ports.
 
     Args:
-        random_bytes: source of nonces and of session keys.
-        timing: keepalive timing that this node requests, where ``set_timing`` sets no other for a port.
-        life: mark of this node's incarnation, ``LIFE_BYTES``.
         digest_for: returns the digest of our link state for the far end of a port.
         life_elsewhere: the mark of a node with a name that is known to be alive, but at none of our ports; or None.
         rtcert_for: of a RIB, its RtCert for a switch; None of any other node.
@@ -235,13 +98,8 @@ class HelloProtocol:
         identity: Identity,
         policy: Policy,
         fragmenter: ControlFragmenter,
-        random_bytes: Callable[[int], bytes],
+        settings: NodeSettings,
         *,
-        hello_s: float = HELLO_S,
-        dead_s: float = DEAD_S,
-        timing: Timing = NO_KEEPALIVES,
-        incarnation: int = 0,
-        life: bytes = bytes(LIFE_BYTES),
         digest_for: Callable[[HelloPort], bytes] = lambda _: bytes(DIGEST_BYTES),
         life_elsewhere: Callable[[Name], bytes | None] = lambda _: None,
         rtcert_for: Callable[[Name], bytes] | None = None,
@@ -249,23 +107,23 @@ class HelloProtocol:
         self._identity = identity
         self._policy = policy
         self._fragmenter = fragmenter
-        self._random_bytes = random_bytes
-        self._hello_s = hello_s
-        self._dead_s = dead_s
-        self._timing = timing
+        self._random_bytes = settings.random_bytes
+        self._hello_s = settings.hello_s
+        self._dead_s = settings.dead_s
+        self._timing = settings.timing  # where ``set_timing`` sets no other for a port
         self._timings: dict[int, Timing] = {}
-        self._incarnation = incarnation
+        self._incarnation = settings.incarnation
         self._due_s = float("inf")  # when the next call was requested
         self._next_s: float | None = None  # no timer is due before; None: to be computed
         self._lateness_s = 0.0  # how long, in all, this node was called later than it had requested
         self._slowness = Slowness()
         self._digest_for = digest_for
-        self._life = life
+        self._life = settings.life
         self._life_elsewhere = life_elsewhere
         self._rtcert_for = rtcert_for
         self._rtcerts = RtCertCache(_RTCERTS_REMEMBERED)
         self.conflicts = IdentityConflicts()
-        self._cookies = Cookies(random_bytes)
+        self._cookies = Cookies(settings.random_bytes)
         self._replies: list[OutgoingFrames] = []
         self._reply_at_s = float("inf")
         self._has_moved = False  # there is a new address
@@ -276,34 +134,6 @@ class HelloProtocol:
         self.clash_reporter: Name | None = None
         self._clash_since_s = self._clash_s = float("-inf")
         self.ports: dict[int, HelloPort] = {}
-
-    @classmethod
-    def of_node(
-        cls,
-        identity: Identity,
-        policy: Policy,
-        fragmenter: ControlFragmenter,
-        settings: NodeSettings,
-        *,
-        digest_for: Callable[[HelloPort], bytes] = lambda _: bytes(DIGEST_BYTES),
-        life_elsewhere: Callable[[Name], bytes | None] = lambda _: None,
-        rtcert_for: Callable[[Name], bytes] | None = None,
-    ) -> HelloProtocol:
-        """Return the hello protocol of a node with these settings."""
-        return cls(
-            identity,
-            policy,
-            fragmenter,
-            settings.random_bytes,
-            hello_s=settings.hello_s,
-            dead_s=settings.dead_s,
-            timing=settings.timing,
-            incarnation=settings.incarnation,
-            life=settings.life,
-            digest_for=digest_for,
-            life_elsewhere=life_elsewhere,
-            rtcert_for=rtcert_for,
-        )
 
     def set_timing(self, index: int, timing: Timing) -> None:
         """Request another keepalive timing on one port, from its next session on."""
@@ -443,7 +273,7 @@ class HelloProtocol:
             if not has_news:
                 port.schedule_hello(received_bytes, now.mono_s)
         if has_news:
-            port.hurry(max(now.mono_s, port.said_s + _ANSWER_S))
+            port.hurry(max(now.mono_s, port.said_s + ANSWER_S))
         if is_new_session and not is_two_way and known.is_proven:
             known.candidate, known.candidate_sequence = hello.nonce, hello.sequence
             # a restart, or a replayed hello: only an echo of our nonce decides
@@ -781,7 +611,7 @@ class HelloProtocol:
     def _begin_keepalives(self, port: HelloPort, neighbour: Neighbour, hello: Hello, now_s: float) -> None:
         timing = self._timings.get(port.index, self._timing)
         ends = port.nonce + self._identity.name, neighbour.nonce + neighbour.name
-        _, received = port.ended.get((neighbour.name, neighbour.nonce), _UNREACHABLE)
+        _, received = port.ended.get((neighbour.name, neighbour.nonce), UNREACHABLE)
         neighbour.keepalives = KeepaliveSession.begin(
             port.exchange_key, hello.exchange_key, ends, (timing, hello.timing), received, now_s
         )

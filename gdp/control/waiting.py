@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
-from gdp.control.neighbor_discovery import HelloPort, HelloProtocol
+from gdp.control.hello_port import HelloPort
+from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.neighbour import NeighbourState
 from gdp.crypto.certificates import Role
 from gdp.errors import DropReason

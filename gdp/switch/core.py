@@ -18,8 +18,9 @@ from typing import Final
 from gdp.control.boundary import ErrorBoundary
 from gdp.control.channel import Channels, Opened
 from gdp.control.fragments import ControlFragmenter, ControlReassembler
+from gdp.control.hello_port import HelloPort
 from gdp.control.join import Join
-from gdp.control.neighbor_discovery import Change, HelloPort, HelloProtocol
+from gdp.control.neighbor_discovery import Change, HelloProtocol
 from gdp.control.neighbour import Neighbour, NeighbourState
 from gdp.control.revocation_sync import RevocationSync
 from gdp.control.settings import NodeSettings
@@ -67,7 +68,7 @@ class SwitchCore:
         self.table = table
         self._fragmenter = ControlFragmenter(identity.name, settings.incarnation)
         self._reassembler = ControlReassembler()
-        self.hello_protocol = HelloProtocol.of_node(
+        self.hello_protocol = HelloProtocol(
             identity, policy, self._fragmenter, settings,
             digest_for=self._digest_for, life_elsewhere=self._life_elsewhere,
         )  # fmt: skip

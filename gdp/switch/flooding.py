@@ -15,8 +15,9 @@ from dataclasses import replace
 from typing import Final
 
 from gdp.control.hello import DIGEST_BYTES, LIFE_BYTES
+from gdp.control.hello_port import HelloPort
 from gdp.control.link_state import Adjacency, AttachedRib, LinkState, Scope
-from gdp.control.neighbor_discovery import HelloPort, HelloProtocol
+from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.neighbour import Neighbour
 from gdp.crypto.certificates import Role
 from gdp.crypto.fields import check_sequence

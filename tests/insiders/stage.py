@@ -18,7 +18,7 @@ from typing import Final
 from gdp.client.participant import Participant, Topic
 from gdp.client.rib_host import RibHost
 from gdp.control.hello import ECHO_BYTES
-from gdp.control.neighbor_discovery import HelloPort
+from gdp.control.hello_port import HelloPort
 from gdp.crypto.identity import Identity
 from gdp.limits import RIB_NAMES_PER_SENDER, RIB_WATCHES_MAX
 from gdp.rib.core import RibSettings

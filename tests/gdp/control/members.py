@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from gdp.control.fragments import ControlFragmenter
 from gdp.control.neighbor_discovery import HelloProtocol
+from gdp.control.settings import NodeSettings
 from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
@@ -48,7 +49,8 @@ class Nonces:
 
 def hello_protocol(identity: Identity, salt: int, policy: Policy = POLICY) -> HelloProtocol:
     """Return a HelloProtocol with one port, numbered 0."""
-    made = HelloProtocol(identity, policy, ControlFragmenter(identity.name, salt), Nonces(salt))
+    settings = NodeSettings(incarnation=0, first_sequence=0, random_bytes=Nonces(salt), keepalive_ms=0)
+    made = HelloProtocol(identity, policy, ControlFragmenter(identity.name, salt), settings)
     made.add_port(0, bytes([2, salt, 0, 0, 0, 0]), 1_500, 10, 0.0)
     return made
 

@@ -11,6 +11,7 @@ from gdp.control.hello import Hello, Timing
 from gdp.control.keepalive import KeepaliveFlag, Slowness, open_keepalive
 from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.neighbour import NeighbourState
+from gdp.control.settings import NodeSettings
 from gdp.crypto.exchange import ExchangeKey
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import parse
@@ -48,7 +49,9 @@ class Pair:
     @staticmethod
     def hello_protocol(identity: Identity, salt: int, timing: Timing) -> HelloProtocol:
         fragmenter = ControlFragmenter(identity.name, salt)
-        made = HelloProtocol(identity, POLICY, fragmenter, Nonces(salt), timing=timing, incarnation=salt)
+        settings = NodeSettings(incarnation=salt, first_sequence=0, random_bytes=Nonces(salt))
+        made = HelloProtocol(identity, POLICY, fragmenter, settings)
+        made.set_timing(0, timing)
         made.add_port(0, bytes([2, salt, 0, 0, 0, 0]), 1_500, 10, 0.0)
         return made
 

@@ -7,8 +7,9 @@ from itertools import product
 import pytest
 
 from gdp.control.hello import ECHO_BYTES, Hello
+from gdp.control.hello_port import HelloPort
 from gdp.control.join import Join
-from gdp.control.neighbor_discovery import NEIGHBOURS_MAX, PADDED_BYTES, Change, HelloPort, HelloProtocol
+from gdp.control.neighbor_discovery import NEIGHBOURS_MAX, PADDED_BYTES, Change, HelloProtocol
 from gdp.control.neighbour import TRANSITIONS, Neighbour, NeighbourEvent, NeighbourState
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity

@@ -1,0 +1,150 @@
+"""Port of the hello protocol: its session, its neighbours, and what hellos on it must carry.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+from gdp.control.admission import Admission
+from gdp.control.hello import echo_of
+from gdp.control.join import Join
+from gdp.control.neighbour import Neighbour, NeighbourState
+from gdp.control.strangers import Strangers
+from gdp.crypto.exchange import ExchangeKey
+from gdp.errors import DropReason, StatementError
+from gdp.message.replay import ReplayWindow
+from gdp.names import Name
+
+__all__ = ["ANSWER_S", "UNREACHABLE", "HelloPort"]
+
+_ADDRESSES_MAX: Final = 96  # of neighbours and former ones, whose frames the data plane keeps apart from strangers'
+_CREDIT_MAX_BYTES: Final = 16 << 10
+_ENDED_MAX: Final = 1_024  # sessions of the far ends, remembered for one session of a port
+_JOINS_WINDOW: Final = 1_024  # how far joins may overtake each other
+ANSWER_S: Final = 0.02  # a stranger's hello is answered at once, but not more often than this
+_EAGER_HELLOS: Final = 4  # after a change, so that a lost one causes no delay
+UNREACHABLE: Final = (-1, -1)
+
+
+@dataclass(slots=True, kw_only=True)
+class HelloPort:
+    """A port as the control plane sees it."""
+
+    owner: Name  # the node whose port it is
+    index: int
+    mac: bytes
+    own_mtu: int  # what our end accepts, in bytes after the Ethernet header
+    cost: int
+    nonce: bytes
+    exchange_key: ExchangeKey
+    admission: Admission
+    is_up: bool = True
+    sequence: int = 0
+    keepalive_sequence: int = 0
+    eager: int = _EAGER_HELLOS  # hellos until they become rare
+    hello_at_s: float = 0.0
+    answer_at_s: float = float("inf")  # of a hello to candidates, as far as ``credit_bytes`` allow
+    credit_bytes: int = 0  # received from them, and not answered yet
+    owes_answer: bool = False  # an answer waits for credit
+    said_s: float = float("-inf")
+    neighbours: dict[Name, Neighbour] = field(default_factory=dict)
+    ended: dict[tuple[Name, bytes], tuple[int, int]] = field(default_factory=dict)  # last numbers
+    # joins that were accepted, by session of the far end
+    joins: dict[bytes, ReplayWindow] = field(default_factory=dict)
+    said_mtus: dict[Name, int] = field(default_factory=dict)  # what each neighbour's end accepts
+    addresses: dict[bytes, None] = field(default_factory=dict)  # of neighbours, former ones too; the last proven last
+    strangers: Strangers = field(default_factory=Strangers)  # nodes whose hellos were refused
+
+    @property
+    def echo(self) -> bytes:
+        """Return how others refer to our present session."""
+        return echo_of(self.nonce, self.owner)
+
+    @property
+    def mtu(self) -> int:
+        """Return what our end and those of all neighbours that are up accept, in bytes after the Ethernet header."""
+        up = [n.mtu for n in self.neighbours.values() if n.state is NeighbourState.UP]
+        return min([self.own_mtu, *up])
+
+    @property
+    def hello_mtu(self) -> int:
+        """Return an MTU that every node heard so far accepts; a neighbour behind a narrow end must get our hellos."""
+        return min([self.own_mtu, *self.said_mtus.values()])
+
+    def last_of(self, name: Name, nonce: bytes) -> int:
+        """Return the last sequence number received in a neighbour's session, or -1."""
+        known = self.neighbours.get(name)
+        if known is not None and nonce in (known.nonce, known.candidate):
+            return known.sequence if known.nonce == nonce else known.candidate_sequence
+        return self.ended.get((name, nonce), UNREACHABLE)[0]
+
+    @property
+    def is_idle(self) -> bool:
+        """Return whether keepalives pass both ways with all neighbours; candidates do not count."""
+        sessions = [each.keepalives for each in self.neighbours.values() if each.is_proven]
+        return bool(sessions) and all(each is not None and each.is_alive and each.hears_us for each in sessions)
+
+    def hurry(self, at_s: float) -> None:
+        """Send a hello at ``at_s`` or before, and then often for a while: its content has changed."""
+        self.hello_at_s, self.eager = min(self.hello_at_s, at_s), _EAGER_HELLOS
+
+    def schedule_hello(self, received_bytes: int, now_s: float) -> None:
+        """Send a hello to candidates soon, with at most as many bytes as came from candidates."""
+        self.credit_bytes = min(self.credit_bytes + received_bytes, _CREDIT_MAX_BYTES)
+        self.answer_at_s = min(self.answer_at_s, max(now_s, self.said_s + ANSWER_S))
+
+    def note_address(self, mac: bytes) -> bool:
+        """Note that a neighbour has this address; return whether that is news."""
+        is_new = mac not in self.addresses
+        self.addresses.pop(mac, None)
+        self.addresses[mac] = None
+        if len(self.addresses) > _ADDRESSES_MAX:
+            del self.addresses[next(iter(self.addresses))]
+        return is_new
+
+    def candidates(self) -> list[Neighbour]:
+        """Return the nodes that were heard, and have not echoed our nonce."""
+        return [each for each in self.neighbours.values() if not each.is_proven]
+
+    def is_neighbour_at(self, mac: bytes) -> bool:
+        """Return whether a neighbour that is up has this address."""
+        return any(each.mac == mac and each.state is NeighbourState.UP for each in self.neighbours.values())
+
+    def heard(self) -> tuple[bytes, ...]:
+        """Return the echoes that a hello carries: neighbours first, then candidates, the newest first."""
+        proven = [each for each in self.neighbours.values() if each.is_proven]
+        others = sorted(self.candidates(), key=lambda each: each.heard_s, reverse=True)
+        restarts = [echo_of(each.candidate, each.name) for each in proven if each.candidate]
+        return *(each.echo for each in proven), *(each.echo for each in others), *restarts
+
+    def end(self, neighbour: Neighbour) -> None:
+        """Remember the last number of a proven session; an unproven one cannot bring a neighbour up again."""
+        if neighbour.is_proven:
+            session = neighbour.name, neighbour.nonce  # another member could also send a nonce alone
+            _, received = self.ended.pop(session, UNREACHABLE)
+            if neighbour.keepalives is not None:
+                received = neighbour.keepalives.received
+            self.ended[session] = neighbour.sequence, received
+            if len(self.ended) > _ENDED_MAX:
+                del self.ended[next(iter(self.ended))]
+
+    def receive_join(self, join: Join, neighbour: Neighbour) -> None:
+        """Note a verified join or leave of a neighbour.
+
+        Raises:
+            StatementError: REPLAYED: it is of another session of either end, came before, or is below the replay
+                window.
+        """
+        if (join.session, join.sender_session) != (self.echo, neighbour.nonce):
+            raise StatementError(DropReason.REPLAYED, "a join of another session")
+        window = self.joins.get(neighbour.nonce)
+        if window is None:
+            if len(self.joins) >= _ENDED_MAX:
+                del self.joins[next(iter(self.joins))]
+            window = self.joins[neighbour.nonce] = ReplayWindow(_JOINS_WINDOW)
+        if window.is_finished(join.sequence):
+            raise StatementError(DropReason.REPLAYED, "join")
+        window.finish(join.sequence)
