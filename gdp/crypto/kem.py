@@ -55,7 +55,6 @@ class KemPublicKey:
 
         Raises:
             StatementError: MALFORMED, the bytes are no key.
-            LocalError: the installed library has no such KEM.
         """
         library = _library()
         try:
@@ -77,11 +76,7 @@ class KemPrivateKey:
 
     @classmethod
     def generate(cls) -> KemPrivateKey:
-        """Return a new key from the system's randomness.
-
-        Raises:
-            LocalError: the installed library has no such KEM.
-        """
+        """Return a new key from the system's randomness."""
         seed = _library().mlkem.MLKEM768PrivateKey.generate().private_bytes_raw()
         return cls.from_wire(seed + x25519.X25519PrivateKey.generate().private_bytes_raw())
 
@@ -104,7 +99,6 @@ class KemPrivateKey:
 
         Raises:
             StatementError: BAD_TAG, it was sealed to another, or altered.
-            LocalError: the installed library has no such KEM.
         """
         library = _library()
         key = library.hpke.MLKEM768X25519PrivateKey(

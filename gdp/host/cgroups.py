@@ -34,7 +34,8 @@ _GONE: Final = (errno.ENOENT, errno.ENODEV)
 class Cgroup:
     """The group called ``name`` directly below each usable root.
 
-    The constructor makes no group; see ``make``. The other methods raise ``LocalError`` if the kernel refuses.
+    The constructor makes no group; see ``make``. The other methods raise ``LocalError`` if the kernel
+    refuses, or if this host has no such bound.
     """
 
     def __init__(self, name: str) -> None:
@@ -66,11 +67,7 @@ class Cgroup:
             self._write(folder / "cgroup.procs", str(pid))
 
     def limit_cpu(self, cpus: float | None) -> None:
-        """Limit the group to the time of ``cpus`` processors; None: no limit.
-
-        Raises:
-            LocalError: this host has no such bound.
-        """
+        """Limit the group to the time of ``cpus`` processors; None: no limit."""
         period_us = _PERIOD_US
         if cpus is not None and cpus * period_us < _LEAST_US:
             period_us = min(int(_LEAST_US / cpus), _LONGEST_PERIOD_US)
@@ -85,11 +82,7 @@ class Cgroup:
             self._write(path, str(-1 if quota_us is None else quota_us))
 
     def limit_memory(self, size_bytes: int | None) -> None:
-        """Limit the group's memory; the kernel kills processes in it that exceed the limit; None: no limit.
-
-        Raises:
-            LocalError: this host has no such bound.
-        """
+        """Limit the group's memory; the kernel kills processes in it that exceed the limit; None: no limit."""
         path = self._find(("memory.max", "memory.limit_in_bytes"))
         if path is None:
             raise LocalError(f"the group {self.name} has no bound on memory here")

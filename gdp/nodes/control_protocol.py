@@ -129,11 +129,7 @@ def encode_response(response: Response) -> bytes:
 
 
 def decode_response(line: bytes) -> Response:
-    """Return the response that a line holds.
-
-    Raises:
-        ControlRequestError: the line is not a response.
-    """
+    """Return the response that a line holds."""
     match _decode_object(line):
         case {"ok": True, "result": dict(result)}:
             return Response(result)

@@ -147,19 +147,14 @@ def _command(pid: int) -> str:
     return text if len(text) <= _COMMAND_MAX else f"{text[:_COMMAND_MAX]}..."
 
 
-def lock_directory() -> Path:
-    """Return the directory of this user's locks, whether it exists or not."""
-    return _place()
-
-
 def lock_directories() -> tuple[Path, ...]:
     """Return the directories of locks that concern this user: its own, then that of root."""
-    return tuple(dict.fromkeys((_place(), _ROOT_DIRECTORY)))
+    return tuple(dict.fromkeys((lock_directory(), _ROOT_DIRECTORY)))
 
 
 def _directory() -> Path | None:
     """Return the lock directory, made if necessary; None, with a warning, if it cannot exist."""
-    path = _place()
+    path = lock_directory()
     try:
         path.mkdir(mode=0o755, exist_ok=True)
         status = path.lstat()
@@ -173,7 +168,8 @@ def _directory() -> Path | None:
     return path
 
 
-def _place() -> Path:
+def lock_directory() -> Path:
+    """Return the directory of this user's locks, whether it exists or not."""
     if os.geteuid() == 0 and os.access(_ROOT_DIRECTORY.parent, os.W_OK):
         return _ROOT_DIRECTORY
     runtime = os.environ.get("XDG_RUNTIME_DIR", "")

@@ -39,10 +39,6 @@ def open_uplink(ifname: str) -> Iterator[RawPlane]:
 
 
 def refuse_loopback(ifnames: Iterable[str]) -> None:
-    """Refuse the loopback device as a port.
-
-    Raises:
-        LocalError: it is among the devices.
-    """
+    """Refuse the loopback device as a port, with a ``LocalError``."""
     if "lo" in ifnames:
         raise LocalError("lo is the loopback device, which leads to no neighbour; name a network device such as eth0")

@@ -30,6 +30,7 @@ from gdp.ports.plane import MAC_BYTES, Port, ReceivedFrame
 from gdp.ports.sockets import TrafficClass, attach_drop_all_filter, kernel_drops, open_port, tell_neighbours
 from gdp.switch.forwarder import Drop, Forward, decide
 from gdp.switch.table import NOWHERE, Hops, Table, is_side
+from gdp.token_bucket import TokenBucket
 
 __all__ = ["RawPlane"]
 
@@ -58,27 +59,6 @@ def _lane_of(frame: bytes) -> TrafficClass:
     if frame[KIND_AT] >= CONTROL_FROM:
         return TrafficClass.CONTROL
     return TrafficClass.URGENT if frame[FLAGS_AT] & _URGENT else TrafficClass.ORDINARY
-
-
-class _PuntQuota:
-    """The remaining quota of one source of frames, beyond which its socket pauses.
-
-    Source: a leaky bucket as a meter (ITU-T I.371), charged after the fact, because a batch is read before its size is
-    known.
-    """
-
-    __slots__ = ("_at_s", "_burst", "_left", "_rate")
-
-    def __init__(self, rate: float, burst: float, now_s: float) -> None:
-        self._rate = rate
-        self._burst = self._left = burst
-        self._at_s = now_s
-
-    def charge(self, frames: int, now_s: float) -> float:
-        """Charge frames; return the seconds to pause, 0 while some quota is left."""
-        self._left = min(self._left + (now_s - self._at_s) * self._rate, self._burst) - frames
-        self._at_s = now_s
-        return max(-self._left, 0.0) / self._rate
 
 
 class RawPlane(NetdevPlane):
@@ -116,7 +96,7 @@ class RawPlane(NetdevPlane):
         else:
             ready = partial(self._forward_all, self._entries, self._sides, port.index, opened, sockets)
         if lane in (TrafficClass.HELLO, TrafficClass.GUEST):
-            ready = partial(self._take_some, opened, _PuntQuota(*_GREETINGS, time.monotonic()), ready)
+            ready = partial(self._take_some, opened, TokenBucket(*_GREETINGS), ready)
         self.watch(opened, ready, rank=rank)
         tell_neighbours(opened, lane, self._neighbours.get(port.index, ()))
 
@@ -151,11 +131,13 @@ class RawPlane(NetdevPlane):
         super().remove_port(index)
         self._neighbours.pop(index, None)
 
-    def _take_some(self, source: socket.socket, ration: _PuntQuota, ready: Callable[[], None]) -> None:
+    def _take_some(self, source: socket.socket, quota: TokenBucket, ready: Callable[[], None]) -> None:
         """Receive a batch; pause the socket if it exceeded its quota."""
         before = self._counters.frames_in
         ready()
-        rest_s = ration.charge(self._counters.frames_in - before, now_s := time.monotonic())
+        now_s = time.monotonic()
+        quota.charge(now_s, self._counters.frames_in - before)  # afterwards: only then is the batch's size known
+        rest_s = -quota.left(now_s) / _GREETINGS[0]
         if rest_s > 0 and source.fileno() not in self._resting:
             self._epoll.unregister(source)
             self._resting[source.fileno()] = source, now_s + rest_s

@@ -72,7 +72,7 @@ class Topology:
 
     Raises:
         LocalError: an unknown or repeated switch, a link twice or to itself, a domain that overlaps, a cost, MTU or
-            device name out of bounds.
+            device name out of bounds. Methods raise it for switches that are unknown or not joined.
     """
 
     links: tuple[Link, ...]
@@ -107,22 +107,14 @@ class Topology:
         return (link for link in self.links if node in link.ends())
 
     def link(self, a: str, b: str) -> Link:
-        """Return the link between two switches, named in either order.
-
-        Raises:
-            LocalError: they are not joined.
-        """
+        """Return the link between two switches, named in either order."""
         for link in self.links:
             if link.ends() == {a, b}:
                 return link
         raise LocalError(f"no link {a}-{b}; there are {', '.join(map(str, self.links))}")
 
     def domain_of(self, node: str) -> DomainPlan:
-        """Return the trust domain of a switch.
-
-        Raises:
-            LocalError: no such switch.
-        """
+        """Return the trust domain of a switch."""
         for domain in self.domains:
             if node in domain.switches:
                 return domain

@@ -7,6 +7,9 @@ I/O, through ``files``. The content of a file shows its form::
     pkcs11:token=...;object=...             the key is in a token (``token``), and the file names it
     32 or 96 bytes                          an owner's master secret, a node's KEM key
     -----BEGIN ENCRYPTED GDP SECRET-----    the same under a passphrase
+
+A file that is missing, not private, invalid, or does not open raises ``LocalError`` with its name; an empty passphrase
+raises one, too.
 """
 
 from __future__ import annotations
@@ -34,20 +37,12 @@ class Storage(str, Enum):
 
 
 def storage_of(path: Path) -> Storage:
-    """Return how a private file guards its content.
-
-    Raises:
-        LocalError: it is missing, or not private.
-    """
+    """Return how a private file guards its content."""
     return _storage(read_private(path))
 
 
 def read_signing_key(path: Path) -> SigningKey:
-    """Read a signing key.
-
-    Raises:
-        LocalError: it is missing, not private, not a key, or does not open; the text names the file.
-    """
+    """Read a signing key."""
     data = read_private(path)
     storage = _storage(data)
     try:
@@ -68,11 +63,7 @@ def _opened_key(plain: bytes) -> SigningKey:
 
 
 def read_secret(path: Path) -> bytes:
-    """Read another secret: an owner's master secret, a node's KEM key.
-
-    Raises:
-        LocalError: it is missing, not private, or does not open; the text names the file.
-    """
+    """Read another secret: an owner's master secret, a node's KEM key."""
     data = read_private(path)
     if _storage(data) is not Storage.PASSPHRASE:
         return data
@@ -83,22 +74,14 @@ def read_secret(path: Path) -> bytes:
 
 
 def key_file(key: SigningKey, passphrase: bytes | None = None) -> NewFile:
-    """Return the file that holds a signing key, or names its token.
-
-    Raises:
-        LocalError: an empty passphrase.
-    """
+    """Return the file that holds a signing key, or names its token."""
     if passphrase is None:
         return private(key.to_file())
     return private(key.to_file(lambda plain: protect(plain, passphrase, secrets.token_bytes(RANDOM_BYTES), KEY_LABEL)))
 
 
 def secret_file(secret: bytes, passphrase: bytes | None = None) -> NewFile:
-    """Return the file that holds another secret.
-
-    Raises:
-        LocalError: an empty passphrase.
-    """
+    """Return the file that holds another secret."""
     if passphrase is None:
         return private(secret)
     return private(protect(secret, passphrase, secrets.token_bytes(RANDOM_BYTES), SECRET_LABEL))

@@ -42,37 +42,29 @@ class JoinedBranch(NamedTuple):
     at: Downstream
 
 
-class Dependents:
+class Dependents(Holdings[AttachedAdvertisement | KnownLocation | JoinedBranch]):
     """The index of one switch."""
 
     def __init__(self, attached: LocalAdvertisements, places: NameCache, multicast: MulticastTrees) -> None:
         self._attached = attached
         self._places = places
         self._multicast = multicast
-        self._holdings = Holdings[AttachedAdvertisement | KnownLocation | JoinedBranch](self._is_held)
+        super().__init__(self._has)
 
     def note_advertisement(self, advertisement: Advertisement, at: Downstream) -> None:
         """Record the advertisement of an attached node."""
-        self._holdings.note(AttachedAdvertisement(advertisement.name, advertisement.node, at), advertisement)
+        self.note(AttachedAdvertisement(advertisement.name, advertisement.node, at), advertisement)
 
     def note_place(self, place: Location) -> None:
         """Record a location that a RIB or a switch proved."""
         if place.proof is not None:
-            self._holdings.note(KnownLocation(place.name, place.advertiser), place.proof)
+            self.note(KnownLocation(place.name, place.advertiser), place.proof)
 
     def note_branch(self, topic: Name, publisher: Name, at: Downstream, evidence: Advertisement) -> None:
         """Record the reader's advertisement that a join from downstream carried."""
-        self._holdings.note(JoinedBranch(topic, publisher, at), evidence)
+        self.note(JoinedBranch(topic, publisher, at), evidence)
 
-    def resting_on(self, fingerprint: bytes) -> list[AttachedAdvertisement | KnownLocation | JoinedBranch]:
-        """Return what depends on a certificate."""
-        return self._holdings.resting_on(fingerprint)
-
-    def has_issuer(self, key: bytes) -> bool:
-        """Return whether anything depends on a certificate that this key, 33 bytes, issued."""
-        return self._holdings.has_issuer(key)
-
-    def _is_held(self, holder: AttachedAdvertisement | KnownLocation | JoinedBranch) -> bool:
+    def _has(self, holder: AttachedAdvertisement | KnownLocation | JoinedBranch) -> bool:
         if isinstance(holder, AttachedAdvertisement):
             is_reader = self._multicast.advertisement_of(holder.name, holder.at) is not None
             return is_reader or self._attached.get(holder.name, holder.node) is not None

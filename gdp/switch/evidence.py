@@ -23,7 +23,7 @@ __all__ = ["Evidence"]
 
 
 class Evidence:
-    """Verifies where nodes are.
+    """Verifies where nodes are; what is not valid, or is about something else, raises ``StatementError``.
 
     Args:
         verifier: shared with the other parts of the switch, so that a known advertisement is cheap.
@@ -34,22 +34,14 @@ class Evidence:
         self._verifier = verifier
 
     def from_answer(self, answer: Response, now: Timestamps) -> Location:
-        """Return the location in a response whose signature was verified.
-
-        Raises:
-            StatementError: the advertisement in it is not valid, or is about something else.
-        """
+        """Return the location in a response whose signature was verified."""
         advertisement = self._verifier.verify(answer.advertisement, now.unix_s)
         if advertisement.name != answer.name or advertisement.node != answer.advertiser:
             raise StatementError(DropReason.WRONG_NAME, "an answer about something else than its claim")
         return _place(advertisement, answer.domain, frozenset(answer.transit), answer.lease_s, now)
 
     def from_relay(self, statement: Statement, now: Timestamps) -> Location:
-        """Return the location that a switch reports of a node that is attached to it.
-
-        Raises:
-            StatementError: it is not valid, or the node authorised another switch.
-        """
+        """Return the location that a switch reports of a node that is attached to it."""
         relay = Relay.from_fields(statement.expect(StatementType.RELAY))
         member = self._policy.verify_membership(relay.membership, now.unix_s)
         if member.name != statement.signer or not member.role.is_switch:
@@ -61,11 +53,7 @@ class Evidence:
         return _place(advertisement, member.domain, frozenset(relay.transit), advertisement.lease_s, now)
 
     def of_join(self, join: Join, now: Timestamps) -> Advertisement:
-        """Return the reader's advertisement of a join with a lease; the publisher's proves where the join leads.
-
-        Raises:
-            StatementError: one of the two is not valid, or is about something else.
-        """
+        """Return the reader's advertisement of a join with a lease; the publisher's proves where the join leads."""
         reader = self._verifier.verify(join.evidence, now.unix_s)
         if reader.right not in HEARS or reader.name != join.topic:
             raise StatementError(DropReason.NOT_DELEGATED, "a join without a reader's claim")

@@ -48,7 +48,10 @@ _PER_TICK: Final = 4
 
 
 class RevocationHandler:
-    """Handles, applies and distributes revocations at one switch."""
+    """Handles, applies and distributes revocations at one switch.
+
+    One that is not valid, concerns nothing here, or exceeds a quota raises ``StatementError``.
+    """
 
     def __init__(
         self,
@@ -79,20 +82,12 @@ class RevocationHandler:
         self._sent_to: Name | None = None  # the RIB that received the operator's revocations
 
     def receive_revocation(self, statement: Statement, neighbour: Neighbour, now: Timestamps) -> list[Name]:
-        """Handle a revocation from a neighbour; return the topics that lost all readers here.
-
-        Raises:
-            StatementError: it is not valid, concerns nothing here, or exceeds a quota.
-        """
+        """Handle a revocation from a neighbour; return the topics that lost all readers here."""
         revocation = self._revoked.receive_revocation(statement, neighbour.name, now, self._held.has_issuer)
         return [] if revocation is None else self._spread(revocation, statement, neighbour, now)
 
     def receive_lacking(self, statement: Statement, neighbour: Neighbour, now: Timestamps) -> list[Name]:
-        """Handle a revocation that was missing here; the other neighbours receive it by digests.
-
-        Raises:
-            StatementError: as ``receive_revocation``.
-        """
+        """Handle a revocation that was missing here; the other neighbours receive it by digests."""
         revocation = self._revoked.receive_revocation(statement, neighbour.name, now, self._held.has_issuer)
         if revocation is None:
             return []
@@ -100,20 +95,12 @@ class RevocationHandler:
         return self._apply(revocation, now)
 
     def receive_from_rib(self, statement: Statement, rib: Name, now: Timestamps) -> list[Name]:
-        """Handle a revocation that a RIB sent.
-
-        Raises:
-            StatementError: as ``receive_revocation``.
-        """
+        """Handle a revocation that a RIB sent."""
         revocation = self._revoked.receive_revocation(statement, rib, now, self._held.has_issuer)
         return [] if revocation is None else self._spread(revocation, statement, None, now)
 
     def hand_in(self, statement: Statement, now: Timestamps) -> list[Name]:
-        """Handle a revocation from this node's operator, for any issuer.
-
-        Raises:
-            StatementError: it is not valid.
-        """
+        """Handle a revocation from this node's operator, for any issuer."""
         revocation = self._revoked.receive_revocation(statement, OPERATOR, now, self._held.has_issuer)
         issued = revocation or Revocation.read(statement)
         if not self._revoked.is_root(issued.issuer.owner_key):
