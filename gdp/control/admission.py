@@ -100,11 +100,7 @@ def cookie_payload(session: bytes, nonce: bytes, cookie: bytes) -> bytes:
 
 
 def read_cookie(payload: bytes) -> tuple[bytes, bytes, bytes]:
-    """Return session, nonce and cookie.
-
-    Raises:
-        FrameError: TRUNCATED.
-    """
+    """Return session, nonce and cookie. Raises ``FrameError``: TRUNCATED."""
     if len(payload) < 2 * NONCE_BYTES + COOKIE_BYTES:
         raise FrameError(DropReason.TRUNCATED, "cookie")
     at = 2 * NONCE_BYTES
@@ -148,11 +144,7 @@ class Admission:
             self.flooded_until_s = now_s + _LOADED_S
 
     def admit_neighbour(self, bucket: TokenBucket, now_s: float) -> None:
-        """Take a token of a neighbour.
-
-        Raises:
-            StatementError: RATE_LIMITED.
-        """
+        """Take a token of a neighbour. Raises ``StatementError``: RATE_LIMITED."""
         if not bucket.spend(now_s):
             self.flooded_until_s = now_s + _LOADED_S
             raise StatementError(DropReason.RATE_LIMITED, "hellos of one neighbour")

@@ -110,11 +110,7 @@ class LinkState:
         )  # fmt: skip
 
     def to_wire(self, key: SigningKey, membership: bytes) -> bytes:
-        """Return the signed statement.
-
-        Raises:
-            LocalError: it does not fit; ``fitted`` does.
-        """
+        """Return the signed statement. Raises ``LocalError``: it does not fit; ``fitted`` does."""
         body = {
             "o": self.scope.value,
             "s": self.sequence,

@@ -60,11 +60,7 @@ def note_key(
 
 
 def topic_of(header: Header, frame: bytes) -> bytes:
-    """Return the topic of a control message; not yet authenticated.
-
-    Raises:
-        EnvelopeError: shorter than a topic.
-    """
+    """Return the topic of a control message; not yet authenticated. Raises ``EnvelopeError``: shorter than a topic."""
     if header.length < NAME_BYTES + TAG_BYTES or header.parts != 1:
         raise EnvelopeError(DropReason.TRUNCATED, "note")
     return frame[HEADER_BYTES:_BODY_AT]
@@ -114,11 +110,7 @@ class ControlOpener:
         self._context = topic + _INCARNATION.pack(destination_incarnation)
 
     def open(self, header: Header, frame: bytes) -> bytes:
-        """Return the body of a control message.
-
-        Raises:
-            EnvelopeError: BAD_TAG, altered or under another key.
-        """
+        """Return the body of a control message. Raises ``EnvelopeError``: BAD_TAG, altered or under another key."""
         sealed = frame[_BODY_AT : HEADER_BYTES + header.length]
         try:
             return self._aead.decrypt(_NONCE.pack(header.number, 0), sealed, authenticated(frame) + self._context)

@@ -134,11 +134,7 @@ class Identity:
         return self.member.label
 
     def sign(self, type_: StatementType, body: Mapping[str, object]) -> bytes:
-        """Return a statement of this node.
-
-        Raises:
-            LocalError: the body cannot be written, or is too long.
-        """
+        """Return a statement of this node. Raises ``LocalError``: the body cannot be written, or is too long."""
         return sign(type_, body, self.name, self.key)
 
 

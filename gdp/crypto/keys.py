@@ -60,11 +60,7 @@ class PublicKey:
 
     @classmethod
     def from_point(cls, point: object) -> PublicKey:
-        """Wrap a library key.
-
-        Raises:
-            StatementError: MALFORMED, another kind of key or another curve.
-        """
+        """Wrap a library key. Raises ``StatementError``: MALFORMED, another kind of key or another curve."""
         if not isinstance(point, ec.EllipticCurvePublicKey) or not isinstance(point.curve, ec.SECP256R1):
             raise StatementError(DropReason.MALFORMED, "a key that is not ECDSA P-256")
         form = serialization.Encoding.X962, serialization.PublicFormat.CompressedPoint
@@ -72,11 +68,7 @@ class PublicKey:
 
     @classmethod
     def from_pem(cls, pem: bytes) -> PublicKey:
-        """Read a SubjectPublicKeyInfo in PEM.
-
-        Raises:
-            LocalError: not a P-256 public key in PEM.
-        """
+        """Read a SubjectPublicKeyInfo in PEM. Raises ``LocalError``: not a P-256 public key in PEM."""
         try:
             return cls.from_point(serialization.load_pem_public_key(pem))
         except (ValueError, UnsupportedAlgorithm, StatementError) as error:
@@ -139,11 +131,7 @@ class SigningKey(ABC):
 
     @staticmethod
     def from_der(der: bytes) -> SoftwareKey:
-        """Read a private key in PKCS #8, DER, unencrypted.
-
-        Raises:
-            LocalError: not a P-256 private key.
-        """
+        """Read a private key in PKCS #8, DER, unencrypted. Raises ``LocalError``: not a P-256 private key."""
         try:
             private = serialization.load_der_private_key(der, password=None)
         except (ValueError, TypeError, UnsupportedAlgorithm) as error:
@@ -156,11 +144,7 @@ class SigningKey(ABC):
 
     @abstractmethod
     def sign_digest(self, digest: bytes) -> bytes:
-        """Return r || s (64 bytes) over a SHA-256 digest (32 bytes).
-
-        Raises:
-            LocalError: not 32 bytes.
-        """
+        """Return r || s (64 bytes) over a SHA-256 digest (32 bytes). Raises ``LocalError``: not 32 bytes."""
 
     def sign_der(self, data: bytes) -> bytes:
         """Return the signature over SHA-256 of ``data`` in DER, as X.509 carries it."""
@@ -205,11 +189,7 @@ class SoftwareKey(SigningKey):
         return _from_der(self.private.sign(data, _ECDSA))
 
     def sign_digest(self, digest: bytes) -> bytes:
-        """Return r || s (64 bytes) over a SHA-256 digest.
-
-        Raises:
-            LocalError: not 32 bytes.
-        """
+        """Return r || s (64 bytes) over a SHA-256 digest. Raises ``LocalError``: not 32 bytes."""
         if len(digest) != _HALF:
             raise LocalError("a SHA-256 digest has 32 bytes")
         return _from_der(self.private.sign(digest, _ECDSA_DIGEST))

@@ -35,11 +35,7 @@ class RecordKey:
         return self._aead.encrypt(number.to_bytes(_NONCE_BYTES, "big"), plaintext, head)
 
     def open(self, number: int, head: bytes, ciphertext: bytes) -> bytes:
-        """Return the plaintext.
-
-        Raises:
-            EnvelopeError: BAD_TAG.
-        """
+        """Return the plaintext. Raises ``EnvelopeError``: BAD_TAG."""
         try:
             return self._aead.decrypt(number.to_bytes(_NONCE_BYTES, "big"), ciphertext, head)
         except InvalidTag as error:

@@ -97,11 +97,7 @@ class Statement:
         return hashlib.sha256(self.signed_bytes).digest()
 
     def expect(self, expected: StatementType) -> Fields:
-        """Return the body if the statement is of this type.
-
-        Raises:
-            StatementError: MALFORMED.
-        """
+        """Return the body if the statement is of this type. Raises ``StatementError``: MALFORMED."""
         if self.type is not expected:
             raise StatementError(DropReason.MALFORMED, f"{self.type.value} where {expected.value} was due")
         return self.fields

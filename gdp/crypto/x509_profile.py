@@ -141,11 +141,7 @@ def to_pem(wire: bytes) -> bytes:
 
 
 def distinguished_name(unit: str, label: str) -> x509.Name:
-    """Return OU and CN.
-
-    Raises:
-        LocalError: the label is empty, too long or holds control characters.
-    """
+    """Return OU and CN. Raises ``LocalError``: the label is empty, too long or holds control characters."""
     if not 0 < len(label) <= LABEL_MAX_CHARS or not label.isprintable():
         raise LocalError(f"a label has 1 to {LABEL_MAX_CHARS} printable characters")
     return x509.Name(

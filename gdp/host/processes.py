@@ -26,11 +26,7 @@ class Process:
 
     @classmethod
     def of(cls, pid: int) -> Process:
-        """Return the running process ``pid``.
-
-        Raises:
-            ProcessLookupError: there is no such process.
-        """
+        """Return the running process ``pid``. Raises ``ProcessLookupError``: there is no such process."""
         started = _started(pid)
         if started is None:
             raise ProcessLookupError(pid)

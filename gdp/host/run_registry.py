@@ -70,11 +70,7 @@ class Record:
 
     @classmethod
     def from_text(cls, text: str) -> Record:
-        """Read the text of ``to_text``.
-
-        Raises:
-            ValueError: it is something else.
-        """
+        """Read the text of ``to_text``. Raises ``ValueError``: it is something else."""
         try:
             items = json.loads(text)
             items["owner"] = Process(**items["owner"])

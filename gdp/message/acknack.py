@@ -61,11 +61,7 @@ class AckNack(NamedTuple):
 
     @classmethod
     def from_wire(cls, wire: bytes) -> AckNack:
-        """Read the wire form.
-
-        Raises:
-            FrameError: the bytes are not exactly one AckNack.
-        """
+        """Read the wire form. Raises ``FrameError``: the bytes are not exactly one AckNack."""
         if len(wire) < _HEAD.size:
             raise FrameError(DropReason.TRUNCATED, "report")
         flags, number, part, sequence, lost, count = _HEAD.unpack_from(wire)

@@ -73,11 +73,7 @@ class ReaderPositions:
             self.suspended[reader] = position
 
     def resume(self, reader: bytes, now_s: float) -> None:
-        """Reactivate a suspended reader at its position.
-
-        Raises:
-            KeyError: it is not suspended.
-        """
+        """Reactivate a suspended reader at its position. Raises ``KeyError``: it is not suspended."""
         position = self.active[reader] = self.suspended.pop(reader)
         position.last_progress_s = position.mark_s = now_s
         position.mark_at = position.acked_at

@@ -32,11 +32,7 @@ def pack(messages: Iterable[bytes]) -> bytes:
 
 
 def unpack(wire: bytes) -> list[bytes]:
-    """Read the wire form.
-
-    Raises:
-        FrameError: the bytes are not exactly one bundle; none of its messages counts.
-    """
+    """Read the wire form. Raises ``FrameError``: the bytes are not exactly one bundle; none of its messages counts."""
     if not 0 < len(wire) <= BUNDLE_MAX_BYTES:
         raise FrameError(DropReason.MALFORMED, "bundle")
     messages, at, end = [], 0, len(wire)

@@ -33,11 +33,7 @@ class FairQueue(Generic[_T]):
         self._of.setdefault(owner, OrderedDict())[item] = None
 
     def pop(self) -> _T:
-        """Return the next item.
-
-        Raises:
-            KeyError: there is none.
-        """
+        """Return the next item. Raises ``KeyError``: there is none."""
         owner, items = self._of.popitem(last=False)
         item, _ = items.popitem(last=False)
         if items:

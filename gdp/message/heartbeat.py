@@ -76,11 +76,7 @@ class Heartbeat(NamedTuple):
 
     @classmethod
     def from_wire(cls, wire: bytes) -> Heartbeat:
-        """Read the wire form.
-
-        Raises:
-            FrameError: too short for what it announces.
-        """
+        """Read the wire form. Raises ``FrameError``: too short for what it announces."""
         if len(wire) < _HEAD.size:
             raise FrameError(DropReason.TRUNCATED, "status")
         oldest, oldest_sequence, sent_number, sent_part, sent_sequence, starts, moves, gone = _HEAD.unpack_from(wire)
@@ -99,11 +95,7 @@ class Heartbeat(NamedTuple):
 
 
 def _range(first: int, last: int, reason: int) -> LostRange:
-    """Return a range as read.
-
-    Raises:
-        FrameError: it is invalid. A reason of a later version counts as GIVEN_UP.
-    """
+    """Return a range as read. Raises ``FrameError``: it is invalid. A reason of a later version counts as GIVEN_UP."""
     if first > last:
         raise FrameError(DropReason.MALFORMED, "status")
     return LostRange(first, last, LossReason(reason) if reason in _REASONS else LossReason.GIVEN_UP)

@@ -67,11 +67,7 @@ class HistoryCache:
         self.end_at += size
 
     def remove(self, number: int) -> CachedMessage:
-        """Remove and return a message.
-
-        Raises:
-            KeyError: it is not cached.
-        """
+        """Remove and return a message. Raises ``KeyError``: it is not cached."""
         message = self.messages.pop(number)
         self.held_bytes -= message.size
         return message

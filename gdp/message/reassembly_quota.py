@@ -74,11 +74,7 @@ class ReassemblyQuota:
         return True
 
     def release(self, source: bytes, size: int) -> None:
-        """Release ``size`` bytes.
-
-        Raises:
-            LocalError: more than the source holds.
-        """
+        """Release ``size`` bytes. Raises ``LocalError``: more than the source holds."""
         left = self._by_source.get(source, 0) - size
         if left < 0:
             raise LocalError("more memory given back than was taken")

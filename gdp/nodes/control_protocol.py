@@ -115,11 +115,7 @@ def decode_request(line: bytes) -> Command:
 
 
 def encode_response(response: Response) -> bytes:
-    """Return a response as one line.
-
-    Raises:
-        LocalError: the result is larger than a client accepts.
-    """
+    """Return a response as one line. Raises ``LocalError``: the result is larger than a client accepts."""
     fields: dict[str, object] = {"ok": response.is_ok}
     fields |= {"result": dict(response.result)} if response.is_ok else {"error": response.error}
     line = json.dumps(fields).encode() + b"\n"

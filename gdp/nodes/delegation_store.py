@@ -64,11 +64,7 @@ class DelegationStore:
 
 
 def open_delegation(delegation: Delegation, identity: Identity) -> Topic:
-    """Return a delegation verified, with its secrets.
-
-    Raises:
-        GdpError: it is not valid now, or has no secret.
-    """
+    """Return a delegation verified, with its secrets. Raises ``GdpError``: it is not valid now, or has no secret."""
     delegation.verify(identity, time.time())
     secrets = {epoch: grant.secret for epoch, grant in delegation.open(identity).items()}
     if not secrets:

@@ -596,11 +596,7 @@ class RibCore:
         self._letters.append(OutgoingStatement(upper, Kind.RIB_REQUEST, wire))
 
     def _upper_member(self, statement: Statement, now: Timestamps) -> Membership:
-        """Return the signer of a statement from the tier above.
-
-        Raises:
-            StatementError: it is not from there.
-        """
+        """Return the signer of a statement from the tier above. Raises ``StatementError``: it is not from there."""
         member = self._sender(statement.fields.bytes_("c"), statement, now)
         if not self._upstream.has(member.name) or member.role is not Role.RIB:
             raise StatementError(DropReason.WRONG_DOMAIN, "not from the tier above")
@@ -886,11 +882,7 @@ def _revocable(statement: Statement) -> list[tuple[bytes, bytes]]:
 
 
 def _withdrawal(statement: Statement, now: Timestamps) -> Fields:
-    """Return the fields of a withdrawal.
-
-    Raises:
-        StatementError: MALFORMED, or TOO_BIG to be forwarded.
-    """
+    """Return the fields of a withdrawal. Raises ``StatementError``: MALFORMED, or TOO_BIG to be forwarded."""
     fields = statement.expect(StatementType.WITHDRAW)
     if len(statement.wire) > WITHDRAWAL_MAX_BYTES:
         raise StatementError(DropReason.TOO_BIG, "a withdrawal")

@@ -40,11 +40,7 @@ class Watches:
         return len(self._shares)
 
     def add(self, name: Name, asker: Asker, until_s: float) -> None:
-        """Add or renew a watch.
-
-        Raises:
-            StatementError: QUOTA.
-        """
+        """Add or renew a watch. Raises ``StatementError``: QUOTA."""
         watchers = self._by_name.get(name)
         known_s = None if watchers is None else watchers.get(asker)
         if known_s is not None and watchers is not None:

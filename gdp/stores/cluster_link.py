@@ -223,11 +223,7 @@ class ClusterLink:
         return True
 
     def _refresh(self) -> None:
-        """Read the map of slots from the first server that has one.
-
-        Raises:
-            StoreError: no server has one.
-        """
+        """Read the map of slots from the first server that has one. Raises ``StoreError``: no server has one."""
         if time.monotonic() - self._refreshed_s < _REFRESH_S:
             raise StoreError("read the map of slots a moment ago")
         reason = "no server is configured"

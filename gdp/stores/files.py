@@ -84,11 +84,7 @@ def write_all(directory: Path, files: Mapping[str, NewFile], *, force: bool = Fa
 
 
 def read_public(path: Path) -> bytes:
-    """Return the content of a file.
-
-    Raises:
-        LocalError: it is missing or too long, or the system refuses.
-    """
+    """Return the content of a file. Raises ``LocalError``: it is missing or too long, or the system refuses."""
     return _read(path)
 
 
@@ -153,11 +149,7 @@ def read_at_most(file: BinaryIO, limit: int) -> bytes:
 
 
 def refuse_existing(path: Path) -> None:
-    """Refuse to replace a file, or a link of its name.
-
-    Raises:
-        LocalError: it exists already.
-    """
+    """Refuse to replace a file, or a link of its name. Raises ``LocalError``: it exists already."""
     if os.path.lexists(path):
         raise LocalError(f"{path}: is there already; --force replaces it")
 

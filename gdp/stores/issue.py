@@ -335,11 +335,7 @@ def install_delegation(node: Path, delegation: Delegation, *, force: bool = Fals
 
 
 def delegate_route(node: Path, switch: Name, *, days: float, unix_s: float | None = None) -> bytes:
-    """Return the RtCert by which a node lets a switch attract its traffic.
-
-    Raises:
-        LocalError: no node is there.
-    """
+    """Return the RtCert by which a node lets a switch attract its traffic. Raises ``LocalError``: no node is there."""
     now = _now(unix_s)
     return RtCert.make(load_identity(node, now), switch, Validity.lasting(now, days * DAY_S))
 

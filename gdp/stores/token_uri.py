@@ -41,11 +41,7 @@ class TokenUri:
 
     @classmethod
     def from_text(cls, text: str) -> TokenUri:
-        """Read a URI.
-
-        Raises:
-            LocalError: the form is not supported; the text gives the reason.
-        """
+        """Read a URI. Raises ``LocalError``: the form is not supported; the text gives the reason."""
         if not text.startswith(SCHEME) or not text.isprintable():
             raise LocalError(f"not a PKCS #11 URI, such as {_EXAMPLE}")
         path, _, query = text.removeprefix(SCHEME).partition("?")

@@ -384,11 +384,7 @@ class SwitchCore:
             raise FrameError(DropReason.UNKNOWN_KIND, str(kind))
 
     def _sender(self, arrival: ReceivedFrame) -> Neighbour:
-        """Return the neighbour with the sender's address.
-
-        Raises:
-            FrameError: UNKNOWN_SENDER, it is not up.
-        """
+        """Return the neighbour with the sender's address. Raises ``FrameError``: UNKNOWN_SENDER, it is not up."""
         port = self.hello_protocol.ports.get(arrival.port)
         for neighbour in port.neighbours.values() if port is not None else ():
             if neighbour.mac == arrival.mac and neighbour.state is NeighbourState.UP:

@@ -83,11 +83,7 @@ class AdCert:
 
     @classmethod
     def from_statement(cls, statement: Statement) -> AdCert:
-        """Read a parsed statement; its signature is not checked.
-
-        Raises:
-            StatementError: MALFORMED or WRONG_NAME.
-        """
+        """Read a parsed statement; its signature is not checked. Raises ``StatementError``: MALFORMED or WRONG_NAME."""
         fields = statement.expect(StatementType.ADCERT)
         return cls(
             subject=Subject.from_fields(fields, fields.name("name")),

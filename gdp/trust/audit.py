@@ -65,11 +65,7 @@ class AuditLine:
 
     @classmethod
     def from_line(cls, line: bytes) -> AuditLine:
-        """Read a line, with or without its end.
-
-        Raises:
-            LocalError: not in the format of ``to_line``.
-        """
+        """Read a line, with or without its end. Raises ``LocalError``: not in the format of ``to_line``."""
         try:
             read = cls(**json.loads(line))
         except (ValueError, TypeError, RecursionError) as error:

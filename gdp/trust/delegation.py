@@ -53,11 +53,7 @@ class Delegation:
         return self.subject.name
 
     def to_wire(self) -> bytes:
-        """Return the file's bytes: deterministic CBOR.
-
-        Raises:
-            LocalError: more epochs than a file may hold.
-        """
+        """Return the file's bytes: deterministic CBOR. Raises ``LocalError``: more epochs than a file may hold."""
         if len(self.grants) > EPOCHS_MAX:
             raise LocalError(f"a delegation holds at most {EPOCHS_MAX} epochs")
         grants = [{"epoch": epoch, "grant": wire} for epoch, wire in sorted(self.grants.items())]

@@ -127,11 +127,7 @@ class Ticket:
 
     @classmethod
     def from_json(cls, data: bytes) -> Ticket:
-        """Read a ticket.
-
-        Raises:
-            LocalError: not a ticket.
-        """
+        """Read a ticket. Raises ``LocalError``: not a ticket."""
         try:
             document = json.loads(data)
             responder = KemPublicKey.from_wire(base64.b64decode(document["responder"], validate=True))
@@ -163,11 +159,7 @@ class Application:
     proof: bytes
 
     def verify(self, key: PublicKey, identifier: bytes) -> None:
-        """Return if the key signed this with the token of this id.
-
-        Raises:
-            StatementError: BAD_SIGNATURE.
-        """
+        """Return if the key signed this with the token of this id. Raises ``StatementError``: BAD_SIGNATURE."""
         key.verify(self.proof, _proven(identifier, self.request, self.kem))
 
 

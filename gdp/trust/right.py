@@ -27,11 +27,7 @@ class Right(str, Enum):
 
     @classmethod
     def from_wire(cls, text: str) -> Right:
-        """Read a right.
-
-        Raises:
-            StatementError: MALFORMED, an unknown one.
-        """
+        """Read a right. Raises ``StatementError``: MALFORMED, an unknown one."""
         try:
             return cls(text)
         except ValueError as error:
@@ -44,11 +40,7 @@ HEARS: Final = MappingProxyType({Right.READ: Right.PUBLISH, Right.SERVE: Right.C
 
 
 def rights_to_wire(rights: Collection[Right]) -> list[str]:
-    """Return the sorted texts of a set of rights.
-
-    Raises:
-        LocalError: none, or one that cannot be delegated.
-    """
+    """Return the sorted texts of a set of rights. Raises ``LocalError``: none, or one that cannot be delegated."""
     if not rights or not DELEGABLE.issuperset(rights):
         raise LocalError("the rights to delegate are one or more of publish, serve, call and read")
     return sorted({right.value for right in rights})

@@ -63,11 +63,7 @@ class Assembler:
         self._labels: dict[str, int] = {}
 
     def label(self, name: str) -> None:
-        """Name the next instruction.
-
-        Raises:
-            LocalError: the label exists already.
-        """
+        """Name the next instruction. Raises ``LocalError``: the label exists already."""
         if name in self._labels:
             raise LocalError(f"label {name} stands twice")
         self._labels[name] = len(self._steps)

@@ -38,11 +38,7 @@ _START_TIME: Final = 19  # field 22 of proc_pid_stat(5), counted after the comma
 
 
 def has_links() -> bool:
-    """Return whether this kernel has TCX links.
-
-    Raises:
-        BpfError: the process may not query the kernel.
-    """
+    """Return whether this kernel has TCX links. Raises ``BpfError``: the process may not query the kernel."""
     try:
         attached(_LOOPBACK, _TCX_INGRESS)
     except BpfError as error:

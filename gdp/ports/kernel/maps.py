@@ -86,11 +86,7 @@ class KernelMap:
             self.fd = -1
 
     def put(self, key: bytes, value: bytes) -> None:
-        """Put or replace one entry.
-
-        Raises:
-            BpfError: E2BIG if the map is full.
-        """
+        """Put or replace one entry. Raises ``BpfError``: E2BIG if the map is full."""
         self._key[:], self._value[:] = key, value
         bpf(Command.MAP_UPDATE_ELEM, self._one, self._tried)
 
