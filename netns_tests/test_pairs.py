@@ -10,8 +10,8 @@ import pytest
 
 from gdp.errors import LocalError
 from gdp.names import Name
+from gdp.nodes.uplink import wait_for_device
 from gdp.nodes.veth import attach_pairs
-from gdp.nodes.wait_for_device import wait_for_device
 from gdp.ports.rtnetlink import LinkMonitor
 from netns_tests.spaces import Space
 

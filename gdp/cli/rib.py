@@ -14,7 +14,7 @@ from gdp.names import Name
 from gdp.nodes.config import RibConfig
 from gdp.nodes.membership import load_member
 from gdp.nodes.rib import run_rib
-from gdp.nodes.wait_for_device import wait_for_device
+from gdp.nodes.uplink import wait_for_device
 
 __all__ = ["main"]
 

@@ -1,4 +1,4 @@
-"""Uplink device of a RIB or proxy: locked against a second node, and opened with advice in the error.
+"""Uplink device of a RIB or proxy: awaited, locked against a second node, and opened with advice in the error.
 
 I/O.
 """
@@ -6,14 +6,20 @@ I/O.
 from __future__ import annotations
 
 import contextlib
+import logging
+import select
+import time
 from collections.abc import Iterable, Iterator
 
 from gdp.errors import LocalError
 from gdp.nodes.single_instance import own_devices
 from gdp.ports.netdev import NoDeviceError
 from gdp.ports.raw import RawPlane
+from gdp.ports.rtnetlink import LinkMonitor
 
-__all__ = ["open_uplink", "refuse_loopback"]
+__all__ = ["open_uplink", "refuse_loopback", "wait_for_device"]
+
+log = logging.getLogger(__name__)
 
 
 @contextlib.contextmanager
@@ -42,3 +48,17 @@ def refuse_loopback(ifnames: Iterable[str]) -> None:
     """Refuse the loopback device as a port, with a ``LocalError``."""
     if "lo" in ifnames:
         raise LocalError("lo is the loopback device, which leads to no neighbour; name a network device such as eth0")
+
+
+def wait_for_device(ifname: str, patience_s: float) -> None:
+    """Return when a device of this name exists, or after ``patience_s``; opening it then reports its absence."""
+    end_s = time.monotonic() + patience_s
+    with contextlib.closing(LinkMonitor()) as links:
+        found = links.all()
+        while not any(link.ifname == ifname and not link.gone for link in found):
+            rest_s = end_s - time.monotonic()
+            if rest_s <= 0:
+                return
+            log.debug("waiting for device ifname=%s", ifname)
+            select.select([links], [], [], rest_s)
+            found = links.poll()

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.control.replica import Key
-from gdp.crypto import cbor, cbor_writer
+from gdp.crypto import cbor
 from gdp.crypto.fields import Fields
 from gdp.crypto.statements import parse
 from gdp.errors import DropReason, LocalError, RemoteError, StatementError, StoreError
@@ -252,7 +252,7 @@ class ClusterStore:
         The context that a node's advertisements share is the dictionary of the compression.
         """
         body = UnverifiedAdvertisement.from_statement(parse(route.advertisement))
-        context = cbor_writer.encode(
+        context = cbor.encode(
             {
                 "w": route.sender,
                 "d": route.domain,

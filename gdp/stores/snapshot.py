@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from gdp.control.replica import Entry, Key
-from gdp.crypto import cbor, cbor_writer
+from gdp.crypto import cbor
 from gdp.crypto.fields import Fields
 from gdp.errors import RemoteError
 from gdp.stores.background_database import BackgroundDatabase
@@ -94,7 +94,7 @@ class Snapshot(BackgroundDatabase[_Slice]):
         kept = [
             (
                 _key(key),
-                cbor_writer.encode(entry.to_fields()),
+                cbor.encode(entry.to_fields()),
                 entry.until_unix_s or slice_.unix_s + entry.lease_s,
             )
             for key, entry in slice_.changes

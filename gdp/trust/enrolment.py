@@ -33,8 +33,7 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
-from gdp.crypto.cbor import decode
-from gdp.crypto.cbor_writer import encode
+from gdp.crypto.cbor import decode, encode
 from gdp.crypto.certificates import Role
 from gdp.crypto.fields import Fields
 from gdp.crypto.kem import KEM_PUBLIC_BYTES, KemPrivateKey, KemPublicKey

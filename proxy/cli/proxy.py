@@ -9,7 +9,7 @@ import typer
 
 from gdp.cli.node import AwaitIface, Check, Config, Json, Verbose, failing_clearly, set_up_logging
 from gdp.cli.version import Version
-from gdp.nodes.wait_for_device import wait_for_device
+from gdp.nodes.uplink import wait_for_device
 from proxy.cli.schema import Schema
 from proxy.config.config import ProxyConfig
 
