@@ -107,7 +107,7 @@ def read_cookie(payload: bytes) -> tuple[bytes, bytes, bytes]:
     return payload[:NONCE_BYTES], payload[NONCE_BYTES:at], payload[at : at + COOKIE_BYTES]
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Admission:
     """Budget of one port for hellos.
 
