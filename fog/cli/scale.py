@@ -191,7 +191,7 @@ def _last_words(journal: Journal, record: Record, program: str, lines: int) -> s
     Raises:
         LocalError: none were kept.
     """
-    kept = journal.last_words(record.spec.cluster, record.name)
+    kept = journal.stored_logs(record.spec.cluster, record.name)
     gone = f"{record.name} is gone: {stage(record)}, {record.reason}"
     if not kept:
         raise LocalError(f"{gone}; its logs went with it")
