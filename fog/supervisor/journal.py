@@ -25,7 +25,7 @@ from gdp.errors import LocalError, StoreError
 
 __all__ = ["FINAL_LOGS", "Cluster", "Entry", "Journal"]
 
-FINAL_LOGS: Final = "last words"
+FINAL_LOGS: Final = "final logs"
 
 _PATIENCE_S: Final = 10.0  # wait for another writing process
 _EVENTS_MAX: Final = 10_000  # older ones are deleted

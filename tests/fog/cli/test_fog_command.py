@@ -148,13 +148,13 @@ def test_a_missing_launch_file_is_reported(fog: Run) -> None:
     assert (result.exit_code, "nowhere.py" in result.output) == (2, True)
 
 
-def test_the_last_words_of_a_machine_that_is_gone_are_shown(fog: Run, journal: Journal) -> None:
+def test_the_final_log_lines_of_a_machine_that_is_gone_are_shown(fog: Run, journal: Journal) -> None:
     up(journal)
     gone = serving("m3").ended(Outcome.PREEMPTED, "killed", time.time())
     journal.put(gone, time.time(), "preempted", "killed", time.time() - 0.25)
     journal.tell(time.time(), "c", "m3", FINAL_LOGS, "node", lines="one\nout of memory")
     said = fog("logs", "m3", "node", "-n", "1").output.splitlines()
-    assert said == ["# m3 is gone: taken, killed; its last lines:", "out of memory"]
+    assert said == ["# m3 is gone: preempted, killed; its last lines:", "out of memory"]
     assert "kept are the last lines of node" in fog("logs", "m3", "switch").output
     assert "of node: out of memory" in fog("status", "--events").output
     assert "seen after 0.2" in fog("status", "--events").output
