@@ -25,7 +25,7 @@ class Process:
     started: int
 
     @classmethod
-    def of(cls, pid: int) -> Process:
+    def from_pid(cls, pid: int) -> Process:
         """Return the running process ``pid``. Raises ``ProcessLookupError``: there is no such process."""
         started = _started(pid)
         if started is None:

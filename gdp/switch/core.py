@@ -70,12 +70,12 @@ class SwitchCore:
         self._reassembler = ControlReassembler()
         self.hello_protocol = HelloProtocol(
             identity, policy, self._fragmenter, settings,
-            digest_for=self._digest_for, life_elsewhere=self._life_elsewhere,
+            digest_for=self._digest_for, incarnation_elsewhere=self._incarnation_elsewhere,
         )  # fmt: skip
         self._outbox = Outbox(self.hello_protocol, self._fragmenter)
         self._flooding = Flooding(
             identity=identity, policy=policy, hello_protocol=self.hello_protocol, send=self._send_link_state,
-            first_sequence=settings.first_sequence, life=settings.life,
+            first_sequence=settings.first_sequence, incarnation_id=settings.incarnation_id,
         )  # fmt: skip
         self._paths = self._flooding.paths
         self._verifier = AdvertisementVerifier(policy)
@@ -239,7 +239,7 @@ class SwitchCore:
         for key in self.table.expire(now_s):
             self.unicast.expired(key)
         for attachment in self.attached.expire(now_s):
-            self.unicast.forget(attachment.advertisement.name)
+            self.unicast.remove(attachment.advertisement.name)
         for topic in self.multicast.handle_timer(now_s):
             self.resolver.unwatch(topic)
         self.relocations.handle_timer(now_s)
@@ -298,8 +298,8 @@ class SwitchCore:
             for wire in self._revoker.due_for_rib(self.rib_client.rib, now_s):
                 self.rib_client.relay(wire, now_s)
 
-    def _life_elsewhere(self, name: Name) -> bytes | None:
-        return self._paths.life_elsewhere(name)
+    def _incarnation_elsewhere(self, name: Name) -> bytes | None:
+        return self._paths.incarnation_elsewhere(name)
 
     def _digest_for(self, port: HelloPort) -> bytes:
         return self._flooding.digest_for(port)
@@ -365,7 +365,7 @@ class SwitchCore:
         elif kind in (Kind.ADVERTISE, Kind.WITHDRAW):
             if not self._advertisement_paces.spend(neighbour.name, now.mono_s):
                 # No response is sent: that would cost work, too.
-                raise StatementError(DropReason.QUOTA, "claims of one neighbour")
+                raise StatementError(DropReason.QUOTA, "advertisements of one neighbour")
             take = (
                 self._advertisements.receive_advertisement if kind == Kind.ADVERTISE else self._advertisements.withdraw
             )
@@ -451,7 +451,7 @@ class SwitchCore:
                 if attachment.port == neighbour.port:
                     self.relocations.departed(attachment.advertisement, now_s)
                     self.attached.remove(attachment.advertisement.name, neighbour.name)
-                    self.unicast.forget(attachment.advertisement.name)
+                    self.unicast.remove(attachment.advertisement.name)
 
     def _send_link_state(self, neighbour: Neighbour, wire: bytes) -> None:
         self._outbox.say(neighbour, Kind.LINK_STATE, wire)

@@ -51,7 +51,7 @@ class Dependents(Holdings[AttachedAdvertisement | KnownLocation | JoinedBranch])
         self._multicast = multicast
         super().__init__(self._has)
 
-    def note_advertisement(self, advertisement: Advertisement, at: Downstream) -> None:
+    def record_advertisement(self, advertisement: Advertisement, at: Downstream) -> None:
         """Record the advertisement of an attached node."""
         self.note(AttachedAdvertisement(advertisement.name, advertisement.node, at), advertisement)
 

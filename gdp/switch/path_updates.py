@@ -104,10 +104,10 @@ class PathUpdates:
         """Drop RIBs with an older node's identity; notify nodes whose identity a younger node elsewhere copies."""
         self._conflicts_sought_s = now_s
         for neighbour in self._hello_protocol.all_up():
-            elsewhere = self._paths.life_elsewhere(neighbour.name) if neighbour.role is Role.RIB else None
-            if elsewhere is not None and elsewhere < neighbour.life:
+            elsewhere = self._paths.incarnation_elsewhere(neighbour.name) if neighbour.role is Role.RIB else None
+            if elsewhere is not None and elsewhere < neighbour.incarnation_id:
                 self._hello_protocol.let_go(neighbour, now_s)
         for name in self._paths.refused_elsewhere():
             self._hello_protocol.tell_conflicts(name, now_s)
             if name == self._me:
-                self._hello_protocol.note_clash(name, now_s)
+                self._hello_protocol.record_clash(name, now_s)

@@ -66,7 +66,7 @@ _ENTRY: Final = Entry(
     via=_A,
     transit=(_A,),
     lease_s=9.0,
-    is_from_above=False,
+    is_from_upstream=False,
 )
 _READS: Final[dict[str, tuple[bytes, Callable[[Fields], object]]]] = {
     **{name.replace(" ", "-"): (wire, read) for name, (wire, _, read) in BODIES.items()},

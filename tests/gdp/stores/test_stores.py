@@ -336,7 +336,7 @@ def slice_of(generation: int) -> list[tuple[Key, Entry | None]]:
         via=name,
         transit=(),
         lease_s=60.0,
-        is_from_above=False,
+        is_from_upstream=False,
     )
     return [((Name(at.to_bytes(32, "big")), name), entry) for at in range(1, SLICE + 1)]
 
