@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from gdp.cli.gdp import main
-from gdp.nodes.single_instance import _place
+from gdp.nodes.single_instance import lock_directory
 from netns_tests.spaces import Space
 from netns_tests.test_pairs import devices
 
@@ -21,7 +21,14 @@ pytestmark = pytest.mark.netns
 _PATIENCE_S = 60.0
 _MACS = bytes.fromhex("020000000001"), bytes.fromhex("020000000002")
 _PROXY = "identity: proxy\ndomain: {root: proxy/root.crt}\ndelegations: proxy/delegations\niface: proxy0\n"
-_OTHER_HOST = ("unshare", "--mount", "sh", "-c", 'mount -t tmpfs -o mode=700 locks "$0" && exec "$@"', str(_place()))
+_OTHER_HOST = (
+    "unshare",
+    "--mount",
+    "sh",
+    "-c",
+    'mount -t tmpfs -o mode=700 locks "$0" && exec "$@"',
+    str(lock_directory()),
+)
 _PROGRAMS = {"switch": "gdp.cli.switch", "rib": "gdp.cli.rib", "proxy": "proxy.cli.proxy"}
 
 

@@ -25,7 +25,7 @@ from gdp.names import Name
 from gdp.nodes import single_instance
 from pathlib import Path
 single_instance._ROOT_DIRECTORY = Path(sys.argv[2])
-single_instance._place = lambda: single_instance._ROOT_DIRECTORY
+single_instance.lock_directory = lambda: single_instance._ROOT_DIRECTORY
 with single_instance.run_alone("switch", Name.from_text(sys.argv[1])), single_instance.own_devices(["eth7"]):
     print("held", flush=True)
     sys.stdin.read()
@@ -35,7 +35,7 @@ with single_instance.run_alone("switch", Name.from_text(sys.argv[1])), single_in
 @pytest.fixture(autouse=True)
 def _directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(single_instance, "_ROOT_DIRECTORY", tmp_path / "locks")
-    monkeypatch.setattr(single_instance, "_place", lambda: tmp_path / "locks")
+    monkeypatch.setattr(single_instance, "lock_directory", lambda: tmp_path / "locks")
 
 
 @contextmanager
@@ -83,7 +83,7 @@ def test_the_lock_of_a_process_that_ended_is_free_and_leaves_no_file(tmp_path: P
 
 
 def test_another_user_sees_the_locks_of_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(single_instance, "_place", lambda: tmp_path / "of-a-user")
+    monkeypatch.setattr(single_instance, "lock_directory", lambda: tmp_path / "of-a-user")
     with holder(tmp_path), pytest.raises(LocalError, match="already runs"):
         hold()
     hold()
@@ -92,7 +92,7 @@ def test_another_user_sees_the_locks_of_root(tmp_path: Path, monkeypatch: pytest
 def test_where_no_lock_can_be_held_the_node_runs_and_a_warning_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(single_instance, "_place", lambda: tmp_path / "nowhere" / "locks")
+    monkeypatch.setattr(single_instance, "lock_directory", lambda: tmp_path / "nowhere" / "locks")
     with caplog.at_level(logging.WARNING):
         hold()
     assert "goes unnoticed" in caplog.text
