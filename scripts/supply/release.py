@@ -171,7 +171,10 @@ def _checked_out(root: Path, commit: str) -> Iterator[Path]:
     if archive.returncode:
         raise ReleaseError(archive.stderr.decode(errors="replace").strip())
     with tempfile.TemporaryDirectory() as folder, tarfile.open(fileobj=io.BytesIO(archive.stdout)) as tar:
-        tar.extractall(folder, **({"filter": "tar"} if hasattr(tarfile, "tar_filter") else {}))  # of our own git
+        if hasattr(tarfile, "tar_filter"):
+            tar.extractall(folder, filter="tar")  # of our own git
+        else:
+            tar.extractall(folder)
         yield Path(folder)
 
 

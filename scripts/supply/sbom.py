@@ -135,15 +135,19 @@ def _component(pin: Pin, dist: Distribution | None) -> dict[str, Any]:
 
 def _licences(dist: Distribution) -> list[dict[str, Any]]:
     """Return the licence of a package: an SPDX expression, else its words."""
-    if expression := dist.metadata.get("License-Expression"):
+    if expression := _field(dist, "License-Expression"):
         return [{"expression": expression}]
     words = [
         each.rpartition(" :: ")[2] for each in dist.metadata.get_all("Classifier", []) if each.startswith("License ::")
     ]
-    text = (dist.metadata.get("License") or "").strip()
+    text = _field(dist, "License").strip()
     if not words and text and len(text) <= _LICENCE_MAX_CHARS and "\n" not in text:
         words = [text]
     return [{"license": {"name": each}} for each in words]
+
+
+def _field(dist: Distribution, name: str) -> str:
+    return next(iter(dist.metadata.get_all(name) or ()), "")
 
 
 def _installed(pin: Pin) -> Distribution | None:
@@ -156,7 +160,7 @@ def _installed(pin: Pin) -> Distribution | None:
 
 def _requires(dist: Distribution) -> set[str]:
     """Return the requirements of a package here, without extras, by name."""
-    names = set()
+    names: set[str] = set()
     for text in dist.requires or ():
         try:
             requirement = Requirement(text)
