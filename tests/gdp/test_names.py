@@ -36,7 +36,8 @@ def test_the_published_names_all_differ() -> None:
 
 
 def test_a_name_is_found_in_a_table_by_the_bytes_of_a_frame() -> None:
-    assert {Name(bytes(range(32))): 1}[bytes(range(32))] == 1
+    table: dict[bytes, int] = {Name(bytes(range(32))): 1}
+    assert table[bytes(range(32))] == 1
 
 
 def test_text_form_keeps_leading_zeros_and_comes_back() -> None:
