@@ -135,19 +135,15 @@ def _component(pin: Pin, dist: Distribution | None) -> dict[str, Any]:
 
 def _licences(dist: Distribution) -> list[dict[str, Any]]:
     """Return the licence of a package: an SPDX expression, else its words."""
-    if expression := _field(dist, "License-Expression"):
-        return [{"expression": expression}]
+    if expressions := dist.metadata.get_all("License-Expression"):
+        return [{"expression": expressions[0]}]
     words = [
         each.rpartition(" :: ")[2] for each in dist.metadata.get_all("Classifier", []) if each.startswith("License ::")
     ]
-    text = _field(dist, "License").strip()
+    text = "".join(dist.metadata.get_all("License", [])[:1]).strip()
     if not words and text and len(text) <= _LICENCE_MAX_CHARS and "\n" not in text:
         words = [text]
     return [{"license": {"name": each}} for each in words]
-
-
-def _field(dist: Distribution, name: str) -> str:
-    return next(iter(dist.metadata.get_all(name) or ()), "")
 
 
 def _installed(pin: Pin) -> Distribution | None:
