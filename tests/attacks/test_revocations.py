@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 
@@ -161,9 +162,9 @@ def test_a05_a_junk_revocation_has_nothing_verified_again(monkeypatch: pytest.Mo
     for what in ("verify", "recheck"):
         before = getattr(switch._verifier, what)
 
-        def counted(*given: object, before: object = before) -> object:
+        def counted(*given: object, before: Callable[..., object] = before) -> object:
             looks[0] += 1
-            return before(*given)  # type: ignore[operator]
+            return before(*given)
 
         monkeypatch.setattr(switch._verifier, what, counted)
     now = world.network.now
