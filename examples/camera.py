@@ -25,4 +25,4 @@ async def main(role: str, node: str, count: int = 30) -> None:
                     break
 
 
-asyncio.run(main(*sys.argv[1:3]))
+asyncio.run(main(sys.argv[1], sys.argv[2]))

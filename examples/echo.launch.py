@@ -6,7 +6,7 @@
 from fog import DeclareLaunchArgument, FogCluster, LaunchConfiguration, LaunchDescription, Node, SpotMachine
 
 
-def generate_launch_description():
+def generate_launch_description() -> LaunchDescription:
     rate = DeclareLaunchArgument("rate", default_value="20.0", description="Calls a second.")
     cluster = FogCluster(
         name="echo",

@@ -6,7 +6,7 @@
 from fog import CloudMachine, FogCluster, LaunchDescription, Node, SpotMachine
 
 
-def generate_launch_description():
+def generate_launch_description() -> LaunchDescription:
     detector = Node(package="detection", executable="detector")
     FogCluster(
         cloud_nodes=[detector],

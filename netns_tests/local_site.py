@@ -13,7 +13,7 @@ from typing import Final
 import yaml
 
 from fog.hardware import Hardware
-from fog.machine import Machine, MachineBundle, MachineSpec, Program
+from fog.machine import Machine, MachineBundle, MachineSpec, MachineState, Program
 from fog.offer import Offer
 from fog.providers.local.netlinks import UP
 from fog.providers.local.provider import LocalProvider
@@ -49,6 +49,11 @@ def machine_of(provider: LocalProvider, machine: str) -> Machine:
     """Return the provider's description of a machine."""
     (found,) = (each for each in provider.describe("test") if each.id == machine)
     return found
+
+
+def is_running(provider: LocalProvider, machine: str) -> bool:
+    """Return whether a machine runs."""
+    return machine_of(provider, machine).state is MachineState.RUNNING
 
 
 def plain_gateway(_: str, __: Sequence[str]) -> MachineBundle:

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -60,7 +59,7 @@ class Nodes:
 
 
 @pytest.fixture
-def nodes(space: Space, commands: Commands) -> Iterator[Nodes]:
+def nodes(space: Space, commands: Commands) -> Nodes:
     """Running nodes of one domain."""
     del space
     return Nodes(commands)

@@ -28,6 +28,7 @@ from gdp.host import netns_files
 from netns_tests.local_site import (
     PATIENCE_S,
     Domain,
+    is_running,
     leftovers,
     machine_of,
     plain_gateway,
@@ -79,7 +80,7 @@ def test_a_machine_boots_and_is_reached_through_the_trees_gateways(folder: Path,
             provider.create(spec("m2", "us-west-1"), domain.machine("m2")),
         ]
         for machine in ids:  # its proxy is attached when the robot's RIB has acknowledged it
-            until(lambda m=machine: machine_of(provider, m).state is MachineState.RUNNING, "running")
+            until(partial(is_running, provider, machine), "running")
         assert {find(provider.runs, machine).gateway.name[-5:] for machine in ids} == {"-west"}
         provider.drain(ids[0])
         until(lambda: machine_of(provider, ids[0]).state is MachineState.GONE, "drained")

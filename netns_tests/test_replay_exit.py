@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -57,13 +58,13 @@ def _stand_up(machines: Machines, terminals: Terminals) -> tuple[str, Path]:
     return recorder
 
 
-def _replay(machines: Machines, more: str = "") -> tuple[int, dict[str, object]]:
+def _replay(machines: Machines, more: str = "") -> tuple[int, dict[str, Any]]:
     """Replay; return the exit code and the content of the last events."""
     words = f"{_REPLAY} {more}".split()
     done = subprocess.run(
         words, cwd=machines.robot, env=machines.environment, capture_output=True, text=True, check=False
     )
-    said: dict[str, object] = {}
+    said: dict[str, Any] = {}
     for line in done.stdout.splitlines():
         said |= json.loads(line)
     return done.returncode, said

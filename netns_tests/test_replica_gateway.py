@@ -14,13 +14,13 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import closing
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 from pyroute2 import IPRoute
 
-from fog.machine import MachineState
 from fog.providers.local import fault_injection
 from fog.providers.local.machine_handle import find
 from fog.providers.local.netlinks import UP, exists
@@ -33,7 +33,17 @@ from gdp.errors import LocalError
 from gdp.host import netns_files
 from gdp.limits import CALL_QUIET_S
 from gdp.metadata import Metadata
-from netns_tests.local_site import PATIENCE_S, Domain, leftovers, machine_of, plain_gateway, spec, ticking, until
+from netns_tests.local_site import (
+    PATIENCE_S,
+    Domain,
+    is_running,
+    leftovers,
+    machine_of,
+    plain_gateway,
+    spec,
+    ticking,
+    until,
+)
 from netns_tests.spaces import Space
 from netns_tests.test_fog import Fog, left_of
 from netns_tests.test_uplink import BYTES, OVERHEAD_BYTES, PARTS, REQUESTS, tell
@@ -119,7 +129,7 @@ def test_the_uplink_carries_one_copy_of_a_request_whichever_machine_is_the_gatew
         machines = [provider.create(spec(name), domain.replica(name, SERVICE)) for name in ("m1", "m2", "m3")]
         provider.attach_uplink(machines[0])
         for each in machines:
-            until(lambda m=each: machine_of(provider, m).state is MachineState.RUNNING, "running")
+            until(partial(is_running, provider, each), "running")
         client = domain.start_client("client0", SERVICE, REQUESTS, BYTES)
         once = REQUESTS * (BYTES + PARTS * OVERHEAD_BYTES)
         for gateway, before in ((machines[0], None), (machines[1], machines[0])):

@@ -113,7 +113,7 @@ def commands(space: Space, tmp_path: Path) -> Iterator[Commands]:
         node.process.wait()
 
 
-def assert_fenced(node: Node, kept: set[int]) -> None:
+def assert_fenced(node: Node, kept: set[Capability]) -> None:
     node.until(" rights ")
     status = node.status
     assert node.capabilities == kept

@@ -153,8 +153,9 @@ class Reader:
 def reader(machines: Machines, terminals: Terminals, robot: Peer, desk: Peer) -> Reader:
     """Reader who has followed the page up to the start."""
     made = Reader(machines, terminals)
-    for heading in ("What you need", "Keys", "The two files"):
-        printed = made.follow(heading)
+    made.follow("What you need")
+    made.follow("Keys")
+    printed = made.follow("The two files")
     for file, right in (("robot", "publish"), ("server", "read")):
         assert f"{file}/proxy.yaml: + {right} topic /camera/left [sensor_msgs/msg/Image]" in printed
     made.follow("Start")

@@ -12,7 +12,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
+from lz4.frame import LZ4FrameDecompressor
 from rosbags.rosbag1 import ReaderError as ReaderError1
 from rosbags.rosbag1 import reader as rosbag1_reader
 from rosbags.rosbag2 import ReaderError as ReaderError2

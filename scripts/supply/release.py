@@ -163,15 +163,13 @@ def _check_sums(folder: Path) -> list[str]:
 @contextlib.contextmanager
 def _checked_out(root: Path, commit: str) -> Iterator[Path]:
     """Yield a folder with the files of a commit, with the modes of umask 022."""
-    archive = subprocess.run(
-        ["git", "-C", str(root), "-c", "tar.umask=022", "archive", "--format=tar", commit],
-        capture_output=True,
-        check=False,
-    )
+    words = ["git", "-C", str(root), "-c", "tar.umask=022", "archive", "--format=tar", commit]
+    archive = subprocess.run(words, capture_output=True, check=False)
     if archive.returncode:
         raise ReleaseError(archive.stderr.decode(errors="replace").strip())
     with tempfile.TemporaryDirectory() as folder, tarfile.open(fileobj=io.BytesIO(archive.stdout)) as tar:
-        tar.extractall(folder, **({"filter": "tar"} if hasattr(tarfile, "tar_filter") else {}))  # of our own git
+        tar.extraction_filter = getattr(tarfile, "tar_filter", None)  # the archive is of our own git
+        tar.extractall(folder)
         yield Path(folder)
 
 

@@ -135,12 +135,12 @@ def _component(pin: Pin, dist: Distribution | None) -> dict[str, Any]:
 
 def _licences(dist: Distribution) -> list[dict[str, Any]]:
     """Return the licence of a package: an SPDX expression, else its words."""
-    if expression := dist.metadata.get("License-Expression"):
-        return [{"expression": expression}]
+    if expressions := dist.metadata.get_all("License-Expression"):
+        return [{"expression": expressions[0]}]
     words = [
         each.rpartition(" :: ")[2] for each in dist.metadata.get_all("Classifier", []) if each.startswith("License ::")
     ]
-    text = (dist.metadata.get("License") or "").strip()
+    text = "".join(dist.metadata.get_all("License", [])[:1]).strip()
     if not words and text and len(text) <= _LICENCE_MAX_CHARS and "\n" not in text:
         words = [text]
     return [{"license": {"name": each}} for each in words]
@@ -156,7 +156,7 @@ def _installed(pin: Pin) -> Distribution | None:
 
 def _requires(dist: Distribution) -> set[str]:
     """Return the requirements of a package here, without extras, by name."""
-    names = set()
+    names: set[str] = set()
     for text in dist.requires or ():
         try:
             requirement = Requirement(text)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeVar
 
@@ -33,10 +34,10 @@ def off(machine: _M, by_s: float) -> _M:
     for name in ("add_port", "receive", "port_changed", "handle_timer"):
         method = getattr(machine, name)
 
-        def shifted(*given: object, method: object = method) -> None:
+        def shifted(*given: object, method: Callable[..., None] = method) -> None:
             *others, now = given
             assert isinstance(now, Timestamps)
-            method(*others, now._replace(unix_s=now.unix_s + by_s))  # type: ignore[operator]
+            method(*others, now._replace(unix_s=now.unix_s + by_s))
 
         setattr(machine, name, shifted)
     return machine

@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from cryptography.hazmat.primitives.asymmetric import ec
 
 from fog.enrolment.listener import CONNECTION_S, CONNECTIONS_MAX, Listener, bind_tcp
 from fog.enrolment.responder import OPENED_MAX, Responder
@@ -29,7 +30,7 @@ from fog.supervisor.journal import Journal
 from gdp.crypto.certificates import Membership, Role, Root
 from gdp.crypto.identity import NodeKeys
 from gdp.crypto.kem import KemPrivateKey
-from gdp.crypto.keys import PublicKey, SigningKey
+from gdp.crypto.keys import PublicKey, SigningKey, SoftwareKey
 from gdp.errors import LocalError, StatementError
 from gdp.stores.audit_log import verify_audit
 from gdp.stores.keyring import load_domain, load_owner
@@ -89,10 +90,19 @@ def launchers_secrets(desk: Desk) -> list[bytes]:
 def test_a52_no_provider_tells_a_machine_a_private_key(
     desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, provider: str
 ) -> None:
-    drawn: list[object] = []
+    drawn: list[str] = []
     generate, generate_kem = SigningKey.generate, KemPrivateKey.generate
-    monkeypatch.setattr(SigningKey, "generate", staticmethod(lambda: drawn.append("key") or generate()))
-    monkeypatch.setattr(KemPrivateKey, "generate", staticmethod(lambda: drawn.append("kem") or generate_kem()))
+
+    def counted() -> SoftwareKey:
+        drawn.append("key")
+        return generate()
+
+    def counted_kem() -> KemPrivateKey:
+        drawn.append("kem")
+        return generate_kem()
+
+    monkeypatch.setattr(SigningKey, "generate", staticmethod(counted))
+    monkeypatch.setattr(KemPrivateKey, "generate", staticmethod(counted_kem))
     boot = desk.boot(shares_host=provider == "local")
     if provider == "local":
         install(tmp_path / "home", boot)
@@ -363,8 +373,17 @@ def dear(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Counter of operations that cost more than a hash."""
     done: list[str] = []
     opened, verified = KemPrivateKey.open, PublicKey._verify
-    monkeypatch.setattr(KemPrivateKey, "open", lambda self, *words: done.append("open") or opened(self, *words))
-    monkeypatch.setattr(PublicKey, "_verify", lambda self, *words: done.append("verify") or verified(self, *words))
+
+    def counted_open(self: KemPrivateKey, sealed: bytes, info: bytes) -> bytes:
+        done.append("open")
+        return opened(self, sealed, info)
+
+    def counted_verify(self: PublicKey, signature: bytes, data: bytes, scheme: ec.ECDSA) -> None:
+        done.append("verify")
+        verified(self, signature, data, scheme)
+
+    monkeypatch.setattr(KemPrivateKey, "open", counted_open)
+    monkeypatch.setattr(PublicKey, "_verify", counted_verify)
     return done
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 
@@ -298,7 +299,7 @@ def test_a_node_that_moves_to_a_leaf_and_on_keeps_its_reader() -> None:
     flow = flowing(world, source=TALKER, readers=(LISTENER,))
     flow.stream(300, 0.02, size=100)
     for at_s, to in ((1.0, "leaf"), (3.0, "right"), (4.5, "leaf")):
-        world.network.call(at_s, lambda to=to: world.roam(TALKER, to))  # type: ignore[misc]
+        world.network.call(at_s, partial(world.roam, TALKER, to))
     assert world.network.run(30, lambda: flow.has(LISTENER, 300))
     assert flow.numbers(LISTENER) == list(range(300))
     flow.outlive()

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
+from gdp.names import Name
+from gdp.switch.core import SwitchCore
 from gdp.switch.table import is_side
 from tests.journeys.flows import ROBOT, SERVER, Tap, flowing, ring
 from tests.journeys.test_attacks import mac_of, still_flows
@@ -40,11 +44,15 @@ def test_a19_a_frame_in_a_publishers_name_from_below_it_becomes_no_copies() -> N
     flow.outlive()
 
 
+def is_attached(switch: SwitchCore, member: Name) -> bool:
+    return switch.attached.of(member) != []
+
+
 def test_a19_a_topic_follows_its_publisher_to_another_side() -> None:
     world = ring()
     flow = flowing(world)
     for switch in ("nuc2", "nuc3", "nuc1"):
         world.roam(ROBOT, switch)
-        assert world.network.run(5, lambda at=world.switches[switch]: at.attached.of(flow.member.name) != [])  # type: ignore[misc]
+        assert world.network.run(5, partial(is_attached, world.switches[switch], flow.member.name))
         still_flows(flow)
     flow.outlive()

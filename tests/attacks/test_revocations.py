@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.nodes.revocation_upkeep import RevocationUpkeep
 from gdp.simulation.simulation import Simulation
+from gdp.trust.advertisement import Advertisement
 from gdp.trust.revocation import Revocation
 from gdp.trust.revocations import hash_of
 from gdp.trust.right import Right
@@ -160,9 +162,9 @@ def test_a05_a_junk_revocation_has_nothing_verified_again(monkeypatch: pytest.Mo
     for what in ("verify", "recheck"):
         before = getattr(switch._verifier, what)
 
-        def counted(*given: object, before: object = before) -> object:
+        def counted(*given: object, before: Callable[..., object] = before) -> object:
             looks[0] += 1
-            return before(*given)  # type: ignore[operator]
+            return before(*given)
 
         monkeypatch.setattr(switch._verifier, what, counted)
     now = world.network.now
@@ -192,13 +194,14 @@ def test_a05_a_real_revocation_has_only_what_rests_on_it_verified_again(monkeypa
         flow.read_by(f"nuc1/reader{label}")
     assert world.network.run(5, lambda: flow.is_read_by(9))
     switch = world.switches["nuc1"]
-    seen: list[object] = []
+    seen: list[Name] = []
     before = switch._verifier.recheck
-    monkeypatch.setattr(
-        switch._verifier,
-        "recheck",
-        lambda advertisement, at: (seen.append(advertisement.node), before(advertisement, at))[1],
-    )
+
+    def recheck(advertisement: Advertisement, unix_s: float) -> None:
+        seen.append(advertisement.node)
+        before(advertisement, unix_s)
+
+    monkeypatch.setattr(switch._verifier, "recheck", recheck)
     reader = world.members["nuc1/reader3"]
     delegation = reader.subscribed()[0].delegation
     wire = world.owner.revoke(delegation.subject, parse(delegation.chain[-1]).fingerprint, until(world))

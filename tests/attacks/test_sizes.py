@@ -139,7 +139,9 @@ def contained() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("contained")
-def test_an_error_of_ours_is_contained_counted_logged_once_and_its_sender_quarantined() -> None:
+def test_an_error_of_ours_is_contained_counted_logged_once_and_its_sender_quarantined(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     world = ring()
     flow = flowing(world)
     nuc1 = world.switches["nuc1"]
@@ -147,16 +149,16 @@ def test_an_error_of_ours_is_contained_counted_logged_once_and_its_sender_quaran
     def broken(*_: object) -> None:
         raise ZeroDivisionError("a fault of ours")
 
-    whole, nuc1._advertisements.receive_advertisement = nuc1._advertisements.receive_advertisement, broken  # type: ignore[method-assign]
     robot = world.identities[ROBOT]
     wire = sign(StatementType.ADVERTISE, {}, robot.name, robot.key)
-    for number in range(6):
-        say(world, Kind.ADVERTISE, wire, (1 << 40) + number)
+    with monkeypatch.context() as patch:
+        patch.setattr(nuc1._advertisements, "receive_advertisement", broken)
+        for number in range(6):
+            say(world, Kind.ADVERTISE, wire, (1 << 40) + number)
     assert nuc1.drops()[DropReason.INTERNAL] == 3
     assert nuc1.drops()[DropReason.QUARANTINED] == 3
     (text,) = nuc1.boundary.poll_tracebacks()
     assert "a fault of ours" in text
-    nuc1._advertisements.receive_advertisement = whole  # type: ignore[method-assign]
     still_flows(flow)
     world.network.run(11)
     say(world, Kind.ADVERTISE, wire, 1 << 41)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from itertools import count
 from os import urandom
 
@@ -12,7 +13,6 @@ from gdp.crypto.envelope import SALT_BYTES, SIGNATURE_BYTES, Sealer
 from gdp.frame.codec import HEADER_BYTES
 from gdp.frame.kinds import Kind
 from gdp.names import NAME_BYTES
-from gdp.nodes import membership
 from gdp.nodes.membership import fresh_bytes, incarnation
 from tests.gdp.message.sealed import INCARNATION, SECRET, SOURCE, TOPIC, WRITER
 
@@ -47,6 +47,11 @@ def test_a32_copies_of_a_publisher_do_not_repeat_a_nonce() -> None:
 
 def test_a32_what_was_drawn_before_the_snapshot_seals_nothing_after_it() -> None:
     drawn: list[bytes] = []
+
+    def draw(size: int) -> bytes:
+        drawn.append(urandom(size))
+        return drawn[-1]
+
     sealer = Sealer(
         secret=SECRET,
         epoch=1,
@@ -55,7 +60,7 @@ def test_a32_what_was_drawn_before_the_snapshot_seals_nothing_after_it() -> None
         incarnation=INCARNATION,
         destination=TOPIC,
         signer=WRITER,
-        random_bytes=lambda size: drawn.append(urandom(size)) or drawn[-1],
+        random_bytes=draw,
     )
     for number in range(1, 5):
         assert len(drawn) == number - 1
@@ -84,7 +89,7 @@ def test_a32_copies_of_a_reader_that_use_one_number_give_no_plaintext_away() -> 
 
 
 def test_a32_fresh_bytes_differ_even_where_the_generator_repeats_itself(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(membership.os, "urandom", bytes)
+    monkeypatch.setattr(os, "urandom", bytes)
     assert len({fresh_bytes(8) for _ in range(100)}) == 100
     assert len({incarnation() for _ in range(100)}) == 100
     assert {len(fresh_bytes(size)) for size in (8, 32, 64)} == {8, 32, 64}

@@ -112,7 +112,8 @@ def _of_statement(wire: bytes, read: Callable[[Statement], object]) -> Callable[
 
 def _control(data: bytes) -> object:
     """Take frames, each after two bytes of its length."""
-    reassembler, at, got = ControlReassembler(), 0, []
+    reassembler, at = ControlReassembler(), 0
+    got: list[bytes | None] = []
     while at + 2 <= len(data):
         end = at + 2 + int.from_bytes(data[at : at + 2], "big")
         frame = data[at + 2 : end]

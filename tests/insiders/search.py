@@ -90,7 +90,7 @@ def searched(statements: int, processes: int, seed: int, seconds: float | None =
     """Run trials until this many statements were tried, or the time is over; yield the results after each."""
     search, begun_s = Search(), time.monotonic()
     seeds, words = iter(range(seed, seed + 1_000_000_000)), min(statements, WORDS)
-    with ProcessPoolExecutor(processes, mp_context=get_context("fork"), max_tasks_per_child=None) as pool:
+    with ProcessPoolExecutor(processes, mp_context=get_context("fork")) as pool:
         under_way = {pool.submit(run_plan, plan_of(next(seeds), words)) for _ in range(processes)}
         while under_way:
             done, under_way = wait(under_way, return_when=FIRST_COMPLETED)

@@ -20,8 +20,6 @@ from gdp.client.rib_host import RibHost
 from gdp.control.hello import ECHO_BYTES
 from gdp.control.hello_port import HelloPort
 from gdp.crypto.identity import Identity
-from gdp.limits import RIB_NAMES_PER_SENDER, RIB_WATCHES_MAX
-from gdp.rib.core import RibSettings
 from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from gdp.switch.core import SwitchCore
@@ -130,13 +128,11 @@ class Stage:
     """Settled network: topics flow, a service works, one member is revoked.
 
     Attributes:
-        rib_limits: names of one sender, and watches, that each RIB keeps.
         flow: the good one.
         topics: what the insiders may do with their topic and their service, by label and right.
     """
 
     seed: int
-    rib_limits: tuple[int, int] = (RIB_NAMES_PER_SENDER, RIB_WATCHES_MAX)
     world: Simulation = field(init=False)
     flow: Flow = field(init=False)
     topics: dict[str, Topic] = field(default_factory=dict)
@@ -154,13 +150,6 @@ class Stage:
             trusts=dict.fromkeys(_TRUSTED, _TRUSTED) | {"stranger": ("stranger", *_TRUSTED)},
         )
         self._rib_nodes = {label: world.rib_node(label) for label in world.ribs}
-        names, watches = self.rib_limits
-        for host in world.ribs.values():
-            settings = host.rib._settings
-            host.rib._settings = RibSettings(
-                upper=settings.upper, peers=settings.peers, names_per_sender=names, watches=watches
-            )
-            host.rib._watches._maximum = host.rib._holders._maximum = watches
         world.settle(8.0)
         source, sink = GOOD
         topic = world.topic("/good", world.members[source], [Right.PUBLISH])

@@ -354,7 +354,7 @@ def shrunk(plan: Plan, fails: Callable[[Plan], bool], budget_s: float = 120.0) -
             at, has_changed = 0, False
             while at < len(items) and time.monotonic() < until_s:
                 less = (*items[:at], *items[at + size :])
-                smaller = replace(plan, **{part: less})
+                smaller = replace(plan, words=less) if part == "words" else replace(plan, acts=less)
                 if fails(smaller):
                     plan, items, has_changed = smaller, less, True
                 else:

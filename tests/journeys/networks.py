@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import partial
 from itertools import pairwise
 from typing import Final
 from unittest import mock
@@ -216,7 +217,7 @@ class Trial:
         for flow in flows:
             flow.stream(count, PERIOD_S, size=50)
         for fault in self.plan.faults:
-            self.world.network.call(fault.after_s, lambda fault=fault: self._fail(fault))
+            self.world.network.call(fault.after_s, partial(self._fail, fault))
         self.world.network.run(count * PERIOD_S + 3.0)
         self._collect(flows)
         for flow in flows:
@@ -234,7 +235,7 @@ class Trial:
             return Fate.NONE
         own, far = (self.topology.domain_of(each).label for each in (start, end))
         barred = {f"d{d}" for d in self.plan.barred} - {own, far}
-        left = nx.Graph()
+        left: nx.Graph[str] = nx.Graph()
         left.add_nodes_from(set(self.topology.nodes) - self.dead)
         for link in self.topology.links:
             if link.ends() not in self.cut and not link.ends() & self.dead:

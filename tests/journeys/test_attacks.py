@@ -303,7 +303,8 @@ def test_a_join_without_evidence_installs_nothing() -> None:
     flow = flowing(world)
     nuc2, nuc1 = world.identities["nuc2"], world.switches["nuc1"]
     secret = Name(b"t" * 32)
-    session = nuc1.hello_protocol.ports[0].echo
+    session, neighbour = nuc1.hello_protocol.ports[0].echo, nuc1.hello_protocol.neighbour(0, nuc2.name)
+    assert neighbour is not None
     domains = frozenset(nuc1._policy.transit)
     join = Join(
         topic=secret,
@@ -316,7 +317,7 @@ def test_a_join_without_evidence_installs_nothing() -> None:
         evidence=b"",
         session=session,
         sequence=1 << 60,
-        sender_session=nuc1.hello_protocol.neighbour(0, nuc2.name).nonce,
+        sender_session=neighbour.nonce,
     )
     world.network.inject("nuc1", 0, control(Kind.JOIN, join.to_wire(nuc2.name, nuc2.key)), mac_of(world, "nuc1"))
     assert nuc1.multicast.trees.of_topic(secret) == []
@@ -331,6 +332,8 @@ def test_a_join_with_evidence_of_another_topic_installs_nothing() -> None:
     nuc2, nuc1 = world.identities["nuc2"], world.switches["nuc1"]
     evidence = nuc1.multicast.trees.of_topic(flow.topic.name)[0].evidence
     secret, session = Name(b"t" * 32), nuc1.hello_protocol.ports[0].echo
+    neighbour = nuc1.hello_protocol.neighbour(0, nuc2.name)
+    assert neighbour is not None
     domains = frozenset(nuc1._policy.transit)
     join = Join(
         topic=secret,
@@ -343,7 +346,7 @@ def test_a_join_with_evidence_of_another_topic_installs_nothing() -> None:
         evidence=evidence,
         session=session,
         sequence=1 << 60,
-        sender_session=nuc1.hello_protocol.neighbour(0, nuc2.name).nonce,
+        sender_session=neighbour.nonce,
     )
     world.network.inject("nuc1", 0, control(Kind.JOIN, join.to_wire(nuc2.name, nuc2.key)), mac_of(world, "nuc1"))
     assert nuc1.multicast.trees.of_topic(secret) == []

@@ -22,7 +22,7 @@ def three_tiers() -> Simulation:
     """Return a publisher and a reader in two bottom domains, each below a middle one, and these below the top."""
     uppers = {"m": "t", "n": "t", "l": "m", "r": "n"}
     topology = Topology(
-        tuple(Link(*each.split("-")) for each in ("m1-t1", "n1-t1", "l1-m1", "r1-n1")),
+        (Link("m1", "t1"), Link("n1", "t1"), Link("l1", "m1"), Link("r1", "n1")),
         tuple(DomainPlan(label, switches, uppers.get(label)) for label, switches in TIERS.items()),
         (
             *(Attachment(switch, "rib", "rib") for (switch,) in TIERS.values()),

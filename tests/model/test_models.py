@@ -32,7 +32,8 @@ def _copy(folder: Path) -> Path:
 
 
 def test_no_model_has_changed_since_its_proof() -> None:
-    proved = dict(reversed(line.split("  ")) for line in (MODELS / "SHA256SUMS").read_text().splitlines())
+    lines = (MODELS / "SHA256SUMS").read_text().splitlines()
+    proved = {name: digest for digest, name in (line.split("  ") for line in lines)}
     present = [*MODELS.glob("*.pv"), *MODELS.glob("*.pvl")]
     assert proved == {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in present}
 

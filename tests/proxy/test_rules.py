@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import yaml
 
 from gdp.errors import LocalError
 from gdp.metadata import Metadata
@@ -44,7 +45,7 @@ GOOD = [
 
 @pytest.mark.parametrize("text", GOOD)
 def test_a_good_rule_is_taken(place: Path, text: str) -> None:
-    assert rule(place, text)
+    assert rule(place, text).name == yaml.safe_load(f"{{{text}}}")["name"]
 
 
 BAD = [
@@ -129,7 +130,8 @@ def test_two_rules_about_one_thing_are_refused(place: Path, side: str, texts: li
     ],
 )
 def test_rules_about_different_things_stand_together(place: Path, side: str, texts: list[str]) -> None:
-    assert proxy(place, f"ros: {{endpoint: ros2, domain: 0}}\n{side}:\n{rules(*texts)}")
+    config = proxy(place, f"ros: {{endpoint: ros2, domain: 0}}\n{side}:\n{rules(*texts)}")
+    assert len(config.expose if side == "expose" else config.imports) == len(texts)
 
 
 @pytest.mark.parametrize("kind", ["service", "action"])
@@ -140,7 +142,8 @@ def test_a_service_is_not_both_exposed_and_imported_but_a_topic_may_be(place: Pa
 
     (line,) = refusals(place, both(kind))
     assert line.startswith("proxy.yaml:9:12: import[0].name: expose[0] gives the same name: /a; one machine serves a")
-    assert proxy(place, both("topic"))
+    config = proxy(place, both("topic"))
+    assert [each.name for each in (*config.expose, *config.imports)] == ["/a", "/a"]
 
 
 def test_what_a_rule_leaves_open_follows_the_source(place: Path) -> None:

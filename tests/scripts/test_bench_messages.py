@@ -8,6 +8,7 @@ import time
 from collections import deque
 from ipaddress import ip_address, ip_network
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -52,7 +53,7 @@ class Echo:
 @pytest.mark.parametrize("size", [SIZE_MIN, 100, 10_000, 921_600])
 def test_a_message_is_an_image_of_exactly_so_many_bytes(size: int) -> None:
     raw = bytes(image(size))
-    read = get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(raw, IMAGE)
+    read: Any = get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(raw, IMAGE)  # a class that the type store generates
     assert len(raw) == size
     assert read.encoding == "mono8"
     assert read.height * read.step == len(read.data)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -64,15 +65,15 @@ def test_every_message_is_canonical_already(bag: Path) -> None:
 
 def test_the_scan_has_nan_and_both_infinities_and_the_camera_sees_a_moving_scene(bag: Path) -> None:
     with AnyReader([bag]) as recording:
-        seen: dict[str, list[object]] = {"/scan": [], "/camera/image": []}
+        seen: dict[str, list[Any]] = {"/scan": [], "/camera/image": []}
         for connection, _, raw in recording.messages():
             if connection.topic in seen:
                 seen[connection.topic].append(recording.deserialize(raw, connection.msgtype))
-    ranges = seen["/scan"][0].ranges  # type: ignore[attr-defined]
+    ranges = seen["/scan"][0].ranges
     assert np.isnan(ranges).any()
     assert np.isposinf(ranges).any()
     assert np.isneginf(ranges).any()
-    first, second = (image.data.reshape(480, 640, 3).astype(int) for image in seen["/camera/image"][:2])  # type: ignore[attr-defined]
+    first, second = (image.data.reshape(480, 640, 3).astype(int) for image in seen["/camera/image"][:2])
     assert (first != second).mean() > 0.5
     assert np.abs(np.diff(first, axis=1)).mean() < 8  # neighbours are alike: a scene, not noise
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import availability
 import numpy as np
 import pytest
+import table1
 from typer.testing import CliRunner
 
 from gdp.errors import LocalError
-from scripts.experiments import availability, table1
 
 needs_traces = pytest.mark.skipif(not availability.SPOT.is_dir(), reason="no ../shared/data/spot here")
 

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.scripts.load_script import load_script
+import readability
 
-readability = load_script("readability.py")
 SETTINGS = readability.Settings.from_file(readability.SETTINGS)
 LISTED = min(SETTINGS.words)  # any of them, so that this file holds none
 

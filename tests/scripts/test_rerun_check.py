@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.scripts.load_script import load_script
+import rerun_check
 
-rerun_check = load_script("rerun_check.py")
 TEST, CASE = "tests/a/test_b.py::test_c", "tests.a.test_b::test_c"
 
 

@@ -29,14 +29,19 @@ from packaging.utils import canonicalize_name
 from gdp.stores.issue import make_owner
 from tests.pages import ROOT
 
-if sys.version_info >= (3, 11):
-    import tomllib
-
 LOCKS = {path.name: read_lock(path) for path in sorted((ROOT / "requirements").glob("*.lock"))}
 HASH = "0a" * 32
 PINNED = f"alpha==1.2 \\\n    --hash=sha256:{HASH}\nbeta==2.0 ; python_version >= '3' --hash=sha256:{HASH}\n"
 
 needs_toml = pytest.mark.skipif(sys.version_info < (3, 11), reason="this Python has no tomllib")
+
+
+@pytest.fixture
+def project() -> dict[str, Any]:
+    """Return the project's table of pyproject.toml."""
+    tomllib = pytest.importorskip("tomllib", reason="this Python has no tomllib")
+    table: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    return table
 
 
 def _has_backend() -> bool:
@@ -97,10 +102,10 @@ def test_every_lock_is_a_part_of_the_one_for_development() -> None:
         assert [pin for pin in pins if known.get((pin.name, pin.version)) != pin.hashes] == [], name
 
 
-@needs_toml
 @pytest.mark.parametrize(("name", "extras"), [("run.lock", ()), ("ros2.lock", ("ros2",)), ("dev.lock", None)])
-def test_each_dependency_is_pinned_in_a_version_that_is_allowed(name: str, extras: tuple[str, ...] | None) -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+def test_each_dependency_is_pinned_in_a_version_that_is_allowed(
+    project: dict[str, Any], name: str, extras: tuple[str, ...] | None
+) -> None:
     optional = project["optional-dependencies"]
     chosen = optional if extras is None else extras
     wanted = [*project["dependencies"], *(each for extra in chosen for each in optional[extra])]
@@ -128,9 +133,7 @@ def test_a_changed_dependency_makes_each_lock_outdated(tmp_path: Path) -> None:
     assert lock_stamp.outdated_locks(tmp_path) == []
 
 
-@needs_toml
-def test_a_switch_needs_no_ros_package_and_no_scapy() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+def test_a_switch_needs_no_ros_package_and_no_scapy(project: dict[str, Any]) -> None:
     names = {canonicalize_name(Requirement(each).name) for each in project["dependencies"]}
     assert not names & {"scapy", "rosbags", "numpy", "apsw", "lz4", "backports-zstd"}
 

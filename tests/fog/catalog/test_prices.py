@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
+import make_catalog
 from fog.catalog.aws import aws_prices
 from fog.catalog.measured import measured
 from fog.catalog.prices import price_list, regions_of
 from fog.hardware import Hardware
 from gdp.errors import LocalError
-from scripts import make_catalog
 
 SPOT = Path(__file__).parents[3].parent / "shared/data/spot"
 

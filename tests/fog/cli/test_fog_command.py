@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from click.testing import Result
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from fog.cli import options
 from fog.cli.app import app
@@ -37,7 +36,7 @@ def fog(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
 
 
 @pytest.fixture
-def journal(tmp_path: Path, fog: Run):
+def journal(tmp_path: Path, fog: Run) -> Iterator[Journal]:
     journal = Journal(tmp_path / "state" / "journal.sqlite3")
     yield journal
     journal.close()

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import secrets
-import socket
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from socket import socket as Socket  # noqa: N812 (``Desk.socket`` is the path)
 
 from fog.cluster import CloudNode, ClusterPlan, ExportedInterface, MachineRequest
 from fog.enrolment.bootstrap import machine_boot, machine_seats
@@ -80,7 +80,7 @@ class Desk:
         )
 
     @contextmanager
-    def listening(self, listening: socket.socket | None = None) -> Iterator[Listener]:
+    def listening(self, listening: Socket | None = None) -> Iterator[Listener]:
         with closing(Listener(listening or bind_unix(self.socket), self.responder)) as made:
             yield made
 

@@ -27,8 +27,8 @@ TELLS = "signal.signal({}, lambda *_: (open('signalled', 'a').write('{} '), sys.
 Start = Callable[..., "subprocess.Popen[str]"]
 
 
-def program(name: str, code: str = WAITS, **options: bool) -> Program:
-    return Program(name, ("{python}", "-c", code), "ready", **options)
+def program(name: str, code: str = WAITS, *, restarts: bool = True) -> Program:
+    return Program(name, ("{python}", "-c", code), "ready", restarts=restarts)
 
 
 def teller(name: str, number: str = "signal.SIGTERM") -> Program:

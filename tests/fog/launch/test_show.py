@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -65,7 +66,8 @@ def test_how_far_a_machine_is_and_where_that_comes_from_is_shown(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     loaded = loaded_from(written(tmp_path, LISTING), [], dry_run=True)
-    assert priced(of(loaded, OFFER, OFFER))["machines"][0]["latency_ms"] == 12.5
+    machines: Any = priced(of(loaded, OFFER, OFFER))["machines"]
+    assert machines[0]["latency_ms"] == 12.5
     show_plan(of(loaded, OFFER, OFFER), as_json=False)
     assert "latency us-west-1 12.5 ms: measured now, tcp://127.0.0.1:7" in capsys.readouterr().out
 

@@ -17,6 +17,7 @@ from sky import check, core, execution
 
 from fog.hardware import Hardware
 from fog.machine import MachineBundle, MachineSpec, Program
+from fog.offer import Offer
 from fog.providers.skypilot.config import SkyPilotConfig
 from fog.providers.skypilot.provider import SkyPilotProvider
 from gdp.errors import GdpError
@@ -58,17 +59,17 @@ def main() -> None:
     spec = MachineSpec("a-demo", "m1", offers[0])
     boot = MachineBundle({"own.key": b"\x00"}, (Program("switch", ("gdp-switch",)),))
 
-    def dry_run(**changes: str) -> str:
-        return outcome(lambda: provider.dry_run(replace(spec, offer=replace(spec.offer, **changes)), boot))
+    def dry_run(offer: Offer) -> str:
+        return outcome(lambda: provider.dry_run(replace(spec, offer=offer), boot))
 
     reported = {
         "enabled": list(enabled.values()),
         "offers": [asdict(each) for each in offers],
         "gpu": [each.type_name for each in provider.offers(Hardware.from_text("T4"), spot=False)],
         "none": [each.type_name for each in provider.offers(Hardware.from_text("cpu:64"), spot=False)],
-        "dry run": dry_run(),
-        "no such type": dry_run(type_name="nope.large"),
-        "no such region": dry_run(region="aws/nowhere"),
+        "dry run": dry_run(spec.offer),
+        "no such type": dry_run(replace(spec.offer, type_name="nope.large")),
+        "no such region": dry_run(replace(spec.offer, region="aws/nowhere")),
         "machines": outcome(lambda: provider.describe("a-demo")),
         "terminate": outcome(lambda: provider.terminate(["fog-a-demo-m1"])),
     }

@@ -6,6 +6,7 @@ import base64
 import gzip
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import pytest
 import yaml
@@ -17,6 +18,11 @@ from fog.providers.aws.config import AwsConfig, Ssh
 from fog.providers.aws.provider import AwsProvider
 from fog.providers.cloud_init import Setup, Vxlan
 from gdp.errors import LocalError, StoreError
+
+if TYPE_CHECKING:
+    from moto.ec2.models import EC2Backend
+    from types_boto3_ec2 import EC2Client
+    from types_boto3_ec2.type_defs import InstanceTypeDef, TagSpecificationTypeDef, TagTypeDef
 
 boto3 = pytest.importorskip("boto3", reason="the extra `aws` is not installed")
 moto_server = pytest.importorskip("moto.server", reason="moto[ec2,server] of the extra `dev` is not installed")
@@ -31,11 +37,12 @@ BOOT = MachineBundle({"keys/own.key": b"\x00\xff", "proxy.yaml": b"rules: []\n"}
 class Cloud:
     """Simulated EC2, seen from behind its API."""
 
-    def client(self, region: str = EAST):
-        return boto3.client("ec2", region_name=region)
+    def client(self, region: str = EAST) -> EC2Client:
+        client: EC2Client = boto3.client("ec2", region_name=region)
+        return client
 
-    def backend(self, region: str = EAST):
-        from moto.core import DEFAULT_ACCOUNT_ID
+    def backend(self, region: str = EAST) -> EC2Backend:
+        from moto.core.models import DEFAULT_ACCOUNT_ID
         from moto.ec2.models import ec2_backends
 
         return ec2_backends[DEFAULT_ACCOUNT_ID][region]
@@ -48,19 +55,17 @@ class Cloud:
 
         monkeypatch.setattr(self.backend(), asked, refuse)
 
-    def instance(self, machine: str) -> dict:
+    def instance(self, machine: str) -> InstanceTypeDef:
         region, instance = machine.split("/")
         found = self.client(region).describe_instances(InstanceIds=[instance])
         return found["Reservations"][0]["Instances"][0]
 
-    def user_data(self, machine: str) -> dict:
+    def user_data(self, machine: str) -> dict[str, Any]:
         region, instance = machine.split("/")
         reported = self.client(region).describe_instance_attribute(InstanceId=instance, Attribute="userData")
-        return yaml.safe_load(gzip.decompress(base64.b64decode(reported["UserData"]["Value"])))
-
-
-def config(**settings: object) -> AwsConfig:
-    return AwsConfig(regions=(EAST, WEST), image_owner=UBUNTU, image_name="ubuntu/images/*", **settings)
+        packed = base64.b64decode(reported["UserData"]["Value"])
+        config: dict[str, Any] = yaml.safe_load(gzip.decompress(packed))
+        return config
 
 
 def prices(hardware: Hardware, spot: bool) -> list[Offer]:
@@ -72,8 +77,11 @@ def prices(hardware: Hardware, spot: bool) -> list[Offer]:
     return [line for line in lines if hardware.fits(line.hardware)]
 
 
-def provider(**settings: object) -> AwsProvider:
-    return AwsProvider(prices, config(**settings))
+def provider(ssh: Ssh | None = None, setup: Setup | None = None) -> AwsProvider:
+    config = AwsConfig(
+        regions=(EAST, WEST), image_owner=UBUNTU, image_name="ubuntu/images/*", ssh=ssh, setup=setup or Setup()
+    )
+    return AwsProvider(prices, config)
 
 
 def spec(cluster: str, name: str = "m1", region: str = EAST, *, spot: bool = False) -> MachineSpec:
@@ -184,10 +192,14 @@ def test_a_machine_without_ssh_settings_has_no_shell(cloud: Cloud, aws: AwsProvi
 
 
 def test_an_interruption_notice_is_seen(cloud: Cloud, aws: AwsProvider) -> None:
-    cluster = [{"Key": "fog-cluster", "Value": "notice"}, {"Key": "fog-machine", "Value": "m1"}]
+    cluster: list[TagTypeDef] = [{"Key": "fog-cluster", "Value": "notice"}, {"Key": "fog-machine", "Value": "m1"}]
+    tags: list[TagSpecificationTypeDef] = [
+        {"ResourceType": "spot-instances-request", "Tags": cluster},
+        {"ResourceType": "instance", "Tags": cluster},
+    ]
     asked = cloud.client().request_spot_instances(
         LaunchSpecification={"ImageId": "ami-1", "InstanceType": "c5.xlarge"},
-        TagSpecifications=[{"ResourceType": kind, "Tags": cluster} for kind in ("spot-instances-request", "instance")],
+        TagSpecifications=tags,
     )["SpotInstanceRequests"][0]
     assert aws.describe("notice")[0].state is MachineState.RUNNING
     request = cloud.backend().spot_instance_requests[asked["SpotInstanceRequestId"]]

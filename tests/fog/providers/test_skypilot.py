@@ -51,7 +51,7 @@ class Sky:
 
     records: list[SimpleNamespace] = field(default_factory=list)
     requests: list[SimpleNamespace] = field(default_factory=list)
-    asked: list[tuple[str, object]] = field(default_factory=list)
+    asked: list[tuple[str, SimpleNamespace | str]] = field(default_factory=list)
     fails: Exception | None = None
 
     exceptions = SimpleNamespace(ClusterDoesNotExist=ClusterDoesNotExist, NoCloudAccessError=NoCloudAccessError)
@@ -113,6 +113,7 @@ def test_a_machine_is_asked_for_as_its_offer_says(sky: Sky, provider: SkyPilotPr
     assert provider.create(SPEC, BOOT) == "fog-a-demo-m1"
     ((what, task),) = sky.asked
     assert what == "launch"
+    assert isinstance(task, SimpleNamespace)
     resources = task.resources
     assert (resources["infra"], resources["instance_type"], resources["use_spot"]) == (EAST, "g4dn.xlarge", True)
     assert resources["accelerators"] == "T4:1"
@@ -245,9 +246,9 @@ def an_image(region: str, endpoint: str) -> str:
     boto3 = pytest.importorskip("boto3", reason="the extra `aws` is not installed")
     keys = {"aws_access_key_id": "testing", "aws_secret_access_key": "testing"}
     client = boto3.client("ec2", region_name=region, endpoint_url=endpoint, **keys)
-    found = client.describe_images(Owners=["099720109477"])["Images"]
+    found: str = client.describe_images(Owners=["099720109477"])["Images"][0]["ImageId"]
     client.close()
-    return found[0]["ImageId"]
+    return found
 
 
 def test_the_real_package_takes_our_tasks_in_a_dry_run(home: Path) -> None:

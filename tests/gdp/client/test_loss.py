@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
@@ -99,6 +101,10 @@ def test_a_suspended_reader_delays_no_other_and_gets_what_it_lacks_when_it_retur
     assert moves.writer_proxy.lost == 0
 
 
+def has_more_than(end: End, count: int) -> bool:
+    return len(end.delivered) > count
+
+
 def test_others_do_not_wait_for_a_reader_that_catches_up() -> None:
     pipe = Pipe(publisher_of())
     stays, moves = live(pipe, b"a", b"b")
@@ -109,7 +115,7 @@ def test_others_do_not_wait_for_a_reader_that_catches_up() -> None:
     for _ in range(100):
         before = len(stays.delivered)
         pipe.publish([bytes(1_000)])
-        assert pipe.run(0.05, lambda now=before: len(stays.delivered) > now)
+        assert pipe.run(0.05, partial(has_more_than, stays, before))
     moves.loss = 0.0
     assert pipe.run(30.0, pipe.publisher.is_acknowledged)
     assert_complete(pipe, moves)

@@ -31,7 +31,8 @@ from gdp.metadata import Metadata
 NOW = 1_800_000_000
 YEAR = Validity(NOW, NOW + 365 * 86_400)
 MONTH = Validity(NOW, NOW + 30 * 86_400)
-SCHOOL = CertificateAuthority.create("school", SigningKey.generate(), YEAR)
+SCHOOL_KEY = SigningKey.generate()
+SCHOOL = CertificateAuthority.create("school", SCHOOL_KEY, YEAR)
 DIGEST = node_metadata(Role.PROXY, "robot").digest()
 KEY = SigningKey.generate()
 REQUEST = request_membership(KEY, Role.PROXY, "robot", DIGEST)
@@ -145,7 +146,7 @@ def certificate(
     label: str = "robot",
     extension: x509.ExtensionType | None = None,
     public: object = None,
-    digest: hashes.HashAlgorithm | None = None,
+    digest: hashes.SHA256 | hashes.SHA512 | None = None,
 ) -> bytes:
     """Return a certificate by the school's root that may break any rule."""
     key = key or KEY
@@ -166,7 +167,7 @@ def certificate(
     )
     if extension is not None:
         builder = builder.add_extension(extension, critical=True)
-    return builder.sign(SCHOOL.key.private, digest or hashes.SHA256()).public_bytes(Encoding.DER)
+    return builder.sign(SCHOOL_KEY.private, digest or hashes.SHA256()).public_bytes(Encoding.DER)
 
 
 def uris(*values: str) -> x509.SubjectAlternativeName:
@@ -243,7 +244,7 @@ def test_a_request_for_a_domain_is_refused() -> None:
         x509.CertificateSigningRequestBuilder()
         .subject_name(x509.Name(attributes))
         .add_extension(alternative_names(subject), critical=False)
-        .sign(SCHOOL.key.private, hashes.SHA256())
+        .sign(SCHOOL_KEY.private, hashes.SHA256())
     )
     with pytest.raises(StatementError) as caught:
         SCHOOL.issue(request.public_bytes(Encoding.PEM), MONTH)
@@ -308,10 +309,11 @@ def test_openssl_reads_name_role_and_label(files: Path) -> None:
 @needs_openssl
 def test_a_membership_issued_by_openssl_holds_here(tmp_path: Path) -> None:
     now = time.time()  # openssl uses the real clock
-    authority = CertificateAuthority.create("school", SigningKey.generate(), Validity.lasting(now - 60, 86_400))
+    authority_key = SigningKey.generate()
+    authority = CertificateAuthority.create("school", authority_key, Validity.lasting(now - 60, 86_400))
     root, key, request, out = (tmp_path / name for name in ("root.crt", "root.key", "node.csr", "node.crt"))
     root.write_bytes(to_pem(authority.root.wire))
-    key.write_bytes(authority.key.to_pem())
+    key.write_bytes(authority_key.to_pem())
     request.write_bytes(REQUEST)
     issuer = ("-CA", root, "-CAkey", key, "-set_serial", "7")
     openssl("x509", "-req", "-in", request, *issuer, "-copy_extensions", "copy", "-days", "1", "-out", out)

@@ -86,7 +86,7 @@ def test_a_note_opens_with_padding_behind_it(body: bytes) -> None:
 def test_an_older_number_than_the_last_is_a_replay() -> None:
     numbers = ControlReplayWindow()
     numbers.check(2, 0.0)
-    assert numbers.check(1, 0.0) is None  # a datagram that did not open moves nothing
+    numbers.check(1, 0.0)  # a datagram that did not open moves nothing
     numbers.accept(2, 0.0)
     assert refused(numbers, 1) is refused(numbers, 2) is DropReason.REPLAYED
 
@@ -108,10 +108,20 @@ def test_a_note_about_another_topic_or_to_another_life_does_not_open() -> None:
 
 
 def test_whatever_differs_makes_another_key() -> None:
-    base = (SHARED, SECRET, Kind.ACKNACK, READER, 5, PUBLISHER, 9, TOPIC)
-    others = [b"X" * 32, b"S" * 32, Kind.DATA, b"q" * 32, 6, b"Q" * 32, 8, b"u" * 32]
-    keys = {control_key(*base[:at], other, *base[at + 1 :]) for at, other in enumerate(others)}  # type: ignore[arg-type]
-    assert len(keys | {KEY}) == len(others) + 1
+    keys = {
+        control_key(shared, secret, kind, source, incarnation, destination, to_incarnation, topic)
+        for shared, secret, kind, source, incarnation, destination, to_incarnation, topic in (
+            (b"X" * 32, SECRET, Kind.ACKNACK, READER, 5, PUBLISHER, 9, TOPIC),
+            (SHARED, b"S" * 32, Kind.ACKNACK, READER, 5, PUBLISHER, 9, TOPIC),
+            (SHARED, SECRET, Kind.DATA, READER, 5, PUBLISHER, 9, TOPIC),
+            (SHARED, SECRET, Kind.ACKNACK, b"q" * 32, 5, PUBLISHER, 9, TOPIC),
+            (SHARED, SECRET, Kind.ACKNACK, READER, 6, PUBLISHER, 9, TOPIC),
+            (SHARED, SECRET, Kind.ACKNACK, READER, 5, b"Q" * 32, 9, TOPIC),
+            (SHARED, SECRET, Kind.ACKNACK, READER, 5, PUBLISHER, 8, TOPIC),
+            (SHARED, SECRET, Kind.ACKNACK, READER, 5, PUBLISHER, 9, b"u" * 32),
+        )
+    }
+    assert len(keys | {KEY}) == 9
 
 
 def test_two_sealers_that_share_numbers_make_no_nonce_twice() -> None:

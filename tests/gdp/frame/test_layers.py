@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cbor2
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scapy.layers.l2 import Ether
-from scapy.packet import Padding, Raw
+from scapy.packet import Packet, Padding, Raw
 
 from gdp.errors import DropReason, FrameError, LocalError
 from gdp.frame import codec
@@ -33,7 +35,12 @@ ALICE, BOB = b"a" * 32, b"b" * 32
 
 def read(layer: GDP) -> Header:
     """Return the fields of the Scapy layer in the codec's form."""
-    return Header(*(int(v) if not isinstance(v, bytes) else v for v in (getattr(layer, f) for f in Header._fields)))
+    values = (getattr(layer, name) for name in Header._fields)
+    return Header._make(value if isinstance(value, bytes) else int(value) for value in values)
+
+
+def shown(packet: Packet) -> str:
+    return str(packet.show(dump=True))
 
 
 def statement(body: dict[str, object], signature: bytes = b"s" * 64) -> bytes:
@@ -146,14 +153,15 @@ def test_the_defaults_make_a_frame_that_decodes() -> None:
 
 
 def test_ethernet_above_a_frame_gets_the_ethertype() -> None:
-    assert (Ether() / GDP()).type == ETHERTYPE
+    packet: Packet = Ether() / GDP()
+    assert packet.type == ETHERTYPE
 
 
 def test_kinds_and_flags_have_words() -> None:
     packet = GDP(kind="echo-request", flags="last+reliable")
     assert (packet.kind, int(packet.flags)) == (Kind.ECHO_REQUEST, 3)
-    assert "echo-request" in packet.show(dump=True)
-    assert "last+reliable" in packet.show(dump=True)
+    assert "echo-request" in shown(packet)
+    assert "last+reliable" in shown(packet)
 
 
 def test_a_name_may_be_given_as_hex_digits() -> None:
@@ -178,8 +186,8 @@ def test_the_summary_tells_the_way_and_the_part() -> None:
     ("question", "answer"), [(Kind.ECHO_REQUEST, Kind.ECHO_REPLY), (Kind.RIB_REQUEST, Kind.RIB_ANSWER)]
 )
 def test_an_answer_belongs_to_its_question(question: Kind, answer: Kind) -> None:
-    asked = Ether() / GDP(kind=question, number=9, source=ALICE, destination=BOB)
-    answered = Ether() / GDP(kind=answer, number=9, source=BOB, destination=ALICE)
+    asked: Packet = Ether() / GDP(kind=question, number=9, source=ALICE, destination=BOB)
+    answered: Packet = Ether() / GDP(kind=answer, number=9, source=BOB, destination=ALICE)
     assert answered.answers(asked)
     assert answered.hashret() == asked.hashret()
 
@@ -188,7 +196,7 @@ def test_an_answer_belongs_to_its_question(question: Kind, answer: Kind) -> None
     "changed",
     [{"number": 10}, {"kind": Kind.RIB_ANSWER}, {"kind": Kind.ECHO_REQUEST}, {"source": ALICE}, {"destination": BOB}],
 )
-def test_anything_else_answers_nothing(changed: dict[str, object]) -> None:
+def test_anything_else_answers_nothing(changed: dict[str, Any]) -> None:
     asked = GDP(kind=Kind.ECHO_REQUEST, number=9, source=ALICE, destination=BOB)
     fields = {"kind": Kind.ECHO_REPLY, "number": 9, "source": BOB, "destination": ALICE}
     assert not GDP(**{**fields, **changed}).answers(asked)
@@ -198,11 +206,11 @@ def test_anything_else_answers_nothing(changed: dict[str, object]) -> None:
 
 
 def test_a_statement_is_shown_in_words() -> None:
-    body = {"t": "hello", "name": ALICE, "inside": cbor2.dumps({"cost": 10})}
+    body: dict[str, object] = {"t": "hello", "name": ALICE, "inside": cbor2.dumps({"cost": 10})}
     packet = Ether(bytes(Ether() / GDP(kind=Kind.HELLO) / Raw(statement(body))))
-    shown = packet.show(dump=True)
-    assert f'{{"t": "hello", "name": h\'{ALICE.hex()}\', "inside": <<{{"cost": 10}}>>}}' in shown
-    assert f"{{1: -7, 4: h'{BOB.hex()}'}}" in shown
+    text = shown(packet)
+    assert f'{{"t": "hello", "name": h\'{ALICE.hex()}\', "inside": <<{{"cost": 10}}>>}}' in text
+    assert f"{{1: -7, 4: h'{BOB.hex()}'}}" in text
     assert packet[Statement].signature == b"s" * 64
 
 

@@ -282,6 +282,7 @@ def test_a_reader_is_slow_when_it_has_not_confirmed_for_so_long_what_another_has
     behind_s = 10.0 + lag_s / 2  # when A confirmed the third
     assert window.slow_readers(behind_s + lag_s - 0.01) == []
     due_s = window.next_slow_reader()
+    assert due_s is not None
     assert due_s == pytest.approx(behind_s + lag_s, abs=0.01)
     assert window.slow_readers(due_s) == [B]
     window.drop_reader(B)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import os
 import socket
@@ -10,7 +11,6 @@ from collections.abc import Iterator
 import pytest
 
 from gdp.errors import DROP_COUNTERS, DropReason
-from gdp.ports import mmsg as batch_module
 from gdp.ports.mmsg import SLOTS, MmsgBatch, PlainBatch, make_batch, send_failure
 
 KINDS = pytest.mark.parametrize("kind", [MmsgBatch, PlainBatch])
@@ -153,5 +153,5 @@ def test_a_c_library_without_these_calls_is_no_obstacle(monkeypatch: pytest.Monk
     def absent(*_: object, **__: object) -> None:
         raise OSError(errno.ENOENT, os.strerror(errno.ENOENT))
 
-    monkeypatch.setattr(batch_module.ctypes, "CDLL", absent)
+    monkeypatch.setattr(ctypes, "CDLL", absent)
     assert isinstance(make_batch(200), PlainBatch)

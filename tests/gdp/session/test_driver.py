@@ -58,13 +58,14 @@ class Stub:
         if self.fails:
             raise RuntimeError("broken")
         left_s = None if latest_s is None else max(latest_s - time.monotonic(), 0.0)
-        ready, _, _ = select.select([self._pushed, *self._watched], [], [], left_s)
+        pushed = self._pushed.fileno()
+        ready, _, _ = select.select([pushed, *self._watched], [], [], left_s)
         for each in ready:
-            if each in self._watched:
-                self._watched[each]()
-            else:
+            if each == pushed:
                 queue, *values = self._pushed.recv(1_000)
                 self.queue(queue).extend(values)
+            else:
+                self._watched[each]()
 
     def send(self) -> bool:
         return False

@@ -8,6 +8,7 @@ import gdp
 from gdp.errors import LocalError
 from gdp.message.loss import LossReason
 from gdp.metadata import Metadata
+from gdp.names import Name
 from gdp.session.core import QUEUE_MAX_BYTES
 from gdp.trust.right import Right
 from tests.gdp.session.simulated import Simulated, world_of
@@ -122,7 +123,7 @@ def test_a_message_above_the_limit_is_refused(pair: Simulated) -> None:
 def test_a_name_is_found_by_each_of_its_forms(pair: Simulated, form: str) -> None:
     session = pair.sessions["robot"]
     (known,) = session.delegations
-    forms = {
+    forms: dict[str, str | Name | Metadata] = {
         "hex": known.name.to_text(),
         "name": known.name,
         "metadata": Metadata({"kind": "topic", "name": "/camera"}),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import pytest
 
@@ -38,6 +38,9 @@ class Talker:
 
     def get_timer(self) -> float | None:
         return self.due_s
+
+    def poll_neighbours(self) -> Mapping[int, frozenset[bytes]]:
+        return {}
 
     def frames_to_send(self) -> list[OutgoingFrames]:
         out, self.out = self.out, []

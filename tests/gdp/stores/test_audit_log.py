@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -43,9 +44,11 @@ def test_what_was_written_verifies_and_is_private(tmp_path: Path) -> None:
     ],
     ids=["changed", "removed", "inserted", "no line", "exchanged"],
 )
-def test_a_break_is_named_with_its_line(tmp_path: Path, change: object, line: int) -> None:
+def test_a_break_is_named_with_its_line(
+    tmp_path: Path, change: Callable[[list[bytes]], list[bytes]], line: int
+) -> None:
     path = note(tmp_path)
-    path.write_bytes(b"".join(change(path.read_bytes().splitlines(keepends=True))))  # type: ignore[operator]
+    path.write_bytes(b"".join(change(path.read_bytes().splitlines(keepends=True))))
     with pytest.raises(LocalError, match=rf"audit.jsonl:{line}: "):
         verify_audit(tmp_path)
 

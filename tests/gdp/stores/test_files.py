@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from gdp.errors import LocalError
-from gdp.stores import files
 from gdp.stores.files import FILE_MAX_BYTES, private, public, read_private, read_public, write_all
 
 
@@ -64,7 +63,7 @@ def test_force_replaces_and_makes_private(tmp_path: Path) -> None:
 
 def test_one_who_comes_first_in_the_last_moment_wins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "key").write_bytes(b"theirs")
-    monkeypatch.setattr(files.os.path, "lexists", lambda path: False)
+    monkeypatch.setattr(os.path, "lexists", lambda path: False)
     with pytest.raises(LocalError, match="--force"):
         write_all(tmp_path, {"key": private(b"ours")})
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"theirs"]

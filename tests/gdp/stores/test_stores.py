@@ -312,7 +312,9 @@ def test_a_file_that_could_not_be_read_at_the_start_is_replaced_and_not_added_to
         snapshot.write(changes_of(pair, [name], pair.one), pair.site.unix_s)
         snapshot.close()
     (read,) = Snapshot(path).load(pair.site.unix_s)
-    assert [entry.statement for entry in read] == [changes_of(pair, ["/b"], pair.one)[0][1].statement]
+    ((_, wanted),) = changes_of(pair, ["/b"], pair.one)
+    assert wanted is not None
+    assert [entry.statement for entry in read] == [wanted.statement]
 
 
 def write_generations(path: Path, said: Connection) -> None:

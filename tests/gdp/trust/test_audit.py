@@ -38,7 +38,8 @@ def test_an_unread_trail_keeps_nothing() -> None:
 
 
 def test_a_flood_is_bounded_in_memory_and_in_lines() -> None:
-    of, lines = trail(), []
+    of = trail()
+    lines: list[AuditLine] = []
     for second in range(3_600):
         for number in range(100):
             of.note(Action.REFUSED, "name", who=f"{number}", reason=f"reason {number % 5}")

@@ -43,7 +43,7 @@ def refusal(delegation: Delegation, unix_s: float = NOW) -> DropReason:
 def test_a_delegation_comes_back_from_its_file() -> None:
     again = Delegation.from_wire(GIVEN.to_wire())
     assert again.to_wire() == GIVEN.to_wire()
-    assert (again.name, again.node, again.rights) == (CAMERA.name, ROBOT.name, {Right.PUBLISH, Right.READ})
+    assert (again.name, again.node, again.rights) == (CAMERA.name, ROBOT.name, frozenset({Right.PUBLISH, Right.READ}))
     assert dict(again.metadata or {}) == dict(CAMERA_METADATA)
 
 

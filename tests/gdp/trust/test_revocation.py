@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 
 from gdp.crypto.keys import SigningKey
@@ -74,8 +76,8 @@ def test_an_owner_takes_back_only_what_is_its_own() -> None:
 
 
 @pytest.mark.parametrize("make", [by_lab, by_root])
-def test_new_revocations_are_distinguished_from_known_ones(make: object) -> None:
-    revoked, statement = Revocations(ROOTS), make(1)  # type: ignore[operator]
+def test_new_revocations_are_distinguished_from_known_ones(make: Callable[..., Statement]) -> None:
+    revoked, statement = Revocations(ROOTS), make(1)
     assert take(revoked, statement) is not None
     assert take(revoked, statement) is None
     assert len(revoked) == 1
@@ -84,8 +86,8 @@ def test_new_revocations_are_distinguished_from_known_ones(make: object) -> None
 
 
 @pytest.mark.parametrize("make", [by_lab, by_root])
-def test_a_statement_comes_out_as_it_went_in(make: object) -> None:
-    revoked, statement = Revocations(ROOTS), make(1)  # type: ignore[operator]
+def test_a_statement_comes_out_as_it_went_in(make: Callable[..., Statement]) -> None:
+    revoked, statement = Revocations(ROOTS), make(1)
     take(revoked, statement)
     assert revoked.wire(statement.fields.bytes_("owner"), fingerprint(1)) == statement.wire
 
@@ -99,20 +101,20 @@ def test_a_statement_of_a_later_form_comes_out_whole() -> None:
 
 
 @pytest.mark.parametrize("make", [by_lab, by_root])
-def test_it_is_kept_until_the_certificate_would_have_run_out(make: object) -> None:
+def test_it_is_kept_until_the_certificate_would_have_run_out(make: Callable[..., Statement]) -> None:
     revoked = Revocations(ROOTS)
-    take(revoked, make(1))  # type: ignore[operator]
-    take(revoked, make(2, NOW + 9_000), at=Timestamps(5_000.0, NOW + 5_000))  # type: ignore[operator]
+    take(revoked, make(1))
+    take(revoked, make(2, NOW + 9_000), at=Timestamps(5_000.0, NOW + 5_000))
     assert len(revoked) == 1
     assert [number for _, number in revoked.keys()] == [fingerprint(2)]  # noqa: SIM118
 
 
 @pytest.mark.parametrize("make", [by_lab, by_root])
-def test_a_later_end_replaces_an_earlier_one(make: object) -> None:
+def test_a_later_end_replaces_an_earlier_one(make: Callable[..., Statement]) -> None:
     revoked = Revocations(ROOTS)
-    take(revoked, make(1))  # type: ignore[operator]
-    assert take(revoked, make(1, NOW + 9_000)) is not None  # type: ignore[operator]
-    take(revoked, make(2, NOW + 9_000), at=Timestamps(5_000.0, NOW + 5_000))  # type: ignore[operator]
+    take(revoked, make(1))
+    assert take(revoked, make(1, NOW + 9_000)) is not None
+    take(revoked, make(2, NOW + 9_000), at=Timestamps(5_000.0, NOW + 5_000))
     assert len(revoked) == 2
 
 

@@ -22,7 +22,7 @@ from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import ring5
 from gdp.trust.owner import Owner
 from gdp.trust.right import Right
-from proxy.bridge.bridge import Bridge
+from proxy.bridge.bridge import Bridge, BridgeRules
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.counters import Traffic
 from proxy.bridge.faults import Faults
@@ -212,7 +212,7 @@ class Sites:
         text += f"import:\n{rules(*imports)}" if imports else ""
         return proxy(self._folder, text)
 
-    def held(self, member: Participant, config: ProxyConfig, holds: Sequence[Metadata] | None = None) -> Granted:
+    def held(self, member: Participant, config: BridgeRules, holds: Sequence[Metadata] | None = None) -> Granted:
         """Return delegations for the full names in the rules, or for ``holds``."""
         given: dict[Name, tuple[Metadata, set[Right]]] = {}
         for is_exposed, listed in ((True, config.expose), (False, config.imports)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -90,7 +91,7 @@ def test_a_new_epoch_takes_effect_without_a_message_lost(sites: Sites) -> None:
     robot, server, talker, ear = flowing(sites)
     sites.every(0.005, 600, lambda number: talker.publish(string(str(number))))
     for at, machine in ((1.0, server), (1.5, robot)):
-        sites.world.network.call(at, lambda machine=machine: renew(sites, machine, {1: 1, 2: 7}))  # type: ignore[misc]
+        sites.world.network.call(at, partial(renew, sites, machine, {1: 1, 2: 7}))
     sites.run(5)
     assert ear.texts == [str(number) for number in range(600)]
     assert (robot.faults, server.faults) == ({}, {})

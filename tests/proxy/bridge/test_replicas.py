@@ -12,6 +12,7 @@ import pytest
 
 from gdp.client.delivery import Delivered
 from gdp.client.participant import Message
+from gdp.service.dispatch import Dispatch
 from proxy.bridge.imported_service import ImportedService
 from proxy.endpoints.qos import default
 from proxy.serial.channel import RosVersion
@@ -137,7 +138,9 @@ def test_an_answer_of_somebody_without_a_delegation_is_not_taken(sites: Sites) -
     assert sites.run(1, lambda: locals_[0].asked == 1)
     flow = client.bridge.flows[0][1]
     assert isinstance(flow, ImportedService)
-    (call,) = (number for number, _ in flow._calls[0]._calls)
+    dispatch = flow._calls[0]
+    assert isinstance(dispatch, Dispatch)
+    (call,) = (number for number, _ in dispatch._calls)
     wire = Answer(0, call, Outcome.ANSWERED, b'{"success":true,"message":"forged"}').to_wire()
     delivered = Delivered(bytes(forger.member.name), 1, 1, wire, 1, 1)
     flow.receive(Message(flow._topic.name, delivered, b"", True), sites.now_s)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
 
-from proxy.endpoints.fake import FakeGraph
+from proxy.endpoints.fake import FakeGraph, Publication
 from proxy.endpoints.qos import default
 from proxy.serial.channel import Qos, RosVersion
 from tests.proxy.bridge import known
@@ -26,6 +27,10 @@ def sites(tmp_path: Path) -> Sites:
 
 def pair(sites: Sites, more: str = "") -> tuple[Machine, Machine]:
     return sites.add(ROBOT, expose=[CHATTER + more]), sites.add(SERVER, imports=[CHATTER])
+
+
+def count_aloud(talker: Publication, number: int) -> None:
+    talker.publish(string(str(number)))
 
 
 def offered(machine: Machine) -> Qos:
@@ -57,7 +62,7 @@ def test_what_is_lost_is_repaired_for_a_reliable_publisher_only(sites: Sites) ->
     assert sites.run(3, lambda: robot.is_read() and len(robot.member.publishers()) == 2)
     sites.world.leads[SERVER].loss = 0.2
     for talker in talkers:
-        sites.every(0.01, 100, lambda number, talker=talker: talker.publish(string(str(number))))  # type: ignore[misc]
+        sites.every(0.01, 100, partial(count_aloud, talker))
     sites.run(10)
     assert ears[0].texts == [str(number) for number in range(100)]
     assert 40 < len(ears[1].heard) < 100

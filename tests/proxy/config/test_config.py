@@ -106,7 +106,8 @@ def test_without_a_graph_there_are_only_recordings(place: Path) -> None:
 def test_a_rule_that_only_a_graph_can_fulfil_needs_one(place: Path, more: str) -> None:
     text = "expose:\n" + rules(f"name: /a, {more}")
     assert refusal(place, text) == "proxy.yaml:6:5: expose[0]: no graph is stated under ros"
-    assert proxy(place, text + "ros: {endpoint: ros2, domain: 0}\n")
+    config = proxy(place, text + "ros: {endpoint: ros2, domain: 0}\n")
+    assert config.endpoint_of(config.expose[0]) == 0
 
 
 @pytest.mark.parametrize("text", ["ros: {endpoint: dds, domain: 7}", "ros: [{endpoint: dds, domain: 7}]"])

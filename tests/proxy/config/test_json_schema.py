@@ -41,7 +41,7 @@ def test_every_key_is_described_and_no_other_is_known() -> None:
 
 
 def test_the_keys_are_those_of_the_file_and_not_those_of_the_code() -> None:
-    schema = ProxyConfig.json_schema()
+    schema: dict[str, Any] = ProxyConfig.json_schema()
     assert {"ros", "expose", "import", "record"} <= schema["properties"].keys()
     assert {"type", "reliable", "latched", "global"} <= schema["$defs"]["Rule"]["properties"].keys()
 

@@ -18,10 +18,12 @@ import pytest
 
 from proxy.endpoints.endpoint import (
     CallFailed,
+    EndpointError,
     Event,
     MessageReceived,
     RequestReceived,
     ResponseReceived,
+    TypeResolved,
     proxy_node_name,
 )
 from proxy.endpoints.ros2 import Ros2Endpoint
@@ -29,7 +31,9 @@ from proxy.endpoints.ros2 import Ros2Endpoint
 DOMAIN = 100 + os.getpid() % 100
 NODE = proxy_node_name("0123456789abcdef" * 4)
 PATIENCE_S = 10.0
-_Found = TypeVar("_Found", bound=Event)
+_Found = TypeVar(
+    "_Found", TypeResolved, MessageReceived, RequestReceived, ResponseReceived, CallFailed, EndpointError
+)  # the events of a handle
 
 # loopback, and no shared memory: it would cross network namespaces
 CONFINED = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
@@ -107,7 +111,7 @@ class Ears:
 
     def of(self, kind: type[_Found], handle: int) -> list[_Found]:
         """Return the events of a kind of a handle so far."""
-        return [event for event in self.events if isinstance(event, kind) and event[0] == handle]
+        return [event for event in self.events if isinstance(event, kind) and event.handle == handle]
 
     def heard(self, handle: int) -> list[bytes]:
         return [event.raw for event in self.of(MessageReceived, handle)]
@@ -118,11 +122,11 @@ class Ears:
 
     def outcome(self, handle: int, call: int) -> ResponseReceived | CallFailed:
         def found() -> list[ResponseReceived | CallFailed]:
-            return [
-                event
-                for event in (*self.of(ResponseReceived, handle), *self.of(CallFailed, handle))
-                if event.call == call
+            ends: list[ResponseReceived | CallFailed] = [
+                *self.of(ResponseReceived, handle),
+                *self.of(CallFailed, handle),
             ]
+            return [event for event in ends if event.call == call]
 
         self.until(found, f"the outcome of call {call}")
         return found()[0]

@@ -54,7 +54,11 @@ def main() -> None:
     thread.start()
     for line in sys.stdin:
         try:
-            result = eval(line, names) if not line.startswith("!") else exec(line[1:].replace("\\n", "\n"), names)
+            result = None
+            if line.startswith("!"):
+                exec(line[1:].replace("\\n", "\n"), names)
+            else:
+                result = eval(line, names)
             print(json.dumps(result, default=repr), flush=True)
         except Exception as error:  # the test gets every error, whatever its type
             print(json.dumps(f"ERROR {error!r}"), flush=True)

@@ -111,5 +111,5 @@ def test_what_comes_after_the_traffic_is_refused(text: str) -> None:
 
 
 def test_each_proxy_that_roams_is_named_once() -> None:
-    moves = [Roam("robot", "nuc2", 1.0), Roam("robot", "nuc3", 2.0), Cut("nuc1", "nuc2", 3.0)]
+    moves: list[Fault] = [Roam("robot", "nuc2", 1.0), Roam("robot", "nuc3", 2.0), Cut("nuc1", "nuc2", 3.0)]
     assert [at.ifname for at in roamers(moves, ring5())] == ["robot"]

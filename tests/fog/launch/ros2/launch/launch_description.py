@@ -1,18 +1,31 @@
 """Description of a launch; visiting it returns its entities."""
 
-from launch.core import LaunchDescriptionEntity
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from .core import LaunchDescriptionEntity
+
+if TYPE_CHECKING:
+    from .core import LaunchContext
 
 
 class LaunchDescription(LaunchDescriptionEntity):
-    def __init__(self, initial_entities=None, *, deprecated_reason=None):
+    def __init__(
+        self,
+        initial_entities: Iterable[LaunchDescriptionEntity] | None = None,
+        *,
+        deprecated_reason: str | None = None,
+    ) -> None:
         self._entities = list(initial_entities or ())
 
     @property
-    def entities(self):
+    def entities(self) -> list[LaunchDescriptionEntity]:
         return self._entities
 
-    def add_action(self, action):
+    def add_action(self, action: LaunchDescriptionEntity) -> None:
         self._entities.append(action)
 
-    def visit(self, context):
+    def visit(self, context: LaunchContext) -> list[LaunchDescriptionEntity]:
         return self._entities

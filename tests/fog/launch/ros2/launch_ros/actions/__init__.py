@@ -1,5 +1,5 @@
 """Actions of ``launch_ros``."""
 
-from launch_ros.actions.node import Node
+from .node import Node
 
 __all__ = ["Node"]
