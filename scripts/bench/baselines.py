@@ -20,13 +20,14 @@ from typing import Final, Protocol
 
 from chains import Chain
 from frames import SINK, SOURCE, Wire, gdp_frame, ip_frame
+from peers.process import Started
 from pyroute2 import IPRoute
-from worker import Worker
 
 from gdp.frame.kinds import ETHERTYPE
 
 __all__ = ["Baseline", "Bridge", "Direct", "IPv4", "Plane"]
 
+_READY_S: Final = 120.0
 _IPV4: Final = 0x0800
 _ABSENT: Final = "02:67:64:70:ff:ff"
 _BRIDGE: Final = "bridge"
@@ -54,7 +55,7 @@ class Baseline(Protocol):
             LocalError: it is not available here; the text gives the reason.
         """
 
-    def workers(self) -> list[Worker]:
+    def workers(self) -> list[Started]:
         """Return the processes that forward while it is set up."""
 
 
@@ -82,7 +83,7 @@ class Direct:
         """Set up nothing."""
         return ExitStack()
 
-    def workers(self) -> list[Worker]:
+    def workers(self) -> list[Started]:
         """Return no process."""
         return []
 
@@ -100,7 +101,7 @@ class Plane:
         self.name = name
         self.processes = processes
         self._names = names
-        self._workers: list[Worker] = []
+        self._workers: list[Started] = []
 
     def wire(self, chain: Chain, size: int) -> Wire:
         """Return GDP frames of ``size`` bytes, Ethernet header included."""
@@ -117,13 +118,13 @@ class Plane:
                     "left": f"{left} {chain.mac(left, node).hex()}",
                     "right": f"{right} {chain.mac(right, node).hex()}",
                 }
-                worker = Worker(chain.spaces, node, "switch", plane=self.name, ways=ways, names=self._names)
+                worker = chain.worker(node, "switch", plane=self.name, ways=ways, names=self._names)
                 self._workers.append(undo.enter_context(worker))
             for worker in self._workers:
-                worker.read()
+                worker.read(_READY_S)
             return undo.pop_all()
 
-    def workers(self) -> list[Worker]:
+    def workers(self) -> list[Started]:
         """Return the switch processes."""
         return self._workers
 
@@ -147,7 +148,7 @@ class Bridge:
             chain.round_trips(self.wire(chain, 128), 10, poll=False)  # every bridge has then learnt both addresses
             return undo.pop_all()
 
-    def workers(self) -> list[Worker]:
+    def workers(self) -> list[Started]:
         """Return no process: the kernel forwards."""
         return []
 
@@ -177,7 +178,7 @@ class IPv4:
                 chain.inside(node, partial(_route, chain, node, at))
             return undo.pop_all()
 
-    def workers(self) -> list[Worker]:
+    def workers(self) -> list[Started]:
         """Return no process: the kernel forwards."""
         return []
 

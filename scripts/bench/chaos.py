@@ -39,7 +39,7 @@ from faults.link_faults import FrameFaults
 from faults.network import VICTIM, random_network
 from faults.oracle import Oracle
 from faults.overlay import Overlay
-from faults.plan import Plan
+from faults.plan import Plan, ends_of
 from faults.schedule import STORE, Fault, FaultKind, broken_by, make_schedule
 from faults.store import StoreCluster, has_server
 from peers.process import FailedError
@@ -197,10 +197,10 @@ class Chaos:
         if kind is FaultKind.CUT:
             overlay.cut(*targets)
         elif kind in FRAMES:
-            overlay.disturb(*targets, FRAMES[kind])
+            overlay.disturb(targets[0], targets[1], FRAMES[kind])
         elif kind is FaultKind.PARTITION:
             for link in targets[1:]:
-                overlay.cut(*link.split("-"))
+                overlay.cut(*ends_of(link))
         elif kind in (FaultKind.KILL_SWITCH, FaultKind.KILL_RIB, FaultKind.KILL_MEMBER):
             self._ended_lives.add((targets[0].removeprefix("member "), overlay.life(targets[0])))
             overlay.kill(targets[0])
@@ -238,7 +238,7 @@ class Chaos:
             overlay.calm(*targets)
         elif kind is FaultKind.PARTITION:
             for link in targets[1:]:
-                overlay.restore_link(*link.split("-"))
+                overlay.restore_link(*ends_of(link))
         elif kind in (FaultKind.KILL_SWITCH, FaultKind.KILL_RIB, FaultKind.KILL_MEMBER):
             overlay.restart(targets[0])
             self._await(targets[0])

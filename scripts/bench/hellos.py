@@ -10,7 +10,6 @@ up, the processor time of the one in the middle is taken over each round, with k
 from __future__ import annotations
 
 import json
-import os
 import statistics
 import time
 from dataclasses import asdict
@@ -19,7 +18,7 @@ from typing import Final
 
 from faults.overlay import Overlay
 from faults.plan import Plan, make_topology
-from machine import machine_state
+from machine import machine_state, processor_s
 from report import progress
 from rich.console import Console
 from rich.table import Table
@@ -30,7 +29,6 @@ from gdp.host.run_registry import RunRegistry
 OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks" / "hellos.json"
 TARGET: Final = 1.0  # percent of a core
 SETTLE_S: Final = 8.0  # hellos are frequent until keepalives have taken over
-_TICK_S: Final = 1 / os.sysconf("SC_CLK_TCK")
 _CASES: Final[dict[str, int | None]] = {"keepalives as shipped": None, "no keepalives": 0}
 
 
@@ -39,12 +37,6 @@ def plan(neighbours: int) -> Plan:
     leaves = [f"s{number}" for number in range(1, neighbours + 1)]
     topology, members = make_topology({"home": ("s0", *leaves)}, {}, [f"s0-{leaf}" for leaf in leaves], ("s0",), {})
     return Plan(topology, members)
-
-
-def processor_s(pid: int) -> float:
-    """Return the processor time that a process has used, of the system too."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) * _TICK_S
 
 
 def measure(runs: RunRegistry, neighbours: int, seconds: float, rounds: int, keepalive_ms: int | None) -> list[float]:

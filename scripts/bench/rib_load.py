@@ -14,7 +14,7 @@ import sys
 import time
 from dataclasses import asdict, dataclass
 
-from table_fill import resident_bytes
+from machine import resident_bytes
 
 from gdp.control.query import Query
 from gdp.control.relay import Relay

@@ -21,7 +21,6 @@ retransmissions would then dominate the time. ROS 2's guide to tuning recommends
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -30,6 +29,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Final, Literal
 
+from machine import processor_s
 from peers.process import Started
 from pyroute2 import IPRoute
 from testbed import LEFT, MIDDLE, RIGHT, ROW, Lab, OverlayNodes, make_topology
@@ -49,7 +49,6 @@ _DOMAINS: Final = {LEFT: 141, RIGHT: 142}
 DIRECT_DOMAIN: Final = 143
 _RIGHTS: Final = {"topic": (Right.PUBLISH, Right.READ), "service": (Right.SERVE, Right.CALL)}
 _BRIDGE: Final = "bridge"
-_TICKS_PER_S: Final = os.sysconf("SC_CLK_TCK")
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,8 +123,8 @@ class Row:
         return self._lab.start(node, what, arguments, [*environment, f"CYCLONEDDS_URI={_cyclone(node)}"])
 
     def proxies_cpu_s(self) -> float:
-        """Return the processor time that both proxies have used, as proc(5) counts it in ``/proc/<pid>/stat``."""
-        return sum(_cpu_s(pid) for pid in self.proxies)
+        """Return the processor time that both proxies have used."""
+        return sum(processor_s(pid) for pid in self.proxies)
 
     def _admit(self, node: str, carried: Sequence[Carried]) -> str:
         """Give a proxy the delegations of its side, and write its configuration; return the file."""
@@ -161,8 +160,3 @@ def _cyclone(node: str) -> str:
         f'</Interfaces></General><Internal><SocketReceiveBufferSize max="{BUFFER_BYTES}B"/></Internal></Domain>'
         "</CycloneDDS>"
     )
-
-
-def _cpu_s(pid: int) -> float:
-    fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / _TICKS_PER_S  # utime, stime

@@ -142,11 +142,11 @@ def run(options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
     strangers = max((_decisive(row) for row in rows if row.speaker in _STRANGERS), default=0.0)
     progress(f"members, beyond their grants: {members:.2f}, at most {GOAL_BEYOND}")
     progress(f"strangers: {strangers:.2f}, at most {GOAL_STRANGER}")
-    figures = {
+    found: dict[str, Any] = {
         "members_beyond": members, "strangers": strangers, "target_members": GOAL_BEYOND,
         "target_strangers": GOAL_STRANGER, "rows": [asdict(row) for row in rows],
     }  # fmt: skip
-    return figures, all(map(_is_met, rows))
+    return found, all(map(_is_met, rows))
 
 
 def _held(path: Path) -> list[Row]:

@@ -40,6 +40,7 @@ from typing import Final
 from faults.overlay import Overlay
 from faults.plan import Flow, Plan, make_topology
 from faults.records import Kind as Happened
+from machine import processor_s, resident_bytes
 from peers.process import Started
 from report import progress
 from rich.console import Console
@@ -76,7 +77,6 @@ _LOST: Final = re.compile(r"neighbour lost port=(?![hg]\b)")
 _RESTART_S: Final = 12.0
 _HOSTILE_READY_S: Final = 60.0
 _MTU: Final = 1_500
-_TICK_S: Final = 1 / os.sysconf("SC_CLK_TCK")
 _VICTIM: Final = "s0"
 _NEAR: Final = "s1"
 _HOSTILE: Final = dict.fromkeys(OF_SWITCH, "switch h") | dict.fromkeys(OF_PROXY, "member g")
@@ -155,18 +155,6 @@ def _hello(member: Identity, key: SigningKey | None) -> list[bytes]:
     return ControlFragmenter(member.name, secrets.randbits(64)).split(Kind.HELLO, wire, _MTU)
 
 
-def memory_mib(pid: int) -> float:
-    """Return the resident memory of a process."""
-    line = next(each for each in Path(f"/proc/{pid}/status").read_text().splitlines() if each.startswith("VmRSS:"))
-    return int(line.split()[1]) / 1_024
-
-
-def processor_s(pid: int) -> float:
-    """Return the processor time that a process has used, of the system too."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) * _TICK_S
-
-
 def waited_s(overlay: Overlay) -> float:
     """Return how long the good switches have waited for a core so far (schedstat, proc(5))."""
     pids = [overlay.pid(f"switch {node}") for node in (_VICTIM, _NEAR, "s2")]
@@ -226,7 +214,7 @@ def phase(overlay: Overlay, kind: str, seconds: float) -> Phase:
     time.sleep(seconds)
     took_s = time.monotonic() - begun_s
     core, waited = (processor_s(pid) - before_s) / took_s, (waited_s(overlay) - before_waited_s) / took_s
-    memory = memory_mib(overlay.pid(aimed_at))
+    memory = resident_bytes(overlay.pid(aimed_at)) / (1 << 20)
     reached = (overlay.received(node, [link])[link] - before_reached) / took_s
     published, delivered = counted(overlay)
     time.sleep(1.0)  # a switch logs what it lost each half second

@@ -172,7 +172,7 @@ class RecordingNetwork(SimNetwork):
         """Replace a machine; its wall clock keeps the present offset."""
         stepped = _Stepped(machine, self.ahead_s) if self.ahead_s else machine
         ahead_s, self.ahead_s = self.ahead_s, 0.0
-        super().replace(name, stepped, table)  # type: ignore[arg-type]
+        super().replace(name, stepped, table)
         self.ahead_s = ahead_s
 
     def _send(self, wired: Any, frame: bytes) -> None:

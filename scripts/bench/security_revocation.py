@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import gc
-import os
 import random
 import signal
 import subprocess
@@ -29,6 +28,7 @@ from typing import Any, Final
 from faults.overlay import Overlay
 from faults.plan import Flow, Plan, make_topology
 from faults.records import Kind
+from machine import resident_bytes
 from peers.process import FailedError
 from report import percentile, progress
 from rich.console import Console
@@ -92,11 +92,6 @@ def run(options: argparse.Namespace) -> tuple[dict[str, object], bool]:
 # -- kept
 
 
-def _resident_bytes() -> int:
-    gc.collect()
-    return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
-
-
 def _statements(authority: CertificateAuthority, count: int, unix_s: float) -> Iterator[bytes]:
     """Yield revocations of memberships that a domain never issued: fingerprints are hashes, so they have one form."""
     chance = random.Random(1)
@@ -113,7 +108,8 @@ def _kept(count: int) -> dict[str, float]:
     wires = list(_statements(authority, count, unix_s))
     found: dict[str, float] = {"count": count, "statement_bytes": len(wires[0])}
     revoked = Revocations({key: authority.root.domain})
-    before = _resident_bytes()
+    gc.collect()
+    before = resident_bytes()
     took = array("d", bytes(8 * count))
     for at, wire in enumerate(wires):
         statement = parse(wire)
@@ -121,7 +117,8 @@ def _kept(count: int) -> dict[str, float]:
         begun_ns = time.perf_counter_ns()
         revoked.receive_revocation(statement, origin, now, _nothing)
         took[at] = (time.perf_counter_ns() - begun_ns) / 1e3
-    found["kept_bytes_each"] = (_resident_bytes() - before) / count
+    gc.collect()
+    found["kept_bytes_each"] = (resident_bytes() - before) / count
     found["take_us_p50"], found["take_us_p99"] = percentile(took, 0.5), percentile(took, 0.99)
     found["known_us"] = _each_us(
         lambda s: revoked.receive_revocation(s, b"a", Timestamps(1e6, unix_s), _nothing), wires[:5_000]

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import argparse
 import gc
-import os
 import sys
 import time
 from collections import defaultdict
@@ -30,6 +29,7 @@ from typing import Final
 from faults.overlay import Overlay
 from faults.plan import Churn, Flow, Plan, make_topology
 from faults.slope import Growth, growth_of
+from machine import map_bytes, resident_bytes
 from peers.process import FailedError
 from report import progress
 from rich.console import Console
@@ -50,7 +50,6 @@ CACHES: Final = ADCERTS_REMEMBERED + 500  # publishers until every bounded memor
 FILL_KB: Final = 16.0  # a publisher, until then: seven delegations over six nodes, and other remembered state
 FILLING: Final = "publishers of new names, while memories fill"
 LEFT, RIGHT = "s1/left", "s3/right"
-PAGE_BYTES: Final = os.sysconf("SC_PAGE_SIZE")
 SHARE: Final = 0.02  # share of the mean
 LEAST: Final = {"objects": 200.0, "memory, kB": 512.0, "descriptors": 0.0, "threads": 0.0, "map bytes": 1_024.0}
 
@@ -132,7 +131,7 @@ def _repeat(label: str, once: Callable[[], None], times: int, samples: Samples |
             gc.collect()
             if label != FILLING:
                 samples[label, "objects"].append(len(gc.get_objects()))
-            samples[label, "memory, kB"].append(_resident_bytes(os.getpid()) / 1_024)
+            samples[label, "memory, kB"].append(resident_bytes() / 1_024)
     progress(f"{label}: {times} in {time.monotonic() - begun_s:.0f} s")
 
 
@@ -184,22 +183,9 @@ def _look(pid: int) -> Iterator[tuple[str, float]]:
     folder = Path(f"/proc/{pid}")
     yield "descriptors", float(len(list((folder / "fd").iterdir())))
     yield "threads", float(len(list((folder / "task").iterdir())))
-    yield "memory, kB", _resident_bytes(pid) / 1_024
-    maps = list(_map_bytes(folder))
-    if maps:
-        yield "map bytes", float(sum(maps))
-
-
-def _resident_bytes(pid: int) -> int:
-    return int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]) * PAGE_BYTES
-
-
-def _map_bytes(folder: Path) -> Iterator[int]:
-    """Yield the bytes of each BPF map of a process. Source: Linux, kernel/bpf/syscall.c, ``bpf_map_show_fdinfo``."""
-    for each in (folder / "fdinfo").iterdir():
-        facts = dict(line.split(":", 1) for line in each.read_text(encoding="ascii").splitlines() if ":" in line)
-        if "map_type" in facts:
-            yield int(facts["memlock"])
+    yield "memory, kB", resident_bytes(pid) / 1_024
+    if maps := map_bytes(pid):
+        yield "map bytes", float(maps)
 
 
 def show(samples: Samples, publishers: int) -> bool:

@@ -20,7 +20,7 @@ from typing import Final
 
 from faults.link_faults import FrameFaults
 from faults.overlay import Overlay
-from faults.plan import Flow, Plan, make_topology
+from faults.plan import Flow, Plan, ends_of, make_topology
 
 from gdp.simulation.topology import Link
 
@@ -153,8 +153,8 @@ def _cut(**ways: str) -> dict[str, Callable[[Overlay, int], None]]:
     return _OnPath(
         "s4",
         ways,
-        lambda overlay, link: overlay.cut(*link.split("-")),
-        lambda overlay, link: overlay.restore_link(*link.split("-")),
+        lambda overlay, link: overlay.cut(*ends_of(link)),
+        lambda overlay, link: overlay.restore_link(*ends_of(link)),
     ).both()
 
 
@@ -162,8 +162,8 @@ def _silence(**ways: str) -> dict[str, Callable[[Overlay, int], None]]:
     return _OnPath(
         "s4",
         ways,
-        lambda overlay, link: overlay.disturb(*link.split("-"), FrameFaults(lost=1.0)),
-        lambda overlay, link: overlay.calm(*link.split("-")),
+        lambda overlay, link: overlay.disturb(*ends_of(link), FrameFaults(lost=1.0)),
+        lambda overlay, link: overlay.calm(*ends_of(link)),
     ).both()
 
 

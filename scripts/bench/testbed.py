@@ -99,13 +99,21 @@ class Lab:
         """Call ``work`` in a machine's namespace."""
         return netns_files.inside(self.namespaces.path(node), work)
 
-    def start(self, node: str, what: str, arguments: Sequence[str], environment: Sequence[str] = ()) -> Started:
+    def start(
+        self,
+        node: str,
+        what: str,
+        arguments: Sequence[str],
+        environment: Sequence[str] = (),
+        *,
+        has_orders: bool = False,
+    ) -> Started:
         """Start Python on a machine; ``what`` names its log, ``environment`` holds ``KEY=value``."""
 
         def command(argv: Sequence[str]) -> list[str]:
             return self.namespaces.command(node, ["env", *environment, *argv] if environment else list(argv))
 
-        started = Started(self.run, f"{what} at {node}", command, arguments)
+        started = Started(self.run, f"{what} at {node}", command, arguments, has_orders=has_orders)
         if (priority := self._priorities.get(what)) is not None:
             os.sched_setscheduler(started.pid, os.SCHED_FIFO, os.sched_param(priority))
         return started

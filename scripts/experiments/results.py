@@ -66,7 +66,7 @@ def rows_of(folder: Path) -> list[Row]:
         "fig9": _kills,
         "outages": _outages,
     }
-    rows = []
+    rows: list[Row] = []
     for name, make in makers.items():
         path = folder / f"{name}.json"
         if path.exists():

@@ -68,7 +68,7 @@ class Source:
         self._publisher = station.advertise(settings["name"], reliable=settings["reliable"])
         self._token, self._out = token, out
         self._filler = bytes(max(settings["size"] - _HEAD.size, 0))
-        self._every_s = 1.0 / settings["hz"]
+        self._every_s = 1.0 / float(settings["hz"])
         self.due_s = time.monotonic() + random.random() * self._every_s
         self._number = 0
         self._readers = -1
@@ -94,10 +94,10 @@ class Caller:
 
     def __init__(self, station: Station, settings: dict[str, Any], token: bytes, life: int, out: RecordWriter) -> None:
         self._station, self._token, self._out, self._life = station, token, out, life
-        self._channel, self._timeout_s = settings["channel"], settings["timeout_s"]
+        self._channel, self._timeout_s = settings["channel"], float(settings["timeout_s"])
         self._stream, self._name = station.call(settings["name"]), station.name_of(settings["name"])
         self._dispatch: Dispatch[int] = Dispatch(start=random.getrandbits(62))
-        self._every_s = 1.0 / settings["hz"]
+        self._every_s = 1.0 / float(settings["hz"])
         self.due_s = time.monotonic() + random.random() * self._every_s
         self._count = 0
 
@@ -217,7 +217,7 @@ class Churning:
     def __init__(self, station: Station, settings: dict[str, Any], begin: Callable[[dict[str, Any]], None]) -> None:
         self._station, self._reported_counts, self._begin = station, settings, begin
         self._name = station.name_of(settings["name"])
-        self._every_s = 1.0 / settings["hz"]
+        self._every_s = 1.0 / float(settings["hz"])
         self.due_s = time.monotonic() + random.random() * self._every_s
         self._is_taken_up = False
 
@@ -280,8 +280,8 @@ def main() -> None:
             now_s = time.monotonic()
             for source in sources:
                 source.go_on(now_s)
-            for each in (*remote_clients, *churn):
-                each.go_on(now_s)
+            for active in (*remote_clients, *churn):
+                active.go_on(now_s)
             for name, taker in takers.items():
                 if isinstance(taker, Reading):
                     taker.look(station, name, now_s)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 
-__all__ = ["Churn", "Flow", "Plan", "Service", "make_topology"]
+__all__ = ["Churn", "Flow", "Plan", "Service", "ends_of", "make_topology"]
 
 RIB_IFNAME = "rib"
 
@@ -112,6 +112,12 @@ class Plan:
                 yield topics.index(each.topic), each
 
 
+def ends_of(link: str) -> tuple[str, str]:
+    """Return the two ends of a link ``a-b``."""
+    a, _, b = link.partition("-")
+    return a, b
+
+
 def make_topology(
     domains: Mapping[str, Iterable[str]],
     uppers: Mapping[str, str],
@@ -136,7 +142,7 @@ def make_topology(
         DomainPlan(label, (*switches, *(m for m, home in members.items() if of[home] == label)), uppers.get(label))
         for label, switches in domains.items()
     )
-    made = [Link(*each.split("-")) if isinstance(each, str) else each for each in links]
+    made = [Link(*ends_of(each)) if isinstance(each, str) else each for each in links]
     leads = [Link(member, home) for member, home in members.items()]
     attachments = (
         *(Attachment(switch, "rib", RIB_IFNAME) for switch in ribs),
