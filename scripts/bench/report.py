@@ -35,7 +35,19 @@ from machine import MachineState
 from rich.console import Console
 from rich.table import Table
 
-__all__ = ["Rounds", "Settings", "Spread", "Target", "number_text", "percentile", "progress", "show", "write_json"]
+__all__ = [
+    "Rounds",
+    "Settings",
+    "Spread",
+    "Target",
+    "markdown_table",
+    "number_text",
+    "percentile",
+    "print_table",
+    "progress",
+    "show",
+    "write_json",
+]
 
 Settings = Mapping[str, str | int | float | bool | Sequence[int] | Sequence[str]]
 _CONSOLE_COLUMNS = 165
@@ -214,6 +226,26 @@ def number_text(value: float) -> str:
     return f"{value:.2f}" if size >= 0.1 or not size else f"{value:.2g}"
 
 
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]], numbers: int = 0) -> str:
+    """Return a table in Markdown; the last ``numbers`` columns are aligned to the right."""
+    rule = ["---"] * (len(head) - numbers) + ["--:"] * numbers
+    return "\n".join("| " + " | ".join(line) + " |" for line in [head, rule, *rows])
+
+
+def print_table(head: Sequence[str], rows: Iterable[Sequence[str]], *, title: str = "", words: int = 1) -> None:
+    """Print a table whose first ``words`` columns are words, and all others figures."""
+    table = Table(title=title or None, title_justify="left")
+    for at, heading in enumerate(head):
+        table.add_column(heading, justify="left" if at < words else "right")
+    for row in rows:
+        table.add_row(*row)
+    _console().print(table)
+
+
+def _console() -> Console:
+    return Console() if sys.stdout.isatty() else Console(width=_CONSOLE_COLUMNS)
+
+
 def progress(text: str) -> None:
     """Report progress on stderr, so that stdout holds results alone."""
     print(text, file=sys.stderr, flush=True)
@@ -221,7 +253,7 @@ def progress(text: str) -> None:
 
 def show(title: str, state: MachineState, settings: Settings, over: Rounds, targets: Sequence[Target] = ()) -> None:
     """Print the machine, a table a case, and a line for each figure with a target."""
-    console = Console() if sys.stdout.isatty() else Console(width=_CONSOLE_COLUMNS)
+    console = _console()
     console.print(f"[bold]{title}[/bold]\n{state}", highlight=False)
     console.print(
         "; ".join(f"{key}: {_setting_text(value)}" for key, value in settings.items()), highlight=False, soft_wrap=True
