@@ -280,16 +280,32 @@ def _setting_text(value: str | float | Sequence[int] | Sequence[str]) -> str:
 
 
 def write_json(
-    path: Path, bench: str, state: MachineState, settings: Settings, over: Rounds, targets: Sequence[Target] = ()
+    path: Path,
+    bench: str,
+    state: MachineState,
+    settings: Settings,
+    over: Rounds,
+    targets: Sequence[Target] = (),
+    *,
+    keeps: bool = False,
 ) -> None:
-    """Write all values of all rounds, and the targets with their results."""
+    """Write all values of all rounds, and the targets with their results.
+
+    Args:
+        keeps: rows and targets that the file has and this run has not are kept.
+    """
+    held = json.loads(path.read_text(encoding="utf-8")) if keeps and path.exists() else {"rounds": {}, "targets": []}
+    new = {target.what for target in targets}
     answer = {
         "bench": bench,
         "machine": asdict(state),
         "settings": dict(settings),
-        "rounds": over.values,
+        "rounds": {**held["rounds"], **over.values},
         "not_here": over.reasons,
-        "targets": [{**asdict(target), "met": target.met} for target in targets],
+        "targets": [
+            *(target for target in held["targets"] if target["what"] not in new),
+            *({**asdict(target), "met": target.met} for target in targets),
+        ],
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(answer, indent=1) + "\n", encoding="utf-8")
