@@ -38,9 +38,7 @@ from pathlib import Path
 from typing import Any, Final
 from unittest import mock
 
-from report import progress
-from rich.console import Console
-from rich.table import Table
+from report import print_table, progress
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
@@ -131,13 +129,12 @@ def run(options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
     measured = list(_measured(options))
     new = {(row.speaker, row.kind) for row in measured}
     rows = [*(row for row in _held(options.json) if (row.speaker, row.kind) not in new), *measured]
-    table = Table(title="Bytes drawn for each byte said", title_justify="left")
-    for heading in ("speaker", "kind", "said, bytes", "plain", "beyond its grants", "towards it", "met"):
-        table.add_column(heading, justify="left" if heading in ("speaker", "kind") else "right")
+    lines = []
     for row in sorted(rows, key=lambda each: (each.speaker, -_decisive(each))):
         figures = (_text(row.plain), _text(row.beyond), _text(row.towards))
-        table.add_row(row.speaker, row.kind, f"{row.said:,}", *figures, "yes" if _is_met(row) else "NO")
-    Console(width=120).print(table)
+        lines.append((row.speaker, row.kind, f"{row.said:,}", *figures, "yes" if _is_met(row) else "NO"))
+    head = ("speaker", "kind", "said, bytes", "plain", "beyond its grants", "towards it", "met")
+    print_table(head, lines, title="Bytes drawn for each byte said", words=2)
     members = max((_decisive(row) for row in rows if row.speaker not in _STRANGERS), default=0.0)
     strangers = max((_decisive(row) for row in rows if row.speaker in _STRANGERS), default=0.0)
     progress(f"members, beyond their grants: {members:.2f}, at most {GOAL_BEYOND}")

@@ -42,9 +42,8 @@ from faults.plan import Flow, Plan, make_topology
 from faults.records import Kind as Happened
 from machine import processor_s, resident_bytes
 from peers.process import Started
-from report import progress
-from rich.console import Console
-from rich.table import Table
+from report import print_table, progress
+from skeleton import new_run
 
 from gdp.control.fragments import ControlFragmenter
 from gdp.control.hello import ECHO_BYTES, LIFE_BYTES, NONCE_BYTES, Hello
@@ -229,27 +228,23 @@ def measure(
     runs: RunRegistry, plane: str, kinds: Sequence[str], seconds: float, rate: float, rounds: int, *, spoof: bool
 ) -> dict[str, list[dict[str, Phase]]]:
     """Return the phases of each round by kind of flood, calm and flooded."""
-    run = runs.start()
-    try:
-        with Overlay(run, plan(), plane=plane) as overlay:
-            overlay.start_all()
-            time.sleep(SETTLE_S)
-            found: dict[str, list[dict[str, Phase]]] = {kind: [] for kind in kinds}
-            for number in range(rounds):
-                for kind in kinds:
-                    progress(f"{plane}, {kind}, round {number + 1}")
-                    calm = phase(overlay, kind, seconds)
-                    time.sleep(SETTLE_S)
-                    of_kind = TIMES * FLOW.hz if kind == "parts" else rate
-                    with _flooding(run, overlay, kind, of_kind, seconds + 1 + _RESTART_S, spoof=spoof) as flood:
-                        flooded = phase(overlay, kind, seconds)
-                        said = flood.read(_RESTART_S + 30)
-                        progress(f"{float(str(said['sent'])) / float(str(said['seconds'])):,.0f} frames a second")
-                        found[kind].append({"calm": calm, "flooded": flooded})
-                    time.sleep(SETTLE_S)
-            return found
-    finally:
-        run.end()
+    with new_run(runs) as run, Overlay(run, plan(), plane=plane) as overlay:
+        overlay.start_all()
+        time.sleep(SETTLE_S)
+        found: dict[str, list[dict[str, Phase]]] = {kind: [] for kind in kinds}
+        for number in range(rounds):
+            for kind in kinds:
+                progress(f"{plane}, {kind}, round {number + 1}")
+                calm = phase(overlay, kind, seconds)
+                time.sleep(SETTLE_S)
+                of_kind = TIMES * FLOW.hz if kind == "parts" else rate
+                with _flooding(run, overlay, kind, of_kind, seconds + 1 + _RESTART_S, spoof=spoof) as flood:
+                    flooded = phase(overlay, kind, seconds)
+                    said = flood.read(_RESTART_S + 30)
+                    progress(f"{float(str(said['sent'])) / float(str(said['seconds'])):,.0f} frames a second")
+                    found[kind].append({"calm": calm, "flooded": flooded})
+                time.sleep(SETTLE_S)
+        return found
 
 
 @contextmanager
@@ -315,19 +310,19 @@ def run(options: argparse.Namespace) -> tuple[dict[str, object], bool]:
     verified = verifications_hz()
     rate = options.rate or TIMES * verified
     headers = ("goodput, ratio", "lost", "memory, MiB", "core", "restart, s", "backlog drops", "waited", "reached")
-    table = Table("plane", "flood", *headers, title=f"{rate:,.0f} frames a second")
+    rows = list[tuple[str, ...]]()
     saved: dict[str, object] = {"verified_hz": verified, "rate_hz": rate}
     has_met = True
     for plane in options.planes:
         found = measure(runs, plane, options.kinds, options.seconds, rate, options.rounds, spoof=options.spoof)
         for kind, rounds in found.items():
-            table.add_row(plane, kind, *_row(rounds))
+            rows.append((plane, kind, *_row(rounds)))
             has_met = has_met and (kind == "noise" or _has_met(rounds))
         saved[plane] = {
             kind: [{name: asdict(each) for name, each in pair.items()} for pair in rounds]
             for kind, rounds in found.items()
         }
-    Console(width=140).print(table)
+    print_table(("plane", "flood", *headers), rows, title=f"{rate:,.0f} frames a second", words=2)
     return saved, has_met
 
 

@@ -42,13 +42,12 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Final
 from unittest import mock
 
-from report import progress
-from rich.console import Console
-from rich.table import Table
+from report import print_table, progress
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
@@ -661,16 +660,9 @@ def _episode(domain: Domain, tries: int, counts: Counter[str], restarts: Counter
 
 
 def _show(counts: Counter[str], restarts: Counter[str], found: list[str]) -> None:
-    table = Table(title=f"{counts.total():,} recorded frames played back, {len(found)} accepted", title_justify="left")
-    table.add_column("kind")
-    table.add_column("tries", justify="right")
-    table.add_column("restarted")
-    table.add_column("tries", justify="right")
-    left, right = counts.most_common(), restarts.most_common()
-    for at in range(max(len(left), len(right))):
-        a, b = (each[at] if at < len(each) else ("", "") for each in (left, right))
-        table.add_row(str(a[0]), str(a[1]), str(b[0]), str(b[1]))
-    console = Console(width=120)
-    console.print(table)
+    rows = zip_longest(counts.most_common(), restarts.most_common(), fillvalue=("", ""))
+    cells = [(str(what), str(tries), str(which), str(often)) for (what, tries), (which, often) in rows]
+    title = f"{counts.total():,} recorded frames played back, {len(found)} accepted"
+    print_table(("kind", "tries", "restarted", "tries"), cells, title=title)
     for each in found[:20]:
-        console.print(each, highlight=False)
+        print(each)

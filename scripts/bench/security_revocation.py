@@ -20,7 +20,6 @@ import tempfile
 import time
 from array import array
 from collections.abc import Iterator
-from contextlib import ExitStack
 from itertools import chain
 from pathlib import Path
 from typing import Any, Final
@@ -30,9 +29,8 @@ from faults.plan import Flow, Plan, make_topology
 from faults.records import Kind
 from machine import resident_bytes
 from peers.process import FailedError
-from report import percentile, progress
-from rich.console import Console
-from rich.table import Table
+from report import percentile, print_table, progress
+from skeleton import new_run
 
 from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.keys import SigningKey
@@ -231,10 +229,7 @@ def _statements_more(authority: CertificateAuthority, count: int, unix_s: float)
 
 
 def _show_kept(found: dict[str, float]) -> None:
-    table = Table(title=f"{found['count']:,.0f} revocations of one domain", title_justify="left")
-    table.add_column("what")
-    table.add_column("figure", justify="right")
-    for what, text in (
+    rows = (
         ("memory, each", f"{found['kept_bytes_each']:.0f} B (the statement has {found['statement_bytes']:.0f})"),
         ("memory, all", f"{found['kept_bytes_each'] * found['count'] / 1e6:.1f} MB"),
         ("to take one, p50, p99", f"{found['take_us_p50']:.0f}, {found['take_us_p99']:.0f} µs"),
@@ -246,9 +241,8 @@ def _show_kept(found: dict[str, float]) -> None:
         ("until a newcomer keeps all", f"{found['newcomer_s']:.0f} s, paced; {found['newcomer_bytes'] / 1e6:.1f} MB"),
         ("... processor time of both ends", f"{found['newcomer_cpu_s']:.0f} s"),
         ("it comes back, ten are new", f"{found['ten_more_s']:.1f} s, {found['ten_more_bytes'] / 1e3:.1f} kB"),
-    ):
-        table.add_row(what, text)
-    Console(width=120).print(table)
+    )
+    print_table(("what", "figure"), rows, title=f"{found['count']:,.0f} revocations of one domain")
 
 
 # -- closed
@@ -277,10 +271,7 @@ def _closed(options: argparse.Namespace) -> dict[str, Any]:
     runs.sweep()
     for number in range(options.rounds):
         progress(f"closed: network {number + 1} of {options.rounds}")
-        with ExitStack() as undo:
-            run_ = runs.start()
-            undo.callback(run_.end)
-            overlay = undo.enter_context(Overlay(run_, _plan(options.hz), plane=options.plane))
+        with new_run(runs) as run_, Overlay(run_, _plan(options.hz), plane=options.plane) as overlay:
             overlay.start_all()
             late += _Closing(overlay).measure(found)
     return {"target_s": TARGET_S, "hz": options.hz, "not_closed": late, **found}
@@ -362,9 +353,7 @@ class _Closing:
 
 
 def _show_closed(found: dict[str, Any]) -> bool:
-    table = Table(title="From a revocation to the last message of the closed flow, three tiers", title_justify="left")
-    for heading in ("revoked", "from", "to reach", "flows", "p50 ms", "p99 ms", "max ms", "met"):
-        table.add_column(heading, justify="left" if heading in ("revoked", "from") else "right")
+    rows = list[tuple[str, ...]]()
     has_met = not found["not_closed"]
     for what in ("delegation", "membership"):
         for since, key, target_s in (("the signal", what, found["target_s"]), ("the command", f"{what}_command", None)):
@@ -374,10 +363,10 @@ def _show_closed(found: dict[str, Any]) -> bool:
             has_met = has_met and is_met
             figures = (f"{p50 * 1e3:.0f}", f"{p99 * 1e3:.0f}", f"{max(seconds) * 1e3:.0f}")
             asked = "" if target_s is None else f"≤ {target_s * 1e3:g}"
-            table.add_row(what, since, asked, str(len(seconds)), *figures, "" if target_s is None else _yes(is_met))
-    console = Console(width=120)
-    console.print(table)
-    console.print(f"flows that were not closed: {found['not_closed']}", highlight=False)
+            rows.append((what, since, asked, str(len(seconds)), *figures, "" if target_s is None else _yes(is_met)))
+    head = ("revoked", "from", "to reach", "flows", "p50 ms", "p99 ms", "max ms", "met")
+    print_table(head, rows, title="From a revocation to the last message of the closed flow, three tiers", words=2)
+    print(f"flows that were not closed: {found['not_closed']}")
     return has_met
 
 

@@ -31,9 +31,7 @@ from faults.plan import Churn, Flow, Plan, make_topology
 from faults.slope import Growth, growth_of
 from machine import map_bytes, resident_bytes
 from peers.process import FailedError
-from report import progress
-from rich.console import Console
-from rich.table import Table
+from report import print_table, progress
 from skeleton import clean_exit, command_line, new_run
 
 from gdp.simulation.simulation import Simulation
@@ -190,18 +188,15 @@ def _look(pid: int) -> Iterator[tuple[str, float]]:
 
 def show(samples: Samples, publishers: int) -> bool:
     """Print every figure; return whether all are flat, or grew as filling memories do."""
-    table = Table(title="After the warm-up", title_justify="left")
-    for heading in ("who", "figure", "mean", "rise", "scatter", "flat"):
-        table.add_column(heading, justify="left" if heading in ("who", "figure") else "right")
-    flat = True
+    rows, flat = [], True
     for (who, what), values in samples.items():
         growth: Growth = growth_of(values)
         least = FILL_KB * publishers if who == FILLING else LEAST[what]
         is_flat = growth.is_flat(SHARE, least)
         flat = flat and is_flat
         figures = (f"{each:,.1f}" for each in (growth.mean, growth.rise, growth.scatter))
-        table.add_row(who, what, *figures, "yes" if is_flat else "NO")
-    Console(width=120).print(table)
+        rows.append((who, what, *figures, "yes" if is_flat else "NO"))
+    print_table(("who", "figure", "mean", "rise", "scatter", "flat"), rows, title="After the warm-up", words=2)
     return flat
 
 
