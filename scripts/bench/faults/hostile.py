@@ -21,8 +21,8 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
+from member_endpoint import End
 from peers.jsonl import say
-from priority_endpoint import End
 
 from gdp.client.writer_proxy import WriterProxyState
 from gdp.control.fragments import ControlFragmenter
@@ -109,7 +109,7 @@ class HostileProxy:
         self._end = End(Path(reported["config"]), 0.0)
         self.plane, self.runtime = self._end.plane, self._end.runtime
         self._topic = self._end.subscribe(reported["reads"])
-        self._own = self._end._topics[reported["publishes"]]
+        self._own = self._end.topics[reported["publishes"]]
         self._publisher = self._end.advertise(reported["publishes"], reliable=True)
 
     def is_ready(self) -> bool:

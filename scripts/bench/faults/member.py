@@ -21,12 +21,11 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
+from member_endpoint import End
 from peers.jsonl import say
-from priority_endpoint import End
 
 from faults.records import Kind, RecordWriter
 from gdp.client.participant import Message
-from gdp.client.publisher import Publisher
 from gdp.errors import LocalError
 from gdp.message.loss import LossReason
 from gdp.names import Name
@@ -41,28 +40,11 @@ _BEHIND_S: Final = 0.5  # messages that are overdue for so long are skipped
 _LOOK_S: Final = 0.25  # pause between two checks for losses
 
 
-class Station(End):
-    """A member on its plane, with services."""
-
-    def serve(self, name: str) -> Name:
-        """Serve a name from now on; return it."""
-        self.member.serve(self._topics[name], b"bench")
-        return self._topics[name].name
-
-    def call(self, name: str) -> Publisher:
-        """Call a name from now on; return the stream that all its servers receive."""
-        return self.member.call(self._topics[name], b"bench")
-
-    def name_of(self, name: str) -> Name:
-        """Return the overlay name of a topic or service."""
-        return self._topics[name].name
-
-
 class Source:
     """Publishes one topic at an even rate."""
 
     def __init__(
-        self, station: Station, settings: dict[str, Any], token: bytes, who: tuple[int, int], out: RecordWriter
+        self, station: End, settings: dict[str, Any], token: bytes, who: tuple[int, int], out: RecordWriter
     ) -> None:
         self._channel, (self._index, self._life) = settings["channel"], who
         self._publisher = station.advertise(settings["name"], reliable=settings["reliable"])
@@ -92,7 +74,7 @@ class Source:
 class Caller:
     """Caller of one service at an even rate: all replicas receive the request, the first response counts."""
 
-    def __init__(self, station: Station, settings: dict[str, Any], token: bytes, life: int, out: RecordWriter) -> None:
+    def __init__(self, station: End, settings: dict[str, Any], token: bytes, life: int, out: RecordWriter) -> None:
         self._station, self._token, self._out, self._life = station, token, out, life
         self._channel, self._timeout_s = settings["channel"], float(settings["timeout_s"])
         self._stream, self._name = station.call(settings["name"]), station.name_of(settings["name"])
@@ -173,7 +155,7 @@ class Reading:
         self._reported_counts = Counter[LossReason]()
         self._look_at_s = 0.0
 
-    def look(self, station: Station, name: Name, now_s: float) -> None:
+    def look(self, station: End, name: Name, now_s: float) -> None:
         """Record reported losses, at intervals."""
         if now_s < self._look_at_s:
             return
@@ -197,7 +179,7 @@ class Reading:
 class Serving:
     """Server that echoes each request."""
 
-    def __init__(self, station: Station, name: Name, token: bytes) -> None:
+    def __init__(self, station: End, name: Name, token: bytes) -> None:
         self._station, self._name, self._token = station, name, token
 
     def take(self, message: Message, now_s: float) -> None:
@@ -214,7 +196,7 @@ class Serving:
 class Churning:
     """Topic that is subscribed or published, and left, repeatedly."""
 
-    def __init__(self, station: Station, settings: dict[str, Any], begin: Callable[[dict[str, Any]], None]) -> None:
+    def __init__(self, station: End, settings: dict[str, Any], begin: Callable[[dict[str, Any]], None]) -> None:
         self._station, self._reported_counts, self._begin = station, settings, begin
         self._name = station.name_of(settings["name"])
         self._every_s = 1.0 / float(settings["hz"])
@@ -240,7 +222,7 @@ def main() -> None:
     settings: dict[str, Any] = json.loads(sys.argv[1])
     out, life = RecordWriter(Path(settings["records"])), settings["life"]
     tokens = {int(channel): bytes.fromhex(token) for channel, token in settings["tokens"].items()}
-    station = Station(Path(settings["config"]), 0.0)
+    station = End(Path(settings["config"]), 0.0)
     takers: dict[Name, Reading | Serving | Caller] = {}
     for each in settings["read"]:
         takers[station.subscribe(each["name"])] = Reading(each["channel"], tokens[each["channel"]], out)
