@@ -19,6 +19,7 @@ from socket import AF_INET
 from typing import Final, Protocol
 
 from chains import Chain
+from devices import add_bridge
 from frames import SINK, SOURCE, Wire, gdp_frame, ip_frame
 from peers.process import Started
 from pyroute2 import IPRoute
@@ -144,7 +145,7 @@ class Bridge:
         with ExitStack() as undo:
             for node in chain.middles:
                 undo.callback(chain.inside, node, _remove_bridge)
-                chain.inside(node, partial(_make_bridge, chain.devices(node)))
+                chain.inside(node, partial(add_bridge, _BRIDGE, chain.devices(node)))
             chain.round_trips(self.wire(chain, 128), 10, poll=False)  # every bridge has then learnt both addresses
             return undo.pop_all()
 
@@ -187,15 +188,6 @@ class IPv4:
 def _links() -> Iterator[tuple[IPRoute, dict[str, int]]]:
     with IPRoute() as ipr:
         yield ipr, {link.get("ifname"): link["index"] for link in ipr.get_links()}
-
-
-def _make_bridge(devices: list[str]) -> None:
-    with _links() as (ipr, index):
-        ipr.link("add", ifname=_BRIDGE, kind="bridge", br_stp_state=0, br_forward_delay=0)
-        bridge = ipr.link_lookup(ifname=_BRIDGE)[0]
-        for device in devices:
-            ipr.link("set", index=index[device], master=bridge)
-        ipr.link("set", index=bridge, state="up")
 
 
 def _remove_bridge() -> None:

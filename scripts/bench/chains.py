@@ -15,10 +15,10 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+from devices import mac_addresses, set_mtu
 from frames import Wire
 from machine import offloads, soft_interrupts_s, thread_s
 from peers.process import Started, figures_of, floats_of
-from pyroute2 import IPRoute
 from rate_search import Try
 from testbed import Lab
 
@@ -56,7 +56,7 @@ class Chain(Lab):
             undo.callback(run.end)
             super().__init__(run, chain(switches + 2, mtu))
             self.nodes = self.topology.nodes
-            self._macs = {node: self.inside(node, partial(_addresses, self.devices(node))) for node in self.nodes}
+            self._macs = {node: self.inside(node, partial(mac_addresses, self.devices(node))) for node in self.nodes}
             self._source, self._sink = (
                 undo.enter_context(self.worker(node, "end", cpu=cpu, ifname=self.devices(node)[0]))
                 for node, cpu in ((self.nodes[0], _SOURCE_CPU), (self.nodes[-1], _SINK_CPU))
@@ -93,7 +93,8 @@ class Chain(Lab):
     def set_mtu(self, mtu: int) -> None:
         """Set the MTU of every device, in bytes."""
         for node in self.nodes:
-            self.inside(node, partial(_set_mtus, self.devices(node), mtu))
+            for device in self.devices(node):
+                self.inside(node, partial(set_mtu, device, mtu))
 
     def offloads(self) -> list[dict[str, bool]]:
         """Return the offloads of every device."""
@@ -147,18 +148,6 @@ class Chain(Lab):
         times = floats_of(self._source.ask(do="ping", frame=wire.out.hex(), **same), "rtt_us")
         self._sink.read(_READY_S)
         return times
-
-
-def _addresses(devices: Sequence[str]) -> dict[str, bytes]:
-    with IPRoute() as ipr:
-        links = {link.get("ifname"): link.get("address") for link in ipr.get_links()}
-    return {device: bytes.fromhex(links[device].replace(":", "")) for device in devices}
-
-
-def _set_mtus(devices: Sequence[str], mtu: int) -> None:
-    with IPRoute() as ipr:
-        for device in devices:
-            ipr.link("set", index=ipr.link_lookup(ifname=device)[0], mtu=mtu)
 
 
 def _all_offloads(devices: Sequence[str]) -> list[dict[str, bool]]:

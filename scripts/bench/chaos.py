@@ -38,12 +38,13 @@ from faults.link_faults import FrameFaults
 from faults.network import VICTIM, random_network
 from faults.oracle import Oracle
 from faults.overlay import Overlay
-from faults.plan import Plan, ends_of
+from faults.plan import Plan
 from faults.schedule import STORE, Fault, FaultKind, broken_by, make_schedule
 from faults.store import StoreCluster, has_server
 from peers.process import FailedError
 from report import percentile, print_table, progress
 from skeleton import Options, clean_exit, command_line, new_run
+from topologies import ends_of
 
 from gdp.errors import GdpError
 from gdp.host.run_registry import RunRegistry

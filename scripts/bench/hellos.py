@@ -13,10 +13,11 @@ import time
 from typing import Final
 
 from faults.overlay import Overlay
-from faults.plan import Plan, make_topology
+from faults.plan import Plan
 from machine import processor_s
 from report import Rounds, progress
 from skeleton import Options, Outcome, command_line, new_run, run_bench
+from topologies import make_topology
 
 from gdp.host.run_registry import RunRegistry
 

@@ -29,11 +29,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Final, Literal
 
+from devices import add_address, add_bridge
 from machine import processor_s
 from peers.process import Started
-from pyroute2 import IPRoute
-from testbed import LEFT, MIDDLE, RIGHT, ROW, Lab, OverlayNodes, make_topology
 from testbed import SOCKET_BUFFER_BYTES as BUFFER_BYTES
+from testbed import Lab, OverlayNodes
+from topologies import LEFT, MIDDLE, RIGHT, ROW, flat_topology
 
 from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
@@ -89,11 +90,11 @@ class Row:
     def __init__(self, run: Run, carried: Sequence[Carried], *, mtu: int, bridged: bool = False) -> None:
         direct = (LEFT, *(_BRIDGES if bridged else ()), RIGHT)
         links = [*pairwise(ROW), *pairwise(direct)]
-        self._lab = Lab(run, make_topology(links, mtu=mtu, rib="s2", members=(LEFT, RIGHT)))
-        for node in direct[1:-1]:
-            self._lab.inside(node, _bridge)
+        self._lab = Lab(run, flat_topology(links, mtu=mtu, rib="s2", members=(LEFT, RIGHT)))
+        for before, node, after in zip(direct, direct[1:-1], direct[2:], strict=False):
+            self._lab.inside(node, partial(add_bridge, _BRIDGE, (before, after)))
         for node, device in ((LEFT, direct[1]), (RIGHT, direct[-2])):
-            self._lab.inside(node, partial(_number, device, _ADDRESSES[node]))
+            self._lab.inside(node, partial(add_address, device, _ADDRESSES[node]))
         with ExitStack() as undo:
             self._nodes = OverlayNodes(self._lab, MIDDLE, plane="kernel", ready_s=READY_S)
             undo.callback(self._nodes.close)
@@ -134,23 +135,6 @@ class Row:
             self._nodes.admit(node, each.metadata, _RIGHTS[each.kind][not is_source])
             sides["expose" if is_source else "import"].append(each.rule(self._nodes.owner_key))
         return str(self._nodes.admit_proxy(node, _DOMAINS[node], sides))
-
-
-def _number(device: str, address: str) -> None:
-    with IPRoute() as here:
-        (index,) = here.link_lookup(ifname=device)
-        here.addr("add", index=index, address=address, prefixlen=24)
-
-
-def _bridge() -> None:
-    """Join all links of this namespace by a bridge."""
-    with IPRoute() as here:
-        here.link("add", ifname=_BRIDGE, kind="bridge")
-        (bridge,) = here.link_lookup(ifname=_BRIDGE)
-        for link in here.get_links():
-            if link["index"] not in (1, bridge):  # 1 is the loopback device
-                here.link("set", index=link["index"], master=bridge)
-        here.link("set", index=bridge, state="up")
 
 
 def _cyclone(node: str) -> str:

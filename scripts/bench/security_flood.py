@@ -33,17 +33,17 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Final
 
 from faults.overlay import Overlay
-from faults.plan import Flow, Plan, make_topology
+from faults.plan import Flow, Plan
 from faults.records import Kind as Happened
 from machine import processor_s, resident_bytes
 from peers.process import Started
 from report import print_table, progress
 from skeleton import new_run
+from topologies import make_topology
 
 from gdp.control.fragments import ControlFragmenter
 from gdp.control.hello import ECHO_BYTES, LIFE_BYTES, NONCE_BYTES, Hello
@@ -258,7 +258,7 @@ def _flooding(run: Run, overlay: Overlay, kind: str, rate: float, seconds: float
             "source": _address_of(overlay) if spoof else "",
         }  # fmt: skip
         argv = ["-m", "faults.hello_flood", json.dumps(reported)]
-        with Started(run, f"flood {kind}", partial(overlay.spaces.command, _NEAR), argv) as flood:
+        with overlay.start_other(_NEAR, f"flood {kind}", argv) as flood:
             flood.read(30)
             yield flood
         return
@@ -272,7 +272,7 @@ def _flooding(run: Run, overlay: Overlay, kind: str, rate: float, seconds: float
     overlay.kill(who)
     try:
         argv = ["-m", "faults.hostile", json.dumps(reported)]
-        with Started(run, f"flood {kind}", partial(overlay.spaces.command, node), argv) as flood:
+        with overlay.start_other(node, f"flood {kind}", argv) as flood:
             flood.read(_HOSTILE_READY_S)
             os.kill(flood.pid, signal.SIGUSR1)
             yield flood

@@ -25,12 +25,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from faults.overlay import Overlay
-from faults.plan import Flow, Plan, make_topology
+from faults.plan import Flow, Plan
 from faults.records import Kind
 from machine import resident_bytes
 from peers.process import FailedError
 from report import percentile, print_table, progress
 from skeleton import new_run
+from topologies import make_topology
 
 from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.keys import SigningKey

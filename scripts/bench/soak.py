@@ -27,12 +27,13 @@ from pathlib import Path
 from typing import Final
 
 from faults.overlay import Overlay
-from faults.plan import Churn, Flow, Plan, make_topology
+from faults.plan import Churn, Flow, Plan
 from faults.slope import Growth, growth_of
 from machine import map_bytes, resident_bytes
 from peers.process import FailedError
 from report import print_table, progress
 from skeleton import clean_exit, command_line, new_run
+from topologies import make_topology
 
 from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import chain

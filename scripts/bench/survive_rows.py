@@ -20,7 +20,8 @@ from typing import Final
 
 from faults.link_faults import FrameFaults
 from faults.overlay import Overlay
-from faults.plan import Flow, Plan, ends_of, make_topology
+from faults.plan import Flow, Plan
+from topologies import ends_of, make_topology
 
 from gdp.simulation.topology import Link
 
