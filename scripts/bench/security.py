@@ -20,7 +20,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from types import ModuleType
-from typing import Final
+from typing import Any, Final
 
 import security_amplification
 import security_cost
@@ -61,7 +61,7 @@ def arguments() -> argparse.ArgumentParser:
 
 def save(path: Path, command: str, figures: Mapping[str, object], state: MachineState) -> None:
     """Write the figures of one subcommand; figures of others, and parts that were not measured now, are kept."""
-    held = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"bench": "security"}
+    held: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"bench": "security"}
     before = held.get(command, {})
     held[command] = {**before, **figures, "machine": asdict(state)}
     path.write_text(json.dumps(held, indent=1) + "\n", encoding="utf-8")

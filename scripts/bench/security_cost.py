@@ -230,7 +230,7 @@ def _forwarding(tree: Tree, _: argparse.Namespace) -> Figures:
                         continue
                     (switch,) = plane.workers()
                     costs = []
-                    for _ in range(_TRIES):
+                    for _try in range(_TRIES):
                         before_s = thread_s(switch.pid)
                         got = chain.attempt(wire, [], _STEADY_HZ, _TRY_S).got
                         costs.append(1e6 * (thread_s(switch.pid) - before_s) / got)

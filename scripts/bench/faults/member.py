@@ -203,6 +203,10 @@ class Churning:
         self.due_s = time.monotonic() + random.random() * self._every_s
         self._is_taken_up = False
 
+    def next_s(self) -> float:
+        """Return the next deadline, in monotonic seconds."""
+        return self.due_s
+
     def go_on(self, now_s: float) -> None:
         """Apply the changes that are due."""
         if now_s < self.due_s:
@@ -254,6 +258,7 @@ def main() -> None:
         else:
             takers[station.subscribe(each["name"])] = Reading(each["channel"], token, out)
 
+    actives: list[Caller | Churning] = [*remote_clients, *churn]
     signal.signal(signal.SIGUSR1, begin_spare)
     tune_memory()
     with station.runtime.signals():
@@ -262,14 +267,14 @@ def main() -> None:
             now_s = time.monotonic()
             for source in sources:
                 source.go_on(now_s)
-            for active in (*remote_clients, *churn):
+            for active in actives:
                 active.go_on(now_s)
             for name, taker in takers.items():
                 if isinstance(taker, Reading):
                     taker.look(station, name, now_s)
             station.member.flush(now_s)
             out.flush()
-            due = [each.due_s for each in (*sources, *churn)] + [caller.next_s() for caller in remote_clients]
+            due = [each.due_s for each in sources] + [each.next_s() for each in actives]
             station.runtime.step(min([*due, now_s + _LOOK_S]))
             now_s = time.monotonic()
             for message in station.member.poll_messages():

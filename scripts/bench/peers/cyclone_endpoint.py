@@ -39,7 +39,7 @@ _PREFIX: Final = b"\x00\x01\x00\x00"  # of CDR: little-endian; the answer needs 
 
 
 @dataclass
-class Opaque(IdlStruct, typename="bench::Opaque"):
+class Opaque(IdlStruct, typename="bench::Opaque"):  # type: ignore[call-arg, misc]
     """Any serialised message."""
 
     first: uint8
