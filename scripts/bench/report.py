@@ -27,7 +27,7 @@ import json
 import math
 import statistics
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -166,10 +166,8 @@ class Rounds:
         Args:
             other_case: the other's case, where it is not the same.
         """
-        neighbouring = other_case or case
-        pairs = zip(self.column(one, case, column), self.column(other, neighbouring, column), strict=False)
-        ratios = [None if a is None or not b else a / b for a, b in pairs]
-        return _target(what, asked, at_most, ratios, self._why_not(one, case) or self._why_not(other, neighbouring))
+        values = self._pairwise(one, other, case, column, other_case, lambda a, b: a / b if b else None)
+        return _target(what, asked, at_most, values, self._why_none(one, other, case, other_case))
 
     def difference(
         self,
@@ -184,10 +182,23 @@ class Rounds:
         at_most: bool = True,
     ) -> Target:
         """Return a bound on ``one - other``, round by round."""
-        neighbouring = other_case or case
-        pairs = zip(self.column(one, case, column), self.column(other, neighbouring, column), strict=False)
-        gaps = [None if a is None or b is None else a - b for a, b in pairs]
-        return _target(what, asked, at_most, gaps, self._why_not(one, case) or self._why_not(other, neighbouring))
+        values = self._pairwise(one, other, case, column, other_case, lambda a, b: a - b)
+        return _target(what, asked, at_most, values, self._why_none(one, other, case, other_case))
+
+    def _pairwise(
+        self,
+        one: str,
+        other: str,
+        case: str,
+        column: str,
+        other_case: str | None,
+        of: Callable[[float, float], float | None],
+    ) -> list[float | None]:
+        pairs = zip(self.column(one, case, column), self.column(other, other_case or case, column), strict=False)
+        return [None if a is None or b is None else of(a, b) for a, b in pairs]
+
+    def _why_none(self, one: str, other: str, case: str, other_case: str | None) -> str:
+        return self._why_not(one, case) or self._why_not(other, other_case or case)
 
     def _why_not(self, contender: str, case: str) -> str:
         if contender in self.reasons:

@@ -25,7 +25,6 @@ Rows of earlier runs stay in the file until they are measured again.
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import multiprocessing
 import random
@@ -122,13 +121,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--processes", type=int, default=1)
 
 
-def run(options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
+def run(options: argparse.Namespace, held: dict[str, Any]) -> tuple[dict[str, Any], bool]:
     """Measure every speaker with every kind."""
     logging.disable(logging.CRITICAL)
     ErrorBoundary.reraises = True
     measured = list(_measured(options))
+    before = [Row(**row) for row in held.get("rows", [])]
     new = {(row.speaker, row.kind) for row in measured}
-    rows = [*(row for row in _held(options.json) if (row.speaker, row.kind) not in new), *measured]
+    rows = [*(row for row in before if (row.speaker, row.kind) not in new), *measured]
     lines = []
     for row in sorted(rows, key=lambda each: (each.speaker, -_decisive(each))):
         figures = (_text(row.plain), _text(row.beyond), _text(row.towards))
@@ -144,12 +144,6 @@ def run(options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
         "target_strangers": GOAL_STRANGER, "rows": [asdict(row) for row in rows],
     }  # fmt: skip
     return found, all(map(_is_met, rows))
-
-
-def _held(path: Path) -> list[Row]:
-    """Return the rows of earlier runs."""
-    saved = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    return [Row(**row) for row in saved.get("amplification", {}).get("rows", [])]
 
 
 def _decisive(row: Row) -> float:

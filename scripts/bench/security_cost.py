@@ -93,7 +93,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=float, default=3.0, help="of a figure of messages (default: %(default)s)")
 
 
-def run(options: argparse.Namespace) -> tuple[dict[str, object], bool]:
+def run(options: argparse.Namespace, _: object) -> tuple[dict[str, object], bool]:
     """Measure; return the figures, and whether all costs are within the target."""
     figures: dict[str, object] = {}
     has_met = True

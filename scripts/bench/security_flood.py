@@ -303,7 +303,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--spoof", action="store_true", help="under the address of the neighbour on that link")
 
 
-def run(options: argparse.Namespace) -> tuple[dict[str, object], bool]:
+def run(options: argparse.Namespace, _: object) -> tuple[dict[str, object], bool]:
     """Measure every plane with every kind of flood; return the figures, and whether the targets were met."""
     runs = RunRegistry()
     runs.sweep()

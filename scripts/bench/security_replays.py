@@ -33,7 +33,6 @@ What a frame warrants by itself is none of these: a current keepalive keeps a pr
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import random
 import sys
@@ -568,14 +567,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--control", choices=list(CONTROLS), help="take this check away; something must be found")
 
 
-def run(options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
+def run(options: argparse.Namespace, before: dict[str, Any]) -> tuple[dict[str, Any], bool]:
     """Play back so many frames."""
     logging.disable(logging.CRITICAL)
     ErrorBoundary.reraises = True
     counts: Counter[str] = Counter()
     restarts: Counter[str] = Counter()
     found: list[str] = []
-    held = _held(options.json) if options.add else {}
+    held = before if options.add else {}
     begun_s, first = time.monotonic(), held["seeds"][1] + 1 if held else options.seed
     seed = first
     with ExitStack() as stack:
@@ -589,8 +588,8 @@ def run(options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
     seconds = round(time.monotonic() - begun_s, 1)
     if options.control is not None:
         _show(counts, restarts, found)
-        controls = _held(options.json).get("controls", {})
-        controls[options.control] = {"tries": counts.total(), "accepted": len(found)}
+        tried = {options.control: {"tries": counts.total(), "accepted": len(found)}}
+        controls = {**before.get("controls", {}), **tried}
         return {"controls": controls}, bool(found)
     counts.update(held.get("by_kind", {}))
     restarts.update(held.get("by_restart", {}))
@@ -603,12 +602,6 @@ def run(options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
         "seconds": seconds + held.get("seconds", 0.0),
     }  # fmt: skip
     return figures, not figures["accepted"]
-
-
-def _held(path: Path) -> dict[str, Any]:
-    """Return the figures of earlier runs."""
-    saved = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    return dict(saved.get("replays", {}))
 
 
 @contextmanager

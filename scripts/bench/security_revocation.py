@@ -73,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plane", default="auto", help="as gdp-switch --data-plane (default: %(default)s)")
 
 
-def run(options: argparse.Namespace) -> tuple[dict[str, object], bool]:
+def run(options: argparse.Namespace, _: object) -> tuple[dict[str, object], bool]:
     """Measure; return the figures, and whether the targets were met."""
     parts = options.part or ["kept", "closed"]
     figures: dict[str, object] = {}

@@ -150,7 +150,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--loss", type=float, default=0.0, help="share of frames that each link loses")
 
 
-def run(options: argparse.Namespace) -> tuple[dict[str, object], bool]:
+def run(options: argparse.Namespace, _: object) -> tuple[dict[str, object], bool]:
     """Publish so many messages on all topics together; return the account of each."""
     rotation = Rotation(options.loss)
     accounts = rotation.run(options.messages, options.rate, options.rotate_s)

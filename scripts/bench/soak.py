@@ -35,6 +35,7 @@ from report import print_table, progress
 from skeleton import clean_exit, command_line, new_run
 from topologies import make_topology
 
+from gdp.client.publisher import Publisher
 from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import chain
 from gdp.trust.right import Right
@@ -74,11 +75,7 @@ class Memory:
         def once() -> None:
             right.subscribe(topic)
             world.network.touch(RIGHT)
-            self._until(lambda: publisher.readers == 1, "a reader")
-            publisher.publish(b"message")
-            left.flush(world.network.now.mono_s)
-            world.network.touch(LEFT)
-            self._until(lambda: bool(right.poll_messages()), "a message")
+            self._pass_one(publisher)
             right.unsubscribe(topic.name)
             world.network.touch(RIGHT)
             self._until(lambda: not publisher.readers, "the reader's end")
@@ -99,11 +96,7 @@ class Memory:
             right.subscribe(topic)
             world.network.touch(LEFT)
             world.network.touch(RIGHT)
-            self._until(lambda: publisher.readers == 1, "a reader")
-            publisher.publish(b"message")
-            left.flush(world.network.now.mono_s)
-            world.network.touch(LEFT)
-            self._until(lambda: bool(right.poll_messages()), "a message")
+            self._pass_one(publisher)
             left.withdraw(topic.name)
             right.unsubscribe(topic.name)
             world.network.touch(LEFT)
@@ -115,6 +108,14 @@ class Memory:
             _repeat("publishers of new names", once, publishers - CACHES, samples)
         else:
             _repeat(FILLING, once, publishers, samples)
+
+    def _pass_one(self, publisher: Publisher) -> None:
+        """Send one message to the only reader."""
+        self._until(lambda: publisher.readers == 1, "a reader")
+        publisher.publish(b"message")
+        self._world.members[LEFT].flush(self._world.network.now.mono_s)
+        self._world.network.touch(LEFT)
+        self._until(lambda: bool(self._world.members[RIGHT].poll_messages()), "a message")
 
     def _until(self, is_met: Callable[[], bool], what: str) -> None:
         if not self._world.network.run(30.0, is_met):
