@@ -6,7 +6,6 @@ The other systems are set up as cheaply as possible. The bridge learns both addr
 measured. IPv4 has static neighbours, so no ARP request is sent. The last static neighbour has an address that is not
 the endpoint's own: the IP stack there discards a frame at once instead of routing it. The endpoint's packet socket
 receives the frame all the same.
-
 """
 
 from __future__ import annotations

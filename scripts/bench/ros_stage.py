@@ -41,7 +41,7 @@ class Turn:
 
     Args:
         encoding: how proxies carry messages; None: they go directly.
-        counts: columns besides latency and cores, each with its key in the report.
+        counts: further columns, each with its key in the report.
         report: measures; gets the row, the encoding and the number of the round, from 1; may raise ``FailedError``.
     """
 

@@ -19,7 +19,6 @@ Rows of earlier runs stay in the file until they are measured again.
 
     .venv/bin/python scripts/bench/security.py amplification
     .venv/bin/python scripts/bench/security.py amplification --speakers proxy --kinds withdraw query --no-save
-
 """
 
 from __future__ import annotations

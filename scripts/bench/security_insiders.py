@@ -10,7 +10,6 @@ findings.
 
     .venv/bin/python scripts/bench/security.py insiders --seconds 400 --processes 2
     .venv/bin/python scripts/bench/security.py insiders --statements 20000 --seed 7 --no-save
-
 """
 
 from __future__ import annotations

@@ -27,7 +27,6 @@ What a frame warrants by itself is none of these: a current keepalive keeps a pr
 
     .venv/bin/python scripts/bench/security.py replays
     .venv/bin/python scripts/bench/security.py replays --tries 2000 --control window --no-save
-
 """
 
 from __future__ import annotations

@@ -6,7 +6,6 @@ One process, without a network. An image of 921,600 bytes is sealed as parts for
 place and by a second thread. A small message is verified in place and by a second thread. Work of a thread must be
 handed over and awaited, and a thread helps only while the interpreter's lock is released. The time that two threads
 take for twice the work shows how far: 1 for parallel, 2 for one after the other.
-
 """
 
 from __future__ import annotations

@@ -39,8 +39,6 @@ from recorded import LIMIT_S, RECORDED, draw, load
 from samples import Sample, Summary, least_of_two, p99
 from series import Series
 
-__all__: list[str] = []
-
 TYPE: Final = "nav_msgs/srv/GetPlan"
 MESHES: Final = ROOT.parent / "shared" / "data" / "planning"
 TRIALS: Final = {"Home": 12, "Cubicles": 60, "Twistycool": 5}

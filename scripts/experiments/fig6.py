@@ -30,8 +30,6 @@ from pictures import save_distributions
 from samples import Sample, Summary
 from series import Contention, Series
 
-__all__: list[str] = []
-
 REQUESTS: Final = 300
 COMPUTED: Final = 100
 QUICK: Final = 5

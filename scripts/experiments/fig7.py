@@ -27,8 +27,6 @@ from pictures import save_distributions
 from samples import Sample, Summary
 from series import Series
 
-__all__: list[str] = []
-
 DELAY_S: Final = 0.1
 REQUESTS: Final = 300
 QUICK: Final = 6

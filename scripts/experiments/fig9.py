@@ -19,8 +19,6 @@ from report import progress
 from samples import Sample, Summary
 from series import Series
 
-__all__: list[str] = []
-
 MINUTES: Final = 2.0
 QUICK_MINUTES: Final = 0.13
 _SERVICE: Final = "/tag"

@@ -30,8 +30,6 @@ from skeleton import clean_exit, new_run
 
 from gdp.host.cgroups import Cgroup
 
-__all__: list[str] = []
-
 OVERLAY: Final = "overlay"
 BASELINES: Final = {"ROS 2, Cyclone DDS": "cyclone", "ROS 2, Fast DDS": "fast", OVERLAY: "fast"}
 ROUNDS: Final = 3

@@ -22,8 +22,6 @@ from experiment import OUTPUT
 from report import progress
 from results import machines_of, page_of, rows_of
 
-__all__: list[str] = []
-
 EXPERIMENTS: Final = ("offload", "table1", "fig5", "fig6", "fig7", "fig9", "outages", "availability")
 _HERE: Final = Path(__file__).parent
 

@@ -19,8 +19,6 @@ from bench_path import ROOT
 from planning import PROBLEMS, Problem, be_quiet
 from recorded import RECORDING
 
-__all__: list[str] = []
-
 PLANNER: Final = "RRTConnect"
 LIMIT_S: Final = 1_000.0  # limit by the wall clock; the paper's 100 s are applied when the recording is used
 MESHES: Final = ROOT.parent / "shared" / "data" / "planning"

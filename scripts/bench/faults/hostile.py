@@ -5,7 +5,6 @@ I/O. It is a switch (``names``, ``joins``, ``revocations``) or a proxy that read
 session stays up. Its only argument is JSON: ``what``; ``config``, its file; ``frames``, how many different ones;
 ``rate`` a second; ``seconds``; for a proxy ``reads`` and ``publishes``, topics. It prints a line of JSON when it takes
 part, begins to flood at SIGUSR1, and prints another line at the end.
-
 """
 
 from __future__ import annotations

@@ -3,7 +3,6 @@
 Process of its own, started by ``faults.overlay`` with one argument of JSON. Each arrival is appended to a file of
 records at once, so that nothing is lost when this process is killed. A message names its channel, its publisher and
 the publisher's incarnation, so a message at a wrong reader is detected.
-
 """
 
 from __future__ import annotations
@@ -31,8 +30,6 @@ from gdp.message.loss import LossReason
 from gdp.names import Name
 from gdp.nodes.memory_tuning import tune_memory
 from gdp.service.dispatch import Ask, Dispatch, Failure
-
-__all__: list[str] = []
 
 _HEAD: Final = struct.Struct("!8sHHIQ")  # token of the channel, channel, publisher, incarnation, number
 _REQUEST: Final = struct.Struct("!8sQ")  # token, number of the call

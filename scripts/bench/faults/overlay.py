@@ -2,7 +2,6 @@
 
 I/O. Namespaces and processes through ``gdp.simulation``, the commands that robots run, and ``faults.member`` at the
 ends. A process is called ``switch s1``, ``rib s1`` or ``member m1``. Each may be killed, restarted, frozen.
-
 """
 
 from __future__ import annotations

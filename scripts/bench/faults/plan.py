@@ -2,7 +2,6 @@
 
 Sans-I/O. A member is a node of the topology without a switch of its own, joined to its home switch by one link. That
 link may be moved to the other switches it lists.
-
 """
 
 from __future__ import annotations

@@ -2,7 +2,6 @@
 
 I/O. ``scripts/start_cluster.sh`` starts three primaries with a replica each. The servers are daemons. They are in the
 run's record, and they run in a namespace of the run; its end ends all processes inside.
-
 """
 
 from __future__ import annotations

@@ -6,7 +6,6 @@ Messages go in and out as serialised bytes, which is what a ROS 2 node passes to
 serialiser, in Python, would cost 26 ms for an image. For that the type is one octet: Cyclone carries the rest of a
 longer message along. Each endpoint waits by a WaitSet in the thread that continues the work. A listener would add a
 change of threads.
-
 """
 
 from __future__ import annotations
