@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from experiment import OUTPUT, clean_exit, page_command_line, write
+from experiment import OUTPUT, page_command_line, write
 from report import print_table
+from skeleton import clean_exit
 
 from fog.catalog.measured import measured
 from fog.plan.duration import duration_text, seconds_from_text

@@ -48,7 +48,7 @@ class Features:
             depth: uint16 [height, width], ``DEPTH_SCALE`` units a metre; 0: unknown.
         """
         points, descriptors = cv2.ORB.create(_FEATURES).detectAndCompute(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), None)
-        return cls(np.array([point.pt for point in points]), descriptors, depth)
+        return cls(np.array([point.pt for point in points]), np.asarray(descriptors, dtype=np.uint8), depth)
 
     def positions(self, which: NDArray[np.intp]) -> NDArray[np.float64]:
         """Return x, y, z in metres of some features, in the camera's frame; z is 0 where the depth is unknown."""

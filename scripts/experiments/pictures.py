@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 import matplotlib as mpl
 
@@ -76,7 +76,7 @@ def save_timeline(path: Path, title: str, samples: Sequence[Sample], spans: Sequ
     save(figure, path, title)
 
 
-def tidy(axis: Axes, *, ncols: int = 1, loc: str = "best") -> None:
+def tidy(axis: Axes, *, ncols: int = 1, loc: Literal["best", "upper left"] = "best") -> None:
     """Give an axis small labels, a legend without a frame, and no lines above and to the right."""
     axis.tick_params(labelsize=8)
     axis.spines[["top", "right"]].set_visible(False)

@@ -15,8 +15,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
-from experiment import OUTPUT, clean_exit, page_command_line, write
+from experiment import OUTPUT, page_command_line, write
 from report import print_table
+from skeleton import clean_exit
 
 from fog.catalog.aws import aws_prices
 from fog.hardware import Hardware
@@ -91,8 +92,8 @@ def main(words: Sequence[str] | None = None) -> None:
     else:
         head = ("USD", "needs", "", "one /h", "two /h", "two spot /h", "two spot / one", "machines")
         print_table(head, _application_rows(needed), words=3)
-        head = (f"{region}, USD", *(f"{each} /{per}" for per in ("h", "month") for each in _WAYS))
-        print_table((*head, "of one", "taken a month"), map(_cells, rows))
+        prices = [f"{each} /{per}" for per in ("h", "month") for each in _WAYS]
+        print_table((f"{region}, USD", *prices, "of one", "taken a month"), map(_cells, rows))
     if options.write:
         write(OUTPUT, "table1", document, page(region, rows, needed))
         _draw(OUTPUT / "table1.png", region, rows)
