@@ -69,11 +69,20 @@ def _gdp_wire(chain: Chain, size: int, *, far: bool) -> Wire:
     return Wire(ETHERTYPE, out, back)
 
 
-class Direct:
+class _ByKernel:
+    """Baseline without processes in the middle."""
+
+    processes = False
+
+    def workers(self) -> list[Started]:
+        """Return no process: the kernel forwards."""
+        return []
+
+
+class Direct(_ByKernel):
     """No forwarder: the endpoints are joined directly. The figures are the cost of the endpoints."""
 
     name = "ends alone"
-    processes = False
 
     def wire(self, chain: Chain, size: int) -> Wire:
         """Return GDP frames of ``size`` bytes, Ethernet header included."""
@@ -82,10 +91,6 @@ class Direct:
     def stand(self, chain: Chain) -> ExitStack:  # noqa: ARG002
         """Set up nothing."""
         return ExitStack()
-
-    def workers(self) -> list[Started]:
-        """Return no process."""
-        return []
 
 
 class Plane:
@@ -129,11 +134,10 @@ class Plane:
         return self._workers
 
 
-class Bridge:
+class Bridge(_ByKernel):
     """The Linux bridge: one in each middle namespace, with that node's two devices."""
 
     name = "bridge"
-    processes = False
 
     def wire(self, chain: Chain, size: int) -> Wire:
         """Return GDP frames addressed to the other endpoint."""
@@ -148,16 +152,11 @@ class Bridge:
             chain.round_trips(self.wire(chain, 128), 10, poll=False)  # every bridge has then learnt both addresses
             return undo.pop_all()
 
-    def workers(self) -> list[Started]:
-        """Return no process: the kernel forwards."""
-        return []
 
-
-class IPv4:
+class IPv4(_ByKernel):
     """The kernel's IPv4 forwarding, with static routes and neighbours. Link n is 10.99.n.0/24."""
 
     name = "IPv4"
-    processes = False
 
     def wire(self, chain: Chain, size: int) -> Wire:
         """Return IPv4 frames of ``size`` bytes, Ethernet header included."""
@@ -177,10 +176,6 @@ class IPv4:
                 undo.callback(chain.inside, node, partial(_clear_addresses, chain.devices(node)))
                 chain.inside(node, partial(_route, chain, node, at))
             return undo.pop_all()
-
-    def workers(self) -> list[Started]:
-        """Return no process: the kernel forwards."""
-        return []
 
 
 @contextmanager
