@@ -8,8 +8,8 @@ from __future__ import annotations
 import sys
 
 from faults.disk import Disk
-from faults.plan import make_topology
 from faults.store import StoreCluster
+from topologies import make_topology
 
 from gdp.host.run_registry import RunRegistry
 from gdp.simulation.namespaces import Namespaces

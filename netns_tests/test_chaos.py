@@ -13,9 +13,10 @@ import pytest
 from faults.disk import NOT_WRITTEN, snapshot_faults
 from faults.link_faults import FrameFaults
 from faults.overlay import Overlay
-from faults.plan import Flow, Plan, make_topology
+from faults.plan import Flow, Plan
 from faults.records import Kind
 from faults.store import has_server
+from topologies import make_topology
 
 from gdp.host.netns_files import processes_inside
 from gdp.host.processes import Process

@@ -6,7 +6,6 @@ The other systems are set up as cheaply as possible. The bridge learns both addr
 measured. IPv4 has static neighbours, so no ARP request is sent. The last static neighbour has an address that is not
 the endpoint's own: the IP stack there discards a frame at once instead of routing it. The endpoint's packet socket
 receives the frame all the same.
-
 """
 
 from __future__ import annotations
@@ -19,14 +18,16 @@ from socket import AF_INET
 from typing import Final, Protocol
 
 from chains import Chain
+from devices import add_bridge
 from frames import SINK, SOURCE, Wire, gdp_frame, ip_frame
+from peers.process import Started
 from pyroute2 import IPRoute
-from worker import Worker
 
 from gdp.frame.kinds import ETHERTYPE
 
 __all__ = ["Baseline", "Bridge", "Direct", "IPv4", "Plane"]
 
+_READY_S: Final = 120.0
 _IPV4: Final = 0x0800
 _ABSENT: Final = "02:67:64:70:ff:ff"
 _BRIDGE: Final = "bridge"
@@ -54,7 +55,7 @@ class Baseline(Protocol):
             LocalError: it is not available here; the text gives the reason.
         """
 
-    def workers(self) -> list[Worker]:
+    def workers(self) -> list[Started]:
         """Return the processes that forward while it is set up."""
 
 
@@ -68,11 +69,20 @@ def _gdp_wire(chain: Chain, size: int, *, far: bool) -> Wire:
     return Wire(ETHERTYPE, out, back)
 
 
-class Direct:
+class _ByKernel:
+    """Baseline without processes in the middle."""
+
+    processes = False
+
+    def workers(self) -> list[Started]:
+        """Return no process: the kernel forwards."""
+        return []
+
+
+class Direct(_ByKernel):
     """No forwarder: the endpoints are joined directly. The figures are the cost of the endpoints."""
 
     name = "ends alone"
-    processes = False
 
     def wire(self, chain: Chain, size: int) -> Wire:
         """Return GDP frames of ``size`` bytes, Ethernet header included."""
@@ -81,10 +91,6 @@ class Direct:
     def stand(self, chain: Chain) -> ExitStack:  # noqa: ARG002
         """Set up nothing."""
         return ExitStack()
-
-    def workers(self) -> list[Worker]:
-        """Return no process."""
-        return []
 
 
 class Plane:
@@ -100,7 +106,7 @@ class Plane:
         self.name = name
         self.processes = processes
         self._names = names
-        self._workers: list[Worker] = []
+        self._workers: list[Started] = []
 
     def wire(self, chain: Chain, size: int) -> Wire:
         """Return GDP frames of ``size`` bytes, Ethernet header included."""
@@ -117,22 +123,21 @@ class Plane:
                     "left": f"{left} {chain.mac(left, node).hex()}",
                     "right": f"{right} {chain.mac(right, node).hex()}",
                 }
-                worker = Worker(chain.spaces, node, "switch", plane=self.name, ways=ways, names=self._names)
+                worker = chain.worker(node, "switch", plane=self.name, ways=ways, names=self._names)
                 self._workers.append(undo.enter_context(worker))
             for worker in self._workers:
-                worker.read()
+                worker.read(_READY_S)
             return undo.pop_all()
 
-    def workers(self) -> list[Worker]:
+    def workers(self) -> list[Started]:
         """Return the switch processes."""
         return self._workers
 
 
-class Bridge:
+class Bridge(_ByKernel):
     """The Linux bridge: one in each middle namespace, with that node's two devices."""
 
     name = "bridge"
-    processes = False
 
     def wire(self, chain: Chain, size: int) -> Wire:
         """Return GDP frames addressed to the other endpoint."""
@@ -143,20 +148,15 @@ class Bridge:
         with ExitStack() as undo:
             for node in chain.middles:
                 undo.callback(chain.inside, node, _remove_bridge)
-                chain.inside(node, partial(_make_bridge, chain.devices(node)))
+                chain.inside(node, partial(add_bridge, _BRIDGE, chain.devices(node)))
             chain.round_trips(self.wire(chain, 128), 10, poll=False)  # every bridge has then learnt both addresses
             return undo.pop_all()
 
-    def workers(self) -> list[Worker]:
-        """Return no process: the kernel forwards."""
-        return []
 
-
-class IPv4:
+class IPv4(_ByKernel):
     """The kernel's IPv4 forwarding, with static routes and neighbours. Link n is 10.99.n.0/24."""
 
     name = "IPv4"
-    processes = False
 
     def wire(self, chain: Chain, size: int) -> Wire:
         """Return IPv4 frames of ``size`` bytes, Ethernet header included."""
@@ -177,24 +177,11 @@ class IPv4:
                 chain.inside(node, partial(_route, chain, node, at))
             return undo.pop_all()
 
-    def workers(self) -> list[Worker]:
-        """Return no process: the kernel forwards."""
-        return []
-
 
 @contextmanager
 def _links() -> Iterator[tuple[IPRoute, dict[str, int]]]:
     with IPRoute() as ipr:
         yield ipr, {link.get("ifname"): link["index"] for link in ipr.get_links()}
-
-
-def _make_bridge(devices: list[str]) -> None:
-    with _links() as (ipr, index):
-        ipr.link("add", ifname=_BRIDGE, kind="bridge", br_stp_state=0, br_forward_delay=0)
-        bridge = ipr.link_lookup(ifname=_BRIDGE)[0]
-        for device in devices:
-            ipr.link("set", index=index[device], master=bridge)
-        ipr.link("set", index=bridge, state="up")
 
 
 def _remove_bridge() -> None:

@@ -20,7 +20,8 @@ from peers.process import FailedError
 from plot import panel_of
 from report import Rounds, Target
 from skeleton import Options, Outcome, Recorder, Trial, command_line, new_run, run_bench
-from testbed import LEFT, RIGHT, Lab, MemberRow, row
+from testbed import Lab, MemberRow
+from topologies import LEFT, RIGHT, row
 
 from gdp.host.run_registry import RunRegistry
 from gdp.nodes.busy_poll import SPIN_US

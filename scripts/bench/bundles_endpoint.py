@@ -7,23 +7,20 @@ after topic. In overload a message is due whenever its topic has fewer than ``BA
 
 from __future__ import annotations
 
-import json
 import struct
-import sys
 import time
 from collections.abc import Mapping
 from itertools import cycle, islice
-from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
+from member_endpoint import PATIENCE_S, End, Timer, run_role
 from peers.jsonl import say
-from priority_endpoint import End, Timer
 from report import percentile
 
 from gdp.client.publisher import Publisher
 from gdp.nodes.memory_tuning import tune_memory
 
-__all__ = ["BACKLOG", "MESSAGE_BYTES", "main", "topics"]
+__all__ = ["BACKLOG", "MESSAGE_BYTES", "topics"]
 
 BACKLOG: Final = 2_000  # unconfirmed messages a topic, in overload
 MESSAGE_BYTES: Final = 100
@@ -31,10 +28,9 @@ _MESSAGE: Final = struct.Struct("!Bq91x")  # kind of message, due time in ns
 _WARM_UP, _MEASURED, _LAST = range(3)
 _WARM_UP_S: Final = 0.5
 _AT_ONCE: Final = 400  # messages published between two polls of the network, in overload
-_PATIENCE_S: Final = 20.0
 _TICK_S: Final = 0.001
 
-Settings = Mapping[str, str | float]
+Settings = Mapping[str, Any]
 
 
 def topics(count: int) -> list[str]:
@@ -98,7 +94,7 @@ class _Sender:
         for publisher in self.publishers:
             publisher.publish(_MESSAGE.pack(_LAST, time.monotonic_ns()))
         self._end.member.flush(time.monotonic())
-        latest_s = time.monotonic() + _PATIENCE_S
+        latest_s = time.monotonic() + PATIENCE_S
         if not self._end.runtime.run(lambda: all(each.is_acknowledged() for each in self.publishers), latest_s):
             raise TimeoutError("messages were not confirmed")
         repaired = sum(each.repairs for each in self.publishers)
@@ -112,8 +108,7 @@ def send(end: End, settings: Settings) -> None:
         for publisher in publishers:
             publisher.bundle_bytes = 0
     tune_memory()
-    if not end.runtime.run(lambda: all(each.readers for each in publishers), time.monotonic() + _PATIENCE_S):
-        raise TimeoutError("no reader: the overlay did not come up")
+    end.wait_for_readers(publishers)
     sender = _Sender(end, publishers, float(settings["seconds"]))
     if rate := float(settings["rate"]):
         sender.at_rate(rate)
@@ -133,7 +128,7 @@ def read(end: End, settings: Settings) -> None:
     with end.runtime.signals():
         say(event="ready")
         while open_topics and not end.runtime.is_stopped:
-            end.runtime.step(time.monotonic() + _PATIENCE_S)
+            end.runtime.step(time.monotonic() + PATIENCE_S)
             now_ns = time.monotonic_ns()
             for each in end.member.poll_messages():
                 what, due_ns = _MESSAGE.unpack(each.delivered.message)
@@ -155,15 +150,8 @@ def read(end: End, settings: Settings) -> None:
             drops=end.drops(),
         )
         while not end.runtime.is_stopped:  # the last confirmations
-            end.runtime.step(time.monotonic() + _PATIENCE_S)
-
-
-def main() -> None:
-    """Run ``send`` or ``read``, as the first argument states."""
-    settings = json.loads(sys.argv[2])
-    end = End(Path(settings["config"]), settings["spin_s"])
-    {"send": send, "read": read}[sys.argv[1]](end, settings)
+            end.runtime.step(time.monotonic() + PATIENCE_S)
 
 
 if __name__ == "__main__":
-    main()
+    run_role({"send": send, "read": read})

@@ -8,58 +8,61 @@ I/O. ``gdp.simulation`` makes and removes the namespaces. ``baselines.py`` defin
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import json
+from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
-from typing import TypeVar
+from pathlib import Path
+from typing import Final
 
+from devices import mac_addresses, set_mtu
 from frames import Wire
 from machine import offloads, soft_interrupts_s, thread_s
-from pyroute2 import IPRoute
+from peers.process import Started, figures_of, floats_of
 from rate_search import Try
-from worker import Worker, floats, integer, number
+from testbed import Lab
 
-from gdp.host import netns_files
 from gdp.host.run_registry import RunRegistry
-from gdp.simulation.namespaces import Namespaces
 from gdp.simulation.topology import chain
 
-__all__ = ["Chain"]
+__all__ = ["ROLES", "Chain"]
 
+ROLES: Final = Path(__file__).with_name("roles.py")
 _SOURCE_CPU, _SINK_CPU = 0, 1
+_READY_S: Final = 120.0
 
-T = TypeVar("T")
 
-
-class Chain:
+class Chain(Lab):
     """Chain with ``switches`` switches, none of which runs yet; a context manager that removes all of it.
 
     Args:
         runs: location of the record of what is made.
         switches: 0 joins the source and the sink directly.
         mtu: bytes after the Ethernet header.
-        pin: the source on one core, the sink on another; without it the scheduler chooses.
+
+    Attributes:
+        roles: script of the processes; another commit's while its packages are measured.
 
     Raises:
         LocalError: the kernel refuses.
     """
 
-    def __init__(self, runs: RunRegistry, switches: int, mtu: int, *, pin: bool = True) -> None:
+    def __init__(self, runs: RunRegistry, switches: int, mtu: int) -> None:
         self.switches = switches
+        self.roles = ROLES
         self._undo = ExitStack()
         with ExitStack() as undo:
             run = runs.start()
             undo.callback(run.end)
-            self.spaces = Namespaces(chain(switches + 2, mtu), run)
-            self.nodes = self.spaces.topology.nodes
-            self._macs = {node: self.inside(node, partial(_addresses, self.devices(node))) for node in self.nodes}
-            cpus = (_SOURCE_CPU, _SINK_CPU) if pin else (None, None)
+            super().__init__(run, chain(switches + 2, mtu))
+            self.nodes = self.topology.nodes
+            self._macs = {node: self.inside(node, partial(mac_addresses, self.devices(node))) for node in self.nodes}
             self._source, self._sink = (
-                undo.enter_context(Worker(self.spaces, node, "end", cpu=cpu, ifname=self.devices(node)[0]))
-                for node, cpu in zip((self.nodes[0], self.nodes[-1]), cpus, strict=True)
+                undo.enter_context(self.worker(node, "end", cpu=cpu, ifname=self.devices(node)[0]))
+                for node, cpu in ((self.nodes[0], _SOURCE_CPU), (self.nodes[-1], _SINK_CPU))
             )
-            self._source.read()
-            self._sink.read()
+            self._source.read(_READY_S)
+            self._sink.read(_READY_S)
             self._undo = undo.pop_all()
 
     def __enter__(self) -> Chain:
@@ -67,6 +70,11 @@ class Chain:
 
     def __exit__(self, *_: object) -> None:
         self._undo.close()
+
+    def worker(self, node: str, role: str, *, cpu: int | None = None, **settings: object) -> Started:
+        """Start a role of ``roles.py``; ``cpu``: the core to run on, None: any."""
+        reported = json.dumps({"role": role, "cpu": cpu, **settings})
+        return self.start(node, role, [str(self.roles), reported], has_orders=True)
 
     @property
     def middles(self) -> Sequence[str]:
@@ -82,14 +90,11 @@ class Chain:
         """Return the address of a node's device towards a neighbour."""
         return self._macs[node][towards]
 
-    def inside(self, node: str, work: Callable[[], T]) -> T:
-        """Call ``work`` in a node's namespace."""
-        return netns_files.inside(self.spaces.path(node), work)
-
     def set_mtu(self, mtu: int) -> None:
         """Set the MTU of every device, in bytes."""
         for node in self.nodes:
-            self.inside(node, partial(_set_mtus, self.devices(node), mtu))
+            for device in self.devices(node):
+                self.inside(node, partial(set_mtu, device, mtu))
 
     def offloads(self) -> list[dict[str, bool]]:
         """Return the offloads of every device."""
@@ -98,7 +103,7 @@ class Chain:
     def attempt(
         self,
         wire: Wire,
-        switches: Sequence[Worker],
+        switches: Sequence[Started],
         rate: float | None,
         seconds: float,
         spread: tuple[int, int] = (0, 0),
@@ -113,49 +118,36 @@ class Chain:
             spread: send to so many names, out of so many of a large table; (0, 0) sends to the sink's own.
 
         Raises:
-            LocalError: a process of the bench ended.
+            FailedError: a process of the bench ended.
         """
         self._sink.ask(do="count", ethertype=wire.ethertype)
         spent_s = soft_interrupts_s() + sum(thread_s(each.pid) for each in switches)
-        sent = self._source.ask(
-            do="send", frame=wire.out.hex(), rate=rate, seconds=seconds, names=spread[0], of=spread[1]
+        sent = figures_of(
+            self._source.ask(do="send", frame=wire.out.hex(), rate=rate, seconds=seconds, names=spread[0], of=spread[1])
         )
-        got = self._sink.ask(expected=sent["sent"])
+        got = figures_of(self._sink.ask(expected=sent["sent"]))
         spent_s = soft_interrupts_s() + sum(thread_s(each.pid) for each in switches) - spent_s
-        ended_s = number(sent["end_s"])
         return Try(
             asked=rate,
-            sent=integer(sent["sent"]),
-            got=integer(got["got"]),
-            sink_drops=integer(got["drops"]),
-            send_s=ended_s - number(sent["start_s"]),
-            late_s=number(got["last_s"]) - ended_s,
-            cpu_s=spent_s + number(sent["cpu_s"]),
+            sent=int(sent["sent"]),
+            got=int(got["got"]),
+            sink_drops=int(got["drops"]),
+            send_s=sent["end_s"] - sent["start_s"],
+            late_s=got["last_s"] - sent["end_s"],
+            cpu_s=spent_s + sent["cpu_s"],
         )
 
     def round_trips(self, wire: Wire, pings: int, *, poll: bool) -> list[float]:
         """Return round-trip times in microseconds; fewer than ``pings`` when some were lost.
 
         Raises:
-            LocalError: a process of the bench ended.
+            FailedError: a process of the bench ended.
         """
         same = {"ethertype": wire.ethertype, "pings": pings, "poll": poll}
         self._sink.ask(do="answer", frame=wire.back.hex(), **same)
-        times = floats(self._source.ask(do="ping", frame=wire.out.hex(), **same)["rtt_us"])
-        self._sink.read()
+        times = floats_of(self._source.ask(do="ping", frame=wire.out.hex(), **same), "rtt_us")
+        self._sink.read(_READY_S)
         return times
-
-
-def _addresses(devices: Sequence[str]) -> dict[str, bytes]:
-    with IPRoute() as ipr:
-        links = {link.get("ifname"): link.get("address") for link in ipr.get_links()}
-    return {device: bytes.fromhex(links[device].replace(":", "")) for device in devices}
-
-
-def _set_mtus(devices: Sequence[str], mtu: int) -> None:
-    with IPRoute() as ipr:
-        for device in devices:
-            ipr.link("set", index=ipr.link_lookup(ifname=device)[0], mtu=mtu)
 
 
 def _all_offloads(devices: Sequence[str]) -> list[dict[str, bool]]:

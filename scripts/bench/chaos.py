@@ -24,12 +24,11 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import signal
 import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -43,9 +42,9 @@ from faults.plan import Plan
 from faults.schedule import STORE, Fault, FaultKind, broken_by, make_schedule
 from faults.store import StoreCluster, has_server
 from peers.process import FailedError
-from report import percentile, progress
-from rich.console import Console
-from rich.table import Table
+from report import percentile, print_table, progress
+from skeleton import Options, clean_exit, command_line, new_run
+from topologies import ends_of
 
 from gdp.errors import GdpError
 from gdp.host.run_registry import RunRegistry
@@ -199,10 +198,10 @@ class Chaos:
         if kind is FaultKind.CUT:
             overlay.cut(*targets)
         elif kind in FRAMES:
-            overlay.disturb(*targets, FRAMES[kind])
+            overlay.disturb(targets[0], targets[1], FRAMES[kind])
         elif kind is FaultKind.PARTITION:
             for link in targets[1:]:
-                overlay.cut(*link.split("-"))
+                overlay.cut(*ends_of(link))
         elif kind in (FaultKind.KILL_SWITCH, FaultKind.KILL_RIB, FaultKind.KILL_MEMBER):
             self._ended_lives.add((targets[0].removeprefix("member "), overlay.incarnation_id(targets[0])))
             overlay.kill(targets[0])
@@ -240,7 +239,7 @@ class Chaos:
             overlay.calm(*targets)
         elif kind is FaultKind.PARTITION:
             for link in targets[1:]:
-                overlay.restore_link(*link.split("-"))
+                overlay.restore_link(*ends_of(link))
         elif kind in (FaultKind.KILL_SWITCH, FaultKind.KILL_RIB, FaultKind.KILL_MEMBER):
             overlay.restart(targets[0])
             self._await(targets[0])
@@ -307,7 +306,7 @@ def _moments(faults: list[Fault]) -> Iterator[tuple[float, Fault, bool]]:
     return iter(sorted([*begins, *ends], key=lambda each: (each[0], not each[2])))
 
 
-def run_seed(runs: RunRegistry, seed: int, options: argparse.Namespace) -> list[str]:
+def run_seed(runs: RunRegistry, seed: int, options: Options) -> list[str]:
     """Run one seed; print its table; return what broke.
 
     Raises:
@@ -319,11 +318,10 @@ def run_seed(runs: RunRegistry, seed: int, options: argparse.Namespace) -> list[
     in_store = _in_store(plan, seed, is_wanted=options.cluster)
     faults = make_schedule(plan, seed, options.seconds, pace_s=options.pace_s, kinds=kinds, has_store=bool(in_store))
     begun_s = time.monotonic()
-    with ExitStack() as undo:
-        run = runs.start()
-        undo.callback(run.end)
-        made = Overlay(run, plan, plane=options.plane, has_clocks=True, has_disk=True, in_store=in_store)
-        overlay = undo.enter_context(made)
+    with (
+        new_run(runs) as run,
+        Overlay(run, plan, plane=options.plane, has_clocks=True, has_disk=True, in_store=in_store) as overlay,
+    ):
         overlay.start_all()
         progress(f"seed {seed}: {len(plan.switches)} switches, {len(plan.ribs)} RIBs, {len(plan.members)} members up")
         chaos = Chaos(overlay, faults)
@@ -377,24 +375,22 @@ def _show(seed: int, chaos: Chaos) -> None:
     counts: defaultdict[str, int] = defaultdict(int)
     for _, fault, begins in chaos.moments:
         counts[fault.kind.value + ("" if begins else ", over")] += 1
-    table = Table(title=f"seed {seed}: silences above {REPORTED_S:g} s while connected, s", title_justify="left")
-    for heading in ("last event before", "events", "silences", "p50", "max"):
-        table.add_column(heading, justify="left" if heading == "last event before" else "right")
+    rows = []
     for what in sorted(counts | dict.fromkeys(by, 0)):
         seconds = by.get(what, [])
         if seconds or not what.endswith("over"):
             figures = [f"{percentile(seconds, 0.5):.2f}", f"{max(seconds):.2f}"] if seconds else ["", ""]
-            table.add_row(what, str(counts[what]), str(len(seconds)), *figures)
+            rows.append((what, str(counts[what]), str(len(seconds)), *figures))
     calls, answered, failed = chaos.books.calls()
     delivered = sum(len(each) for each in chaos.books.arrivals_ns.values())
     reported_losses = sum(chaos.books.reported_losses.values())
-    console = Console(width=120)
-    console.print(table)
+    title = f"seed {seed}: silences above {REPORTED_S:g} s while connected, s"
+    print_table(("last event before", "events", "silences", "p50", "max"), rows, title=title)
     called = f"{calls} calls: {answered} answered, {failed} failed"
-    console.print(f"{delivered} messages delivered, {reported_losses} reported lost; {called}")
+    print(f"{delivered} messages delivered, {reported_losses} reported lost; {called}")
     waited = f"{chaos.waited_share:.0%} of the time some process on this machine waited for a processor"
-    console.print(f"the schedule was {chaos.late_s:.1f} s late in the end; {waited}")
-    console.print(f"{chaos.noticed()} times a RIB said that its snapshot is not written")
+    print(f"the schedule was {chaos.late_s:.1f} s late in the end; {waited}")
+    print(f"{chaos.noticed()} times a RIB said that its snapshot is not written")
 
 
 def _explain(seed: int, faults: list[Fault], broke: list[str], overlay: Overlay) -> None:
@@ -407,11 +403,10 @@ def _explain(seed: int, faults: list[Fault], broke: list[str], overlay: Overlay)
             print(f"{who}:", *(f"    {line}" for line in tail.splitlines()), sep="\n")
 
 
-def arguments() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main() -> None:
+    """Run seeds; exit 1 when one failed."""
+    parser = command_line(__doc__, seconds=SECONDS, seconds_of="of faults in each run")
     parser.add_argument("--seed", type=int, action="append", help="a run of this seed; may be repeated (default: 1)")
-    parser.add_argument("--seconds", type=float, default=SECONDS, help="of faults in each run (default: %(default)s)")
     parser.add_argument("--hours", type=float, help="seed after seed, from the first on, for so long")
     parser.add_argument("--switches", type=int, default=14, help="12 to 20 (default: %(default)s)")
     parser.add_argument("--pace-s", type=float, default=2.0, help="mean time between faults (%(default)s)")
@@ -430,25 +425,18 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--one-rib", action="store_true", help="one RIB in each domain")
     parser.add_argument("--plane", default="auto", help="as gdp-switch --data-plane (default: %(default)s)")
     parser.add_argument("--logs", type=Path, help="a folder to copy the logs of a failed run to")
-    return parser
-
-
-def main() -> None:
-    """Run seeds; exit 1 when one failed."""
-    options = arguments().parse_args()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # SIGTERM must remove everything that was made
-    runs = RunRegistry()
-    runs.sweep()  # remains of a killed run
+    options = parser.parse_args()
     broken: list[int] = []
-    for seed in _seeds(options.seed or [1], options.hours, time.monotonic):
-        try:
-            broke = run_seed(runs, seed, options)
-        except KeyboardInterrupt:
-            sys.exit(130)
-        except (GdpError, FailedError) as error:
-            print(f"seed {seed}: {error}")
-            broke = [str(error)]
-        broken += [seed] if broke else []
+    with clean_exit():
+        runs = RunRegistry()
+        runs.sweep()  # remains of a killed run
+        for seed in _seeds(options.seed or [1], options.hours, time.monotonic):
+            try:
+                broke = run_seed(runs, seed, options)
+            except (GdpError, FailedError) as error:
+                print(f"seed {seed}: {error}")
+                broke = [str(error)]
+            broken += [seed] if broke else []
     print(f"broken seeds: {broken}" if broken else "all is well")
     sys.exit(bool(broken))
 

@@ -5,7 +5,6 @@ I/O. AF_PACKET sockets on one device. Frames are prepared in advance, so the cos
 An endpoint that *polls* queries its socket continuously and measures the path alone. One that *sleeps* waits in epoll,
 as a real node does, and measures the scheduler too. The sink checks for frames every half millisecond. A wake-up for
 each frame would be paid by the sender, and in-kernel forwarding runs in the sender's time.
-
 """
 
 from __future__ import annotations

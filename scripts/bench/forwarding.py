@@ -32,6 +32,7 @@ from typing import Final
 from baselines import Baseline, Bridge, Direct, IPv4, Plane
 from chains import Chain
 from machine import offload_text
+from peers.process import FailedError
 from plot import Panel, panel_of
 from rate_search import LOSS_MAX, highest
 from report import Rounds, Target, percentile, progress
@@ -76,7 +77,7 @@ class Bench:
             return
         try:
             standing = baseline.stand(chain)
-        except LocalError as error:
+        except (LocalError, FailedError) as error:
             self.over.absent(baseline.name, str(error))
             return
         with standing:

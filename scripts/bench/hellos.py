@@ -9,29 +9,23 @@ up, the processor time of the one in the middle is taken over each round, with k
 
 from __future__ import annotations
 
-import json
-import os
-import statistics
 import time
-from dataclasses import asdict
-from pathlib import Path
 from typing import Final
 
 from faults.overlay import Overlay
-from faults.plan import Plan, make_topology
-from machine import machine_state
-from report import progress
-from rich.console import Console
-from rich.table import Table
-from skeleton import clean_exit, command_line, new_run
+from faults.plan import Plan
+from machine import processor_s
+from report import Rounds, progress
+from skeleton import Options, Outcome, command_line, new_run, run_bench
+from topologies import make_topology
 
 from gdp.host.run_registry import RunRegistry
 
-OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks" / "hellos.json"
-TARGET: Final = 1.0  # percent of a core
+TARGET: Final = 1.0
+COLUMN: Final = "% of a core"
+SHIPPED: Final = "keepalives as shipped"
 SETTLE_S: Final = 8.0  # hellos are frequent until keepalives have taken over
-_TICK_S: Final = 1 / os.sysconf("SC_CLK_TCK")
-_CASES: Final[dict[str, int | None]] = {"keepalives as shipped": None, "no keepalives": 0}
+_CASES: Final[dict[str, int | None]] = {SHIPPED: None, "no keepalives": 0}
 
 
 def plan(neighbours: int) -> Plan:
@@ -41,47 +35,33 @@ def plan(neighbours: int) -> Plan:
     return Plan(topology, members)
 
 
-def processor_s(pid: int) -> float:
-    """Return the processor time that a process has used, of the system too."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) * _TICK_S
-
-
-def measure(runs: RunRegistry, neighbours: int, seconds: float, rounds: int, keepalive_ms: int | None) -> list[float]:
+def shares(runs: RunRegistry, options: Options, keepalive_ms: int | None) -> list[float]:
     """Return the percent of a core that the switch in the middle took, one figure a round."""
     more = {} if keepalive_ms is None else {"switch": {"keepalive_ms": keepalive_ms}}
-    with new_run(runs) as run, Overlay(run, plan(neighbours), more=more) as overlay:
+    with new_run(runs) as run, Overlay(run, plan(options.neighbours), more=more) as overlay:
         overlay.start_all()
         time.sleep(SETTLE_S)
         pid, figures = overlay.pid("switch s0"), []
-        for _ in range(rounds):
+        for _ in range(options.rounds):
             before, begun_s = processor_s(pid), time.monotonic()
-            time.sleep(seconds)
+            time.sleep(options.seconds)
             figures.append(100 * (processor_s(pid) - before) / (time.monotonic() - begun_s))
     return figures
 
 
-def main() -> None:
+def measure(options: Options, runs: RunRegistry) -> Outcome:
     """Measure both cases."""
-    parser = command_line(__doc__, rounds=5, seconds=20.0, seconds_of="of each round")
-    parser.add_argument("--neighbours", type=int, default=20)
-    parser.add_argument("--no-save", action="store_true", help=f"do not write {OUTPUT.name}")
-    options = parser.parse_args()
-    state, runs = machine_state(), RunRegistry()
-    runs.sweep()
-    found: dict[str, list[float]] = {}
-    with clean_exit():
-        for case, keepalive_ms in _CASES.items():
-            progress(f"{options.neighbours} neighbours, {case}")
-            found[case] = measure(runs, options.neighbours, options.seconds, options.rounds, keepalive_ms)
-    table = Table(f"{options.neighbours} neighbours", "% of a core, median", "lowest-highest", "to reach")
-    for case, figures in found.items():
-        target = f"≤ {TARGET:g}" if case != "no keepalives" else ""
-        table.add_row(case, f"{statistics.median(figures):.2f}", f"{min(figures):.2f}-{max(figures):.2f}", target)
-    Console().print(table)
-    if not options.no_save:
-        OUTPUT.write_text(json.dumps({"machine": asdict(state), "neighbours": options.neighbours, **found}, indent=1))
+    over, heading = Rounds(), f"{options.neighbours} neighbours"
+    for case, keepalive_ms in _CASES.items():
+        progress(f"{heading}, {case}")
+        for value in shares(runs, options, keepalive_ms):
+            over.add(case, heading, COLUMN, value)
+    target = over.target(f"{SHIPPED}, {COLUMN}", SHIPPED, heading, COLUMN, TARGET, at_most=True)
+    settings = {"rounds": options.rounds, "seconds of a round": options.seconds}
+    return Outcome("hellos", "Cost of immediate loss detection", over, [target], settings)
 
 
 if __name__ == "__main__":
-    main()
+    parser = command_line(__doc__, rounds=5, seconds=20.0, seconds_of="of each round", has_record=True)
+    parser.add_argument("--neighbours", type=int, default=20)
+    run_bench(parser, measure)

@@ -28,8 +28,11 @@ from typing import Final
 __all__ = [
     "MachineState",
     "machine_state",
+    "map_bytes",
     "offload_text",
     "offloads",
+    "processor_s",
+    "resident_bytes",
     "set_offloads",
     "soft_interrupts_s",
     "thread_s",
@@ -113,6 +116,35 @@ def _ask(ifname: str, command: int, value: int) -> int:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
         fcntl.ioctl(asked, _SIOCETHTOOL, argument)
     return int(struct.unpack("=II", request.raw)[1])
+
+
+def resident_bytes(pid: int | None = None) -> int:
+    """Return the present resident memory of a process, by default of this one.
+
+    Its recorded maximum would include the parent's, from before exec.
+    """
+    pages = Path(f"/proc/{pid or 'self'}/statm").read_text(encoding="ascii").split()[1]
+    return int(pages) * os.sysconf("SC_PAGE_SIZE")
+
+
+def map_bytes(pid: int | None = None) -> int:
+    """Return the kernel memory of all eBPF maps that a process holds open; 0 without any.
+
+    Source: Linux, kernel/bpf/syscall.c, ``bpf_map_show_fdinfo``.
+    """
+    total = 0
+    for path in Path(f"/proc/{pid or 'self'}/fdinfo").iterdir():
+        with suppress(FileNotFoundError):  # the descriptor of this very listing
+            lines = path.read_text(encoding="ascii").splitlines()
+            facts = dict(line.split(":", 1) for line in lines if ":" in line)
+            total += int(facts["memlock"]) if "map_type" in facts else 0
+    return total
+
+
+def processor_s(pid: int) -> float:
+    """Return the processor time of a process, of the system too, as proc(5) counts it in ``/proc/<pid>/stat``."""
+    fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")  # utime, stime
 
 
 def thread_s(pid: int) -> float:

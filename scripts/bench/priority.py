@@ -31,7 +31,8 @@ from priority_endpoint import IMAGES as IMAGE_TOPIC
 from pyroute2 import IPRoute
 from report import Rounds, Target, percentile
 from skeleton import Options, Outcome, Recorder, Trial, command_line, new_run, run_bench
-from testbed import MIDDLE, Lab, MemberRow, make_topology
+from testbed import Lab, MemberRow
+from topologies import MIDDLE, flat_topology
 
 from gdp.host.run_registry import Run, RunRegistry
 from gdp.nodes.busy_poll import SPIN_US
@@ -100,7 +101,7 @@ def measure_flood(members: MemberRow, flood: str, seconds: float, spin_s: float)
 def measure_row(run: Run, plane: str, link: str, recorder: Recorder, number: int, options: Options) -> None:
     """Measure every flood on one plane and link; the idle one sets the round's bound."""
     case, columns = case_of(plane, link), (MEDIAN, P99, WORST, IMAGES)
-    topology = make_topology(_LINKS, mtu=MTU, rib="s2", members=("a", "c", "b"), switches=("a", "c", *MIDDLE, "b"))
+    topology = flat_topology(_LINKS, mtu=MTU, rib="s2", members=("a", "c", "b"), switches=("a", "c", *MIDDLE, "b"))
     lab = Lab(run, topology, priorities=_PRIORITIES if options.realtime else None)
     if link == "shaped":
         lab.inside("s1", partial(_shape, "s2"))

@@ -1,39 +1,24 @@
 """Endpoint process of the priority bench at A, B and C: a member that ticks, floods, or reads.
 
 Process of its own, started by ``priority.py``. A tick is a small message that carries the moment at which it was due. A
-kernel timer wakes the process, as a robot's own loop would. Every delay before the tick leaves counts. Source:
-timerfd_create(2); CLOCK_MONOTONIC is one clock for all namespaces of a machine.
+kernel timer wakes the process, as a robot's own loop would. Every delay before the tick leaves counts.
 """
 
 from __future__ import annotations
 
-import ctypes
-import json
 import os
-import secrets
 import struct
-import sys
 import time
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
+from member_endpoint import PATIENCE_S, End, Timer, run_role
 from peers.jsonl import say
 
-from gdp.client.participant import Participant, Topic
 from gdp.client.publisher import Publisher
-from gdp.control.settings import NodeSettings
-from gdp.crypto.certificates import Role
-from gdp.errors import DropReason, LocalError
-from gdp.names import Name
-from gdp.nodes.config import RibConfig
-from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
 from gdp.nodes.memory_tuning import tune_memory
-from gdp.nodes.runtime import Runtime
-from gdp.ports.raw import RawPlane
-from gdp.stores.keyring import load_delegations
 
-__all__ = ["CONTROL", "IMAGES", "TICK_S", "main"]
+__all__ = ["CONTROL", "IMAGES", "TICK_S"]
 
 CONTROL: Final = "/control"
 IMAGES: Final = "/images"
@@ -42,85 +27,6 @@ _TICK: Final = struct.Struct("!Bq91x")  # what it is, when it was due in ns; 100
 _WARM_UP, _MEASURED, _LAST = range(3)
 _WARM_UP_TICKS: Final = 50
 _IMAGE_BYTES: Final = 921_600
-_PATIENCE_S: Final = 20.0
-
-_LIBRARY: Final = ctypes.CDLL(None, use_errno=True)
-_ABSOLUTE: Final = 1  # TFD_TIMER_ABSTIME
-_SPEC: Final = struct.Struct("@qqqq")  # interval, first; each in seconds and nanoseconds
-
-
-def _checked(result: int) -> int:
-    if result < 0:
-        number = ctypes.get_errno()
-        raise OSError(number, os.strerror(number))
-    return result
-
-
-class Timer:
-    """Timer whose descriptor becomes readable at every tick.
-
-    Raises:
-        OSError: the kernel refuses.
-    """
-
-    def __init__(self, first_ns: int, every_s: float) -> None:
-        self._fd = _checked(_LIBRARY.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC))
-        spec = _SPEC.pack(0, round(every_s * 1e9), *divmod(first_ns, 1_000_000_000))
-        _checked(_LIBRARY.timerfd_settime(self._fd, _ABSOLUTE, spec, None))
-
-    def fileno(self) -> int:
-        """Return its descriptor."""
-        return self._fd
-
-    def passed(self) -> int:
-        """Return how many ticks were due since the last call."""
-        return int.from_bytes(os.read(self._fd, 8), sys.byteorder)
-
-    def close(self) -> None:
-        """Stop it."""
-        os.close(self._fd)
-
-
-class End:
-    """Member on its plane."""
-
-    def __init__(self, config: Path, spin_s: float) -> None:
-        settings = RibConfig.load(config)  # identity, domain and iface are all that an endpoint needs
-        identity, policy = load_member(settings.identity, settings.domain, Role.PROXY)
-        self.member = Participant(
-            identity,
-            policy,
-            NodeSettings(incarnation=incarnation(), first_sequence=wall_clock_ms(), random_bytes=secrets.token_bytes),
-        )
-        self.plane = RawPlane([settings.iface])
-        self.runtime = Runtime(self.member, self.plane, spin_s=spin_s)
-        self._topics: dict[str, Topic] = {}
-        for each in load_delegations(settings.identity / "delegations"):
-            if each.metadata is None:
-                raise LocalError("a delegation without metadata")
-            grants = {epoch: grant.secret for epoch, grant in each.open(identity).items()}
-            self._topics[str(each.metadata["name"])] = Topic(each, grants)
-
-    def advertise(self, topic: str, *, reliable: bool, urgent: bool = False) -> Publisher:
-        """Publish a topic."""
-        return self.member.advertise(self._topics[topic], b"bench", reliable=reliable, urgent=urgent)
-
-    def subscribe(self, topic: str) -> Name:
-        """Read a topic; return its name."""
-        self.member.subscribe(self._topics[topic])
-        return self._topics[topic].name
-
-    def drops(self) -> dict[str, int]:
-        """Return what this process dropped, by reason."""
-        of_member, of_plane = self.member.drops(), self.plane.counters.drops
-        found = {reason.label: of_member.get(reason, 0) + of_plane[reason] for reason in DropReason}
-        return {label: count for label, count in found.items() if count}
-
-    def leave(self) -> None:
-        """Withdraw and close."""
-        self.member.leave()
-        while self.runtime.send():
-            continue
 
 
 class Ticks:
@@ -183,16 +89,16 @@ class Flood:
 _FLOODS: Final = ("reliable", "best-effort")
 
 
-def tick(end: End, settings: Mapping[str, str | float]) -> None:
+def tick(end: End, settings: Mapping[str, Any]) -> None:
     """Run as A: tick, and flood if configured."""
     control = end.advertise(CONTROL, reliable=True, urgent=True)
     flood = Flood(end, str(settings["flood"]))
     tune_memory()
-    if not end.runtime.run(lambda: control.readers > 0 and flood.is_ready, time.monotonic() + _PATIENCE_S):
+    if not end.runtime.run(lambda: control.readers > 0 and flood.is_ready, time.monotonic() + PATIENCE_S):
         raise TimeoutError("no reader: the overlay did not come up")
     seconds = float(settings["seconds"])
     ticks = Ticks(end, control, round(seconds / TICK_S))
-    latest_s = time.monotonic() + seconds + _PATIENCE_S
+    latest_s = time.monotonic() + seconds + PATIENCE_S
     while not ticks.is_over:
         if time.monotonic() > latest_s:
             raise TimeoutError("ticks were not acknowledged")
@@ -203,20 +109,20 @@ def tick(end: End, settings: Mapping[str, str | float]) -> None:
     end.leave()
 
 
-def flood(end: End, settings: Mapping[str, str | float]) -> None:
+def flood(end: End, settings: Mapping[str, Any]) -> None:
     """Run as C: flood until ended."""
     images = Flood(end, str(settings["flood"]))
     with end.runtime.signals():
-        if not end.runtime.run(lambda: images.is_ready, time.monotonic() + _PATIENCE_S):
+        if not end.runtime.run(lambda: images.is_ready, time.monotonic() + PATIENCE_S):
             raise TimeoutError("no reader: the overlay did not come up")
         say(event="ready")
         while not end.runtime.is_stopped:
             images.go_on()
-            end.runtime.step(time.monotonic() + _PATIENCE_S)
+            end.runtime.step(time.monotonic() + PATIENCE_S)
         end.leave()
 
 
-def read(end: End) -> None:
+def read(end: End, _: Mapping[str, Any]) -> None:
     """Run as B: read both, and report at each last tick what arrived since the first measured one."""
     control = end.subscribe(CONTROL)
     end.subscribe(IMAGES)
@@ -225,7 +131,7 @@ def read(end: End) -> None:
     with end.runtime.signals():
         say(event="ready")
         while not end.runtime.is_stopped:
-            end.runtime.step(time.monotonic() + _PATIENCE_S)
+            end.runtime.step(time.monotonic() + PATIENCE_S)
             now_ns = time.monotonic_ns()
             for each in end.member.poll_messages():
                 if each.topic != control:
@@ -240,17 +146,5 @@ def read(end: End) -> None:
                     say(latencies_s=latencies_s, images_s=images / (now_ns / 1e9 - begun_s), drops=end.drops())
 
 
-def main() -> None:
-    """Run ``tick``, ``flood`` or ``read``, as the first argument states."""
-    settings = json.loads(sys.argv[2])
-    end = End(Path(settings["config"]), settings["spin_s"])
-    if sys.argv[1] == "tick":
-        tick(end, settings)
-    elif sys.argv[1] == "flood":
-        flood(end, settings)
-    else:
-        read(end)
-
-
 if __name__ == "__main__":
-    main()
+    run_role({"tick": tick, "flood": flood, "read": read})

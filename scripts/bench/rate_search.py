@@ -4,7 +4,6 @@ Sans-I/O. A try holds under three conditions. It loses less than ``LOSS_MAX`` of
 after the last sending, because a rate that only fills queues does not count. The source kept the rate. Where frames are
 forwarded in the sender's own time, the best of three tries at full speed shows the rate. Else the rate is bracketed and
 bisected. A rate that fails is tried once more, because other load of the machine can spoil a single try.
-
 """
 
 from __future__ import annotations

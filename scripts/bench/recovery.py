@@ -13,10 +13,10 @@ Then there are two further figures: until another machine has the role, and the 
 A real ROS node calls ``/echo`` at the robot all the while. Target: no request fails. Every machine has a switch, a
 proxy and a real ROS node of its own; they, the robot and the supervisor share this machine's cores.
 
-    sudo .venv/bin/python scripts/bench/recovery.py                     # the whole; writes docs/benchmarks/healing.*
+    sudo .venv/bin/python scripts/bench/recovery.py                     # the whole; writes docs/benchmarks/recovery.*
     sudo .venv/bin/python scripts/bench/recovery.py --quick --no-save   # one round: does it work?
     sudo .venv/bin/python scripts/bench/recovery.py --only killed --rounds 10 --no-save
-    sudo .venv/bin/python scripts/bench/recovery.py --gateway replica   # three machines; writes healing_gateway.*
+    sudo .venv/bin/python scripts/bench/recovery.py --gateway replica   # three machines; writes recovery_gateway.*
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from __future__ import annotations
 import time
 from typing import Final
 
-from healing_stage import Cluster
 from peers.process import FailedError
 from plot import Panel, panel_of
+from recovery_stage import Cluster
 from report import Rounds, Target, progress
 from skeleton import Options, Outcome, command_line, run_bench
 
@@ -133,7 +133,7 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
         for column, count in cluster.end_caller().items():
             over.add(WHO, TRAFFIC, column, count)
     return Outcome(
-        "healing_gateway" if is_replica else "healing",
+        "recovery_gateway" if is_replica else "recovery",
         f"A cluster of {machines} machines of the provider local heals; gateway: {options.gateway}",
         over,
         targets_of(over),

@@ -30,7 +30,7 @@ _HERE: Final = Path(__file__).resolve().parent
 sys.path.append(str(_HERE.parent / "experiments"))
 
 from field import READY_S, ROBOT, Field, Served, Server, Work  # noqa: E402 - it lies with the experiments
-from peers.process import FailedError  # noqa: E402
+from peers.process import FailedError, figures_of  # noqa: E402
 from plot import Panel, panel_of  # noqa: E402
 from report import Rounds, Target, percentile, progress  # noqa: E402
 from skeleton import Options, Outcome, command_line, new_run, run_bench  # noqa: E402
@@ -153,7 +153,8 @@ class Bench:
         with self._field(served) as here, Kills(here, self._draw) as kills:
             reported = {"lanes": _LANES, "rate": self._rate, "counts_answers": True}
             said = _ask(here, ["/number"], count, reported)
-        figures = {column: _number(said, key) for column, key in COUNTS.items()}
+        counts = figures_of(said)
+        figures = {column: counts.get(key) for column, key in COUNTS.items()}
         figures |= {COUNT: count, KILLS: kills.count, **_latencies(_times(said, "/number"))}
         self._add(KILLED, THREE, figures)
 
@@ -259,11 +260,6 @@ def _ask(here: Field, services: Sequence[str], count: int, reported: Mapping[str
                 reported_s = time.monotonic()
                 progress(f"    {said['ended']} of {count}, failed: {said['failed']}")
     return said
-
-
-def _number(said: Said, key: str) -> float | None:
-    value = said[key]
-    return value if isinstance(value, int | float) else None
 
 
 def _times(said: Said, name: str) -> list[float]:

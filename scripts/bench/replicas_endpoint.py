@@ -30,8 +30,6 @@ from rclpy.task import Future
 from ros_endpoint import End, Settings, reliable, run_role
 from service_msgs.msg import ServiceEventInfo
 
-__all__: list[str] = []
-
 _FILL: Final = "x" * 79  # 4 encapsulation, 4 count, 4 length, 80 text with its end, 8 depth: 100
 _DEPTH: Final = 1_000
 _EVENTS: Final = 10_000

@@ -27,7 +27,7 @@ import json
 import math
 import statistics
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -35,7 +35,19 @@ from machine import MachineState
 from rich.console import Console
 from rich.table import Table
 
-__all__ = ["Rounds", "Settings", "Spread", "Target", "number_text", "percentile", "progress", "show", "write_json"]
+__all__ = [
+    "Rounds",
+    "Settings",
+    "Spread",
+    "Target",
+    "markdown_table",
+    "number_text",
+    "percentile",
+    "print_table",
+    "progress",
+    "show",
+    "write_json",
+]
 
 Settings = Mapping[str, str | int | float | bool | Sequence[int] | Sequence[str]]
 _CONSOLE_COLUMNS = 165
@@ -154,10 +166,8 @@ class Rounds:
         Args:
             other_case: the other's case, where it is not the same.
         """
-        neighbouring = other_case or case
-        pairs = zip(self.column(one, case, column), self.column(other, neighbouring, column), strict=False)
-        ratios = [None if a is None or not b else a / b for a, b in pairs]
-        return _target(what, asked, at_most, ratios, self._why_not(one, case) or self._why_not(other, neighbouring))
+        values = self._pairwise(one, other, case, column, other_case, lambda a, b: a / b if b else None)
+        return _target(what, asked, at_most, values, self._why_none(one, other, case, other_case))
 
     def difference(
         self,
@@ -172,10 +182,23 @@ class Rounds:
         at_most: bool = True,
     ) -> Target:
         """Return a bound on ``one - other``, round by round."""
-        neighbouring = other_case or case
-        pairs = zip(self.column(one, case, column), self.column(other, neighbouring, column), strict=False)
-        gaps = [None if a is None or b is None else a - b for a, b in pairs]
-        return _target(what, asked, at_most, gaps, self._why_not(one, case) or self._why_not(other, neighbouring))
+        values = self._pairwise(one, other, case, column, other_case, lambda a, b: a - b)
+        return _target(what, asked, at_most, values, self._why_none(one, other, case, other_case))
+
+    def _pairwise(
+        self,
+        one: str,
+        other: str,
+        case: str,
+        column: str,
+        other_case: str | None,
+        of: Callable[[float, float], float | None],
+    ) -> list[float | None]:
+        pairs = zip(self.column(one, case, column), self.column(other, other_case or case, column), strict=False)
+        return [None if a is None or b is None else of(a, b) for a, b in pairs]
+
+    def _why_none(self, one: str, other: str, case: str, other_case: str | None) -> str:
+        return self._why_not(one, case) or self._why_not(other, other_case or case)
 
     def _why_not(self, contender: str, case: str) -> str:
         if contender in self.reasons:
@@ -214,6 +237,26 @@ def number_text(value: float) -> str:
     return f"{value:.2f}" if size >= 0.1 or not size else f"{value:.2g}"
 
 
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]], numbers: int = 0) -> str:
+    """Return a table in Markdown; the last ``numbers`` columns are aligned to the right."""
+    rule = ["---"] * (len(head) - numbers) + ["--:"] * numbers
+    return "\n".join("| " + " | ".join(line) + " |" for line in [head, rule, *rows])
+
+
+def print_table(head: Sequence[str], rows: Iterable[Sequence[str]], *, title: str = "", words: int = 1) -> None:
+    """Print a table whose first ``words`` columns are words, and all others figures."""
+    table = Table(title=title or None, title_justify="left")
+    for at, heading in enumerate(head):
+        table.add_column(heading, justify="left" if at < words else "right")
+    for row in rows:
+        table.add_row(*row)
+    _console().print(table)
+
+
+def _console() -> Console:
+    return Console() if sys.stdout.isatty() else Console(width=_CONSOLE_COLUMNS)
+
+
 def progress(text: str) -> None:
     """Report progress on stderr, so that stdout holds results alone."""
     print(text, file=sys.stderr, flush=True)
@@ -221,7 +264,7 @@ def progress(text: str) -> None:
 
 def show(title: str, state: MachineState, settings: Settings, over: Rounds, targets: Sequence[Target] = ()) -> None:
     """Print the machine, a table a case, and a line for each figure with a target."""
-    console = Console() if sys.stdout.isatty() else Console(width=_CONSOLE_COLUMNS)
+    console = _console()
     console.print(f"[bold]{title}[/bold]\n{state}", highlight=False)
     console.print(
         "; ".join(f"{key}: {_setting_text(value)}" for key, value in settings.items()), highlight=False, soft_wrap=True
@@ -248,16 +291,32 @@ def _setting_text(value: str | float | Sequence[int] | Sequence[str]) -> str:
 
 
 def write_json(
-    path: Path, bench: str, state: MachineState, settings: Settings, over: Rounds, targets: Sequence[Target] = ()
+    path: Path,
+    bench: str,
+    state: MachineState,
+    settings: Settings,
+    over: Rounds,
+    targets: Sequence[Target] = (),
+    *,
+    keeps: bool = False,
 ) -> None:
-    """Write all values of all rounds, and the targets with their results."""
+    """Write all values of all rounds, and the targets with their results.
+
+    Args:
+        keeps: rows and targets that the file has and this run has not are kept.
+    """
+    held = json.loads(path.read_text(encoding="utf-8")) if keeps and path.exists() else {"rounds": {}, "targets": []}
+    new = {target.what for target in targets}
     answer = {
         "bench": bench,
         "machine": asdict(state),
         "settings": dict(settings),
-        "rounds": over.values,
+        "rounds": {**held["rounds"], **over.values},
         "not_here": over.reasons,
-        "targets": [{**asdict(target), "met": target.met} for target in targets],
+        "targets": [
+            *(target for target in held["targets"] if target["what"] not in new),
+            *({**asdict(target), "met": target.met} for target in targets),
+        ],
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(answer, indent=1) + "\n", encoding="utf-8")

@@ -11,124 +11,49 @@ Each row of ``gap`` is the time from the kill until a name of that primary can b
 
 from __future__ import annotations
 
-import argparse
 import gc
-import json
 import multiprocessing
 import os
 import random
 import signal
 import subprocess
-import sys
 import tempfile
 import time
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
 import yaml
-from machine import machine_state
-from report import percentile, progress
-from rich.console import Console
-from rich.table import Table
+from domain import BenchDomain
+from report import Rounds, percentile, progress
+from skeleton import Options, Outcome, command_line, run_bench
 
-from gdp.crypto.ca import CertificateAuthority
-from gdp.crypto.certificates import Role
-from gdp.crypto.identity import Identity, NodeKeys
-from gdp.crypto.keys import SigningKey
-from gdp.crypto.subject import Subject
-from gdp.crypto.validity import Validity
-from gdp.errors import GdpError, LocalError, StoreError
-from gdp.metadata import Metadata
+from gdp.errors import LocalError, StoreError
+from gdp.host.run_registry import RunRegistry
 from gdp.names import Name
 from gdp.nodes.config import ClusterConfig
 from gdp.rib.route import Route
 from gdp.sansio import Timestamps
 from gdp.stores.cluster import ClusterStore, load_functions
 from gdp.stores.cluster_link import ClusterLink
-from gdp.trust.adcert import AdCert
-from gdp.trust.advertisement import Advertisement, sign_advertisement
-from gdp.trust.domain import Policy
-from gdp.trust.right import Right
-from gdp.trust.rtcert import RtCert
-from gdp.trust.verifier import AdvertisementVerifier
 
-ROOT: Final = Path(__file__).resolve().parents[2]
-OUTPUT: Final = ROOT / "docs" / "benchmarks" / "rib_cluster.json"
-START_CLUSTER: Final = ROOT / "scripts" / "start_cluster.sh"
+START_CLUSTER: Final = Path(__file__).resolve().parents[1] / "start_cluster.sh"
 NAMES: Final = 1_000_000
 LOOKUPS: Final = 5_000
 BATCH: Final = 256
 LEASE_S: Final = 3_600.0
 PATIENCE_S: Final = 30.0
 LOOK_S: Final = 0.01
+WHO: Final = "cluster"
+BYTES, FILL, GAP, LOST = (
+    "bytes a name",
+    "names written/s",
+    "primary killed, until its names are served, s",
+    "names lost",
+)
+LOOKUP, WARM = "lookup", "lookup in the RIB's memory"
 BYTES_GOAL, LOOKUP_GOAL_MS, GAP_GOAL_S = 1_000, 2.0, 2.0
-
-
-@dataclass
-class Measured:
-    """Result of a run.
-
-    Attributes:
-        bytes_a_name: growth of the primaries' memory.
-        lookup_ms: one figure a lookup.
-        warm_ms: the same for a name that is in the RIB's memory.
-        gap_s: one figure a killed primary.
-        gone: names that were there and could not be read after the last kill.
-    """
-
-    names: int
-    fill_s: float = 0.0
-    bytes_a_name: float = 0.0
-    lookup_ms: list[float] = field(default_factory=list)
-    warm_ms: list[float] = field(default_factory=list)
-    gap_s: list[float] = field(default_factory=list)
-    gone: int = 0
-
-
-class Field:
-    """A domain whose owner lets one proxy publish any number of names."""
-
-    def __init__(self) -> None:
-        self.validity = Validity.lasting(time.time(), 86_400)
-        self.authority = CertificateAuthority.create("bench", SigningKey.generate(), self.validity)
-        self.switch, self.proxy = self._node(Role.SWITCH, "s"), self._node(Role.PROXY, "p")
-        self.owner = SigningKey.generate()
-        self.rtcert = RtCert.make(self.proxy, self.switch.name, self.validity)
-
-    def _node(self, role: Role, label: str) -> Identity:
-        return NodeKeys.generate(role, label).join(self.authority, self.validity)
-
-    def verifier(self) -> AdvertisementVerifier:
-        """Return a new verifier that trusts the domain."""
-        return AdvertisementVerifier(Policy(self.authority.root))
-
-    def about(self, number: int) -> Subject:
-        """Return the subject of the name with this number."""
-        return Subject.of(Metadata({"kind": "topic", "name": f"/topic/{number}"}), self.owner.public.compressed)
-
-    def name(self, number: int) -> Name:
-        """Return the name with this number."""
-        return self.about(number).name
-
-    def advertisement(self, number: int, sequence: int = 1) -> bytes:
-        """Return a signed advertisement of the name with this number."""
-        about = self.about(number)
-        adcert = AdCert.make(
-            self.owner, about.name, about, self.proxy.subject, {Right.PUBLISH}, self.validity, may_delegate=False
-        )
-        return sign_advertisement(
-            self.proxy, Right.PUBLISH, about,
-            rtcert=self.rtcert, sequence=sequence, incarnation=1, lease_s=LEASE_S, is_global=False, chain=(adcert,),
-        )  # fmt: skip
-
-    def route(self, advertisement: Advertisement, now: Timestamps) -> Route:
-        """Return the route that a RIB makes of an advertisement."""
-        domain = self.authority.root.domain
-        expires_s = now.mono_s + LEASE_S
-        return Route.of(
-            advertisement, sender=self.switch.name, domain=domain, via=domain, transit=(), expires_s=expires_s
-        )
 
 
 def now() -> Timestamps:
@@ -136,26 +61,31 @@ def now() -> Timestamps:
     return Timestamps(time.monotonic(), time.time())
 
 
-def put(store: ClusterStore, field_: Field, numbers: range, sequence: int = 1) -> None:
+def put(store: ClusterStore, domain: BenchDomain, numbers: range, sequence: int = 1) -> None:
     """Write names as a RIB does after verification.
 
     Raises:
         LocalError: the cluster rejected some.
     """
-    verifier, at = field_.verifier(), now()
-    store.prefetch([field_.name(number) for number in numbers], at)
+    verifier, at = domain.verifier(), now()
+    store.prefetch([domain.subject(number).name for number in numbers], at)
     for number in numbers:
-        store.put(field_.route(verifier.verify(field_.advertisement(number, sequence), at.unix_s), at))
+        wire = domain.advertisement(number, sequence=sequence, lease_s=LEASE_S)
+        own, expires_s = domain.authority.root.domain, at.mono_s + LEASE_S
+        advertisement = verifier.verify(wire, at.unix_s)
+        store.put(
+            Route.of(advertisement, sender=domain.switch.name, domain=own, via=own, transit=(), expires_s=expires_s)
+        )
     if refused := store.commit():
         raise LocalError(f"the cluster did not take {len(refused)} of {len(numbers)} names")
 
 
-def fill(config: ClusterConfig, field_: Field, numbers: range) -> None:
+def fill(config: ClusterConfig, domain: BenchDomain, numbers: range) -> None:
     """Write many names, from a process of its own."""
     link = ClusterLink(config.address())
-    store = ClusterStore(link, field_.verifier())
+    store = ClusterStore(link, domain.verifier())
     for first in range(numbers.start, numbers.stop, BATCH):
-        put(store, field_, range(first, min(first + BATCH, numbers.stop)))
+        put(store, domain, range(first, min(first + BATCH, numbers.stop)))
     link.close()
 
 
@@ -196,27 +126,27 @@ def kill(folder: Path, port: int) -> None:
     raise LocalError(f"no server on port {port}")
 
 
-def one_of_each_shard(config: ClusterConfig, field_: Field, names: int, dice: random.Random) -> list[int]:
+def one_of_each_shard(config: ClusterConfig, domain: BenchDomain, names: int, dice: random.Random) -> list[int]:
     """Return a name of each primary: a shard has one replica, so it can lose one primary."""
     link, found = ClusterLink(config.address()), dict[tuple[str, int], int]()
     for number in dice.sample(range(names), min(names, 200)):
-        found.setdefault(link.primary_of(field_.name(number)), number)
+        found.setdefault(link.primary_of(domain.subject(number).name), number)
     link.close()
     return list(found.values())
 
 
-def gap_after_death(folder: Path, config: ClusterConfig, field_: Field, number: int) -> float:
+def gap_after_death(folder: Path, config: ClusterConfig, domain: BenchDomain, number: int) -> float:
     """Kill the primary of a name and return the seconds until the name is read and written again."""
     link = ClusterLink(config.address())
-    victim = link.primary_of(field_.name(number))
+    victim = link.primary_of(domain.subject(number).name)
     kill(folder, victim[1])
     begun_s = time.monotonic()
     sequence = 1 + int(time.time() * 1_000)
     while time.monotonic() - begun_s < PATIENCE_S:
         try:
-            store = ClusterStore(link, field_.verifier())  # the new RIB has nothing in memory
-            look_up(store, field_.name(number))
-            put(store, field_, range(number, number + 1), sequence)
+            store = ClusterStore(link, domain.verifier())  # the new RIB has nothing in memory
+            look_up(store, domain.subject(number).name)
+            put(store, domain, range(number, number + 1), sequence)
             break
         except (StoreError, LocalError):
             time.sleep(LOOK_S)
@@ -227,22 +157,36 @@ def gap_after_death(folder: Path, config: ClusterConfig, field_: Field, number: 
     return took_s
 
 
-def measure(folder: Path, names: int, lookups: int, kills: int) -> Measured:
-    """Fill a cluster, and measure."""
-    said = subprocess.run([START_CLUSTER, folder], capture_output=True, text=True, check=False)
-    if said.returncode:
-        raise LocalError(said.stderr.strip())
-    values = yaml.safe_load(Path(said.stdout.strip()).read_text())["store"]["cluster"]
-    paths = {key: Path(values[key]) for key in ("password_file", "ca")}
-    config = ClusterConfig(**{**values, "nodes": tuple(values["nodes"]), **paths})
-    link = ClusterLink(config.address())
-    load_functions(link)
-    measured, field_, dice = Measured(names), Field(), random.Random(7)
-    before, begun_s = used_bytes(folder, config), time.monotonic()
-    half = names // 2
+@contextmanager
+def started_cluster() -> Iterator[tuple[Path, ClusterConfig]]:
+    """Yield the folder and the configuration of a new cluster; stop it at the end.
+
+    Raises:
+        LocalError: it did not start.
+    """
+    with tempfile.TemporaryDirectory(prefix="gdp-rib-cluster-") as made:
+        folder = Path(made)
+        try:
+            said = subprocess.run([START_CLUSTER, folder], capture_output=True, text=True, check=False)
+            if said.returncode:
+                raise LocalError(said.stderr.strip())
+            values = yaml.safe_load(Path(said.stdout.strip()).read_text())["store"]["cluster"]
+            paths = {key: Path(values[key]) for key in ("password_file", "ca")}
+            yield folder, ClusterConfig(**{**values, "nodes": tuple(values["nodes"]), **paths})
+        finally:
+            subprocess.run([START_CLUSTER, "--stop", folder], check=False)
+
+
+def filled(folder: Path, config: ClusterConfig, domain: BenchDomain, names: int, case: str, over: Rounds) -> None:
+    """Write the names from two processes, and add the cost.
+
+    Raises:
+        LocalError: a process failed.
+    """
+    before, begun_s, half = used_bytes(folder, config), time.monotonic(), names // 2
     progress(f"writing {names:,} names")
     workers = [
-        multiprocessing.get_context("fork").Process(target=fill, args=(config, field_, numbers))
+        multiprocessing.get_context("fork").Process(target=fill, args=(config, domain, numbers))
         for numbers in (range(half), range(half, names))
     ]
     for worker in workers:
@@ -251,74 +195,53 @@ def measure(folder: Path, names: int, lookups: int, kills: int) -> Measured:
         worker.join()
     if any(worker.exitcode for worker in workers):
         raise LocalError("a process that wrote names failed; its last lines are above")
-    measured.fill_s = time.monotonic() - begun_s
-    measured.bytes_a_name = (used_bytes(folder, config) - before) / names
-    progress(f"looking up {lookups:,} of them")
-    store = ClusterStore(link, field_.verifier())
-    gc.collect()
-    for number in dice.sample(range(names), lookups):
-        measured.lookup_ms.append(1_000 * look_up(store, field_.name(number)))
-        measured.warm_ms.append(1_000 * look_up(store, field_.name(number)))
-    link.close()
-    for at, number in enumerate(one_of_each_shard(config, field_, names, dice)[:kills], 1):
-        progress(f"killing primary {at} of {kills}")
-        measured.gap_s.append(gap_after_death(folder, config, field_, number))
-    link = ClusterLink(config.address())
-    store = ClusterStore(link, field_.verifier())
-    for number in dice.sample(range(names), lookups):
-        try:
-            look_up(store, field_.name(number))
-        except (LocalError, StoreError):
-            measured.gone += 1
-    link.close()
-    return measured
+    over.add(WHO, case, FILL, names / (time.monotonic() - begun_s))
+    over.add(WHO, case, BYTES, (used_bytes(folder, config) - before) / names)
 
 
-def summary(measured: Measured) -> dict[str, object]:
-    """Return the record for the disk: percentiles in place of thousands of figures."""
-    figures = {"lookup_ms": measured.lookup_ms, "warm_ms": measured.warm_ms}
-    shares = {"p50": 0.5, "p99": 0.99, "max": 1.0}
-    of = {key: {label: percentile(each, share) for label, share in shares.items()} for key, each in figures.items()}
-    return {**asdict(measured), **of, "lookups": len(measured.lookup_ms)}
-
-
-def table(measured: Measured) -> Table:
-    """Return the table to print."""
-    shown = Table("what", "to reach", "got")
-    shown.add_row(f"bytes a name, of {measured.names:,}", f"≤ {BYTES_GOAL:,}", f"{measured.bytes_a_name:,.0f}")
-    for label, figures in (("lookup", measured.lookup_ms), ("lookup, in the RIB's memory", measured.warm_ms)):
-        p50, p99 = percentile(figures, 0.5), percentile(figures, 0.99)
-        shown.add_row(f"{label}, p50 / p99", f"p99 ≤ {LOOKUP_GOAL_MS:g} ms", f"{p50:.2f} / {p99:.2f} ms")
-    gaps = ", ".join(f"{gap:.2f}" for gap in measured.gap_s)
-    shown.add_row("primary killed, until its names are served", f"≤ {GAP_GOAL_S:g} s", f"{gaps} s")
-    shown.add_row("names gone after that", "0", f"{measured.gone} of {len(measured.lookup_ms):,}")
-    shown.add_row("written", "", f"{measured.names / measured.fill_s:,.0f}/s")
-    return shown
-
-
-def main() -> int:
-    """Run the bench; return the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--names", type=int, default=NAMES)
-    parser.add_argument("--lookups", type=int, default=LOOKUPS)
-    parser.add_argument("--kills", type=int, default=2, help="primaries to kill, one after the other")
-    parser.add_argument("--no-save", action="store_true", help=f"do not write {OUTPUT.name}")
-    options = parser.parse_args()
-    console, state = Console(stderr=True), machine_state()
-    with tempfile.TemporaryDirectory(prefix="gdp-rib-cluster-") as made:
-        folder = Path(made)
-        try:
-            measured = measure(folder, options.names, min(options.lookups, options.names), options.kills)
-        except GdpError as error:
-            console.print(f"error: {error}")
-            return 1
-        finally:
-            subprocess.run([START_CLUSTER, "--stop", folder], check=False)
-    Console().print(table(measured))
-    if not options.no_save:
-        OUTPUT.write_text(json.dumps({"machine": asdict(state), **summary(measured)}, indent=1) + "\n")
-    return 0 if measured.gone == 0 else 1
+def measure(options: Options, runs: RunRegistry) -> Outcome:
+    """Fill a cluster, look names up, kill primaries, and count the names that are lost."""
+    del runs
+    names, lookups = options.names, min(options.lookups, options.names)
+    over, case, domain, dice = Rounds(), f"{names:,} names", BenchDomain(time.time()), random.Random(7)
+    with started_cluster() as (folder, config):
+        link = ClusterLink(config.address())
+        load_functions(link)
+        filled(folder, config, domain, names, case, over)
+        progress(f"looking up {lookups:,} of them")
+        store = ClusterStore(link, domain.verifier())
+        gc.collect()
+        took_ms: dict[str, list[float]] = {LOOKUP: [], WARM: []}
+        for number in dice.sample(range(names), lookups):
+            for times in took_ms.values():
+                times.append(1_000 * look_up(store, domain.subject(number).name))
+        link.close()
+        for what, times in took_ms.items():
+            for label, share in (("p50", 0.5), ("p99", 0.99), ("max", 1.0)):
+                over.add(WHO, case, f"{what}, {label}, ms", percentile(times, share))
+        for at, number in enumerate(one_of_each_shard(config, domain, names, dice)[: options.kills], 1):
+            progress(f"killing primary {at} of {options.kills}")
+            over.add(WHO, case, GAP, gap_after_death(folder, config, domain, number))
+        link = ClusterLink(config.address())
+        store, lost = ClusterStore(link, domain.verifier()), 0
+        for number in dice.sample(range(names), lookups):
+            try:
+                look_up(store, domain.subject(number).name)
+            except (LocalError, StoreError):
+                lost += 1
+        link.close()
+        over.add(WHO, case, LOST, lost)
+    targets = [
+        over.target(column, WHO, case, column, goal, at_most=True)
+        for column, goal in ((BYTES, BYTES_GOAL), (f"{LOOKUP}, p99, ms", LOOKUP_GOAL_MS), (GAP, GAP_GOAL_S), (LOST, 0))
+    ]
+    settings = {"names": names, "lookups": lookups, "primaries killed": options.kills}
+    return Outcome("rib_cluster", "A cluster that RIBs share", over, targets, settings, has_failed=lost > 0)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    parser = command_line(__doc__, has_record=True)
+    parser.add_argument("--names", type=int, default=NAMES, help="(default: %(default)s)")
+    parser.add_argument("--lookups", type=int, default=LOOKUPS, help="(default: %(default)s)")
+    parser.add_argument("--kills", type=int, default=2, help="primaries to kill, one after the other")
+    run_bench(parser, measure)

@@ -1,7 +1,6 @@
 """Processes of the forwarding and scale benches, each in a namespace of its own: ``switch`` and ``end``.
 
-Started by ``worker.py``. Each reads commands as JSON lines on stdin and answers every one with a JSON line.
-
+Started by ``chains.py``. Each reads commands as JSON lines on stdin and answers every one with a JSON line.
 """
 
 from __future__ import annotations
@@ -10,15 +9,15 @@ import gc
 import json
 import os
 import sys
-import time
+from contextlib import ExitStack
 from typing import Any
 
 from ends import answer_pings, count_frames, ping, send, spread_frames
 from frames import NAME_AT, SINK, SOURCE, spread_names
-from table_fill import ENTRY_LEASE_S, fill, resident_bytes
-from worker import answer, command, command_waits, integer
+from peers.jsonl import order_waits, read_order, say
+from table_fill import ENTRY_LEASE_S, fill
 
-from gdp.errors import DropReason, LocalError
+from gdp.errors import LocalError
 from gdp.ports.netdev import NetdevPlane
 from gdp.switch.table import Table
 
@@ -56,7 +55,7 @@ def switch(plane: str, ways: dict[str, str], names: int = 0, **_: Any) -> None:
     try:
         made = make_plane(plane, [left[0], right[0]], table, entries_max)
     except LocalError as error:
-        answer({"refused_because": str(error)})
+        say(refused_because=str(error))
         return
     own = {port.ifname: port for port in made.ports.values()}
     hops = {
@@ -67,59 +66,49 @@ def switch(plane: str, ways: dict[str, str], names: int = 0, **_: Any) -> None:
         table.install(name, hop, ENTRY_LEASE_S)
 
     def asked() -> None:
-        if not (line := sys.stdin.readline()):
-            made.close()
-            sys.exit(0)
-        if json.loads(line).get("do") == "fill":
-            answer(fill(table, names, hops[SINK]))
-            return
-        drops = made.counters.drops
-        answer(
-            {
-                "drops": {reason.name: lost for reason in DropReason if (lost := drops[reason])},
-                "cpu_s": time.process_time(),
-                "rss_mib": resident_bytes() / (1 << 20),
-            }
-        )
+        with ExitStack() as undo:
+            undo.callback(made.close)
+            read_order()
+            undo.pop_all()
+        say(**fill(table, names, hops[SINK]))
 
     made.watch(sys.stdin, asked)
     gc.collect()
     gc.freeze()
-    answer({"event": "ready"})
+    say(event="ready")
     while True:
         made.poll(None)
 
 
 def end(ifname: str, **_: Any) -> None:
     """Send, count, ping or answer on one device, as commanded."""
-    answer({"event": "ready"})
+    say(event="ready")
     gc.freeze()
     gc.disable()
     while True:
-        order: dict[str, Any] = command()
+        order = read_order()
         ethertype = order.get("ethertype", 0)
         frame = bytes.fromhex(order.get("frame", ""))
         if order["do"] == "send":
             names = spread_names(order["names"], order["of"]) if order["names"] else []
             frames = spread_frames(frame, NAME_AT, names) if names else [frame]
-            answer(send(ifname, frames, order["rate"], order["seconds"])._asdict())
+            say(**send(ifname, frames, order["rate"], order["seconds"])._asdict())
         elif order["do"] == "count":
-            seen = count_frames(ifname, ethertype, ready, expected)
-            answer(seen._asdict())
+            say(**count_frames(ifname, ethertype, ready, expected)._asdict())
         elif order["do"] == "ping":
-            answer({"rtt_us": ping(ifname, ethertype, frame, order["pings"], poll=order["poll"])})
+            say(rtt_us=ping(ifname, ethertype, frame, order["pings"], poll=order["poll"]))
         elif order["do"] == "answer":
-            answer({"answered": answer_pings(ifname, ethertype, frame, order["pings"], ready, poll=order["poll"])})
+            say(answered=answer_pings(ifname, ethertype, frame, order["pings"], ready, poll=order["poll"]))
 
 
 def expected() -> int | None:
     """Return how many frames the source has sent, once the bench has reported it."""
-    return integer(command()["expected"]) if command_waits() else None
+    return int(read_order()["expected"]) if order_waits() else None
 
 
 def ready() -> None:
     """Report that the process is ready."""
-    answer({"event": "ready"})
+    say(event="ready")
 
 
 if __name__ == "__main__":

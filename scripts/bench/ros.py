@@ -19,23 +19,18 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
-from peers.process import FailedError
-from plot import Panel, panel_of
 from report import Rounds, Target
 from ros_row import LEFT, READY_S, RIGHT, Carried, Row
-from ros_stage import DIRECT, Bench, Options, Turn, parse, perform
+from ros_stage import CORES, DIRECT, MEDIAN, Bench, Measured, Options, Turn, main
 
 from proxy.config.config import Encoding
 
 MODULE: Final = "ros_topics"
 LOST: Final = "lost"
-TWICE: Final = "twice"
-MEDIAN: Final = "p50, ms"
-P99: Final = "p99, ms"
-CORES: Final = "both proxies, cores"
+COUNTS: Final = {LOST: "lost", "twice": "twice"}
 TEXT, QUICK, IMAGE, SMALL = "text", "quick", "image", "small"
 SMALL_TOPICS: Final = 20
 ENCODINGS: Final[Mapping[str, tuple[Encoding, ...]]] = {
@@ -55,51 +50,32 @@ WHAT: Final = {
 }
 SHORT: Final = (TEXT, QUICK)  # never longer than ``--seconds``
 MTUS: Final = (1_500, 9_000)
-SECONDS: Final = 6.0
 LONG_S: Final = 60.0
-QUICK_S: Final = 2.0
 _DONE_S: Final = 30.0
 
 
-@dataclass(frozen=True, slots=True)
-class Stream:
-    """Messages from a talker to a listener. ``encoding``: how proxies carry them; None: they go directly."""
+def measure(kind: str, seconds: float, first_s: float, row: Row, encoding: Encoding | None, number: int) -> Measured:
+    """Return the listener's report, and the cores that the proxies used.
 
-    kind: str
-    encoding: Encoding | None
-    seconds: float
-    first_s: float
+    Args:
+        first_s: seconds of the first round.
 
-    @property
-    def contender(self) -> str:
-        """Return the row of its figures."""
-        return DIRECT if self.encoding is None else f"overlay, {self.encoding}"
-
-    def measure(self, row: Row, round_number: int) -> dict[str, float]:
-        """Return the figures of one trial, by column.
-
-        Raises:
-            FailedError: a node did not come up, or nothing came.
-        """
-        seconds = self.first_s if round_number == 1 else self.seconds
-        every_s, is_direct = EVERY_S[self.kind], self.encoding is None
-        topics = topics_of(self.kind, self.encoding or "cdr")
-        reported = {"kind": self.kind, "topics": topics, "count": round(seconds / every_s), "every_s": every_s}
-        with (
-            row.node(RIGHT, MODULE, "listen", direct=is_direct, **reported) as listener,
-            row.node(LEFT, MODULE, "talk", direct=is_direct, **reported) as talker,
-        ):
-            listener.read(READY_S)
-            cpu_s = row.proxies_cpu_s()
-            os.kill(talker.pid, signal.SIGUSR1)
-            said = listener.read(seconds + _DONE_S)
-            cpu_s = row.proxies_cpu_s() - cpu_s
-        figures = {key: value for key, value in said.items() if isinstance(value, int | float)}
-        if "p50_s" not in figures:
-            raise FailedError("nothing came")
-        found = {LOST: figures["lost"], TWICE: figures["twice"]}
-        found |= {MEDIAN: 1e3 * figures["p50_s"], P99: 1e3 * figures["p99_s"]}
-        return found if is_direct else {**found, CORES: cpu_s / seconds}
+    Raises:
+        FailedError: a node did not come up.
+    """
+    seconds = first_s if number == 1 else seconds
+    every_s, is_direct = EVERY_S[kind], encoding is None
+    topics = topics_of(kind, encoding or "cdr")
+    reported = {"kind": kind, "topics": topics, "count": round(seconds / every_s), "every_s": every_s}
+    with (
+        row.node(RIGHT, MODULE, "listen", direct=is_direct, **reported) as listener,
+        row.node(LEFT, MODULE, "talk", direct=is_direct, **reported) as talker,
+    ):
+        listener.read(READY_S)
+        cpu_s = row.proxies_cpu_s()
+        os.kill(talker.pid, signal.SIGUSR1)
+        said = listener.read(seconds + _DONE_S)
+        return said, (row.proxies_cpu_s() - cpu_s) / seconds
 
 
 def topics_of(kind: str, encoding: Encoding) -> list[str]:
@@ -120,15 +96,9 @@ def bench_of(options: Options) -> Bench:
         for encoding in encodings
         for topic in topics_of(kind, encoding)
     ]
-    return Bench(
-        "ros",
-        "Real ROS 2 nodes over three kernel switches",
-        carried,
-        [turn for mtu in options.mtus for turn in turns_of(options, mtu)],
-        lambda over: [target for mtu in options.mtus for target in targets_of(over, mtu)],
-        lambda over: [panel for mtu in options.mtus for panel in panels_of(over, mtu)],
-        {"seconds of image and small in round 1": first_s(options)},
-    )
+    turns = [turn for mtu in options.mtus for turn in turns_of(options, mtu)]
+    settings = {"seconds of image and small in round 1": first_s(options)}
+    return Bench("ros", "Real ROS 2 nodes over three kernel switches", carried, turns, targets_of, settings)
 
 
 def first_s(options: Options) -> float:
@@ -146,9 +116,7 @@ def turns_of(options: Options, mtu: int) -> Iterator[Turn]:
     for kind in kinds_of(options, mtu):
         for encoding in (None, *ENCODINGS[kind]):
             long_s = options.seconds if kind in SHORT or encoding is None else first_s(options)
-            stream = Stream(kind, encoding, options.seconds, long_s)
-            columns = [MEDIAN, P99, LOST, TWICE, *([] if encoding is None else [CORES])]
-            yield Turn(case_of(kind, mtu), stream.contender, mtu, columns, stream.measure)
+            yield Turn(case_of(kind, mtu), mtu, encoding, COUNTS, partial(measure, kind, options.seconds, long_s))
 
 
 def targets_of(over: Rounds, mtu: int) -> list[Target]:
@@ -168,20 +136,5 @@ def targets_of(over: Rounds, mtu: int) -> list[Target]:
     return targets
 
 
-def panels_of(over: Rounds, mtu: int) -> list[Panel]:
-    """Return a panel for each case: medians, whiskers to the p99."""
-    panels = []
-    for kind in WHAT:
-        ours = [f"overlay, {encoding}" for encoding in ENCODINGS[kind]]
-        panels.append(panel_of(over, case_of(kind, mtu), MEDIAN, [*ours, DIRECT], p99=P99, ours=ours))
-    return panels
-
-
-def main() -> None:
-    """Run the bench."""
-    options = parse(__doc__ or "", rounds=3, seconds=SECONDS, mtus=MTUS, quick_s=QUICK_S)
-    perform(bench_of(options), options)
-
-
 if __name__ == "__main__":
-    main()
+    main(bench_of, __doc__, seconds=6.0, mtus=MTUS, quick_s=2.0)

@@ -5,7 +5,6 @@ no knowledge of the overlay.
 
 The executor is rclpy's ``EventsExecutor`` where it exists. The ordinary one takes longer the more subscriptions a node
 has, and would distort the measurement.
-
 """
 
 from __future__ import annotations

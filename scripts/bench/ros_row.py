@@ -21,7 +21,6 @@ retransmissions would then dominate the time. ROS 2's guide to tuning recommends
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -30,10 +29,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Final, Literal
 
+from devices import add_address, add_bridge
+from machine import processor_s
 from peers.process import Started
-from pyroute2 import IPRoute
-from testbed import LEFT, MIDDLE, RIGHT, ROW, Lab, OverlayNodes, make_topology
 from testbed import SOCKET_BUFFER_BYTES as BUFFER_BYTES
+from testbed import Lab, OverlayNodes
+from topologies import LEFT, MIDDLE, RIGHT, ROW, flat_topology
 
 from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
@@ -49,7 +50,6 @@ _DOMAINS: Final = {LEFT: 141, RIGHT: 142}
 DIRECT_DOMAIN: Final = 143
 _RIGHTS: Final = {"topic": (Right.PUBLISH, Right.READ), "service": (Right.SERVE, Right.CALL)}
 _BRIDGE: Final = "bridge"
-_TICKS_PER_S: Final = os.sysconf("SC_CLK_TCK")
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,11 +90,11 @@ class Row:
     def __init__(self, run: Run, carried: Sequence[Carried], *, mtu: int, bridged: bool = False) -> None:
         direct = (LEFT, *(_BRIDGES if bridged else ()), RIGHT)
         links = [*pairwise(ROW), *pairwise(direct)]
-        self._lab = Lab(run, make_topology(links, mtu=mtu, rib="s2", members=(LEFT, RIGHT)))
-        for node in direct[1:-1]:
-            self._lab.inside(node, _bridge)
+        self._lab = Lab(run, flat_topology(links, mtu=mtu, rib="s2", members=(LEFT, RIGHT)))
+        for before, node, after in zip(direct, direct[1:-1], direct[2:], strict=False):
+            self._lab.inside(node, partial(add_bridge, _BRIDGE, (before, after)))
         for node, device in ((LEFT, direct[1]), (RIGHT, direct[-2])):
-            self._lab.inside(node, partial(_number, device, _ADDRESSES[node]))
+            self._lab.inside(node, partial(add_address, device, _ADDRESSES[node]))
         with ExitStack() as undo:
             self._nodes = OverlayNodes(self._lab, MIDDLE, plane="kernel", ready_s=READY_S)
             undo.callback(self._nodes.close)
@@ -124,8 +124,8 @@ class Row:
         return self._lab.start(node, what, arguments, [*environment, f"CYCLONEDDS_URI={_cyclone(node)}"])
 
     def proxies_cpu_s(self) -> float:
-        """Return the processor time that both proxies have used, as proc(5) counts it in ``/proc/<pid>/stat``."""
-        return sum(_cpu_s(pid) for pid in self.proxies)
+        """Return the processor time that both proxies have used."""
+        return sum(processor_s(pid) for pid in self.proxies)
 
     def _admit(self, node: str, carried: Sequence[Carried]) -> str:
         """Give a proxy the delegations of its side, and write its configuration; return the file."""
@@ -137,23 +137,6 @@ class Row:
         return str(self._nodes.admit_proxy(node, _DOMAINS[node], sides))
 
 
-def _number(device: str, address: str) -> None:
-    with IPRoute() as here:
-        (index,) = here.link_lookup(ifname=device)
-        here.addr("add", index=index, address=address, prefixlen=24)
-
-
-def _bridge() -> None:
-    """Join all links of this namespace by a bridge."""
-    with IPRoute() as here:
-        here.link("add", ifname=_BRIDGE, kind="bridge")
-        (bridge,) = here.link_lookup(ifname=_BRIDGE)
-        for link in here.get_links():
-            if link["index"] not in (1, bridge):  # 1 is the loopback device
-                here.link("set", index=link["index"], master=bridge)
-        here.link("set", index=bridge, state="up")
-
-
 def _cyclone(node: str) -> str:
     """Return the configuration of Cyclone DDS for a direct node: interface, and socket buffers as the others have."""
     return (
@@ -161,8 +144,3 @@ def _cyclone(node: str) -> str:
         f'</Interfaces></General><Internal><SocketReceiveBufferSize max="{BUFFER_BYTES}B"/></Internal></Domain>'
         "</CycloneDDS>"
     )
-
-
-def _cpu_s(pid: int) -> float:
-    fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / _TICKS_PER_S  # utime, stime

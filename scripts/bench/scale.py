@@ -31,11 +31,11 @@ from typing import Final
 
 from baselines import Plane
 from chains import Chain
+from peers.process import FailedError, Started, figures_of
 from plot import Panel, panel_of
 from rate_search import LOSS_MAX, Try, highest
 from report import Rounds, Target, progress
 from skeleton import Options, Outcome, command_line, run_bench
-from worker import Worker, number
 
 from gdp.errors import LocalError
 from gdp.host.run_registry import RunRegistry
@@ -60,7 +60,7 @@ def measure_plane(kind: str, chains: dict[int, Chain], over: Rounds, seconds: fl
             plane = Plane(kind, processes=kind == "raw", names=names)
             try:
                 undo.enter_context(plane.stand(chain))
-            except LocalError as error:
+            except (LocalError, FailedError) as error:
                 over.absent(kind, str(error))
                 return
             planes[names] = plane
@@ -79,15 +79,14 @@ def measure_plane(kind: str, chains: dict[int, Chain], over: Rounds, seconds: fl
             over.add(kind, case_of(names), CPU, statistics.median(costs) if costs else None)
 
 
-def _fill(worker: Worker, names: int, kind: str, over: Rounds) -> None:
-    filled = worker.ask(do="fill")
-    case, placed = case_of(names), number(filled["placed"])
-    if placed != names:
-        raise LocalError(f"{kind}: the table took {placed:.0f} of {names} entries")
-    over.add(kind, case, INSTALLS, number(filled["installs_per_s"]))
-    over.add(kind, case, RENEWALS, number(filled["renewals_per_s"]))
-    over.add(kind, case, TABLE, number(filled["resident_bytes"]) / names)
-    over.add(kind, case, MAP, number(filled["map_bytes"]) / names)
+def _fill(worker: Started, names: int, kind: str, over: Rounds) -> None:
+    filled, case = figures_of(worker.ask(do="fill")), case_of(names)
+    if filled["placed"] != names:
+        raise FailedError(f"{kind}: the table took {filled['placed']:.0f} of {names} entries")
+    over.add(kind, case, INSTALLS, filled["installs_per_s"])
+    over.add(kind, case, RENEWALS, filled["renewals_per_s"])
+    over.add(kind, case, TABLE, filled["resident_bytes"] / names)
+    over.add(kind, case, MAP, filled["map_bytes"] / names)
 
 
 def measure_rib(names: int, over: Rounds) -> None:

@@ -7,8 +7,9 @@
     sudo .venv/bin/python scripts/bench/security.py cost                  # compared with an earlier commit
     sudo .venv/bin/python scripts/bench/security.py flood                 # by strangers and by members; an hour
 
-Each subcommand is a module in this folder with ``add_arguments(parser)`` and ``run(options)``. ``run`` returns its
-figures, which are stored under the subcommand's name, and whether every target was met.
+Each subcommand is a module in this folder with ``add_arguments(parser)`` and ``run(options, held)``; ``held`` are its
+figures of earlier runs. ``run`` returns its figures, which are stored under the subcommand's name, and whether every
+target was met.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from types import ModuleType
-from typing import Final
+from typing import Any, Final
 
 import security_amplification
 import security_cost
@@ -59,19 +60,24 @@ def arguments() -> argparse.ArgumentParser:
     return parser
 
 
+def held(path: Path) -> dict[str, dict[str, Any]]:
+    """Return the figures of earlier runs, by subcommand."""
+    document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    return document
+
+
 def save(path: Path, command: str, figures: Mapping[str, object], state: MachineState) -> None:
     """Write the figures of one subcommand; figures of others, and parts that were not measured now, are kept."""
-    held = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"bench": "security"}
-    before = held.get(command, {})
-    held[command] = {**before, **figures, "machine": asdict(state)}
-    path.write_text(json.dumps(held, indent=1) + "\n", encoding="utf-8")
+    document: dict[str, Any] = {"bench": "security", **held(path)}
+    document[command] = {**document.get(command, {}), **figures, "machine": asdict(state)}
+    path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
 
 def main() -> None:
     """Run one subcommand."""
     options, state = arguments().parse_args(), machine_state()
     with clean_exit():
-        figures, has_met = COMMANDS[options.command].run(options)
+        figures, has_met = COMMANDS[options.command].run(options, held(options.json).get(options.command, {}))
     if not options.no_save:
         save(options.json, options.command, figures, state)
     sys.exit(options.strict and not has_met)

@@ -19,13 +19,11 @@ Rows of earlier runs stay in the file until they are measured again.
 
     .venv/bin/python scripts/bench/security.py amplification
     .venv/bin/python scripts/bench/security.py amplification --speakers proxy --kinds withdraw query --no-save
-
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import multiprocessing
 import random
@@ -38,9 +36,7 @@ from pathlib import Path
 from typing import Any, Final
 from unittest import mock
 
-from report import progress
-from rich.console import Console
-from rich.table import Table
+from report import print_table, progress
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
@@ -124,35 +120,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--processes", type=int, default=1)
 
 
-def run(options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
+def run(options: argparse.Namespace, held: dict[str, Any]) -> tuple[dict[str, Any], bool]:
     """Measure every speaker with every kind."""
     logging.disable(logging.CRITICAL)
     ErrorBoundary.reraises = True
     measured = list(_measured(options))
+    before = [Row(**row) for row in held.get("rows", [])]
     new = {(row.speaker, row.kind) for row in measured}
-    rows = [*(row for row in _held(options.json) if (row.speaker, row.kind) not in new), *measured]
-    table = Table(title="Bytes drawn for each byte said", title_justify="left")
-    for heading in ("speaker", "kind", "said, bytes", "plain", "beyond its grants", "towards it", "met"):
-        table.add_column(heading, justify="left" if heading in ("speaker", "kind") else "right")
+    rows = [*(row for row in before if (row.speaker, row.kind) not in new), *measured]
+    lines = []
     for row in sorted(rows, key=lambda each: (each.speaker, -_decisive(each))):
         figures = (_text(row.plain), _text(row.beyond), _text(row.towards))
-        table.add_row(row.speaker, row.kind, f"{row.said:,}", *figures, "yes" if _is_met(row) else "NO")
-    Console(width=120).print(table)
+        lines.append((row.speaker, row.kind, f"{row.said:,}", *figures, "yes" if _is_met(row) else "NO"))
+    head = ("speaker", "kind", "said, bytes", "plain", "beyond its grants", "towards it", "met")
+    print_table(head, lines, title="Bytes drawn for each byte said", words=2)
     members = max((_decisive(row) for row in rows if row.speaker not in _STRANGERS), default=0.0)
     strangers = max((_decisive(row) for row in rows if row.speaker in _STRANGERS), default=0.0)
     progress(f"members, beyond their grants: {members:.2f}, at most {GOAL_BEYOND}")
     progress(f"strangers: {strangers:.2f}, at most {GOAL_STRANGER}")
-    figures = {
+    found: dict[str, Any] = {
         "members_beyond": members, "strangers": strangers, "target_members": GOAL_BEYOND,
         "target_strangers": GOAL_STRANGER, "rows": [asdict(row) for row in rows],
     }  # fmt: skip
-    return figures, all(map(_is_met, rows))
-
-
-def _held(path: Path) -> list[Row]:
-    """Return the rows of earlier runs."""
-    saved = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    return [Row(**row) for row in saved.get("amplification", {}).get("rows", [])]
+    return found, all(map(_is_met, rows))
 
 
 def _decisive(row: Row) -> float:

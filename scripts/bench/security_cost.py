@@ -32,12 +32,11 @@ from typing import Final
 
 from baselines import Plane
 from bundles import BUNDLES, CPU, OVERLOAD, RATE, SINGLE
-from chains import Chain
+from chains import ROLES, Chain
 from machine import machine_state, thread_s
 from peers.figures import MEDIAN
 from peers.process import FailedError
 from report import Rounds, Target, progress, show
-from worker import Worker
 
 from gdp.host.run_registry import RunRegistry
 
@@ -94,14 +93,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=float, default=3.0, help="of a figure of messages (default: %(default)s)")
 
 
-def run(options: argparse.Namespace) -> tuple[dict[str, object], bool]:
+def run(options: argparse.Namespace, _: object) -> tuple[dict[str, object], bool]:
     """Measure; return the figures, and whether all costs are within the target."""
     figures: dict[str, object] = {}
     has_met = True
     state = machine_state()
-    own = Tree(
-        _TREE, _BENCH / "security_cost_endpoint.py", _BENCH / "roles.py", (OVERLOAD, (BUNDLES, SINGLE), (RATE, *CPU))
-    )
+    own = Tree(_TREE, _BENCH / "security_cost_endpoint.py", ROLES, (OVERLOAD, (BUNDLES, SINGLE), (RATE, *CPU)))
     with _checked_out(options.base) as path, _checked_out(SCRIPTS) as scripts:
         bench = scripts / "scripts" / "bench"
         base = Tree(path, bench / "security_cost_end.py", bench / "roles.py", _BASE_CASES)
@@ -222,7 +219,7 @@ def _forwarding(tree: Tree, _: argparse.Namespace) -> Figures:
     with Chain(runs, 1, 1_500) as chain:
         for name in ("kernel", "raw"):
             plane = Plane(name, processes=name == "raw")
-            with _packages_of(tree):
+            with _packages_of(tree, chain):
                 standing = plane.stand(chain)
             with standing:
                 for size in SIZES:
@@ -233,7 +230,7 @@ def _forwarding(tree: Tree, _: argparse.Namespace) -> Figures:
                         continue
                     (switch,) = plane.workers()
                     costs = []
-                    for _ in range(_TRIES):
+                    for _try in range(_TRIES):
                         before_s = thread_s(switch.pid)
                         got = chain.attempt(wire, [], _STEADY_HZ, _TRY_S).got
                         costs.append(1e6 * (thread_s(switch.pid) - before_s) / got)
@@ -242,14 +239,14 @@ def _forwarding(tree: Tree, _: argparse.Namespace) -> Figures:
 
 
 @contextmanager
-def _packages_of(tree: Tree) -> Iterator[None]:
+def _packages_of(tree: Tree, chain: Chain) -> Iterator[None]:
     """Make processes that start meanwhile use the packages of a tree."""
-    before, roles = os.environ.get("PYTHONPATH"), Worker.roles
-    os.environ["PYTHONPATH"], Worker.roles = str(tree.path), tree.roles
+    before, roles = os.environ.get("PYTHONPATH"), chain.roles
+    os.environ["PYTHONPATH"], chain.roles = str(tree.path), tree.roles
     try:
         yield
     finally:
-        Worker.roles = roles
+        chain.roles = roles
         if before is None:
             del os.environ["PYTHONPATH"]
         else:

@@ -24,8 +24,6 @@ from gdp.frame.codec import decode
 from gdp.frame.kinds import Kind
 from gdp.nodes import membership
 
-__all__: list[str] = []
-
 SIZES: Final = (100, 10_000)
 _MTU: Final = 1_500
 _MESSAGES: Final = 100

@@ -33,17 +33,17 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Final
 
 from faults.overlay import Overlay
-from faults.plan import Flow, Plan, make_topology
+from faults.plan import Flow, Plan
 from faults.records import Kind as Happened
+from machine import processor_s, resident_bytes
 from peers.process import Started
-from report import progress
-from rich.console import Console
-from rich.table import Table
+from report import print_table, progress
+from skeleton import new_run
+from topologies import make_topology
 
 from gdp.control.fragments import ControlFragmenter
 from gdp.control.hello import ECHO_BYTES, INCARNATION_BYTES, NONCE_BYTES, Hello
@@ -76,7 +76,6 @@ _LOST: Final = re.compile(r"neighbour lost port=(?![hg]\b)")
 _RESTART_S: Final = 12.0
 _HOSTILE_READY_S: Final = 60.0
 _MTU: Final = 1_500
-_TICK_S: Final = 1 / os.sysconf("SC_CLK_TCK")
 _VICTIM: Final = "s0"
 _NEAR: Final = "s1"
 _HOSTILE: Final = dict.fromkeys(OF_SWITCH, "switch h") | dict.fromkeys(OF_PROXY, "member g")
@@ -161,18 +160,6 @@ def _hello(member: Identity, key: SigningKey | None) -> list[bytes]:
     return ControlFragmenter(member.name, secrets.randbits(64)).split(Kind.HELLO, wire, _MTU)
 
 
-def memory_mib(pid: int) -> float:
-    """Return the resident memory of a process."""
-    line = next(each for each in Path(f"/proc/{pid}/status").read_text().splitlines() if each.startswith("VmRSS:"))
-    return int(line.split()[1]) / 1_024
-
-
-def processor_s(pid: int) -> float:
-    """Return the processor time that a process has used, of the system too."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) * _TICK_S
-
-
 def waited_s(overlay: Overlay) -> float:
     """Return how long the good switches have waited for a core so far (schedstat, proc(5))."""
     pids = [overlay.pid(f"switch {node}") for node in (_VICTIM, _NEAR, "s2")]
@@ -232,7 +219,7 @@ def phase(overlay: Overlay, kind: str, seconds: float) -> Phase:
     time.sleep(seconds)
     took_s = time.monotonic() - begun_s
     core, waited = (processor_s(pid) - before_s) / took_s, (waited_s(overlay) - before_waited_s) / took_s
-    memory = memory_mib(overlay.pid(aimed_at))
+    memory = resident_bytes(overlay.pid(aimed_at)) / (1 << 20)
     reached = (overlay.received(node, [link])[link] - before_reached) / took_s
     published, delivered = counted(overlay)
     time.sleep(1.0)  # a switch logs what it lost each half second
@@ -247,27 +234,23 @@ def measure(
     runs: RunRegistry, plane: str, kinds: Sequence[str], seconds: float, rate: float, rounds: int, *, spoof: bool
 ) -> dict[str, list[dict[str, Phase]]]:
     """Return the phases of each round by kind of flood, calm and flooded."""
-    run = runs.start()
-    try:
-        with Overlay(run, plan(), plane=plane) as overlay:
-            overlay.start_all()
-            time.sleep(SETTLE_S)
-            found: dict[str, list[dict[str, Phase]]] = {kind: [] for kind in kinds}
-            for number in range(rounds):
-                for kind in kinds:
-                    progress(f"{plane}, {kind}, round {number + 1}")
-                    calm = phase(overlay, kind, seconds)
-                    time.sleep(SETTLE_S)
-                    of_kind = TIMES * FLOW.hz if kind == "parts" else rate
-                    with _flooding(run, overlay, kind, of_kind, seconds + 1 + _RESTART_S, spoof=spoof) as flood:
-                        flooded = phase(overlay, kind, seconds)
-                        said = flood.read(_RESTART_S + 30)
-                        progress(f"{float(str(said['sent'])) / float(str(said['seconds'])):,.0f} frames a second")
-                        found[kind].append({"calm": calm, "flooded": flooded})
-                    time.sleep(SETTLE_S)
-            return found
-    finally:
-        run.end()
+    with new_run(runs) as run, Overlay(run, plan(), plane=plane) as overlay:
+        overlay.start_all()
+        time.sleep(SETTLE_S)
+        found: dict[str, list[dict[str, Phase]]] = {kind: [] for kind in kinds}
+        for number in range(rounds):
+            for kind in kinds:
+                progress(f"{plane}, {kind}, round {number + 1}")
+                calm = phase(overlay, kind, seconds)
+                time.sleep(SETTLE_S)
+                of_kind = TIMES * FLOW.hz if kind == "parts" else rate
+                with _flooding(run, overlay, kind, of_kind, seconds + 1 + _RESTART_S, spoof=spoof) as flood:
+                    flooded = phase(overlay, kind, seconds)
+                    said = flood.read(_RESTART_S + 30)
+                    progress(f"{float(str(said['sent'])) / float(str(said['seconds'])):,.0f} frames a second")
+                    found[kind].append({"calm": calm, "flooded": flooded})
+                time.sleep(SETTLE_S)
+        return found
 
 
 @contextmanager
@@ -281,7 +264,7 @@ def _flooding(run: Run, overlay: Overlay, kind: str, rate: float, seconds: float
             "source": _address_of(overlay) if spoof else "",
         }  # fmt: skip
         argv = ["-m", "faults.hello_flood", json.dumps(reported)]
-        with Started(run, f"flood {kind}", partial(overlay.spaces.command, _NEAR), argv) as flood:
+        with overlay.start_other(_NEAR, f"flood {kind}", argv) as flood:
             flood.read(30)
             yield flood
         return
@@ -295,7 +278,7 @@ def _flooding(run: Run, overlay: Overlay, kind: str, rate: float, seconds: float
     overlay.kill(who)
     try:
         argv = ["-m", "faults.hostile", json.dumps(reported)]
-        with Started(run, f"flood {kind}", partial(overlay.spaces.command, node), argv) as flood:
+        with overlay.start_other(node, f"flood {kind}", argv) as flood:
             flood.read(_HOSTILE_READY_S)
             os.kill(flood.pid, signal.SIGUSR1)
             yield flood
@@ -326,26 +309,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--spoof", action="store_true", help="under the address of the neighbour on that link")
 
 
-def run(options: argparse.Namespace) -> tuple[dict[str, object], bool]:
+def run(options: argparse.Namespace, _: object) -> tuple[dict[str, object], bool]:
     """Measure every plane with every kind of flood; return the figures, and whether the targets were met."""
     runs = RunRegistry()
     runs.sweep()
     verified = verifications_hz()
     rate = options.rate or TIMES * verified
     headers = ("goodput, ratio", "lost", "memory, MiB", "core", "restart, s", "backlog drops", "waited", "reached")
-    table = Table("plane", "flood", *headers, title=f"{rate:,.0f} frames a second")
+    rows = list[tuple[str, ...]]()
     saved: dict[str, object] = {"verified_hz": verified, "rate_hz": rate}
     has_met = True
     for plane in options.planes:
         found = measure(runs, plane, options.kinds, options.seconds, rate, options.rounds, spoof=options.spoof)
         for kind, rounds in found.items():
-            table.add_row(plane, kind, *_row(rounds))
+            rows.append((plane, kind, *_row(rounds)))
             has_met = has_met and (kind == "noise" or _has_met(rounds))
         saved[plane] = {
             kind: [{name: asdict(each) for name, each in pair.items()} for pair in rounds]
             for kind, rounds in found.items()
         }
-    Console(width=140).print(table)
+    print_table(("plane", "flood", *headers), rows, title=f"{rate:,.0f} frames a second", words=2)
     return saved, has_met
 
 

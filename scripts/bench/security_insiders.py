@@ -10,13 +10,11 @@ findings.
 
     .venv/bin/python scripts/bench/security.py insiders --seconds 400 --processes 2
     .venv/bin/python scripts/bench/security.py insiders --statements 20000 --seed 7 --no-save
-
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import sys
 from pathlib import Path
@@ -41,11 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, help="of the first trial (default: the one after the last in the file)")
 
 
-def run(options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
+def run(options: argparse.Namespace, before: dict[str, Any]) -> tuple[dict[str, Any], bool]:
     """Try statements, and add the results to the file."""
     logging.disable(logging.CRITICAL)
-    held = json.loads(options.json.read_text(encoding="utf-8")) if options.json.exists() else {}
-    before: dict[str, Any] = held.get("insiders", {})
     runs: list[list[int]] = before.get("seeds", [])
     seed = options.seed or (runs[-1][1] + 1 if runs else 1)
     search = Search()

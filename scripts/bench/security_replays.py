@@ -27,13 +27,11 @@ What a frame warrants by itself is none of these: a current keepalive keeps a pr
 
     .venv/bin/python scripts/bench/security.py replays
     .venv/bin/python scripts/bench/security.py replays --tries 2000 --control window --no-save
-
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import random
 import sys
@@ -42,13 +40,12 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Final
 from unittest import mock
 
-from report import progress
-from rich.console import Console
-from rich.table import Table
+from report import print_table, progress
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
@@ -172,7 +169,7 @@ class RecordingNetwork(SimNetwork):
         """Replace a machine; its wall clock keeps the present offset."""
         stepped = _Stepped(machine, self.ahead_s) if self.ahead_s else machine
         ahead_s, self.ahead_s = self.ahead_s, 0.0
-        super().replace(name, stepped, table)  # type: ignore[arg-type]
+        super().replace(name, stepped, table)
         self.ahead_s = ahead_s
 
     def _send(self, wired: Any, frame: bytes) -> None:
@@ -569,14 +566,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--control", choices=list(CONTROLS), help="take this check away; something must be found")
 
 
-def run(options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
+def run(options: argparse.Namespace, before: dict[str, Any]) -> tuple[dict[str, Any], bool]:
     """Play back so many frames."""
     logging.disable(logging.CRITICAL)
     ErrorBoundary.reraises = True
     counts: Counter[str] = Counter()
     restarts: Counter[str] = Counter()
     found: list[str] = []
-    held = _held(options.json) if options.add else {}
+    held = before if options.add else {}
     begun_s, first = time.monotonic(), held["seeds"][1] + 1 if held else options.seed
     seed = first
     with ExitStack() as stack:
@@ -590,8 +587,8 @@ def run(options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
     seconds = round(time.monotonic() - begun_s, 1)
     if options.control is not None:
         _show(counts, restarts, found)
-        controls = _held(options.json).get("controls", {})
-        controls[options.control] = {"tries": counts.total(), "accepted": len(found)}
+        tried = {options.control: {"tries": counts.total(), "accepted": len(found)}}
+        controls = {**before.get("controls", {}), **tried}
         return {"controls": controls}, bool(found)
     counts.update(held.get("by_kind", {}))
     restarts.update(held.get("by_restart", {}))
@@ -604,12 +601,6 @@ def run(options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
         "seconds": seconds + held.get("seconds", 0.0),
     }  # fmt: skip
     return figures, not figures["accepted"]
-
-
-def _held(path: Path) -> dict[str, Any]:
-    """Return the figures of earlier runs."""
-    saved = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    return dict(saved.get("replays", {}))
 
 
 @contextmanager
@@ -661,16 +652,9 @@ def _episode(domain: Domain, tries: int, counts: Counter[str], restarts: Counter
 
 
 def _show(counts: Counter[str], restarts: Counter[str], found: list[str]) -> None:
-    table = Table(title=f"{counts.total():,} recorded frames played back, {len(found)} accepted", title_justify="left")
-    table.add_column("kind")
-    table.add_column("tries", justify="right")
-    table.add_column("restarted")
-    table.add_column("tries", justify="right")
-    left, right = counts.most_common(), restarts.most_common()
-    for at in range(max(len(left), len(right))):
-        a, b = (each[at] if at < len(each) else ("", "") for each in (left, right))
-        table.add_row(str(a[0]), str(a[1]), str(b[0]), str(b[1]))
-    console = Console(width=120)
-    console.print(table)
+    rows = zip_longest(counts.most_common(), restarts.most_common(), fillvalue=("", ""))
+    cells = [(str(what), str(tries), str(which), str(often)) for (what, tries), (which, often) in rows]
+    title = f"{counts.total():,} recorded frames played back, {len(found)} accepted"
+    print_table(("kind", "tries", "restarted", "tries"), cells, title=title)
     for each in found[:20]:
-        console.print(each, highlight=False)
+        print(each)

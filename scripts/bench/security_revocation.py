@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import gc
-import os
 import random
 import signal
 import subprocess
@@ -21,18 +20,18 @@ import tempfile
 import time
 from array import array
 from collections.abc import Iterator
-from contextlib import ExitStack
 from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
 from faults.overlay import Overlay
-from faults.plan import Flow, Plan, make_topology
+from faults.plan import Flow, Plan
 from faults.records import Kind
+from machine import resident_bytes
 from peers.process import FailedError
-from report import percentile, progress
-from rich.console import Console
-from rich.table import Table
+from report import percentile, print_table, progress
+from skeleton import new_run
+from topologies import make_topology
 
 from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.keys import SigningKey
@@ -74,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plane", default="auto", help="as gdp-switch --data-plane (default: %(default)s)")
 
 
-def run(options: argparse.Namespace) -> tuple[dict[str, object], bool]:
+def run(options: argparse.Namespace, _: object) -> tuple[dict[str, object], bool]:
     """Measure; return the figures, and whether the targets were met."""
     parts = options.part or ["kept", "closed"]
     figures: dict[str, object] = {}
@@ -90,11 +89,6 @@ def run(options: argparse.Namespace) -> tuple[dict[str, object], bool]:
 
 
 # -- kept
-
-
-def _resident_bytes() -> int:
-    gc.collect()
-    return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def _statements(authority: CertificateAuthority, count: int, unix_s: float) -> Iterator[bytes]:
@@ -113,7 +107,8 @@ def _kept(count: int) -> dict[str, float]:
     wires = list(_statements(authority, count, unix_s))
     found: dict[str, float] = {"count": count, "statement_bytes": len(wires[0])}
     revoked = Revocations({key: authority.root.domain})
-    before = _resident_bytes()
+    gc.collect()
+    before = resident_bytes()
     took = array("d", bytes(8 * count))
     for at, wire in enumerate(wires):
         statement = parse(wire)
@@ -121,7 +116,8 @@ def _kept(count: int) -> dict[str, float]:
         begun_ns = time.perf_counter_ns()
         revoked.receive_revocation(statement, origin, now, _nothing)
         took[at] = (time.perf_counter_ns() - begun_ns) / 1e3
-    found["kept_bytes_each"] = (_resident_bytes() - before) / count
+    gc.collect()
+    found["kept_bytes_each"] = (resident_bytes() - before) / count
     found["take_us_p50"], found["take_us_p99"] = percentile(took, 0.5), percentile(took, 0.99)
     found["known_us"] = _each_us(
         lambda s: revoked.receive_revocation(s, b"a", Timestamps(1e6, unix_s), _nothing), wires[:5_000]
@@ -234,10 +230,7 @@ def _statements_more(authority: CertificateAuthority, count: int, unix_s: float)
 
 
 def _show_kept(found: dict[str, float]) -> None:
-    table = Table(title=f"{found['count']:,.0f} revocations of one domain", title_justify="left")
-    table.add_column("what")
-    table.add_column("figure", justify="right")
-    for what, text in (
+    rows = (
         ("memory, each", f"{found['kept_bytes_each']:.0f} B (the statement has {found['statement_bytes']:.0f})"),
         ("memory, all", f"{found['kept_bytes_each'] * found['count'] / 1e6:.1f} MB"),
         ("to take one, p50, p99", f"{found['take_us_p50']:.0f}, {found['take_us_p99']:.0f} µs"),
@@ -249,9 +242,8 @@ def _show_kept(found: dict[str, float]) -> None:
         ("until a newcomer keeps all", f"{found['newcomer_s']:.0f} s, paced; {found['newcomer_bytes'] / 1e6:.1f} MB"),
         ("... processor time of both ends", f"{found['newcomer_cpu_s']:.0f} s"),
         ("it comes back, ten are new", f"{found['ten_more_s']:.1f} s, {found['ten_more_bytes'] / 1e3:.1f} kB"),
-    ):
-        table.add_row(what, text)
-    Console(width=120).print(table)
+    )
+    print_table(("what", "figure"), rows, title=f"{found['count']:,.0f} revocations of one domain")
 
 
 # -- closed
@@ -280,10 +272,7 @@ def _closed(options: argparse.Namespace) -> dict[str, Any]:
     runs.sweep()
     for number in range(options.rounds):
         progress(f"closed: network {number + 1} of {options.rounds}")
-        with ExitStack() as undo:
-            run_ = runs.start()
-            undo.callback(run_.end)
-            overlay = undo.enter_context(Overlay(run_, _plan(options.hz), plane=options.plane))
+        with new_run(runs) as run_, Overlay(run_, _plan(options.hz), plane=options.plane) as overlay:
             overlay.start_all()
             late += _Closing(overlay).measure(found)
     return {"target_s": TARGET_S, "hz": options.hz, "not_closed": late, **found}
@@ -365,9 +354,7 @@ class _Closing:
 
 
 def _show_closed(found: dict[str, Any]) -> bool:
-    table = Table(title="From a revocation to the last message of the closed flow, three tiers", title_justify="left")
-    for heading in ("revoked", "from", "to reach", "flows", "p50 ms", "p99 ms", "max ms", "met"):
-        table.add_column(heading, justify="left" if heading in ("revoked", "from") else "right")
+    rows = list[tuple[str, ...]]()
     has_met = not found["not_closed"]
     for what in ("delegation", "membership"):
         for since, key, target_s in (("the signal", what, found["target_s"]), ("the command", f"{what}_command", None)):
@@ -377,10 +364,10 @@ def _show_closed(found: dict[str, Any]) -> bool:
             has_met = has_met and is_met
             figures = (f"{p50 * 1e3:.0f}", f"{p99 * 1e3:.0f}", f"{max(seconds) * 1e3:.0f}")
             asked = "" if target_s is None else f"≤ {target_s * 1e3:g}"
-            table.add_row(what, since, asked, str(len(seconds)), *figures, "" if target_s is None else _yes(is_met))
-    console = Console(width=120)
-    console.print(table)
-    console.print(f"flows that were not closed: {found['not_closed']}", highlight=False)
+            rows.append((what, since, asked, str(len(seconds)), *figures, "" if target_s is None else _yes(is_met)))
+    head = ("revoked", "from", "to reach", "flows", "p50 ms", "p99 ms", "max ms", "met")
+    print_table(head, rows, title="From a revocation to the last message of the closed flow, three tiers", words=2)
+    print(f"flows that were not closed: {found['not_closed']}")
     return has_met
 
 

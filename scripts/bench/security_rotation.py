@@ -19,8 +19,7 @@ from functools import partial
 from itertools import pairwise
 from typing import Final
 
-from rich.console import Console
-from rich.table import Table
+from report import print_table
 
 from gdp.client.participant import Topic
 from gdp.client.publisher import Publisher
@@ -151,19 +150,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--loss", type=float, default=0.0, help="share of frames that each link loses")
 
 
-def run(options: argparse.Namespace) -> tuple[dict[str, object], bool]:
+def run(options: argparse.Namespace, _: object) -> tuple[dict[str, object], bool]:
     """Publish so many messages on all topics together; return the account of each."""
     rotation = Rotation(options.loss)
     accounts = rotation.run(options.messages, options.rate, options.rotate_s)
-    table = Table(title=f"{rotation.epoch} epochs of {options.rotate_s:g} s")
     columns = list(next(iter(accounts.values())))
-    for column in ("topic", *columns):
-        table.add_column(column, justify="left" if column == "topic" else "right")
-    for name, account in accounts.items():
-        table.add_row(name, *(f"{account[column]:,}" for column in columns))
-    Console().print(table)
+    rows = [(name, *(f"{account[column]:,}" for column in columns)) for name, account in accounts.items()]
+    print_table(("topic", *columns), rows, title=f"{rotation.epoch} epochs of {options.rotate_s:g} s")
     refused = rotation.refused()
-    Console().print(f"refused by the publisher: {dict(refused) or 'nothing'}")
+    print(f"refused by the publisher: {dict(refused) or 'nothing'}")
     may_lose = {stream.name for stream in rotation.streams if not stream.reliable and options.loss}
     kept = [account for name, account in accounts.items() if name not in may_lose]
     figures: dict[str, object] = {

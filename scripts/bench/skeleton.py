@@ -41,6 +41,8 @@ class Outcome:
         name: of the record, and of its files below ``docs/benchmarks``.
         panels: makes the picture; only called when it is drawn.
         is_whole: False where only ``--json`` and ``--plot`` write files.
+        keeps_rows: rows of an earlier record that were not measured now are kept.
+        has_failed: ends the command with 1.
     """
 
     name: str
@@ -50,6 +52,8 @@ class Outcome:
     settings: Settings
     panels: Callable[[], Sequence[Panel]] | None = None
     is_whole: bool = True
+    keeps_rows: bool = False
+    has_failed: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +111,7 @@ def command_line(
         rounds: default of ``--rounds``; None: no such option.
         seconds: default of ``--seconds``; None: no such option.
         quick: what ``--quick`` sets; None: no such option.
-        has_record: adds ``--json`` and ``--no-save``.
+        has_record: adds ``--json``, ``--no-save`` and ``--strict``.
         has_plot: adds ``--plot`` and ``--no-plot``.
     """
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -122,6 +126,7 @@ def command_line(
     if has_record:
         parser.add_argument("--json", type=Path, help="where the figures go (default: docs/benchmarks)")
         parser.add_argument("--no-save", action="store_true", help="print only")
+        parser.add_argument("--strict", action="store_true", help="exit 1 when a target was missed")
     if has_plot:
         parser.add_argument("--plot", type=Path, help="where the picture goes (default: docs/benchmarks)")
         parser.add_argument("--no-plot", action="store_true", help="no picture")
@@ -190,6 +195,9 @@ def finish(
     record = getattr(options, "json", None) or (own and own / f"{outcome.name}.json")
     picture = getattr(options, "plot", None) or (own and own / f"{outcome.name}.png")
     if is_saved and record:
-        write_json(record, outcome.name, state, settings, outcome.rounds, outcome.targets)
+        write_json(record, outcome.name, state, settings, outcome.rounds, outcome.targets, keeps=outcome.keeps_rows)
     if is_drawn and picture and outcome.panels is not None:
         save_bars(picture, outcome.title, str(state), outcome.panels())
+    is_missed = any(target.met is False for target in outcome.targets)
+    if outcome.has_failed or (getattr(options, "strict", False) and is_missed):
+        sys.exit(1)

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import argparse
 import gc
-import os
 import sys
 import time
 from collections import defaultdict
@@ -28,14 +27,15 @@ from pathlib import Path
 from typing import Final
 
 from faults.overlay import Overlay
-from faults.plan import Churn, Flow, Plan, make_topology
+from faults.plan import Churn, Flow, Plan
 from faults.slope import Growth, growth_of
+from machine import map_bytes, resident_bytes
 from peers.process import FailedError
-from report import progress
-from rich.console import Console
-from rich.table import Table
+from report import print_table, progress
 from skeleton import clean_exit, command_line, new_run
+from topologies import make_topology
 
+from gdp.client.publisher import Publisher
 from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import chain
 from gdp.trust.right import Right
@@ -50,7 +50,6 @@ CACHES: Final = ADCERTS_REMEMBERED + 500  # publishers until every bounded memor
 FILL_KB: Final = 16.0  # a publisher, until then: seven delegations over six nodes, and other remembered state
 FILLING: Final = "publishers of new names, while memories fill"
 LEFT, RIGHT = "s1/left", "s3/right"
-PAGE_BYTES: Final = os.sysconf("SC_PAGE_SIZE")
 SHARE: Final = 0.02  # share of the mean
 LEAST: Final = {"objects": 200.0, "memory, kB": 512.0, "descriptors": 0.0, "threads": 0.0, "map bytes": 1_024.0}
 
@@ -78,11 +77,7 @@ class Memory:
         def once() -> None:
             right.subscribe(topic)
             world.network.touch(RIGHT)
-            self._until(lambda: publisher.readers == 1, "a reader")
-            publisher.publish(b"message")
-            left.flush(world.network.now.mono_s)
-            world.network.touch(LEFT)
-            self._until(lambda: bool(right.poll_messages()), "a message")
+            self._pass_one(publisher)
             right.unsubscribe(topic.name)
             world.network.touch(RIGHT)
             self._until(lambda: not publisher.readers, "the reader's end")
@@ -103,11 +98,7 @@ class Memory:
             right.subscribe(topic)
             world.network.touch(LEFT)
             world.network.touch(RIGHT)
-            self._until(lambda: publisher.readers == 1, "a reader")
-            publisher.publish(b"message")
-            left.flush(world.network.now.mono_s)
-            world.network.touch(LEFT)
-            self._until(lambda: bool(right.poll_messages()), "a message")
+            self._pass_one(publisher)
             left.withdraw(topic.name)
             right.unsubscribe(topic.name)
             world.network.touch(LEFT)
@@ -119,6 +110,14 @@ class Memory:
             _repeat("publishers of new names", once, publishers - CACHES, samples)
         else:
             _repeat(FILLING, once, publishers, samples)
+
+    def _pass_one(self, publisher: Publisher) -> None:
+        """Send one message to the only reader."""
+        self._until(lambda: publisher.readers == 1, "a reader")
+        publisher.publish(b"message")
+        self._world.members[LEFT].flush(self._world.network.now.mono_s)
+        self._world.network.touch(LEFT)
+        self._until(lambda: bool(self._world.members[RIGHT].poll_messages()), "a message")
 
     def _until(self, is_met: Callable[[], bool], what: str) -> None:
         if not self._world.network.run(30.0, is_met):
@@ -134,7 +133,7 @@ def _repeat(label: str, once: Callable[[], None], times: int, samples: Samples |
             gc.collect()
             if label != FILLING:
                 samples[label, "objects"].append(len(gc.get_objects()))
-            samples[label, "memory, kB"].append(_resident_bytes(os.getpid()) / 1_024)
+            samples[label, "memory, kB"].append(resident_bytes() / 1_024)
     progress(f"{label}: {times} in {time.monotonic() - begun_s:.0f} s")
 
 
@@ -186,38 +185,22 @@ def _look(pid: int) -> Iterator[tuple[str, float]]:
     folder = Path(f"/proc/{pid}")
     yield "descriptors", float(len(list((folder / "fd").iterdir())))
     yield "threads", float(len(list((folder / "task").iterdir())))
-    yield "memory, kB", _resident_bytes(pid) / 1_024
-    maps = list(_map_bytes(folder))
-    if maps:
-        yield "map bytes", float(sum(maps))
-
-
-def _resident_bytes(pid: int) -> int:
-    return int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]) * PAGE_BYTES
-
-
-def _map_bytes(folder: Path) -> Iterator[int]:
-    """Yield the bytes of each BPF map of a process. Source: Linux, kernel/bpf/syscall.c, ``bpf_map_show_fdinfo``."""
-    for each in (folder / "fdinfo").iterdir():
-        facts = dict(line.split(":", 1) for line in each.read_text(encoding="ascii").splitlines() if ":" in line)
-        if "map_type" in facts:
-            yield int(facts["memlock"])
+    yield "memory, kB", resident_bytes(pid) / 1_024
+    if maps := map_bytes(pid):
+        yield "map bytes", float(maps)
 
 
 def show(samples: Samples, publishers: int) -> bool:
     """Print every figure; return whether all are flat, or grew as filling memories do."""
-    table = Table(title="After the warm-up", title_justify="left")
-    for heading in ("who", "figure", "mean", "rise", "scatter", "flat"):
-        table.add_column(heading, justify="left" if heading in ("who", "figure") else "right")
-    flat = True
+    rows, flat = [], True
     for (who, what), values in samples.items():
         growth: Growth = growth_of(values)
         least = FILL_KB * publishers if who == FILLING else LEAST[what]
         is_flat = growth.is_flat(SHARE, least)
         flat = flat and is_flat
         figures = (f"{each:,.1f}" for each in (growth.mean, growth.rise, growth.scatter))
-        table.add_row(who, what, *figures, "yes" if is_flat else "NO")
-    Console(width=120).print(table)
+        rows.append((who, what, *figures, "yes" if is_flat else "NO"))
+    print_table(("who", "figure", "mean", "rise", "scatter", "flat"), rows, title="After the warm-up", words=2)
     return flat
 
 

@@ -13,33 +13,25 @@ machine's scheduler (the row ``nothing``). Lost and doubled count messages over 
 
 from __future__ import annotations
 
-import argparse
-import json
 import random
 import signal
-import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from itertools import chain, pairwise
-from pathlib import Path
 from typing import Final
 
 from faults.overlay import Overlay
 from faults.records import Kind, Record
-from machine import machine_state
 from peers.process import FailedError
-from report import percentile, progress
-from rich.console import Console
-from rich.table import Table
+from report import Rounds, Spread, Target, percentile, progress
+from skeleton import Options, Outcome, command_line, new_run, run_bench
 from survive_rows import NEW_TOPICS, ROWS, Row
 
 from gdp.errors import GdpError
-from gdp.host.run_registry import Run, RunRegistry
+from gdp.host.run_registry import RunRegistry
 
-OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks" / "survive.json"
 ROUNDS: Final = 30
 HZ: Final = 500.0
 DEAD_S: Final = 80.0  # longer than three leases of 24 s
@@ -49,7 +41,7 @@ STEADY_GAP_S: Final = 0.1
 PATIENCE_S: Final = 40.0  # longer than a lease
 LOOK_S: Final = 0.05
 LAST_S: Final = 2.0
-COLUMNS: Final = 170
+SILENCE, RETURN, P99 = "silence, ms", "after undo, ms", "p99, ms"
 
 
 @dataclass(slots=True)
@@ -143,7 +135,7 @@ class Flowing:
         return len(missing), sum(number - 1 for number in self.numbers.values())
 
 
-def measure(runs: RunRegistry, row: Row, rounds: int, options: argparse.Namespace) -> Measured:
+def measure_row(runs: RunRegistry, row: Row, rounds: int, options: Options) -> Measured:
     """Make the event of a row happen so often.
 
     Raises:
@@ -151,10 +143,7 @@ def measure(runs: RunRegistry, row: Row, rounds: int, options: argparse.Namespac
         GdpError: the kernel refuses.
     """
     found = Measured()
-    with ExitStack() as undo:
-        run: Run = runs.start()
-        undo.callback(run.end)
-        overlay = undo.enter_context(Overlay(run, row.plan(options.hz), plane=options.plane, more=options.more))
+    with new_run(runs) as run, Overlay(run, row.plan(options.hz), plane=options.plane) as overlay:
         overlay.start_all()
         flow = Flowing(overlay)
         if not flow.await_steady(time.monotonic_ns()):
@@ -170,7 +159,7 @@ def measure(runs: RunRegistry, row: Row, rounds: int, options: argparse.Namespac
     return found
 
 
-def _once(overlay: Overlay, flow: Flowing, row: Row, at: int, found: Measured, options: argparse.Namespace) -> None:
+def _once(overlay: Overlay, flow: Flowing, row: Row, at: int, found: Measured, options: Options) -> None:
     time.sleep(random.random() * options.phase_s)  # events hit any phase of every timer
     since_ns = time.monotonic_ns()
     row.fail(overlay, at)
@@ -210,102 +199,56 @@ def _new_name_s(overlay: Overlay, flow: Flowing, at: int) -> float:
     return (flow.first_of.get(channel, time.monotonic_ns()) - begun_ns) / 1e9
 
 
-def show(measured: dict[str, Measured], options: argparse.Namespace) -> None:
-    """Print the table."""
-    table = Table(title=f"Silence of a flow of {options.hz:g} messages/s, ms", title_justify="left")
-    counts = ("lost", "reported", "doubled", "no return")
-    for heading in ("event", "to reach", "events", "p50", "p99", "max", "met", "undone: max", *counts):
-        table.add_column(heading, justify="left" if heading == "event" else "right")
-    for name, each in measured.items():
-        row = ROWS[name]
-        table.add_row(row.what, *_figures(each.silence_s, row.target_s, _max_text(each.return_s)), *_counts(each))
-        if each.new_name_s:
-            table.add_row("  until a new name is read", *_figures(each.new_name_s, row.new_name_s, ""))
-    console = Console(width=COLUMNS)
-    console.print(f"{machine_state()}", highlight=False)
-    console.print(table)
+def add(over: Rounds, row: Row, case: str, found: Measured) -> list[Target]:
+    """Add the figures of a row; return its targets."""
+    asked = [(row.what, found.silence_s, row.target_s)]
+    if found.new_name_s:
+        asked.append((f"{row.what}: until a new name is read", found.new_name_s, row.new_name_s))
+    targets = []
+    for who, seconds, target_s in asked:
+        for each in seconds:
+            over.add(who, case, SILENCE, 1e3 * each)
+        over.add(who, case, P99, 1e3 * percentile(seconds, 0.99))
+        # A silence of nothing is compared with the row ``nothing``.
+        target_ms = 1e3 * target_s if target_s else None
+        targets.append(over.target(f"{who}: {P99}", who, case, P99, target_ms, at_most=True))
+    for each in found.return_s:
+        over.add(row.what, case, RETURN, 1e3 * each)
+    counts = {"published": found.published, "lost": found.lost, "reported": found.reported_lost}
+    counts |= {"doubled": found.doubled, "no return": found.never}
+    for column, count in counts.items():
+        over.add(row.what, case, column, count)
+    faults = found.lost + found.doubled + found.never
+    return [*targets, Target(f"{row.what}: lost, doubled or without return", 0, True, Spread.of([faults]))]
 
 
-def _figures(seconds: list[float], target_s: float | None, undone: str) -> list[str]:
-    asked = "" if target_s is None else f"≤ {target_s * 1e3:g}"
-    p50, p99 = (f"{percentile(seconds, share) * 1e3:.1f}" for share in (0.5, 0.99))
-    return [asked, str(len(seconds)), p50, p99, _max_text(seconds), _met(seconds, target_s), undone]
-
-
-def _counts(each: Measured) -> list[str]:
-    return [str(each.lost), str(each.reported_lost), str(each.doubled), str(each.never)]
-
-
-def _max_text(seconds: list[float]) -> str:
-    return f"{max(seconds) * 1e3:.1f}" if seconds else ""
-
-
-def _met(seconds: list[float], target_s: float | None) -> str:
-    if not target_s:  # a silence of nothing is compared with the row ``nothing``
-        return ""
-    return "yes" if percentile(seconds, 0.99) <= target_s else "NO"
-
-
-def save(path: Path, measured: dict[str, Measured], options: argparse.Namespace) -> None:
-    """Write every figure; rows of an earlier run that were not measured now are kept."""
-    rows = json.loads(path.read_text(encoding="utf-8"))["rows"] if path.exists() else {}
-    for name, each in measured.items():
-        row = ROWS[name]
-        rows[name] = {
-            "what": row.what, "target_s": row.target_s, "new_name_target_s": row.new_name_s,
-            "hz": options.hz, "data_plane": options.plane, **asdict(each),
-        }  # fmt: skip
-    answer = {"bench": "survive", "machine": asdict(machine_state()), "rows": rows}
-    path.write_text(json.dumps(answer, indent=1) + "\n", encoding="utf-8")
-
-
-def arguments() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", action="append", choices=list(ROWS), help="this row; may be repeated")
-    parser.add_argument("--rounds", type=int, default=ROUNDS, help="events a row (default: %(default)s)")
-    parser.add_argument("--hz", type=float, default=HZ, help="messages a second (default: %(default)s)")
-    parser.add_argument("--plane", default="auto", help="as gdp-switch --data-plane (default: %(default)s)")
-    parser.add_argument("--dead-s", type=float, default=DEAD_S, help="how long no RIB lives (default: %(default)s)")
-    parser.add_argument("--phase-s", type=float, default=0.5, help="random wait before an event (default: %(default)s)")
-    parser.add_argument("--settle-s", type=float, default=SETTLE_S, help="after it is undone (default: %(default)s)")
-    parser.add_argument("--quick", action="store_true", help="one round of each, RIBs dead for 3 s")
-    parser.add_argument("--json", type=Path, default=OUTPUT, help="where the figures go (default: docs/benchmarks)")
-    parser.add_argument("--no-save", action="store_true", help="print only")
-    parser.add_argument("--strict", action="store_true", help="exit 1 when a target was missed or a message")
-    parser.set_defaults(more={})
-    return parser
-
-
-def main() -> None:
-    """Run the bench, or a part of it."""
-    options = arguments().parse_args()
+def measure(options: Options, runs: RunRegistry) -> Outcome:
+    """Measure every row; one that fails is noted."""
     if options.quick:
-        options.rounds, options.dead_s, options.settle_s = 1, 3.0, 0.0
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # SIGTERM must remove everything that was made
-    runs = RunRegistry()
-    runs.sweep()  # remains of a killed run
-    measured: dict[str, Measured] = {}
-    failures: list[str] = []
-    for name in options.only or list(ROWS):
+        options.dead_s, options.settle_s = 3.0, 0.0
+    over, targets, notes = Rounds(), list[Target](), list[str]()
+    case = f"a flow of {options.hz:g} messages/s"
+    for name in options.only or ROWS:
         row = ROWS[name]
         rounds = min(options.rounds, NEW_TOPICS) if row.new_name_s is not None else options.rounds
         rounds = min(rounds, 3) if row.holds else rounds
         progress(f"{name}: {row.what}, {rounds} times")
         try:
-            measured[name] = measure(runs, row, rounds, options)
-            if not options.no_save:
-                save(options.json, measured, options)
-        except KeyboardInterrupt:
-            sys.exit(130)
+            targets += add(over, row, case, measure_row(runs, row, rounds, options))
         except (GdpError, FailedError) as error:
-            failures.append(f"{name}: {error}")
-            progress(f"FAILED {failures[-1]}")
-    show(measured, options)
-    is_bad = any(each.lost or each.doubled or each.never for each in measured.values())
-    missed = any("NO" in (_met(each.silence_s, ROWS[name].target_s),) for name, each in measured.items())
-    sys.exit(bool(failures) or (options.strict and (is_bad or missed)))
+            notes.append(f"{name}: {error}")
+            progress(f"FAILED {notes[-1]}")
+    settings = {"events a row": options.rounds, "data plane": options.plane, "trouble": notes or "none"}
+    title = "Silence when something fails or moves"
+    return Outcome("survive", title, over, targets, settings, keeps_rows=True, has_failed=bool(notes))
 
 
 if __name__ == "__main__":
-    main()
+    parser = command_line(__doc__, rounds=ROUNDS, quick={"rounds": 1}, has_record=True)
+    parser.add_argument("--only", action="append", choices=list(ROWS), help="this row; may be repeated")
+    parser.add_argument("--hz", type=float, default=HZ, help="messages a second (default: %(default)s)")
+    parser.add_argument("--plane", default="auto", help="as gdp-switch --data-plane (default: %(default)s)")
+    parser.add_argument("--dead-s", type=float, default=DEAD_S, help="how long no RIB lives (default: %(default)s)")
+    parser.add_argument("--phase-s", type=float, default=0.5, help="random wait before an event (default: %(default)s)")
+    parser.add_argument("--settle-s", type=float, default=SETTLE_S, help="after it is undone (default: %(default)s)")
+    run_bench(parser, measure)

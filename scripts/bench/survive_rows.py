@@ -16,11 +16,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypedDict
 
 from faults.link_faults import FrameFaults
 from faults.overlay import Overlay
-from faults.plan import Flow, Plan, make_topology
+from faults.plan import Flow, Plan
+from topologies import ends_of, make_topology
 
 from gdp.simulation.topology import Link
 
@@ -113,6 +114,13 @@ def _move(*movers: str) -> Callable[[Overlay, int], None]:
     return move
 
 
+class Both(TypedDict):
+    """Keys of a row that make an event and undo it."""
+
+    fail: Callable[[Overlay, int], None]
+    undo: Callable[[Overlay, int], None]
+
+
 class _OnPath:
     """Faults at the switch, or the link to or from it, that the flow uses at that moment.
 
@@ -144,30 +152,30 @@ class _OnPath:
     def undo(self, overlay: Overlay, _: int) -> None:
         self._undo(overlay, self._failed)
 
-    def both(self) -> dict[str, Callable[[Overlay, int], None]]:
+    def both(self) -> Both:
         """Return both as keys of a row."""
         return {"fail": self.fail, "undo": self.undo}
 
 
-def _cut(**ways: str) -> dict[str, Callable[[Overlay, int], None]]:
+def _cut(**ways: str) -> Both:
     return _OnPath(
         "s4",
         ways,
-        lambda overlay, link: overlay.cut(*link.split("-")),
-        lambda overlay, link: overlay.restore_link(*link.split("-")),
+        lambda overlay, link: overlay.cut(*ends_of(link)),
+        lambda overlay, link: overlay.restore_link(*ends_of(link)),
     ).both()
 
 
-def _silence(**ways: str) -> dict[str, Callable[[Overlay, int], None]]:
+def _silence(**ways: str) -> Both:
     return _OnPath(
         "s4",
         ways,
-        lambda overlay, link: overlay.disturb(*link.split("-"), FrameFaults(lost=1.0)),
-        lambda overlay, link: overlay.calm(*link.split("-")),
+        lambda overlay, link: overlay.disturb(*ends_of(link), FrameFaults(lost=1.0)),
+        lambda overlay, link: overlay.calm(*ends_of(link)),
     ).both()
 
 
-def _kill(last: str, **ways: str) -> dict[str, Callable[[Overlay, int], None]]:
+def _kill(last: str, **ways: str) -> Both:
     return _OnPath(last, ways, lambda overlay, who: overlay.kill(who), _again).both()
 
 

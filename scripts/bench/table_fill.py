@@ -7,43 +7,19 @@ kernel reports it with the map's file descriptor (``memlock``, proc(5)).
 from __future__ import annotations
 
 import gc
-import os
-import resource
 import time
 from itertools import islice
-from pathlib import Path
 from typing import Final
 
 from frames import table_key
+from machine import map_bytes, resident_bytes
 
 from gdp.switch.table import Hops, Table
 
-__all__ = ["ENTRY_LEASE_S", "fill", "map_bytes", "resident_bytes"]
+__all__ = ["ENTRY_LEASE_S", "fill"]
 
 ENTRY_LEASE_S: Final = 1e9
 _CHUNK: Final = 100_000  # entries a call; made outside the measured time
-
-
-def resident_bytes() -> int:
-    """Return the present resident memory of this process.
-
-    Its recorded maximum would include the parent's, from before exec.
-    """
-    return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * resource.getpagesize()
-
-
-def map_bytes() -> int:
-    """Return the kernel memory of all eBPF maps that this process holds open; 0 without any."""
-    total = 0
-    for name in os.listdir("/proc/self/fdinfo"):
-        try:
-            lines = Path("/proc/self/fdinfo", name).read_text(encoding="ascii").splitlines()
-        except FileNotFoundError:  # the descriptor of this very listing
-            continue
-        words = dict(line.split(":", 1) for line in lines if ":" in line)
-        if "map_type" in words:
-            total += int(words["memlock"])
-    return total
 
 
 def fill(table: Table, names: int, hops: Hops) -> dict[str, float]:

@@ -1,7 +1,7 @@
-"""Test bed of the benches and experiments: topologies, machines in namespaces, and the overlay's nodes on them.
+"""Test bed of the benches and experiments: machines in namespaces, and the overlay's nodes on them.
 
-I/O. ``make_topology`` describes a network, ``Lab`` is its machines, ``OverlayNodes`` are switches and RIB on a lab.
-A device is named like the neighbour that it leads to. ``run.end()`` removes namespaces and processes of a lab.
+I/O. ``topologies.py`` describes networks, ``Lab`` is the machines of one, ``OverlayNodes`` are switches and RIB on a
+lab. ``run.end()`` removes namespaces and processes of a lab.
 """
 
 from __future__ import annotations
@@ -10,29 +10,25 @@ import json
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from itertools import chain, pairwise
+from functools import partial
 from pathlib import Path
 from typing import Final, TypeVar
 
 import yaml
 from peers.process import FailedError, Started
+from topologies import MIDDLE
 
 from gdp.host import netns_files
 from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
 from gdp.simulation.namespaces import Namespaces
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from gdp.simulation.topology import Topology
 from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE
 from gdp.trust.right import Right
 from ring.materials import OverlayCredentials
 
-LEFT: Final = "a"
-MIDDLE: Final = ("s1", "s2", "s3")
-RIGHT: Final = "b"
-ROW: Final = (LEFT, *MIDDLE, RIGHT)
 SOCKET_BUFFER_BYTES: Final = 4 << 20
-_DOMAIN: Final = "lab"
 _PROFILE: Final = f"""<?xml version="1.0" encoding="UTF-8" ?>
 <dds xmlns="http://www.eprosima.com"><profiles>
  <transport_descriptors><transport_descriptor>
@@ -46,36 +42,6 @@ _PROFILE: Final = f"""<?xml version="1.0" encoding="UTF-8" ?>
 """
 
 T = TypeVar("T")
-
-
-def make_topology(
-    links: Iterable[tuple[str, str]], *, mtu: int, rib: str, members: Sequence[str], switches: Sequence[str] = ()
-) -> Topology:
-    """Return the topology of one trust domain; ``rib`` is the switch with the RIB, ``members`` run no switch.
-
-    Args:
-        mtu: bytes after the Ethernet header, of every link.
-        switches: nodes that come first in the topology's order.
-
-    Raises:
-        LocalError: they do not fit together.
-    """
-    pairs = list(links)
-    nodes = tuple(dict.fromkeys((*switches, *chain.from_iterable(pairs))))
-    return Topology(
-        links=tuple(Link(a, b, mtu=mtu) for a, b in pairs),
-        domains=(DomainPlan(_DOMAIN, nodes),),
-        attachments=(Attachment(rib, "rib", "rib"), *(Attachment(each, "proxy", "end") for each in members)),
-    )
-
-
-def row(mtu: int) -> Topology:
-    """Return A - s1 - s2 - s3 - B with the RIB at s2.
-
-    Raises:
-        LocalError: the MTU is out of bounds.
-    """
-    return make_topology(pairwise(ROW), mtu=mtu, rib="s2", members=(LEFT, RIGHT))
 
 
 class Lab:
@@ -99,13 +65,23 @@ class Lab:
         """Call ``work`` in a machine's namespace."""
         return netns_files.inside(self.namespaces.path(node), work)
 
-    def start(self, node: str, what: str, arguments: Sequence[str], environment: Sequence[str] = ()) -> Started:
+    def command(self, node: str, argv: Sequence[str], environment: Sequence[str] = ()) -> list[str]:
+        """Return the command line that runs ``argv`` on a machine; ``environment`` holds ``KEY=value``."""
+        return self.namespaces.command(node, ["env", *environment, *argv] if environment else list(argv))
+
+    def start(
+        self,
+        node: str,
+        what: str,
+        arguments: Sequence[str],
+        environment: Sequence[str] = (),
+        *,
+        has_orders: bool = False,
+    ) -> Started:
         """Start Python on a machine; ``what`` names its log, ``environment`` holds ``KEY=value``."""
 
-        def command(argv: Sequence[str]) -> list[str]:
-            return self.namespaces.command(node, ["env", *environment, *argv] if environment else list(argv))
-
-        started = Started(self.run, f"{what} at {node}", command, arguments)
+        command = partial(self.command, node, environment=environment)
+        started = Started(self.run, f"{what} at {node}", command, arguments, has_orders=has_orders)
         if (priority := self._priorities.get(what)) is not None:
             os.sched_setscheduler(started.pid, os.SCHED_FIFO, os.sched_param(priority))
         return started

@@ -6,12 +6,10 @@ One process, without a network. An image of 921,600 bytes is sealed as parts for
 place and by a second thread. A small message is verified in place and by a second thread. Work of a thread must be
 handed over and awaited, and a thread helps only while the interpreter's lock is released. The time that two threads
 take for twice the work shows how far: 1 for parallel, 2 for one after the other.
-
 """
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import secrets
 import statistics
@@ -20,13 +18,13 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from pathlib import Path
 
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
-from machine import machine_state
-from report import Rounds, progress, show, write_json
+from report import Rounds, progress
+from skeleton import Options, Outcome, command_line, run_bench
 
 from gdp.crypto.keys import SigningKey
+from gdp.host.run_registry import RunRegistry
 
 IMAGE_BYTES = 921_600
 CAPACITY_BYTES = 1_388  # plaintext in a part at MTU 1500
@@ -93,14 +91,10 @@ def median_ms(work: Callable[[], object], count: int) -> float:
     return statistics.median(times) * 1e3
 
 
-def main() -> None:
-    """Run the bench."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--count", type=int, default=60, help="images in a round; small messages: ten times that")
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
-    state, over = machine_state(), Rounds()
+def measure(options: Options, runs: RunRegistry) -> Outcome:
+    """Measure both ways in turn, round by round."""
+    del runs
+    over = Rounds()
     aead, image = AESGCM(secrets.token_bytes(32)), memoryview(secrets.token_bytes(IMAGE_BYTES))
     key, digest = SigningKey.generate(), secrets.token_bytes(32)
     verify = partial(key.public.verify_digest, key.sign_digest(digest), digest)
@@ -123,10 +117,11 @@ def main() -> None:
         over.ratio("thread / in place, verify", "thread", "in place", "a message verified", "ms", None),
     ]
     settings = {"rounds": options.rounds, "count": options.count}
-    show("hashing and verifying meanwhile", state, settings, over, targets)
-    if options.json is not None:
-        write_json(options.json, "overlap", state, settings, over, targets)
+    title = "Hashing and verifying in this thread and in another"
+    return Outcome("thread_offload", title, over, targets, settings, is_whole=False)
 
 
 if __name__ == "__main__":
-    main()
+    parser = command_line(__doc__, rounds=5, has_record=True)
+    parser.add_argument("--count", type=int, default=60, help="images in a round; small messages: ten times that")
+    run_bench(parser, measure)

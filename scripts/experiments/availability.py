@@ -14,31 +14,28 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Final
 
 import numpy as np
-import typer
-from rich.console import Console
-from rich.table import Column, Table
+from experiment import OUTPUT, page_command_line, write
+from report import print_table
+from skeleton import clean_exit
 
 from fog.catalog.measured import measured
 from fog.plan.duration import duration_text, seconds_from_text
 from fog.plan.trace import Share, Trace, none_up, outages, pool_down, replica_down, share_with_interval
-from gdp.cli.node import failing_clearly
 from gdp.errors import LocalError
 
 ROOT: Final = Path(__file__).parents[2]
-PAGES: Final = ROOT / "docs/experiments"
 SPOT: Final = ROOT.parent / "shared/data/spot"
 RECOVERIES: Final = ("34s", "5min", "20min")
 BLOCK_S, RESAMPLES, MOST_REPLICAS = 6 * 3600.0, 2000, 3
+_HEAD: Final = ("way", "zones", "replicas", "recovery", "none up", "95 % interval", "if independent")
 WAYS: Final = {
     "stays": "each replica has a zone of its own and waits for it",
     "moves": "a replica that is taken is replaced in any of the zones that has capacity",
     "elsewhere": "there is always capacity somewhere: down for the recovery only",
 }
-
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,28 +56,24 @@ class Case:
     independent: float | None
 
 
-@app.command(epilog="Example: python scripts/experiments/availability.py --recovery 5min --recovery 20min")
-def availability(
-    recovery: Annotated[list[str], typer.Option(help="from a preemption to a serving replacement")] = list(RECOVERIES),  # noqa: B006
-    seed: Annotated[int, typer.Option(help="of the resampling")] = 1,
-    as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
-    write: Annotated[bool, typer.Option("--write/--no-write", help="the page, the picture and the JSON")] = True,
-) -> None:
+def main(words: Sequence[str] | None = None) -> None:
     """Compute the share of time in which no replica would have been up."""
-    with failing_clearly():
-        traces = recorded()
-        chance = np.random.default_rng(seed)
-        cases = [case for span in recovery for case in replay(traces, seconds_from_text(span), chance)]
-        document = {"source": measured().source, "seed": seed, "cases": [asdict(case) for case in cases]}
-        if as_json:
-            print(json.dumps(document))
-        else:
-            Console(width=110).print(_table(cases))
-        if write:
-            PAGES.mkdir(parents=True, exist_ok=True)
-            (PAGES / "availability.json").write_text(json.dumps(document, indent=1) + "\n")
-            (PAGES / "availability.md").write_text(page(cases))
-            _draw(PAGES / "availability.png", cases)
+    parser = page_command_line(__doc__)
+    parser.add_argument("--recovery", action="append", help="from a preemption to a replacement; may be repeated")
+    parser.add_argument("--seed", type=int, default=1, help="of the resampling")
+    options = parser.parse_args(words)
+    with clean_exit():
+        traces, chance = recorded(), np.random.default_rng(options.seed)
+        spans = [seconds_from_text(text) for text in options.recovery or RECOVERIES]
+        cases = [case for recovery_s in spans for case in replay(traces, recovery_s, chance)]
+    document = {"source": measured().source, "seed": options.seed, "cases": [asdict(case) for case in cases]}
+    if options.json:
+        print(json.dumps(document))
+    else:
+        print_table(_HEAD, map(_cells, cases), words=2)
+    if options.write:
+        write(OUTPUT, "availability", document, page(cases))
+        _draw(OUTPUT / "availability.png", cases)
 
 
 def recorded() -> list[Trace]:
@@ -129,7 +122,7 @@ def page(cases: Sequence[Case]) -> str:
         "",
         *(f"- *{way}*: {what}." for way, what in WAYS.items()),
         "",
-        "| way | zones | replicas | recovery | none up | 95 % interval | if independent |",
+        "| " + " | ".join(_HEAD) + " |",
         "|---|---|--:|--:|--:|--:|--:|",
     ]
     lines += ["| " + " | ".join(_cells(case)) + " |" for case in cases]
@@ -167,19 +160,8 @@ def _cells(case: Case) -> tuple[str, ...]:
     )
 
 
-def _table(cases: Sequence[Case]) -> Table:
-    headers = ("replicas", "recovery", "none up", "95 %", "if independent")
-    table = Table("way", "zones", *(Column(header, justify="right") for header in headers))
-    for case in cases:
-        table.add_row(*_cells(case))
-    return table
-
-
 def _draw(path: Path, cases: Sequence[Case]) -> None:
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
+    from pictures import plt, save
 
     figure, axes = plt.subplots(1, len(WAYS), figsize=(11, 3.8), layout="constrained")
     for axis, way in zip(axes, WAYS, strict=True):
@@ -207,9 +189,8 @@ def _draw(path: Path, cases: Sequence[Case]) -> None:
         "dots: replayed, with 95 % interval, one for each choice of zones; dashes: if zones were independent",
         fontsize=8,
     )
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    save(figure, path)
 
 
 if __name__ == "__main__":
-    app()
+    main()

@@ -1,7 +1,6 @@
 """Import path of the benches: importing this module lets the experiments import what they share with them.
 
 I/O.
-
 """
 
 from __future__ import annotations

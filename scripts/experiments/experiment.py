@@ -1,51 +1,55 @@
-"""Common parts of the experiments: a field, a table, a page, and a file with every latency.
+"""Common parts of the experiments: command line, field, table, page, picture, and a file with every latency.
 
-I/O. Prints, and writes ``figN.json`` and ``figN.md`` into the folder of the command line.
+I/O. Prints, and writes ``NAME.json``, ``NAME.md`` and ``NAME.png`` into the folder of the command line. An experiment
+states its options and measures::
 
+    def measure(options: Options) -> Report: ...
+
+    if __name__ == "__main__":
+        run_experiment(command_line(__doc__), measure)
 """
 
 from __future__ import annotations
 
+import argparse
 import json
-import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Final
 
-import typer
 from bench_path import ROOT
 from field import ROBOT, Field, Served, Work
-from machine import MachineState
-from report import number_text, progress
-from rich.console import Console
-from rich.table import Table
+from machine import MachineState, machine_state
+from report import markdown_table, number_text, print_table, progress
 from samples import Sample, Summary
 from series import Series
-from skeleton import clean_exit, new_run
+from skeleton import Options, clean_exit, new_run
 
 __all__ = [
+    "CASES",
+    "OUTPUT",
     "Asking",
     "Finding",
-    "JsonOption",
-    "OutOption",
-    "QuickOption",
+    "Options",
     "Report",
-    "conclude",
+    "command_line",
     "field_of",
-    "place_of",
+    "latencies_of",
+    "page_command_line",
+    "run_experiment",
+    "work_of",
+    "write",
 ]
 
-_OUTPUT: Final = ROOT / "docs" / "experiments"
+OUTPUT: Final = ROOT / "docs" / "experiments"
+CASES: Final = ("one server", "two replicas")
 _BEGIN_S: Final = 90.0
 _SILENT_S: Final = 20.0  # silence of a client between two samples
-_CONSOLE_COLUMNS: Final = 150
 _COLUMNS: Final = ("requests", "failed", "mean, ms", "p50, ms", "p99, ms", "worst, ms")
-
-QuickOption = Annotated[bool, typer.Option("--quick", help="A few seconds: does it work? Writes nothing by itself.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print what would be written as JSON, and no table.")]
-OutOption = Annotated[Path | None, typer.Option("--out", help="Folder for JSON, page and pictures.")]
+Panels = dict[str, dict[str, list[float]]]  # by panel and case
+_FIGURES: Final = ("figure", "here", "target", "", "paper")
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,16 +90,17 @@ class Report:
         setting: the method, in sentences for the page.
         groups: samples by their label in the table.
         notes: differences from the paper, in sentences.
+        draw: writes the picture to a path, under a title.
     """
 
     name: str
     title: str
-    command: str
     setting: Sequence[str]
     groups: Mapping[str, Sequence[Sample]]
     findings: Sequence[Finding]
     notes: Sequence[str]
-    settings: Mapping[str, str | int | float] = field(default_factory=dict)
+    settings: Mapping[str, str | int | float]
+    draw: Callable[[Path, str], None]
 
     def rows(self) -> list[tuple[str, ...]]:
         """Return the table's rows, name first."""
@@ -116,23 +121,31 @@ class Report:
             "findings": [{**asdict(each), "outcome": each.outcome} for each in self.findings],
         }
 
-    def to_page(self, state: MachineState, pictures: Sequence[str]) -> str:
+    def to_page(self, state: MachineState) -> str:
         """Return the page in Markdown."""
-        parts = [f"# {self.title}", *self.setting, f"```bash\n{self.command}\n```"]
-        parts += [f"![{self.title}]({each})" for each in pictures]
-        parts += [_table(("", *_COLUMNS), self.rows())]
-        parts += [_table(("figure", "here", "target", "", "paper"), [each.cells() for each in self.findings])]
+        command = f"```bash\nsudo .venv/bin/python scripts/experiments/{self.name}.py\n```"
+        parts = [f"# {self.title}", *self.setting, command, f"![{self.title}]({self.name}.png)"]
+        parts += [markdown_table(("", *_COLUMNS), self.rows())]
+        parts += [markdown_table(_FIGURES, [each.cells() for each in self.findings])]
         parts += ["\n".join(f"- {note}" for note in self.notes)]
         reported = "; ".join(f"{key}: {value}" for key, value in self.settings.items())
         return "\n\n".join([*parts, f"Measured on {state}. {reported}."]) + "\n"
+
+    def show(self, state: MachineState) -> None:
+        """Print the tables and the notes."""
+        print(f"{self.title}\n{state}")
+        print_table(("", *_COLUMNS), self.rows(), title="latency at the robot's node")
+        print_table(_FIGURES, [each.cells() for each in self.findings], title="figures")
+        for note in self.notes:
+            print(f"- {note}")
 
 
 @contextmanager
 def field_of(
     served: Sequence[Served], work: Mapping[str, Work], delays: Mapping[str, float] | None = None
 ) -> Iterator[Field]:
-    """Yield a field; exit with a clear message if there can be none."""
-    with clean_exit(), new_run() as run, Field(run, served, work, delays=delays) as place:
+    """Yield a field in a run of its own."""
+    with new_run() as run, Field(run, served, work, delays=delays) as place:
         yield place
 
 
@@ -176,42 +189,74 @@ class Asking:
         return found
 
 
-def place_of(out: Path | None, *, quick: bool) -> Path | None:
-    """Return the output folder, or None."""
-    return out or (None if quick else _OUTPUT)
+def work_of(served: Iterable[Served], role: str, settings: Mapping[str, Mapping[str, object]]) -> dict[str, Work]:
+    """Return the work of each machine: the role, its services, and its settings."""
+    offers = list(served)
+    names = {each: " ".join(one.name for one in offers if each in one.machines) for each in settings}
+    return {each: Work(role, {**own, "services": names[each]}) for each, own in settings.items()}
 
 
-def conclude(report: Report, state: MachineState, out: Path | None, pictures: Sequence[str], *, as_json: bool) -> None:
-    """Print a report, and write its files into ``out`` if that is a folder; the pictures are there already."""
-    items = report.to_dict(state).items()
-    text = "{\n" + ",\n".join(f"{json.dumps(key)}: {json.dumps(value)}" for key, value in items) + "\n}"
-    if as_json:
-        print(text)
+def latencies_of(groups: Mapping[str, Sequence[Sample]], label: str, names: Iterable[str], scale: float) -> Panels:
+    """Return the latencies of both cases for each panel.
+
+    Args:
+        label: a group's name, with ``{name}`` and ``{case}`` in it.
+        scale: 1: seconds; 1,000: milliseconds.
+    """
+    return {
+        name: {case: [scale * each.latency_s for each in groups[label.format(name=name, case=case)]] for case in CASES}
+        for name in names
+    }
+
+
+def command_line(description: str | None) -> argparse.ArgumentParser:
+    """Return a parser with the options that experiments share."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="a few seconds: does it work? writes nothing by itself")
+    parser.add_argument("--json", action="store_true", help="print what would be written as JSON, and no table")
+    parser.add_argument("--out", type=Path, help="folder for JSON, page and picture (default: docs/experiments)")
+    return parser
+
+
+def page_command_line(description: str | None) -> argparse.ArgumentParser:
+    """Return a parser for an experiment that only computes."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument(
+        "--write", action=argparse.BooleanOptionalAction, default=True, help="the page, the picture and the JSON"
+    )
+    return parser
+
+
+def run_experiment(parser: argparse.ArgumentParser, measure: Callable[[Options], Report]) -> None:
+    """Run an experiment to its tables, page, picture and JSON; a wrong option that ``measure`` finds exits with 2."""
+    options, state = parser.parse_args(), machine_state()
+    try:
+        with clean_exit():
+            report = measure(options)
+    except argparse.ArgumentTypeError as error:
+        parser.error(str(error))
+    document = report.to_dict(state)
+    if options.json:
+        print(_text(document))
     else:
-        _show(report, state)
-    if out is not None:
-        (out / f"{report.name}.json").write_text(text + "\n", encoding="utf-8")
-        (out / f"{report.name}.md").write_text(report.to_page(state, pictures), encoding="utf-8")
-        progress(f"written: {out / report.name}.json, .md and .png")
+        report.show(state)
+    if folder := options.out or (None if options.quick else OUTPUT):
+        write(folder, report.name, document, report.to_page(state))
+        report.draw(folder / f"{report.name}.png", report.title)
 
 
-def _show(report: Report, state: MachineState) -> None:
-    console = Console() if sys.stdout.isatty() else Console(width=_CONSOLE_COLUMNS)
-    console.print(f"[bold]{report.title}[/bold]\n{state}", highlight=False)
-    latencies = Table("", *_COLUMNS, title="latency at the robot's node", title_justify="left")
-    for row in report.rows():
-        latencies.add_row(*row)
-    findings = Table("figure", "here", "target", "", "paper", title="figures", title_justify="left")
-    for finding in report.findings:
-        findings.add_row(*finding.cells())
-    console.print(latencies, findings)
-    for note in report.notes:
-        console.print(f"- {note}", markup=False, highlight=False, soft_wrap=True)
+def write(folder: Path, name: str, document: Mapping[str, object], page: str) -> None:
+    """Write the JSON and the page of an experiment."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{name}.json").write_text(_text(document) + "\n", encoding="utf-8")
+    (folder / f"{name}.md").write_text(page, encoding="utf-8")
+    progress(f"written: {folder / name}.json and .md")
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+def _text(document: Mapping[str, object]) -> str:
+    """Return JSON with a line for each key."""
+    return "{\n" + ",\n".join(f"{json.dumps(key)}: {json.dumps(value)}" for key, value in document.items()) + "\n}"
 
 
 def _short(sample: Sample) -> list[object]:

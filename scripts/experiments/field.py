@@ -24,7 +24,8 @@ from typing import Final
 
 from bench_path import ROOT
 from peers.process import Started
-from testbed import Lab, OverlayNodes, make_topology
+from testbed import Lab, OverlayNodes
+from topologies import flat_topology
 
 from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
@@ -213,4 +214,4 @@ class Field:
             relay = self._relays.get(machine)
             links += [(_GATE, machine)] if relay is None else [(_GATE, relay), (relay, machine)]
         nodes = (ROBOT, _NEAR, _GATE, *self._relays.values(), *self._machines)
-        return make_topology(links, mtu=mtu, rib=_GATE, members=(ROBOT, *self._machines), switches=nodes)
+        return flat_topology(links, mtu=mtu, rib=_GATE, members=(ROBOT, *self._machines), switches=nodes)

@@ -13,35 +13,31 @@ be compared with arithmetic. With these servers the number of trials is the pape
 
 from __future__ import annotations
 
+import argparse
 import random
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
-from typing import Annotated, Final
+from typing import Final
 
-import typer
 from bench_path import ROOT
 from experiment import (
+    CASES,
     Asking,
     Finding,
-    JsonOption,
-    OutOption,
-    QuickOption,
+    Options,
     Report,
-    conclude,
+    command_line,
     field_of,
-    place_of,
+    latencies_of,
+    run_experiment,
+    work_of,
 )
 from field import Field, Served, Work
-from machine import machine_state
 from pictures import save_distributions
 from recorded import LIMIT_S, RECORDED, draw, load
 from samples import Sample, Summary, least_of_two, p99
 from series import Series
-
-__all__: list[str] = []
-
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 TYPE: Final = "nav_msgs/srv/GetPlan"
 MESHES: Final = ROOT.parent / "shared" / "data" / "planning"
@@ -74,51 +70,39 @@ _SETTING: Final = (
 )
 
 
-@app.command(epilog="Example: sudo .venv/bin/python scripts/experiments/fig5.py --problem Cubicles --trials 20")
-def main(
-    problem: Annotated[list[str] | None, typer.Option(help="To compute; may be repeated. Default: all three.")] = None,
-    trials: Annotated[int, typer.Option(help="Of each problem and case; 0: a number that a person waits for.")] = 0,
-    timeout: Annotated[float, typer.Option(help="Seconds after which a planner gives up.")] = TIMEOUT_S,
-    planner: Annotated[str, typer.Option(help="Its class in ompl.geometric.")] = "RRTConnect",
-    waits: Annotated[int, typer.Option(help="Trials of each wait and case; 0: none.")] = _WAITS,
-    meshes: Annotated[Path, typer.Option(help="Folder of the problems.")] = MESHES,
-    planning: Annotated[bool, typer.Option(help="Plan; without it there are only the waits.")] = True,
-    stop: Annotated[bool, typer.Option(help="Tell the replica that was slower to stop.")] = True,
-    quick: QuickOption = False,
-    as_json: JsonOption = False,
-    out: OutOption = None,
-) -> None:
+def measure(options: Options) -> Report:
     """Plan motions with one server and with two replicas."""
-    state, place = machine_state(), place_of(out, quick=quick)
-    counts = {each: trials or TRIALS.get(each, 20) for each in problem or TRIALS}
-    if quick:
+    counts = {each: options.trials or TRIALS.get(each, 20) for each in options.problem or TRIALS}
+    waits, timeout, planner = options.waits, options.timeout, options.planner
+    if options.quick:
         counts, waits = {QUICK[0]: QUICK[1]}, min(waits, QUICK[2])
-    counts = counts if planning else {}
+    counts = counts if options.planning else {}
     if counts:
-        _check(counts, planner, meshes)
+        _check(counts, planner, options.meshes)
     groups: dict[str, list[Sample]] = {}
     findings: list[Finding] = []
-    reported = {"folder": str(meshes), "problems": " ".join(counts), "planner": planner, "patience_s": timeout}
-    options = _STOP if stop else {}
+    reported = {
+        "folder": str(options.meshes), "problems": " ".join(counts), "planner": planner, "patience_s": timeout
+    }  # fmt: skip
     if counts:
-        with field_of(*_fleet("plan", dict.fromkeys(_MACHINES, reported), options, timeout + _SLACK_S)) as here:
+        stop = _STOP if options.stop else {}
+        with field_of(*_fleet("plan", dict.fromkeys(_MACHINES, reported), stop, timeout + _SLACK_S)) as here:
             for name, count in counts.items():
                 found = _ask(here, name, count, patience_s=timeout + _SLACK_S)
-                what = f"{name}, computed"
-                groups[f"{what}, one server"], groups[f"{what}, two replicas"] = found[_ONE], found[_TWO]
+                groups |= _named(f"{name}, computed", found)
                 findings += _planning_findings(name, found)
-    lists = _lists(waits, [QUICK[0]] if quick else RECORDED) if waits else {}
+    lists = _lists(waits, [QUICK[0]] if options.quick else RECORDED) if waits else {}
     if lists:
         own = {each: {"waits_s": {name: both[at] for name, both in lists.items()}} for at, each in enumerate(_MACHINES)}
         with field_of(*_fleet("replay", own, {}, _SLACK_S)) as here:
             for name, both in lists.items():
                 found = _ask(here, name, waits, patience_s=_SLACK_S)
-                groups[f"{name}, one server"], groups[f"{name}, two replicas"] = found[_ONE], found[_TWO]
+                groups |= _named(name, found)
                 findings += _waiting_findings(name, found, both)
-    report = Report(
+    panels = latencies_of(groups, "{name}, {case}", [*(f"{each}, computed" for each in counts), *lists], 1.0)
+    return Report(
         "fig5",
         "Figure 5: motion planning, one server against two",
-        "sudo .venv/bin/python scripts/experiments/fig5.py",
         _SETTING,
         groups,
         findings,
@@ -128,33 +112,32 @@ def main(
             "timeout, s": timeout,
             "planner": planner,
             "trials of each wait": waits,
-            "the slower one is stopped": "yes" if stop else "no",
+            "the slower one is stopped": "yes" if options.stop else "no",
         },
+        lambda path, title: save_distributions(path, title, panels, "latency, s"),
     )
-    if place is not None:
-        names = [*(f"{each}, computed" for each in counts), *lists]
-        panels = {
-            name: {
-                case: [each.latency_s for each in groups[f"{name}, {case}"]] for case in ("one server", "two replicas")
-            }
-            for name in names
-        }
-        save_distributions(place / "fig5.png", report.title, panels, "latency, s")
-    conclude(report, state, place, ["fig5.png"], as_json=as_json)
+
+
+def _named(what: str, found: Mapping[str, list[Sample]]) -> dict[str, list[Sample]]:
+    return {f"{what}, {case}": found[name] for case, name in zip(CASES, (_ONE, _TWO), strict=True)}
 
 
 def _check(problems: Collection[str], planner: str, meshes: Path) -> None:
-    """Exit with a clear message where the planner or a problem is not available."""
+    """Refuse a planner or a problem that is not available.
+
+    Raises:
+        argparse.ArgumentTypeError: one is not.
+    """
     try:
         from planning import PROBLEMS, planners
     except ImportError as error:
         missing = f"{error.name} is not installed: pip install 'gdp-ros[experiments]', or go without: --no-planning"
-        raise typer.BadParameter(missing) from error
+        raise argparse.ArgumentTypeError(missing) from error
     if planner not in planners():
-        raise typer.BadParameter(f"--planner {planner}: expected one of {', '.join(planners())}")
+        raise argparse.ArgumentTypeError(f"--planner {planner}: expected one of {', '.join(planners())}")
     for each in problems:
         if each not in PROBLEMS or not (meshes / f"{PROBLEMS[each]}.cfg").is_file():
-            raise typer.BadParameter(
+            raise argparse.ArgumentTypeError(
                 f"--problem {each}: expected one of {', '.join(PROBLEMS)}, with its files in {meshes}"
             )
 
@@ -165,8 +148,7 @@ def _fleet(
     """Return the services and the machines' work."""
     imports = {"timeout_s": timeout_s}
     served = [Served(_TWO, TYPE, _MACHINES, options, imports), Served(_ONE, TYPE, _MACHINES[:1], {}, imports)]
-    names = {each: " ".join(s.name for s in served if each in s.machines) for each in _MACHINES}
-    return served, {each: Work(role, {**own[each], "services": names[each]}) for each in _MACHINES}
+    return served, work_of(served, role, own)
 
 
 def _ask(here: Field, problem: str, count: int, *, patience_s: float) -> dict[str, list[Sample]]:
@@ -246,4 +228,13 @@ def _notes(counts: Mapping[str, int], timeout_s: float, planner: str) -> list[st
 
 
 if __name__ == "__main__":
-    app()
+    parser = command_line(__doc__)
+    parser.add_argument("--problem", action="append", help="to compute; may be repeated (default: all three)")
+    parser.add_argument("--trials", type=int, default=0, help="of each problem; 0: a number that a person waits for")
+    parser.add_argument("--timeout", type=float, default=TIMEOUT_S, help="seconds of a planner (default: %(default)s)")
+    parser.add_argument("--planner", default="RRTConnect", help="class in ompl.geometric (default: %(default)s)")
+    parser.add_argument("--waits", type=int, default=_WAITS, help="trials of each wait; 0: none (default: %(default)s)")
+    parser.add_argument("--meshes", type=Path, default=MESHES, help="folder of the problems")
+    parser.add_argument("--planning", action=argparse.BooleanOptionalAction, default=True, help="plan, or only wait")
+    parser.add_argument("--stop", action=argparse.BooleanOptionalAction, default=True, help="stop the slower replica")
+    run_experiment(parser, measure)

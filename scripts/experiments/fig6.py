@@ -10,30 +10,25 @@ import math
 import random
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
-from typing import Annotated, Final
+from typing import Final
 
-import typer
 from experiment import (
+    CASES,
     Asking,
     Finding,
-    JsonOption,
-    OutOption,
-    QuickOption,
+    Options,
     Report,
-    conclude,
+    command_line,
     field_of,
-    place_of,
+    latencies_of,
+    run_experiment,
+    work_of,
 )
-from field import Served, Work
+from field import Served
 from image_request import TYPE
-from machine import machine_state
 from pictures import save_distributions
 from samples import Sample, Summary
 from series import Contention, Series
-
-__all__: list[str] = []
-
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 REQUESTS: Final = 300
 COMPUTED: Final = 100
@@ -44,7 +39,6 @@ _GAP_S: Final = 0.27  # longer than a wait, so that the slower replica is done; 
 _PATIENCE_S: Final = 10.0
 _MACHINES: Final = ("m1", "m2")
 _ONE, _TWO = "/segment/m1", "/segment"
-_CASES: Final = ("one server", "two replicas")
 _MEAN_S: Final = 0.12
 _SIGMA: Final = 0.25
 _SEED: Final = 6
@@ -90,55 +84,39 @@ _NOTES: Final = (
 )
 
 
-@app.command(epilog="Example: sudo .venv/bin/python scripts/experiments/fig6.py --requests 20 --out /tmp/fig6")
-def main(
-    requests: Annotated[int, typer.Option(min=2, help="Of each case in which the servers wait.")] = REQUESTS,
-    computed: Annotated[int, typer.Option(min=0, help="Of each case in which they compute; 0: none.")] = COMPUTED,
-    quick: QuickOption = False,
-    as_json: JsonOption = False,
-    out: OutOption = None,
-) -> None:
+def measure(options: Options) -> Report:
     """Segment frames while a second client contends for one replica."""
-    state, place = machine_state(), place_of(out, quick=quick)
-    counts = {what: requests if each.role == "light" else computed for what, each in _SETTINGS.items()}
-    counts = {_QUICK: QUICK} if quick else {what: count for what, count in counts.items() if count}
+    counts = {what: options.requests if each.role == "light" else options.computed for what, each in _SETTINGS.items()}
+    counts = {_QUICK: QUICK} if options.quick else {what: count for what, count in counts.items() if count}
     served = [Served(_TWO, TYPE, _MACHINES), Served(_ONE, TYPE, _MACHINES[:1])]
-    names = {each: " ".join(s.name for s in served if each in s.machines) for each in _MACHINES}
     groups: dict[str, list[Sample]] = {}
     findings = []
     for what, count in counts.items():
         setting = _SETTINGS[what]
         series = Series("segment", (_ONE, _TWO), 2 * count, _MACHINES, _PATIENCE_S, gap_s=_GAP_S)
-        times = _times()
-        work = {each: Work(setting.role, {"services": names[each], "takes_s": times[each]}) for each in _MACHINES}
+        work = work_of(served, setting.role, {each: {"takes_s": times} for each, times in _times().items()})
         with field_of(served, work) as here:
             contention = asdict(Contention("segment", _ONE, ON_S, OFF_S))
             conflict = here.client(_MACHINES[0], "busy", **contention) if setting.is_contended else nullcontext()
             with conflict, Asking(here, series) as asking:
                 found, plane = asking.by_service(what), here.data_plane
-        groups[f"{what}, one server"], groups[f"{what}, two replicas"] = found[_ONE], found[_TWO]
+        groups |= {f"{what}, {case}": found[name] for case, name in zip(CASES, (_ONE, _TWO), strict=True)}
         one, two = Summary.of(found[_ONE]), Summary.of(found[_TWO])
         findings += [
             Finding(f"mean gain, {what}", one.mean_s / two.mean_s, paper=setting.paper[0]),
             Finding(f"p99 gain, {what}", one.p99_s / two.p99_s, paper=setting.paper[1]),
         ]
-    report = Report(
+    panels = latencies_of(groups, "{name}, {case}", counts, 1e3)
+    return Report(
         "fig6",
         "Figure 6: segmentation, one replica contended",
-        "sudo .venv/bin/python scripts/experiments/fig6.py",
         _SETTING,
         groups,
         findings,
         _NOTES,
         {"requests of each case": ", ".join(map(str, counts.values())), "switches": plane},
+        lambda path, title: save_distributions(path, title, panels, "latency, ms"),
     )
-    if place is not None:
-        panels = {
-            what: {case: [1e3 * each.latency_s for each in groups[f"{what}, {case}"]] for case in _CASES}
-            for what in counts
-        }
-        save_distributions(place / "fig6.png", report.title, panels, "latency, ms")
-    conclude(report, state, place, ["fig6.png"], as_json=as_json)
 
 
 def _times() -> dict[str, list[float]]:
@@ -149,4 +127,7 @@ def _times() -> dict[str, list[float]]:
 
 
 if __name__ == "__main__":
-    app()
+    parser = command_line(__doc__)
+    parser.add_argument("--requests", type=int, default=REQUESTS, help="while servers wait (default: %(default)s)")
+    parser.add_argument("--computed", type=int, default=COMPUTED, help="while they compute (default: %(default)s)")
+    run_experiment(parser, measure)

@@ -7,30 +7,25 @@ sudo .venv/bin/python scripts/experiments/fig7.py --requests 400 --out /tmp/fig7
 
 from __future__ import annotations
 
-from typing import Annotated, Final
+from typing import Final
 
-import typer
 from experiment import (
+    CASES,
     Asking,
     Finding,
-    JsonOption,
-    OutOption,
-    QuickOption,
+    Options,
     Report,
-    conclude,
+    command_line,
     field_of,
-    place_of,
+    latencies_of,
+    run_experiment,
+    work_of,
 )
-from field import Served, Work
+from field import Served
 from image_request import TYPE
-from machine import machine_state
 from pictures import save_distributions
 from samples import Sample, Summary
 from series import Series
-
-__all__: list[str] = []
-
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 DELAY_S: Final = 0.1
 REQUESTS: Final = 300
@@ -63,25 +58,14 @@ _NOTES: Final = (
 )
 
 
-@app.command(epilog="Example: sudo .venv/bin/python scripts/experiments/fig7.py --requests 20 --out /tmp/fig7")
-def main(
-    requests: Annotated[int, typer.Option(min=2, help="Of each case.")] = REQUESTS,
-    compute: Annotated[bool, typer.Option(help="Really detect; without it the servers wait.")] = False,
-    quick: QuickOption = False,
-    as_json: JsonOption = False,
-    out: OutOption = None,
-) -> None:
+def measure(options: Options) -> Report:
     """Detect objects while one replica's link is slow: one server against two replicas."""
-    role, task = ("detect", "detect") if compute else ("light", "segment")
-    state, place = machine_state(), place_of(out, quick=quick)
-    count = QUICK if quick else requests
+    role, task = ("detect", "detect") if options.compute else ("light", "segment")
+    count = QUICK if options.quick else options.requests
     machines = (_NEAR, *_LINKS)
     served = [Served(f"/detect/{each}", TYPE, (each,)) for each in machines]
     served += [Served(f"/detect/both/{each}", TYPE, (_NEAR, each)) for each in _LINKS]
-    work = {
-        each: Work(role, {"services": " ".join(s.name for s in served if each in s.machines), "takes_s": [_TAKES_S]})
-        for each in machines
-    }
+    work = work_of(served, role, {each: {"takes_s": [_TAKES_S]} for each in machines})
     turns = tuple(
         name
         for each in _LINKS
@@ -92,26 +76,17 @@ def main(
     with field_of(served, work, delays) as here, Asking(here, series) as asking:
         found, plane = asking.by_service("requests"), here.data_plane
     groups, findings = _compared(found)
-    report = Report(
+    panels = latencies_of(groups, "{case}, {name}", [link for link, _ in _LINKS.values()], 1e3)
+    return Report(
         "fig7",
         "Figure 7: object detection, one replica's link slow",
-        "sudo .venv/bin/python scripts/experiments/fig7.py",
         _SETTING,
         groups,
         findings,
         _NOTES,
-        {"requests of each case": count, "servers": "compute" if compute else "wait", "switches": plane},
+        {"requests of each case": count, "servers": "compute" if options.compute else "wait", "switches": plane},
+        lambda path, title: save_distributions(path, title, panels, "latency, ms"),
     )
-    if place is not None:
-        panels = {
-            link: {
-                case: [1e3 * each.latency_s for each in groups[f"{case}, {link}"]]
-                for case in ("one server", "two replicas")
-            }
-            for link, _ in _LINKS.values()
-        }
-        save_distributions(place / "fig7.png", report.title, panels, "latency, ms")
-    conclude(report, state, place, ["fig7.png"], as_json=as_json)
 
 
 def _compared(found: dict[str, list[Sample]]) -> tuple[dict[str, list[Sample]], list[Finding]]:
@@ -122,7 +97,7 @@ def _compared(found: dict[str, list[Sample]]) -> tuple[dict[str, list[Sample]], 
     for at, (machine, (link, _)) in enumerate(_LINKS.items()):
         one = near[at :: len(_LINKS)] + found[f"/detect/{machine}"]
         two = found[f"/detect/both/{machine}"]
-        groups[f"one server, {link}"], groups[f"two replicas, {link}"] = one, two
+        groups |= {f"{case}, {link}": samples for case, samples in zip(CASES, (one, two), strict=True)}
         single, pair = Summary.of(one), Summary.of(two)
         findings += [
             Finding(f"mean gain, {link}", single.mean_s / pair.mean_s, 2.1, paper="2.1"),
@@ -132,4 +107,7 @@ def _compared(found: dict[str, list[Sample]]) -> tuple[dict[str, list[Sample]], 
 
 
 if __name__ == "__main__":
-    app()
+    parser = command_line(__doc__)
+    parser.add_argument("--requests", type=int, default=REQUESTS, help="of each case (default: %(default)s)")
+    parser.add_argument("--compute", action="store_true", help="really detect; without it the servers wait")
+    run_experiment(parser, measure)

@@ -9,21 +9,15 @@ from __future__ import annotations
 
 import time
 from enum import Enum, auto
-from typing import Annotated, Final
+from typing import Final
 
-import typer
-from experiment import Asking, Finding, JsonOption, OutOption, QuickOption, Report, conclude, field_of, place_of
-from field import Field, Served, Work
+from experiment import Asking, Finding, Options, Report, command_line, field_of, run_experiment, work_of
+from field import Field, Served
 from image_request import TYPE
-from machine import machine_state
 from pictures import Span, save_timeline
 from report import progress
 from samples import Sample, Summary
 from series import Series
-
-__all__: list[str] = []
-
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 MINUTES: Final = 2.0
 QUICK_MINUTES: Final = 0.13
@@ -95,26 +89,18 @@ class _FaultInjector:
         self._phase, self._since_s = phase, now_s
 
 
-@app.command(epilog="Example: sudo .venv/bin/python scripts/experiments/fig9.py --minutes 10 --machines 3")
-def main(
-    minutes: Annotated[float, typer.Option(help="How long.")] = MINUTES,
-    machines: Annotated[int, typer.Option(min=2, max=8, help="Replicas.")] = 2,
-    quick: QuickOption = False,
-    as_json: JsonOption = False,
-    out: OutOption = None,
-) -> None:
+def measure(options: Options) -> Report:
     """Find a tag while replicas are killed and come back."""
-    state, place = machine_state(), place_of(out, quick=quick)
-    count = round((QUICK_MINUTES if quick else minutes) * 60 * _HZ)
-    labels = tuple(f"m{number + 1}" for number in range(machines))
-    work = {each: Work("tag", {"services": _SERVICE}) for each in labels}
+    count = round((QUICK_MINUTES if options.quick else options.minutes) * 60 * _HZ)
+    labels = tuple(f"m{number + 1}" for number in range(options.machines))
     imports = {"timeout_s": _PATIENCE_S}
     series = Series(
         "tag", (_SERVICE,), count, labels, _PATIENCE_S, lanes=_LANES, gap_s=1 / _HZ, warm_up=10, counts_answers=True
     )
     served = [Served(_SERVICE, TYPE, labels, imports=imports)]
+    work = work_of(served, "tag", {each: {} for each in labels})
     with field_of(served, work) as here, Asking(here, series) as asking:
-        fault_injector = _FaultInjector(here, _QUICK_STEADY_S if quick else _STEADY_S)
+        fault_injector = _FaultInjector(here, _QUICK_STEADY_S if options.quick else _STEADY_S)
         samples = []
         for sample in asking:
             samples.append(sample)
@@ -122,19 +108,16 @@ def main(
         plane = here.data_plane
     from_s, end_s = samples[0].begun_s, max(each.begun_s for each in samples)
     spans = [Span(label, a - from_s, (b if b > a else end_s) - from_s) for label, a, b in fault_injector.spans]
-    report = Report(
+    return Report(
         "fig9",
         "Figure 9: a tag's pose while replicas are killed and come back",
-        "sudo .venv/bin/python scripts/experiments/fig9.py",
         _SETTING,
         _groups(samples, spans, from_s),
         _findings(samples, asking, fault_injector),
         _NOTES,
-        {"replicas": machines, "requests a second": _HZ, "kills": fault_injector.kills, "switches": plane},
+        {"replicas": options.machines, "requests a second": _HZ, "kills": fault_injector.kills, "switches": plane},
+        lambda path, title: save_timeline(path, title, samples, spans, from_s),
     )
-    if place is not None:
-        save_timeline(place / "fig9.png", report.title, samples, spans, from_s)
-    conclude(report, state, place, ["fig9.png"], as_json=as_json)
 
 
 def _groups(samples: list[Sample], spans: list[Span], from_s: float) -> dict[str, list[Sample]]:
@@ -164,4 +147,7 @@ def _findings(samples: list[Sample], asking: Asking, fault_injector: _FaultInjec
 
 
 if __name__ == "__main__":
-    app()
+    parser = command_line(__doc__)
+    parser.add_argument("--minutes", type=float, default=MINUTES, help="how long (default: %(default)s)")
+    parser.add_argument("--machines", type=int, choices=range(2, 9), default=2, help="replicas (default: %(default)s)")
+    run_experiment(parser, measure)

@@ -47,8 +47,8 @@ class Features:
             color: uint8 [height, width, 3], RGB.
             depth: uint16 [height, width], ``DEPTH_SCALE`` units a metre; 0: unknown.
         """
-        points, descriptors = cv2.ORB_create(_FEATURES).detectAndCompute(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), None)
-        return cls(np.array([point.pt for point in points]), descriptors, depth)
+        points, descriptors = cv2.ORB.create(_FEATURES).detectAndCompute(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), None)
+        return cls(np.array([point.pt for point in points]), np.asarray(descriptors, dtype=np.uint8), depth)
 
     def positions(self, which: NDArray[np.intp]) -> NDArray[np.float64]:
         """Return x, y, z in metres of some features, in the camera's frame; z is 0 where the depth is unknown."""
@@ -78,7 +78,8 @@ def motion(before: Features, after: Features) -> Transform | None:
     )
     if not found:
         return None
-    return _transform(cv2.Rodrigues(rotation)[0], translation.ravel())
+    turn, shift = cv2.Rodrigues(rotation)[0], translation.ravel()
+    return _transform(turn.astype(np.float64), shift.astype(np.float64))
 
 
 def transform_of(pose: tuple[float, ...]) -> Transform:

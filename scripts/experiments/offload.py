@@ -17,11 +17,10 @@ import statistics
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
-from typing import Annotated, Final, Literal, TypeAlias
+from typing import Final
 
-import typer
 from bench_path import ROOT
-from experiment import JsonOption, OutOption, QuickOption, place_of
+from experiment import OUTPUT, command_line, write
 from machine import machine_state
 from offload_page import page_of, save_picture
 from peers.process import Started
@@ -30,10 +29,6 @@ from ros_row import DIRECT_DOMAIN, LEFT, READY_S, RIGHT, Carried, Row
 from skeleton import clean_exit, new_run
 
 from gdp.host.cgroups import Cgroup
-
-__all__: list[str] = []
-
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 OVERLAY: Final = "overlay"
 BASELINES: Final = {"ROS 2, Cyclone DDS": "cyclone", "ROS 2, Fast DDS": "fast", OVERLAY: "fast"}
@@ -54,8 +49,6 @@ _ANSWER_S: Final = 200.0
 _ROBOTS_READY_S: Final = 180.0
 _ALONE_S: Final = 1_100.0
 
-Part: TypeAlias = Literal["network", "alone", "both"]
-
 
 @dataclass(slots=True)
 class Measured:
@@ -69,45 +62,32 @@ class Measured:
     failed: int = 0
 
 
-@app.command(
-    epilog="Example: sudo .venv/bin/python scripts/experiments/offload.py --task vSLAM --rounds 1 --out /tmp/g"
-)
-def main(
-    task: Annotated[list[str] | None, typer.Option(help="One of Table I; may be repeated. Default: all three.")] = None,
-    part: Annotated[
-        Part, typer.Option(help="What to measure: over the network, on the robot alone, or both.")
-    ] = "both",
-    rounds: Annotated[int, typer.Option(min=1, help="Contenders take turns, round by round.")] = ROUNDS,
-    quick: QuickOption = False,
-    as_json: JsonOption = False,
-    out: OutOption = None,
-) -> None:
+def main() -> None:
     """Compute three tasks on the robot, and on a server behind three switches."""
-    names = [_QUICK] if quick else task or list(COMPUTED)
-    if unknown := set(names) - set(COMPUTED):
-        raise typer.BadParameter(f"--task {', '.join(unknown)}: expected one of {', '.join(COMPUTED)}")
-    place = place_of(out, quick=quick)
-    kept = place / "offload.json" if place else None
+    parser = command_line(__doc__)
+    parser.add_argument("--task", action="append", choices=list(COMPUTED), help="may be repeated (default: all three)")
+    parser.add_argument("--part", choices=("network", "alone", "both"), default="both", help="(default: %(default)s)")
+    parser.add_argument("--rounds", type=int, default=ROUNDS, help="(default: %(default)s)")
+    options = parser.parse_args()
+    quick: bool = options.quick
+    place = options.out or (None if quick else OUTPUT)
     tasks: dict[str, dict[str, object]] = {}
-    if kept is not None and kept.exists():
-        tasks = json.loads(kept.read_text(encoding="utf-8"))["tasks"]
+    if place is not None and (place / "offload.json").exists():
+        tasks = json.loads((place / "offload.json").read_text(encoding="utf-8"))["tasks"]
     with clean_exit():
-        for name in names:
-            state = machine_state()
+        for name in [_QUICK] if quick else options.task or COMPUTED:
+            machine = {"machine": asdict(machine_state())}
             reported = tasks.setdefault(name, {})
-            if part != "alone":
-                reported["network"] = _network(name, 1 if quick else rounds, quick=quick) | {"machine": asdict(state)}
-            if part != "network":
-                reported["alone"] = _alone(name, quick=quick) | {"machine": asdict(state)}
+            if options.part != "alone":
+                reported["network"] = _network(name, 1 if quick else options.rounds, quick=quick) | machine
+            if options.part != "network":
+                reported["alone"] = _alone(name, quick=quick) | machine
     document = {"experiment": "offload", "slower": SLOWER, "tasks": tasks}
     page = page_of(document)
-    print(json.dumps(document) if as_json else page)
-    if place is not None and kept is not None:
-        place.mkdir(parents=True, exist_ok=True)
-        kept.write_text(json.dumps(document, indent=None, separators=(",", ":")) + "\n", encoding="utf-8")
-        (place / "offload.md").write_text(page, encoding="utf-8")
+    print(json.dumps(document) if options.json else page)
+    if place is not None:
+        write(place, "offload", document, page)
         save_picture(place / "offload.png", document)
-        progress(f"written: {place / 'offload'}.json, .md and .png")
 
 
 def _network(name: str, rounds: int, *, quick: bool) -> dict[str, object]:
@@ -203,4 +183,4 @@ def _short(value: object) -> object:
 
 
 if __name__ == "__main__":
-    app()
+    main()

@@ -26,8 +26,6 @@ from peers.jsonl import say
 from rclpy.serialization import deserialize_message, serialize_message
 from ros_tasks import TYPES, Message, number_of, set_number
 
-__all__: list[str] = []
-
 _GREETING_S: Final = 0.2
 _LONG_S: Final = 3_600.0
 Settings: TypeAlias = "Mapping[str, object]"

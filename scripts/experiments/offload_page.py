@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from report import percentile
+from report import markdown_table, percentile
 
-__all__ = ["CYCLONE", "FAST", "OVERLAY", "PAPER", "added_s", "page_of", "save_picture"]
+__all__ = ["CYCLONE", "FAST", "OVERLAY", "PAPER", "added_s", "page_of", "save_picture", "seconds_text"]
 
 CYCLONE: Final = "ROS 2, Cyclone DDS"
 FAST: Final = "ROS 2, Fast DDS"
@@ -68,7 +68,7 @@ def page_of(document: Document) -> str:
         "## Table I",
         "Medians in seconds, with the p99 (of fewer than a hundred: the slowest) in brackets. *ROS 2* is unsecured, on"
         " Cyclone DDS, over three Linux bridges.",
-        _table(
+        markdown_table(
             ("scenario", "", "robot only", "ROS 2 network", "ROS 2 total", "overlay network", "overlay total"),
             [row for name in PAPER if name in tasks for row in _rows(name, tasks[name])],
         ),
@@ -84,10 +84,7 @@ def page_of(document: Document) -> str:
 
 def save_picture(path: Path, document: Document) -> None:
     """Draw network time by baseline and task, and next to it the time that the overlay adds."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
+    from pictures import plt, save, tidy
 
     networks = {name: each["network"] for name, each in document["tasks"].items() if "network" in each}
     if not networks:
@@ -109,11 +106,8 @@ def save_picture(path: Path, document: Document) -> None:
     right.set_xticks(range(len(names)), names, fontsize=8)
     right.set_title("overlay less ROS 2 on Cyclone DDS, ms; whiskers: rounds", loc="left", fontsize=10)
     for axis in (left, right):
-        axis.tick_params(labelsize=8)
-        axis.spines[["top", "right"]].set_visible(False)
-        axis.legend(fontsize=8, frameon=False)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+        tidy(axis)
+    save(figure, path)
 
 
 def _rows(name: str, task: Document) -> list[tuple[str, ...]]:
@@ -150,7 +144,7 @@ def _figure5(networks: Document) -> list[str]:
         " least and the most of any round. The nodes of the overlay's case use Fast DDS, so the second column compares"
         " equal nodes, and the first one is the paper's comparison."
     )
-    return [text, _table(head, rows)]
+    return [text, markdown_table(head, rows)]
 
 
 def _details(networks: Document) -> list[str]:
@@ -165,7 +159,7 @@ def _details(networks: Document) -> list[str]:
         f" {each['computed']} computed (computed, total)"
         for name, each in networks.items()
     )
-    return [_table(head, rows), f"Of each contender: {trials}."]
+    return [markdown_table(head, rows), f"Of each contender: {trials}."]
 
 
 def _notes(tasks: Document, slower: Mapping[str, float]) -> list[str]:
@@ -199,12 +193,9 @@ def _notes(tasks: Document, slower: Mapping[str, float]) -> list[str]:
 def _text(values: Sequence[float]) -> str:
     if not values:
         return "-"
-    return f"{_seconds(statistics.median(values))} ({_seconds(percentile(values, 0.99))})"
+    return f"{seconds_text(statistics.median(values))} ({seconds_text(percentile(values, 0.99))})"
 
 
-def _seconds(value: float) -> str:
+def seconds_text(value: float) -> str:
+    """Return seconds with three digits, or four decimals."""
     return f"{value:.1f}" if value >= 10 else f"{value:.2f}" if value >= 1 else f"{value:.4f}"
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    return "\n".join("| " + " | ".join(line) + " |" for line in [head, ["---"] * len(head), *rows])

@@ -14,13 +14,14 @@ from __future__ import annotations
 import array
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import cv2
 import numpy as np
 from bench_path import ROOT
 from fogros_tasks import CAMERA, IMAGE, NUMBERS, OCTETS, POSE
 from geometry_msgs.msg import PoseStamped
+from numpy.typing import NDArray
 from ros_tasks import Message
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
@@ -43,15 +44,17 @@ _PLANNING_LIMIT_S: Final = 1_000.0
 
 
 class OffloadTask(Protocol):
-    """Task of the experiment.
+    """Task of the experiment."""
 
-    Attributes:
-        parts: topic and type of each message that the robot sends.
-        answer: topic and type of the server's.
-    """
+    @property
+    def parts(self) -> Sequence[tuple[str, str]]:
+        """Return topic and type of each message that the robot sends."""
+        ...
 
-    parts: Sequence[tuple[str, str]]
-    answer: tuple[str, str]
+    @property
+    def answer(self) -> tuple[str, str]:
+        """Return topic and type of the server's message."""
+        ...
 
     def warm_up(self) -> None:
         """Load what the first computation would load."""
@@ -79,8 +82,8 @@ class Vslam:
     def __init__(self, data: Path = DATA) -> None:
         from odometry import Features, transform_of
 
-        colors = {at: cv2.imread(str(data / "rgbd" / f"color_{at}.png"))[:, :, ::-1] for at in _FRAMES}
-        depths = {at: cv2.imread(str(data / "rgbd" / f"depth_{at}.pgm"), cv2.IMREAD_UNCHANGED) for at in _FRAMES}
+        colors = {at: _read(data / "rgbd" / f"color_{at}.png")[:, :, ::-1] for at in _FRAMES}
+        depths = {at: _read(data / "rgbd" / f"depth_{at}.pgm", cv2.IMREAD_UNCHANGED) for at in _FRAMES}
         poses = [line.split() for line in (data / "rgbd" / "pose.txt").read_text(encoding="ascii").splitlines()]
         self._poses = {at: transform_of(tuple(map(float, poses[at - 1]))) for at in _FRAMES}
         self._images = {at: [_image("rgb8", colors[at]), _image("16UC1", depths[at])] for at in _FRAMES}
@@ -186,7 +189,7 @@ class GraspPlanning:
         self._messages = {}
         info = CameraInfo(height=386, width=516, k=MATRIX.ravel().tolist())
         for at, (top, bottom, left, right) in _OBJECTS.items():
-            image = cv2.imread(str(data / "rgbd" / f"depth_{at}.pgm"), cv2.IMREAD_UNCHANGED)
+            image = _read(data / "rgbd" / f"depth_{at}.pgm", cv2.IMREAD_UNCHANGED)
             depth = (image[_CROP] / DEPTH_SCALE).astype(np.float32)
             inside = np.zeros(depth.shape, dtype=bool)
             inside[top:bottom, left:right] = True
@@ -235,6 +238,18 @@ TASKS: Final[Mapping[str, Callable[[], OffloadTask]]] = {
 _KINDS: Final = {"rgb8": (np.uint8, 3), "16UC1": (np.uint16, 1), "32FC1": (np.float32, 1), "mono8": (np.uint8, 1)}
 
 
+def _read(path: Path, flags: int = cv2.IMREAD_COLOR) -> NDArray[Any]:
+    """Return the pixels of an image file.
+
+    Raises:
+        FileNotFoundError: it is missing, or no image.
+    """
+    image = cv2.imread(str(path), flags)
+    if image is None:
+        raise FileNotFoundError(path)
+    return image
+
+
 def _frame(number: int) -> int:
     """Return the frame of a request: 2 (request 0), 3, 4, 5, 4, 3, 2, ..."""
     last = len(_FRAMES) - 1
@@ -246,13 +261,13 @@ def _object(number: int) -> int:
     return list(_OBJECTS)[number % len(_OBJECTS)]
 
 
-def _image(encoding: str, pixels: np.ndarray) -> Image:
+def _image(encoding: str, pixels: NDArray[Any]) -> Image:
     height, width = pixels.shape[:2]
     raw = np.ascontiguousarray(pixels).tobytes()
     return Image(height=height, width=width, encoding=encoding, step=len(raw) // height, data=array.array("B", raw))
 
 
-def _pixels(message: Message) -> np.ndarray:
+def _pixels(message: Message) -> NDArray[Any]:
     kind, channels = _KINDS[message.encoding]
     shape = (message.height, message.width, channels) if channels > 1 else (message.height, message.width)
     return np.frombuffer(bytes(message.data), dtype=kind).reshape(shape)

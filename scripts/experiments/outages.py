@@ -14,12 +14,10 @@ import random
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Final
+from typing import Final
 
-import typer
-from experiment import Asking, Finding, JsonOption, OutOption, QuickOption, Report, conclude, field_of, place_of
-from field import Field, Served, Work
-from machine import machine_state
+from experiment import Asking, Finding, Options, Report, command_line, field_of, run_experiment, work_of
+from field import Field, Served
 from pictures import Span, save_timeline
 from samples import Sample
 from series import Series
@@ -27,8 +25,6 @@ from series import Series
 from fog.plan.failure import chance_down, joint
 
 __all__ = ["Outage", "draw_outages", "share_unanswered"]
-
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 SECONDS: Final = 180.0
 QUICK_S: Final = 6.0
@@ -102,20 +98,12 @@ class _Stopper:
                 self.spans.append(Span(label, self._down_from_s[label], since_s))
 
 
-@app.command(epilog="Example: sudo .venv/bin/python scripts/experiments/outages.py --seconds 60 --out /tmp/outages")
-def main(
-    seconds: Annotated[float, typer.Option(min=1.0, help="How long.")] = SECONDS,
-    quick: QuickOption = False,
-    as_json: JsonOption = False,
-    out: OutOption = None,
-) -> None:
+def measure(options: Options) -> Report:
     """Call a service on one machine and one on two, while machines stop and continue."""
-    state, place = machine_state(), place_of(out, quick=quick)
-    seconds = QUICK_S if quick else seconds
+    seconds = QUICK_S if options.quick else options.seconds
     drawn = {each: draw_outages(random.Random(f"{_SEED} {each}"), seconds) for each in _MACHINES}
     served = [Served(_TWO, _TYPE, _MACHINES), Served(_ONE, _TYPE, _MACHINES[:1])]
-    names = {each: " ".join(s.name for s in served if each in s.machines) for each in _MACHINES}
-    work = {each: Work("replay", {"services": names[each], "waits_s": {}}) for each in _MACHINES}
+    work = work_of(served, "replay", {each: {"waits_s": {}} for each in _MACHINES})
     count = round(2 * _HZ * seconds)
     series = Series("plan", (_ONE, _TWO), count, _MACHINES, _PATIENCE_S, lanes=_LANES, gap_s=1 / (2 * _HZ))
     samples: list[Sample] = []
@@ -130,20 +118,16 @@ def main(
         plane = here.data_plane
     groups = {what: [each for each in samples if each.service == name] for what, name in _CASES.items()}
     measured = {label: [Outage(s.from_s, s.to_s) for s in stopper.spans if s.machine == label] for label in _MACHINES}
-    report = Report(
+    return Report(
         "outages",
         "Availability, measured: machines that stop and go on",
-        "sudo .venv/bin/python scripts/experiments/outages.py",
         _SETTING,
         groups,
         _findings(groups, measured, seconds),
         _NOTES,
         {"seconds": seconds, "outages": sum(map(len, measured.values())), "switches": plane},
+        lambda path, title: save_timeline(path, title, groups["two machines"], stopper.spans, begun_s),
     )
-    if place is not None:
-        place.mkdir(parents=True, exist_ok=True)
-        save_timeline(place / "outages.png", report.title, groups["two machines"], stopper.spans, begun_s)
-    conclude(report, state, place, ["outages.png"], as_json=as_json)
 
 
 _CASES: Final = {"one machine": _ONE, "two machines": _TWO}
@@ -191,4 +175,6 @@ def _findings(
 
 
 if __name__ == "__main__":
-    app()
+    parser = command_line(__doc__)
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="how long (default: %(default)s)")
+    run_experiment(parser, measure)

@@ -10,38 +10,32 @@ experiment that fails is reported, the others still run, and the exit code is 1.
 
 from __future__ import annotations
 
+import argparse
 import json
 import subprocess
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Final
 
-import typer
-from bench_path import ROOT
+from experiment import OUTPUT
 from report import progress
 from results import machines_of, page_of, rows_of
 
-__all__: list[str] = []
-
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-
 EXPERIMENTS: Final = ("offload", "table1", "fig5", "fig6", "fig7", "fig9", "outages", "availability")
-_PAGES: Final = ROOT / "docs" / "experiments"
 _HERE: Final = Path(__file__).parent
 
 
-@app.command(epilog="Example: sudo .venv/bin/python scripts/experiments/papers.py --only fig6 --only fig7")
-def main(
-    only: Annotated[list[str] | None, typer.Option(help="One of the experiments; may be repeated.")] = None,
-    collect: Annotated[bool, typer.Option("--collect", help="Run nothing.")] = False,
-    folder: Annotated[Path, typer.Option(help="Where the JSON is, and where the table goes.")] = _PAGES,
-) -> None:
+def main() -> None:
     """Run the experiments of both papers, and write one table."""
-    if unknown := set(only or ()) - set(EXPERIMENTS):
-        raise typer.BadParameter(f"--only {', '.join(unknown)}: expected one of {', '.join(EXPERIMENTS)}")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", action="append", choices=EXPERIMENTS, help="this experiment; may be repeated")
+    parser.add_argument("--collect", action="store_true", help="run nothing")
+    parser.add_argument("--folder", type=Path, default=OUTPUT, help="where the JSON is, and where the table goes")
+    options = parser.parse_args()
+    folder: Path = options.folder
     failed = []
-    for name in () if collect else only or EXPERIMENTS:
+    for name in () if options.collect else options.only or EXPERIMENTS:
         progress(f"== {name}")
         if subprocess.run([sys.executable, str(_HERE / f"{name}.py")], check=False).returncode:
             failed.append(name)
@@ -55,4 +49,4 @@ def main(
 
 
 if __name__ == "__main__":
-    app()
+    main()

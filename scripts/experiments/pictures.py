@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 import matplotlib as mpl
 
@@ -19,7 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from samples import Sample, p99
 
-__all__ = ["Span", "save_distributions", "save_timeline"]
+__all__ = ["Span", "plt", "save", "save_distributions", "save_timeline", "tidy"]
 
 _COLOURS: Final = ("#99a8b2", "#1f6f8b", "#c96f3b", "#5b8c5a", "#7a5195")
 _DOTS_PER_INCH: Final = 110
@@ -50,8 +50,8 @@ def save_distributions(path: Path, title: str, panels: Mapping[str, Mapping[str,
         right.set_title(f"{name}: share that took at most so long; dashed: p99", fontsize=10, loc="left")
         for axis in (left, right):
             axis.set_xlabel(unit, fontsize=8)
-            _tidy(axis)
-    _save(figure, path, title)
+            tidy(axis)
+    save(figure, path, title)
 
 
 def save_timeline(path: Path, title: str, samples: Sequence[Sample], spans: Sequence[Span], from_s: float) -> None:
@@ -72,18 +72,21 @@ def save_timeline(path: Path, title: str, samples: Sequence[Sample], spans: Sequ
     axis.set_xlabel("seconds; shaded: the machine of that colour was killed and is not serving yet", fontsize=8)
     axis.set_ylabel("latency, ms", fontsize=8)
     axis.set_ylim(bottom=0)
-    _tidy(axis)
-    _save(figure, path, title)
+    tidy(axis)
+    save(figure, path, title)
 
 
-def _tidy(axis: Axes) -> None:
+def tidy(axis: Axes, *, ncols: int = 1, loc: Literal["best", "upper left"] = "best") -> None:
+    """Give an axis small labels, a legend without a frame, and no lines above and to the right."""
     axis.tick_params(labelsize=8)
     axis.spines[["top", "right"]].set_visible(False)
-    axis.legend(fontsize=8, frameon=False)
+    axis.legend(fontsize=8, frameon=False, ncols=ncols, loc=loc)
 
 
-def _save(figure: Figure, path: Path, title: str) -> None:
-    figure.suptitle(title, fontsize=12)
+def save(figure: Figure, path: Path, title: str = "") -> None:
+    """Write a figure to a PNG file, and close it."""
+    if title:
+        figure.suptitle(title, fontsize=12)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=_DOTS_PER_INCH)
     plt.close(figure)

@@ -63,8 +63,8 @@ class Problem:
             KeyError: no such problem, or a file without what it needs.
         """
         stem = PROBLEMS[name]
-        meshes = ((folder / f"{stem}_{what}.dae").read_bytes() for what in ("robot", "env"))
-        return cls.of(*meshes, *limits(folder, name))
+        robot, world = ((folder / f"{stem}_{what}.dae").read_bytes() for what in ("robot", "env"))
+        return cls.of(robot, world, *limits(folder, name))
 
     @classmethod
     def of(cls, robot: bytes, world: bytes, start: Place, goal: Place, low: Place, high: Place) -> Problem:

@@ -9,36 +9,34 @@ is recorded too.
 
 from __future__ import annotations
 
+import argparse
 import json
 import time
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Final
 
-import typer
 from bench_path import ROOT
-from planning import Problem, be_quiet
+from planning import PROBLEMS, Problem, be_quiet
 from recorded import RECORDING
-
-__all__: list[str] = []
 
 PLANNER: Final = "RRTConnect"
 LIMIT_S: Final = 1_000.0  # limit by the wall clock; the paper's 100 s are applied when the recording is used
 MESHES: Final = ROOT.parent / "shared" / "data" / "planning"
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
-
-@app.command(epilog="Example: nice .venv/bin/python scripts/experiments/record.py --problem Home --runs 60")
-def main(
-    problem: Annotated[str, typer.Option(help="Home, Cubicles or Twistycool.")],
-    runs: Annotated[int, typer.Option(min=1, help="How many to add.")] = 20,
-    meshes: Annotated[Path, typer.Option(help="Folder of the problems.")] = MESHES,
-    out: Annotated[Path, typer.Option(help="The file to add to.")] = RECORDING,
-) -> None:
+def main() -> None:
     """Record planning times."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--problem", required=True, choices=list(PROBLEMS))
+    parser.add_argument("--runs", type=int, default=20, help="how many to add (default: %(default)s)")
+    parser.add_argument("--meshes", type=Path, default=MESHES, help="folder of the problems")
+    parser.add_argument("--out", type=Path, default=RECORDING, help="the file to add to")
+    options = parser.parse_args()
+    problem: str = options.problem
+    out: Path = options.out
     be_quiet()
-    solved = Problem.load(meshes, problem)
-    for _ in range(runs):
+    solved = Problem.load(options.meshes, problem)
+    for _ in range(options.runs):
         begun_s = time.process_time()
         found = solved.solve(PLANNER, LIMIT_S, lambda: False)
         took_s = time.process_time() - begun_s
@@ -50,4 +48,4 @@ def main(
 
 
 if __name__ == "__main__":
-    app()
+    main()

@@ -7,7 +7,6 @@ unknown problem is answered at once, without a path. The stamp of its goal holds
 The answer's header names the machine, and its stamp is the computing time. Both stop when the service's ``/stop`` is
 called (``std_srvs/srv/Trigger``). ``detect``, ``segment``, ``light`` and ``tag`` serve what ``image_request.py``
 describes, one request at a time.
-
 """
 
 from __future__ import annotations
@@ -36,8 +35,6 @@ from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor, Si
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 from vision import Grey
-
-__all__: list[str] = []
 
 _THREADS: Final = 32
 _COARSE: Final = 4

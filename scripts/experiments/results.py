@@ -13,7 +13,8 @@ from statistics import fmean, median
 from typing import Any, Final
 
 import numpy as np
-from offload_page import CYCLONE, OVERLAY, PAPER, PAPER_ADDED_S, added_s
+from offload_page import CYCLONE, OVERLAY, PAPER, PAPER_ADDED_S, added_s, seconds_text
+from report import markdown_table
 from samples import p99
 
 __all__ = ["Row", "machines_of", "page_of", "rows_of"]
@@ -66,7 +67,7 @@ def rows_of(folder: Path) -> list[Row]:
         "fig9": _kills,
         "outages": _outages,
     }
-    rows = []
+    rows: list[Row] = []
     for name, make in makers.items():
         path = folder / f"{name}.json"
         if path.exists():
@@ -92,13 +93,12 @@ def page_of(rows: Sequence[Row], machines: Sequence[str]) -> str:
     """Return the page, in Markdown."""
     head = ("figure", "what", "paper", "here", "spread here", "trials here", "conditions here")
     cells = [(r.figure, r.what, r.paper, r.here, r.spread, r.trials, r.conditions) for r in rows]
-    table = "\n".join("| " + " | ".join(line) + " |" for line in [head, ("---",) * len(head), *cells])
     return "\n\n".join([
         "# The published figures next to ours",
         "G is FogROS G, FT is FogROS2-FT. One command measures everything and writes this page and"
         " [results.json](results.json); `--collect` only writes the page again.",
         "```bash\nsudo .venv/bin/python scripts/experiments/papers.py\n```",
-        table,
+        markdown_table(head, cells),
         "Gains are the time of one server divided by that of two replicas. Their spread is the 95 % interval of a"
         f" bootstrap ({_RESAMPLES:,} resamples). Each experiment's own page has all latencies and its conditions"
         " ([index](README.md)).",
@@ -227,12 +227,8 @@ def _outages(document: Any) -> Iterator[Row]:
 
 def _seconds(figure: str, what: str, paper_s: float, times: Sequence[float], conditions: str) -> Row:
     low, high = min(times), max(times)
-    spread = f"{_short(low)} to {_short(high)} s"
-    return Row(figure, what, f"{paper_s:g} s", f"{_short(median(times))} s", spread, str(len(times)), conditions)
-
-
-def _short(seconds: float) -> str:
-    return f"{seconds:.1f}" if seconds >= 10 else f"{seconds:.2f}" if seconds >= 1 else f"{seconds:.4f}"
+    spread = f"{seconds_text(low)} to {seconds_text(high)} s"
+    return Row(figure, what, f"{paper_s:g} s", f"{seconds_text(median(times))} s", spread, str(len(times)), conditions)
 
 
 def _interval(

@@ -3,7 +3,6 @@
 Process of its own, started by ``field.py`` at the robot or at a server: ``robot.py ROLE SETTINGS``.
 
 ``ask`` makes a series of calls, ``busy`` is the second client of figure 6; see ``series.py`` for their settings.
-
 """
 
 from __future__ import annotations
@@ -29,8 +28,6 @@ from samples import Sample
 from series import Contention, Series
 from service_msgs.msg import ServiceEventInfo
 from tasks import TASKS, WARM_UP, Response, Task
-
-__all__: list[str] = []
 
 _PATIENCE_S: Final = 30.0
 _TICK_S: Final = 0.002

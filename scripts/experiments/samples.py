@@ -6,12 +6,14 @@ Source: FogROS2-FT (IROS 2024), whose figures compare mean and 99th percentile o
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
-__all__ = ["Sample", "Summary", "least_of_two", "p99", "quantile"]
+import bench_path  # noqa: F401 - finds ``report``
+from report import percentile
+
+__all__ = ["Sample", "Summary", "least_of_two", "p99"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,18 +59,7 @@ class Summary:
         """
         times = [each.latency_s for each in samples]
         failed = sum(not each.is_right for each in samples)
-        return cls(len(times), failed, fmean(times), quantile(times, 0.5), p99(times), max(times))
-
-
-def quantile(values: Sequence[float], share: float) -> float:
-    """Return the smallest value that at least ``share`` (0 to 1) of the values do not exceed.
-
-    Raises:
-        ValueError: no values.
-    """
-    if not values:
-        raise ValueError("no values")
-    return sorted(values)[max(0, math.ceil(share * len(values)) - 1)]
+        return cls(len(times), failed, fmean(times), percentile(times, 0.5), p99(times), max(times))
 
 
 def p99(values: Sequence[float]) -> float:
@@ -77,7 +68,7 @@ def p99(values: Sequence[float]) -> float:
     Raises:
         ValueError: no values.
     """
-    return quantile(values, 0.99)
+    return percentile(values, 0.99)
 
 
 def least_of_two(values: Sequence[float]) -> list[float]:

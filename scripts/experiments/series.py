@@ -1,7 +1,6 @@
 """Settings of a client at the robot: a series of calls, and the load of the second client of figure 6.
 
 Sans-I/O. They are passed to the process of the client as JSON.
-
 """
 
 from __future__ import annotations

@@ -13,21 +13,20 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Final
 
-import typer
-from rich.console import Console
-from rich.table import Column, Table
+from experiment import OUTPUT, page_command_line, write
+from report import print_table
+from skeleton import clean_exit
 
 from fog.catalog.aws import aws_prices
 from fog.hardware import Hardware
 from fog.offer import Offer
 from fog.plan.cost import Bill, compared
-from gdp.cli.node import failing_clearly
 from gdp.errors import LocalError
 
-PAGES: Final = Path(__file__).parents[2] / "docs/experiments"
 TYPES: Final = ("c5.4xlarge", "c6i.4xlarge", "m6i.4xlarge", "r5.16xlarge", "t3.xlarge", "g4dn.xlarge", "p3.2xlarge")
+_WAYS: Final = ("one", "two", "two spot")
 REGIONS: Final = ("us-west-1", "us-west-2")  # the paper's
 # Application -> what a machine must have, and the paper's USD an hour: one on-demand, two on-demand, two spot.
 APPLICATIONS: Final[dict[str, tuple[str, tuple[float, float, float]]]] = {
@@ -38,8 +37,6 @@ APPLICATIONS: Final[dict[str, tuple[str, tuple[float, float, float]]]] = {
     "MPT TwistyCool": ("cpu:64", (3.58, 7.16, 1.68)),
     "Pick-scan-place": ("cpu:16", (0.40, 0.80, 0.34)),
 }
-
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,30 +73,30 @@ class Application:
     paper: tuple[float, float, float]
 
 
-@app.command(epilog="Example: python scripts/experiments/table1.py --region us-east-1")
-def table1(
-    region: Annotated[str, typer.Option(help="of AWS")] = "us-east-1",
-    as_json: Annotated[bool, typer.Option("--json", help="print one JSON object")] = False,
-    write: Annotated[bool, typer.Option("--write/--no-write", help="the page, the picture and the JSON")] = True,
-) -> None:
+def main(words: Sequence[str] | None = None) -> None:
     """Compare the cost of one on-demand machine, two on-demand machines and two spot machines."""
-    with failing_clearly():
+    parser = page_command_line(__doc__)
+    parser.add_argument("--region", default="us-east-1", help="of AWS (default: %(default)s)")
+    options = parser.parse_args(words)
+    region: str = options.region
+    with clean_exit():
         rows, needed = bills(region), applications()
-        document = {
-            "region": region,
-            "sources": aws_prices().sources,
-            "applications": [asdict(each) for each in needed],
-            "rows": [asdict(row) | {"times_cheaper": round(row.times_cheaper, 2)} for row in rows],
-        }
-        if as_json:
-            print(json.dumps(document))
-        else:
-            Console(width=120).print(_application_table(needed), _table(region, rows))
-        if write:
-            PAGES.mkdir(parents=True, exist_ok=True)
-            (PAGES / "table1.json").write_text(json.dumps(document, indent=1) + "\n")
-            (PAGES / "table1.md").write_text(page(region, rows, needed))
-            _draw(PAGES / "table1.png", region, rows)
+    document = {
+        "region": region,
+        "sources": aws_prices().sources,
+        "applications": [asdict(each) for each in needed],
+        "rows": [asdict(row) | {"times_cheaper": round(row.times_cheaper, 2)} for row in rows],
+    }
+    if options.json:
+        print(json.dumps(document))
+    else:
+        head = ("USD", "needs", "", "one /h", "two /h", "two spot /h", "two spot / one", "machines")
+        print_table(head, _application_rows(needed), words=3)
+        prices = [f"{each} /{per}" for per in ("h", "month") for each in _WAYS]
+        print_table((f"{region}, USD", *prices, "of one", "taken a month"), map(_cells, rows))
+    if options.write:
+        write(OUTPUT, "table1", document, page(region, rows, needed))
+        _draw(OUTPUT / "table1.png", region, rows)
 
 
 def bills(region: str) -> list[Row]:
@@ -152,20 +149,22 @@ def _where(offers: Sequence[Offer]) -> tuple[str, str]:
     return one, other
 
 
-def _application_lines(needed: Sequence[Application]) -> list[str]:
-    lines = [
-        "| application | needs | | one on-demand | two on-demand | two spot | two spot / one on-demand | machines |",
-        "|---|---|---|--:|--:|--:|--:|---|",
-    ]
+def _application_rows(needed: Sequence[Application]) -> list[tuple[str, ...]]:
+    rows = []
     for each in needed:
-        for who, usd, where in (
-            ("paper", each.paper, ""),
-            ("here", each.usd_per_hour, f"on-demand {', '.join(each.on_demand)}; spot {', '.join(each.spot)}"),
+        where = f"on-demand {', '.join(each.on_demand)}; spot {', '.join(each.spot)}"
+        for labels, usd, machines in (
+            ((each.name, each.needs, "paper"), each.paper, ""),
+            (("", "", "here"), each.usd_per_hour, where),
         ):
-            name, needs = (each.name, each.needs) if who == "paper" else ("", "")
-            prices = " | ".join(f"{price:.2f}" for price in usd)
-            lines.append(f"| {name} | {needs} | {who} | {prices} | {usd[2] / usd[0]:.2f} | {where} |")
-    return lines
+            rows.append((*labels, *(f"{price:.2f}" for price in usd), f"{usd[2] / usd[0]:.2f}", machines))
+    return rows
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    hours = (f"{bill.usd_per_hour:.4f}" for bill in row.bills)
+    months = (f"{bill.usd_per_month:,.2f}" for bill in row.bills)
+    return (row.type_name, *hours, *months, f"{row.bills[2].of_single:.2f} ×", row.taken_a_month)
 
 
 def page(region: str, rows: Sequence[Row], needed: Sequence[Application]) -> str:
@@ -183,7 +182,9 @@ def page(region: str, rows: Sequence[Row], needed: Sequence[Application]) -> str
         " on-demand in the "
         f"cheaper of {' and '.join(REGIONS)}, two as one in either region.",
         "",
-        *_application_lines(needed),
+        "| application | needs | | one on-demand | two on-demand | two spot | two spot / one on-demand | machines |",
+        "|---|---|---|--:|--:|--:|--:|---|",
+        *("| " + " | ".join(row) + " |" for row in _application_rows(needed)),
         "",
         "The paper's prices for MPT are those of m5.8xlarge and m5.16xlarge in us-west-1 on this list (1.792 and"
         " 3.584), "
@@ -199,10 +200,7 @@ def page(region: str, rows: Sequence[Row], needed: Sequence[Application]) -> str
         "| two spot cost | taken a month |",
         "|---|--:|--:|--:|--:|--:|--:|--:|--:|",
     ]
-    for row in rows:
-        hours = " | ".join(f"{bill.usd_per_hour:.4f}" for bill in row.bills)
-        months = " | ".join(f"{bill.usd_per_month:,.2f}" for bill in row.bills)
-        lines.append(f"| {row.type_name} | {hours} | {months} | {_against(row)} | {row.taken_a_month} |")
+    lines += ["| " + " | ".join(_cells(row)) + " |" for row in rows]
     lines += [
         "",
         "![prices](table1.png)",
@@ -217,43 +215,8 @@ def page(region: str, rows: Sequence[Row], needed: Sequence[Application]) -> str
     return "\n".join(lines) + "\n"
 
 
-def _against(row: Row) -> str:
-    return f"{row.bills[2].of_single:.2f} ×"
-
-
-def _application_table(needed: Sequence[Application]) -> Table:
-    headers = ("one /h", "two /h", "two spot /h")
-    table = Table("USD", "needs", "", *(Column(header, justify="right") for header in headers))
-    for each in needed:
-        table.add_row(each.name, each.needs, "paper", *(f"{price:.2f}" for price in each.paper))
-        table.add_row("", "", "here", *(f"{price:.2f}" for price in each.usd_per_hour))
-    return table
-
-
-def _table(region: str, rows: Sequence[Row]) -> Table:
-    headers = (
-        "one /h",
-        "two /h",
-        "two spot /h",
-        "one /month",
-        "two /month",
-        "two spot /month",
-        "of one",
-        "taken a month",
-    )
-    table = Table(f"{region}, USD", *(Column(header, justify="right") for header in headers))
-    for row in rows:
-        hours = (f"{bill.usd_per_hour:.4f}" for bill in row.bills)
-        months = (f"{bill.usd_per_month:,.2f}" for bill in row.bills)
-        table.add_row(row.type_name, *hours, *months, _against(row), row.taken_a_month)
-    return table
-
-
 def _draw(path: Path, region: str, rows: Sequence[Row]) -> None:
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
+    from pictures import plt, save, tidy
 
     figure, axis = plt.subplots(figsize=(8, 4), layout="constrained")
     for at, colour in enumerate(("#99a8b2", "#5d6b75", "#1f6f8b")):
@@ -263,12 +226,10 @@ def _draw(path: Path, region: str, rows: Sequence[Row]) -> None:
     axis.set_xticks(range(len(rows)), [row.type_name for row in rows], fontsize=8)
     axis.set_ylabel("price, of one on-demand machine")
     axis.set_title(f"AWS {region}", loc="left", fontsize=10)
-    axis.spines[["top", "right"]].set_visible(False)
     axis.set_ylim(0, 2.6)
-    axis.legend(fontsize=8, frameon=False, ncols=3, loc="upper left")
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    tidy(axis, ncols=3, loc="upper left")
+    save(figure, path)
 
 
 if __name__ == "__main__":
-    app()
+    main()

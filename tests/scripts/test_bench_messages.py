@@ -26,7 +26,7 @@ from peers.exchange import ANSWER, IMAGE, SIZE_MIN, Load, answer_to, exchange, i
 from peers.figures import MEDIAN, case_of, targets_of
 from peers.jsonl import EndSettings
 from report import Rounds
-from testbed import row
+from topologies import row
 
 from proxy.serial.channel import Channel
 from proxy.serial.serializer import Encoding, Serializer

@@ -11,10 +11,11 @@ from faults.accounts import Books, Timeline
 from faults.disk import snapshot_faults
 from faults.network import VICTIM, random_network
 from faults.oracle import Broken, Oracle
-from faults.plan import Churn, Flow, Plan, Service, make_topology
+from faults.plan import Churn, Flow, Plan, Service
 from faults.records import Kind, Record, RecordReader, RecordWriter
 from faults.schedule import STRUCTURAL, Fault, FaultKind, broken_by, make_schedule
 from faults.slope import growth_of
+from topologies import make_topology
 
 from gdp.message.loss import LossReason
 

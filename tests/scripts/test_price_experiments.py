@@ -9,16 +9,15 @@ import availability
 import numpy as np
 import pytest
 import table1
-from typer.testing import CliRunner
 
 from gdp.errors import LocalError
 
 needs_traces = pytest.mark.skipif(not availability.SPOT.is_dir(), reason="no ../shared/data/spot here")
 
 
-def test_table_one_compares_three_ways_to_run_a_service() -> None:
-    result = CliRunner().invoke(table1.app, ["--json", "--no-write"])
-    (first, *_) = json.loads(result.stdout)["rows"]
+def test_table_one_compares_three_ways_to_run_a_service(capsys: pytest.CaptureFixture[str]) -> None:
+    table1.main(["--json", "--no-write"])
+    (first, *_) = json.loads(capsys.readouterr().out)["rows"]
     assert [bill["of_single"] for bill in first["bills"][:2]] == [1.0, 2.0]
     assert first["bills"][2]["of_single"] < 1 < first["times_cheaper"]
 
@@ -29,7 +28,7 @@ def test_a_region_without_prices_is_refused() -> None:
 
 
 def test_the_page_of_table_one_is_of_the_shipped_prices() -> None:
-    shown = Path(table1.PAGES / "table1.md").read_text()
+    shown = Path(table1.OUTPUT / "table1.md").read_text()
     assert shown == table1.page("us-east-1", table1.bills("us-east-1"), table1.applications())
 
 

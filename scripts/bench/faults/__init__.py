@@ -5,5 +5,4 @@ must stay connected), ``accounts`` (evaluation of the records), ``slope`` (growt
 
 I/O: ``overlay`` (processes and links), ``link_faults`` (frames), ``clock`` (wall clocks), ``disk``, ``store``
 (servers that RIBs share), ``member`` (the endpoint process), ``records`` (its record files).
-
 """

@@ -5,7 +5,6 @@ Sans-I/O. Moments are monotonic nanoseconds, as the members recorded them.
 One incarnation of a reader and one of a publisher make one account: numbers rise by one within it. From the first
 message that arrived, each number must arrive once, or its loss must be reported. What a killed publisher had not
 delivered cannot be reported.
-
 """
 
 from __future__ import annotations

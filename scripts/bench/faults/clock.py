@@ -6,7 +6,6 @@ The offset is eight bytes of a file that the bench writes. The product does not 
 bypass the module ``time`` are not stepped.
 
     python -m faults.clock OFFSET_FILE gdp.cli.switch --config switch.yaml
-
 """
 
 from __future__ import annotations

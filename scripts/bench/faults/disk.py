@@ -1,7 +1,6 @@
 """Disk of a run: a small file system in memory that can be full, and the log lines that RIBs must write about it.
 
 I/O. A tmpfs in the folder of the run; the record of the run names it.
-
 """
 
 from __future__ import annotations

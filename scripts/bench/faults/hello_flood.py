@@ -3,7 +3,6 @@
 I/O. One packet socket. Its only argument is JSON with ``iface``, ``frames``, ``rate`` (a second), ``seconds`` and
 ``source``. The file ``frames`` holds frames from the header on, each after its length (4 bytes). The address ``source``
 is empty for many invented ones. It prints one line of JSON at its begin and one at its end: the number of frames sent.
-
 """
 
 from __future__ import annotations
@@ -22,8 +21,6 @@ from peers.jsonl import say
 from gdp.errors import DROP_COUNTERS
 from gdp.ports.mmsg import make_batch
 from gdp.ports.sockets import attach_drop_all_filter, open_port
-
-__all__: list[str] = []
 
 _BATCH: Final = 16  # frames under one source address
 _BROADCAST: Final = b"\xff" * 6

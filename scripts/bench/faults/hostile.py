@@ -5,7 +5,6 @@ I/O. It is a switch (``names``, ``joins``, ``revocations``) or a proxy that read
 session stays up. Its only argument is JSON: ``what``; ``config``, its file; ``frames``, how many different ones;
 ``rate`` a second; ``seconds``; for a proxy ``reads`` and ``publishes``, topics. It prints a line of JSON when it takes
 part, begins to flood at SIGUSR1, and prints another line at the end.
-
 """
 
 from __future__ import annotations
@@ -21,8 +20,8 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
+from member_endpoint import End
 from peers.jsonl import say
-from priority_endpoint import End
 
 from gdp.client.writer_proxy import WriterProxyState
 from gdp.control.fragments import ControlFragmenter
@@ -111,7 +110,7 @@ class HostileProxy:
         self._end = End(Path(reported["config"]), 0.0)
         self.plane, self.runtime = self._end.plane, self._end.runtime
         self._topic = self._end.subscribe(reported["reads"])
-        self._own = self._end._topics[reported["publishes"]]
+        self._own = self._end.topics[reported["publishes"]]
         self._publisher = self._end.advertise(reported["publishes"], reliable=True)
 
     def is_ready(self) -> bool:

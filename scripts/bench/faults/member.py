@@ -3,7 +3,6 @@
 Process of its own, started by ``faults.overlay`` with one argument of JSON. Each arrival is appended to a file of
 records at once, so that nothing is lost when this process is killed. A message names its channel, its publisher and
 the publisher's incarnation, so a message at a wrong reader is detected.
-
 """
 
 from __future__ import annotations
@@ -21,19 +20,16 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
+from member_endpoint import End
 from peers.jsonl import say
-from priority_endpoint import End
 
 from faults.records import Kind, RecordWriter
 from gdp.client.participant import Message
-from gdp.client.publisher import Publisher
 from gdp.errors import LocalError
 from gdp.message.loss import LossReason
 from gdp.names import Name
 from gdp.nodes.memory_tuning import tune_memory
 from gdp.service.dispatch import Ask, Dispatch, Failure
-
-__all__: list[str] = []
 
 _HEAD: Final = struct.Struct("!8sHHIQ")  # token of the channel, channel, publisher, incarnation, number
 _REQUEST: Final = struct.Struct("!8sQ")  # token, number of the call
@@ -41,34 +37,17 @@ _BEHIND_S: Final = 0.5  # messages that are overdue for so long are skipped
 _LOOK_S: Final = 0.25  # pause between two checks for losses
 
 
-class Station(End):
-    """A member on its plane, with services."""
-
-    def serve(self, name: str) -> Name:
-        """Serve a name from now on; return it."""
-        self.member.serve(self._topics[name], b"bench")
-        return self._topics[name].name
-
-    def call(self, name: str) -> Publisher:
-        """Call a name from now on; return the stream that all its servers receive."""
-        return self.member.call(self._topics[name], b"bench")
-
-    def name_of(self, name: str) -> Name:
-        """Return the overlay name of a topic or service."""
-        return self._topics[name].name
-
-
 class Source:
     """Publishes one topic at an even rate."""
 
     def __init__(
-        self, station: Station, settings: dict[str, Any], token: bytes, who: tuple[int, int], out: RecordWriter
+        self, station: End, settings: dict[str, Any], token: bytes, who: tuple[int, int], out: RecordWriter
     ) -> None:
         self._channel, (self._index, self._incarnation_id) = settings["channel"], who
         self._publisher = station.advertise(settings["name"], reliable=settings["reliable"])
         self._token, self._out = token, out
         self._filler = bytes(max(settings["size"] - _HEAD.size, 0))
-        self._every_s = 1.0 / settings["hz"]
+        self._every_s = 1.0 / float(settings["hz"])
         self.due_s = time.monotonic() + random.random() * self._every_s
         self._number = 0
         self._readers = -1
@@ -94,14 +73,12 @@ class Source:
 class Caller:
     """Caller of one service at an even rate: all replicas receive the request, the first response counts."""
 
-    def __init__(
-        self, station: Station, settings: dict[str, Any], token: bytes, incarnation_id: int, out: RecordWriter
-    ) -> None:
+    def __init__(self, station: End, settings: dict[str, Any], token: bytes, incarnation_id: int, out: RecordWriter) -> None:
         self._station, self._token, self._out, self._incarnation_id = station, token, out, incarnation_id
-        self._channel, self._timeout_s = settings["channel"], settings["timeout_s"]
+        self._channel, self._timeout_s = settings["channel"], float(settings["timeout_s"])
         self._stream, self._name = station.call(settings["name"]), station.name_of(settings["name"])
         self._dispatch: Dispatch[int] = Dispatch(start=random.getrandbits(62))
-        self._every_s = 1.0 / settings["hz"]
+        self._every_s = 1.0 / float(settings["hz"])
         self.due_s = time.monotonic() + random.random() * self._every_s
         self._count = 0
 
@@ -177,7 +154,7 @@ class Reading:
         self._reported_counts = Counter[LossReason]()
         self._look_at_s = 0.0
 
-    def look(self, station: Station, name: Name, now_s: float) -> None:
+    def look(self, station: End, name: Name, now_s: float) -> None:
         """Record reported losses, at intervals."""
         if now_s < self._look_at_s:
             return
@@ -201,7 +178,7 @@ class Reading:
 class Serving:
     """Server that echoes each request."""
 
-    def __init__(self, station: Station, name: Name, token: bytes) -> None:
+    def __init__(self, station: End, name: Name, token: bytes) -> None:
         self._station, self._name, self._token = station, name, token
 
     def take(self, message: Message, now_s: float) -> None:
@@ -218,12 +195,16 @@ class Serving:
 class Churning:
     """Topic that is subscribed or published, and left, repeatedly."""
 
-    def __init__(self, station: Station, settings: dict[str, Any], begin: Callable[[dict[str, Any]], None]) -> None:
+    def __init__(self, station: End, settings: dict[str, Any], begin: Callable[[dict[str, Any]], None]) -> None:
         self._station, self._reported_counts, self._begin = station, settings, begin
         self._name = station.name_of(settings["name"])
-        self._every_s = 1.0 / settings["hz"]
+        self._every_s = 1.0 / float(settings["hz"])
         self.due_s = time.monotonic() + random.random() * self._every_s
         self._is_taken_up = False
+
+    def next_s(self) -> float:
+        """Return the next deadline, in monotonic seconds."""
+        return self.due_s
 
     def go_on(self, now_s: float) -> None:
         """Apply the changes that are due."""
@@ -244,7 +225,7 @@ def main() -> None:
     settings: dict[str, Any] = json.loads(sys.argv[1])
     out, incarnation_id = RecordWriter(Path(settings["records"])), settings["incarnation_id"]
     tokens = {int(channel): bytes.fromhex(token) for channel, token in settings["tokens"].items()}
-    station = Station(Path(settings["config"]), 0.0)
+    station = End(Path(settings["config"]), 0.0)
     takers: dict[Name, Reading | Serving | Caller] = {}
     for each in settings["read"]:
         takers[station.subscribe(each["name"])] = Reading(each["channel"], tokens[each["channel"]], out)
@@ -276,6 +257,7 @@ def main() -> None:
         else:
             takers[station.subscribe(each["name"])] = Reading(each["channel"], token, out)
 
+    actives: list[Caller | Churning] = [*remote_clients, *churn]
     signal.signal(signal.SIGUSR1, begin_spare)
     tune_memory()
     with station.runtime.signals():
@@ -284,14 +266,14 @@ def main() -> None:
             now_s = time.monotonic()
             for source in sources:
                 source.go_on(now_s)
-            for each in (*remote_clients, *churn):
-                each.go_on(now_s)
+            for active in actives:
+                active.go_on(now_s)
             for name, taker in takers.items():
                 if isinstance(taker, Reading):
                     taker.look(station, name, now_s)
             station.member.flush(now_s)
             out.flush()
-            due = [each.due_s for each in (*sources, *churn)] + [caller.next_s() for caller in remote_clients]
+            due = [each.due_s for each in sources] + [each.next_s() for each in actives]
             station.runtime.step(min([*due, now_s + _LOOK_S]))
             now_s = time.monotonic()
             for message in station.member.poll_messages():

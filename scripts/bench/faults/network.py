@@ -10,7 +10,9 @@ from __future__ import annotations
 import random
 from typing import Final
 
-from faults.plan import Flow, Plan, Service, make_topology
+from topologies import make_topology
+
+from faults.plan import Flow, Plan, Service
 from gdp.simulation.topology import Link
 
 __all__ = ["VICTIM", "random_network"]

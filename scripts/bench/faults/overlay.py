@@ -2,7 +2,6 @@
 
 I/O. Namespaces and processes through ``gdp.simulation``, the commands that robots run, and ``faults.member`` at the
 ends. A process is called ``switch s1``, ``rib s1`` or ``member m1``. Each may be killed, restarted, frozen.
-
 """
 
 from __future__ import annotations
@@ -19,8 +18,9 @@ from pathlib import Path
 from typing import Final
 
 import yaml
+from devices import hand_over, received, set_up
 from peers.process import Started
-from pyroute2 import IPRoute
+from testbed import Lab
 
 from faults.clock import Clock
 from faults.disk import Disk
@@ -28,11 +28,9 @@ from faults.link_faults import FrameFaults, LinkFaults
 from faults.plan import Churn, Flow, Plan, Service
 from faults.records import Record, RecordReader
 from faults.store import StoreCluster
-from gdp.host import netns_files
 from gdp.host.processes import Process, end_all
 from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
-from gdp.simulation.namespaces import Namespaces
 from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, ROOT_CERTIFICATE, load_domain, load_identity
 from gdp.trust.revocation import Revocation
@@ -77,6 +75,7 @@ class Overlay:
     ) -> None:
         self.plan = plan
         self.directory = run.directory
+        self._lab = Lab(run, plan.topology)
         self._run = run
         self._plane = plane
         self._more = more or {}
@@ -86,7 +85,7 @@ class Overlay:
         self._processes: dict[str, Started] = {}
         self._frozen: set[str] = set()
         self._records: dict[tuple[str, int], RecordReader] = {}
-        self.spaces = Namespaces(plan.topology, run)
+        self.spaces = self._lab.namespaces
         self._materials = OverlayCredentials(plan.topology, run.directory, metrics=False)
         self._clocks: dict[str, Clock] = {}
         if has_clocks:
@@ -147,7 +146,11 @@ class Overlay:
             argv = ["faults.member", json.dumps(self._settings(node, incarnation_id))]
         clock = self._clocks.get(who)
         argv = ["-m", *argv] if clock is None else ["-m", "faults.clock", str(clock.path), *argv]
-        self._processes[who] = Started(self._run, f"{who} {incarnation_id}", partial(self.spaces.command, node), argv)
+        self._processes[who] = self._lab.start(node, f"{role} {incarnation_id}", argv)
+
+    def start_other(self, node: str, what: str, arguments: Sequence[str]) -> Started:
+        """Start a Python process that is not of the plan on a machine."""
+        return self._lab.start(node, what, arguments)
 
     def await_ready(self, who: str) -> None:
         """Return when a started process reports that it is ready.
@@ -220,11 +223,8 @@ class Overlay:
 
     def log_tail(self, who: str, lines: int = 15) -> str:
         """Return the end of a process's log, of its latest incarnation."""
-        path = self.directory / f"{who} {self._incarnation_ids.get(who, 0)}".replace(" ", "-")
-        with suppress(FileNotFoundError):
-            text = path.with_name(path.name + ".log").read_text(encoding="utf-8", errors="replace")
-            return "\n".join(text.splitlines()[-lines:])
-        return ""
+        texts = [text for _, text in self.logs(who)]
+        return "\n".join(texts[-1].splitlines()[-lines:]) if texts else ""
 
     def keeps_snapshot(self, node: str) -> bool:
         """Return whether the RIB at a switch keeps a snapshot on the disk."""
@@ -233,7 +233,8 @@ class Overlay:
     def logs(self, who: str) -> Iterator[tuple[int, str]]:
         """Yield each incarnation of a process, and its whole log."""
         for incarnation_id in range(1, self._incarnation_ids.get(who, 0) + 1):
-            path = self.directory / f"{who} {incarnation_id}.log".replace(" ", "-")
+            role, _, node = who.partition(" ")
+            path = self.directory / f"{role}-{incarnation_id}-at-{node}.log"
             yield incarnation_id, path.read_text(encoding="utf-8", errors="replace")
 
     # links
@@ -270,7 +271,7 @@ class Overlay:
 
     def received(self, node: str, neighbours: Sequence[str]) -> dict[str, int]:
         """Return how many frames have come in at a node's devices towards these neighbours."""
-        return netns_files.inside(self.spaces.path(node), partial(_received, neighbours))
+        return self._lab.inside(node, partial(received, neighbours))
 
     def at(self, mover: str) -> str:
         """Return the switch that a member is plugged into."""
@@ -280,10 +281,10 @@ class Overlay:
         """Pull the cable of a mover at its switch and plug it into another one; the mover keeps its device."""
         there = os.open(self.spaces.path(to), os.O_RDONLY | os.O_CLOEXEC)
         try:
-            netns_files.inside(self.spaces.path(self._at[mover]), partial(_hand_over, mover, there))
+            self._lab.inside(self._at[mover], partial(hand_over, mover, there))
         finally:
             os.close(there)
-        netns_files.inside(self.spaces.path(to), partial(_raise, mover))
+        self._lab.inside(to, partial(set_up, mover))
         self._at[mover] = to
 
     # files
@@ -383,19 +384,3 @@ class Overlay:
 
 def _flow_part(channel: int, flow: Flow) -> dict[str, object]:
     return {"channel": channel, "name": flow.topic, "hz": flow.hz, "reliable": flow.reliable, "size": flow.size}
-
-
-def _hand_over(device: str, namespace: int) -> None:
-    with IPRoute() as here:
-        here.link("set", index=here.link_lookup(ifname=device)[0], net_ns_fd=namespace)
-
-
-def _received(devices: Sequence[str]) -> dict[str, int]:
-    with IPRoute() as here:
-        links = {link.get_attr("IFLA_IFNAME"): link.get_attr("IFLA_STATS64") for link in here.get_links()}
-    return {device: links[device]["rx_packets"] for device in devices}
-
-
-def _raise(device: str) -> None:
-    with IPRoute() as here:
-        here.link("set", index=here.link_lookup(ifname=device)[0], state="up")

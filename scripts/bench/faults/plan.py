@@ -2,7 +2,6 @@
 
 Sans-I/O. A member is a node of the topology without a switch of its own, joined to its home switch by one link. That
 link may be moved to the other switches it lists.
-
 """
 
 from __future__ import annotations
@@ -10,11 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from gdp.simulation.topology import Topology
 
-__all__ = ["Churn", "Flow", "Plan", "Service", "make_topology"]
-
-RIB_IFNAME = "rib"
+__all__ = ["Churn", "Flow", "Plan", "Service"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,36 +107,3 @@ class Plan:
                 topics.append(each.topic)
             if each.member == member:
                 yield topics.index(each.topic), each
-
-
-def make_topology(
-    domains: Mapping[str, Iterable[str]],
-    uppers: Mapping[str, str],
-    links: Iterable[str | Link],
-    ribs: Iterable[str],
-    members: Mapping[str, str],
-) -> tuple[Topology, tuple[str, ...]]:
-    """Return a topology, and its members.
-
-    Args:
-        domains: switches by label.
-        uppers: the domain of the tier above, by label.
-        links: between switches, ``a-b`` at the usual cost.
-        ribs: switches with a RIB, in the order of the topology's attachments.
-        members: home switch by member; a member is of its home's domain.
-
-    Raises:
-        LocalError: they do not fit together.
-    """
-    of = {switch: label for label, switches in domains.items() for switch in switches}
-    plans = tuple(
-        DomainPlan(label, (*switches, *(m for m, home in members.items() if of[home] == label)), uppers.get(label))
-        for label, switches in domains.items()
-    )
-    made = [Link(*each.split("-")) if isinstance(each, str) else each for each in links]
-    leads = [Link(member, home) for member, home in members.items()]
-    attachments = (
-        *(Attachment(switch, "rib", RIB_IFNAME) for switch in ribs),
-        *(Attachment(member, "proxy", "end") for member in members),
-    )
-    return Topology((*made, *leads), plans, attachments), tuple(members)

@@ -1,7 +1,6 @@
 """Records of a member: fixed size, appended to a file, and their reader.
 
 I/O. One file. Written records remain when the writer is killed, because the kernel holds them from then on.
-
 """
 
 from __future__ import annotations

@@ -3,7 +3,6 @@
 Sans-I/O. Faults of the kinds in ``STRUCTURAL`` remove a switch or a link. One is drawn only if the rest stays whole
 with everything that is broken at that moment, by the oracle. A partition is the exception: it parts a domain on
 purpose, while no other fault is active.
-
 """
 
 from __future__ import annotations

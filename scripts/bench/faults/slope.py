@@ -2,7 +2,6 @@
 
 Sans-I/O. A bounded figure rises while it warms up and is flat after that, so the samples of the warm-up are left out.
 A slope is reported as growth over the rest of the run, with the spread of the samples around their line.
-
 """
 
 from __future__ import annotations

@@ -2,7 +2,6 @@
 
 I/O. ``scripts/start_cluster.sh`` starts three primaries with a replica each. The servers are daemons. They are in the
 run's record, and they run in a namespace of the run; its end ends all processes inside.
-
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ from pathlib import Path
 from typing import Final
 
 import yaml
+from devices import add_address, add_bridge, set_up
 from peers.process import FailedError
 from pyroute2 import IPRoute
 from redis import Redis
@@ -37,7 +37,6 @@ _BRIDGE: Final = "servers"
 _IFNAME: Final = "store"  # device in the namespace of a RIB
 _ADDRESS: Final = "10.255.77.1"
 _OF_RIBS: Final = "10.255.77.{}"
-_PREFIX_BITS: Final = 24
 _START_S: Final = 120.0
 _ANSWER_S: Final = 0.3
 _WHOLE_S: Final = 20.0
@@ -68,7 +67,9 @@ class StoreCluster:
         run.plan_namespace(self._path)
         netns_files.create(self._path)
         netns_files.inside(self._path, netns_files.disable_ipv6)
-        netns_files.inside(self._path, _make_bridge)
+        netns_files.inside(self._path, partial(set_up, "lo"))
+        netns_files.inside(self._path, partial(add_bridge, _BRIDGE))
+        netns_files.inside(self._path, partial(add_address, _BRIDGE, _ADDRESS))
         for at, node in enumerate(ribs, 2):
             self._join(spaces.path(node), f"to-{node}", _OF_RIBS.format(at))
         started = subprocess.run(
@@ -163,7 +164,8 @@ class StoreCluster:
             netns_files.inside(self._path, partial(_plug, ifname, there))
         finally:
             os.close(there)
-        netns_files.inside(rib, partial(_raise, _IFNAME, address))
+        netns_files.inside(rib, partial(add_address, _IFNAME, address))
+        netns_files.inside(rib, partial(set_up, _IFNAME))
 
 
 def _program() -> str | None:
@@ -172,25 +174,11 @@ def _program() -> str | None:
     return next((program for kind in kinds if (program := shutil.which(f"{kind}-server"))), None)
 
 
-def _make_bridge() -> None:
-    with IPRoute() as here:
-        here.link("set", index=here.link_lookup(ifname="lo")[0], state="up")
-        here.link("add", kind="bridge", ifname=_BRIDGE)
-    _raise(_BRIDGE, _ADDRESS)
-
-
 def _plug(ifname: str, namespace: int) -> None:
     with IPRoute() as here:
         here.link("add", kind="veth", ifname=ifname, peer={"ifname": _IFNAME, "net_ns_fd": namespace})
         index = here.link_lookup(ifname=ifname)[0]
         here.link("set", index=index, state="up", master=here.link_lookup(ifname=_BRIDGE)[0])
-
-
-def _raise(ifname: str, address: str) -> None:
-    with IPRoute() as here:
-        index = here.link_lookup(ifname=ifname)[0]
-        here.addr("add", index=index, address=address, prefixlen=_PREFIX_BITS)
-        here.link("set", index=index, state="up")
 
 
 def _port(conf: Path) -> int:

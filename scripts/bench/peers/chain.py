@@ -13,9 +13,11 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+from devices import add_address
 from machine import offload_text, offloads, set_offloads
 from pyroute2 import IPRoute
-from testbed import LEFT, MIDDLE, RIGHT, ROW, Lab, row
+from testbed import Lab
+from topologies import LEFT, MIDDLE, RIGHT, ROW, row
 
 from gdp.host.run_registry import Run
 
@@ -67,10 +69,9 @@ def _neighbours(node: str) -> tuple[str, ...]:
 
 
 def _number(node: str) -> None:
+    for other in _neighbours(node):
+        add_address(other, address(node, other))
     with IPRoute() as here:
-        for other in _neighbours(node):
-            (device,) = here.link_lookup(ifname=other)
-            here.addr("add", index=device, address=address(node, other), prefixlen=24)
         for network, gateway in routes(node).items():
             here.route("add", dst=network, gateway=gateway)
     if node in MIDDLE:

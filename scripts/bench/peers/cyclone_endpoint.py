@@ -6,7 +6,6 @@ Messages go in and out as serialised bytes, which is what a ROS 2 node passes to
 serialiser, in Python, would cost 26 ms for an image. For that the type is one octet: Cyclone carries the rest of a
 longer message along. Each endpoint waits by a WaitSet in the thread that continues the work. A listener would add a
 change of threads.
-
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ _PREFIX: Final = b"\x00\x01\x00\x00"  # of CDR: little-endian; the answer needs 
 
 
 @dataclass
-class Opaque(IdlStruct, typename="bench::Opaque"):
+class Opaque(IdlStruct, typename="bench::Opaque"):  # type: ignore[call-arg, misc]
     """Any serialised message."""
 
     first: uint8

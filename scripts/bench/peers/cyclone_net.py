@@ -1,7 +1,6 @@
 """Cyclone DDS on the row, unsecured: peers by address, no multicast, the kernel forwards IPv4.
 
 I/O. Starts processes. All other settings are the defaults of Cyclone, including its packet sizes.
-
 """
 
 from __future__ import annotations

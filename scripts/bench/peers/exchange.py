@@ -8,7 +8,6 @@ has 16 bytes: the number, the bytes that arrived, and, where the number requests
 CPU is the reading of the processes' own clocks over the measured messages: A's, B's, and that of all in between.
 Kernel forwarding on the way runs in the process that was interrupted, mostly the one that sent.
 Source of the clocks: clock_getcpuclockid(3).
-
 """
 
 from __future__ import annotations

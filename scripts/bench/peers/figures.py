@@ -2,7 +2,6 @@
 
 Sans-I/O. Works on the ``Rounds`` of ``report.py``. A ratio is of medians of one round in one case: same MTU, same
 state of the devices.
-
 """
 
 from __future__ import annotations

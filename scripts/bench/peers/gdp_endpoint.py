@@ -10,7 +10,6 @@ the same with the internal path in place of the library, to measure what that co
 from __future__ import annotations
 
 import os
-import secrets
 import signal
 import time
 from collections import deque
@@ -18,18 +17,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Protocol, get_args
 
+from member_endpoint import End
+
 import gdp
-from gdp.client.participant import Participant, Topic
 from gdp.client.publisher import Publisher
-from gdp.control.settings import NodeSettings
-from gdp.crypto.certificates import Role
 from gdp.errors import LocalError
-from gdp.nodes.config import RibConfig
-from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
 from gdp.nodes.memory_tuning import tune_memory
-from gdp.nodes.runtime import Runtime
-from gdp.ports.raw import RawPlane
-from gdp.stores.keyring import load_delegations
 from peers.exchange import IMAGE, PATIENCE_S, answer_to, exchange
 from peers.jsonl import EndSettings, say
 from proxy.serial.channel import Channel
@@ -108,52 +101,37 @@ class InternalEndpoint:
     """Member on its plane, as the library contains one."""
 
     def __init__(self, config: Path, spin_s: float) -> None:
-        settings = RibConfig.load(config)  # identity, domain and iface are all that an endpoint needs
-        identity, policy = load_member(settings.identity, settings.domain, Role.PROXY)
-        self._member = Participant(
-            identity,
-            policy,
-            NodeSettings(incarnation=incarnation(), first_sequence=wall_clock_ms(), random_bytes=secrets.token_bytes),
-        )
-        self._runtime = Runtime(self._member, RawPlane([settings.iface]), spin_s=spin_s)
+        self._end = End(config, spin_s)
         self._publishers: dict[str, Publisher] = {}
-        self._topics: dict[str, Topic] = {}
         self._labels: dict[bytes, str] = {}
         self._arrived = deque[tuple[str, bytes]]()
-        for each in load_delegations(settings.identity / "delegations"):
-            if each.metadata is None:
-                raise LocalError("a delegation without metadata")
-            grants = {epoch: grant.secret for epoch, grant in each.open(identity).items()}
-            self._topics[str(each.metadata["name"])] = Topic(each, grants)
 
     def advertise(self, topic: str) -> Callable[[bytes], None]:
         """Publish a topic, reliably; return what sends a message."""
-        publisher = self._publishers[topic] = self._member.advertise(self._topics[topic], b"bench", reliable=True)
+        publisher = self._publishers[topic] = self._end.advertise(topic, reliable=True)
 
         def send(message: bytes) -> None:
             publisher.publish(message)
-            self._member.flush(time.monotonic())
-            self._runtime.send()
+            self._end.member.flush(time.monotonic())
+            self._end.runtime.send()
 
         return send
 
     def subscribe(self, topic: str) -> None:
         """Read a topic."""
-        self._member.subscribe(self._topics[topic])
-        self._labels[self._topics[topic].name] = topic
+        self._labels[self._end.subscribe(topic)] = topic
 
     def wait_for_readers(self, deadline_s: float) -> None:
         """Wait until each published topic is read; raises ``TimeoutError``."""
-        if not self._runtime.run(lambda: all(each.readers for each in self._publishers.values()), deadline_s):
-            raise TimeoutError("no reader: the overlay did not come up")
+        self._end.wait_for_readers(self._publishers.values(), deadline_s)
 
     def receive(self, deadline_s: float) -> tuple[str, bytes] | None:
         """Return the next message with its topic; None when the monotonic second passed."""
         while not self._arrived:
             if time.monotonic() >= deadline_s:
                 return None
-            self._runtime.step(deadline_s)
-            for each in self._member.poll_messages():
+            self._end.runtime.step(deadline_s)
+            for each in self._end.member.poll_messages():
                 self._arrived.append((self._labels[each.topic], each.delivered.message))
         return self._arrived.popleft()
 

@@ -1,18 +1,19 @@
-"""Settings of a baseline process as one argument, and its replies as lines of JSON.
+"""Process's side of a bench: its settings as one argument, commands to it and its replies as lines of JSON.
 
-I/O. Standard output.
-
+I/O. Standard input and output. ``peers.process`` is the other side.
 """
 
 from __future__ import annotations
 
 import json
+import select
 import sys
 from dataclasses import asdict, dataclass
+from typing import Any
 
 from peers.exchange import Load
 
-__all__ = ["EndSettings", "say"]
+__all__ = ["EndSettings", "order_waits", "read_order", "say"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,3 +47,17 @@ class EndSettings:
 def say(**values: object) -> None:
     """Print one line of JSON for the parent process."""
     print(json.dumps(values), flush=True)
+
+
+def read_order() -> dict[str, Any]:
+    """Wait for the next command; the process ends with its bench."""
+    line = sys.stdin.readline()
+    if not line:
+        sys.exit(0)
+    order: dict[str, Any] = json.loads(line)
+    return order
+
+
+def order_waits() -> bool:
+    """Return whether ``read_order`` would return at once. One line is read at a time, so none is in a buffer."""
+    return bool(select.select([sys.stdin], [], [], 0)[0])

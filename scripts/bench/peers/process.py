@@ -1,7 +1,7 @@
-"""Process of a baseline: started on a machine of the row, read, ended.
+"""Process of a bench: started on a machine, controlled by lines of JSON, ended.
 
-I/O. Its standard error goes to a file of the run, whose last line is the reason if it fails.
-
+I/O. Its standard error goes to a file of the run, whose last line is the reason if it fails. ``peers.jsonl`` is the
+other side.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import select
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -21,10 +21,12 @@ from typing import Final
 from gdp.host.processes import Process, end_all
 from gdp.host.run_registry import Run
 
-__all__ = ["FailedError", "Started"]
+__all__ = ["FailedError", "Started", "figures_of", "floats_of"]
 
 _BENCH: Final = Path(__file__).resolve().parents[1]
 _REASON_CHARS: Final = 200
+_CLOSE_S: Final = 5.0
+_ANSWER_S: Final = 600.0
 
 
 class FailedError(Exception):
@@ -36,10 +38,17 @@ class Started:
 
     Args:
         command: from the command line to the one that enters the machine.
+        has_orders: it reads commands, and ends by itself when there are no more.
     """
 
     def __init__(
-        self, run: Run, what: str, command: Callable[[Sequence[str]], list[str]], arguments: Sequence[str]
+        self,
+        run: Run,
+        what: str,
+        command: Callable[[Sequence[str]], list[str]],
+        arguments: Sequence[str],
+        *,
+        has_orders: bool = False,
     ) -> None:
         self._what = what
         self._unread = b""
@@ -47,7 +56,7 @@ class Started:
         with self._log.open("wb") as log:
             self._process = subprocess.Popen(
                 command([sys.executable, *arguments]),
-                stdin=subprocess.DEVNULL,
+                stdin=subprocess.PIPE if has_orders else subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=log,
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (str(_BENCH), os.getenv("PYTHONPATH"))))},
@@ -69,6 +78,12 @@ class Started:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        if self._process.stdin is not None:
+            with suppress(BrokenPipeError):  # it ended before
+                self._process.stdin.close()
+            self._process.stdin = None
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(_CLOSE_S)
         if self._process.poll() is None:
             with suppress(ProcessLookupError):  # it ended by itself just now
                 end_all([Process.from_pid(self.pid)])
@@ -78,12 +93,25 @@ class Started:
         """Return the next line that it prints, a JSON object.
 
         Raises:
-            FailedError: it ended, or printed nothing in time, or something else.
+            FailedError: it ended, or printed nothing in time, or a reason why it refuses, or something else.
         """
         said = json.loads(self.read_line(patience_s))
         if not isinstance(said, dict):
             raise FailedError(f"{self._what} said {said!r}")
+        if "refused_because" in said:
+            raise FailedError(str(said["refused_because"]))
         return said
+
+    def tell(self, **values: object) -> None:
+        """Send a command, without waiting for an answer."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(json.dumps(values).encode() + b"\n")
+        self._process.stdin.flush()
+
+    def ask(self, **values: object) -> dict[str, object]:
+        """Send a command and return the answer; raises as ``read``."""
+        self.tell(**values)
+        return self.read(_ANSWER_S)
 
     def has_line(self, patience_s: float) -> bool:
         """Return whether a line is ready, or arrives in time; raises as ``read`` where none can arrive."""
@@ -114,3 +142,20 @@ class Started:
         lines = self._log.read_text(encoding="utf-8", errors="replace").split("\n")
         said = [line.strip() for line in lines if line.strip()]
         return said[-1][-_REASON_CHARS:] if said else "without a word"
+
+
+def figures_of(said: Mapping[str, object]) -> dict[str, float]:
+    """Return the figures of a report, by key."""
+    return {key: value for key, value in said.items() if isinstance(value, int | float)}
+
+
+def floats_of(said: Mapping[str, object], key: str) -> list[float]:
+    """Return a list of figures of a report.
+
+    Raises:
+        FailedError: it has none.
+    """
+    values = said.get(key)
+    if not isinstance(values, list):
+        raise FailedError(f"a list {key!r} was expected, not {said}")
+    return [float(value) for value in values]

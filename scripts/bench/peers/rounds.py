@@ -4,7 +4,6 @@ I/O. Makes the rows and removes them.
 
 A baseline that fails the first time is reported as absent, with its reason. One that fails later has no figures in
 that round, and the results list the failure.
-
 """
 
 from __future__ import annotations

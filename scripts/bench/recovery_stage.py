@@ -17,6 +17,8 @@ from typing import Final, TypeVar
 
 from peers.process import FailedError, Started
 from report import progress
+from testbed import Lab
+from topologies import single
 
 from fog.providers.local import fault_injection
 from fog.site import open_site
@@ -25,13 +27,12 @@ from fog.supervisor.infrastructure import local_provider
 from fog.supervisor.journal import Journal
 from fog.supervisor.record import Record
 from fog_demo.stage import ENVIRONMENT, STATE, end_all_of, fog_command, standing_runs, sweep
-from gdp.simulation.namespaces import Namespaces
-from gdp.simulation.topology import DomainPlan, Topology
 
 __all__ = ["Cluster"]
 
 _LAUNCH_FILE: Final = Path(__file__).resolve().parents[2] / "examples" / "echo.launch.py"
 _ROBOT: Final = "robot"
+_ENVIRONMENT: Final = [f"{name}={value}" for name, value in ENVIRONMENT.items()]
 _LAUNCHED: Final = 2  # by the launch file
 _REPORT_S: Final = 1.0
 _DEPTH: Final = 1_000  # answers to all calls of an outage come in one burst
@@ -64,23 +65,15 @@ class Cluster:
         self._undo = ExitStack()
         with ExitStack() as undo:
             undo.callback(end_all_of, self._run)
-            self._spaces = Namespaces(Topology((), (DomainPlan("home", (_ROBOT,)),), ()), self._run)
+            self._lab = Lab(self._run, single(_ROBOT))
             progress(f"{machines} machines boot")
             self._launch()
             self._site = open_site(None, self._run.directory / STATE)
             self._journal = undo.enter_context(closing(Journal(self._site.journal)))
             self._runs = local_provider(self._site).runs
-            reported = [
-                "-m",
-                "fog_demo.caller",
-                "--ros-args",
-                "-p",
-                f"rate_hz:={rate_hz}",
-                "-p",
-                f"report_s:={_REPORT_S}",
-            ]
-            reported += ["-p", f"depth:={_DEPTH}"]
-            self._caller = undo.enter_context(self._start("caller", reported))
+            parameters = {"rate_hz": rate_hz, "report_s": _REPORT_S, "depth": _DEPTH}
+            words = [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
+            self._caller = undo.enter_context(self._start("caller", ["-m", "fog_demo.caller", "--ros-args", *words]))
             end_s = time.monotonic() + _PATIENCE_S
             while not self._caller.read(_PATIENCE_S)["answered"]:
                 if time.monotonic() > end_s:
@@ -176,7 +169,7 @@ class Cluster:
         os.kill(self._caller.pid, signal.SIGUSR1)
         while not (said := self._caller.read(_PATIENCE_S))["done"]:
             pass  # an earlier line of progress
-        for line in (self._run.directory / "caller.log").read_text(encoding="utf-8").splitlines():
+        for line in (self._run.directory / f"caller-at-{_ROBOT}.log").read_text(encoding="utf-8").splitlines():
             progress(f"caller: {line}")
         calls, answered, wrong, unserved = (int(str(said[key])) for key in ("calls", "answered", "wrong", "unserved"))
         return {"requests": calls + unserved, "failed": calls - answered + wrong + unserved}
@@ -191,16 +184,13 @@ class Cluster:
 
     def _fog(self, *words: str) -> None:
         argv = [sys.executable, *fog_command(self._run, words)]
-        ended = subprocess.run(self._command(argv), capture_output=True, text=True, timeout=_LAUNCH_S, check=False)
+        command = self._lab.command(_ROBOT, argv, _ENVIRONMENT)
+        ended = subprocess.run(command, capture_output=True, text=True, timeout=_LAUNCH_S, check=False)
         if ended.returncode:
             raise FailedError(f"fog {words[0]}: {(ended.stderr or ended.stdout).strip()}")
 
     def _start(self, what: str, arguments: Sequence[str]) -> Started:
-        return Started(self._run, what, self._command, arguments)
-
-    def _command(self, argv: Sequence[str]) -> list[str]:
-        reported = [f"{name}={value}" for name, value in ENVIRONMENT.items()]
-        return self._spaces.command(_ROBOT, ["env", *reported, *argv])
+        return self._lab.start(_ROBOT, what, arguments, _ENVIRONMENT)
 
     def _until(self, found: Callable[[], T | None], what: str) -> T:
         """Poll until a state is reached that sends no event."""

@@ -1,0 +1,61 @@
+"""Network devices of a namespace: addresses, bridges, counters. Each function works in the namespace of its caller.
+
+I/O. Netlink.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from pyroute2 import IPRoute
+
+__all__ = ["add_address", "add_bridge", "hand_over", "mac_addresses", "received", "set_mtu", "set_up"]
+
+
+def add_address(device: str, address: str, *, prefix_bits: int = 24) -> None:
+    """Give a device an IPv4 address."""
+    with IPRoute() as here:
+        (index,) = here.link_lookup(ifname=device)
+        here.addr("add", index=index, address=address, prefixlen=prefix_bits)
+
+
+def add_bridge(name: str, devices: Sequence[str] = ()) -> None:
+    """Join devices by a new bridge without spanning tree."""
+    with IPRoute() as here:
+        here.link("add", ifname=name, kind="bridge", br_stp_state=0, br_forward_delay=0)
+        (bridge,) = here.link_lookup(ifname=name)
+        for device in devices:
+            here.link("set", index=here.link_lookup(ifname=device)[0], master=bridge)
+        here.link("set", index=bridge, state="up")
+
+
+def set_up(device: str) -> None:
+    """Set a device up."""
+    with IPRoute() as here:
+        here.link("set", index=here.link_lookup(ifname=device)[0], state="up")
+
+
+def set_mtu(device: str, mtu: int) -> None:
+    """Set the MTU of a device, in bytes."""
+    with IPRoute() as here:
+        here.link("set", index=here.link_lookup(ifname=device)[0], mtu=mtu)
+
+
+def hand_over(device: str, namespace: int) -> None:
+    """Move a device to the namespace of a descriptor."""
+    with IPRoute() as here:
+        here.link("set", index=here.link_lookup(ifname=device)[0], net_ns_fd=namespace)
+
+
+def received(devices: Sequence[str]) -> dict[str, int]:
+    """Return how many frames have come in, by device."""
+    with IPRoute() as here:
+        links = {link.get_attr("IFLA_IFNAME"): link.get_attr("IFLA_STATS64") for link in here.get_links()}
+    return {device: links[device]["rx_packets"] for device in devices}
+
+
+def mac_addresses(devices: Sequence[str]) -> dict[str, bytes]:
+    """Return the MAC addresses, by device."""
+    with IPRoute() as here:
+        links = {link.get("ifname"): link.get("address") for link in here.get_links()}
+    return {device: bytes.fromhex(links[device].replace(":", "")) for device in devices}
