@@ -78,7 +78,8 @@ class End:
     def __init__(self, config: Path, spin_s: float) -> None:
         settings = RibConfig.load(config)  # identity, domain and iface are all that an endpoint needs
         identity, policy = load_member(settings.identity, settings.domain, Role.PROXY)
-        self.member = Participant(identity, policy, NodeSettings(incarnation(), wall_clock_ms(), secrets.token_bytes))
+        node = NodeSettings(incarnation=incarnation(), first_sequence=wall_clock_ms(), random_bytes=secrets.token_bytes)
+        self.member = Participant(identity, policy, node)
         self.plane = RawPlane([settings.iface])
         self.runtime = Runtime(self.member, self.plane, spin_s=spin_s)
         self.topics: dict[str, Topic] = {}

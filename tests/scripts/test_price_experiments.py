@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import availability
 import numpy as np
 import pytest
 import table1
+from experiment import OUTPUT
 
 from gdp.errors import LocalError
 
@@ -28,7 +28,7 @@ def test_a_region_without_prices_is_refused() -> None:
 
 
 def test_the_page_of_table_one_is_of_the_shipped_prices() -> None:
-    shown = Path(table1.OUTPUT / "table1.md").read_text()
+    shown = (OUTPUT / "table1.md").read_text()
     assert shown == table1.page("us-east-1", table1.bills("us-east-1"), table1.applications())
 
 

@@ -73,7 +73,9 @@ class Source:
 class Caller:
     """Caller of one service at an even rate: all replicas receive the request, the first response counts."""
 
-    def __init__(self, station: End, settings: dict[str, Any], token: bytes, incarnation_id: int, out: RecordWriter) -> None:
+    def __init__(
+        self, station: End, settings: dict[str, Any], token: bytes, incarnation_id: int, out: RecordWriter
+    ) -> None:
         self._station, self._token, self._out, self._incarnation_id = station, token, out, incarnation_id
         self._channel, self._timeout_s = settings["channel"], float(settings["timeout_s"])
         self._stream, self._name = station.call(settings["name"]), station.name_of(settings["name"])
