@@ -18,8 +18,6 @@ class Offer:
 
     Args:
         region: in the provider's notation.
-        type_name: machine type in the provider's notation.
-        hardware: hardware of the type.
         is_spot: cheaper, and may be preempted.
     """
 

@@ -53,8 +53,6 @@ class Priced:
     """A launch file's plan with the offers chosen for its machines.
 
     Args:
-        choice: for each machine of the plan.
-        latencies: of the regions that have offers.
         target: result for the plan's availability; None: the plan has no availability.
         topology: the gateways to the machines; None: their provider has none.
     """

@@ -24,12 +24,7 @@ __all__ = ["Market", "choices", "market", "reached", "refusal"]
 
 @dataclass(frozen=True, slots=True)
 class Market:
-    """Offers and latencies.
-
-    Args:
-        offers: with enough hardware for a machine of the plan.
-        latencies: of all regions with an offer.
-    """
+    """Offers and latencies."""
 
     offers: tuple[Offer, ...]
     latencies: Mapping[str, Latency]

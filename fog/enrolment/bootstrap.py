@@ -90,12 +90,8 @@ def machine_boot(
     """Return the bootstrap bundle of a machine; its only secret is the token.
 
     Args:
-        name: of the machine.
-        command: command line of a node on the machine.
-        ticket: for its ``machine_seats``.
         iface: device of the machine towards the overlay.
         shares_host: whether other machines run on the same host.
-        lease_s: of its advertisements.
         uplink: device that the machine has while it is the gateway of its group; empty: it never is the gateway.
     """
     domain = 1 + int(name[1:]) % _DOMAINS

@@ -32,8 +32,6 @@ def revoke_credentials(
 
     Args:
         fingerprints: in hex.
-        until_unix_s: end of validity of the memberships.
-        unix_s: now.
 
     Raises:
         LocalError: the domain is missing, or the folder cannot be written.

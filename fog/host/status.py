@@ -26,7 +26,6 @@ class ProgramStatus:
     Args:
         pid: process id, also of its process group; None: it does not run.
         up: it reported that it is ready.
-        restarts: number of restarts.
     """
 
     pid: int | None = None

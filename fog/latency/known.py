@@ -56,7 +56,6 @@ class Latencies:
     Args:
         folder: state folder, which holds the measurements.
         stated: region -> ms; takes precedence over measurements.
-        measure: probe function; replaced in tests.
     """
 
     def __init__(

@@ -31,7 +31,6 @@ class ClusterSpec:
         defaults: keys of rules on the robot's side for discovered interfaces.
         keep: whether the cluster continues when the launch ends.
         availability: share of time for which at least one machine is to serve; None: ``machines`` is the full list.
-        notes: messages for the user.
     """
 
     name: str

@@ -36,9 +36,6 @@ def offered(nodes: Sequence[CloudNode], *, cache: Path | None = None) -> Found:
 
     Topics are not discovered, because a launch file must select the topics to export.
 
-    Args:
-        cache: file of cached results; None: ``cache_file()``.
-
     Raises:
         LocalError: a node is not found, ends, or offers no interface; or ROS 2 is not installed.
     """

@@ -38,7 +38,6 @@ class Loaded:
 
     Args:
         keep: whether the cluster continues when the launch ends.
-        notes: messages for the user.
         is_known: whether the plan contains the exported interfaces; otherwise they are still to be discovered.
     """
 

@@ -54,8 +54,6 @@ def parameters_of_file(document: object, where: str, name: str | None, namespace
     """Return the arguments that set a node's parameters from a parameter file.
 
     Args:
-        document: parsed YAML of the file.
-        where: its path, for errors.
         name, namespace: of the node; None: not given, so the node's code determines it.
 
     Raises:

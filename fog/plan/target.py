@@ -32,7 +32,6 @@ class Target:
 
     Args:
         availability: share of time, in (0, 1), for which at least one machine is to serve.
-        machines: requests.
         p_vm: share of time for which a spot machine is down.
         p_system: share of time for which all are down.
     """

@@ -143,7 +143,6 @@ class Placed:
 
     Args:
         path: absolute path.
-        mode: permission bits.
     """
 
     path: str

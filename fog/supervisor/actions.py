@@ -23,7 +23,6 @@ class Done:
 
     Args:
         result: result of the provider; empty if there is none.
-        error: why it failed.
     """
 
     cluster: str

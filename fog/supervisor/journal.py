@@ -165,11 +165,7 @@ class Journal:
                 _tell(file, now_s, spec.cluster, spec.name, what, detail, since_unix_s)
 
     def machines(self, cluster: str, *, gone: bool = True) -> list[Record]:
-        """Return the machines of a cluster in the order of their requests.
-
-        Args:
-            gone: include machines that are gone.
-        """
+        """Return the machines of a cluster in the order of their requests."""
         query = "SELECT name, record FROM machines WHERE cluster = ?" + ("" if gone else " AND is_gone = 0")
         with _translated(self._path):
             rows = self._file.execute(query, (cluster,)).fetchall()

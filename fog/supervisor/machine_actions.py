@@ -36,8 +36,6 @@ class MachineActions:
     """Executor of actions on a site's machines, which writes their results.
 
     Args:
-        provider: provider of the machines; may be replaced.
-        command: returns the command line of a node.
         wake: called when an action has ended, from its thread.
     """
 

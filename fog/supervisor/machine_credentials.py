@@ -51,9 +51,6 @@ class MachineCredentials:
     def issue_ticket(self, plan: ClusterPlan, name: str, now_s: float, *, is_gateway: bool) -> tuple[Ticket, float]:
         """Return a new machine's ticket, and the end of validity of its credentials (Unix time).
 
-        Args:
-            is_gateway: the machine may become the gateway of its group.
-
         Raises:
             LocalError: the domain is missing, or its root certificate has expired.
         """

@@ -18,11 +18,7 @@ _OFFERS_S: Final = 60.0  # validity of a price list
 
 
 class OfferCache:
-    """Offers by machine request.
-
-    Args:
-        latencies: of regions; measured in the background for regions with offers.
-    """
+    """Offers by machine request."""
 
     def __init__(self, latencies: Latencies) -> None:
         self.latencies = latencies

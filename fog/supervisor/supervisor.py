@@ -44,10 +44,7 @@ class Supervisor:
     """Supervisor that keeps the clusters of a site in their desired state.
 
     Args:
-        tickets: store of enrolment tickets.
-        command: returns the command line of a node.
         heard: servers that the overlay reports; None: the overlay cannot be queried.
-        on_names: called when the watch needs more names.
     """
 
     def __init__(

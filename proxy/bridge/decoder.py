@@ -39,7 +39,6 @@ class MessageDecoder:
 
         Args:
             known: this machine's description of the type; None where it has none.
-            ros: ROS version of the local graph.
 
         Raises:
             DefinitionError: the definitions differ, or this ROS has no such type.

@@ -62,9 +62,6 @@ _NOTICE_S: Final = 1.0
 class ExposedService:
     """Lets remote clients call one local server.
 
-    Args:
-        random_start: the first number of a call here, random.
-
     Raises:
         LocalError: this machine does not know a type.
     """

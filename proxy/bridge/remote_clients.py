@@ -30,11 +30,7 @@ class _Caller:
 
 
 class RemoteClients:
-    """All clients of one service.
-
-    Args:
-        ours: the service on this machine.
-    """
+    """All clients of one service."""
 
     def __init__(self, ours: Exchange, ros: RosVersion) -> None:
         self._ours = ours

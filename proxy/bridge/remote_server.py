@@ -26,11 +26,8 @@ class RemoteServer:
     """One incarnation of a remote server.
 
     Args:
-        description: as the server sent it.
         exchange: the same, decoded; None where it has no valid form here.
         ours: the service as this machine describes it.
-        answers: decoders by service.
-        news: decoders by topic.
     """
 
     incarnation: int

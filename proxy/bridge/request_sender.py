@@ -25,8 +25,6 @@ class RequestSender:
     """Sends the effects of the calls of each part; effects for all servers wait for capacity of their common stream.
 
     Args:
-        service: name of the service.
-        goals: of an action.
         publisher: the stream that all servers receive.
     """
 

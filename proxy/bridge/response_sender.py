@@ -23,8 +23,6 @@ class ResponseSender:
     """Encodes and sends the messages of the local server.
 
     Args:
-        service: name of the service.
-        exchange: the service on this machine.
         serving: keeps responses for clients that repeat a request.
         publisher: the stream that all clients receive.
     """

@@ -33,9 +33,7 @@ class ServerDiscovery:
     """Reachable remote servers, each as this machine decodes it.
 
     Args:
-        service: name of the service.
         calls: of each part; they get every change of the servers.
-        goals: of an action.
         opened: called with this machine's description of the service, when the first server has a valid description.
         closed: called with the reason when the last server is gone.
 

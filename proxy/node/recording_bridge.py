@@ -29,9 +29,6 @@ def open_recording_bridge(
 ) -> Iterator[Bridge]:
     """Begin every flow between a recording and the overlay; after a SIGHUP delegations are read again.
 
-    Args:
-        rules: those of ``settings`` that apply.
-
     Raises:
         LocalError: a rule of ``settings`` has no valid delegation, or a topic cannot be published.
     """

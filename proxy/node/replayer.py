@@ -72,7 +72,6 @@ class Replay:
     """One replay of a recording.
 
     Args:
-        bridge: its flows exist.
         rate: 1: as recorded, 2: twice as fast, 0: as fast as readers confirm.
         report: called about twice a second while replaying.
     """

@@ -72,8 +72,6 @@ def compare(sent: Path | str, received: Path | str, *, exact: bool) -> list[Topi
     """Compare two recordings; topics in the order of the first.
 
     Args:
-        sent: the replayed recording.
-        received: the recording at the receiver.
         exact: compare the exact bytes; otherwise topics whose bytes differ are compared in canonical form.
 
     Raises:

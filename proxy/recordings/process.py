@@ -74,7 +74,6 @@ class BagProcess:
     """A running decoder.
 
     Args:
-        path: the recording.
         scratch: folder that it may write to.
 
     Raises:

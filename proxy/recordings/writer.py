@@ -96,7 +96,6 @@ class BagWriter:
         """Record one message.
 
         Args:
-            handle: from ``add``.
             stamp_ns: Unix time; of ROS 1 at most 32 bits of seconds.
             raw: the message in its own wire form.
 

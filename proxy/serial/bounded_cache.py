@@ -29,7 +29,6 @@ class BoundedCache(Generic[_Result]):
     """Keeps results, and errors of one kind.
 
     Args:
-        count_max: results kept.
         refusal: the error that is kept as a result.
     """
 

@@ -46,9 +46,7 @@ class Channel:
     """One publisher's topic, or one topic of a recording.
 
     Args:
-        topic: the local name.
         type_name: as ROS 2 writes it (``sensor_msgs/msg/Image``), for ROS 1 too.
-        ros: ROS version of the wire form.
         hash: md5 sum for ROS 1, ``RIHS01_...`` for ROS 2; empty where unknown.
         definition: full text, used types included; empty where unknown, or for a type without fields.
         definition_format: of ``definition``; empty: there is none.

@@ -39,7 +39,6 @@ class Pace:
     """Timing of the scenario.
 
     Args:
-        rate_hz: requests a second.
         calm_s: seconds of undisturbed traffic before, between and after the faults.
         notice_s: between a preemption's notice and its end.
     """

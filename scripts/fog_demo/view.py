@@ -56,11 +56,7 @@ class Counts:
 
 
 class View:
-    """Display of steps, machines, events and counts; a context manager.
-
-    Args:
-        console: destination.
-    """
+    """Display of steps, machines, events and counts; a context manager."""
 
     def __init__(self, console: Console) -> None:
         self._console = console

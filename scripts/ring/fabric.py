@@ -29,9 +29,7 @@ class Overlay:
     """The overlay of one run, from its creation; other modules start the proxies.
 
     Args:
-        options: of the run.
         run: removes what is created here.
-        teller: reports progress.
 
     Raises:
         LocalError: the kernel refuses namespaces.

@@ -61,7 +61,6 @@ class Kill:
     """A process killed with SIGKILL after ``after_s`` and, unless ``until_s`` is None, restarted.
 
     Args:
-        role: of the process.
         of: a switch; for a RIB its domain, or the switch to which it is attached.
     """
 
@@ -167,7 +166,6 @@ def check_faults(topology: Topology, faults: Sequence[Fault], duration_s: float 
 
     Args:
         topology: with two proxies.
-        faults: in any order.
         duration_s: of the traffic; None: unknown in advance.
 
     Raises:

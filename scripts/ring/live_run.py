@@ -37,10 +37,8 @@ class LiveRing:
     """The ring of one live run, from its creation.
 
     Args:
-        options: of the run.
         live: ROS versions of the sides.
         run: removes what is created here.
-        teller: reports progress.
 
     Raises:
         LocalError: a ROS is missing, or the kernel refuses namespaces.

@@ -53,8 +53,6 @@ class Replay:
         children: supervised throughout; the receiver is released when it is requested to finish.
         sender: ready.
         receiver: ready.
-        total: messages expected.
-        teller: reports the traffic.
     """
 
     def __init__(

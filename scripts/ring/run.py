@@ -36,10 +36,7 @@ class Ring:
     """The ring of one run, from its creation.
 
     Args:
-        options: of the run.
         run: removes what is created here.
-        teller: reports progress.
-        bag: the recording.
 
     Raises:
         ConfigError: the recording cannot be read or is empty.

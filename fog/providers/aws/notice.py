@@ -95,7 +95,6 @@ class Watch:
 
     Args:
         notice: called once with the time of the preemption (Unix time).
-        drain: called once.
     """
 
     def __init__(self, metadata: Metadata, notice: Callable[[float], None], drain: Callable[[], None]) -> None:

@@ -27,9 +27,7 @@ class Ground:
     """Prerequisites of a region's machines.
 
     Args:
-        image: id of the image.
         root_device: name under which the image expects its disk.
-        security_groups: ids of the groups.
     """
 
     image: str

@@ -36,7 +36,6 @@ class DelayLine:
     """Delayed frames of both directions, ordered by due time.
 
     Args:
-        delay_ns: delay of each frame.
         most_bytes: limit of queued bytes; frames beyond it are dropped and counted.
     """
 

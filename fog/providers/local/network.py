@@ -71,8 +71,6 @@ class Network:
     """The single network of a site.
 
     Args:
-        runs: registry with its record.
-        topology: its gateways.
         boot: returns a gateway's bundle for its label and its ports.
         uplink: the robot's end of its link to the first gateway.
         robot: namespace of that end; None: the namespace of the caller of ``open``.

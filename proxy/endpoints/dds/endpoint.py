@@ -33,10 +33,6 @@ class DdsEndpoint:
 
     CYCLONEDDS_URI configures the network, as for every program with Cyclone DDS.
 
-    Args:
-        domain: the domain id.
-        node: the name of the virtual node.
-
     Raises:
         LocalError: the domain cannot be joined.
     """

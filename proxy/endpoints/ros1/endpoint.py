@@ -57,7 +57,6 @@ class _Held:
     Args:
         kind: of the frame that establishes it, with ``payload``.
         kept: last messages of a latched publisher.
-        calls: under way.
     """
 
     kind: Kind

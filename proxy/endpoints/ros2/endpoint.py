@@ -38,7 +38,6 @@ class Ros2Endpoint:
 
     Args:
         domain: ROS domain id, 0 to 232.
-        node: name of the virtual node (``proxy_node_name``).
 
     Raises:
         LocalError: ROS 2 is not installed, or does not start; the text states what to do.

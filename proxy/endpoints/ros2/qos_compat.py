@@ -16,9 +16,6 @@ def incompatibility(role: Role, channel: Channel, qos: Qos, ends: Graph) -> str:
     """Return why some entity of the opposite role cannot be matched, empty where all can.
 
     Args:
-        role: the endpoint's own, PUBLISHES or SUBSCRIBES.
-        channel: the endpoint's own.
-        qos: the offered or requested profile.
         ends: the other entities of the topic; those of the same role are ignored.
     """
     for end in sorted((end for end in ends if end.role is not role), key=lambda end: (end.node, end.key)):
