@@ -60,7 +60,7 @@ def cancel_of(goal: bytes) -> bytes:
     return b"\0\1\0\0" + goal + bytes(_STAMP["<"].size)
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(slots=True, eq=False, kw_only=True)
 class _Goal:
     leader: Name | None = None
     holders: set[Name] = field(default_factory=set)

@@ -21,7 +21,7 @@ from proxy.wire.service import Exchange
 __all__ = ["RemoteServer"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RemoteServer:
     """One incarnation of a remote server.
 
@@ -55,12 +55,12 @@ class RemoteServer:
         services = zip(theirs.services, ours.services, strict=True)
         topics = zip(theirs.topics, ours.topics, strict=True)
         server = cls(
-            incarnation,
-            description,
-            theirs,
-            ours,
-            tuple(MessageDecoder.ready(a.response, theirs.encoding, b.response, ros) for a, b in services),
-            tuple(MessageDecoder.ready(a, theirs.encoding, b, ros) for a, b in topics),
+            incarnation=incarnation,
+            description=description,
+            exchange=theirs,
+            ours=ours,
+            answers=tuple(MessageDecoder.ready(a.response, theirs.encoding, b.response, ros) for a, b in services),
+            news=tuple(MessageDecoder.ready(a, theirs.encoding, b, ros) for a, b in topics),
         )
         for our, their in zip(ours.services, theirs.services, strict=True):
             MessageDecoder.ready(our.request, ours.encoding, their.request, their.ros)  # raises with the reason

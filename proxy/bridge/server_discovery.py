@@ -125,7 +125,7 @@ class ServerDiscovery:
                 self._is_open = True
         except GdpError as error:
             self._site.faults.report(self._flow_spec.local, Fault.OTHER_TYPE, str(error))
-            self.servers[name] = RemoteServer(incarnation, description)
+            self.servers[name] = RemoteServer(incarnation=incarnation, description=description)
             return
         self.servers[name] = server
         self._announce(name, server, now_s)

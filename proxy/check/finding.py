@@ -16,7 +16,7 @@ __all__ = ["Direction", "Finding", "Match"]
 Direction: TypeAlias = Literal["expose", "import"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Match:
     """One name under a rule.
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from enum import Enum
 from typing import Final, NamedTuple, Protocol, TypeAlias
 
@@ -68,6 +68,7 @@ class GraphEntity:
     type_name: str
     node: str
     key: str
+    _: KW_ONLY
     hash: str = ""
     qos: Qos | None = None
 

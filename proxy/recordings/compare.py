@@ -23,7 +23,7 @@ _DIGEST_BYTES: Final = 16
 _Publisher: TypeAlias = "str | None"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TopicComparison:
     """Result for one topic.
 

@@ -111,13 +111,13 @@ class _Looking:
         left = event.count("under_way") if event.fields.get("done") else 0
         won = sorted((name, int(str(count))) for name, count in event.part("by_machine").fields.items())
         self.counts = Counts(
-            event.count("calls") + event.count("unserved"),
-            answered,
-            event.count("failed") + event.count("wrong") + event.count("unserved") + left,
-            event.number_or_none("median_ms"),
-            event.number_or_none("p99_ms"),
-            rate,
-            tuple(won),
+            requests=event.count("calls") + event.count("unserved"),
+            answered=answered,
+            failed=event.count("failed") + event.count("wrong") + event.count("unserved") + left,
+            median_ms=event.number_or_none("median_ms"),
+            p99_ms=event.number_or_none("p99_ms"),
+            rate=rate,
+            by_machine=tuple(won),
         )
 
 

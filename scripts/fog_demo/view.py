@@ -26,7 +26,7 @@ _EVENTS: Final = 10  # number of the newest events shown
 _PLAIN_EVERY_S: Final = 4.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Counts:
     """Request statistics of the robot's node.
 

@@ -25,7 +25,7 @@ LIVE_S: Final = 10.0
 _LIVE_MAX_S: Final = 3_600.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Options:
     """One run of the ring. Paths are absolute, because the processes that read them have other working directories.
 

@@ -18,7 +18,7 @@ __all__ = ["ProgressReporter", "Traffic"]
 _PLAIN_EVERY_S: Final = 2.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Traffic:
     """State of the replay, combined from both sides.
 
@@ -78,7 +78,7 @@ class ProgressReporter:
 
     def begin_traffic(self, total: int) -> None:
         """Begin the report of ``total`` messages."""
-        self._reported, self._reported_s = Traffic(total), time.monotonic()
+        self._reported, self._reported_s = Traffic(total=total), time.monotonic()
         if self._console.is_terminal:
             columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.fields[words]}"))
             self._bar = Progress(*columns, console=self._console, transient=True)

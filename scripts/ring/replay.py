@@ -62,7 +62,7 @@ class Replay:
         self._sender = sender
         self._receiver = receiver
         self._reporter = reporter
-        self._traffic = Traffic(total)
+        self._traffic = Traffic(total=total)
         self._silence = Silence()
         self._unconfirmed = ""  # names of topics
         self._moved = asyncio.Event()

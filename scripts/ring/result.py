@@ -6,7 +6,7 @@ Sans-I/O.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 
 from proxy.recordings.compare import TopicComparison
 from ring.events import Event
@@ -14,7 +14,7 @@ from ring.events import Event
 __all__ = ["Journey", "Result", "TopicResult", "put_together"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Journey:
     """Measurements of the receiver on one topic.
 
@@ -113,6 +113,7 @@ class Result:
 
     topics: tuple[TopicResult, ...]
     settings: Mapping[str, object]
+    _: KW_ONLY
     unread: str | None = None
     complaints: tuple[str, ...] = ()
     traffic_s: float = 0.0

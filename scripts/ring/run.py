@@ -86,7 +86,12 @@ class Ring:
         comparisons = await self._children.guarded(asyncio.to_thread(compare, self.bag, self.recording, exact=exact))
         topics = put_together(comparisons, report.topics)
         return Result(
-            topics, self.overlay.settings, report.unread, report.complaints, report.traffic_s, report.silent_s
+            topics,
+            self.overlay.settings,
+            unread=report.unread,
+            complaints=report.complaints,
+            traffic_s=report.traffic_s,
+            silent_s=report.silent_s,
         )
 
     def start_again(self) -> Path:

@@ -13,13 +13,12 @@ from typing import TypeVar
 from gdp.errors import LocalError
 from proxy.endpoints.dds.discovery import Discovery
 from proxy.endpoints.dds.graph_cache import GraphCache
-from proxy.endpoints.dds.node import Node
+from proxy.endpoints.dds.node import EntityContext, Node
 from proxy.endpoints.dds.services import Client, Server
 from proxy.endpoints.dds.topics import Publication, Subscription
 from proxy.endpoints.dds.types import hash_of, known_channel
 from proxy.endpoints.endpoint import Event, Graph, GraphChanged, Role
 from proxy.serial.channel import Channel, Qos, RosVersion
-from proxy.serial.empty import NoAnswer
 from proxy.serial.service import Service
 
 __all__ = ["DdsEndpoint"]
@@ -97,7 +96,7 @@ class DdsEndpoint:
             return known
         for peer in self._survey.peers(Role.PUBLISHES, topic, type_name):
             if "/_action/" in topic:
-                return Channel(topic, type_name, 2, peer.hash)
+                return Channel(topic, type_name, 2, hash=peer.hash)
         raise LocalError(
             f"{type_name} is not known here: endpoint dds knows the types of ROS 2's own packages;"
             " use endpoint ros2, or publish it from a machine that has its package"
@@ -117,7 +116,7 @@ class DdsEndpoint:
     def subscribe(self, topic: str, type_name: str, qos: Qos | None) -> int:
         """Subscribe to a topic of any type."""
         handle = next(self._numbers)
-        return self._keep(handle, Subscription(self._node, self._survey, handle, self._tell, topic, type_name, qos))
+        return self._keep(handle, Subscription(self._context(handle), topic, type_name, qos))
 
     def advertise(self, channel: Channel) -> int:
         """Create a publisher of a topic.
@@ -128,8 +127,7 @@ class DdsEndpoint:
         if channel.ros != 2:
             raise LocalError(f"{channel.topic}: messages of ROS {channel.ros} cannot be published in DDS")
         handle = next(self._numbers)
-        publication = Publication(self._node, self._survey, handle, self._tell, channel, hash_of(channel))
-        return self._keep(handle, publication)
+        return self._keep(handle, Publication(self._context(handle), channel, hash_of(channel)))
 
     def publish(self, handle: int, raw: bytes) -> None:
         """Publish one message."""
@@ -148,10 +146,7 @@ class DdsEndpoint:
         if service.ros != 2:
             raise LocalError(f"{service.name}: a service of ROS {service.ros} cannot be served in DDS")
         handle, hashed = next(self._numbers), service.hash if service.hash.startswith("RIHS01_") else ""
-        what = (service.name, service.type_name, hashed)
-        no_answer = NoAnswer.of(service)
-        server = Server(self._node, self._survey, handle, self._tell, *what, no_answer, lambda: next(self._numbers))
-        return self._keep(handle, server)
+        return self._keep(handle, Server(self._context(handle), service, hashed, lambda: next(self._numbers)))
 
     def answer(self, handle: int, ticket: int, raw: bytes) -> None:
         """Answer a request."""
@@ -165,8 +160,7 @@ class DdsEndpoint:
         """Create a client for servers on Cyclone DDS; servers on other vendors raise ``EndpointError`` events."""
         handle = next(self._numbers)
         hashed = next((peer.hash for peer in self._survey.peers(Role.SERVES, name, type_name)), "")
-        client = Client(self._node, self._survey, handle, self._tell, name, type_name, hashed)
-        return self._keep(handle, client)
+        return self._keep(handle, Client(self._context(handle), name, type_name, hashed))
 
     def call(self, handle: int, call: int, raw: bytes) -> None:
         """Send a request."""
@@ -185,6 +179,9 @@ class DdsEndpoint:
         self._discovery.close()
         self._open.clear()
         self._node.leave()
+
+    def _context(self, handle: int) -> EntityContext:
+        return EntityContext(self._node, self._survey, handle, self._tell)
 
     def _keep(self, handle: int, opened: _Open) -> int:
         self._open[handle] = opened

@@ -19,14 +19,16 @@ from cyclonedds.sub import DataReader, Subscriber
 
 from gdp.errors import LocalError
 from proxy.endpoints.dds import library
+from proxy.endpoints.dds.graph_cache import GraphCache
 from proxy.endpoints.dds.naming import user_data
 from proxy.endpoints.dds.node_info import GID_BYTES, INFO_HASH, INFO_TOPIC, INFO_TYPE, write_info
 from proxy.endpoints.dds.opaque import OpaqueTopic
 from proxy.endpoints.dds.profile import offered
 from proxy.endpoints.dds.wait_thread import News, WaitThread
+from proxy.endpoints.endpoint import Event
 from proxy.endpoints.qos import default
 
-__all__ = ["ANY_STATE", "Node", "Reader", "Sample", "Writer"]
+__all__ = ["ANY_STATE", "EntityContext", "Node", "Reader", "Sample", "Writer"]
 
 ANY_STATE: Final = SampleState.Any | ViewState.Any | InstanceState.Any
 _BATCH: Final = 64  # samples read at once
@@ -185,6 +187,15 @@ class Node:
         self._writers.clear()
         self.watch.close()
         del self._info, self.publisher, self.subscriber, self.participant
+
+
+class EntityContext(NamedTuple):
+    """What an entity of the endpoint needs: the node, the graph, its handle, and where its events go."""
+
+    node: Node
+    survey: GraphCache
+    handle: int
+    tell: Callable[[Event], None]
 
 
 def _nothing(samples: list[Sample]) -> None:

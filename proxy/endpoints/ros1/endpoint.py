@@ -15,7 +15,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
@@ -154,10 +154,7 @@ class Ros1Endpoint:
         """Create a publisher; if a local node contradicts, ``EndpointError`` follows."""
         if channel.ros != 1 or not (channel.hash or channel.definition):
             here = self.channel(channel.topic, channel.type_name)
-            channel = Channel(
-                channel.topic, channel.type_name, 1, here.hash, here.definition, here.definition_format,
-                channel.qos, channel.latched, channel.callerid,
-            )  # fmt: skip
+            channel = replace(here, qos=channel.qos, latched=channel.latched, callerid=channel.callerid)
         depth = max(1, channel.qos[0].depth) if channel.qos else 1
         kept: deque[bytes] | None = deque(maxlen=depth) if channel.latched else None
         return self._hold(_Held(Kind.ADVERTISE, channel.to_wire(), kept))
@@ -327,7 +324,7 @@ class Ros1Endpoint:
 
     def _look(self, payload: bytes) -> None:
         ends = frozenset(
-            GraphEntity(Role(role), name, type_name, node, node, md5)
+            GraphEntity(Role(role), name, type_name, node, node, hash=md5)
             for role, name, type_name, node, md5 in cbor2.loads(payload)
         )
         if ends != self._graph or self._is_graph_old:

@@ -98,7 +98,15 @@ class Ros2Endpoint:
                 event_callbacks=self._session.silence(publisher=False),
             )
         handle = cast("SubscriptionHandle", entity.handle)
-        subscription_entity = SubscriptionEntity(self._number(), topic, message, requested, channel, entity, handle)
+        subscription_entity = SubscriptionEntity(
+            number=self._number(),
+            topic=topic,
+            message=message,
+            qos=requested,
+            channel=channel,
+            entity=entity,
+            handle=handle,
+        )
         self._subscription_entity[subscription_entity.number] = subscription_entity
         self._tell_apart(topic)
         self._waiting.add(subscription_entity)
@@ -116,7 +124,9 @@ class Ros2Endpoint:
                 event_callbacks=self._session.silence(publisher=True),
             )
         handle = cast("PublisherHandle", entity.handle)
-        publisher_entity = PublisherEntity(self._number(), channel.topic, offered, known, entity, handle)
+        publisher_entity = PublisherEntity(
+            number=self._number(), topic=channel.topic, qos=offered, channel=known, entity=entity, handle=handle
+        )
         if offered.durability == "transient_local":
             publisher_entity.kept = deque(maxlen=offered.depth)
         self._publisher_entity[publisher_entity.number] = publisher_entity

@@ -33,9 +33,10 @@ def filled(qos: Qos | None, *, latched: bool = False) -> Qos:
     """
     if qos is None:
         durability, depth = ("transient_local", 1) if latched else ("volatile", _DEPTH)
-        return Qos("keep_last", depth, "reliable", durability, (0, 0), (0, 0), "automatic", (0, 0), plain_names=False)
+        return Qos(
+            depth=depth, reliability="reliable", durability=durability, deadline=(0, 0), lifespan=(0, 0), lease=(0, 0)
+        )
     return Qos(
-        history="keep_last",
         depth=_DEPTH_OF_ALL if qos.history == "keep_all" else qos.depth or _DEPTH,
         reliability="best_effort" if qos.reliability == "best_effort" else "reliable",
         durability="transient_local" if qos.durability == "transient_local" else "volatile",

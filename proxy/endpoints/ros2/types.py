@@ -55,7 +55,9 @@ def channel_of(topic: str, type_name: str) -> Channel:
     """
     interface = interface_of(type_name, class_of)
     text = definition_of(interface)
-    return Channel(topic, type_name, 2, type_hash_of(interface), text, "msg" if text else "")
+    return Channel(
+        topic, type_name, 2, hash=type_hash_of(interface), definition=text, definition_format="msg" if text else ""
+    )
 
 
 @lru_cache(maxsize=1024)
