@@ -21,7 +21,7 @@ from fog.launch.resolve import PYTHON, command_line
 from gdp.errors import LocalError
 
 if TYPE_CHECKING:
-    from fog.launch.robot_node import RobotNode
+    from fog.cluster import RobotNode
 
 __all__ = ["INTERRUPTED", "Started", "resolved", "run"]
 

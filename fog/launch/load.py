@@ -15,13 +15,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Final, TypeAlias
 
-from fog.cluster import CloudNode, ClusterPlan, ExportedInterface
+from fog.cluster import CloudNode, ClusterPlan, ExportedInterface, RobotNode
 from fog.launch.cloud_node import cloud_node
 from fog.launch.cluster_spec import ClusterSpec
 from fog.launch.description import DeclareLaunchArgument, LaunchDescription, Node
 from fog.launch.entity import FogCluster
 from fog.launch.lazy_names import has_ros_launch
-from fog.launch.robot_node import RobotNode
 from fog.launch.unreturned import watch
 from gdp.errors import ConfigError, GdpError, LocalError
 

@@ -13,10 +13,9 @@ from launch.actions import ExecuteProcess
 from launch.utilities import perform_substitutions
 from launch_ros.actions import Node
 
-from fog.cluster import CloudNode
+from fog.cluster import CloudNode, RobotNode
 from fog.launch.cluster_spec import ClusterSpec
 from fog.launch.launch_ros_adapter import cloud_node
-from fog.launch.robot_node import RobotNode
 from fog.launch.ros_action import FogCluster
 from gdp.errors import LocalError
 

@@ -13,7 +13,9 @@ from typing import Final
 from fog.cluster import CloudNode, ClusterPlan, MachineRequest
 from fog.enrolment.bootstrap import machine_boot, node_names
 from fog.enrolment.credentials import IssuedCredentials
+from fog.latency.known import Latencies
 from fog.machine import Machine, MachineSpec, MachineState
+from fog.offer import Offer
 from fog.providers.provider import GatewayProvider, Provider
 from fog.site import Site
 from fog.supervisor.actions import ActionRunner
@@ -21,7 +23,6 @@ from fog.supervisor.event_log import EventLog
 from fog.supervisor.final_logs import keep, kept
 from fog.supervisor.journal import LAST_WORDS, Journal
 from fog.supervisor.machine_credentials import MachineCredentials
-from fog.supervisor.offer_cache import OfferCache
 from fog.supervisor.placement import place
 from fog.supervisor.reconcile import Action, Drain, Launch
 from fog.supervisor.record import Outcome, Record
@@ -30,6 +31,29 @@ __all__ = ["ATTACH", "DETACH", "MachineActions"]
 
 ATTACH: Final = "attach uplink"
 DETACH: Final = "detach uplink"
+
+_OFFERS_S: Final = 60.0  # validity of a price list
+
+
+class OfferCache:
+    """A provider's offers by machine request."""
+
+    def __init__(self, latencies: Latencies) -> None:
+        self.latencies = latencies
+        self._offers: dict[MachineRequest, tuple[float, list[Offer]]] = {}
+
+    def clear(self) -> None:
+        """Drop all offers."""
+        self._offers.clear()
+
+    def get(self, provider: Provider, wanted: MachineRequest, now_s: float) -> list[Offer]:
+        """Return the provider's offers for a request, at most one minute old."""
+        at_s, offers = self._offers.get(wanted, (0.0, []))
+        if now_s - at_s >= _OFFERS_S or not offers:
+            offers = provider.offers(wanted.hardware, spot=wanted.is_spot)
+            self._offers[wanted] = now_s, offers
+            self.latencies.refresh_in_background((each.region for each in offers), now_s)
+        return offers
 
 
 class MachineActions:

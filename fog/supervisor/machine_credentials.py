@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 from fog.cluster import ClusterPlan
 from fog.enrolment.bootstrap import machine_seats
-from fog.enrolment.revoking import revoke_credentials
+from fog.enrolment.members import revoke_credentials
 from fog.enrolment.robot_config import reload
 from fog.enrolment.tickets import News, Report, Tickets
 from fog.site import Site

@@ -14,7 +14,8 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from datetime import datetime, timezone
+from typing import TYPE_CHECKING, Final, cast
 
 from fog.hardware import Hardware
 from fog.host.bundle import pack
@@ -24,7 +25,6 @@ from fog.providers.aws.clients import Clients, filters
 from fog.providers.aws.config import AwsConfig
 from fog.providers.aws.errors import asking, is_code
 from fog.providers.aws.instances import CLUSTER, DRAIN, MACHINE, machine_of
-from fog.providers.aws.prices import spot_prices
 from fog.providers.aws.region import ground_of
 from fog.providers.aws.run_request import order
 from fog.providers.cloud_init import lines_of, user_data
@@ -32,6 +32,7 @@ from gdp.errors import LocalError
 
 if TYPE_CHECKING:
     from types_boto3_ec2 import EC2Client
+    from types_boto3_ec2.literals import InstanceTypeType
     from types_boto3_ec2.type_defs import FilterTypeDef, InstanceTypeDef, SpotInstanceRequestTypeDef
 
 __all__ = ["WATCHER", "AwsProvider"]
@@ -41,6 +42,7 @@ log = logging.getLogger(__name__)
 WATCHER: Final = Program("notice", ("{python}", "-m", "fog.providers.aws.notice", "--home", "{home}"))
 _AT_ONCE: Final = 8
 _LIVING: Final = ("pending", "running", "stopping", "stopped")
+_LINUX: Final = ("Linux/UNIX", "Linux/UNIX (Amazon VPC)")
 
 
 class AwsProvider:
@@ -212,3 +214,22 @@ def _split(machine: str) -> tuple[str, str]:
     if not slash or not instance.startswith("i-"):
         raise LocalError(f"aws: {machine!r} is no machine of EC2: expected region/i-...")
     return region, instance
+
+
+def spot_prices(client: EC2Client, type_names: Sequence[str]) -> dict[str, float]:
+    """Return type -> US dollars per hour in its cheapest zone; types that are not sold there are omitted.
+
+    Raises:
+        ClientError, BotoCoreError: boto3's own.
+    """
+    cheapest: dict[str, float] = {}
+    pages = client.get_paginator("describe_spot_price_history").paginate(
+        InstanceTypes=[cast("InstanceTypeType", each) for each in type_names],
+        ProductDescriptions=_LINUX,
+        StartTime=datetime.now(timezone.utc),  # EC2 then returns the current price of each zone
+    )
+    for page in pages:
+        for each in page["SpotPriceHistory"]:
+            usd = float(each["SpotPrice"])
+            cheapest[each["InstanceType"]] = min(usd, cheapest.get(each["InstanceType"], usd))
+    return cheapest

@@ -8,8 +8,7 @@ import pytest
 
 from proxy.endpoints.endpoint import GraphEntity, Role
 from proxy.endpoints.ros2.loopback_filter import LoopbackFilter
-from proxy.endpoints.ros2.qos import conflict, filled
-from proxy.endpoints.ros2.qos_compat import incompatibility
+from proxy.endpoints.ros2.qos import conflict, filled, incompatibility
 from proxy.serial.channel import Channel, Qos
 
 RELIABLE = filled(None)
