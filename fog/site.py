@@ -320,11 +320,7 @@ def open_site(file: Path | None, state: Path | None = None) -> Site:
 
 @contextmanager
 def peek_site(file: Path | None, state: Path | None = None) -> Iterator[Site]:
-    """Yield the same site read-only: no file or key is created. A site that does not exist yet is empty.
-
-    Raises:
-        ConfigError, LocalError: as ``open_site``.
-    """
+    """Yield the same site read-only: no file or key is created. A site that does not exist yet is empty."""
     file, config, folder = _stands_where(file, state)
     if (folder / _SITE).exists():
         yield open_site(file, state)

@@ -41,7 +41,7 @@ PATIENCE: Final = Timeouts()
 
 
 class Supervisor:
-    """Supervisor that keeps the clusters of a site in their desired state.
+    """Supervisor that keeps the clusters of a site in their desired state; ``StoreError``: the journal is unusable.
 
     Args:
         heard: servers that the overlay reports; None: the overlay cannot be queried.
@@ -111,11 +111,7 @@ class Supervisor:
         self._actions.collect_results(time.time())
 
     def reconcile(self) -> None:
-        """Reconcile every cluster once.
-
-        Raises:
-            StoreError: the journal cannot be read or written.
-        """
+        """Reconcile every cluster once."""
         self._actions.collect_results(time.time())
         self._credentials.handle_reports(self._release_misused, time.time())
         for cluster in self._journal.clusters():
@@ -131,11 +127,7 @@ class Supervisor:
                 self._events.add_trouble(name, str(error))
 
     def reconciled(self, begun_unix_s: float) -> None:
-        """Write that clusters without trouble match the journal again after the start at ``begun_unix_s``.
-
-        Raises:
-            StoreError: the journal cannot be written.
-        """
+        """Write that clusters without trouble match the journal again after the start at ``begun_unix_s``."""
         now_s = time.time()
         for each in self._journal.clusters():
             name = each.plan.name

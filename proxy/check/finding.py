@@ -64,11 +64,6 @@ class Finding:
     matches: tuple[Match, ...]
     notes: tuple[str, ...]
 
-    @property
-    def is_faulty(self) -> bool:
-        """Return whether any part of it cannot cross."""
-        return any(match.faults for match in self.matches)
-
     def to_fields(self) -> dict[str, object]:
         """Return the JSON form."""
         return {

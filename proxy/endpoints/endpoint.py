@@ -210,9 +210,6 @@ class Endpoint(Protocol):
             LocalError: a recording cannot be written.
         """
 
-    def subscribers(self, handle: int) -> int:
-        """Return the present number of local subscriptions of a publisher."""
-
     def serve(self, service: Service) -> int:
         """Create the server of ``service.name``; requests arrive as ``RequestReceived``.
 

@@ -165,9 +165,6 @@ class ReplayEndpoint(_TopicsEndpoint):
 
         Args:
             waiting: as for ``BagReader.messages``.
-
-        Raises:
-            ConfigError, RecordingError: the decoder failed.
         """
         for index, stamp_ns, raw in self._reader.messages(waiting):
             subscribed = self._subscribed.get(index)
@@ -186,11 +183,6 @@ class ReplayEndpoint(_TopicsEndpoint):
         """Refuse to publish; raises ``LocalError``."""
         del raw
         raise LocalError(f"{self.label}: handle {handle}: a recording that is replayed takes no messages")
-
-    def subscribers(self, handle: int) -> int:
-        """Return 0."""
-        del handle
-        return 0
 
     def close(self, handle: int) -> None:
         """Close a subscription."""
@@ -238,18 +230,9 @@ class RecordingEndpoint(_TopicsEndpoint):
         return 0 if self._writer is None else self._writer.add(channel)
 
     def publish(self, handle: int, raw: bytes) -> None:
-        """Record one message with the present time as its stamp.
-
-        Raises:
-            LocalError: it cannot be written.
-        """
+        """Record one message with the present time as its stamp."""
         if self._writer is not None:
             self._writer.write(handle, time.time_ns(), raw)
-
-    def subscribers(self, handle: int) -> int:
-        """Return 1: the recording."""
-        del handle
-        return 1
 
     def close(self, handle: int) -> None:
         """Do nothing: recorded messages stay."""

@@ -73,11 +73,7 @@ class Stage:
         self.site_file = run.directory / SITE
 
     async def stand_up(self) -> str:
-        """Start switches, RIB and the robot's proxy; return the data plane of the switches.
-
-        Raises:
-            ChildError: a process failed.
-        """
+        """Start switches, RIB and the robot's proxy; return the data plane of the switches."""
         uplink = f"fog{self._run.id}-up"
         proxy, far_switch = self._write_proxy(), self._write_far_switch(uplink)
         self._write_site(uplink, proxy, far_switch)

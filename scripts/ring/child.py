@@ -26,7 +26,10 @@ _TAIL_LINES: Final = 12
 
 
 class ChildError(GdpError):
-    """A process ended too early, or did not report the awaited event in time; the text shows its last lines."""
+    """A process ended too early, or did not report the awaited event in time; the text shows its last lines.
+
+    Every method of the harness that waits for processes may raise it.
+    """
 
 
 class Child:

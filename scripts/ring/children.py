@@ -60,11 +60,7 @@ class Children:
         return self.start(f"{role} {node}", argv, heard=heard)
 
     async def ready(self, children: Sequence[Child]) -> list[Event]:
-        """Wait until each has reported ``ready``, and return these events; from then on they are required.
-
-        Raises:
-            ChildError: one did not, or a required one ended.
-        """
+        """Wait until each has reported ``ready``, and return these events; from then on they are required."""
         said = await self.guarded(_all(child.wait_for("ready", READY_S) for child in children))
         self._standing += children
         self._changed.set()
@@ -82,11 +78,7 @@ class Children:
         await child.ended
 
     async def guarded(self, work: Coroutine[None, None, T]) -> T:
-        """Run ``work``, but stop at once if a required process ends.
-
-        Raises:
-            ChildError: one ended.
-        """
+        """Run ``work``, but stop at once if a required process ends."""
         task = asyncio.ensure_future(work)
         fallen = asyncio.ensure_future(self._first_to_fall())
         try:

@@ -1,6 +1,7 @@
 """Faults of a run, as data: links cut, proxies that roam, processes killed; and the check that a path remains.
 
-Sans-I/O. All seconds count from the time at which the first message may be sent.
+Sans-I/O. All seconds count from the time at which the first message may be sent. An unknown switch, RIB or proxy raises
+``LocalError``.
 """
 
 from __future__ import annotations
@@ -90,11 +91,7 @@ class Kill:
         return frozenset((f"{self.role}:{self.of}",))
 
     def victims(self, topology: Topology) -> tuple[str, ...]:
-        """Return the switches at which a process of this role is killed.
-
-        Raises:
-            LocalError: there is no such process.
-        """
+        """Return the switches at which a process of this role is killed."""
         if self.role == "switch":
             topology.domain_of(self.of)
             return (self.of,)
@@ -134,11 +131,7 @@ class Roam:
         return cls(found[1], found[2], float(found[3]))
 
     def proxy(self, topology: Topology) -> Attachment:
-        """Return the proxy that roams.
-
-        Raises:
-            LocalError: there is no such proxy.
-        """
+        """Return the proxy that roams."""
         proxies = topology.attached("proxy")
         for at in proxies:
             if at.ifname == self.who:
@@ -153,11 +146,7 @@ Fault: TypeAlias = "Cut | Kill | Roam"
 
 
 def roamers(faults: Iterable[Fault], topology: Topology) -> tuple[Attachment, ...]:
-    """Return the proxies that roam, each once.
-
-    Raises:
-        LocalError: there is no such proxy.
-    """
+    """Return the proxies that roam, each once."""
     return tuple(dict.fromkeys(fault.proxy(topology) for fault in faults if isinstance(fault, Roam)))
 
 

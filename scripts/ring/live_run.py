@@ -58,12 +58,7 @@ class LiveRing:
         self._nodes: list[Child] = []
 
     async def result(self) -> Result:
-        """Run the traffic between robot and server, and compare.
-
-        Raises:
-            ChildError: a process failed.
-            LocalError: a fault cannot be injected.
-        """
+        """Run the traffic between robot and server, and compare."""
         overlay, children = self.overlay, self.overlay.children
         await overlay.stand_up()
         await children.ready([self._start_master(at, graph) for at, graph, _ in self._ends if graph.ros == 1])
@@ -98,10 +93,6 @@ class LiveRing:
     def environment(self, graph: Graph) -> Mapping[str, str]:
         """Return the environment of the processes in a graph."""
         return graph.environment(self._run.directory / "ros-logs", self._profiles)
-
-    def forget(self) -> None:
-        """Close the descriptors of the processes here; they continue."""
-        self.overlay.forget()
 
     async def _live_nodes(self) -> LiveNodes:
         """Start the nodes; return when all are ready."""

@@ -64,20 +64,12 @@ class LiveSession:
         return self._silence.longest_s
 
     async def meet(self) -> None:
-        """Wait until the remote side receives every topic and discovers the service.
-
-        Raises:
-            ChildError: a process failed, or it took too long.
-        """
+        """Wait until the remote side receives every topic and discovers the service."""
         far = (self._live_nodes.listener, self._live_nodes.caller)
         await self._children.guarded(_all(*(child.wait_for("hears", MEET_S) for child in far)))
 
     async def talk(self, seconds: float) -> Heard:
-        """Run the traffic for this long, wait for messages under way, and return each node's report.
-
-        Raises:
-            ChildError: a process failed, or did not report.
-        """
+        """Run the traffic for this long, wait for messages under way, and return each node's report."""
         live_nodes = self._live_nodes
         self._reporter.begin_traffic(live_nodes.messages + live_nodes.calls)
         ear = asyncio.ensure_future(self._follow(live_nodes.listener))

@@ -68,12 +68,7 @@ class Replay:
         self._moved = asyncio.Event()
 
     async def report(self, inject: Callable[[], Injection]) -> Report:
-        """Follow the traffic to its end, while ``inject`` causes faults.
-
-        Raises:
-            ChildError: a process failed, nothing moved for long, or a side did not finish.
-            LocalError: a fault cannot be injected.
-        """
+        """Follow the traffic to its end, while ``inject`` causes faults."""
         self._reporter.begin_traffic(self._traffic.total)
         heard = asyncio.ensure_future(self._listen(self._receiver))
         injection, begun_s = inject(), time.monotonic()

@@ -67,12 +67,7 @@ class Ring:
         return (self.options.out or self._run.directory) / name
 
     async def result(self) -> Result:
-        """Send the recording through the ring, and compare.
-
-        Raises:
-            ChildError: a process failed.
-            LocalError: a link cannot be cut.
-        """
+        """Send the recording through the ring, and compare."""
         await self.overlay.stand_up()
         receiver = self._start_receiver(self.recording)
         await self._children.ready([receiver])
@@ -100,15 +95,6 @@ class Ring:
         self._start_receiver(path, heard=False)
         return path
 
-    @property
-    def sender_config(self) -> Path:
-        """Return the ``proxy.yaml`` of the robot."""
-        return self.overlay.materials.proxy_file(self.overlay.robot)
-
-    def forget(self) -> None:
-        """Close the descriptors of the processes here; they continue."""
-        self.overlay.forget()
-
     def _start_receiver(self, record: Path, *, heard: bool = True) -> Child:
         at, encoding = self.overlay.server, self.options.encoding
         config = self.overlay.materials.receiver(at, self._topics, encoding, self._ros, record)
@@ -128,11 +114,7 @@ def _recorded_s(reader: BagReader) -> float:
 
 
 async def make_demo(run: Run, seconds: float) -> Path:
-    """Generate a demonstration recording of this length in the run's directory; return the file.
-
-    Raises:
-        ChildError: the script fails.
-    """
+    """Generate a demonstration recording of this length in the run's directory; return the file."""
     path = run.directory / "demo.mcap"
     children = Children(run, kept=False)
     try:

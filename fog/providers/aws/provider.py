@@ -65,12 +65,7 @@ class AwsProvider:
         self._threads = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="aws")
 
     def offers(self, hardware: Hardware, *, spot: bool) -> list[Offer]:
-        """Return the catalogue's lines; spot machines have the current price if EC2 reports it.
-
-        Raises:
-            StoreError: EC2 cannot be reached now.
-            LocalError: EC2 refuses the credentials.
-        """
+        """Return the catalogue's lines; spot machines have the current price if EC2 reports it."""
         regions = self._clients.regions()
         lines = [each for each in self._prices(hardware, spot) if each.region in regions]
         if spot:
@@ -111,12 +106,7 @@ class AwsProvider:
         return sorted((each for part in parts for each in part), key=lambda each: each.started_unix_s)
 
     def terminate(self, ids: Sequence[str]) -> None:
-        """Terminate instances; their disks and spot requests end with them.
-
-        Raises:
-            StoreError: EC2 cannot be reached now.
-            LocalError: EC2 refuses, or an id is not of this provider.
-        """
+        """Terminate instances; their disks and spot requests end with them."""
         by_region: dict[str, list[str]] = defaultdict(list)
         for each in ids:
             region, instance = _split(each)
@@ -131,23 +121,13 @@ class AwsProvider:
                     client.terminate_instances(InstanceIds=known)
 
     def drain(self, machine: str) -> None:
-        """Tag the instance; its watcher reads the tag in the metadata within seconds and drains.
-
-        Raises:
-            StoreError: EC2 cannot be reached now.
-            LocalError: EC2 refuses, or the instance does not exist.
-        """
+        """Tag the instance; its watcher reads the tag in the metadata within seconds and drains."""
         region, instance = _split(machine)
         with asking(f"{region}: drain {instance}"):
             self._clients[region].create_tags(Resources=[instance], Tags=[{"Key": DRAIN, "Value": "1"}])
 
     def log(self, machine: str, program: str, lines: int) -> str:
-        """Return the last lines of a program in the instance's console, which EC2 updates a minute or more late.
-
-        Raises:
-            StoreError: EC2 cannot be reached now.
-            LocalError: EC2 refuses, or the instance does not exist.
-        """
+        """Return the last lines of a program in the instance's console, which EC2 updates a minute or more late."""
         region, instance = _split(machine)
         with asking(f"{region}: console of {instance}"):
             reported = self._clients[region].get_console_output(InstanceId=instance).get("Output", "")

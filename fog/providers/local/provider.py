@@ -87,9 +87,6 @@ class LocalProvider:
         """Create the gateways and the uplink, and start gateways that do not run; existing ones are unchanged.
 
         The uplink exists afterwards, so a switch with a port on it can start.
-
-        Raises:
-            LocalError: the kernel refuses; the uplink is a foreign device; another topology is up.
         """
         with self._alone():
             self._network.open()

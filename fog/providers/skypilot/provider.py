@@ -124,23 +124,13 @@ class SkyPilotProvider:
                     self._sky.get(request)
 
     def drain(self, machine: str) -> None:
-        """Drain the machine by a SkyPilot job.
-
-        Raises:
-            StoreError: the machine cannot be reached now.
-            LocalError: the machine does not exist.
-        """
+        """Drain the machine by a SkyPilot job."""
         with self._asking(f"drain {machine}"):
             task = self._sky.Task("drain", run=f"sudo systemctl kill --kill-who=main --signal=USR1 {_SERVICE}")
             self._sky.get(self._sky.exec(task, cluster_name=machine))
 
     def log(self, machine: str, program: str, lines: int) -> str:
-        """Return the last lines of a program in the machine's journal.
-
-        Raises:
-            StoreError: it cannot be reached now.
-            LocalError: there is no such machine.
-        """
+        """Return the last lines of a program in the machine's journal."""
         with self._asking(f"log of {machine}"):
             reported = self._sky.tail_logs(machine, None, follow=False, preload_content=False)
             return lines_of((line for line in reported if line), program, lines)

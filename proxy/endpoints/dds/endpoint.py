@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from itertools import count
-from typing import TypeVar
+from typing import Final, TypeVar
 
 from gdp.errors import LocalError
 from proxy.endpoints.dds.discovery import Discovery
@@ -36,8 +36,12 @@ class DdsEndpoint:
         LocalError: the domain cannot be joined.
     """
 
+    ros: Final[RosVersion] = 2
+    is_live: Final = True
+    dropped: Final = 0  # messages wait in the middleware, which drops them by its QoS
+
     def __init__(self, domain: int, node: str) -> None:
-        self._domain = domain
+        self.label = f"dds domain {domain}"
         self._events = deque[Event]([GraphChanged()])
         self._is_taking = False
         self._open: dict[int, _Open] = {}
@@ -47,26 +51,6 @@ class DdsEndpoint:
         self._node = Node(domain, node)
         self._discovery = Discovery(self._node, self._survey, self._follow)
         self._node.watch.tell()
-
-    @property
-    def ros(self) -> RosVersion:
-        """Return the ROS version."""
-        return 2
-
-    @property
-    def is_live(self) -> bool:
-        """Return True: other nodes take part in the graph."""
-        return True
-
-    @property
-    def label(self) -> str:
-        """Return the display name."""
-        return f"dds domain {self._domain}"
-
-    @property
-    def dropped(self) -> int:
-        """Return 0: only the middleware drops messages."""
-        return 0  # messages wait in the middleware, which drops them by its QoS
 
     def fileno(self) -> int:
         """Return a descriptor that is readable while ``poll_events`` has events."""
@@ -86,11 +70,7 @@ class DdsEndpoint:
         return self._survey.graph()
 
     def channel(self, topic: str, type_name: str) -> Channel:
-        """Return a topic of a standard type, or one of the hidden topics of a local action, as bytes.
-
-        Raises:
-            LocalError: the type is neither.
-        """
+        """Return a topic of a standard type, or one of the hidden topics of a local action, as bytes."""
         known = known_channel(topic, type_name)
         if known is not None:
             return known
@@ -103,11 +83,7 @@ class DdsEndpoint:
         )
 
     def service(self, name: str, type_name: str) -> Service:
-        """Return a service that a local node serves; its messages are opaque bytes.
-
-        Raises:
-            LocalError: no node serves it here.
-        """
+        """Return a service that a local node serves; its messages are opaque bytes."""
         for peer in self._survey.peers(Role.SERVES, name, type_name):
             request, response = (Channel(name, f"{type_name}_{part}", 2) for part in ("Request", "Response"))
             return Service(name, type_name, peer.hash, request, response)
@@ -138,11 +114,7 @@ class DdsEndpoint:
         return self._find(handle, Publication).subscribers
 
     def serve(self, service: Service) -> int:
-        """Create a server for clients on Cyclone DDS; clients on other vendors raise ``EndpointError`` events.
-
-        Raises:
-            LocalError: it is not ROS 2's.
-        """
+        """Create a server for clients on Cyclone DDS; clients on other vendors raise ``EndpointError`` events."""
         if service.ros != 2:
             raise LocalError(f"{service.name}: a service of ROS {service.ros} cannot be served in DDS")
         handle, hashed = next(self._numbers), service.hash if service.hash.startswith("RIHS01_") else ""

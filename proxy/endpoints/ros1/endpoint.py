@@ -69,6 +69,9 @@ class _Held:
 class Ros1Endpoint:
     """One ROS 1 graph, with one virtual node in it."""
 
+    ros: Final[RosVersion] = 1
+    is_live: Final = True
+
     def __init__(self, master_uri: str, node: str) -> None:
         """Start the rospy process; it joins the graph as soon as the master answers.
 
@@ -76,6 +79,7 @@ class Ros1Endpoint:
             LocalError: rospy is not installed.
         """
         rospy_folder()
+        self.label = f"ros1 {master_uri}"
         self._master_uri = master_uri
         self._node = node
         self._numbers = itertools.count(1)
@@ -95,21 +99,6 @@ class Ros1Endpoint:
         self._epoll.register(self._woken, select.EPOLLIN)
         self._ended: list[subprocess.Popen[bytes]] = []
         self._start(0.0)
-
-    @property
-    def ros(self) -> RosVersion:
-        """Return 1."""
-        return 1
-
-    @property
-    def is_live(self) -> bool:
-        """Return True: other nodes take part in the graph."""
-        return True
-
-    @property
-    def label(self) -> str:
-        """Return ``ros1`` and the master's URI."""
-        return f"ros1 {self._master_uri}"
 
     @property
     def dropped(self) -> int:

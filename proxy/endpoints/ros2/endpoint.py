@@ -45,6 +45,7 @@ class Ros2Endpoint:
 
     ros: Final[RosVersion] = 2
     is_live: Final = True
+    dropped: Final = 0  # messages wait in the middleware, which drops them by its QoS
 
     def __init__(self, domain: int, node: str) -> None:
         self.label = f"ros2 domain {domain}"
@@ -56,11 +57,6 @@ class Ros2Endpoint:
         self._publisher_entity: dict[int, PublisherEntity] = {}
         self._serving: dict[int, ServiceEntity] = {}
         self._client_entity: dict[int, ClientEntity] = {}
-
-    @property
-    def dropped(self) -> int:
-        """Return 0: only the middleware drops messages."""
-        return 0  # messages wait in the middleware, which drops them by its QoS
 
     def fileno(self) -> int:
         """Return a descriptor that is readable while ``poll_events`` has events."""
