@@ -121,11 +121,7 @@ class ClusterPlan:
 
 @dataclass(frozen=True, slots=True)
 class RobotNode:
-    """Node of the robot's side.
-
-    Args:
-        output: destination of its output: ``screen``, ``both`` or ``log``.
-    """
+    """Node of the robot's side; ``output``: destination of its output: ``screen``, ``both`` or ``log``."""
 
     node: CloudNode
     output: str = "screen"

@@ -14,12 +14,7 @@ __all__ = ["Offer"]
 
 @dataclass(frozen=True, slots=True)
 class Offer:
-    """One line of a price list.
-
-    Args:
-        region: in the provider's notation.
-        is_spot: cheaper, and may be preempted.
-    """
+    """One line of a price list."""
 
     provider: str
     region: str

@@ -214,10 +214,8 @@ class Site:
     Args:
         id: six hex digits.
         file: its ``fog.yaml``; None: self-contained.
-        robots: configuration files of proxies.
         revocations: folder, and the switch's file that names it; None: revocations are not published.
         watch: directory of keys, and device; None: only the provider reports on machines.
-        devices: of the robot's side of a self-contained site.
     """
 
     id: str

@@ -38,9 +38,6 @@ def loaded_from(path: Path, words: Sequence[str], *, dry_run: bool) -> Loaded:
 
     Args:
         dry_run: start no process; interface discovery uses cached results only.
-
-    Raises:
-        ConfigError, LocalError: see ``fog.launch.load.load``.
     """
     loaded = load(path, key_values(words), None if dry_run else offered)
     if loaded.is_known or kept(loaded.plan.nodes) is None:

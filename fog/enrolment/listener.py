@@ -84,11 +84,7 @@ def bind_unix(path: Path) -> socket.socket:
 
 
 class Listener:
-    """Server that passes complete requests to a responder.
-
-    Args:
-        listening: listening socket; ``close`` closes it.
-    """
+    """Server that passes complete requests to a responder; ``close`` closes its listening socket too."""
 
     def __init__(self, listening: socket.socket, responder: Responder) -> None:
         self._listening = listening

@@ -79,9 +79,6 @@ def remove_rules(path: Path, cluster: str) -> bool:
 def control_socket_of(identity: Path, configured: Path | None) -> Path:
     """Return the control socket of a node of this host.
 
-    Args:
-        identity: directory of its keys.
-
     Raises:
         LocalError: the directory does not belong to a node.
     """

@@ -36,7 +36,6 @@ class Loaded:
     """Result of loading a launch file.
 
     Args:
-        keep: whether the cluster continues when the launch ends.
         is_known: whether the plan contains the exported interfaces; otherwise they are still to be discovered.
     """
 
@@ -48,11 +47,7 @@ class Loaded:
 
 
 def key_values(words: Sequence[str]) -> dict[str, str]:
-    """Read launch arguments, ``name:=value`` each.
-
-    Raises:
-        LocalError: an argument has another form or occurs twice.
-    """
+    """Read launch arguments, ``name:=value`` each."""
     given: dict[str, str] = {}
     for word in words:
         key, separator, value = word.partition(":=")

@@ -25,11 +25,7 @@ __all__ = ["gathered"]
 def gathered(
     description: object, arguments: Mapping[str, str]
 ) -> tuple[list[tuple[ClusterSpec, list[CloudNode]]], list[RobotNode]]:
-    """Return the clusters of a description and the nodes of the robot's side, includes and groups followed.
-
-    Raises:
-        LocalError: only ``ros2 launch`` can run an entity of it, or an argument is missing.
-    """
+    """Return the clusters of a description and the nodes of the robot's side, includes and groups followed."""
     if not isinstance(description, LaunchDescription):
         raise LocalError(f"expected a LaunchDescription, not {type(description).__name__}")
     context = LaunchContext(noninteractive=True)

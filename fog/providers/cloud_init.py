@@ -139,11 +139,7 @@ class Setup(Section):
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """File of the machine, owned by root.
-
-    Args:
-        path: absolute path.
-    """
+    """File of the machine, owned by root; ``path``: absolute path."""
 
     path: str
     content: bytes

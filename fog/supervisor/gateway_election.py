@@ -20,11 +20,7 @@ __all__ = ["Election", "elect", "is_settling"]
 
 @dataclass(frozen=True, slots=True)
 class Election:
-    """Change of the role.
-
-    Args:
-        old: previous gateway, if the machine still exists.
-    """
+    """Change of the role; ``old``: previous gateway, if the machine still exists."""
 
     new: Record
     old: Record | None

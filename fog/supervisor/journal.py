@@ -199,7 +199,6 @@ class Journal:
         """Return events, oldest first.
 
         Args:
-            cluster: empty: events of all clusters.
             after: id of the last known event.
             last: maximum number; the newest are returned.
         """

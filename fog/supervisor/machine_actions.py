@@ -80,31 +80,14 @@ class MachineActions:
         self._events = events
         self._credentials = credentials
         self._command = command
-        self._acts = ActionRunner(wake)
+        self.runner = ActionRunner(wake)
         self._offers = OfferCache(site.latencies)
         self._swept: set[str] = set()  # machines without leftovers at the provider
-
-    @property
-    def running(self) -> int:
-        """Return the number of actions that have not ended."""
-        return self._acts.running
 
     def use(self, provider: Provider) -> None:
         """Use another adapter of the same provider from now on."""
         self.provider = provider
         self._offers.clear()
-
-    def is_busy(self, cluster: str, machine: str = "") -> bool:
-        """Return whether an action on a machine runs, or without a machine on any of the cluster."""
-        return self._acts.is_busy(cluster, machine)
-
-    def begin(self, cluster: str, machine: str, what: str, act: Callable[[], str | None]) -> None:
-        """Begin an action on a machine that is not busy."""
-        self._acts.begin(cluster, machine, what, act)
-
-    def close(self) -> None:
-        """Wait until all actions have ended."""
-        self._acts.close()
 
     def apply(self, plan: ClusterPlan, action: Action, records: list[Record], now_s: float) -> None:
         """Begin a decided action on a machine; a busy machine keeps its action."""
@@ -112,12 +95,12 @@ class MachineActions:
             self._launch(plan, action.wanted, records, now_s)
             return
         (record,) = (each for each in records if each.name == action.name)
-        if self.is_busy(plan.name, record.name):
+        if self.runner.is_busy(plan.name, record.name):
             return
         if isinstance(action, Drain):
             known = replace(record, drained_unix_s=now_s, reason=action.reason)
             self._events.put(known, "draining", action.reason, now_s)
-            self._acts.begin(plan.name, record.name, "drain", partial(self.provider.drain, record.id))
+            self.runner.begin(plan.name, record.name, "drain", partial(self.provider.drain, record.id))
         elif not record.id:
             self._events.put(
                 record.ended(action.ending, action.reason, now_s), action.ending.value, action.reason, now_s
@@ -130,7 +113,7 @@ class MachineActions:
 
     def collect_results(self, now_s: float) -> None:
         """Write the results of finished actions into the journal."""
-        for done in self._acts.poll_done():
+        for done in self.runner.poll_done():
             if done.what == "create":
                 record = next(each for each in self._journal.machines(done.cluster) if each.name == done.machine)
                 if done.error is not None:
@@ -156,7 +139,7 @@ class MachineActions:
             provider.terminate([machine])
             return words
 
-        self._acts.begin(plan.name, name, "release", act)
+        self.runner.begin(plan.name, name, "release", act)
 
     def release_orphans(
         self, plan: ClusterPlan, records: Sequence[Record], seen: Mapping[str, Machine], now_s: float
@@ -166,7 +149,7 @@ class MachineActions:
         known = {each.name for each in records if not each.is_gone}
         lost = {each.name for each in records if each.is_gone and each.ending is not Outcome.RELEASED}
         for name, machine in seen.items():
-            if name in known or machine.id in self._swept or self.is_busy(cluster, name):
+            if name in known or machine.id in self._swept or self.runner.is_busy(cluster, name):
                 continue
             if machine.state is MachineState.GONE:
                 self._swept.add(machine.id)
@@ -206,7 +189,7 @@ class MachineActions:
         records.append(record)
         detail = f"{offer.region} {offer.type_name}, {offer.usd_per_hour:.4f} USD an hour: {choice.why}"
         self._events.put(record, "asked", detail, now_s)
-        self._acts.begin(plan.name, spec.name, "create", partial(self.provider.create, spec, boot))
+        self.runner.begin(plan.name, spec.name, "create", partial(self.provider.create, spec, boot))
 
     def _uplink_iface(self, region: str) -> str:
         provider = self.provider

@@ -35,11 +35,7 @@ Release: TypeAlias = "Callable[[ClusterPlan, str, str], None]"
 
 
 class MachineCredentials:
-    """Issuer of machine credentials, which also revokes them.
-
-    Args:
-        boot_s: seconds within which a machine must enrol.
-    """
+    """Issuer of machine credentials, which also revokes them; ``boot_s``: seconds within which a machine must enrol."""
 
     def __init__(self, site: Site, journal: Journal, events: EventLog, tickets: Tickets, *, boot_s: float) -> None:
         self._site = site

@@ -90,7 +90,7 @@ class Supervisor:
     @property
     def running_actions(self) -> int:
         """Return the number of actions on machines that have not ended."""
-        return self._actions.running
+        return self._actions.runner.running
 
     def use(self, provider: Provider) -> None:
         """Use another adapter of the same provider from now on, such as one with more regions."""
@@ -107,7 +107,7 @@ class Supervisor:
 
     def close(self) -> None:
         """Wait for running actions and write their results; machines continue."""
-        self._actions.close()
+        self._actions.runner.close()
         self._actions.collect_results(time.time())
 
     def reconcile(self) -> None:
@@ -156,7 +156,7 @@ class Supervisor:
             self._actions.apply(plan, action, records, now_s)
         if is_new and not self._robots.has(plan):
             self._robots.grant(plan)
-        if not cluster.is_up and all(each.is_gone for each in records) and not self._actions.is_busy(plan.name):
+        if not cluster.is_up and all(each.is_gone for each in records) and not self._actions.runner.is_busy(plan.name):
             self._settled.add(plan.name)
             self._limits.forget(plan.name)
             self._robots.remove(plan.name)
@@ -172,7 +172,7 @@ class Supervisor:
         records = []
         for before in self._journal.machines(plan.name, gone=False):
             after, machine = before, seen.get(before.name)
-            if before.id or not self._actions.is_busy(plan.name, before.name):
+            if before.id or not self._actions.runner.is_busy(plan.name, before.name):
                 serves = None if heard is None else all(before.papers.proxy in heard.get(each, ()) for each in names)
                 if not names:  # topics have no calls: a machine that is up counts as serving
                     serves = machine is not None and machine.state is not MachineState.BOOTING
@@ -188,7 +188,7 @@ class Supervisor:
 
     def _release_misused(self, plan: ClusterPlan, name: str, machine: str) -> None:
         """Release a machine whose token was misused, unless it is busy."""
-        if not self._actions.is_busy(plan.name, name):
+        if not self._actions.runner.is_busy(plan.name, name):
             self._actions.release(plan, name, machine, is_lost=True)
 
 

@@ -20,7 +20,6 @@ class MessageDecoder:
 
     Args:
         source: description by the remote side.
-        target: description on this machine.
         twin: converter; None where both sides have the same wire form.
     """
 

@@ -82,11 +82,7 @@ class RemoteServer:
 
 
 def _ours(theirs: Exchange, parts: ActionInterface, endpoint: Endpoint, encoding: Encoding) -> Exchange:
-    """Return this machine's description of the service, built from the remote definitions where it has none.
-
-    Raises:
-        LocalError: it cannot be known here.
-    """
+    """Return this machine's description of the service, built from the remote definitions where it has none."""
     services = list[Service]()
     for (name, type_name), their in zip(parts.services, theirs.services, strict=True):
         try:

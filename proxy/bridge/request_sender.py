@@ -55,11 +55,7 @@ class RequestSender:
         self._goal_of[part, call] = goal
 
     def forget(self, part: int, call: int, *, is_cancelled: bool) -> None:
-        """Forget a call that has ended.
-
-        Args:
-            is_cancelled: its request must not be sent any more.
-        """
+        """Forget a call that has ended; ``is_cancelled``: its request must not be sent any more."""
         self._goal_of.pop((part, call), None)
         if is_cancelled:
             self._for_all.end(part, call)

@@ -75,7 +75,6 @@ class ResponseSender:
         """Send a message of an action's topic to all clients.
 
         Args:
-            at: index of the topic.
             stamp_ns: when the local server sent it, in nanoseconds since 1970.
         """
         what, publisher, services = self._flow_spec.local, self._publisher, len(self._responses)

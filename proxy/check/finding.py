@@ -21,7 +21,6 @@ class Match:
     """One name under a rule.
 
     Args:
-        local: the name on this machine.
         type_name: empty while unknown.
         nodes: local nodes of the opposite role; empty: there are none.
         qos: what they offer or request, such as ``reliable, transient local``; empty where QoS does not apply.

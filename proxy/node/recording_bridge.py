@@ -56,11 +56,7 @@ def work(node: ProxyNode, bridge: Bridge) -> None:
 
 
 def _renew(node: ProxyNode, settings: ProxyConfig, rules: RecordedRules, bridge: Bridge) -> None:
-    """Read the delegations again: new epochs and longer validity take effect without losing a message.
-
-    Raises:
-        GdpError: a delegation is missing or is invalid; the old ones stay in use.
-    """
+    """Read the delegations again: new epochs and longer validity take effect without losing a message."""
     held = DelegationStore(settings.delegations, node.identity)
     topics = open_topics(settings, held)
     bridge.reload(rules, held)

@@ -107,11 +107,7 @@ class _TopicsEndpoint:
 
 
 class ReplayEndpoint(_TopicsEndpoint):
-    """The publishers of a recording.
-
-    Args:
-        reader: open; its owner closes it.
-    """
+    """The publishers of a recording; ``reader``: open; its owner closes it."""
 
     def __init__(self, reader: BagReader) -> None:
         super().__init__(f"recording {reader.path}")
@@ -161,11 +157,7 @@ class ReplayEndpoint(_TopicsEndpoint):
         return self._numbers
 
     def messages(self, waiting: Callable[[], bool] | None = None) -> Iterator[RecordedMessage]:
-        """Yield the messages of subscribed topics in time order.
-
-        Args:
-            waiting: as for ``BagReader.messages``.
-        """
+        """Yield the messages of subscribed topics in time order; ``waiting``: as for ``BagReader.messages``."""
         for index, stamp_ns, raw in self._reader.messages(waiting):
             subscribed = self._subscribed.get(index)
             if subscribed is not None:

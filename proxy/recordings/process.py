@@ -58,8 +58,6 @@ class Cost:
     """Limits of the process.
 
     Args:
-        memory_bytes: address space.
-        cpu_s: processor time.
         wait_s: how long it may send nothing while the caller waits.
         file_bytes: length of a file in its scratch folder.
     """

@@ -50,7 +50,6 @@ class Channel:
         type_name: as ROS 2 writes it (``sensor_msgs/msg/Image``), for ROS 1 too.
         hash: md5 sum for ROS 1, ``RIHS01_...`` for ROS 2; empty where unknown.
         definition: full text, used types included; empty where unknown, or for a type without fields.
-        definition_format: of ``definition``; empty: there is none.
         qos: offered profiles, ROS 2 only.
         latched: late joiners get the last message.
         callerid: the publishing node, ROS 1 only, where known.

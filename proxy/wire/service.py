@@ -167,7 +167,6 @@ class Exchange:
     """Description of a service or an action by one side, with its encoding.
 
     Args:
-        services: by part.
         topics: of an action; their parts follow the services'.
         is_leaving: the server answers what is under way, and then leaves; clients use others.
         is_ordered: it keeps state, and executes requests in one order only.

@@ -32,8 +32,6 @@ class Counts:
 
     Args:
         failed: requests without a response or with a wrong one, and requests that were not sent for lack of a server.
-        rate: recent responses a second.
-        by_machine: machine -> number of its first responses.
     """
 
     requests: int = 0

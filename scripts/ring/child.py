@@ -38,7 +38,6 @@ class Child:
     Args:
         label: display name, such as ``switch nuc1``.
         argv: the command line; inherited by exec, so that the process id stays.
-        log: a file to create.
         heard: False: its standard output is not read, and goes to the log too.
     """
 

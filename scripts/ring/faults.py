@@ -108,11 +108,7 @@ class Kill:
 
 @dataclass(frozen=True, slots=True)
 class Roam:
-    """A proxy whose cable moves to another switch after ``after_s``.
-
-    Args:
-        who: the proxy's device, such as ``robot``.
-    """
+    """A proxy whose cable moves to another switch after ``after_s``; ``who``: the proxy's device, such as ``robot``."""
 
     who: str
     to: str
@@ -154,7 +150,6 @@ def check_faults(topology: Topology, faults: Sequence[Fault], duration_s: float 
     """Refuse impossible faults, and faults that separate both proxies permanently.
 
     Args:
-        topology: with two proxies.
         duration_s: of the traffic; None: unknown in advance.
 
     Raises:

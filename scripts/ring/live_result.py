@@ -31,7 +31,6 @@ def rows(heard: Heard, carried: Sequence[Event]) -> tuple[TopicResult, ...]:
     """Return the rows of the table.
 
     Args:
-        heard: reports of the nodes.
         carried: measurements of the server's proxy, one event a topic; latencies are the listener's.
     """
     reports = [_with_latency(each, _of(each.text("topic"), heard.listener.parts("topics"))) for each in carried]

@@ -37,7 +37,6 @@ class LiveRing:
     """The ring of one live run, from its creation.
 
     Args:
-        live: ROS versions of the sides.
         run: removes what is created here.
 
     Raises:

@@ -32,13 +32,10 @@ class Options:
     Args:
         bag: the recording; None: a generated robot drive.
         rate: 1 is the recorded pace, 0 as fast as possible.
-        keep: leave everything up afterwards.
         out: directory, created if necessary, for the received recording; None: it is deleted with the run.
-        pcap: file for a capture in the middle of the ring.
         live: real nodes instead of a recording; their ROS version. ``mixed``: ROS 1 at the robot, ROS 2 at the server.
         seconds: of traffic; a recording is replayed slower or faster to last this long, a generated one is created with
             this length. None: ``LIVE_S`` live, else the recording's own time.
-        lease_s: of every node's advertisements and watches.
 
     Raises:
         LocalError: an invalid rate, a fault that cannot be injected, a directory that is missing, a recording for a

@@ -51,11 +51,7 @@ class Traffic:
 
 
 class ProgressReporter:
-    """Reports steps and traffic.
-
-    Args:
-        console: on standard error.
-    """
+    """Reports steps and traffic; ``console``: on standard error."""
 
     def __init__(self, console: Console) -> None:
         self._console = console

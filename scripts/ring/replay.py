@@ -51,8 +51,6 @@ class Replay:
 
     Args:
         children: supervised throughout; the receiver is released when it is requested to finish.
-        sender: ready.
-        receiver: ready.
     """
 
     def __init__(

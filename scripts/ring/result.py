@@ -107,7 +107,6 @@ class Result:
     Args:
         unread: why the end of the recording could not be read; None if all of it was.
         complaints: other faults, such as a side that did not finish.
-        traffic_s: duration of the traffic.
         silent_s: the longest time in which something was due and nothing came, to half a second.
     """
 

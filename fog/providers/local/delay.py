@@ -83,11 +83,7 @@ def _open(device: str) -> socket.socket:
 
 
 def _relay(sides: tuple[socket.socket, socket.socket], line: DelayLine) -> None:
-    """Relay until a device is removed.
-
-    Raises:
-        OSError: a device was removed.
-    """
+    """Relay until a device is removed."""
     while True:
         ready, _, _ = select.select(sides, (), (), line.pause_s(time.time_ns()))
         for source in ready:

@@ -51,7 +51,6 @@ class LocalProvider:
     """``Provider`` of namespaces.
 
     Args:
-        directory: records of this site's machines and gateways; created if missing.
         gateway_boot: returns a gateway's bundle for its label and its ports.
         uplink: the robot's end of its link to the first gateway.
         robot: namespace of that end; None: the namespace of the caller of ``open_network``.

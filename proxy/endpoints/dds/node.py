@@ -1,6 +1,6 @@
 """Node: one DDS participant that appears as one ROS 2 node, with its readers and writers.
 
-I/O.
+I/O. What DDS refuses raises ``LocalError``.
 Source: rmw_dds_common for the announcement of nodes; the binding's own samples of built-in topics.
 """
 
@@ -134,11 +134,7 @@ class Node:
         self.announce()
 
     def read(self, topic: str, type_name: str, qos: DdsQos, hear: Callable[[list[Sample]], None]) -> Reader:
-        """Open a reader of the node.
-
-        Raises:
-            LocalError: DDS does not accept such a reader.
-        """
+        """Open a reader of the node."""
         try:
             reader = Reader(self, topic, type_name, qos, hear)
         except DDSException as error:
@@ -148,11 +144,7 @@ class Node:
         return reader
 
     def write(self, topic: str, type_name: str, qos: DdsQos) -> Writer:
-        """Open a writer of the node.
-
-        Raises:
-            LocalError: DDS does not accept such a writer.
-        """
+        """Open a writer of the node."""
         try:
             writer = Writer(self, topic, type_name, qos)
         except DDSException as error:

@@ -353,11 +353,7 @@ class Ros1Endpoint:
             return  # no wake-up was needed
 
     def _ask(self, kind: Kind, name: str, type_name: str) -> bytes | None:
-        """Query the process, wait for its response, and keep events that arrive meanwhile for ``poll_events``.
-
-        Raises:
-            LocalError: it does not answer in time.
-        """
+        """Query the process, wait for its response, and keep events that arrive meanwhile for ``poll_events``."""
         known = self._known.get((kind, name, type_name))
         if known is not None:
             return known
