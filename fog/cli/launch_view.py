@@ -23,13 +23,13 @@ from fog.latency.known import Latency
 from fog.launch.interface_discovery import kept, offered
 from fog.launch.load import Loaded, key_values, load
 from fog.offer import Offer
+from fog.plan.cost import HOURS_A_MONTH
 from fog.plan.duration import duration_text
 from fog.plan.target import Target
 from fog.topology import Gateway
 
 __all__ = ["BY_HAND", "Priced", "loaded_from", "priced", "show_plan"]
 
-MONTH_H: Final = 730.0  # as cloud providers count
 BY_HAND: Final = "by fog down"
 
 
@@ -93,7 +93,7 @@ def priced(said: Priced) -> dict[str, object]:
         "machines": machines,
         "latencies": {region: asdict(each) for region, each in said.latencies.items()},
         "usd_per_hour": per_hour,
-        "usd_per_month": None if per_hour is None else round(per_hour * MONTH_H, 2),
+        "usd_per_month": None if per_hour is None else round(per_hour * HOURS_A_MONTH, 2),
         "budget_usd": plan.budget_usd,
         "idle_s": plan.idle_s,
         "availability": target

@@ -7,6 +7,7 @@ I/O; files are opened for reading only.
 from __future__ import annotations
 
 import heapq
+import os
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import BinaryIO, Final, NamedTuple, Protocol
 from proxy.recordings.unpacking import CHUNK_MAX_BYTES, SalvageError, unpack
 from proxy.serial.channel import Channel
 
-__all__ = ["Chunk", "JoinedSource", "Message", "Place", "ScannedSource", "Source", "Tally", "UnpackedSource"]
+__all__ = ["Chunk", "JoinedSource", "Message", "Place", "Scan", "ScannedSource", "Source", "Tally", "UnpackedSource"]
 
 _CHUNKS_KEPT: Final = 4  # unpacked at a time; messages close in time are close in the file
 
@@ -124,6 +125,41 @@ class ScannedSource:
                 self._unpacked.popitem(last=False)
         self._unpacked.move_to_end(place.chunk)
         return self._unpacked[place.chunk][place.at : place.at + place.size]
+
+
+class Scan:
+    """Contents of a file that is read from its beginning; a subclass knows the format."""
+
+    def __init__(self) -> None:
+        self.channels: list[Channel] = []
+        self.chunks: list[Chunk] = []
+        self.places: list[Place] = []
+        self.stats = Tally()
+        self._index: dict[int, int] = {}  # the format's number of a channel, to its index
+
+    def traverse(self, file: BinaryIO, size: int) -> str:
+        """Read every record; return why it ended early, empty where it did not."""
+        raise NotImplementedError
+
+    def source(self, path: Path, magic: bytes, form: str, unclosed: str = "") -> ScannedSource:
+        """Return the readable part of a file; ``unclosed``: why even a file that is read to its end lacks something.
+
+        Raises:
+            SalvageError: nothing can be read.
+            OSError: the file cannot be opened.
+        """
+        with path.open("rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(0)
+            if file.read(len(magic)) != magic:
+                raise SalvageError(f"not {form}")
+            reason = self.traverse(file, size)
+        if not self.channels:
+            raise SalvageError(reason or "no channel in it")
+        source = ScannedSource(path, self.channels, self.chunks, self.places)
+        if reason or unclosed:
+            source.unread = self.stats.text(reason or unclosed)
+        return source
 
 
 class UnpackedSource:
