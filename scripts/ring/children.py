@@ -15,7 +15,7 @@ from gdp.simulation.namespaces import Namespaces
 from ring.child import Child
 from ring.events import Event
 
-__all__ = ["READY_S", "Children", "cancel"]
+__all__ = ["READY_S", "Children", "cancel", "gathered"]
 
 READY_S: Final = 60.0
 
@@ -61,7 +61,7 @@ class Children:
 
     async def ready(self, children: Sequence[Child]) -> list[Event]:
         """Wait until each has reported ``ready``, and return these events; from then on they are required."""
-        said = await self.guarded(_all(child.wait_for("ready", READY_S) for child in children))
+        said = await self.guarded(gathered(child.wait_for("ready", READY_S) for child in children))
         self._standing += children
         self._changed.set()
         return said
@@ -120,5 +120,6 @@ async def cancel(*tasks: asyncio.Future[T] | asyncio.Future[Child]) -> None:
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def _all(works: Iterable[Coroutine[None, None, Event]]) -> list[Event]:
+async def gathered(works: Iterable[Coroutine[None, None, Event]]) -> list[Event]:
+    """Run all at once; return their events in order."""
     return await asyncio.gather(*works)

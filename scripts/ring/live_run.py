@@ -75,7 +75,7 @@ class LiveRing:
         traffic_s = time.monotonic() - begun_s
         self._reporter.step("comparing what was published with what was heard")
         result = await self._compare(heard, injection.complaints())
-        return replace(result, traffic_s=traffic_s, silent_s=session.silent_s)
+        return replace(result, traffic_s=traffic_s, silent_s=session.silence.longest_s)
 
     def go_on(self) -> None:
         """Replace the proxies that have reported by ones that outlive this process, and continue the nodes' traffic."""
