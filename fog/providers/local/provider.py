@@ -52,8 +52,7 @@ class LocalProvider:
 
     Args:
         gateway_boot: returns a gateway's bundle for its label and its ports.
-        uplink: the robot's end of its link to the first gateway.
-        robot: namespace of that end; None: the namespace of the caller of ``open_network``.
+        uplink: the robot's end of its link to the first gateway, in the namespace of the caller of ``open_network``.
         regions: offered in addition to the provider's own; it simulates any region.
 
     Raises:
@@ -71,12 +70,11 @@ class LocalProvider:
         topology: Gateway = AUTOMATIC,
         *,
         uplink: str = UPLINK,
-        robot: Path | None = None,
         regions: Sequence[str] = (),
     ) -> None:
         self._directory = directory
         self.runs = RunRegistry(directory)  # also for ``fault_injection``
-        self._network = Network(self.runs, topology, gateway_boot, uplink, robot)
+        self._network = Network(self.runs, topology, gateway_boot, uplink)
         named = [region for gateway in topology.traverse() for region in gateway.regions]
         self._regions = tuple(dict.fromkeys((*LOCAL_REGIONS, *named, *regions)))
 
