@@ -141,9 +141,9 @@ def test_without_a_delegation_the_command_that_makes_one_is_shown(place: Path) -
 
 
 def test_metadata_that_no_option_states_are_shown_as_they_are(place: Path) -> None:
-    (fault,) = only(place, "expose", f"name: /image, type: {IMAGE}, metadata: {{minimum: 3}}").faults
+    (fault,) = only(place, "expose", f"name: /image, type: {IMAGE}, metadata: {{storey: 3}}").faults
     assert "makes one for these metadata" in fault
-    assert "'minimum': 3" in fault
+    assert "'storey': 3" in fault
 
 
 @pytest.mark.parametrize(
