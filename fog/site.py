@@ -96,7 +96,7 @@ class SiteConfig(Section):
     )
     lease_s: LeaseSeconds = Field(
         default=ADVERTISEMENT_LEASE_S,
-        description="Lease of the machines' claims, in seconds: `lease_s` of their proxy.yaml.",
+        description="Lease of the machines' advertisements, in seconds: `lease_s` of their proxy.yaml.",
     )
     enrolment: EnrolmentConfig = Field(
         default=EnrolmentConfig(), description="Where rented machines, with keys of their own, ask for memberships."

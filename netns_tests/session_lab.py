@@ -100,7 +100,7 @@ class SessionLab:
 
 def _end(process: subprocess.Popen[str]) -> None:
     if process.poll() is None:
-        end_all([Process.of(process.pid)])
+        end_all([Process.from_pid(process.pid)])
     process.communicate()
 
 

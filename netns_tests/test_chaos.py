@@ -114,8 +114,8 @@ def test_a_rib_comes_through_a_full_disk_and_starts_on_one() -> None:
             until(lambda: "snapshot written again" in rib_log(overlay), "a word that it is written again")
             faults = [
                 fault
-                for life, log in overlay.logs("rib s1")
-                for fault in snapshot_faults(f"life {life}", log, is_alive=life == 2)
+                for incarnation_id, log in overlay.logs("rib s1")
+                for fault in snapshot_faults(f"life {incarnation_id}", log, is_alive=incarnation_id == 2)
             ]
             assert (faults, overlay.disk.broken()) == ([], [])
     finally:
@@ -157,12 +157,12 @@ def test_frames_of_a_link_are_lost_doubled_and_delayed_as_configured(overlay: Ov
 
 
 def test_a_killed_process_is_started_again_and_a_frozen_one_goes_on(overlay: Overlay) -> None:
-    assert Process.of(overlay.pid("member P")).alive
+    assert Process.from_pid(overlay.pid("member P")).alive
     overlay.kill("member P")
     assert not overlay.is_running("member P")
     overlay.restart("member P")
     overlay.await_ready("member P")
-    assert overlay.life("member P") == 2
+    assert overlay.incarnation_id("member P") == 2
     until(lambda: numbers(overlay, "R"), "a message of its new life")
     overlay.freeze("member R")
     overlay.thaw("member R")

@@ -114,10 +114,10 @@ def test_calls_go_on_while_machines_are_taken_and_killed_and_the_supervisor_is(f
         caller.kill()
         caller.wait()
     events = [json.loads(line) for line in fog.run("status", "--events", "--json", "-n", "200").splitlines()]
-    assert {"enrolled", "taken", "notice", "draining"} <= {each["what"] for each in events}
+    assert {"enrolled", "preempted", "notice", "draining"} <= {each["what"] for each in events}
     assert "alarm" not in {each["what"] for each in events}
     assert [each["what"] for each in events].count("reconciled") == 2
-    assert all(each["since_unix_s"] <= each["unix_s"] for each in events if each["what"] in ("taken", "notice"))
+    assert all(each["since_unix_s"] <= each["unix_s"] for each in events if each["what"] in ("preempted", "notice"))
     assert "ready" in fog.run("logs", first, "node")
     fog.run("scale", "down")
     fog.until(lambda: len(fog.living()) == 1, "one replica is let go")
@@ -136,7 +136,7 @@ def test_down_ends_everything_though_launch_and_supervisor_were_killed_and_the_j
     )
     assert launch.stdout is not None
     for line in launch.stdout:
-        if '"asked"' in line:
+        if '"requested"' in line:
             break
     launch.kill()
     launch.communicate()

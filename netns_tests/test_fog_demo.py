@@ -54,13 +54,13 @@ def test_no_request_fails_while_one_machine_is_preempted_and_the_other_one_kille
     assert reported["failed"] == 0
     assert reported["requests"] > 100
     happened = {(each["machine"], each["what"]) for each in reported["events"]}
-    assert {("m1", "notice"), ("m2", "taken"), ("m3", "serving"), ("m4", "serving")} <= happened
+    assert {("m1", "notice"), ("m2", "preempted"), ("m3", "serving"), ("m4", "serving")} <= happened
     assert {"m1", "m2"} & reported["by_machine"].keys()
 
 
 def test_what_a_killed_demonstration_left_is_taken_down_by_the_next_one() -> None:
     with subprocess.Popen(command(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
-        line_with(["m2", "asked"], process)
+        line_with(["m2", "requested"], process)
         records, ids = all_of(process.pid)
         process.kill()
     assert leftovers(records, ids), "there was something to take down"

@@ -213,7 +213,7 @@ def say(node: Peer, first: int, end: int) -> object:
 
 def test_of_two_proxies_in_one_graph_one_carries_and_the_other_takes_over(a: Peer, b: Peer, pair: Pair) -> None:
     proxies = [pair.proxy("b"), pair.proxy("twin")]
-    until(lambda: any(proxy.faults("rival") for proxy in proxies), "one gives way")
+    until(lambda: any(proxy.faults("other-bridge") for proxy in proxies), "one gives way")
     b.tell("read(String, '/twice', 1_000)")
     until(lambda: say(a, 0, 1) or said(b), "/twice")
     say(a, 1, 101)

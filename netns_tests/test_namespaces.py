@@ -153,7 +153,7 @@ def test_what_a_killed_process_left_behind_is_swept_by_the_next(runs: RunRegistr
     with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True, env=where) as process:
         assert process.stdout is not None
         leashed, free, path = process.stdout.readline().split()
-        leash, loose = os.pidfd_open(int(leashed)), Process.of(int(free))
+        leash, loose = os.pidfd_open(int(leashed)), Process.from_pid(int(free))
         process.send_signal(signal.SIGKILL)
     poller = select.poll()
     poller.register(leash, select.POLLIN)

@@ -193,13 +193,13 @@ def name_resolution() -> Drawing:
         [("client", 85), ("data plane", 265), ("switch core", 445), ("RIB", 625), ("RIB, tier above", 805)],
         450,
     )
-    client, plane, core, rib, above = at.values()
+    client, plane, core, rib, upstream = at.values()
     _step(drawing, (client, plane), 95, "frame for a name")
     _step(drawing, (plane, core), 130, "no entry: punt", ORANGE)
     drawing.box(core - 80, 144, 160, 38, ("pending frames", "bounded"), ORANGE)
     _step(drawing, (core, rib), 212, "query")
-    _step(drawing, (rib, above), 246, "not known here: query")
-    _step(drawing, (above, rib), 280, "advertisement", GREEN)
+    _step(drawing, (rib, upstream), 246, "not known here: query")
+    _step(drawing, (upstream, rib), 280, "advertisement", GREEN)
     _step(drawing, (rib, core), 314, "advertisement", GREEN)
     drawing.box(core - 80, 326, 160, 38, ("name cache", "verified, with a lease"), GREEN)
     _step(drawing, (core, plane), 394, "install entry", GREEN)

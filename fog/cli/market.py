@@ -42,7 +42,7 @@ def market(provider: Provider, machines: Sequence[MachineRequest], latencies: La
         offers |= dict.fromkeys(provider.offers(hardware, spot=is_spot))
     regions = list(dict.fromkeys(offer.region for offer in offers))
     latencies.refresh(regions, time.time())
-    return Market(tuple(offers), latencies.of(regions, time.time()))
+    return Market(tuple(offers), latencies.lookup(regions, time.time()))
 
 
 def reached(plan: ClusterPlan, found: Market) -> tuple[ClusterPlan, Target | None]:

@@ -125,7 +125,7 @@ def cost_table(
         with peek_site(site, state) as here:
             regions = list(dict.fromkeys(where for where, _ in on_demand))
             here.latencies.refresh(regions, time.time())
-            latencies = here.latencies.of(regions, time.time())
+            latencies = here.latencies.lookup(regions, time.time())
         aws = aws_prices()
         rows: list[dict[str, object]] = []
         for (where, name), offer in sorted(

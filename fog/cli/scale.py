@@ -132,7 +132,7 @@ def logs(
             return
         record = _machine(journal, cluster, machine)
         if record.is_gone:
-            typer.echo(_last_words(journal, record, program or MACHINE, lines))
+            typer.echo(_final_log_lines(journal, record, program or MACHINE, lines))
             return
         with closing(open_provider(here)) as provider:
             typer.echo(provider.log(record.id, program, lines).rstrip("\n"))
@@ -181,9 +181,9 @@ def _machine(journal: Journal, cluster: str | None, name: str) -> Record:
     return found
 
 
-def _last_words(journal: Journal, record: Record, program: str, lines: int) -> str:
+def _final_log_lines(journal: Journal, record: Record, program: str, lines: int) -> str:
     """Return the final log lines of a machine that is gone."""
-    kept = journal.last_words(record.spec.cluster, record.name)
+    kept = journal.stored_logs(record.spec.cluster, record.name)
     gone = f"{record.name} is gone: {stage(record)}, {record.reason}"
     if not kept:
         raise LocalError(f"{gone}; its logs went with it")

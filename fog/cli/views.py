@@ -42,8 +42,8 @@ __all__ = [
 _PIPE_COLUMNS: Final = 10_000  # a program that reads a pipe needs whole lines
 _STYLES: Final = {
     "serving": "green",
-    "unheard": "red",
-    "taken": "red",
+    "unreachable": "red",
+    "preempted": "red",
     "failed": "red",
     "refused": "red",
     "trouble": "red",
@@ -72,10 +72,10 @@ def stage(record: Record, *, is_watched: bool = True) -> str:
     if record.noticed_unix_s is not None:
         return "notice"
     if record.is_serving:
-        return "serving" if is_watched else "up"
+        return "serving" if is_watched else "running"
     if record.served_unix_s is not None:
-        return "unheard"
-    return "asked" if not record.id else "booting" if record.up_unix_s is None else "up"
+        return "unreachable"
+    return "requested" if not record.id else "booting" if record.up_unix_s is None else "up"
 
 
 def machine_fields(

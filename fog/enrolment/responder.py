@@ -119,7 +119,11 @@ class Responder:
         keys = _keys_digest(asked, holders)
         about = f"{kept.cluster}/{kept.machine}"
         if kept.keys is not None and kept.keys != keys:
-            enrolled = f"; enrolled first is {kept.papers.proxy[:16]}" if kept.papers is not None else ""
+            enrolled = (
+                f"; enrolled first is {kept.issued_credentials.proxy[:16]}"
+                if kept.issued_credentials is not None
+                else ""
+            )
             self._misused(identifier, f"{_KNOWN}: the token was used again with another key{enrolled}", about)
             return REFUSED
         if unix_s >= kept.expires_unix_s:
@@ -130,12 +134,12 @@ class Responder:
         if not self._tickets.use(identifier, keys):
             self._refuse("a ticket that was taken back", about)
             return REFUSED
-        answer, papers = self._issue(kept, asked.applications, unix_s)
+        answer, issued_credentials = self._issue(kept, asked.applications, unix_s)
         sealed = seal_answer(kept.token, request, asked.answer_secret, answer)
-        if not self._tickets.complete(identifier, answer, papers, f"as {papers.proxy[:16]}"):
+        if not self._tickets.complete(identifier, answer, issued_credentials, f"as {issued_credentials.proxy[:16]}"):
             self._refuse("a ticket that was taken back", about)
             return REFUSED
-        self._trail.note(Action.ACCEPTED, _WHAT, who=papers.proxy, about=about)
+        self._trail.note(Action.ACCEPTED, _WHAT, who=issued_credentials.proxy, about=about)
         return sealed
 
     def _issue(
@@ -151,8 +155,10 @@ class Responder:
         root = load_root(self._authority.domain / ROOT_CERTIFICATE)
         serves = next((each for each in members if each.role is Role.PROXY), members[0])
         until_s = float(min(each.not_after_unix_s for each in members))
-        papers = IssuedCredentials(serves.name.to_text(), until_s, tuple(each.fingerprint.hex() for each in members))
-        return EnrolmentResponse(root.to_pem(), tuple(granted)).to_wire(), papers
+        issued_credentials = IssuedCredentials(
+            serves.name.to_text(), until_s, tuple(each.fingerprint.hex() for each in members)
+        )
+        return EnrolmentResponse(root.to_pem(), tuple(granted)).to_wire(), issued_credentials
 
     def _may_open(self, identifier: bytes) -> bool:
         opened = self._opened.get(identifier, 0)

@@ -40,11 +40,11 @@ _TABLES: Final = """
 CREATE TABLE IF NOT EXISTS tickets (
   id BLOB PRIMARY KEY, token BLOB NOT NULL, cluster TEXT NOT NULL, machine TEXT NOT NULL, seats TEXT NOT NULL,
   expires_unix_s REAL NOT NULL, until_unix_s REAL NOT NULL,
-  keys BLOB, answer BLOB, papers TEXT, is_reported INTEGER NOT NULL DEFAULT 0
+  keys BLOB, answer BLOB, issued_credentials TEXT, is_reported INTEGER NOT NULL DEFAULT 0
 ) STRICT;
 CREATE TABLE IF NOT EXISTS news (
   id INTEGER PRIMARY KEY AUTOINCREMENT, cluster TEXT NOT NULL, machine TEXT NOT NULL,
-  report TEXT NOT NULL, detail TEXT NOT NULL, papers TEXT
+  report TEXT NOT NULL, detail TEXT NOT NULL, issued_credentials TEXT
 ) STRICT;
 """
 
@@ -73,7 +73,7 @@ class Kept:
         until_unix_s: end of validity of everything issued for it.
         keys: SHA-256 of the keys that used it; None: not used.
         answer: response to these keys; None: not complete yet.
-        papers: credentials issued to the machine that used it.
+        issued_credentials: credentials issued to the machine that used it.
         is_reported: a misuse was reported; further requests get no response.
     """
 
@@ -85,7 +85,7 @@ class Kept:
     until_unix_s: float
     keys: bytes | None
     answer: bytes | None = field(repr=False)
-    papers: IssuedCredentials | None
+    issued_credentials: IssuedCredentials | None
     is_reported: bool
 
 
@@ -98,7 +98,7 @@ class News:
     machine: str
     report: Report
     detail: str
-    papers: IssuedCredentials | None
+    issued_credentials: IssuedCredentials | None
 
 
 class Tickets:
@@ -159,14 +159,16 @@ class Tickets:
     def find(self, identifier: bytes) -> Kept | None:
         """Return the ticket with this id."""
         query = (
-            "SELECT token, cluster, machine, seats, expires_unix_s, until_unix_s, keys, answer, papers, is_reported"
-            " FROM tickets WHERE id = ?"
+            "SELECT token, cluster, machine, seats, expires_unix_s, until_unix_s, keys, answer, issued_credentials,"
+            " is_reported FROM tickets WHERE id = ?"
         )
         with self._translated(), self._lock:
             row = self._file.execute(query, (identifier,)).fetchone()
         if row is None:
             return None
-        token, cluster, machine, seats, expires_unix_s, until_unix_s, keys, answer, papers, is_reported = row
+        token, cluster, machine, seats, expires_unix_s, until_unix_s, keys, answer, issued_credentials, is_reported = (
+            row
+        )
         return Kept(
             token=token,
             cluster=cluster,
@@ -176,7 +178,7 @@ class Tickets:
             until_unix_s=until_unix_s,
             keys=keys,
             answer=answer,
-            papers=_papers(papers),
+            issued_credentials=_issued_credentials(issued_credentials),
             is_reported=bool(is_reported),
         )
 
@@ -190,12 +192,12 @@ class Tickets:
                 ).rowcount
             )
 
-    def complete(self, identifier: bytes, answer: bytes, papers: IssuedCredentials, detail: str) -> bool:
+    def complete(self, identifier: bytes, answer: bytes, issued_credentials: IssuedCredentials, detail: str) -> bool:
         """Store the response to a ticket's keys, and report it to the supervisor; False: the ticket was withdrawn."""
-        text = json.dumps(asdict(papers))
+        text = json.dumps(asdict(issued_credentials))
         with self._writing() as file:
             if not file.execute(
-                "UPDATE tickets SET answer = ?, papers = ? WHERE id = ?", (answer, text, identifier)
+                "UPDATE tickets SET answer = ?, issued_credentials = ? WHERE id = ?", (answer, text, identifier)
             ).rowcount:
                 return False
             _tell(file, identifier, Report.ENROLLED, detail, text)
@@ -218,7 +220,7 @@ class Tickets:
         """Return the news that was not ``taken`` yet, oldest first."""
         with self._translated(), self._lock:
             rows = self._file.execute(
-                "SELECT id, cluster, machine, report, detail, papers FROM news ORDER BY id"
+                "SELECT id, cluster, machine, report, detail, issued_credentials FROM news ORDER BY id"
             ).fetchall()
         return [
             News(
@@ -227,9 +229,9 @@ class Tickets:
                 machine=machine,
                 report=Report(report),
                 detail=detail,
-                papers=_papers(papers),
+                issued_credentials=_issued_credentials(issued_credentials),
             )
-            for number, cluster, machine, report, detail, papers in rows
+            for number, cluster, machine, report, detail, issued_credentials in rows
         ]
 
     def taken(self, news: News) -> None:
@@ -252,11 +254,13 @@ class Tickets:
             raise StoreError(f"{self._path}: {error}") from error
 
 
-def _tell(file: sqlite3.Connection, identifier: bytes, report: Report, detail: str, papers: str | None) -> None:
+def _tell(
+    file: sqlite3.Connection, identifier: bytes, report: Report, detail: str, issued_credentials: str | None
+) -> None:
     file.execute(
-        "INSERT INTO news (cluster, machine, report, detail, papers)"
-        " SELECT cluster, machine, ?, ?, coalesce(?, papers) FROM tickets WHERE id = ?",
-        (report.value, detail, papers, identifier),
+        "INSERT INTO news (cluster, machine, report, detail, issued_credentials)"
+        " SELECT cluster, machine, ?, ?, coalesce(?, issued_credentials) FROM tickets WHERE id = ?",
+        (report.value, detail, issued_credentials, identifier),
     )
 
 
@@ -279,7 +283,7 @@ def _seats(text: str) -> tuple[PlannedSeat, ...]:
     )
 
 
-def _papers(text: str | None) -> IssuedCredentials | None:
+def _issued_credentials(text: str | None) -> IssuedCredentials | None:
     if text is None:
         return None
     document = json.loads(text)

@@ -53,13 +53,13 @@ class MachineAgent:
         (home / "logs").mkdir(mode=0o700, exist_ok=True)
         self._state = MachineState.BOOTING
         self._reason = ""
-        self._keepers: tuple[ProgramSupervisor, ...] = ()
+        self._supervisors: tuple[ProgramSupervisor, ...] = ()
         self._programs = programs
         self._tasks: list[asyncio.Task[str]] = []
 
     async def run(self) -> str:
         """Run the machine until its end; return the reason."""
-        self._keepers = tuple(ProgramSupervisor(program, self._home, self._tell) for program in self._programs)
+        self._supervisors = tuple(ProgramSupervisor(program, self._home, self._tell) for program in self._programs)
         end, drain = asyncio.Event(), asyncio.Event()
         self._listen(end, drain)
         self._take_notice()
@@ -78,7 +78,7 @@ class MachineAgent:
         finally:
             for task in (ended, drained, fallen, *self._tasks):
                 task.cancel()
-            for supervisor in reversed(self._keepers):
+            for supervisor in reversed(self._supervisors):
                 await supervisor.end()
             self._become(MachineState.GONE, self._reason)
         return self._reason
@@ -93,7 +93,7 @@ class MachineAgent:
 
     async def _stand(self) -> str:
         """Start all programs, wait until all are up, then wait until one ends permanently."""
-        self._tasks = [asyncio.ensure_future(supervisor.keep()) for supervisor in self._keepers]
+        self._tasks = [asyncio.ensure_future(supervisor.keep()) for supervisor in self._supervisors]
         up = asyncio.create_task(self._all_up())
         await asyncio.wait([up, *self._tasks], return_when=asyncio.FIRST_COMPLETED)
         if up.done():
@@ -107,14 +107,14 @@ class MachineAgent:
         return done.pop().result()
 
     async def _all_up(self) -> None:
-        for supervisor in self._keepers:
+        for supervisor in self._supervisors:
             await supervisor.ready.wait()
 
     async def _drain(self, end: asyncio.Event) -> None:
         """Let calls in progress finish; no program is restarted."""
         for task in self._tasks:
             task.cancel()
-        for supervisor in self._keepers:
+        for supervisor in self._supervisors:
             if supervisor.program.name == DRAINS and (answered := supervisor.ask(signal.SIGUSR1)) is not None:
                 answered.add_done_callback(lambda _: end.set())
                 with suppress(asyncio.TimeoutError):
@@ -128,7 +128,7 @@ class MachineAgent:
 
     def _die(self) -> None:
         """End like a machine that is switched off."""
-        for supervisor in self._keepers:
+        for supervisor in self._supervisors:
             supervisor.kill()
         os.kill(os.getpid(), signal.SIGKILL)
 
@@ -141,5 +141,5 @@ class MachineAgent:
         self._tell()
 
     def _tell(self) -> None:
-        programs = {supervisor.program.name: supervisor.status for supervisor in self._keepers}
+        programs = {supervisor.program.name: supervisor.status for supervisor in self._supervisors}
         Status(self._state, time.time(), programs, self._reason).write(self._home)

@@ -36,7 +36,7 @@ class ProgramSupervisor:
         self.ready = asyncio.Event()  # set when it is up for the first time
         self._home = home
         self._changed = changed
-        self._life: ManagedProcess | None = None
+        self._incarnation_id: ManagedProcess | None = None
         self._log = BoundedLog(home / "logs" / f"{program.name}.log")
 
     async def keep(self) -> str:
@@ -57,39 +57,41 @@ class ProgramSupervisor:
 
     def ask(self, number: signal.Signals) -> asyncio.Future[int] | None:
         """Send the program a signal; return a future of its exit status, or None if it does not run."""
-        if self._life is None or self._life.ended.done():
+        if self._incarnation_id is None or self._incarnation_id.ended.done():
             return None
-        self._life.signal(number)
-        return self._life.ended
+        self._incarnation_id.signal(number)
+        return self._incarnation_id.ended
 
     def kill(self) -> None:
         """Kill the program at once."""
-        if self._life is not None:
-            self._life.kill()
+        if self._incarnation_id is not None:
+            self._incarnation_id.kill()
 
     async def end(self) -> None:
         """End the program with SIGTERM, after ``keep`` was cancelled."""
-        if self._life is not None:
-            await self._life.end(_END_PATIENCE_S)
+        if self._incarnation_id is not None:
+            await self._incarnation_id.end(_END_PATIENCE_S)
         self._log.close()
         self._become(ProgramStatus(restarts=self.status.restarts))
 
     async def _live(self, restarts: int) -> str:
         try:
-            life = self._life = ManagedProcess(self.program, self._home, self._log, lambda: self._up(restarts))
+            incarnation_id = self._incarnation_id = ManagedProcess(
+                self.program, self._home, self._log, lambda: self._up(restarts)
+            )
         except OSError as error:
             return f"could not be started: {error}"
         if not self.status.up:
-            self._become(ProgramStatus(life.pid, restarts=restarts))
-        return f"ended with code {await asyncio.shield(life.ended)}"
+            self._become(ProgramStatus(incarnation_id.pid, restarts=restarts))
+        return f"ended with code {await asyncio.shield(incarnation_id.ended)}"
 
     def _up(self, restarts: int) -> None:
         self.ready.set()
         asyncio.get_running_loop().call_soon(self._tell_up, restarts)
 
     def _tell_up(self, restarts: int) -> None:
-        if self._life is not None and not self._life.ended.done():
-            self._become(ProgramStatus(self._life.pid, up=True, restarts=restarts))
+        if self._incarnation_id is not None and not self._incarnation_id.ended.done():
+            self._become(ProgramStatus(self._incarnation_id.pid, up=True, restarts=restarts))
 
     def _become(self, status: ProgramStatus) -> None:
         if status != self.status:

@@ -103,14 +103,14 @@ class Latencies:
         self._refreshing = threading.Thread(target=work, name="measures latency", daemon=True)
         self._refreshing.start()
 
-    def of(self, regions: Iterable[str], now_unix_s: float) -> dict[str, Latency]:
+    def lookup(self, regions: Iterable[str], now_unix_s: float) -> dict[str, Latency]:
         """Return the known latency of each region without measuring."""
         kept = self._read()
         return {region: self._one(region, kept.get(region), now_unix_s) for region in dict.fromkeys(regions)}
 
     def ms(self, regions: Iterable[str], now_unix_s: float) -> dict[str, float]:
         """Return region -> ms for the regions with a known latency."""
-        return {region: each.ms for region, each in self.of(regions, now_unix_s).items() if each.ms is not None}
+        return {region: each.ms for region, each in self.lookup(regions, now_unix_s).items() if each.ms is not None}
 
     def _one(self, region: str, kept: _Kept | None, now_unix_s: float) -> Latency:
         if region in self._stated:

@@ -26,7 +26,7 @@ def changes(before: Record, after: Record, seen: Machine | None, now_s: float) -
     """Yield the events between two records."""
     since = f"{now_s - after.asked_unix_s:.1f} s after it was asked for"
     if before.up_unix_s is None and after.up_unix_s is not None:
-        yield Change("up", since)
+        yield Change("running", since)
     if before.noticed_unix_s is None and after.noticed_unix_s is not None:
         leaves_in_s = (after.leaves_at_unix_s or now_s) - now_s
         yield Change("notice", f"{after.reason}; leaves in {leaves_in_s:.1f} s", _since(seen, MachineState.LEAVING))
@@ -36,7 +36,7 @@ def changes(before: Record, after: Record, seen: Machine | None, now_s: float) -
         yield Change("serving", f"again, after {now_s - before.unreachable_unix_s:.1f} s")
     is_lost = before.unreachable_unix_s is None and after.unreachable_unix_s is not None
     if after.served_unix_s is not None and is_lost and not after.is_released and after.drained_unix_s is None:
-        yield Change("unheard", "its replica is not heard in the overlay")
+        yield Change("unreachable", "its replica is not heard in the overlay")
     if not before.is_gone and after.is_gone:
         what = after.ending.value if after.ending is not None else "gone"
         yield Change(what, after.reason, _since(seen, MachineState.GONE))

@@ -23,9 +23,9 @@ from fog.offer import Offer
 from fog.supervisor.record import Outcome, Record
 from gdp.errors import LocalError, StoreError
 
-__all__ = ["LAST_WORDS", "Cluster", "Entry", "Journal"]
+__all__ = ["FINAL_LOGS", "Cluster", "Entry", "Journal"]
 
-LAST_WORDS: Final = "last words"
+FINAL_LOGS: Final = "final logs"
 
 _PATIENCE_S: Final = 10.0  # wait for another writing process
 _EVENTS_MAX: Final = 10_000  # older ones are deleted
@@ -69,7 +69,7 @@ class Entry:
     Args:
         unix_s: time of the observation.
         since_unix_s: time of the event by the machine's or the provider's records; None: unknown.
-        lines: for ``LAST_WORDS``: final log lines of the program ``detail`` of a machine that is gone.
+        lines: for ``FINAL_LOGS``: final log lines of the program ``detail`` of a machine that is gone.
     """
 
     id: int
@@ -189,11 +189,11 @@ class Journal:
         with self._writing() as file:
             _tell(file, now_s, cluster, machine, what, detail, since_unix_s, lines)
 
-    def last_words(self, cluster: str, machine: str) -> dict[str, str]:
+    def stored_logs(self, cluster: str, machine: str) -> dict[str, str]:
         """Return program -> final log lines of a machine that failed or was preempted."""
         query = "SELECT detail, lines FROM events WHERE what = ? AND cluster = ? AND machine = ? ORDER BY id"
         with _translated(self._path):
-            return dict(self._file.execute(query, (LAST_WORDS, cluster, machine)).fetchall())
+            return dict(self._file.execute(query, (FINAL_LOGS, cluster, machine)).fetchall())
 
     def events(self, cluster: str = "", after: int = 0, last: int | None = None) -> list[Entry]:
         """Return events, oldest first.
@@ -267,15 +267,19 @@ def _plain(value: object) -> object:
 
 def _record(items: dict[str, object]) -> Record:
     match items:
-        case {"spec": dict(spec), "wanted": dict(wanted), "papers": dict(papers), **rest}:
+        case {"spec": dict(spec), "wanted": dict(wanted), "issued_credentials": dict(issued_credentials), **rest}:
             offer = spec["offer"]
             return replace(
-                Record(**{**rest, "spec": None, "wanted": None, "papers": None}),  # type: ignore[arg-type]
+                Record(**{**rest, "spec": None, "wanted": None, "issued_credentials": None}),  # type: ignore[arg-type]
                 spec=MachineSpec(
                     spec["cluster"], spec["name"], Offer(**{**offer, "hardware": Hardware(**offer["hardware"])})
                 ),
                 wanted=MachineRequest(Hardware(**wanted["hardware"]), wanted["region"], wanted["is_spot"]),
-                papers=IssuedCredentials(papers["proxy"], papers["until_unix_s"], tuple(papers["fingerprints"])),
+                issued_credentials=IssuedCredentials(
+                    issued_credentials["proxy"],
+                    issued_credentials["until_unix_s"],
+                    tuple(issued_credentials["fingerprints"]),
+                ),
                 state=MachineState(rest["state"]),
                 ending=None if rest["ending"] is None else Outcome(rest["ending"]),
             )

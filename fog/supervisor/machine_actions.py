@@ -21,7 +21,7 @@ from fog.site import Site
 from fog.supervisor.actions import ActionRunner
 from fog.supervisor.event_log import EventLog
 from fog.supervisor.final_logs import keep, kept
-from fog.supervisor.journal import LAST_WORDS, Journal
+from fog.supervisor.journal import FINAL_LOGS, Journal
 from fog.supervisor.machine_credentials import MachineCredentials
 from fog.supervisor.placement import place
 from fog.supervisor.reconcile import Action, Drain, Launch
@@ -128,7 +128,7 @@ class MachineActions:
             elif done.error is not None:
                 self._journal.tell(now_s, done.cluster, done.machine, "trouble", f"{done.what}: {done.error}")
             for program, lines in kept(done.result) if done.what == "release" else ():
-                self._journal.tell(now_s, done.cluster, done.machine, LAST_WORDS, program, lines=lines)
+                self._journal.tell(now_s, done.cluster, done.machine, FINAL_LOGS, program, lines=lines)
 
     def release(self, plan: ClusterPlan, name: str, machine: str, *, is_lost: bool) -> None:
         """Begin to release a machine; the final log lines of a lost machine are stored."""
@@ -188,7 +188,7 @@ class MachineActions:
         record = Record(spec, wanted, IssuedCredentials("", until_unix_s), now_s)
         records.append(record)
         detail = f"{offer.region} {offer.type_name}, {offer.usd_per_hour:.4f} USD an hour: {choice.why}"
-        self._events.put(record, "asked", detail, now_s)
+        self._events.put(record, "requested", detail, now_s)
         self.runner.begin(plan.name, spec.name, "create", partial(self.provider.create, spec, boot))
 
     def _uplink_iface(self, region: str) -> str:

@@ -71,8 +71,8 @@ class MachineCredentials:
         for news in self._tickets.news():
             record = next((each for each in self._journal.machines(news.cluster) if each.name == news.machine), None)
             if record is not None:
-                if news.papers is not None:
-                    record = replace(record, papers=news.papers)
+                if news.issued_credentials is not None:
+                    record = replace(record, issued_credentials=news.issued_credentials)
                 if news.report is Report.ENROLLED:
                     self._events.put(record, "enrolled", news.detail, now_s)
                     if record.is_gone or record.is_released:
@@ -87,10 +87,16 @@ class MachineCredentials:
         if self._site.revocations is None:
             return
         folder, switch = self._site.revocations
-        papers = record.papers
+        issued_credentials = record.issued_credentials
         domain = self._site.authority.domain
         try:
-            if revoke_credentials(domain, folder, papers.fingerprints, until_unix_s=papers.until_unix_s, unix_s=now_s):
+            if revoke_credentials(
+                domain,
+                folder,
+                issued_credentials.fingerprints,
+                until_unix_s=issued_credentials.until_unix_s,
+                unix_s=now_s,
+            ):
                 config = SwitchConfig.load(switch)
                 reload(config.identity, config.control_socket)
         except LocalError as error:
@@ -101,7 +107,7 @@ class MachineCredentials:
         if not self._site.enrolment.revoke_misused or record.is_gone:
             self._events.put(record, "alarm", news.detail, now_s)
             return
-        ending = Outcome.FAILED if record.served_unix_s is None else Outcome.TAKEN
+        ending = Outcome.FAILED if record.served_unix_s is None else Outcome.PREEMPTED
         known = replace(record, released_unix_s=now_s, ending=ending, reason="its enrolment token was misused")
         self._events.put(known, "alarm", f"{news.detail}; it is revoked and replaced", now_s)
         self.revoke(known, now_s)

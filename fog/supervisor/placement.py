@@ -61,7 +61,7 @@ def place(
 
 def wary_until(records: Iterable[Record], now_s: float) -> float:
     """Return until when a location is avoided because machines were preempted there."""
-    lost = _moments(records, Outcome.TAKEN, now_s)
+    lost = _moments(records, Outcome.PREEMPTED, now_s)
     return lost[-1] + min(_WARY_S * 2 ** (len(lost) - 1), _WARY_MAX_S) if lost else 0.0
 
 

@@ -162,5 +162,5 @@ def _offered(site: Site, journal: Journal) -> tuple[tuple[str, ...], Gateway]:
 
 def _begun_unix_s() -> float:
     """Return when this process was started, before its imports."""
-    started_s = Process.of(os.getpid()).started / os.sysconf("SC_CLK_TCK")
+    started_s = Process.from_pid(os.getpid()).started / os.sysconf("SC_CLK_TCK")
     return time.time() - (time.clock_gettime(time.CLOCK_BOOTTIME) - started_s)

@@ -139,12 +139,12 @@ class _View:
         return _serves(record, liveness_known=self.liveness_known)
 
     def is_old(self, record: Record) -> bool:
-        return record.papers.until_unix_s - self.patience.credential_renewal_s <= self.now_s
+        return record.issued_credentials.until_unix_s - self.patience.credential_renewal_s <= self.now_s
 
     def is_due(self, record: Record) -> bool:
         """Return whether half of the notice period is over; calls in progress need the rest."""
         if record.noticed_unix_s is None or record.leaves_at_unix_s is None:
-            return record.papers.until_unix_s <= self.now_s
+            return record.issued_credentials.until_unix_s <= self.now_s
         return self.now_s >= (record.noticed_unix_s + record.leaves_at_unix_s) / 2
 
     def ended(self, record: Record) -> Release | None:
@@ -164,7 +164,7 @@ class _View:
         since_s = record.unreachable_unix_s
         patience_s = limit.unreachable_timeout_s if self.is_any_serving else limit.partition_timeout_s
         if since_s is not None and now_s - since_s >= patience_s and record.name not in self.excused:
-            return Release(record.name, "its replica is not heard any more", Outcome.TAKEN)
+            return Release(record.name, "its replica is not heard any more", Outcome.PREEMPTED)
         return None
 
 

@@ -19,7 +19,7 @@ class Outcome(Enum):
     """Outcome of a machine."""
 
     RELEASED = "released"  # the supervisor released it
-    TAKEN = "taken"  # the provider preempted it, or it failed
+    PREEMPTED = "preempted"  # the provider preempted it, or it failed
     FAILED = "failed"  # no capacity, or it never served
 
 
@@ -41,7 +41,7 @@ class Record:
 
     spec: MachineSpec
     wanted: MachineRequest
-    papers: IssuedCredentials
+    issued_credentials: IssuedCredentials
     asked_unix_s: float
     _: KW_ONLY
     id: str = ""
@@ -140,4 +140,4 @@ def _missed(record: Record, seen: Machine | None, now_s: float, grace_s: float) 
     said = seen.reason if seen is not None else ""
     if record.up_unix_s is None:
         return record.ended(Outcome.FAILED, said or "never came up", now_s)
-    return record.ended(Outcome.TAKEN, record.reason or said or "gone without a word", now_s)
+    return record.ended(Outcome.PREEMPTED, record.reason or said or "gone without a word", now_s)

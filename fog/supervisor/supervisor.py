@@ -158,7 +158,7 @@ class Supervisor:
             self._robots.grant(plan)
         if not cluster.is_up and all(each.is_gone for each in records) and not self._actions.runner.is_busy(plan.name):
             self._settled.add(plan.name)
-            self._limits.forget(plan.name)
+            self._limits.reset(plan.name)
             self._robots.remove(plan.name)
 
     def _observe(
@@ -173,7 +173,11 @@ class Supervisor:
         for before in self._journal.machines(plan.name, gone=False):
             after, machine = before, seen.get(before.name)
             if before.id or not self._actions.runner.is_busy(plan.name, before.name):
-                serves = None if heard is None else all(before.papers.proxy in heard.get(each, ()) for each in names)
+                serves = (
+                    None
+                    if heard is None
+                    else all(before.issued_credentials.proxy in heard.get(each, ()) for each in names)
+                )
                 if not names:  # topics have no calls: a machine that is up counts as serving
                     serves = machine is not None and machine.state is not MachineState.BOOTING
                 after = learn(before, machine, serves, now_s, grace_s=self._grace_s)

@@ -31,7 +31,7 @@ class UsageLimits:
         self._activities: dict[str, Activity] = {}
         self._asked_s: dict[str, float] = {}  # when the counters were last read
 
-    def forget(self, cluster: str) -> None:
+    def reset(self, cluster: str) -> None:
         """Reset the state for the next cluster of this name."""
         self._activities.pop(cluster, None)
 
@@ -47,7 +47,7 @@ class UsageLimits:
             return ""
         self._asked_s[plan.name] = now_s
         if provider == _ON_THIS_HOST:
-            counts = {each.name: received_by(each.papers.proxy) for each in records if each.is_serving}
+            counts = {each.name: received_by(each.issued_credentials.proxy) for each in records if each.is_serving}
         else:
             counts = {str(path): sent_by(path) for path in self._site.robots} or {"": None}
         idle_s = self._activities.setdefault(plan.name, Activity(now_s)).idle_s(counts, now_s)

@@ -117,10 +117,10 @@ class AckNackHandler:
         """Translate the start numbers of new readers, after everything cached got new numbers."""
         starts = self._heartbeats.starts
         for name, start in starts.items():
-            starts[name] = start._replace(number=move.of(start.number))
+            starts[name] = start._replace(number=move.new_number(start.number))
         for reader in self._readers.all():
             if reader.start is not None:
-                reader.start = reader.start._replace(number=move.of(reader.start.number))
+                reader.start = reader.start._replace(number=move.new_number(reader.start.number))
         self._heartbeats.wanted = True
 
     def release_window(self) -> None:
@@ -161,7 +161,7 @@ class AckNackHandler:
         """Return a report under the present numbers; a Heartbeat announces them to a reader that does not know them."""
         for move in self._queue.moves:
             if move.is_before(report.next_number):
-                report = report._replace(next_number=move.of(report.next_number), next_part=0, missing=())
+                report = report._replace(next_number=move.new_number(report.next_number), next_part=0, missing=())
                 self._heartbeats.wanted = True
         return report
 

@@ -13,7 +13,7 @@ from typing import Final
 
 from gdp.client.identities import ReaderIdentity
 from gdp.client.key_epochs import Secrets
-from gdp.crypto.control_seal import ControlSealer, note_key
+from gdp.crypto.control_seal import ControlSealer, control_key
 from gdp.crypto.envelope import seal_key
 from gdp.frame.kinds import Kind
 from gdp.message.acknack import AckNack
@@ -114,7 +114,7 @@ class AckNackSealer:
         if sealer is None:
             reader = self._reader
             ends = reader.name, reader.incarnation, self._publisher, self._incarnation
-            key = note_key(self._shared, self._secrets[epoch], Kind.ACKNACK, *ends, self._topic)
+            key = control_key(self._shared, self._secrets[epoch], Kind.ACKNACK, *ends, self._topic)
             sealer = self._sealers[epoch] = self._note_sealer(key, epoch, Kind.ACKNACK)
         return sealer
 

@@ -196,9 +196,9 @@ class Publications:
         """Return the unicast stream that a report concerns."""
         for service, streams in self._private.items():
             heard = self._heard(service, reader)
-            if heard is None or not streams.is_about(stream, heard.life):
+            if heard is None or not streams.is_about(stream, heard.incarnation_id):
                 continue
-            known = streams.get(heard.life)
+            known = streams.get(heard.incarnation_id)
             if known is not None:
                 return known
             try:

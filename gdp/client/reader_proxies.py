@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from gdp.client.identities import WriterIdentity
-from gdp.crypto.control_seal import ControlOpener, ControlReplayWindow, note_key
+from gdp.crypto.control_seal import ControlOpener, ControlReplayWindow, control_key
 from gdp.crypto.envelope import seal_key
 from gdp.errors import DropReason, EnvelopeError, FrameError, StatementError
 from gdp.frame.codec import Header
@@ -30,7 +30,7 @@ from gdp.names import Name
 __all__ = ["CALLS", "TOPICS", "ReaderProxies", "ReaderProxy", "ReaderTimeouts"]
 
 READERS_MAX: Final = 1_024
-_LIVES_MAX: Final = 4_096  # incarnations of readers whose introductions are remembered
+_INCARNATIONS_MAX: Final = 4_096  # incarnations of readers whose introductions are remembered
 _EPOCHS_KEPT: Final = 2  # the one in use and the one before
 _SUSPENSION_MIN_LAGS: Final = 2
 _SUSPENSION_MAX_LAGS: Final = 16
@@ -52,7 +52,7 @@ TOPICS: Final = ReaderTimeouts(READER_LEASE_S, READER_LEASE_S, REPORT_IDLE_S)
 CALLS: Final = ReaderTimeouts(CALL_LAG_S, CALL_QUIET_S, CALL_IDLE_S)  # other replicas must not wait for a dead one
 
 
-class _Life:
+class _Incarnation:
     """Openers of the reports of one incarnation of a reader, and their replay window."""
 
     def __init__(self, topic: Name, source: WriterIdentity, incarnation: int, started: int, exchange: bytes) -> None:
@@ -74,7 +74,7 @@ class _Life:
         opener = self._openers.get(secret)
         if opener is None:
             ends = header.source, self._incarnation, self._source.name, self._source.incarnation
-            key = note_key(self._shared, secret, Kind.ACKNACK, *ends, self._topic)
+            key = control_key(self._shared, secret, Kind.ACKNACK, *ends, self._topic)
             opener = self._openers[secret] = ControlOpener(key, self._topic, self._source.incarnation)
             if len(self._openers) > _EPOCHS_KEPT:
                 del self._openers[next(iter(self._openers))]
@@ -88,14 +88,14 @@ class ReaderProxy:
     """One reader, in one incarnation of its process.
 
     Attributes:
-        life: opens its reports.
+        incarnation_id: opens its reports.
         sequence: it has confirmed every message before this one, except ``lost`` of them that it counted as lost.
         behind_s: since when its window has been suspended; None: it is not.
         confirmed: ``sequence`` at the end of a former incarnation; 0: not known.
     """
 
     incarnation: int
-    life: _Life
+    incarnation_id: _Incarnation
     heard_s: float
     sequence: int = 0
     lost: int = 0
@@ -115,7 +115,7 @@ class ReaderProxies:
         self._patience = patience
         self._readers: dict[bytes, ReaderProxy] = {}
         self._suspended: dict[bytes, ReaderProxy] = {}
-        self._lives: OrderedDict[tuple[bytes, int], _Life] = OrderedDict()
+        self._incarnation_ids: OrderedDict[tuple[bytes, int], _Incarnation] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self._readers)
@@ -197,17 +197,19 @@ class ReaderProxies:
         Raises:
             StatementError: MALFORMED, it is no key.
         """
-        life = (name, incarnation)
-        if life not in self._lives:
-            self._lives[life] = _Life(self._topic, self._source, incarnation, started, exchange)
-            if len(self._lives) > _LIVES_MAX:
-                self._lives.popitem(last=False)
+        incarnation_id = (name, incarnation)
+        if incarnation_id not in self._incarnation_ids:
+            self._incarnation_ids[incarnation_id] = _Incarnation(
+                self._topic, self._source, incarnation, started, exchange
+            )
+            if len(self._incarnation_ids) > _INCARNATIONS_MAX:
+                self._incarnation_ids.popitem(last=False)
 
     def admit(self, name: bytes, incarnation: int, now_s: float) -> ReaderProxy:
         """Make a known node a reader, in place of a former incarnation of it."""
         former = self._readers.get(name) or self._suspended.pop(name, None)
-        life, confirmed = self._lives[name, incarnation], former.sequence if former else 0
-        reading = self._readers[name] = ReaderProxy(incarnation, life, now_s, confirmed=confirmed)
+        incarnation_id, confirmed = self._incarnation_ids[name, incarnation], former.sequence if former else 0
+        reading = self._readers[name] = ReaderProxy(incarnation, incarnation_id, now_s, confirmed=confirmed)
         return reading
 
     def forget(self, name: bytes) -> bool:
@@ -223,14 +225,16 @@ class ReaderProxies:
         Raises:
             RemoteError: it does not open, is invalid, or is of an earlier incarnation than the reader's present one.
         """
-        life, source = (header.source, header.incarnation), self._source
+        incarnation_id, source = (header.source, header.incarnation), self._source
         reading = self._reading_of(header.source)
-        if life in self._lives or (reading is not None and reading.incarnation == header.incarnation):
+        if incarnation_id in self._incarnation_ids or (
+            reading is not None and reading.incarnation == header.incarnation
+        ):
             return
         key = seal_key(secret, Kind.INTRODUCTION, header.source, header.incarnation, source.name)
         body = ControlOpener(key, self._topic, source.incarnation).open(header, frame)
         introduction = source.notes.introduced(body, Name(header.source), header.incarnation)
-        if reading is not None and introduction.started <= reading.life.started:
+        if reading is not None and introduction.started <= reading.incarnation_id.started:
             raise StatementError(DropReason.STALE, "an introduction of an earlier life")
         self.know(header.source, header.incarnation, introduction.started, introduction.exchange)
 
@@ -249,10 +253,14 @@ class ReaderProxies:
         name = header.source
         reading = self._reading_of(name)
         is_current = reading is not None and reading.incarnation == header.incarnation
-        life = reading.life if reading is not None and is_current else self._lives.get((name, header.incarnation))
-        if life is None:
+        incarnation_id = (
+            reading.incarnation_id
+            if reading is not None and is_current
+            else self._incarnation_ids.get((name, header.incarnation))
+        )
+        if incarnation_id is None:
             raise FrameError(DropReason.UNKNOWN_SENDER, "a note of a life that did not introduce itself")
-        report = AckNack.from_wire(life.open(header, frame, secret, now_s))
+        report = AckNack.from_wire(incarnation_id.open(header, frame, secret, now_s))
         is_new = AckNackFlag.NEW in report.flags
         if not may_begin and (is_new or not is_current):
             raise EnvelopeError(DropReason.UNKNOWN_EPOCH, "a new reader under an epoch that is over")
@@ -262,9 +270,9 @@ class ReaderProxies:
             reading.heard_s = now_s
             self.resume(name, now_s)
             return report, False
-        if reading is not None and (not is_new or life.started <= reading.life.started):
+        if reading is not None and (not is_new or incarnation_id.started <= reading.incarnation_id.started):
             raise FrameError(DropReason.UNKNOWN_SENDER, "a report of a life that never began, or is over")
-        self._lives.move_to_end((name, header.incarnation))
+        self._incarnation_ids.move_to_end((name, header.incarnation))
         self.admit(name, header.incarnation, now_s)
         return report, True
 

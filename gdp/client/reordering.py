@@ -75,13 +75,13 @@ class ReorderingBuffer:
 
     def renumber(self, move: Renumbering) -> list[ReassembledMessage]:
         """Expect the new numbers of a renumbering; remove and return what waited, under its new numbers."""
-        self.expected = move.of(self.expected)
+        self.expected = move.new_number(self.expected)
         early = {number: self._pop(number) for number in list(self._waiting) if move.is_before(number)}
         for number in [number for number in self._waiting if number < self.expected]:
             self._pop(number)  # it was delivered under its old number
-        return [replace(joined, number=move.of(old)) for old, joined in early.items()]
+        return [replace(joined, number=move.new_number(old)) for old, joined in early.items()]
 
-    def drain(self) -> list[ReassembledMessage]:
+    def poll_all(self) -> list[ReassembledMessage]:
         """Remove and return what waits, in order."""
         return [self._pop(number) for number in self.numbers]
 

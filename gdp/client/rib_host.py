@@ -66,7 +66,7 @@ class RibHost:
                 self.rib.boundary.note(error)
                 self._drops[DropReason.INTERNAL] += 1
         self.rib.receive_all(statements, now)
-        self._note_connection(now)
+        self._record_connection(now)
         self._post()
 
     def port_changed(self, port: int, up: bool, now: Timestamps) -> None:
@@ -77,7 +77,7 @@ class RibHost:
         """Process the timers that are due."""
         self._now_s = now.mono_s
         self.attachment.handle_timer(now)
-        self._note_connection(now)
+        self._record_connection(now)
         self._reassembler.drop_expired(now.mono_s)
         self.rib.handle_timer(now)
         self._channels.handle_timer(now.mono_s)
@@ -125,7 +125,7 @@ class RibHost:
             self.rib.revoke(statement.wire, switch.name, now)
             self.attachment.hello_protocol.recheck(statement.fields.bytes_("cert"), now)
 
-    def _note_connection(self, now: Timestamps) -> None:
+    def _record_connection(self, now: Timestamps) -> None:
         is_connected = self.attachment.switch is not None
         if is_connected and not self._is_connected:
             self.rib.connected(now)

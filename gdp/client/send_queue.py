@@ -190,12 +190,12 @@ class SendQueue:
         move = Renumbering(first, end - first, end + 1)
         is_bundle = self.ledger.is_bundle
         sealed = [
-            (move.of(number), self._seal(move.of(number), each, mtu, is_bundle=is_bundle(number)))
+            (move.new_number(number), self._seal(move.new_number(number), each, mtu, is_bundle=is_bundle(number)))
             for number, each in cached
         ]
         self.ledger.forget(first)
         self.ledger.move(move)
-        self.next_number = move.of(end)
+        self.next_number = move.new_number(end)
         self.moves.append(move)
         self._window.renumber(move, [(number, each, each.size_bytes) for number, each in sealed])
         return move

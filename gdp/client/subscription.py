@@ -199,14 +199,14 @@ class Subscriptions:
         writer_proxy = subscription.writer_proxies.get(answer.advertiser)
         if not answer.advertisement:
             if writer_proxy is not None and writer_proxy.advertisement_sequence > answer.sequence:
-                raise StatementError(DropReason.STALE, "gone, of an earlier claim")
+                raise StatementError(DropReason.STALE, "gone, of an earlier advertisement")
             return (
                 change if writer_proxy is None else StreamChanges([], self._detach(subscription, answer.advertiser), [])
             )
         advertisement = self._verifier.verify(answer.advertisement, now.unix_s)
         is_heard = HEARS[subscription.right] is advertisement.right
         if not is_heard or advertisement.name != answer.name or advertisement.node != answer.advertiser:
-            raise StatementError(DropReason.WRONG_NAME, "a claim about something else")
+            raise StatementError(DropReason.WRONG_NAME, "an advertisement about something else")
         self._reader.notes.shared(advertisement.exchange)  # or it is refused before anything changes
         if writer_proxy is not None:
             if advertisement.sequence <= writer_proxy.advertisement_sequence:
@@ -252,8 +252,8 @@ class Subscriptions:
     def _open(self, subscription: Subscription, advertisement: Advertisement, now_s: float) -> list[WriterProxy]:
         topic, reader, party = subscription.topic, self._reader, advertisement.node
         ended = self._ended.get(topic.name + _key(party, advertisement.incarnation)) or _NOWHERE
-        life, before = subscription.absent.get(party, (advertisement.incarnation, ended))
-        if life == advertisement.incarnation:
+        incarnation_id, before = subscription.absent.get(party, (advertisement.incarnation, ended))
+        if incarnation_id == advertisement.incarnation:
             ended = before
             subscription.absent.pop(party, None)
         else:
@@ -269,7 +269,7 @@ class Subscriptions:
             budget=self._budget,
             now_s=now_s,
             ended=ended,
-            restarted=life != advertisement.incarnation,
+            restarted=incarnation_id != advertisement.incarnation,
         )
         writer_proxy.advertisement_sequence, writer_proxy.advertisement = advertisement.sequence, advertisement
         subscription.writer_proxies[party] = writer_proxy

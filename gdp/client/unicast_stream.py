@@ -51,7 +51,7 @@ class PeerIncarnation(NamedTuple):
 class Party(NamedTuple):
     """Incarnation of a connected node, and the X25519 key that its advertisement names."""
 
-    life: PeerIncarnation
+    incarnation_id: PeerIncarnation
     exchange: bytes
 
 
@@ -87,7 +87,7 @@ class UnicastStream(Publisher):
         past: SequenceState,
         now_s: float,
     ) -> None:
-        self.reader = party.life
+        self.reader = party.incarnation_id
         self._exchange = party.exchange
         self._touched_s = now_s
         name = private_name(service, PeerIncarnation(writer.name, writer.incarnation), self.reader)

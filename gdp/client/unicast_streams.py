@@ -89,7 +89,7 @@ class UnicastStreams:
         Raises:
             LocalError: there are too many, all of them in use.
         """
-        reader = party.life
+        reader = party.incarnation_id
         stream = self._streams.get(reader.name)
         if stream is None:
             self._free_space()

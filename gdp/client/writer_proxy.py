@@ -200,7 +200,7 @@ class WriterProxy:
         if self.state is WriterProxyState.LIVE:
             delivery = self._delivery
             delivery.skipped = LossReason.PUBLISHER_RESTARTED
-            for joined in self._order.drain():
+            for joined in self._order.poll_all():
                 delivery.deliver(joined)
             delivery.lose_until(delivery.known, LossReason.PUBLISHER_RESTARTED)
 
@@ -265,7 +265,7 @@ class WriterProxy:
         """Release all memory; return the frame of the goodbye."""
         self._data.close()
         self._status.close()
-        self._order.drain()
+        self._order.poll_all()
         self._schedule.due_s = float("inf")
         return self._sealer.seal(
             AckNack(AckNackFlag.BYE, self._order.expected, 0, (), self._delivery.sequence, self.lost)

@@ -24,8 +24,8 @@ __all__ = [
     "ECHO_BYTES",
     "HEARD_MAX",
     "HELLO_MAX_BYTES",
+    "INCARNATION_BYTES",
     "INTERVAL_MAX_MS",
-    "LIFE_BYTES",
     "MULTIPLIER_MAX",
     "NONCE_BYTES",
     "NO_KEEPALIVES",
@@ -38,7 +38,7 @@ __all__ = [
 NONCE_BYTES: Final = 8
 ECHO_BYTES: Final = 16
 DIGEST_BYTES: Final = 8
-LIFE_BYTES: Final = 16  # first sequence number (wall-clock milliseconds of the start), incarnation; big-endian
+INCARNATION_BYTES: Final = 16  # first sequence number (wall-clock milliseconds of the start), incarnation; big-endian
 COOKIE_BYTES: Final = 16
 HEARD_MAX: Final = 128  # NEIGHBOURS_MAX of a port, and as many that have not proved themselves yet
 CONFLICTS_MAX: Final = 32
@@ -91,7 +91,7 @@ class Hello:
         membership: the sender's certificate, DER.
         timing: the keepalive timing that the sender requests.
         exchange_key: X25519, for the key of keepalives; empty if the sender wants none.
-        life: mark of the sender's incarnation, ``LIFE_BYTES``.
+        incarnation_id: mark of the sender's incarnation, ``INCARNATION_BYTES``.
         rtcerts: of a RIB, one for each switch that it receives here: permission to attract its traffic.
         rivals: echoes of those at this port whose identity another node has, too; those not in ``heard`` are refused.
         cookies: for each receiver that required one, the nonce of its port and the tag that proves the cookie.
@@ -105,7 +105,7 @@ class Hello:
     membership: bytes
     timing: Timing = NO_KEEPALIVES
     exchange_key: bytes = b""
-    life: bytes = bytes(LIFE_BYTES)
+    incarnation_id: bytes = bytes(INCARNATION_BYTES)
     conflicts: tuple[bytes, ...] = ()
     rtcerts: tuple[bytes, ...] = ()
     cookies: tuple[tuple[bytes, bytes], ...] = ()
@@ -121,7 +121,7 @@ class Hello:
             "c": self.membership,
             "k": list(self.timing),
             "x": self.exchange_key,
-            "b": self.life,
+            "b": self.incarnation_id,
             "u": list(self.conflicts[:CONFLICTS_MAX]),
             "r": list(self.rtcerts[:RTCERTS_MAX]),
             "y": [asker + tag for asker, tag in self.cookies[:COOKIES_MAX]],
@@ -144,7 +144,7 @@ class Hello:
             fields.bytes_("c"),
             _timing(fields),
             fields.bytes_("x", EXCHANGE_KEY_BYTES) if fields.get("x") != b"" else b"",
-            fields.bytes_("b", LIFE_BYTES),
+            fields.bytes_("b", INCARNATION_BYTES),
             tuple(fields.byte_strings("u", CONFLICTS_MAX, ECHO_BYTES)),
             tuple(fields.byte_strings("r", RTCERTS_MAX)),
             tuple(

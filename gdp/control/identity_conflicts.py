@@ -30,7 +30,7 @@ class _Session:
 
 @dataclass(slots=True)
 class _Refused:
-    life: bytes
+    incarnation_id: bytes
     until_s: float
 
 
@@ -48,20 +48,20 @@ class IdentityConflicts:
         self.refusals = 0
         self.changes = 0
 
-    def refuse(self, name: Name, life: bytes, now_s: float) -> None:
+    def record_refusal(self, name: Name, incarnation_id: bytes, now_s: float) -> None:
         """Note that a hello was refused."""
         self.refusals += 1
         known = self._refused.get(name)
         self.changes += known is None or known.until_s <= now_s
-        _put(self._refused, name, _Refused(life, now_s + _REPORT_INTERVAL_S))
+        _put(self._refused, name, _Refused(incarnation_id, now_s + _REPORT_INTERVAL_S))
 
-    def accept(self, name: Name, life: bytes) -> None:
+    def accept(self, name: Name, incarnation_id: bytes) -> None:
         """Note that a hello was accepted.
 
         If it was refused before, the older incarnation was already dead, but that was not known yet.
         """
         known = self._refused.get(name)
-        if known is not None and known.life == life:
+        if known is not None and known.incarnation_id == incarnation_id:
             del self._refused[name]
             self.changes += 1
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Final, NamedTuple, TypeVar
 
-from gdp.control.hello import LIFE_BYTES, NONCE_BYTES
+from gdp.control.hello import INCARNATION_BYTES, NONCE_BYTES
 from gdp.crypto.fields import Fields
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.statements import StatementType, sign
@@ -56,7 +56,7 @@ class AttachedRib(NamedTuple):
     Args:
         domain: the RIB's own, which may differ from the switch's.
         session: nonce of its present session with its switch; a restarted or moved RIB has another one.
-        life: mark of its incarnation (``LIFE_BYTES``), which distinguishes two nodes with one identity.
+        incarnation_id: mark of its incarnation (``INCARNATION_BYTES``); it distinguishes two nodes with one identity.
         membership: its certificate, DER.
         rtcert: the RIB's permission for a switch to attract its traffic.
     """
@@ -64,7 +64,7 @@ class AttachedRib(NamedTuple):
     name: Name
     domain: Name
     session: bytes
-    life: bytes = bytes(LIFE_BYTES)
+    incarnation_id: bytes = bytes(INCARNATION_BYTES)
     membership: bytes = b""
     rtcert: bytes = b""
 
@@ -86,7 +86,7 @@ class LinkState:
     inside: tuple[Adjacency, ...]  # BORDER only
     ribs: tuple[AttachedRib, ...]  # attached here (DOMAIN), or reachable within this domain (BORDER)
     members: tuple[Name, ...] = ()  # BORDER only: switches of the domain that are reachable within it from here
-    life: bytes = bytes(LIFE_BYTES)  # mark of the origin's incarnation
+    incarnation_id: bytes = bytes(INCARNATION_BYTES)  # mark of the origin's incarnation
     refused: tuple[Name, ...] = ()  # identities refused at this switch, because an older node has them
     is_partial: bool = False  # there are members that are not listed
     said_unix_s: int = 0  # when it was signed, by the origin's wall clock
@@ -123,7 +123,7 @@ class LinkState:
             "r": [list(each) for each in self.ribs],
             "m": list(self.members),
             "z": self.is_partial,
-            "b": self.life,
+            "b": self.incarnation_id,
             "u": list(self.refused),
             "e": self.said_unix_s,
             "c": membership,
@@ -151,7 +151,7 @@ class LinkState:
             _adjacencies(fields, "i"),
             _ribs(fields),
             tuple(fields.names("m", MEMBERS_MAX)),
-            fields.bytes_("b", LIFE_BYTES),
+            fields.bytes_("b", INCARNATION_BYTES),
             tuple(fields.names("u", RIBS_MAX)),
             fields.flag("z"),
             fields.uint("e"),
@@ -174,13 +174,20 @@ def _ribs(fields: Fields) -> tuple[AttachedRib, ...]:
     found = []
     for each in fields.list_("r", RIBS_MAX):
         match each:
-            case [bytes(name), bytes(domain), bytes(session), bytes(life), bytes(membership), bytes(rtcert)] if (
+            case [
+                bytes(name),
+                bytes(domain),
+                bytes(session),
+                bytes(incarnation_id),
+                bytes(membership),
+                bytes(rtcert),
+            ] if (
                 len(name) == len(domain) == 32
                 and ZERO not in (name, domain)
                 and len(session) == NONCE_BYTES
-                and len(life) == LIFE_BYTES
+                and len(incarnation_id) == INCARNATION_BYTES
             ):
-                found.append(AttachedRib(Name(name), Name(domain), session, life, membership, rtcert))
+                found.append(AttachedRib(Name(name), Name(domain), session, incarnation_id, membership, rtcert))
             case _:
                 raise StatementError(DropReason.MALFORMED, "RIB")
     return tuple(found)

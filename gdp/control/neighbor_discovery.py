@@ -38,7 +38,7 @@ from gdp.control.fragments import ControlFragmenter, ControlReassembler
 from gdp.control.hello import (
     DIGEST_BYTES,
     HELLO_MAX_BYTES,
-    LIFE_BYTES,
+    INCARNATION_BYTES,
     NO_KEEPALIVES,
     NONCE_BYTES,
     RTCERTS_MAX,
@@ -219,9 +219,9 @@ class HelloProtocol:
     Args:
         random_bytes: source of nonces and of session keys.
         timing: keepalive timing that this node requests, where ``set_timing`` sets no other for a port.
-        life: mark of this node's incarnation, ``LIFE_BYTES``.
+        incarnation_id: mark of this node's incarnation, ``INCARNATION_BYTES``.
         digest_for: returns the digest of our link state for the far end of a port.
-        life_elsewhere: the mark of a node with a name that is known to be alive, but at none of our ports; or None.
+        incarnation_elsewhere: returns the mark of a named node that is alive, but at none of our ports; or None.
         rtcert_for: of a RIB, its RtCert for a switch; None of any other node.
 
     Attributes:
@@ -241,9 +241,9 @@ class HelloProtocol:
         dead_s: float = DEAD_S,
         timing: Timing = NO_KEEPALIVES,
         incarnation: int = 0,
-        life: bytes = bytes(LIFE_BYTES),
+        incarnation_id: bytes = bytes(INCARNATION_BYTES),
         digest_for: Callable[[HelloPort], bytes] = lambda _: bytes(DIGEST_BYTES),
-        life_elsewhere: Callable[[Name], bytes | None] = lambda _: None,
+        incarnation_elsewhere: Callable[[Name], bytes | None] = lambda _: None,
         rtcert_for: Callable[[Name], bytes] | None = None,
     ) -> None:
         self._identity = identity
@@ -260,8 +260,8 @@ class HelloProtocol:
         self._lateness_s = 0.0  # how long, in all, this node was called later than it had requested
         self._slowness = Slowness()
         self._digest_for = digest_for
-        self._life = life
-        self._life_elsewhere = life_elsewhere
+        self._incarnation_id = incarnation_id
+        self._incarnation_elsewhere = incarnation_elsewhere
         self._rtcert_for = rtcert_for
         self._rtcerts = RtCertCache(_RTCERTS_REMEMBERED)
         self.conflicts = IdentityConflicts()
@@ -286,7 +286,7 @@ class HelloProtocol:
         settings: NodeSettings,
         *,
         digest_for: Callable[[HelloPort], bytes] = lambda _: bytes(DIGEST_BYTES),
-        life_elsewhere: Callable[[Name], bytes | None] = lambda _: None,
+        incarnation_elsewhere: Callable[[Name], bytes | None] = lambda _: None,
         rtcert_for: Callable[[Name], bytes] | None = None,
     ) -> HelloProtocol:
         """Return the hello protocol of a node with these settings."""
@@ -299,9 +299,9 @@ class HelloProtocol:
             dead_s=settings.dead_s,
             timing=settings.timing,
             incarnation=settings.incarnation,
-            life=settings.life,
+            incarnation_id=settings.incarnation_id,
             digest_for=digest_for,
-            life_elsewhere=life_elsewhere,
+            incarnation_elsewhere=incarnation_elsewhere,
             rtcert_for=rtcert_for,
         )
 
@@ -409,7 +409,7 @@ class HelloProtocol:
         proof = self._proof_of_place(hello, member)
         received_bytes = _received_bytes(arrival, statement)
         self._refuse_conflict(port, hello, member.name, (arrival.mac, received_bytes), now.mono_s)
-        self.conflicts.accept(member.name, hello.life)
+        self.conflicts.accept(member.name, hello.incarnation_id)
         is_two_way = port.echo in hello.heard
         known = port.neighbours.get(member.name)
         self._free_space(port, known, is_two_way=is_two_way)
@@ -442,7 +442,7 @@ class HelloProtocol:
             self._has_moved = port.note_address(arrival.mac) or self._has_moved
         known.cookie = b"" if is_new_session else known.cookie
         known.sequence, known.digest, known.greeted_s = hello.sequence, hello.digest, now.mono_s
-        known.member, known.checked_s, known.life = member, now.mono_s, hello.life
+        known.member, known.checked_s, known.incarnation_id = member, now.mono_s, hello.incarnation_id
         known.role = member.role  # a root may have changed a switch into a leaf
         had_proof, known.proof = known.proof is not None, proof
         self._note_clash(port, known, hello, now.mono_s)
@@ -562,14 +562,14 @@ class HelloProtocol:
             for each in self.ports.values()
             if (other := each.neighbours.get(name)) is not None
             and other.is_proven
-            and other.life != hello.life
+            and other.incarnation_id != hello.incarnation_id
             and now_s < self._gone_at_s(other)
         ]
         mac, received_bytes = arrived
         if any((other.port, other.mac) == (port.index, mac) for other in others):
             return  # it was restarted there
-        elsewhere = self._life_elsewhere(name)
-        is_outlived_here = any(other.life < hello.life for other in others)
+        elsewhere = self._incarnation_elsewhere(name)
+        is_outlived_here = any(other.incarnation_id < hello.incarnation_id for other in others)
         is_proven = port.echo in hello.heard  # else it may be a replayed one
         tell = self._tell_conflict if is_proven else self.conflicts.tell
         for other in others:
@@ -577,9 +577,9 @@ class HelloProtocol:
                 tell(other.port, other.nonce, name, now_s)
             elif is_proven:
                 self.let_go(other, now_s)
-        if not is_outlived_here and (elsewhere is None or hello.life <= elsewhere):
+        if not is_outlived_here and (elsewhere is None or hello.incarnation_id <= elsewhere):
             return
-        self.conflicts.refuse(name, hello.life, now_s)
+        self.conflicts.record_refusal(name, hello.incarnation_id, now_s)
         tell(port.index, hello.nonce, name, now_s)
         if not is_proven:
             port.schedule_hello(received_bytes, now_s)
@@ -601,7 +601,7 @@ class HelloProtocol:
     def let_go(self, neighbour: Neighbour, now_s: float) -> None:
         """Have ``drop_silent`` remove a neighbour, because an older node with its identity is alive."""
         self._next_s = None
-        self.conflicts.refuse(neighbour.name, neighbour.life, now_s)
+        self.conflicts.record_refusal(neighbour.name, neighbour.incarnation_id, now_s)
         self._tell_conflict(neighbour.port, neighbour.nonce, neighbour.name, now_s)
         neighbour.let_go_s = now_s
 
@@ -618,7 +618,7 @@ class HelloProtocol:
             self._next_s = None
             self.ports[port].hurry(now_s)
 
-    def note_clash(self, reporter: Name, now_s: float, *, is_proven: bool = False) -> None:
+    def record_clash(self, reporter: Name, now_s: float, *, is_proven: bool = False) -> None:
         """Note that another node has our own identity.
 
         Args:
@@ -635,7 +635,7 @@ class HelloProtocol:
         """Note what a neighbour's hello states about our identity."""
         neighbour.refuses_us = port.echo in hello.conflicts and port.echo not in hello.heard
         if port.echo in hello.conflicts:
-            self.note_clash(neighbour.name, now_s)
+            self.record_clash(neighbour.name, now_s)
 
     def receive_keepalive(self, arrival: ReceivedFrame, header: Header, now: Timestamps) -> Neighbour:
         """Process a keepalive; return the neighbour that sent it.
@@ -796,7 +796,8 @@ class HelloProtocol:
         identity, timing = self._identity, self._timings.get(port.index, self._timing)
         hello = Hello(
             port.nonce, port.sequence, heard, port.own_mtu, self._digest_for(port), identity.membership,
-            timing, port.exchange_key.public, self._life, self.conflicts.on(port.index, now_s), self._rtcerts_on(port),
+            timing, port.exchange_key.public, self._incarnation_id,
+            self.conflicts.on(port.index, now_s), self._rtcerts_on(port),
             tuple(
                 (each.nonce, seal_cookie(each.cookie, port.nonce, port.sequence))
                 for each in port.neighbours.values() if each.cookie

@@ -15,7 +15,7 @@ from enum import Enum
 from typing import Final
 
 from gdp.control.admission import TokenBucket
-from gdp.control.hello import LIFE_BYTES, echo_of
+from gdp.control.hello import INCARNATION_BYTES, echo_of
 from gdp.control.keepalive import KeepaliveSession
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.keys import PublicKey
@@ -81,7 +81,7 @@ class Neighbour:
     greeted_s: float = 0.0  # when its last hello came
     keepalives: KeepaliveSession | None = None  # while it is up and both ends want them
     lateness_s: float = 0.0  # of this node, in all, when the neighbour was last heard
-    life: bytes = bytes(LIFE_BYTES)
+    incarnation_id: bytes = bytes(INCARNATION_BYTES)
     proof: tuple[bytes, bytes] | None = None  # of a RIB that is attached here: its membership, its RtCert for us
     # it is removed then, unless a frame of it comes before: an older node has its identity
     let_go_s: float | None = None

@@ -94,7 +94,7 @@ class IdentityChecks:
 
     def __init__(self) -> None:
         self._checks: dict[Name, _Check] = {}
-        self._refused_above: dict[Name, tuple[int, float]] = {}  # incarnation, and until when
+        self._refused_upstream: dict[Name, tuple[int, float]] = {}  # incarnation, and until when
         self.clashes = 0
 
     def is_free(self, node: Name, incarnation: int, switch: Name, now_s: float) -> bool:
@@ -123,18 +123,18 @@ class IdentityChecks:
 
     def refused_above(self, node: Name, incarnation: int, now_s: float) -> None:
         """Note that the tier above knows of an older node with this identity."""
-        self._refused_above.pop(node, None)
-        if len(self._refused_above) >= _CHECKS_MAX:
-            del self._refused_above[next(iter(self._refused_above))]
-        self._refused_above[node] = incarnation, now_s + _REFUSED_ABOVE_S
+        self._refused_upstream.pop(node, None)
+        if len(self._refused_upstream) >= _CHECKS_MAX:
+            del self._refused_upstream[next(iter(self._refused_upstream))]
+        self._refused_upstream[node] = incarnation, now_s + _REFUSED_ABOVE_S
 
     def taken_above(self, node: Name) -> None:
         """Note that the tier above accepts a node's advertisement."""
-        self._refused_above.pop(node, None)
+        self._refused_upstream.pop(node, None)
 
     def is_refused_above(self, node: Name, incarnation: int, now_s: float) -> bool:
         """Return whether a node must be accepted by the tier above first."""
-        refused, until_s = self._refused_above.get(node, (incarnation, now_s))
+        refused, until_s = self._refused_upstream.get(node, (incarnation, now_s))
         return refused == incarnation and now_s < until_s
 
     def answered(self, presence: Presence, switch: Name, now_s: float) -> None:

@@ -149,7 +149,7 @@ class Entry:
         via: the domain of ``sender``.
         transit: domains through which that domain lets its traffic pass.
         lease_s: what is left of the lease.
-        is_from_above: received from the tier above.
+        is_from_upstream: received from the tier above.
         until_unix_s: when a withdrawal may be forgotten, because its advertisement is no longer provable; 0 for an
             advertisement.
     """
@@ -161,7 +161,7 @@ class Entry:
     via: Name
     transit: tuple[Name, ...]
     lease_s: float
-    is_from_above: bool
+    is_from_upstream: bool
     until_unix_s: int = 0
 
     def to_fields(self) -> dict[str, object]:
@@ -174,7 +174,7 @@ class Entry:
             "v": self.via,
             "x": list(self.transit[:TRANSIT_MAX]),
             "l": float(self.lease_s),
-            "u": self.is_from_above,
+            "u": self.is_from_upstream,
             "t": self.until_unix_s,
         }
 

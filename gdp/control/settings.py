@@ -39,8 +39,8 @@ class NodeSettings:
     detect_multiplier: int = DETECT_MULTIPLIER
 
     @property
-    def life(self) -> bytes:
-        """Return the mark of this incarnation, ``LIFE_BYTES``: of two, that of the older one is less."""
+    def incarnation_id(self) -> bytes:
+        """Return the mark of this incarnation, ``INCARNATION_BYTES``: of two, that of the older one is less."""
         return self.first_sequence.to_bytes(8, "big") + self.incarnation.to_bytes(8, "big")
 
     @property

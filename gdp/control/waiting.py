@@ -33,7 +33,7 @@ class WaitReason(Enum):
     ONE_WAY = "not-heard"  # a neighbour whose hellos we receive does not receive ours, or refuses us
     NO_SWITCH = "no-switch"  # neighbours, but none is a switch
     NO_RIB = "no-rib"
-    REFUSED = "claim-refused"
+    REFUSED = "advertisement-refused"
     IN_USE = "identity-in-use"
     THROUGH_LEAF = "through-leaf"  # switches of the domain that only a leaf connects to this one
 
@@ -61,7 +61,7 @@ class Wait:
         if self.reason is WaitReason.STRANGER:
             return "stranger", self.port, self.domain
         if self.reason is WaitReason.REFUSED:
-            return "claim", self.name
+            return "advertisement", self.name
         if self.reason is WaitReason.THROUGH_LEAF:
             return "leaf", None
         return "port", self.port

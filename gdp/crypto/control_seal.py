@@ -28,7 +28,7 @@ from gdp.frame.kinds import Flag
 from gdp.limits import HOPS_MAX
 from gdp.names import NAME_BYTES
 
-__all__ = ["JUMP_MAX", "ControlOpener", "ControlReplayWindow", "ControlSealer", "note_key", "topic_of"]
+__all__ = ["JUMP_MAX", "ControlOpener", "ControlReplayWindow", "ControlSealer", "control_key", "topic_of"]
 
 _NONCE: Final = struct.Struct("!QI")
 _INCARNATION: Final = struct.Struct("!Q")
@@ -38,7 +38,7 @@ _NUMBERS_PER_S: Final = 100_000  # more than one process sends
 _BODY_AT: Final = HEADER_BYTES + NAME_BYTES
 
 
-def note_key(
+def control_key(
     shared: bytes,
     secret: bytes,
     kind: int,

@@ -80,7 +80,7 @@ def processes_inside(paths: Collection[Path]) -> list[Process]:
     for folder in Path("/proc").iterdir() if held else ():
         if folder.name.isdecimal() and _identity(folder / "ns" / "net") in held:
             with suppress(ProcessLookupError):
-                found.append(Process.of(int(folder.name)))
+                found.append(Process.from_pid(int(folder.name)))
     return found
 
 

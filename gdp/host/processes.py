@@ -25,7 +25,7 @@ class Process:
     started: int
 
     @classmethod
-    def of(cls, pid: int) -> Process:
+    def from_pid(cls, pid: int) -> Process:
         """Return the running process ``pid``.
 
         Raises:

@@ -142,7 +142,7 @@ class Run:
     def note_process(self, pid: int) -> None:
         """Record a process that was just started as the leader of its group, unless it has already ended."""
         with suppress(ProcessLookupError):
-            self._record.processes.append(Process.of(pid))
+            self._record.processes.append(Process.from_pid(pid))
             self._save()
 
     def keep(self, *, passive: bool = False) -> None:
@@ -186,7 +186,7 @@ class RunRegistry:
         """Begin a run with a new id and an empty scratch directory (in the directory for temporary files)."""
         run = secrets.token_hex(_ID_BYTES)
         directory = Path(tempfile.gettempdir()) / f"gdp-{run}"
-        record = Record(run, boot_id(), Process.of(os.getpid()), files=[str(directory)])
+        record = Record(run, boot_id(), Process.from_pid(os.getpid()), files=[str(directory)])
         return Run(record, self._directory / f"{run}.json", directory)
 
     def all(self) -> list[Record]:

@@ -65,7 +65,7 @@ class Ledger:
 
     def move(self, move: Renumbering) -> None:
         """Apply a renumbering."""
-        self._of = {move.of(number): carried for number, carried in self._of.items()}
+        self._of = {move.new_number(number): carried for number, carried in self._of.items()}
 
     def let_go(self, numbers: Iterable[int], reason: LossReason) -> int:
         """Note that message numbers are gone before every reader had them; return how many messages they carried."""

@@ -64,11 +64,11 @@ class ReassemblyQuota:
         larger = [source for source, held in self._by_source.items() if held > size]
         return sorted(larger, key=lambda source: -self._by_source[source])
 
-    def _relieve(self, asker: QuotaHolder | None, source: bytes, above: int) -> bool:
-        """Release memory of the source's largest holder, if that could release more than ``above`` bytes."""
+    def _relieve(self, asker: QuotaHolder | None, source: bytes, upstream: int) -> bool:
+        """Release memory of the source's largest holder, if that could release more than ``upstream`` bytes."""
         others = [each for each, of in self._holders.items() if of == source and each is not asker]
         victim = max(others, key=lambda each: each.unfinished_bytes, default=None)
-        if victim is None or victim.unfinished_bytes <= above:
+        if victim is None or victim.unfinished_bytes <= upstream:
             return False
         victim.give_way()
         return True

@@ -31,6 +31,6 @@ class Renumbering(NamedTuple):
         """Return whether a number dates from before the renumbering."""
         return number < self.to
 
-    def of(self, number: int) -> int:
+    def new_number(self, number: int) -> int:
         """Return the new number of a message: the first for one that is no longer cached, its own for a new one."""
         return number if number >= self.to else self.to + max(number - self.first, 0)

@@ -165,7 +165,7 @@ class SendWindow:
             self.add(number, each, size)
         positions = self._readers.all()
         for position in positions:
-            position.next_number = move.of(position.next_number)
+            position.next_number = move.new_number(position.next_number)
         least = self._readers.least_active() if self._readers.active else 0
         while self._best_effort_queue and self._best_effort_queue[0][0] < least:
             self._sent_at = self._cache.messages[self._best_effort_queue.popleft()[0]].end_at

@@ -113,7 +113,7 @@ class RibCore:
             self._verifier, store, lambda name: bool(self._watches.watchers(name, self._now_s))
         )
         self._holders = Watches(settings.watches)  # members that received a response, for its lease
-        self._above = UpstreamQueries(is_top=not settings.upper)
+        self._upstream_queries = UpstreamQueries(is_top=not settings.upper)
         self._upstream = UpstreamAdvertisements(settings.upper)
         self._replication = self._replication_over(store.digests)
         self._answer_paces = Paces(ANSWER_BYTES_PER_S, ANSWER_BYTES_BURST)
@@ -185,7 +185,7 @@ class RibCore:
                 continue
             known = {route.advertiser: route for route in before}
             for advertiser, route in routes.items():
-                self._tell(route, known.get(advertiser), now.mono_s, self._above.answered(name, now.mono_s))
+                self._tell(route, known.get(advertiser), now.mono_s, self._upstream_queries.answered(name, now.mono_s))
             for advertiser in known.keys() - routes.keys():
                 self._tell_gone(known[advertiser], now.mono_s)
 
@@ -236,7 +236,7 @@ class RibCore:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self._store.next_expiry(), self._above.next_due(), self._upstream.next_due()]
+        times = [self._store.next_expiry(), self._upstream_queries.next_due(), self._upstream.next_due()]
         if self._replication is not None:
             times.append(self._replication.next_due())
         return min((time for time in times if time is not None), default=None)
@@ -273,7 +273,7 @@ class RibCore:
             if member.role.is_switch and advertisement.switch != member.name:
                 raise StatementError(DropReason.NOT_DELEGATED, "the RtCert names another switch than the relay")
             if relay.domain is not None and not self._policy.trusts(relay.domain):
-                raise StatementError(DropReason.WRONG_DOMAIN, "a claim of a domain that is not trusted")
+                raise StatementError(DropReason.WRONG_DOMAIN, "an advertisement of a domain that is not trusted")
             if member.domain != self._policy.own and not advertisement.is_global:
                 raise StatementError(DropReason.WRONG_DOMAIN, "a local name of another domain")
             self._check_identity(advertisement, now)
@@ -462,9 +462,11 @@ class RibCore:
         for route in routes:
             self._answer(route, asker, now.mono_s)
         is_below = not self._upstream.has(member.name)
-        if is_below and self._above.want(query.name, asker, query.watch_s, now.mono_s, is_known=bool(routes)):
-            self._ask_above(query.name, self._above.watch_s(query.name))
-        elif not routes and not self._above.is_waiting(query.name):
+        if is_below and self._upstream_queries.want(
+            query.name, asker, query.watch_s, now.mono_s, is_known=bool(routes)
+        ):
+            self._ask_upstream(query.name, self._upstream_queries.watch_s(query.name))
+        elif not routes and not self._upstream_queries.is_waiting(query.name):
             self._answer_negative(query.name, member.name)
 
     def _watch(self, query: Query, asker: Asker, now_s: float) -> None:
@@ -509,7 +511,7 @@ class RibCore:
     def _concerns(self, name: Name, now_s: float) -> bool:
         """Return whether any node is to be notified of a name."""
         is_held = self._watches.watchers(name, now_s) or self._holders.watchers(name, now_s)
-        return bool(is_held) or self._above.is_waiting(name)
+        return bool(is_held) or self._upstream_queries.is_waiting(name)
 
     def _tell(self, route: Route, known: Route | Withdrawn | None, now_s: float, askers: Sequence[Asker] = ()) -> None:
         """Send a route to ``askers``, to watchers, and after a move to holders and the sender of the old location."""
@@ -525,7 +527,7 @@ class RibCore:
     def _sender_of(self, route: Route) -> dict[Asker, None]:
         """Return the relay of a route, unless that was the tier above."""
         is_rib = route.sender != route.switch
-        return {} if route.is_from_above else {Asker(route.sender, route.via, is_rib): None}
+        return {} if route.is_from_upstream else {Asker(route.sender, route.via, is_rib): None}
 
     def _tell_gone(self, route: Route, now_s: float, by: Name | None = None) -> None:
         """Notify a name's watchers, holders and sender that a route is gone, except ``by``, which knows."""
@@ -544,10 +546,10 @@ class RibCore:
     def _ask_what_is_due(self, now_s: float) -> None:
         """Repeat queries to the tier above; of several RIBs there, replace a silent one."""
         if self._upstream.turn_over(now_s):
-            self._above.ask_again(now_s)
-        ask, given_up = self._above.due(now_s)
+            self._upstream_queries.ask_again(now_s)
+        ask, given_up = self._upstream_queries.due(now_s)
         for name, watch_s in ask:
-            self._ask_above(name, watch_s)
+            self._ask_upstream(name, watch_s)
         for name, askers in given_up:
             for asker in askers:
                 self._answer_negative(name, asker.name)
@@ -556,13 +558,13 @@ class RibCore:
     def _probe(self, now_s: float, quiet_s: float) -> None:
         """Send one of several RIBs above a probe if it gave no sign of life for ``quiet_s``."""
         if self._upstream.probe(now_s, quiet_s):
-            self._query_above(self._upstream.rib, 0.0)
+            self._query_upstream(self._upstream.rib, 0.0)
 
-    def _ask_above(self, name: Name, watch_s: float) -> None:
-        self._query_above(name, watch_s)
+    def _ask_upstream(self, name: Name, watch_s: float) -> None:
+        self._query_upstream(name, watch_s)
         self._probe(self._now_s, _DOUBT_S)
 
-    def _query_above(self, name: Name | None, watch_s: float) -> None:
+    def _query_upstream(self, name: Name | None, watch_s: float) -> None:
         upper = self._upstream.rib
         assert upper is not None
         assert name is not None
@@ -593,7 +595,7 @@ class RibCore:
             return
         self._upstream.refused(key)
         known = self._store.get(*key)
-        if ack.refused is DropReason.IN_USE and isinstance(known, Route) and not known.is_from_above:
+        if ack.refused is DropReason.IN_USE and isinstance(known, Route) and not known.is_from_upstream:
             incarnation = UnverifiedAdvertisement.from_statement(parse(known.advertisement)).incarnation
             self.identities.refused_above(ack.name, incarnation, now.mono_s)
             self._store.withdraw(*key)
@@ -605,14 +607,14 @@ class RibCore:
         member = self._upper_member(statement, now)
         answer = Response.from_fields(fields)
         if answer.is_negative:
-            askers = self._above.answered(answer.name, now.mono_s)
+            askers = self._upstream_queries.answered(answer.name, now.mono_s)
             if not self._store.routes(answer.name):
                 for asker in askers:
                     self._answer_negative(answer.name, asker.name)
             return
         known = self._store.get(answer.name, answer.advertiser)
         if not answer.advertisement:
-            if isinstance(known, Route) and known.is_from_above and known.sequence <= answer.sequence:
+            if isinstance(known, Route) and known.is_from_upstream and known.sequence <= answer.sequence:
                 self._store.withdraw(answer.name, answer.advertiser)
                 self._tell_gone(known, now.mono_s)
             return
@@ -623,9 +625,9 @@ class RibCore:
     ) -> None:
         advertisement = self._verifier.verify(answer.advertisement, now.unix_s)
         if advertisement.name != answer.name or advertisement.node != answer.advertiser:
-            raise StatementError(DropReason.WRONG_NAME, "an answer about something else than its claim")
+            raise StatementError(DropReason.WRONG_NAME, "an answer about something else than its advertisement")
         is_from_below = (
-            isinstance(known, Route) and not known.is_from_above and known.advertisement == advertisement.wire
+            isinstance(known, Route) and not known.is_from_upstream and known.advertisement == advertisement.wire
         )
         if answer.domain == self._policy.own or is_from_below:
             return  # our own, or of a tier below, returned from above
@@ -634,13 +636,13 @@ class RibCore:
         route = replace(
             self._route(advertisement, answer.transit, member, now),
             domain=answer.domain,
-            is_from_above=True,
+            is_from_upstream=True,
             expires_s=now.mono_s + answer.lease_s,
         )
         self._store.put(route)
-        if isinstance(known, Route) and not known.is_from_above:
+        if isinstance(known, Route) and not known.is_from_upstream:
             self._replicate(route.name, route.advertiser)  # a peer has the old location
-        self._tell(route, known, now.mono_s, self._above.answered(answer.name, now.mono_s))
+        self._tell(route, known, now.mono_s, self._upstream_queries.answered(answer.name, now.mono_s))
 
     # -- revocations
 
@@ -701,8 +703,8 @@ class RibCore:
         """Return the RIBs that receive every revocation: the tier above, and peers."""
         if self._upstream.has(origin):
             return list(self._settings.peers)
-        above = [] if self._upstream.rib is None else [self._upstream.rib]
-        return above if origin in self._settings.peers else [*above, *self._settings.peers]
+        upstream = [] if self._upstream.rib is None else [self._upstream.rib]
+        return upstream if origin in self._settings.peers else [*upstream, *self._settings.peers]
 
     def _send_revocations(self, wires: Iterable[bytes], to: Iterable[Name], kind: Kind = Kind.RIB_ANSWER) -> None:
         names = list(to)
@@ -732,13 +734,13 @@ class RibCore:
             lease_s = min(known.expires_s - now_s, LEASE_MAX_S)
             return Entry(
                 known.advertisement, b"", known.sender, known.domain, known.via, known.transit, lease_s,
-                known.is_from_above,
+                known.is_from_upstream,
             )  # fmt: skip
         if isinstance(known, Withdrawn) and known.proof:
             own = self._policy.own
             return Entry(
                 known.proof, known.membership, known.sender, own, own, (), 0.0,
-                is_from_above=False, until_unix_s=known.valid_until_unix_s,
+                is_from_upstream=False, until_unix_s=known.valid_until_unix_s,
             )  # fmt: skip
         return None
 
@@ -773,7 +775,7 @@ class RibCore:
             raise StatementError(DropReason.LEASE_BOUNDS)
         if known is not None and not self._is_newer(advertisement, known, now.mono_s + lease_s):
             return
-        if entry.is_from_above and (not isinstance(known, Route) or known.is_from_above):
+        if entry.is_from_upstream and (not isinstance(known, Route) or known.is_from_upstream):
             return  # no entry here that it corrects
         if known is None:
             self._check_quota(entry.sender, advertisement.node)
@@ -784,17 +786,17 @@ class RibCore:
             via=entry.via,
             transit=entry.transit,
             expires_s=now.mono_s + lease_s,
-            is_from_above=entry.is_from_above,
+            is_from_upstream=entry.is_from_upstream,
         )
         self._store.put(route)
-        self._tell(route, known, now.mono_s, self._above.answered(route.name, now.mono_s))
+        self._tell(route, known, now.mono_s, self._upstream_queries.answered(route.name, now.mono_s))
 
     def _is_newer(self, advertisement: Advertisement, known: Route | Withdrawn, expires_s: float) -> bool:
         """Return whether a peer's advertisement replaces the known one: a higher sequence, or the same for longer."""
         if advertisement.sequence != known.sequence:
             return advertisement.sequence > known.sequence
         is_same = isinstance(known, Route) and known.advertisement == advertisement.wire
-        return is_same and isinstance(known, Route) and (known.is_from_above or expires_s > known.expires_s)
+        return is_same and isinstance(known, Route) and (known.is_from_upstream or expires_s > known.expires_s)
 
     def _take_withdrawn_entry(self, entry: Entry, withdrawal: Statement, now: Timestamps) -> None:
         fields = _withdrawal(withdrawal, now)

@@ -25,7 +25,7 @@ class Route:
         via: the domain of ``sender``: another one where the advertisement came over several tiers.
         transit: domains through which that domain lets its traffic pass.
         advertisement: the signed bytes.
-        is_from_above: learnt from the tier above, and sent downwards only.
+        is_from_upstream: learnt from the tier above, and sent downwards only.
         expires_s: end of the lease, monotonic seconds.
         valid_until_unix_s: ``CLOCK_SKEW_S`` after the advertisement's evidence expires; no replay is possible after
             that.
@@ -43,7 +43,7 @@ class Route:
     sequence: int
     is_global: bool
     advertisement: bytes
-    is_from_above: bool
+    is_from_upstream: bool
     expires_s: float
     valid_until_unix_s: int
     fingerprints: frozenset[bytes]
@@ -59,7 +59,7 @@ class Route:
         via: Name,
         transit: tuple[Name, ...],
         expires_s: float,
-        is_from_above: bool = False,
+        is_from_upstream: bool = False,
     ) -> Route:
         """Return the route of a verified advertisement."""
         return cls(
@@ -73,7 +73,7 @@ class Route:
             sequence=advertisement.sequence,
             is_global=advertisement.is_global,
             advertisement=advertisement.wire,
-            is_from_above=is_from_above,
+            is_from_upstream=is_from_upstream,
             expires_s=expires_s,
             valid_until_unix_s=advertisement.valid_until_unix_s + int(CLOCK_SKEW_S),
             fingerprints=advertisement.fingerprints,

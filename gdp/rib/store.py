@@ -114,7 +114,7 @@ class MemoryStore:
         self._forget_withdrawn(route.name, route.advertiser)
         if self.changes is not None:
             self.changes.add((route.name, route.advertiser))
-        if not route.is_from_above:
+        if not route.is_from_upstream:
             self.digests.put(route.name, route.advertiser, route.sequence, is_withdrawn=False)
         self._routes.setdefault(route.name, {})[route.advertiser] = route
         self._evidence.put((route.name, route.advertiser), route.fingerprints | route.issuers)

@@ -96,7 +96,7 @@ class Dispatch(Generic[A]):
 
     Attributes:
         late: responses that came for a call that had ended.
-        strange: responses of servers that were not asked, or that refused or declined before.
+        unexpected: responses of servers that were not asked, or that refused or declined before.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class Dispatch(Generic[A]):
         self._ended: dict[int, _Ended] = {}  # in the order of their end
         self._effects: list[Effect] = []
         self.late = 0
-        self.strange = 0
+        self.unexpected = 0
         self.hedged = 0
 
     def __len__(self) -> int:
@@ -184,7 +184,7 @@ class Dispatch(Generic[A]):
         self._hedge(now_s)
         return number
 
-    def came(self, server: Name, now_s: float) -> None:
+    def replica_joined(self, server: Name, now_s: float) -> None:
         """Add a server; where all are asked, it also receives the calls under way that it has not received yet."""
         if server in self._servers:
             self._servers[server] = False
@@ -195,12 +195,12 @@ class Dispatch(Generic[A]):
                 if server not in call.tried:
                     self._ask(number, call, [server], now_s)
 
-    def leaves(self, server: Name) -> None:
+    def replica_leaving(self, server: Name) -> None:
         """Record that a server goes soon: it is asked only where no other is left, and its responses count."""
         if server in self._servers:
             self._servers[server] = True
 
-    def gone(self, server: Name, now_s: float, reason: str) -> None:
+    def replica_lost(self, server: Name, now_s: float, reason: str) -> None:
         """Remove a server that is gone, or no longer confirms."""
         if self._servers.pop(server, None) is None:
             return
@@ -281,7 +281,7 @@ class Dispatch(Generic[A]):
                 del self._ended[number]
         else:
             since_s = call.owing.pop(server, None)
-            self.strange += since_s is None
+            self.unexpected += since_s is None
         if since_s is None:
             return None
         if says_no:

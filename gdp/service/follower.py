@@ -111,7 +111,7 @@ class Follower:
     def heard(self, client: Name, word: ReplicaProbe | AttachReplica | SnapshotRequest) -> None:
         """Handle a sequencer's message."""
         if isinstance(word, ReplicaProbe):
-            if client == self._sequencer and word.life != self._log.life and self._follow is None:
+            if client == self._sequencer and word.incarnation_id != self._log.incarnation_id and self._follow is None:
                 self._sequencer = None  # the sequencer keeps this log no more
             if self._follow is None or client != self._sequencer:
                 self._say(client)
@@ -125,12 +125,12 @@ class Follower:
 
     def entry(self, client: Name, call: int, request: bytes) -> None:
         """Handle an entry, or a request that a client sent as one."""
-        life, index = place_of(call)
+        incarnation_id, index = place_of(call)
         if client != self._sequencer:
             reason = UNKEPT if self._sequencer is None else f"kept in order by {self._sequencer.short}"
             self._effects.append(Refuse(client, call, reason))
             return
-        if life != self._log.life or self._is_lost or index <= self._index or index in self._held:
+        if incarnation_id != self._log.incarnation_id or self._is_lost or index <= self._index or index in self._held:
             return  # of a log that is over or unknown here, or a duplicate
         if index > self._index + HELD_MAX:
             return  # the sequencer detects that it is not applied, and sends it again

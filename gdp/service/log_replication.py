@@ -76,12 +76,12 @@ class LogReplication:
             self.is_sent = True
         replica.sent = max(replica.sent, until)
 
-    def handle_done(self, server: Name, life: int, index: int, now_s: float) -> bool:
+    def handle_done(self, server: Name, incarnation_id: int, index: int, now_s: float) -> bool:
         """Record that a replica has applied all entries up to ``index``; return False where it does not follow."""
         replica = self._replicas.get(server)
         if replica is None or not replica.follows or replica.position is None:
             return False
-        if life != self.log.life or index > self._entries.last:
+        if incarnation_id != self.log.incarnation_id or index > self._entries.last:
             return False
         if index > replica.position.at:
             replica.position = replica.position._replace(at=index, held=max(index, replica.position.held))

@@ -24,7 +24,7 @@ from typing import Final, NamedTuple, TypeAlias
 from gdp.names import Name
 
 __all__ = [
-    "LIFE_BITS",
+    "INCARNATION_BITS",
     "NO_LOG",
     "AttachReplica",
     "FollowerMessage",
@@ -39,18 +39,18 @@ __all__ = [
     "place_of",
 ]
 
-LIFE_BITS: Final = 32  # the upper half of a call's number is the log, the lower half the entry
+INCARNATION_BITS: Final = 32  # the upper half of a call's number is the log, the lower half the entry
 
 
 class LogId(NamedTuple):
     """Identifier of a log. Of two the greater wins.
 
-    ``generation``: above that of every log that its sequencer received. ``life``: 32 random bits, for two that began at
-    once.
+    ``generation``: above that of every log that its sequencer received. ``incarnation_id``: 32 random bits,
+    for two that began at once.
     """
 
     generation: int
-    life: int
+    incarnation_id: int
 
 
 NO_LOG: Final = LogId(0, 0)  # of a server that has just started
@@ -59,7 +59,7 @@ NO_LOG: Final = LogId(0, 0)  # of a server that has just started
 class ReplicaProbe(NamedTuple):
     """A sequencer's probe for a replica's position; it releases a follower of the sequencer's other log."""
 
-    life: int
+    incarnation_id: int
 
 
 class AttachReplica(NamedTuple):
@@ -126,9 +126,9 @@ FollowerMessage: TypeAlias = "ReplicaStatus | Snapshot"
 
 def call_of(log: LogId, index: int) -> int:
     """Return the call number of an entry."""
-    return log.life << LIFE_BITS | index
+    return log.incarnation_id << INCARNATION_BITS | index
 
 
 def place_of(call: int) -> tuple[int, int]:
-    """Return the ``life`` of a log, and the index in it."""
-    return call >> LIFE_BITS, call & (1 << LIFE_BITS) - 1
+    """Return the ``incarnation_id`` of a log, and the index in it."""
+    return call >> INCARNATION_BITS, call & (1 << INCARNATION_BITS) - 1

@@ -1,7 +1,7 @@
 """Sequencer of one service with state, at its client: every request goes to all replicas in one order.
 
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds), randomness as ``life``; ``poll_effects`` returns what to send.
-It has the methods of a ``Dispatch``, which serves services without state.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds), randomness as ``incarnation_id``. ``poll_effects`` returns
+what to send. It has the methods of a ``Dispatch``, which serves services without state.
 
 ::
 
@@ -27,7 +27,7 @@ from gdp.service.pending import Pending
 from gdp.service.replicas import Replica, Replicas
 from gdp.service.replicated_log import ReplicatedLog
 from gdp.service.replication_messages import (
-    LIFE_BITS,
+    INCARNATION_BITS,
     NO_LOG,
     AttachReplica,
     FollowerMessage,
@@ -60,34 +60,34 @@ class Sequencer(Generic[A]):
     """The calls of one service from this client, and the log of them.
 
     Args:
-        life: returns 32 random bits.
+        incarnation_id: returns 32 random bits.
         entries: returns an empty log.
 
     Attributes:
         late: responses that came for a call that had ended: those of all replicas but the first.
-        strange: responses of replicas that do not follow.
+        unexpected: responses of replicas that do not follow.
         hedged: always none; every replica gets every request.
     """
 
     def __init__(
         self,
         *,
-        life: Callable[[], int],
+        incarnation_id: Callable[[], int],
         entries: Callable[[], ReplicatedLog] = ReplicatedLog,
     ) -> None:
-        self._life = life
+        self._incarnation_id = incarnation_id
         self._new_entries = entries
         self._replicas = Replicas()
         self._effects: list[Effect] = []
         self._election = Election()
         self._restart()
         self.late = 0
-        self.strange = 0
+        self.unexpected = 0
         self.hedged = 0
 
     def _restart(self) -> None:
         """Discard the log; no replica follows it."""
-        self._log = LogId(0, self._life() or 1)
+        self._log = LogId(0, self._incarnation_id() or 1)
         self._calls = Pending[A](call_of(self._log, 1))
         self._entries = self._new_entries()
         self._replication = LogReplication(
@@ -103,8 +103,8 @@ class Sequencer(Generic[A]):
         return len(self._calls)
 
     def __contains__(self, number: int) -> bool:
-        life, index = place_of(number)
-        return life == self._log.life and index in self._entries
+        incarnation_id, index = place_of(number)
+        return incarnation_id == self._log.incarnation_id and index in self._entries
 
     @property
     def log(self) -> LogId:
@@ -144,26 +144,26 @@ class Sequencer(Generic[A]):
             raise LocalError(f"kept in order by {self._election.leader.short}")
         if self._entries.is_full:
             raise LocalError(f"the log is full: {len(self._entries)} requests, and no state that stands for them")
-        if self._entries.last + 1 >> LIFE_BITS:
+        if self._entries.last + 1 >> INCARNATION_BITS:
             raise LocalError("the log is at its end; restart this proxy")
         number = self._calls.begin(now_s, timeout_s, answered, failed)
         self._replication.append(number, write(number), now_s)
         self._request_snapshot_if_wanted(now_s)
         return number
 
-    def came(self, server: Name, now_s: float) -> None:
+    def replica_joined(self, server: Name, now_s: float) -> None:
         """Add a replica."""
         if server not in self._replicas:
             self._replicas[server] = Replica(0.0)
             self._election.restart(now_s)
             self._look(now_s)
 
-    def leaves(self, server: Name) -> None:
+    def replica_leaving(self, server: Name) -> None:
         """Record that a replica goes soon: where others follow it is detached."""
         if any(replica.follows for name, replica in self._replicas.items() if name != server):
             self._let_go(server)
 
-    def gone(self, server: Name, now_s: float, reason: str) -> None:
+    def replica_lost(self, server: Name, now_s: float, reason: str) -> None:
         """Remove a replica. Its calls stay pending, for later replicas get the log."""
         del reason
         self._let_go(server)
@@ -173,7 +173,7 @@ class Sequencer(Generic[A]):
         """Handle a replica's message about itself."""
         replica = self._replicas.get(server)
         if replica is None or word.log.generation >= GENERATION_MAX:
-            self.strange += 1
+            self.unexpected += 1
         elif isinstance(word, Snapshot):
             self._handle_state(server, replica, word, now_s)
         else:
@@ -185,7 +185,7 @@ class Sequencer(Generic[A]):
         if self._replication.handle_done(server, *place_of(number), now_s):
             self.late += not self._calls.handle_response(number, answer)
         else:
-            self.strange += 1
+            self.unexpected += 1
 
     def refused(self, number: int, server: Name, reason: str, now_s: float) -> None:
         """Handle a replica's refusal: it may follow another sequencer by now."""
@@ -234,7 +234,7 @@ class Sequencer(Generic[A]):
     def _ask(self, server: Name, replica: Replica, now_s: float) -> None:
         replica.quiet_until_s = now_s + (STALL_S if replica.follows else AGAIN_S)
         replica.is_offered = False
-        self._effects.append(ReplicaCommand(server, ReplicaProbe(self._log.life)))
+        self._effects.append(ReplicaCommand(server, ReplicaProbe(self._log.incarnation_id)))
 
     def _let_go(self, server: Name) -> None:
         self._replicas.pop(server, None)
@@ -275,12 +275,14 @@ class Sequencer(Generic[A]):
 
     def _begin_log(self, now_s: float) -> None:
         """Begin the log with the elected replica, if there is one."""
-        elected = self._election.elect(self._replicas, self._log.life)
+        elected = self._election.elect(self._replicas, self._log.incarnation_id)
         if elected is None:
             return
         best = elected.position
         self._log = self._replication.log = elected.log
-        if best.log.life != self._log.life:  # otherwise it accepted this log, and its status was lost
+        if (
+            best.log.incarnation_id != self._log.incarnation_id
+        ):  # otherwise it accepted this log, and its status was lost
             self._base = best.log, best.at
         self._is_keeping, self._election.leader = True, None
         for replica in self._replicas.values():
@@ -311,7 +313,7 @@ class Sequencer(Generic[A]):
 
     def _is_level(self, position: ReplicaStatus) -> bool:
         """Return whether a replica is where the log begins."""
-        is_begun = position.log.life == self._log.life and position.at == 0
+        is_begun = position.log.incarnation_id == self._log.incarnation_id and position.at == 0
         return not position.is_lost and (is_begun or (position.log, position.at) == self._base)
 
     def _request_snapshot_if_wanted(self, now_s: float) -> None:

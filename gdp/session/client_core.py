@@ -165,17 +165,17 @@ class ClientCore:
                 del self._servers[name]
                 self._leaving.discard(name)
                 for dispatch in self._dispatches.values():
-                    dispatch.gone(name, now_s, _GONE)
+                    dispatch.replica_lost(name, now_s, _GONE)
         for name, writer_proxy in heard.items():
             is_new = name not in self._servers
             self._servers[name] = writer_proxy.incarnation
             if is_new:
                 for dispatch in self._dispatches.values():
-                    dispatch.came(name, now_s)
+                    dispatch.replica_joined(name, now_s)
             if writer_proxy.description == LEAVING and name not in self._leaving:
                 self._leaving.add(name)
                 for dispatch in self._dispatches.values():
-                    dispatch.leaves(name)
+                    dispatch.replica_leaving(name)
         if self._servers and self._unasked:
             waiting, self._unasked = self._unasked, []
             for call in waiting:
@@ -211,9 +211,9 @@ class ClientCore:
         start = (self._start + (len(self._dispatches) << 48)) % (1 << 64)
         dispatch = self._dispatches[replication] = Dispatch(replication, start=start)
         for name in self._servers:
-            dispatch.came(name, now_s)
+            dispatch.replica_joined(name, now_s)
             if name in self._leaving:
-                dispatch.leaves(name)
+                dispatch.replica_leaving(name)
         return dispatch
 
     def _send_out(self, now_s: float) -> None:

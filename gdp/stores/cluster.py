@@ -121,7 +121,7 @@ class ClusterStore:
         heapq.heappush(self._ends, (route.expires_s, route.name, route.advertiser))
         for owner in (route.sender, route.advertiser):
             self._owners.setdefault(owner, {})[hash((route.name, route.advertiser))] = route.expires_s
-        if not route.is_from_above:
+        if not route.is_from_upstream:
             self._writes.append(self._put_command(route))
 
     def withdraw(self, name: Name, advertiser: Name, withdrawn: Withdrawn | None = None) -> Route | None:
@@ -139,7 +139,7 @@ class ClusterStore:
             *(b"FCALL", b"gdp_rib_withdraw", 2, _routes_key(name), _sequence_key(name, advertiser)),
             *(bytes(advertiser), sequence, until, tag, self._me + name),
         )
-        if route is None or not route.is_from_above:
+        if route is None or not route.is_from_upstream:
             self._writes.append(_Write((name, advertiser), withdrawn.sequence, tag, command))
         self._set_minimum((name, advertiser), withdrawn)
         return route

@@ -95,7 +95,7 @@ class AdvertisementHandler:
             StatementError: it is not valid, or is not the node's newest.
         """
         if statement.signer != neighbour.name:
-            raise StatementError(DropReason.UNKNOWN_SENDER, "a claim that its maker did not bring")
+            raise StatementError(DropReason.UNKNOWN_SENDER, "an advertisement that its signer did not send")
         try:
             advertisement = self._verifier.verify_statement(statement, now.unix_s)
             if advertisement.switch != self._identity.name:
@@ -108,7 +108,7 @@ class AdvertisementHandler:
         newest = self._sequence_of(advertisement.name, neighbour)
         if advertisement.sequence < newest:
             self._judge(neighbour, advertisement.name, DropReason.STALE, newest)
-            raise StatementError(DropReason.STALE, "a claim that its maker has renewed")
+            raise StatementError(DropReason.STALE, "an advertisement that its signer has renewed")
         if advertisement.right in HEARS:
             cache = self._resolver.cache
             try:
@@ -118,7 +118,7 @@ class AdvertisementHandler:
             except StatementError as error:
                 self._refuse(neighbour, statement, error)
                 raise
-            self._held.note_advertisement(advertisement, at)
+            self._held.record_advertisement(advertisement, at)
             if is_first:
                 self._resolver.watch(advertisement.name, now.mono_s)
             for place in cache.of(advertisement.name, now.mono_s):
@@ -135,12 +135,12 @@ class AdvertisementHandler:
             except StatementError as error:
                 self._refuse(neighbour, statement, error)
                 raise
-            self._held.note_advertisement(advertisement, at)
+            self._held.record_advertisement(advertisement, at)
             if known is None or (known.port, known.mac) != at:
                 self._audit.note(
                     Action.ACCEPTED, "name", who=advertisement.node.to_text(), about=advertisement.name.to_text()
                 )
-                self._unicast.forget(advertisement.name)
+                self._unicast.remove(advertisement.name)
             self._unicast.release(advertisement.name, now.mono_s)
             self._multicast.publisher_attached(advertisement, now.mono_s)
         self._relocations.arrived(advertisement, now.mono_s)
@@ -152,8 +152,11 @@ class AdvertisementHandler:
         Raises:
             StatementError: REPLAYED, it is of another incarnation or session of the node, or came before.
         """
-        if advertisement.incarnation.to_bytes(_INCARNATION_BYTES, "big") != neighbour.life[-_INCARNATION_BYTES:]:
-            raise StatementError(DropReason.REPLAYED, "a claim of another life of its maker")
+        if (
+            advertisement.incarnation.to_bytes(_INCARNATION_BYTES, "big")
+            != neighbour.incarnation_id[-_INCARNATION_BYTES:]
+        ):
+            raise StatementError(DropReason.REPLAYED, "an advertisement of another incarnation of its signer")
         session = self._sessions.get(neighbour.nonce)
         if session is None:
             session = self._sessions[neighbour.nonce] = _Session(advertisement.sequence)
@@ -167,7 +170,7 @@ class AdvertisementHandler:
                 # The advertisement may be the node's own; the node sends nothing newer unless it receives this report.
                 session.reported_s = now_s
                 self._judge(neighbour, advertisement.name, DropReason.STALE, session.window.top)
-            raise StatementError(DropReason.REPLAYED, "a claim")
+            raise StatementError(DropReason.REPLAYED, "an advertisement")
         session.window.finish(advertisement.sequence)
         self._sessions.move_to_end(neighbour.nonce)
 
@@ -213,5 +216,5 @@ class AdvertisementHandler:
         if right in HEARS and self._multicast.remove_reader(name, (neighbour.port, neighbour.mac)):
             self._resolver.unwatch(name)
         if right is not Right.READ and self._attached.remove(name, neighbour.name) is not None:
-            self._unicast.forget(name)
+            self._unicast.remove(name)
             self._rib_client.relay(statement.wire, now.mono_s)

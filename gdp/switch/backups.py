@@ -29,15 +29,15 @@ class Backups:
         self._paths = paths
         self._outbox = outbox
 
-    def above(self, tree: Tree) -> tuple[Downstream, Name] | None:
+    def upstream(self, tree: Tree) -> tuple[Downstream, Name] | None:
         """Return where to request a backup branch: the loop-free alternate towards the publisher, or None."""
-        if tree.is_backup or tree.above is None or tree.switch == self._me:
+        if tree.is_backup or tree.upstream is None or tree.switch == self._me:
             return None
         way = self._paths.to_switch(tree.switch, tree.domain, tree.allowed)
         if way is None or way.alternate is None:
             return None
         neighbour = self._outbox.neighbour(way.alternate)
-        if neighbour is None or (at := (neighbour.port, neighbour.mac)) == tree.above or at in tree.branches:
+        if neighbour is None or (at := (neighbour.port, neighbour.mac)) == tree.upstream or at in tree.branches:
             return None
         return at, neighbour.name
 

@@ -77,12 +77,12 @@ class SwitchCore:
         self._reassembler = ControlReassembler()
         self.hello_protocol = HelloProtocol.of_node(
             identity, policy, self._fragmenter, settings,
-            digest_for=self._digest_for, life_elsewhere=self._life_elsewhere,
+            digest_for=self._digest_for, incarnation_elsewhere=self._incarnation_elsewhere,
         )  # fmt: skip
         self._outbox = Outbox(self.hello_protocol, self._fragmenter)
         self._flooding = Flooding(
             identity=identity, policy=policy, hello_protocol=self.hello_protocol, send=self._send_link_state,
-            first_sequence=settings.first_sequence, life=settings.life,
+            first_sequence=settings.first_sequence, incarnation_id=settings.incarnation_id,
         )  # fmt: skip
         self._paths = self._flooding.paths
         self._verifier = AdvertisementVerifier(policy)
@@ -257,7 +257,7 @@ class SwitchCore:
         for key in self.table.expire(now_s):
             self.unicast.expired(key)
         for attachment in self.attached.expire(now_s):
-            self.unicast.forget(attachment.advertisement.name)
+            self.unicast.remove(attachment.advertisement.name)
         for topic in self.multicast.handle_timer(now_s):
             self.resolver.unwatch(topic)
         self.relocations.handle_timer(now_s)
@@ -385,7 +385,7 @@ class SwitchCore:
         elif kind in (Kind.ADVERTISE, Kind.WITHDRAW):
             if not self._advertisement_paces.spend(neighbour.name, now.mono_s):
                 # No response is sent: that would cost work, too.
-                raise StatementError(DropReason.QUOTA, "claims of one neighbour")
+                raise StatementError(DropReason.QUOTA, "advertisements of one neighbour")
             take = (
                 self._advertisements.receive_advertisement if kind == Kind.ADVERTISE else self._advertisements.withdraw
             )
@@ -474,7 +474,7 @@ class SwitchCore:
                 if attachment.port == neighbour.port:
                     self.relocations.departed(attachment.advertisement, now_s)
                     self.attached.remove(attachment.advertisement.name, neighbour.name)
-                    self.unicast.forget(attachment.advertisement.name)
+                    self.unicast.remove(attachment.advertisement.name)
 
     def _plan_follow(self, now_s: float) -> None:
         """Schedule the update after a link change, so that it covers the changes that follow closely.
@@ -499,7 +499,7 @@ class SwitchCore:
         self.rib_client.links_changed(now_s)
         self._look_for_conflicts(now_s)
 
-    def _life_elsewhere(self, name: Name) -> bytes | None:
+    def _incarnation_elsewhere(self, name: Name) -> bytes | None:
         role = Role.SWITCH if self._paths.is_switch(name) else Role.RIB
         return self._paths.life_of(name, role)
 
@@ -507,13 +507,13 @@ class SwitchCore:
         """Drop RIBs with an older node's identity; notify nodes whose identity a younger node elsewhere copies."""
         self._conflicts_sought_s = now_s
         for neighbour in self.hello_protocol.all_up():
-            elsewhere = self._life_elsewhere(neighbour.name) if neighbour.role is Role.RIB else None
-            if elsewhere is not None and elsewhere < neighbour.life:
+            elsewhere = self._incarnation_elsewhere(neighbour.name) if neighbour.role is Role.RIB else None
+            if elsewhere is not None and elsewhere < neighbour.incarnation_id:
                 self.hello_protocol.let_go(neighbour, now_s)
         for name in self._paths.refused_elsewhere():
             self.hello_protocol.tell_conflicts(name, now_s)
             if name == self.name:
-                self.hello_protocol.note_clash(name, now_s)
+                self.hello_protocol.record_clash(name, now_s)
 
     def _send_link_state(self, neighbour: Neighbour, wire: bytes) -> None:
         self._outbox.say(neighbour, Kind.LINK_STATE, wire)

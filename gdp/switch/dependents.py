@@ -51,7 +51,7 @@ class Dependents:
         self._multicast = multicast
         self._holdings = Holdings[AttachedAdvertisement | KnownLocation | JoinedBranch](self._is_held)
 
-    def note_advertisement(self, advertisement: Advertisement, at: Downstream) -> None:
+    def record_advertisement(self, advertisement: Advertisement, at: Downstream) -> None:
         """Record the advertisement of an attached node."""
         self._holdings.note(AttachedAdvertisement(advertisement.name, advertisement.node, at), advertisement)
 

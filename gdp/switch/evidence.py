@@ -41,7 +41,7 @@ class Evidence:
         """
         advertisement = self._verifier.verify(answer.advertisement, now.unix_s)
         if advertisement.name != answer.name or advertisement.node != answer.advertiser:
-            raise StatementError(DropReason.WRONG_NAME, "an answer about something else than its claim")
+            raise StatementError(DropReason.WRONG_NAME, "an answer about something else than its advertisement")
         return _place(advertisement, answer.domain, frozenset(answer.transit), answer.lease_s, now)
 
     def from_relay(self, statement: Statement, now: Timestamps) -> Location:
@@ -68,11 +68,11 @@ class Evidence:
         """
         reader = self._verifier.verify(join.evidence, now.unix_s)
         if reader.right not in HEARS or reader.name != join.topic:
-            raise StatementError(DropReason.NOT_DELEGATED, "a join without a reader's claim")
+            raise StatementError(DropReason.NOT_DELEGATED, "a join without a reader's advertisement")
         publisher = self._verifier.verify(join.proof, now.unix_s)
         proven = publisher.name, publisher.node, publisher.right, publisher.switch, publisher.sequence
         if proven != (join.topic, join.publisher, HEARS[reader.right], join.switch, join.version):
-            raise StatementError(DropReason.NOT_DELEGATED, "a join to where the publisher's claim is not")
+            raise StatementError(DropReason.NOT_DELEGATED, "a join to where the publisher's advertisement is not")
         return reader
 
     def still_holds(self, place: Location, now: Timestamps) -> bool:

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
-from gdp.control.hello import DIGEST_BYTES, LIFE_BYTES
+from gdp.control.hello import DIGEST_BYTES, INCARNATION_BYTES
 from gdp.control.link_state import Adjacency, AttachedRib, LinkState, Scope
 from gdp.control.neighbor_discovery import HelloPort, HelloProtocol
 from gdp.control.neighbour import Neighbour
@@ -35,7 +35,7 @@ from gdp.trust.rtcert import RtCertCache
 
 __all__ = ["Flooding"]
 
-_LIVES_MAX: Final = 64
+_INCARNATIONS_MAX: Final = 64
 _RTCERTS_REMEMBERED: Final = 1_024
 # of another incarnation of ours to our link states; a few old ones of a dead incarnation may remain
 _ANSWERS: Final = 5
@@ -55,7 +55,7 @@ class Flooding:
     Args:
         send: sends a link state to a neighbour.
         first_sequence: above every sequence number of an earlier incarnation; wall-clock milliseconds suffice.
-        life: mark of this incarnation, ``LIFE_BYTES``.
+        incarnation_id: mark of this incarnation, ``INCARNATION_BYTES``.
 
     Attributes:
         is_displaced: an older switch with our identity is alive. This switch then originates nothing more.
@@ -69,14 +69,14 @@ class Flooding:
         hello_protocol: HelloProtocol,
         send: SendStatement,
         first_sequence: int,
-        life: bytes = bytes(LIFE_BYTES),
+        incarnation_id: bytes = bytes(INCARNATION_BYTES),
     ) -> None:
         self._identity = identity
         self._policy = policy
         self._hello_protocol = hello_protocol
         self._send = send
         self._sequence = self._first_sequence = first_sequence
-        self._life = life
+        self._incarnation_id = incarnation_id
         self._answers: dict[tuple[bytes, Scope], int] = {}  # by incarnation: how often it exceeded our sequence number
         self.is_displaced = False
         self._conflicts_seen = 0
@@ -117,7 +117,9 @@ class Flooding:
             scope = Scope.BORDER if fields.text("o", 8) == Scope.BORDER.value else Scope.DOMAIN
             if not self.link_states.is_news(statement.signer, scope, fields.uint("s")):
                 return False
-            if self.link_states.is_past(statement.signer, scope, fields.uint("s"), fields.bytes_("b", LIFE_BYTES)):
+            if self.link_states.is_past(
+                statement.signer, scope, fields.uint("s"), fields.bytes_("b", INCARNATION_BYTES)
+            ):
                 raise StatementError(DropReason.STALE, "a link state that is over")
             if abs(now.unix_s - fields.uint("e")) > LINK_STATE_AGE_MAX_S:
                 raise StatementError(DropReason.STALE, "a link state of another time")
@@ -226,7 +228,7 @@ class Flooding:
         links = tuple(sorted(Adjacency(n.name, n.domain, self._cost(n), n.mtu) for n in switches))
         self._conflicts_seen = self._hello_protocol.conflicts.changes
         ribs = {
-            AttachedRib(n.name, n.domain, n.nonce, n.life, *n.proof)
+            AttachedRib(n.name, n.domain, n.nonce, n.incarnation_id, *n.proof)
             for n in up
             if n.role == Role.RIB and n.proof is not None
         }
@@ -270,7 +272,7 @@ class Flooding:
             inside,
             ribs,
             members,
-            self._life,
+            self._incarnation_id,
             refused,
             said_unix_s=max(int(now_s + self._unix_ahead_s), 0),
             is_leaf=self._is_leaf,
@@ -286,13 +288,13 @@ class Flooding:
         An earlier incarnation's leftover state does not answer. So a sender that exceeds our sequence number repeatedly
         is alive.
         """
-        key = state.life, state.scope
-        if state.life != self._life and state.sequence > self._sequence:
-            if key in self._answers or len(self._answers) < _LIVES_MAX:
+        key = state.incarnation_id, state.scope
+        if state.incarnation_id != self._incarnation_id and state.sequence > self._sequence:
+            if key in self._answers or len(self._answers) < _INCARNATIONS_MAX:
                 self._answers[key] = self._answers.get(key, 0) + 1
             if self._answers.get(key, 0) > _ANSWERS:
-                self._hello_protocol.note_clash(self._identity.name, now_s, is_proven=True)
-                self.is_displaced = self.is_displaced or state.life < self._life
+                self._hello_protocol.record_clash(self._identity.name, now_s, is_proven=True)
+                self.is_displaced = self.is_displaced or state.incarnation_id < self._incarnation_id
         is_early = self._begun_s is not None and now_s - self._begun_s < _EARLY_S
         if is_early and not self._was_stub and state.sequence <= self._first_sequence:
             self._was_stub, self._stub_until_s = True, now_s + _STUB_S

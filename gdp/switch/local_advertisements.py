@@ -68,7 +68,7 @@ class LocalAdvertisements:
             StatementError: QUOTA, the node has too many.
         """
         if self.get(advertisement.name, advertisement.node) is None and not self._shares.reserve(advertisement.node):
-            raise StatementError(DropReason.QUOTA, "claims of one node")
+            raise StatementError(DropReason.QUOTA, "advertisements of one node")
         attachment = LocalAdvertisement(
             advertisement=advertisement, port=port, mac=mac, expires_s=now_s + advertisement.lease_s, relay_at_s=now_s
         )

@@ -83,7 +83,7 @@ class LocationUpdates:
         if attachment is not None and attachment.advertisement.sequence < place.sequence and not is_ours:
             self._attached.remove(place.name, place.advertiser)  # it has moved to another switch
             self._relocations.departed(attachment.advertisement, now_s)
-            self._unicast.forget(place.name)
+            self._unicast.remove(place.name)
             was_here = True
         before = self.get(place.name, place.advertiser)
         if before is not None and before.sequence > place.sequence:
@@ -92,8 +92,8 @@ class LocationUpdates:
         self._held.note_place(place)
         self._resolver.receive_location(place, now_s, is_ours=is_ours, has_left=is_ours and attachment is None)
         if before is None or (before.switch, before.domain) != (place.switch, place.domain):
-            self._unicast.forget(place.name)
-            self._unicast.forget(place.advertiser)
+            self._unicast.remove(place.name)
+            self._unicast.remove(place.advertiser)
             self._multicast.publisher_moved(place, now_s)
             if was_here and not is_ours:
                 self._relocations.moved(place, statement, now_s)
@@ -112,10 +112,10 @@ class LocationUpdates:
         """
         known = self.get(answer.name, answer.advertiser)
         if known is not None and known.sequence > answer.sequence:
-            raise StatementError(DropReason.STALE, "a removal of an earlier claim")
+            raise StatementError(DropReason.STALE, "a removal of an earlier advertisement")
         self._resolver.receive_removal(answer.name, answer.advertiser, now_s)
         self._multicast.publisher_gone(answer.name, answer.advertiser)
-        self._unicast.forget(answer.name)
+        self._unicast.remove(answer.name)
         wire = answer.to_wire(self._identity.name, self._identity.key, self._identity.membership)
         for at, _ in self._multicast.readers(answer.name):
             self._outbox.say_at(*at, Kind.ADVERTISE_ACK, wire)

@@ -23,7 +23,9 @@ __all__ = ["LINK_STATES_MAX", "PAST_S", "LinkStateDatabase"]
 
 LINK_STATES_MAX = 8_192
 PAST_S: Final = 2 * LINK_STATE_AGE_MAX_S  # a state signed by a fast clock stays valid this long at slow clocks
-_LIVES_MAX: Final = 8  # incarnations of one origin that are tracked; above that, the highest number of all counts
+_INCARNATIONS_MAX: Final = (
+    8  # incarnations of one origin that are tracked; above that, the highest number of all counts
+)
 
 
 @dataclass(slots=True)
@@ -38,14 +40,14 @@ class _Past:
     """Past sequence numbers of one origin and scope."""
 
     until_s: float
-    lives: dict[bytes, int] = field(default_factory=dict)
+    incarnation_ids: dict[bytes, int] = field(default_factory=dict)
     minimum: int = -1  # minimum for all incarnations that are not listed
 
-    def note(self, life: bytes, sequence: int, until_s: float) -> None:
+    def note(self, incarnation_id: bytes, sequence: int, until_s: float) -> None:
         self.until_s = until_s
-        self.lives[life] = max(sequence, self.lives.pop(life, -1))
-        if len(self.lives) > _LIVES_MAX:
-            self.minimum = max(self.minimum, self.lives.pop(next(iter(self.lives))))
+        self.incarnation_ids[incarnation_id] = max(sequence, self.incarnation_ids.pop(incarnation_id, -1))
+        if len(self.incarnation_ids) > _INCARNATIONS_MAX:
+            self.minimum = max(self.minimum, self.incarnation_ids.pop(next(iter(self.incarnation_ids))))
 
 
 class LinkStateDatabase:
@@ -70,10 +72,10 @@ class LinkStateDatabase:
         known = self._entries.get((origin, scope))
         return known is None or sequence > known.state.sequence
 
-    def is_past(self, origin: Name, scope: Scope, sequence: int, life: bytes) -> bool:
+    def is_past(self, origin: Name, scope: Scope, sequence: int, incarnation_id: bytes) -> bool:
         """Return whether a link state was removed or replaced before."""
         past = self._past.get((origin, scope))
-        return past is not None and sequence <= past.lives.get(life, past.minimum)
+        return past is not None and sequence <= past.incarnation_ids.get(incarnation_id, past.minimum)
 
     def sequence_of(self, origin: Name, scope: Scope) -> int:
         """Return the newest sequence number known, or 0."""
@@ -87,12 +89,12 @@ class LinkStateDatabase:
             StatementError: QUOTA, the database is full.
         """
         key = (state.origin, state.scope)
-        if not self.is_news(*key, state.sequence) or self.is_past(*key, state.sequence, state.life):
+        if not self.is_news(*key, state.sequence) or self.is_past(*key, state.sequence, state.incarnation_id):
             return False
         known = self._entries.get(key)
         if known is None and len(self._entries) >= LINK_STATES_MAX:
             raise StatementError(DropReason.QUOTA, "link states")
-        if known is not None and known.state.life != state.life:
+        if known is not None and known.state.incarnation_id != state.incarnation_id:
             self._bury(known.state, now_s)
         self._entries[key] = _Entry(state, wire, now_s + LINK_STATE_LEASE_S)
         self._digests.clear()
@@ -117,7 +119,7 @@ class LinkStateDatabase:
     def _bury(self, state: LinkState, now_s: float) -> None:
         key = state.origin, state.scope
         past = self._past.pop(key, None) or _Past(now_s)
-        past.note(state.life, state.sequence, now_s + PAST_S)
+        past.note(state.incarnation_id, state.sequence, now_s + PAST_S)
         self._past[key] = past
         if len(self._past) > 2 * LINK_STATES_MAX:
             del self._past[next(iter(self._past))]
@@ -152,4 +154,4 @@ class LinkStateDatabase:
 
 
 def _ways(state: LinkState) -> tuple[object, ...]:
-    return state.links, state.inside, state.ribs, state.members, state.life, state.refused, state.is_leaf
+    return state.links, state.inside, state.ribs, state.members, state.incarnation_id, state.refused, state.is_leaf

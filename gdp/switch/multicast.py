@@ -148,7 +148,7 @@ class MulticastTrees:
                 continue
             self._plant(tree)
             self._follow(tree, now_s)
-            self._ask_above(tree, now_s)
+            self._ask_upstream(tree, now_s)
 
     def publisher_attached(self, advertisement: Advertisement, now_s: float) -> None:
         """Handle a publisher's advertisement of its topic here: trees that pass here join it directly at once."""
@@ -236,7 +236,7 @@ class MulticastTrees:
         self._plant(tree)
         if not self._follow(tree, now_s):
             if (before is None and branch.is_active) or not is_same_place or tree.is_doubted:
-                self._ask_above(tree, now_s)
+                self._ask_upstream(tree, now_s)
             else:
                 self._restate(tree)
         return is_behind and tree.switch != join.switch
@@ -244,8 +244,8 @@ class MulticastTrees:
     def neighbour_up(self, at: Downstream, now_s: float) -> None:
         """Repeat to a neighbour the joins that it received before its present session, whose state it has lost."""
         for tree in self.trees.all():
-            if tree.above == at:
-                self._ask_above(tree, now_s)
+            if tree.upstream == at:
+                self._ask_upstream(tree, now_s)
 
     def neighbour_lost(self, at: Downstream, now_s: float) -> None:
         """Remove every branch to a lost neighbour; backups of these branches replace them."""
@@ -325,7 +325,7 @@ class MulticastTrees:
             self._plant(tree)
             self._restate(tree)
         if tree.renew_at_s <= now_s:
-            self._ask_above(tree, now_s)
+            self._ask_upstream(tree, now_s)
         if tree.former is not None and tree.former_until_s <= now_s:
             self._leave_former(tree)
 
@@ -378,7 +378,7 @@ class MulticastTrees:
         self._leave(tree)
         self.trees.remove(tree)
 
-    def _above(self, tree: Tree) -> tuple[int, bytes, Name] | None:
+    def _upstream_queries(self, tree: Tree) -> tuple[int, bytes, Name] | None:
         """Return port, address and name of the next hop towards the publisher; None when there is no path now."""
         if tree.switch == self._identity.name:
             attachment = self._attached.get(tree.topic, tree.publisher)
@@ -389,31 +389,31 @@ class MulticastTrees:
 
     def _follow(self, tree: Tree, now_s: float) -> bool:
         """Join another upstream neighbour where the path to the publisher has changed; return whether it has."""
-        above = self._above(tree)
-        if (None if above is None else above[:2]) == tree.above:
+        upstream = self._upstream_queries(tree)
+        if (None if upstream is None else upstream[:2]) == tree.upstream:
             return False
-        self._ask_above(tree, now_s)
+        self._ask_upstream(tree, now_s)
         return True
 
-    def _ask_above(self, tree: Tree, now_s: float) -> None:
-        above = self._above(tree)
+    def _ask_upstream(self, tree: Tree, now_s: float) -> None:
+        upstream = self._upstream_queries(tree)
         tree.renew_at_s = now_s + JOIN_REFRESH_S
-        if (None if above is None else above[:2]) != tree.above:
-            self._part_from_above(tree, now_s, keep=above is not None)
-            if above is not None:
-                tree.above, tree.above_name = above[:2], above[2]
-                if tree.backup is not None and tree.backup[0] == tree.above:
+        if (None if upstream is None else upstream[:2]) != tree.upstream:
+            self._part_from_above(tree, now_s, keep=upstream is not None)
+            if upstream is not None:
+                tree.upstream, tree.upstream_name = upstream[:2], upstream[2]
+                if tree.backup is not None and tree.backup[0] == tree.upstream:
                     tree.backup = None  # an ordinary join replaces it
             self._plant(tree)
-        if above is None and self._paths.leads_through_leaf(tree.switch, tree.domain):
+        if upstream is None and self._paths.leads_through_leaf(tree.switch, tree.domain):
             self.drops[DropReason.THROUGH_LEAF] += 1
-        if above is None or not tree.is_wanted_below:
+        if upstream is None or not tree.is_wanted_below:
             return
         has_settled = tree.joins >= len(_JOIN_AGAIN_S)
         if not has_settled:
             tree.renew_at_s = now_s + _JOIN_AGAIN_S[tree.joins]
             tree.joins += 1
-        tree.asked_mtu = min(tree.mtu, self._outbox.mtu_of(above[0]))
+        tree.asked_mtu = min(tree.mtu, self._outbox.mtu_of(upstream[0]))
         self._show(tree)
         if has_settled and self._paths.has_alternates:
             self._ask_for_backup(tree)
@@ -423,16 +423,16 @@ class MulticastTrees:
 
     def _restate(self, tree: Tree) -> None:
         """Send a join upstream at once: the tree's MTU, or whether it is only a backup, has changed."""
-        if tree.above is None:
+        if tree.upstream is None:
             return
-        mtu = min(tree.mtu, self._outbox.mtu_of(tree.above[0]))
+        mtu = min(tree.mtu, self._outbox.mtu_of(tree.upstream[0]))
         if mtu != tree.asked_mtu or tree.backup_for != tree.asked_backup_for:
             tree.asked_mtu = mtu
             self._show(tree)
 
     def _ask_for_backup(self, tree: Tree) -> None:
         """Request a backup branch from the neighbour that could replace the best one, or leave it."""
-        other = self._backups.above(tree)
+        other = self._backups.upstream(tree)
         if other != tree.backup:
             self._leave_backup(tree)
             tree.backup = other
@@ -447,7 +447,7 @@ class MulticastTrees:
         if tree.backup is not None:
             (at, name), tree.backup = tree.backup, None
             tree.left.add(at[0])
-            if at != tree.above:
+            if at != tree.upstream:
                 self._say(tree, at, name, 1, 0.0, b"")
 
     def _show(self, tree: Tree) -> None:
@@ -456,12 +456,14 @@ class MulticastTrees:
         tree.is_doubted = tree.is_doubted and evidence == tree.shown
         tree.shown = evidence
         tree.asked_backup_for = tree.backup_for
-        if tree.above is None or tree.above_name is None or not evidence:
+        if tree.upstream is None or tree.upstream_name is None or not evidence:
             return
         backup_for = tree.backup_for or ZERO
-        if backup_for != ZERO and self._paths.domain_of(tree.above_name) != self._policy.own:
+        if backup_for != ZERO and self._paths.domain_of(tree.upstream_name) != self._policy.own:
             return  # backups are internal to a domain
-        self._say(tree, tree.above, tree.above_name, tree.asked_mtu, JOIN_LEASE_S, evidence, backup_for=backup_for)
+        self._say(
+            tree, tree.upstream, tree.upstream_name, tree.asked_mtu, JOIN_LEASE_S, evidence, backup_for=backup_for
+        )
 
     def _evidence(self, tree: Tree) -> bytes:
         """Return the advertisement to send upstream; of a leaf only an attached reader's, empty where none is.
@@ -484,9 +486,9 @@ class MulticastTrees:
     def _part_from_above(self, tree: Tree, now_s: float, *, keep: bool) -> None:
         """Leave the upstream neighbour: at once, or after a while where only the path to the same location changed."""
         self._leave_former(tree)
-        if keep and tree.above is not None and tree.above_name is not None and self._is_loop_free(tree):
-            tree.former, tree.former_until_s = (tree.above, tree.above_name), now_s + _OVERLAP_S
-            tree.above = tree.above_name = None
+        if keep and tree.upstream is not None and tree.upstream_name is not None and self._is_loop_free(tree):
+            tree.former, tree.former_until_s = (tree.upstream, tree.upstream_name), now_s + _OVERLAP_S
+            tree.upstream = tree.upstream_name = None
         else:
             self._leave(tree)
         tree.joins, tree.has_moved = 0, False
@@ -497,31 +499,31 @@ class MulticastTrees:
         Source: RFC 5286, inequality 3 (a downstream neighbour is nearer to the destination than we are). No switch
         takes other nodes' messages from a leaf.
         """
-        if tree.has_moved or tree.above_name is None:
+        if tree.has_moved or tree.upstream_name is None:
             return False
         if self._is_leaf:
             return True
         own = self._paths.to_switch(tree.switch, tree.domain, tree.allowed)
-        its = self._paths.distance_from(tree.above_name, tree.switch, tree.domain, tree.allowed)
+        its = self._paths.distance_from(tree.upstream_name, tree.switch, tree.domain, tree.allowed)
         return own is not None and its is not None and its < own.distance
 
     def _leave_former(self, tree: Tree) -> None:
         if tree.former is not None:
             (at, name), tree.former = tree.former, None
             tree.left.add(at[0])
-            if at != tree.above:
+            if at != tree.upstream:
                 self._say(tree, at, name, 1, 0.0, b"")
 
     def _leave(self, tree: Tree) -> None:
-        if tree.above is not None and tree.above_name is not None:
-            tree.left.add(tree.above[0])
-            self._say(tree, tree.above, tree.above_name, 1, 0.0, b"")
-        tree.above = tree.above_name = None
+        if tree.upstream is not None and tree.upstream_name is not None:
+            tree.left.add(tree.upstream[0])
+            self._say(tree, tree.upstream, tree.upstream_name, 1, 0.0, b"")
+        tree.upstream = tree.upstream_name = None
 
     def _say(
         self,
         tree: Tree,
-        above: Downstream,
+        upstream: Downstream,
         name: Name,
         mtu: int,
         lease_s: float,
@@ -530,7 +532,7 @@ class MulticastTrees:
         backup_for: Name = ZERO,
     ) -> None:
         """Send a join, or with no lease a leave, to one upstream neighbour."""
-        sessions = self._outbox.sessions_with(above[0], name)
+        sessions = self._outbox.sessions_with(upstream[0], name)
         if sessions is None:
             return  # it is gone, and so is its state of our joins
         own_session, its_echo = sessions
@@ -552,7 +554,7 @@ class MulticastTrees:
             tree.proof if lease_s else b"",
         )
         kind = Kind.JOIN if lease_s else Kind.LEAVE
-        self._outbox.say_at(*above, kind, join.to_wire(self._identity.name, self._identity.key))
+        self._outbox.say_at(*upstream, kind, join.to_wire(self._identity.name, self._identity.key))
 
 
 def _owner(at: Downstream) -> bytes:

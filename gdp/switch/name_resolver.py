@@ -192,7 +192,7 @@ class NameResolver:
         self._queries.receive_answer(name, now_s)
         if not (keep and self.cache.of(name, now_s)):
             self.cache.put_negative(name, now_s)
-            self._pending.refuse(name, DropReason.NO_ROUTE)
+            self._pending.drop(name, DropReason.NO_ROUTE)
 
     # -- time and the RIB
 
@@ -200,7 +200,7 @@ class NameResolver:
         """Return the queries that are due, as (name, seconds to watch it); drop the frames of names that failed."""
         queries, failed = self._queries.poll_due(now_s)
         for name in failed:
-            self._pending.refuse(name, DropReason.NO_ROUTE)
+            self._pending.drop(name, DropReason.NO_ROUTE)
         return queries
 
     def rib_changed(self, now_s: float, *, has_rib: bool) -> None:

@@ -62,7 +62,7 @@ class Paths:
         self._open_borders: dict[Name, list[Name]] = {}  # by domain: borders that could not list all their switches
         self._ribs: dict[Name, dict[Name, AttachedRib]] = {}  # RIB to the switches where it is attached or reached
         self._known_domains: frozenset[Name] = frozenset()
-        self._lives: dict[Name, bytes] = {}  # of every switch whose link state is known
+        self._incarnation_ids: dict[Name, bytes] = {}  # of every switch whose link state is known
         self._refused: frozenset[Name] = frozenset()
         self._ways: dict[tuple[Name, frozenset[Name]], dict[Name, Path]] = {}
         self._alternates: dict[tuple[Name, Name, frozenset[Name]], Name | None] = {}
@@ -151,14 +151,14 @@ class Paths:
         """Return the mark of the oldest incarnation in which other switches reach a switch or a RIB, or None."""
         self._refresh()
         if role is Role.RIB:
-            hosts = {host: rib.life for host, rib in self._ribs.get(name, {}).items() if host != self._me}
+            hosts = {host: rib.incarnation_id for host, rib in self._ribs.get(name, {}).items() if host != self._me}
         else:
-            hosts = {} if (life := self._lives.get(name)) is None else {name: life}
+            hosts = {} if (incarnation_id := self._incarnation_ids.get(name)) is None else {name: incarnation_id}
         if not hosts:
             return None  # a proxy, for example: its hellos cause no computation
         everywhere = frozenset(self._domains.values())
-        lives = [life for host, life in hosts.items() if host in self._to_all(everywhere)]
-        return min(lives, default=None)
+        incarnation_ids = [incarnation_id for host, incarnation_id in hosts.items() if host in self._to_all(everywhere)]
+        return min(incarnation_ids, default=None)
 
     def refused_elsewhere(self) -> frozenset[Name]:
         """Return the identities that other switches refuse at present because an older node has them."""
@@ -271,7 +271,7 @@ class Paths:
         self._known_domains = frozenset(self._domains.values())
         self._borders_of, self._open_borders, self._beyond, self._ribs = {}, {}, {}, {}
         others = [state for state in [*inside, *beyond] if state.origin != self._me]
-        self._lives = {state.origin: state.life for state in others}
+        self._incarnation_ids = {state.origin: state.incarnation_id for state in others}
         self._refused = frozenset(name for state in others for name in state.refused)
         for state in beyond:
             self._beyond.setdefault(state.domain, []).append(state.origin)

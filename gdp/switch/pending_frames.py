@@ -67,7 +67,7 @@ class PendingFrames:
         self._frames.release(waiting.owner)
         self._bytes.release(waiting.owner, size=len(waiting.frame))
 
-    def refuse(self, name: bytes, reason: DropReason) -> None:
+    def drop(self, name: bytes, reason: DropReason) -> None:
         """Drop the frames that wait for a name, under a reason."""
         self.drops[reason] += len(self.release(name))
 

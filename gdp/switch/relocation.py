@@ -131,7 +131,7 @@ class Relocations:
         """
         if self._moved_names.get(destination, 0.0) <= now_s:
             return
-        self._unicast.forget(destination)
+        self._unicast.remove(destination)
         if not neighbour.role.is_switch:
             return
         for (name, _), moved in self._moved.items():

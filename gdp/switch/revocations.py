@@ -165,7 +165,7 @@ class RevocationHandler:
         attachment = self._attached.get(holder.name, holder.node)
         if attachment is not None and not self._holds(attachment.advertisement, now):
             self._attached.remove(holder.name, holder.node)
-            self._unicast.forget(holder.name)
+            self._unicast.remove(holder.name)
         advertisement = self._multicast.advertisement_of(holder.name, holder.at)
         if advertisement is None or self._holds(advertisement, now):
             return []
@@ -179,7 +179,7 @@ class RevocationHandler:
         if place is not None and not self._evidence.still_holds(place, now):
             self._resolver.receive_removal(place.name, place.advertiser, now.mono_s)
             self._multicast.publisher_gone(place.name, place.advertiser)
-            self._unicast.forget(place.name)
+            self._unicast.remove(place.name)
 
     def _doubt(self, branch: JoinedBranch, now: Timestamps) -> None:
         proves = lambda evidence: self._proves(evidence, now)  # noqa: E731

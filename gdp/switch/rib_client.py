@@ -287,7 +287,7 @@ class RibClient:
             self._outbox.say_at(attachment.port, attachment.mac, Kind.ADVERTISE_ACK, statement.wire)
             if ack.refused is DropReason.IN_USE:  # the older node with this identity is elsewhere
                 self._attached.remove(ack.name, ack.advertiser)
-                self._unicast.forget(ack.name)
+                self._unicast.remove(ack.name)
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next query, or of the moment to leave a silent RIB."""

@@ -57,8 +57,8 @@ class Tree:
     domain: Name  # of that switch
     allowed: frozenset[Name]
     branches: dict[Downstream, Branch] = field(default_factory=dict)
-    above: Downstream | None = None  # the neighbour that received the last join
-    above_name: Name | None = None
+    upstream: Downstream | None = None  # the neighbour that received the last join
+    upstream_name: Name | None = None
     renew_at_s: float = 0.0
     asked_mtu: int = 0  # MTU in the last join
     shown: bytes = b""  # evidence in the last join
@@ -114,7 +114,7 @@ class Tree:
 
         Without either, the mask is empty.
         """
-        asked = [self.above] if self.above is not None else []
+        asked = [self.upstream] if self.upstream is not None else []
         asked += [each[0] for each in (self.former, self.backup) if each is not None]
         return sides_of([*(port for port, _ in asked), *self.left])
 
@@ -132,7 +132,7 @@ class Tree:
     @property
     def is_wanted_below(self) -> bool:
         """Return whether any neighbour except the upstream one wants a copy."""
-        return any(at != self.above for at in self.branches)
+        return any(at != self.upstream for at in self.branches)
 
     def hops(self, mac_of: dict[int, bytes]) -> Hops:
         """Return where copies go: one per active branch, in a stable order, with its backup as the alternate.
@@ -144,13 +144,13 @@ class Tree:
         below = [
             at
             for at in sorted(self.branches)
-            if at != self.above and at[0] in mac_of and (only_backups or self.branches[at].is_active)
+            if at != self.upstream and at[0] in mac_of and (only_backups or self.branches[at].is_active)
         ]
         hops: list[Hop | ProtectedHop] = []
         for port, mac in below:
             hop = port, mac + mac_of[port]
             backup = self.protection.get((port, mac))
-            if backup is None or backup == self.above or backup[0] not in mac_of:
+            if backup is None or backup == self.upstream or backup[0] not in mac_of:
                 hops.append(hop)
             else:
                 hops.append((*hop, backup[0], backup[1] + mac_of[backup[0]]))

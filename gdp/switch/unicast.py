@@ -116,7 +116,7 @@ class Unicast:
         """Return whether ``refresh_more`` has work left."""
         return bool(self._stale)
 
-    def forget(self, name: Name) -> None:
+    def remove(self, name: Name) -> None:
         """Remove the entries to a name whose location has changed, negative ones included."""
         for key in list(self._keys_of.get(name, ())):
             self._uninstall(key)

@@ -127,7 +127,7 @@ class UnverifiedAdvertisement:
         """
         fields = statement.expect(StatementType.ADVERTISE)
         if len(statement.wire) > ADVERTISEMENT_MAX_BYTES:
-            raise StatementError(DropReason.TOO_BIG, f"a claim of {len(statement.wire)} bytes")
+            raise StatementError(DropReason.TOO_BIG, f"an advertisement of {len(statement.wire)} bytes")
         exchange = fields.bytes_("x")
         if len(exchange) not in (0, EXCHANGE_KEY_BYTES):
             raise StatementError(DropReason.MALFORMED, "an exchange key of the wrong length")
@@ -214,6 +214,6 @@ def sign_advertisement(
     wire = identity.sign(StatementType.ADVERTISE, body.to_fields())
     if len(wire) > ADVERTISEMENT_MAX_BYTES:
         raise LocalError(
-            f"a claim of {len(wire)} bytes, above {ADVERTISEMENT_MAX_BYTES}: shorten metadata or delegations"
+            f"an advertisement of {len(wire)} bytes, above {ADVERTISEMENT_MAX_BYTES}: shorten metadata or delegations"
         )
     return wire

@@ -356,22 +356,22 @@ class Revocations:
         if len(self._owners.get(issuer_key, ())) >= self._per_issuer:
             raise StatementError(DropReason.QUOTA, "revocations of one owner")
         own = self._shares.get(origin, {})
-        if sum(own.values()) >= self._per_origin and not self._give_way(origin, above=own.get(issuer_key, 0) + 1):
+        if sum(own.values()) >= self._per_origin and not self._give_way(origin, upstream=own.get(issuer_key, 0) + 1):
             raise StatementError(DropReason.QUOTA, "revocations over one neighbour")
         if self._owned < self._of_owners:
             return
         held = sum(own.values()) + 1
         others = {each: sum(share.values()) for each, share in self._shares.items() if each != OPERATOR}
         most = max(others, key=lambda each: others[each], default=origin)
-        above = own.get(issuer_key, 0) + 1 if most == origin else 0
-        if (most != origin and others[most] <= held) or not self._give_way(most, above=above):
+        upstream = own.get(issuer_key, 0) + 1 if most == origin else 0
+        if (most != origin and others[most] <= held) or not self._give_way(most, upstream=upstream):
             raise StatementError(DropReason.QUOTA, "revocations of owners")
 
-    def _give_way(self, origin: bytes, above: int) -> bool:
-        """Drop the oldest revocation of the owner with most of an origin's share, if that is more than ``above``."""
+    def _give_way(self, origin: bytes, upstream: int) -> bool:
+        """Drop the oldest revocation of the owner with most of an origin's share, if that is more than ``upstream``."""
         share = self._shares.get(origin, {})
         issuer_key = max(share, key=lambda key: share[key], default=None)
-        if issuer_key is None or share[issuer_key] <= above:
+        if issuer_key is None or share[issuer_key] <= upstream:
             return False
         entries = self._owners[issuer_key].items()
         self._remove(issuer_key, next(fingerprint for fingerprint, owned in entries if owned.origin == origin))

@@ -236,7 +236,7 @@ class Bridge:
                 conflict = view.conflicts.before_us(_shown_as(flow_spec), is_begun=key in self._flows)
                 if conflict:
                     complaints.append(
-                        ConfigProblem(flow_spec.local, Fault.CONFLICT, f"{conflict} carries it in this graph")
+                        ConfigProblem(flow_spec.local, Fault.OTHER_BRIDGE, f"{conflict} carries it in this graph")
                     )
                     continue
                 wished.add(key)

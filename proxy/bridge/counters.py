@@ -22,7 +22,7 @@ class Traffic:
         thinned: messages left out because their rule limits the rate.
         dropped: messages that endpoints dropped because a local node did not keep up.
         late: responses of servers that were not the first.
-        strange: responses of servers that had no request.
+        unexpected: responses of servers that had no request.
         hedged: second copies of requests.
         latency: one-way, from the remote proxy's stamp until delivery to the endpoint here.
     """
@@ -35,7 +35,7 @@ class Traffic:
     thinned: int = 0
     dropped: int = 0
     late: int = 0
-    strange: int = 0
+    unexpected: int = 0
     hedged: int = 0
     latency: Histogram = field(default_factory=Histogram)
 
@@ -61,7 +61,7 @@ class Traffic:
 
     def calls(self) -> Mapping[str, int]:
         """Return the counts of calls that several servers of one service cause: late, unexpected, hedged."""
-        return {"late": self.late, "strange": self.strange, "hedged": self.hedged}
+        return {"late": self.late, "unexpected": self.unexpected, "hedged": self.hedged}
 
     def message_bytes(self) -> Mapping[str, int]:
         """Return the bytes carried, before sealing, by direction."""

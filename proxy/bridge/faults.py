@@ -37,7 +37,7 @@ class Fault(str, Enum):
     NO_SERVER = "no-server"
     TIMED_OUT = "timed-out"
     REFUSED = "refused"  # a service or the overlay refused
-    CONFLICT = "rival"  # another proxy of this graph carries it already
+    OTHER_BRIDGE = "other-bridge"  # another proxy of this graph carries it already
 
 
 class Faults:

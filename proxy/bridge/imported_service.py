@@ -20,7 +20,7 @@ from gdp.errors import LocalError, RemoteError
 from gdp.names import Name
 from gdp.service.dispatch import Dispatch, Failure
 from gdp.service.replication import ALL, Mode
-from gdp.service.replication_messages import LIFE_BITS
+from gdp.service.replication_messages import INCARNATION_BITS
 from gdp.service.sequencer import Sequencer
 from proxy.bridge.action_interface import CANCEL, GOAL, PROFILES, RESULT, ActionInterface
 from proxy.bridge.context import BridgeContext
@@ -70,7 +70,7 @@ class ImportedService:
         self._sequencer: Sequencer[Response] | None = None
         self._outside: dict[Name, str] = {}  # servers that cannot be kept in order, with the reported reason
         if flow_spec.rule.is_ordered:
-            self._sequencer = Sequencer(life=lambda: secrets.randbits(LIFE_BITS))
+            self._sequencer = Sequencer(incarnation_id=lambda: secrets.randbits(INCARNATION_BITS))
         self._calls: tuple[ServerCalls, ...] = tuple(
             self._sequencer
             if self._sequencer is not None
@@ -166,9 +166,11 @@ class ImportedService:
     def _count(self) -> None:
         """Add the increments since the last call to the proxy's counters."""
         traffic = self._site.traffic
-        now = tuple(sum(counts) for counts in zip(*((d.late, d.strange, d.hedged) for d in self._calls), strict=True))
+        now = tuple(
+            sum(counts) for counts in zip(*((d.late, d.unexpected, d.hedged) for d in self._calls), strict=True)
+        )
         traffic.late += now[0] - self._counted[0]
-        traffic.strange += now[1] - self._counted[1]
+        traffic.unexpected += now[1] - self._counted[1]
         traffic.hedged += now[2] - self._counted[2]
         self._counted = now
 
@@ -289,7 +291,7 @@ class ImportedService:
 
     def _forget(self, waiting: _Waiting) -> None:
         is_cancelled = self._sequencer is None  # entries of a log go to all servers in any case
-        self._sender.forget(waiting.part, waiting.call, is_cancelled=is_cancelled)
+        self._sender.discard(waiting.part, waiting.call, is_cancelled=is_cancelled)
 
     def _receive_news(self, message: Message) -> None:
         news, name = News.from_wire(message.delivered.message), Name(message.delivered.publisher)

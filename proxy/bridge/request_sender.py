@@ -54,7 +54,7 @@ class RequestSender:
         """Record the goal of a call."""
         self._goal_of[part, call] = goal
 
-    def forget(self, part: int, call: int, *, is_cancelled: bool) -> None:
+    def discard(self, part: int, call: int, *, is_cancelled: bool) -> None:
         """Forget a call that has ended; ``is_cancelled``: its request must not be sent any more."""
         self._goal_of.pop((part, call), None)
         if is_cancelled:
@@ -82,7 +82,7 @@ class RequestSender:
         if isinstance(effect, Ask):
             if effect.call not in self._calls[part]:
                 return  # of a log that has ended
-            self._note_holders(part, effect.call, set(servers))
+            self._record_holders(part, effect.call, set(servers))
         try:
             wire = wire_of(part, effect)
             self._publisher.publish(wire)
@@ -96,7 +96,7 @@ class RequestSender:
             goal = self._goal_of.get((part, effect.call), b"")
             if part == RESULT and server not in self._goals.holders(goal):
                 again = self._goals.again(goal)  # a server that joined later executes the goal as well
-            self._note_holders(part, effect.call, {server})
+            self._record_holders(part, effect.call, {server})
         try:
             for wire in (*([] if again is None else [again]), wire_of(part, effect)):
                 self._site.member.ask(self._service, server, wire)
@@ -110,6 +110,6 @@ class RequestSender:
             for server in servers:
                 self._calls[part].refused(effect.call, server, reason, now_s)
 
-    def _note_holders(self, part: int, call: int, servers: set[Name]) -> None:
+    def _record_holders(self, part: int, call: int, servers: set[Name]) -> None:
         if self._goals is not None and part != CANCEL:
             self._goals.holds(self._goal_of[part, call], servers)

@@ -110,7 +110,7 @@ class ServerDiscovery:
         if self._goals is not None:
             self._goals.gone(name)
         for dispatch in self._calls:
-            dispatch.gone(name, now_s, _SERVER_GONE)
+            dispatch.replica_lost(name, now_s, _SERVER_GONE)
 
     def _add(self, name: Name, incarnation: int, description: bytes, now_s: float) -> None:
         """Prepare the decoders of a server's responses; an invalid description is reported."""
@@ -132,6 +132,6 @@ class ServerDiscovery:
 
     def _announce(self, name: Name, server: RemoteServer, now_s: float) -> None:
         for dispatch in self._calls:
-            dispatch.came(name, now_s)
+            dispatch.replica_joined(name, now_s)
             if server.is_leaving:
-                dispatch.leaves(name)
+                dispatch.replica_leaving(name)

@@ -39,10 +39,10 @@ class TopicStats:
 
     def count_number(self, publisher: bytes, incarnation: int, number: int, place: int = 0) -> None:
         """Count a message that arrived again: numbers rise within an incarnation, positions within a bundle."""
-        life, at = (publisher, incarnation), (number, place)
-        newest = self.newest.get(life, (-1, 0))
+        incarnation_id, at = (publisher, incarnation), (number, place)
+        newest = self.newest.get(incarnation_id, (-1, 0))
         self.duplicated += at <= newest
-        self.newest[life] = max(at, newest)
+        self.newest[incarnation_id] = max(at, newest)
 
     def add(self, latency_ms: float, parts: int, hops: int) -> None:
         """Count one message."""

@@ -107,7 +107,7 @@ def _replay(
             raise LocalError(f"no switch answered on {settings.iface} within {ATTACH_PATIENCE_S:g} s")
         refused = [each for each in node.member.attachment.advertisements if each.refused is not None]
         for each in refused:
-            log.warning("claim refused name=%s reason=%s", each.subject.name.short, each.refused)
+            log.warning("advertisement refused name=%s reason=%s", each.subject.name.short, each.refused)
         if json:
             emit("ready", name=node.member.name.to_text())
         for topic in replay.wait_for_readers(wait_s):

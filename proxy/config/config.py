@@ -93,7 +93,7 @@ class ProxyConfig(Section):
     metrics: Metrics | None = Field(default=None, description="Serve Prometheus text on 127.0.0.1.")
     lease_s: LeaseSeconds = Field(
         default=ADVERTISEMENT_LEASE_S,
-        description="Lease of this node's claims, in seconds; each is renewed after a third of it.",
+        description="Lease of this node's advertisements, in seconds; each is renewed after a third of it.",
     )
     busy_poll_us: int = Field(
         default=SPIN_US,

@@ -121,7 +121,7 @@ class ProxyNode:
         for each in self.member.attachment.advertisements:
             if each.refused is not None:
                 name, right, reason = each.subject.name.short, each.right.value, each.refused.label
-                log.warning("claim refused name=%s right=%s reason=%s", name, right, reason)
+                log.warning("advertisement refused name=%s right=%s reason=%s", name, right, reason)
 
     def sources(self) -> Sources:
         """Return the sources of the metrics."""

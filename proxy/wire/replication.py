@@ -40,8 +40,8 @@ def to_wire(word: SequencerMessage | FollowerMessage) -> bytes:
     """Return the wire form."""
     said: list[Value]
     match word:
-        case ReplicaProbe(life):
-            said = ["keep", life]
+        case ReplicaProbe(incarnation_id):
+            said = ["keep", incarnation_id]
         case AttachReplica(log, at, log_before, at_before, state):
             said = ["follow", *log, at, *log_before, at_before, state]
         case SnapshotRequest(log):
@@ -56,28 +56,35 @@ def to_wire(word: SequencerMessage | FollowerMessage) -> bytes:
 def sequencer_message(wire: bytes) -> SequencerMessage:
     """Parse a sequencer's message."""
     match _read(wire):
-        case ["keep", int(life)]:
-            return ReplicaProbe(life)
-        case ["follow", int(g), int(life), int(at), int(g_before), int(life_before), int(at_before), state] if (
-            state is None or isinstance(state, bytes)
-        ):
-            return AttachReplica(LogId(g, life), at, LogId(g_before, life_before), at_before, state)
-        case ["tell", int(g), int(life)]:
-            return SnapshotRequest(LogId(g, life))
+        case ["keep", int(incarnation_id)]:
+            return ReplicaProbe(incarnation_id)
+        case [
+            "follow",
+            int(g),
+            int(incarnation_id),
+            int(at),
+            int(g_before),
+            int(life_before),
+            int(at_before),
+            state,
+        ] if state is None or isinstance(state, bytes):
+            return AttachReplica(LogId(g, incarnation_id), at, LogId(g_before, life_before), at_before, state)
+        case ["tell", int(g), int(incarnation_id)]:
+            return SnapshotRequest(LogId(g, incarnation_id))
     raise RemoteError(DropReason.MALFORMED, "a keeper's word")
 
 
 def follower_message(wire: bytes) -> FollowerMessage:
     """Parse a replica's message."""
     match _read(wire):
-        case ["position", int(g), int(life), int(at), int(held), bool(is_lost), bool(tells), None]:
-            return ReplicaStatus(LogId(g, life), at, held, is_lost, tells)
-        case ["position", int(g), int(life), int(at), int(held), bool(is_lost), bool(tells), bytes(name)] if (
+        case ["position", int(g), int(incarnation_id), int(at), int(held), bool(is_lost), bool(tells), None]:
+            return ReplicaStatus(LogId(g, incarnation_id), at, held, is_lost, tells)
+        case ["position", int(g), int(incarnation_id), int(at), int(held), bool(is_lost), bool(tells), bytes(name)] if (
             len(name) == NAME_BYTES
         ):
-            return ReplicaStatus(LogId(g, life), at, held, is_lost, tells, Name(name))
-        case ["state", int(g), int(life), int(at), state] if state is None or isinstance(state, bytes):
-            return Snapshot(LogId(g, life), at, state)
+            return ReplicaStatus(LogId(g, incarnation_id), at, held, is_lost, tells, Name(name))
+        case ["state", int(g), int(incarnation_id), int(at), state] if state is None or isinstance(state, bytes):
+            return Snapshot(LogId(g, incarnation_id), at, state)
     raise RemoteError(DropReason.MALFORMED, "a replica's word")
 
 

@@ -140,7 +140,9 @@ class Chaos:
         found += sorted(set(self.books.wrong))
         found += self.books.incomplete(self._is_last_life, end_ns - round(2e9))
         over_ns = end_ns - round((CALL_S + 1) * 1e9)
-        found += self.books.miscalled(over_ns, lambda member, life: (member, life) in self._ended_lives)
+        found += self.books.miscalled(
+            over_ns, lambda member, incarnation_id: (member, incarnation_id) in self._ended_lives
+        )
         if failed := self.books.failed_since(well_ns):
             found.append(f"after the last fault: {failed} calls failed")
         return [*found, *self._after_revocation(), *self._of_snapshots()]
@@ -160,10 +162,10 @@ class Chaos:
             found.append(("before any" if fault is None else fault.kind.value + over, silence))
         return found
 
-    def _is_last_life(self, member: str, life: int) -> bool:
+    def _is_last_life(self, member: str, incarnation_id: int) -> bool:
         """Return whether what this incarnation of a member sends and receives continues to the end of the run."""
         is_revoked = member == VICTIM and self.revoked_ns is not None
-        return life == self._overlay.life(f"member {member}") and not is_revoked
+        return incarnation_id == self._overlay.incarnation_id(f"member {member}") and not is_revoked
 
     def _unreachable(self) -> list[str]:
         silent = [
@@ -176,8 +178,8 @@ class Chaos:
     def _watch(self, until_s: float) -> None:
         while True:
             for member in self._plan.members:
-                for life, records in self._overlay.read(member):
-                    self.books.take(member, life, records)
+                for incarnation_id, records in self._overlay.read(member):
+                    self.books.take(member, incarnation_id, records)
             if (left_s := until_s - time.monotonic()) <= 0:
                 return
             time.sleep(min(LOOK_S, left_s))
@@ -202,7 +204,7 @@ class Chaos:
             for link in targets[1:]:
                 overlay.cut(*link.split("-"))
         elif kind in (FaultKind.KILL_SWITCH, FaultKind.KILL_RIB, FaultKind.KILL_MEMBER):
-            self._ended_lives.add((targets[0].removeprefix("member "), overlay.life(targets[0])))
+            self._ended_lives.add((targets[0].removeprefix("member "), overlay.incarnation_id(targets[0])))
             overlay.kill(targets[0])
         elif kind is FaultKind.FREEZE:
             overlay.freeze(targets[0])
@@ -284,10 +286,10 @@ class Chaos:
         found = [f"{name}: a snapshot that its RIB could not make sense of" for name in self._overlay.disk.broken()]
         for node in self._plan.ribs:
             who = f"rib {node}"
-            for life, log in self._overlay.logs(who):
+            for incarnation_id, log in self._overlay.logs(who):
                 if self._overlay.keeps_snapshot(node):
-                    is_alive = life == self._overlay.life(who) and self._overlay.is_running(who)
-                    found += snapshot_faults(f"{who} (life {life})", log, is_alive=is_alive)
+                    is_alive = incarnation_id == self._overlay.incarnation_id(who) and self._overlay.is_running(who)
+                    found += snapshot_faults(f"{who} (life {incarnation_id})", log, is_alive=is_alive)
         if not self.noticed() and any(fault.kind is FaultKind.DISK_FULL for fault in self._faults):
             found.append("no RIB noticed that the disk was full")
         return found

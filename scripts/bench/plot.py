@@ -117,8 +117,8 @@ def save_bars(path: Path, title: str, footer: str, panels: Sequence[Panel]) -> N
             medians = [bar.median for bar in panel.bars]
             axis.barh(places, medians, 0.66, color=[_COLOURS[not bar.ours] for bar in panel.bars])
             below = [bar.median - (bar.median if bar.low is None else bar.low) for bar in panel.bars]
-            above = [(bar.median if bar.high is None else bar.high) - bar.median for bar in panel.bars]
-            axis.errorbar(medians, places, xerr=[below, above], fmt="none", ecolor="#222222", capsize=2.5, lw=0.9)
+            upstream = [(bar.median if bar.high is None else bar.high) - bar.median for bar in panel.bars]
+            axis.errorbar(medians, places, xerr=[below, upstream], fmt="none", ecolor="#222222", capsize=2.5, lw=0.9)
             for place, bar in zip(places, panel.bars, strict=True):
                 end = max(bar.median, bar.high or 0.0)
                 axis.annotate(

@@ -46,7 +46,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gdp.control.fragments import ControlFragmenter
-from gdp.control.hello import ECHO_BYTES, LIFE_BYTES, NONCE_BYTES, Hello
+from gdp.control.hello import ECHO_BYTES, INCARNATION_BYTES, NONCE_BYTES, Hello
 from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
@@ -149,7 +149,7 @@ def hellos(kind: str, overlay: Overlay) -> list[bytes]:
 def _hello(member: Identity, key: SigningKey | None) -> list[bytes]:
     hello = Hello(
         secrets.token_bytes(NONCE_BYTES), 1, (secrets.token_bytes(ECHO_BYTES),), _MTU, bytes(8), member.membership,
-        exchange_key=secrets.token_bytes(32), life=secrets.token_bytes(LIFE_BYTES),
+        exchange_key=secrets.token_bytes(32), incarnation_id=secrets.token_bytes(INCARNATION_BYTES),
     )  # fmt: skip
     wire = hello.to_wire(member.name, key or member.key)
     return ControlFragmenter(member.name, secrets.randbits(64)).split(Kind.HELLO, wire, _MTU)

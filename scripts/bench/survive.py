@@ -98,14 +98,14 @@ class Flowing:
                 self.first_of.setdefault(each.channel, each.at_ns)
                 if each.channel == 0:
                     self.arrivals_ns.append(each.at_ns)
-                    self.numbers[each.life, each.number] += 1
+                    self.numbers[each.incarnation_id, each.number] += 1
             elif each.kind == Kind.LOST and each.channel == 0:
                 self.reported_lost += each.number
             elif each.kind == Kind.WRONG:
                 raise FailedError(f"R had a message of channel {each.other} on channel {each.channel}")
         for each in self._records("P"):
             if each.kind == Kind.PUBLISHED and each.channel == 0:
-                self.published.add((each.life, each.number))
+                self.published.add((each.incarnation_id, each.number))
 
     def _records(self, member: str) -> Iterator[Record]:
         return chain.from_iterable(records for _, records in self._overlay.read(member))

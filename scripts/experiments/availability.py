@@ -189,9 +189,9 @@ def _draw(path: Path, cases: Sequence[Case]) -> None:
             places = [case.replicas + (at - 1) * 0.12 for case in mine]
             shares = [case.none_up.share for case in mine]
             below = [case.none_up.share - min(case.none_up.low, case.none_up.share) for case in mine]
-            above = [max(case.none_up.high, case.none_up.share) - case.none_up.share for case in mine]
+            upstream = [max(case.none_up.high, case.none_up.share) - case.none_up.share for case in mine]
             label = f"recovery {duration_text(recovery_s)}"
-            axis.errorbar(places, shares, yerr=[below, above], fmt="o", ms=4, lw=0.8, color=colour, label=label)
+            axis.errorbar(places, shares, yerr=[below, upstream], fmt="o", ms=4, lw=0.8, color=colour, label=label)
             alone = [case.independent for case in mine]
             axis.plot(places, [float("nan") if each is None else each for each in alone], "_", ms=11, color=colour)
         axis.set_title(way, loc="left", fontsize=10)

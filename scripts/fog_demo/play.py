@@ -162,7 +162,7 @@ async def _befall(site: Site, looking: _Looking, pace: Pace, view: View) -> dict
     view.step(f"{second.name} is killed: SIGKILL to all of it, its link gone")
     at_s = time.time()
     kill(runs, second.id)
-    steps_s |= await _replaced(looking, second, {"taken", "unheard"}, at_s, "death")
+    steps_s |= await _replaced(looking, second, {"preempted", "unreachable"}, at_s, "death")
     await asyncio.sleep(pace.calm_s)
     return steps_s
 

@@ -81,8 +81,8 @@ class OverlayCredentials:
 
     def rib(self, at: Attachment) -> Path:
         """Write ``rib.yaml`` of a RIB; return the file."""
-        above = upper_rib(self._topology, self._topology.domain_of(at.switch))
-        upper = self._names[_title(Role.RIB, above.switch)] if above is not None else None
+        upstream = upper_rib(self._topology, self._topology.domain_of(at.switch))
+        upper = self._names[_title(Role.RIB, upstream.switch)] if upstream is not None else None
         content = rib_yaml(
             at, self._credentials(Role.RIB, at.switch), upper, metrics=self._metrics, lease_s=self._lease_s
         )

@@ -40,8 +40,8 @@ def test_a63_a_program_of_a_machine_inherits_no_credentials(tmp_path: Path) -> N
     async def live() -> None:
         program = Program("node", ("{python}", "-c", PRINTS), environment={"OWN": "1"})
         log = BoundedLog(tmp_path / "log")
-        life = ManagedProcess(program, tmp_path, log, lambda: None)
-        await asyncio.wait_for(life.ended, 20)
+        incarnation_id = ManagedProcess(program, tmp_path, log, lambda: None)
+        await asyncio.wait_for(incarnation_id.ended, 20)
         log.close()
 
     asyncio.run(live())

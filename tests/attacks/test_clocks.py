@@ -160,8 +160,8 @@ def test_a38_a_switch_that_has_restarted_since_refuses_it_by_its_time() -> None:
 
 
 def test_a38_numbers_of_the_dead_are_known_for_as_long_as_their_time_could_be_believed() -> None:
-    states, life = known(), b"1" * 16
-    first = replace(state("a", link("b"), sequence=5), life=life)
+    states, incarnation_id = known(), b"1" * 16
+    first = replace(state("a", link("b"), sequence=5), incarnation_id=incarnation_id)
     states.put(first, b"wire", 0.0)
     states.expire(LINK_STATE_LEASE_S)
     for now_s in (LINK_STATE_LEASE_S, LINK_STATE_LEASE_S + PAST_S - 1):
@@ -175,13 +175,13 @@ def test_a38_numbers_of_the_dead_are_known_for_as_long_as_their_time_could_be_be
 
 def test_a38_a30_a_new_life_is_heard_below_the_numbers_of_the_last_and_that_stays_over() -> None:
     states = known()
-    old = replace(state("a", link("b"), sequence=500), life=b"1" * 16)
+    old = replace(state("a", link("b"), sequence=500), incarnation_id=b"1" * 16)
     states.put(old, b"wire", 0.0)
     states.expire(LINK_STATE_LEASE_S)
-    assert states.put(replace(old, sequence=3, life=b"2" * 16), b"wire", 200.0) is True
+    assert states.put(replace(old, sequence=3, incarnation_id=b"2" * 16), b"wire", 200.0) is True
     assert states.put(old, b"wire", 201.0) is False
     for number in range(3, 20):  # an origin that draws incarnations to have its own forgotten
-        states.put(replace(old, sequence=500 + number, life=bytes([number]) * 16), b"wire", 202.0)
+        states.put(replace(old, sequence=500 + number, incarnation_id=bytes([number]) * 16), b"wire", 202.0)
     states.expire(202.0 + LINK_STATE_LEASE_S)
     assert states.put(old, b"wire", 400.0) is False
-    assert states.put(replace(old, life=b"n" * 16, sequence=501), b"wire", 400.0) is False
+    assert states.put(replace(old, incarnation_id=b"n" * 16, sequence=501), b"wire", 400.0) is False

@@ -144,8 +144,8 @@ def test_a52_a_token_admits_one_machine_as_it_was_planned(desk: Desk) -> None:
     assert all(each.not_after_unix_s <= time.time() + 86_401 for each in got)
     (news,) = desk.tickets.news()
     assert news.report is Report.ENROLLED
-    assert news.papers is not None
-    assert news.papers.fingerprints == tuple(each.fingerprint.hex() for each in got)
+    assert news.issued_credentials is not None
+    assert news.issued_credentials.fingerprints == tuple(each.fingerprint.hex() for each in got)
     assert verify_audit(desk.authority.domain).events["accepted", "membership leaf"] == 1
 
 
@@ -157,9 +157,9 @@ def test_a52_who_uses_a_token_after_the_machine_gets_nothing_and_is_reported(des
     assert asked(desk, thief.request()) == REFUSED
     misused = desk.tickets.news()[-1]
     assert misused.report is Report.MISUSED
-    assert misused.papers == enrolled.papers
-    assert enrolled.papers is not None
-    assert enrolled.papers.proxy[:16] in misused.detail
+    assert misused.issued_credentials == enrolled.issued_credentials
+    assert enrolled.issued_credentials is not None
+    assert enrolled.issued_credentials.proxy[:16] in misused.detail
     assert asked(desk, thief.request()) == asked(desk, machine.request()) == REFUSED
     assert reports(desk.tickets) == [Report.ENROLLED, Report.MISUSED]  # once
     desk.responder.flush()
@@ -510,17 +510,17 @@ def test_a52_a_machine_whose_token_is_used_again_is_named_revoked_and_replaced(
     journal.want(replace(PLAN, machines=PLAN.machines[:1]), time.time())
     work(ours, lambda: "m1" in provider.boots and journal.machines("c")[0].id)
     assert responder.answer(Machine(provider.ticket("m1")).request(), time.time()) != REFUSED
-    work(ours, lambda: journal.machines("c")[0].papers.proxy)
-    papers = journal.machines("c")[0].papers
+    work(ours, lambda: journal.machines("c")[0].issued_credentials.proxy)
+    issued_credentials = journal.machines("c")[0].issued_credentials
     assert responder.answer(Machine(provider.ticket("m1")).request(), time.time()) == REFUSED
     work(ours, lambda: list(provider.machines) == ["m2"])
     ours.close()
     (alarm,) = (each for each in journal.events("c") if each.what == "alarm")
     assert alarm.machine == "m1"
-    assert papers.proxy[:16] in alarm.detail
+    assert issued_credentials.proxy[:16] in alarm.detail
     assert site.revocations is not None
     revoked = {path.stem for path in site.revocations[0].glob("*.revoke")}
-    assert revoked == {each[:32] for each in papers.fingerprints}
+    assert revoked == {each[:32] for each in issued_credentials.fingerprints}
 
 
 def test_a52_a_machine_that_enrols_when_it_is_no_longer_wanted_is_revoked(
@@ -549,7 +549,7 @@ def test_a52_what_happened_while_no_supervisor_lived_is_acted_on_by_the_next(
     first.close()
     Responder(tickets, site.authority).answer(Machine(provider.ticket("m1")).request(), time.time())
     second = supervisor(site, journal, provider)
-    work(second, lambda: journal.machines("c")[0].papers.fingerprints)
+    work(second, lambda: journal.machines("c")[0].issued_credentials.fingerprints)
     second.close()
     assert tickets.news() == []
 

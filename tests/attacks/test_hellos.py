@@ -253,9 +253,11 @@ def test_a22_a_hello_of_an_earlier_life_played_at_another_port_lets_no_neighbour
     link = pair()
     one = link.ends[0]
     one.add_port(1, b"\x02\x01\x01\x00\x00\x00", 1_500, 10, link.now_s)
-    link.ends[1]._life = bytes(15) + b"\x02"
+    link.ends[1]._incarnation_id = bytes(15) + b"\x02"
     link.run(6.0)
-    old = Hello(b"n" * 8, 9, (), 1_500, bytes(8), B.membership, life=bytes(15) + b"\x01").to_wire(B.name, B.key)
+    old = Hello(b"n" * 8, 9, (), 1_500, bytes(8), B.membership, incarnation_id=bytes(15) + b"\x01").to_wire(
+        B.name, B.key
+    )
     one.receive(hello_in(old, 1, mac_of(1)), parse(old), at(link.now_s))
     one.drop_silent(link.now_s)
     (known,) = (each for each in one.ports[0].neighbours.values())
@@ -269,7 +271,9 @@ def test_a20_a_second_node_of_an_identity_without_proof_draws_no_more_than_it_se
         each.sent = 0
     received = 0
     for number in range(16):  # later incarnations of the neighbour, at another address
-        hello = Hello(number.to_bytes(8, "big"), 1, (), 1_500, bytes(8), B.membership, life=bytes(15) + b"\x09")
+        hello = Hello(
+            number.to_bytes(8, "big"), 1, (), 1_500, bytes(8), B.membership, incarnation_id=bytes(15) + b"\x09"
+        )
         received += link.inject(hello.to_wire(B.name, B.key), mac_of(number))
         link.run(1.0)
     calm.run(16.0)

@@ -25,7 +25,7 @@ def aside(world: Simulation, flow: Flow) -> tuple[SwitchCore, Tree, Neighbour, I
     )
     (tree,) = home.multicast.trees.of_topic(flow.topic.name)
     switches = [each for each in home.hello_protocol.all_up() if each.role is Role.SWITCH]
-    (liar,) = (each for each in switches if each.name != tree.above_name)
+    (liar,) = (each for each in switches if each.name != tree.upstream_name)
     (identity,) = (each for each in world.identities.values() if each.name == liar.name)
     return home, tree, liar, identity
 
@@ -36,7 +36,7 @@ def test_x03_a_join_that_leads_elsewhere_moves_no_tree(proof: str) -> None:
     flow = flowing(world)
     home, tree, liar, identity = aside(world, flow)
     (label,) = (each for each, machine in world.switches.items() if machine is home)
-    above, true_place, version = tree.above, tree.switch, tree.version
+    upstream, true_place, version = tree.upstream, tree.switch, tree.version
     lie = next(each.name for each in world.switches.values() if each.name not in (home.name, tree.switch))
     shown = {"none": b"", "of the true place": tree.proof, "of another topic": identity.membership}[proof]
     join = Join(
@@ -47,7 +47,7 @@ def test_x03_a_join_that_leads_elsewhere_moves_no_tree(proof: str) -> None:
     frames = world.switches["nuc1"]._fragmenter.split(Kind.JOIN, join.to_wire(identity.name, identity.key), 1_500)
     for frame in frames:
         world.network.inject(label, liar.port, frame, liar.mac)
-    assert (tree.above, tree.switch, tree.version) == (above, true_place, version)
+    assert (tree.upstream, tree.switch, tree.version) == (upstream, true_place, version)
     gained = counted(world) - before
     assert gained[DropReason.NOT_DELEGATED] + gained[DropReason.MALFORMED] == 1
     still_flows(flow)

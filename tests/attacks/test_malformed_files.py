@@ -115,7 +115,7 @@ def test_a_boot_that_is_none_is_named(content: bytes) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "{", "[]", "null", "3", DEEP.decode(), '{"spec": {}, "wanted": {}, "papers": {}}']
+    "text", ["", "{", "[]", "null", "3", DEEP.decode(), '{"spec": {}, "wanted": {}, "issued_credentials": {}}']
 )
 def test_a_row_of_the_journal_that_is_none_is_named(tmp_path: Path, text: str) -> None:
     path = tmp_path / "journal.sqlite3"

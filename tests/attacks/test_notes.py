@@ -20,7 +20,7 @@ from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
 from gdp.message.send_window import SendWindow
 from gdp.names import Name
 from tests.attacks.work import lines_run
-from tests.gdp.client.lives import Notes, key_of, name_of, reader_of, subject_of
+from tests.gdp.client.incarnation_ids import Notes, key_of, name_of, reader_of, subject_of
 from tests.gdp.client.pipe import SECRETS, TOPIC, End, Pipe, publisher_of
 
 TWO = {1: b"1" * 32, 2: b"2" * 32}
@@ -150,7 +150,7 @@ def test_a24_epochs_that_change_all_the_time_lose_nothing() -> None:
     assert [end.messages for end in ends] == [sent, sent]
 
 
-def lives() -> Iterator[tuple[bytes, int, int]]:
+def incarnation_ids() -> Iterator[tuple[bytes, int, int]]:
     """Yield reader, its incarnation and the epoch in use, over restarts and new epochs."""
     for epoch in (1, 2, 3):
         for incarnation in (7, 8):
@@ -165,7 +165,7 @@ def test_a33_no_note_is_accepted_that_is_forged_or_recorded_whatever_restarts() 
     recorded: list[bytes] = []
     present: dict[bytes, Notes] = {}
     names = {label: name_of(label) for label in (b"a", b"b", b"c")}
-    for turn, (label, incarnation, epoch) in enumerate(lives()):
+    for turn, (label, incarnation, epoch) in enumerate(incarnation_ids()):
         if max(pipe.publisher._keys._secrets) != epoch:
             pipe.publisher.renew({epoch: secrets[epoch]}, pipe.now_s)
             pipe.now_s += EPOCH_GRACE_S
@@ -183,8 +183,8 @@ def test_a33_no_note_is_accepted_that_is_forged_or_recorded_whatever_restarts() 
         recorded += said
         before = snapshot(pipe)
         for other in present.keys() - {label}:
-            for life in (incarnation, incarnation + 1):
-                forger = Notes(reader_of(other, life), pipe.source, TOPIC, secrets, as_name=names[label])
+            for incarnation_id in (incarnation, incarnation + 1):
+                forger = Notes(reader_of(other, incarnation_id), pipe.source, TOPIC, secrets, as_name=names[label])
                 pipe.tell(*forger.hello(epoch), *(forger.report(report, epoch) for report in LIES))
         pipe.tell(*recorded)
         assert snapshot(pipe) == before, f"turn {turn}"

@@ -140,8 +140,8 @@ def looked(tmp_path: Path, *, is_users: bool) -> dict[str, object]:
     async def live() -> None:
         log = BoundedLog(tmp_path / "log")
         program = Program("node", ("/usr/bin/python3", "-c", LOOKS, str(key)), is_users=is_users)
-        life = ManagedProcess(program, tmp_path, log, lambda: None)
-        await asyncio.wait_for(life.ended, 30)
+        incarnation_id = ManagedProcess(program, tmp_path, log, lambda: None)
+        await asyncio.wait_for(incarnation_id.ended, 30)
         log.close()
 
     asyncio.run(live())

@@ -56,7 +56,7 @@ _A: Final = Name(b"a" * 32)
 _NODE: Final = ROBOT
 _HEIR: Final = SCHOOL.succeed(LAB.key, DAY, NOW)
 _AUDIT: Final = AuditLine(1, NOW, "accepted", "name", "ab", "cd", "", 1, BEGIN).to_line()
-_ENTRY: Final = Entry(b"claim", b"cert", _A, _A, _A, (_A,), 9.0, is_from_above=False)
+_ENTRY: Final = Entry(b"claim", b"cert", _A, _A, _A, (_A,), 9.0, is_from_upstream=False)
 _READS: Final[dict[str, tuple[bytes, Callable[[Fields], object]]]] = {
     **{name.replace(" ", "-"): (wire, read) for name, (wire, _, read) in BODIES.items()},
     "presence": (Presence(_A, 1, _A, 7).to_wire(_NODE.name, _NODE.key, b"cert"), Presence.from_fields),

@@ -304,14 +304,14 @@ class Forge:
         persona = next(each for each in PERSONAS if self._stage.identity(each).name == identity.name)
         return self._stage.own_nonce(persona, place)
 
-    def _own_life(self, identity: Identity, rng: random.Random) -> bytes:
+    def _own_incarnation(self, identity: Identity, rng: random.Random) -> bytes:
         """Return the incarnation of the persona's machine, usually the present one, else an older or a newer one."""
         machine = next((each for each in self._stage.machines().values() if each.name == identity.name), None)
         hello_protocol = getattr(machine, "hello_protocol", None) or getattr(
             getattr(machine, "attachment", None), "hello_protocol", None
         )
-        life = bytes(16) if hello_protocol is None else hello_protocol._life
-        return life if rng.random() < 0.9 else rng.choice((bytes(16), b"\xff" * 16, rng.randbytes(16)))
+        incarnation_id = bytes(16) if hello_protocol is None else hello_protocol._incarnation_id
+        return incarnation_id if rng.random() < 0.9 else rng.choice((bytes(16), b"\xff" * 16, rng.randbytes(16)))
 
     def _hello(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
         nonce = rng.choice((bytes([1]) * 8, bytes([2]) * 8, rng.randbytes(8)))
@@ -322,7 +322,8 @@ class Forge:
             "n": nonce, "s": next(self._counters), "h": [self._echo(place)] if rng.random() < 0.8 else [],
             "m": 1_500, "d": rng.choice((bytes(8), rng.randbytes(8))), "c": identity.membership,
             "k": rng.choice(([1_000, 1_000, 3], [0, 0, 1], [1, 1, 1], [60_000, 60_000, 255])),
-            "x": rng.choice((b"", bytes(32), b"\xff" * 32, rng.randbytes(32))), "b": self._own_life(identity, rng),
+            "x": rng.choice((b"", bytes(32), b"\xff" * 32, rng.randbytes(32))),
+            "b": self._own_incarnation(identity, rng),
             "u": [self._echo(place)] if rng.random() < 0.1 else [], "r": rtcerts[:RTCERTS_MAX],
             "y": [self._nonce(place) + rng.randbytes(COOKIE_BYTES)] if rng.random() < 0.2 else [],
         }  # fmt: skip
@@ -349,7 +350,7 @@ class Forge:
             "i": [adjacency() for _ in range(rng.choice((0, 0, 1, 3)))],
             "r": [rib() for _ in range(rng.choice((0, 1, 2)))],
             "m": [rng.choice(self._nodes) for _ in range(rng.choice((0, 1, 4)))],
-            "z": rng.random() < 0.2, "b": self._own_life(identity, rng),
+            "z": rng.random() < 0.2, "b": self._own_incarnation(identity, rng),
             "e": int(world.network.now.unix_s),
             "u": [rng.choice(self._nodes)] if rng.random() < 0.2 else [], "c": identity.membership,
             **({"d": own} if rng.random() < 0.01 else {}),
@@ -413,7 +414,7 @@ class Forge:
                 )
         return {
             **subject.to_fields(), "name": subject.name, "right": right.value, "seq": next(self._numbers),
-            "inc": int.from_bytes(self._own_life(identity, rng)[8:], "big"),
+            "inc": int.from_bytes(self._own_incarnation(identity, rng)[8:], "big"),
             "x": rng.choice((b"", bytes(32), rng.randbytes(32))),
             "lease": rng.choice((1_000, 6_000, 24_000, 3_600_000)),
             "global": rng.random() < 0.5, "member": identity.membership, "chain": chain,

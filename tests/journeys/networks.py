@@ -93,9 +93,9 @@ class Plan:
             nodes = domains[domain % len(domains)]
             join(nodes[one % len(nodes)], nodes[two % len(nodes)])
         for number, upper in enumerate(self.uppers, start=1):
-            own, above = domains[number], domains[upper]
-            join(own[0], above[number % len(above)])
-            join(own[-1], above[(number + len(above) // 2) % len(above)])
+            own, upstream = domains[number], domains[upper]
+            join(own[0], upstream[number % len(upstream)])
+            join(own[-1], upstream[(number + len(upstream) // 2) % len(upstream)])
         for domain, one, other, two in self.joints:
             own, far = domains[domain % len(domains)], domains[other % len(domains)]
             join(own[one % len(own)], far[two % len(far)])

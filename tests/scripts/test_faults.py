@@ -144,8 +144,8 @@ def test_frozen_processes_and_the_revoked_are_broken() -> None:
     assert (broken.members, broken.switches) == ({"P", VICTIM}, {"s2"})
 
 
-def delivered(number: int, at_s: float = 0.0, life: int = 1, publisher: int = 0) -> Record:
-    return Record(Kind.DELIVERED, 0, life, publisher, number, round(at_s * SECOND_NS))
+def delivered(number: int, at_s: float = 0.0, incarnation_id: int = 1, publisher: int = 0) -> Record:
+    return Record(Kind.DELIVERED, 0, incarnation_id, publisher, number, round(at_s * SECOND_NS))
 
 
 def published(count: int) -> Iterator[Record]:
@@ -175,10 +175,10 @@ def test_the_last_messages_of_a_dead_publisher_between_two_incarnations_of_a_rea
     found.take("P", 2, (Record(Kind.PUBLISHED, 0, 2, 0, number, number) for number in range(1, 6)))
     between = Record(Kind.LOST, 0, 2, LossReason.READER_RESTARTED, 97, 0)
     head = Record(Kind.LOST, 0, 2, LossReason.PUBLISHER_RESTARTED, 3, 0)
-    found.take("R", 2, iter((between, delivered(4, life=2), delivered(5, life=2), head)))
-    assert not found.incomplete(lambda _, life: life == 2, SECOND_NS)
+    found.take("R", 2, iter((between, delivered(4, incarnation_id=2), delivered(5, incarnation_id=2), head)))
+    assert not found.incomplete(lambda _, incarnation_id: incarnation_id == 2, SECOND_NS)
     found.take("R", 2, iter((Record(Kind.LOST, 0, 2, LossReason.READER_RESTARTED, 41, 0),)))
-    assert found.incomplete(lambda _, life: life == 2, SECOND_NS)
+    assert found.incomplete(lambda _, incarnation_id: incarnation_id == 2, SECOND_NS)
 
 
 def test_more_reported_than_missing_is_found() -> None:

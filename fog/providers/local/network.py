@@ -178,7 +178,7 @@ class Network:
             (home / "logs").mkdir(mode=0o700, exist_ok=True)
 
         def note(pid: int) -> None:
-            process = Process.of(pid)
+            process = Process.from_pid(pid)
             (home / "process.json").write_text(json.dumps([process.pid, process.started]), encoding="ascii")
 
         argv = ["fog.host.cli", "--home", str(home), "--await-go"]

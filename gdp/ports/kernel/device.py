@@ -80,7 +80,7 @@ class QueueWatch:
         """Return the descriptor to wait on; it is readable when there are notifications."""
         return self._socket.fileno()
 
-    def drain(self) -> None:
+    def discard_events(self) -> None:
         """Discard the notifications; the caller queries the present state."""
         while True:
             try:

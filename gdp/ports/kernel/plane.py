@@ -178,7 +178,7 @@ class KernelPlane(RawPlane):
 
     def _review_queues(self) -> None:
         """Check again on which ports redirected frames may bypass the egress path."""
-        self._queues.drain()
+        self._queues.discard_events()
         for port in self._ports.values():
             self._tell_kernel(port)
 

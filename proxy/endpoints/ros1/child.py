@@ -17,7 +17,7 @@ from proxy.endpoints.ros1.ipc import IpcLink, Kind
 
 def main() -> None:
     """Serve the IPC link until it ends."""
-    descriptor, master, node, life, delay_s = sys.argv[1:]
+    descriptor, master, node, incarnation_id, delay_s = sys.argv[1:]
     woken = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
     link = IpcLink(socket.socket(fileno=int(descriptor)), lambda: os.eventfd_write(woken, 1))
     try:
@@ -29,7 +29,9 @@ def main() -> None:
         reason = error if isinstance(error, LocalError) else f"rospy does not load in this Python {version}: {error}"
         link.send(Kind.ENDING, payload=str(reason).encode())
         sys.exit(1)
-    Node(link=link, woken=woken, master=master, node=node, life=int(life), delay_s=float(delay_s)).run()
+    Node(
+        link=link, woken=woken, master=master, node=node, incarnation_id=int(incarnation_id), delay_s=float(delay_s)
+    ).run()
 
 
 if __name__ == "__main__":

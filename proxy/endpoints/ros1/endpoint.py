@@ -90,7 +90,7 @@ class Ros1Endpoint:
         self._trouble = ""  # the present fault; also reported to handles created while it lasts
         self._answers: dict[int, bytes | None] = {}
         self._known: dict[tuple[Kind, str, str], bytes] = {}
-        self._life = 0
+        self._incarnation_id = 0
         self._failures = 0
         self._lost = 0
         self._lost_before = 0
@@ -214,14 +214,14 @@ class Ros1Endpoint:
 
     def _start(self, delay_s: float) -> None:
         ours, its = socket.socketpair()
-        self._life += 1
+        self._incarnation_id += 1
         self._started_s = time.monotonic()
         self._is_answering = False
         left_out = ("ROS_NAMESPACE", "GDP_PASSPHRASE")
         environment = {key: value for key, value in os.environ.items() if key not in left_out}
         environment["ROS_MASTER_URI"] = self._master_uri
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, (os.environ.get("PYTHONPATH"), str(_ROOT))))
-        arguments = (its.fileno(), self._master_uri, self._node, self._life, delay_s)
+        arguments = (its.fileno(), self._master_uri, self._node, self._incarnation_id, delay_s)
         with its:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "proxy.endpoints.ros1.child", *map(str, arguments)],
@@ -269,7 +269,7 @@ class Ros1Endpoint:
             if not self._link.is_behind:
                 self._epoll.modify(self._link, select.EPOLLIN)
         try:
-            frames = self._link.receive()
+            frames = self._link.poll_frames()
         except LinkEndedError:
             self._restart()
             return

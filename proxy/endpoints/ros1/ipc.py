@@ -158,7 +158,7 @@ class IpcLink:
                     self._undroppable(waiting)
                     self._queue.popleft()
 
-    def receive(self) -> list[Frame]:
+    def poll_frames(self) -> list[Frame]:
         """Return the received frames, up to some megabytes of them.
 
         Raises:

@@ -50,14 +50,16 @@ _BACKLOG: Final = 128
 class Node:
     """One node on one master."""
 
-    def __init__(self, *, link: IpcLink, woken: int, master: str, node: str, life: int, delay_s: float) -> None:
+    def __init__(
+        self, *, link: IpcLink, woken: int, master: str, node: str, incarnation_id: int, delay_s: float
+    ) -> None:
         self._link = link
         self._woken = woken
         self._master = master
         self._name = node
         self._id = f"/{node}"
         self._delay_s = delay_s
-        self._tickets = tickets(life)
+        self._tickets = tickets(incarnation_id)
         self._inlets: dict[int, Subscriber] = {}
         self._outlets: dict[int, Publisher] = {}
         self._servers: dict[int, Server] = {}
@@ -83,7 +85,7 @@ class Node:
                     os.eventfd_read(self._woken)
             self._link.flush()
             try:
-                frames = self._link.receive()
+                frames = self._link.poll_frames()
             except LinkEndedError:
                 self._leave()
             for frame in frames:

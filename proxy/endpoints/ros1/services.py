@@ -194,9 +194,9 @@ class Client:
         return transport
 
 
-def tickets(life: int) -> Iterator[int]:
+def tickets(incarnation_id: int) -> Iterator[int]:
     """Return numbers that no earlier rospy process of this endpoint has used."""
-    return itertools.count((life << 40) + 1)
+    return itertools.count((incarnation_id << 40) + 1)
 
 
 def _has_ended(proxy: ServiceProxy) -> bool:

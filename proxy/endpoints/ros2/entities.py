@@ -62,7 +62,7 @@ class Source(Protocol):
     def join(self, wait_set: WaitSet) -> Callable[[], object]:
         """Return the callable that adds this entity to a wait set for one wait."""
 
-    def drain(self) -> list[Event]:
+    def poll_events(self) -> list[Event]:
         """Read the available data."""
 
 
@@ -86,7 +86,7 @@ class SubscriptionEntity:
         """Return the callable that adds the subscription to a wait set."""
         return partial(wait_set.add_subscription, self.handle)
 
-    def drain(self) -> list[Event]:
+    def poll_events(self) -> list[Event]:
         """Read a bounded number of messages; the endpoint's own are left out."""
         events: list[Event] = []
         stamp_ns = time.time_ns()
@@ -149,7 +149,7 @@ class ServiceEntity:
         """Return the callable that adds the server to a wait set."""
         return partial(wait_set.add_service, self.handle)
 
-    def drain(self) -> list[Event]:
+    def poll_events(self) -> list[Event]:
         """Read a bounded number of requests."""
         from rclpy.serialization import serialize_message
 
@@ -212,7 +212,7 @@ class ClientEntity:
         """Return the callable that adds the client to a wait set."""
         return partial(wait_set.add_client, self.handle)
 
-    def drain(self) -> list[Event]:
+    def poll_events(self) -> list[Event]:
         """Read a bounded number of responses."""
         from rclpy.serialization import serialize_message
 

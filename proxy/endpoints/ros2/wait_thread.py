@@ -164,7 +164,7 @@ class WaitThread:
 
     def _drained(self, source: Source) -> list[Event]:
         try:
-            events = source.drain()
+            events = source.poll_events()
         except (RuntimeError, ValueError) as error:  # rclpy's own errors, and text that is not UTF-8
             return [EndpointError(source.number, f"cannot be taken: {error}")]
         if isinstance(source, SubscriptionEntity) and source.described is None and events:

@@ -112,28 +112,28 @@ class Books:
         self.answered: list[tuple[int, int]] = []  # time of the call, time of the answer
         self.failed: list[tuple[int, int]] = []
 
-    def take(self, member: str, life: int, records: Iterator[Record]) -> None:
+    def take(self, member: str, incarnation_id: int, records: Iterator[Record]) -> None:
         """Read the records of one incarnation of a member."""
         for each in records:
             if each.kind == Kind.DELIVERED:
-                self.accounts[each.channel, member, life, each.life].add(each.number)
+                self.accounts[each.channel, member, incarnation_id, each.incarnation_id].add(each.number)
                 self.arrivals_ns[each.channel, member].append(each.at_ns)
                 expected = self._plan.members.index(self._publisher(each.channel))
                 if each.other != expected:
                     self.wrong.append(f"{member} had a message of member {each.other} on channel {each.channel}")
             elif each.kind == Kind.PUBLISHED:
-                self.published[each.channel, life].append(each.at_ns)
+                self.published[each.channel, incarnation_id].append(each.at_ns)
             elif each.kind == Kind.LOST:
                 is_between = each.other == LossReason.READER_RESTARTED
                 reported_losses = self.reported_between if is_between else self.reported_losses
-                reported_losses[each.channel, member, life] += each.number
+                reported_losses[each.channel, member, incarnation_id] += each.number
             elif each.kind == Kind.WRONG:
                 self.wrong.append(f"{member} had, on channel {each.channel}, a message for channel {each.other}")
             elif each.kind in (Kind.CALLED, Kind.ANSWERED, Kind.FAILED):
-                self._take_call(member, life, each)
+                self._take_call(member, incarnation_id, each)
 
-    def _take_call(self, member: str, life: int, each: Record) -> None:
-        key = each.channel, member, life, each.number
+    def _take_call(self, member: str, incarnation_id: int, each: Record) -> None:
+        key = each.channel, member, incarnation_id, each.number
         call = self._calls.setdefault(key, [each.at_ns, 0])
         if each.kind != Kind.CALLED:
             call[1] += 1
@@ -162,57 +162,59 @@ class Books:
         """
         found = []
         of_reader: defaultdict[tuple[int, str, int], list[tuple[int, Account]]] = defaultdict(list)
-        for (channel, reader, life, source_life), account in sorted(self.accounts.items()):
-            of_reader[channel, reader, life].append((source_life, account))
-        for (channel, reader, life), accounts in of_reader.items():
+        for (channel, reader, incarnation_id, source_incarnation), account in sorted(self.accounts.items()):
+            of_reader[channel, reader, incarnation_id].append((source_incarnation, account))
+        for (channel, reader, incarnation_id), accounts in of_reader.items():
             flow = self._plan.flows[channel]
-            who = f"{flow.topic} at {reader} (life {life})"
+            who = f"{flow.topic} at {reader} (life {incarnation_id})"
             if doubled := sum(account.doubled for _, account in accounts):
                 found.append(f"{who}: {doubled} messages came twice")
             if not flow.reliable:
                 continue
             least = most = 0
-            for at, (source_life, account) in enumerate(accounts):
-                sent = sum(at_ns <= until_ns for at_ns in self.published[channel, source_life])
-                is_last = is_last_life(flow.publisher, source_life) and is_last_life(reader, life)
+            for at, (source_incarnation, account) in enumerate(accounts):
+                sent = sum(at_ns <= until_ns for at_ns in self.published[channel, source_incarnation])
+                is_last = is_last_life(flow.publisher, source_incarnation) and is_last_life(reader, incarnation_id)
                 # losses of a later incarnation count from its start, also if only an earlier reader knew an older one
-                is_later = at or self._known_before(channel, reader, life, source_life)
+                is_later = at or self._known_before(channel, reader, incarnation_id, source_incarnation)
                 head = account.first - 1 if is_later else 0
                 least += account.missing(sent if is_last else account.last)
                 most += account.missing(max(sent, account.last)) + head
-            between = self.reported_between[channel, reader, life]
-            gap = sum(self._gap(channel, reader, life, source_life) for source_life, _ in accounts)
-            tail = self._tail(channel, reader, life)
+            between = self.reported_between[channel, reader, incarnation_id]
+            gap = sum(
+                self._gap(channel, reader, incarnation_id, source_incarnation) for source_incarnation, _ in accounts
+            )
+            tail = self._tail(channel, reader, incarnation_id)
             if between and not gap <= between <= gap + tail + math.ceil(flow.hz * UNCONFIRMED_S):
                 found.append(f"{who}: {gap} messages missing since its former life, {between} reported")
-            reported_losses = self.reported_losses[channel, reader, life]
+            reported_losses = self.reported_losses[channel, reader, incarnation_id]
             if not least <= reported_losses <= most:
                 lack = f"{least}" if least == most else f"{least} to {most}"
                 found.append(f"{who}: {lack} messages missing, {reported_losses} reported")
         return found
 
-    def _gap(self, channel: int, reader: str, life: int, source_life: int) -> int:
+    def _gap(self, channel: int, reader: str, incarnation_id: int, source_incarnation: int) -> int:
         """Return how many messages in between reached neither this incarnation of a reader nor an earlier one."""
         before = [
             account.last
             for (of, who, earlier, source), account in self.accounts.items()
-            if (of, who, source) == (channel, reader, source_life) and earlier < life
+            if (of, who, source) == (channel, reader, source_incarnation) and earlier < incarnation_id
         ]
-        account = self.accounts[channel, reader, life, source_life]
+        account = self.accounts[channel, reader, incarnation_id, source_incarnation]
         return max(account.first - 1 - max(before), 0) if before else 0
 
-    def _known_before(self, channel: int, reader: str, life: int, source_life: int) -> dict[int, int]:
+    def _known_before(self, channel: int, reader: str, incarnation_id: int, source_incarnation: int) -> dict[int, int]:
         """Return the last number of earlier publisher incarnations that earlier incarnations of a reader received."""
         known: dict[int, int] = {}
         for (of, who, earlier, source), account in self.accounts.items():
-            if (of, who) == (channel, reader) and earlier < life and source < source_life:
+            if (of, who) == (channel, reader) and earlier < incarnation_id and source < source_incarnation:
                 known[source] = max(known.get(source, 0), account.last)
         return known
 
-    def _tail(self, channel: int, reader: str, life: int) -> int:
+    def _tail(self, channel: int, reader: str, incarnation_id: int) -> int:
         """Return what publisher incarnations sent after a reader's former ones last received from them, and died."""
-        own = {source for of, who, its, source in self.accounts if (of, who, its) == (channel, reader, life)}
-        known = self._known_before(channel, reader, life, max(own))
+        own = {source for of, who, its, source in self.accounts if (of, who, its) == (channel, reader, incarnation_id)}
+        known = self._known_before(channel, reader, incarnation_id, max(own))
         lost = (len(self.published[channel, source]) - last for source, last in known.items() if source not in own)
         return sum(max(each, 0) for each in lost)
 
@@ -224,8 +226,8 @@ class Books:
             is_over: whether an incarnation of a member ended before its calls did.
         """
         found = []
-        for (channel, client, life, number), (since_ns, ends) in self._calls.items():
-            if ends > 1 or (not ends and since_ns < until_ns and not is_over(client, life)):
+        for (channel, client, incarnation_id, number), (since_ns, ends) in self._calls.items():
+            if ends > 1 or (not ends and since_ns < until_ns and not is_over(client, incarnation_id)):
                 found.append(f"call {number} of {client} on channel {channel}: {ends} answers")
         return found
 

@@ -70,7 +70,7 @@ class HostileSwitch:
 
     def is_ready(self) -> bool:
         """Return whether it has a tree through the neighbour that it will flood."""
-        return any(tree.above is not None for tree in self._switch.multicast.trees.all())
+        return any(tree.upstream is not None for tree in self._switch.multicast.trees.all())
 
     def neighbour(self) -> bytes:
         """Return the address of the switch that it will flood."""
@@ -88,9 +88,9 @@ class HostileSwitch:
     def joins(self) -> _Frames:
         """Yield joins of a tree that it is part of, each new and valid."""
         multicast = self._switch.multicast
-        tree = next(each for each in multicast.trees.all() if each.above is not None)
-        while tree.above is not None and tree.above_name is not None:
-            multicast._say(tree, tree.above, tree.above_name, _MTU, _LEASE_S, tree.evidence)
+        tree = next(each for each in multicast.trees.all() if each.upstream is not None)
+        while tree.upstream is not None and tree.upstream_name is not None:
+            multicast._say(tree, tree.upstream, tree.upstream_name, _MTU, _LEASE_S, tree.evidence)
             for transmit in self._switch.frames_to_send():
                 yield from transmit.frames
 

@@ -64,7 +64,7 @@ class Source:
     def __init__(
         self, station: Station, settings: dict[str, Any], token: bytes, who: tuple[int, int], out: RecordWriter
     ) -> None:
-        self._channel, (self._index, self._life) = settings["channel"], who
+        self._channel, (self._index, self._incarnation_id) = settings["channel"], who
         self._publisher = station.advertise(settings["name"], reliable=settings["reliable"])
         self._token, self._out = token, out
         self._filler = bytes(max(settings["size"] - _HEAD.size, 0))
@@ -78,13 +78,15 @@ class Source:
         readers = self._publisher.readers
         if readers != self._readers:
             self._readers = readers
-            self._out.add(Kind.READERS, self._channel, self._life, 0, readers, time.monotonic_ns())
+            self._out.add(Kind.READERS, self._channel, self._incarnation_id, 0, readers, time.monotonic_ns())
         if now_s - self.due_s > _BEHIND_S:
             self.due_s = now_s
         while self.due_s <= now_s:
             self._number += 1
-            head = _HEAD.pack(self._token, self._channel, self._index, self._life, self._number)
-            self._out.add(Kind.PUBLISHED, self._channel, self._life, self._index, self._number, time.monotonic_ns())
+            head = _HEAD.pack(self._token, self._channel, self._index, self._incarnation_id, self._number)
+            self._out.add(
+                Kind.PUBLISHED, self._channel, self._incarnation_id, self._index, self._number, time.monotonic_ns()
+            )
             self._publisher.publish(head + self._filler)
             self.due_s += self._every_s
 
@@ -92,8 +94,10 @@ class Source:
 class Caller:
     """Caller of one service at an even rate: all replicas receive the request, the first response counts."""
 
-    def __init__(self, station: Station, settings: dict[str, Any], token: bytes, life: int, out: RecordWriter) -> None:
-        self._station, self._token, self._out, self._life = station, token, out, life
+    def __init__(
+        self, station: Station, settings: dict[str, Any], token: bytes, incarnation_id: int, out: RecordWriter
+    ) -> None:
+        self._station, self._token, self._out, self._incarnation_id = station, token, out, incarnation_id
         self._channel, self._timeout_s = settings["channel"], settings["timeout_s"]
         self._stream, self._name = station.call(settings["name"]), station.name_of(settings["name"])
         self._dispatch: Dispatch[int] = Dispatch(start=random.getrandbits(62))
@@ -110,9 +114,9 @@ class Caller:
         """Discover servers, make the calls that are due, end those that time out."""
         peers = set(self._station.member.peers(self._name)) or set(self._station.member.heard(self._name))
         for server in set(self._dispatch.servers) - peers:
-            self._dispatch.gone(server, now_s, "gone")
+            self._dispatch.replica_lost(server, now_s, "gone")
         for server in peers:
-            self._dispatch.came(server, now_s)
+            self._dispatch.replica_joined(server, now_s)
         self._dispatch.handle_timer(now_s)
         if now_s >= self.due_s:
             self.due_s = max(self.due_s + self._every_s, now_s - _BEHIND_S)
@@ -162,7 +166,7 @@ class Caller:
                     self._dispatch.refused(effect.call, server, str(error), now_s)
 
     def _note(self, kind: Kind, number: int) -> None:
-        self._out.add(kind, self._channel, self._life, 0, number, time.monotonic_ns())
+        self._out.add(kind, self._channel, self._incarnation_id, 0, number, time.monotonic_ns())
 
 
 class Reading:
@@ -186,12 +190,12 @@ class Reading:
     def take(self, message: Message, now_s: float) -> None:
         """Record a message; one of another channel counts as wrong."""
         del now_s
-        token, channel, publisher, life, number = _HEAD.unpack_from(message.delivered.message)
+        token, channel, publisher, incarnation_id, number = _HEAD.unpack_from(message.delivered.message)
         at_ns = time.monotonic_ns()
         if token != self._token or channel != self._channel:
             self._out.add(Kind.WRONG, self._channel, 0, channel, number, at_ns)
         else:
-            self._out.add(Kind.DELIVERED, self._channel, life, publisher, number, at_ns)
+            self._out.add(Kind.DELIVERED, self._channel, incarnation_id, publisher, number, at_ns)
 
 
 class Serving:
@@ -238,7 +242,7 @@ class Churning:
 def main() -> None:
     """Run as a member until ended."""
     settings: dict[str, Any] = json.loads(sys.argv[1])
-    out, life = RecordWriter(Path(settings["records"])), settings["life"]
+    out, incarnation_id = RecordWriter(Path(settings["records"])), settings["incarnation_id"]
     tokens = {int(channel): bytes.fromhex(token) for channel, token in settings["tokens"].items()}
     station = Station(Path(settings["config"]), 0.0)
     takers: dict[Name, Reading | Serving | Caller] = {}
@@ -247,16 +251,16 @@ def main() -> None:
     for each in settings["serve"]:
         name = station.serve(each["name"])
         takers[name] = Serving(station, name, tokens[each["channel"]])
-    remote_clients = [Caller(station, each, tokens[each["channel"]], life, out) for each in settings["call"]]
+    remote_clients = [Caller(station, each, tokens[each["channel"]], incarnation_id, out) for each in settings["call"]]
     for each, caller in zip(settings["call"], remote_clients, strict=True):
         takers[station.name_of(each["name"])] = caller
-    who = settings["index"], life
+    who = settings["index"], incarnation_id
     sources = [Source(station, each, tokens[each["channel"]], who, out) for each in settings["publish"]]
     spare, churned = iter(settings["spare"]), count(1)
 
     def begin_churn(each: dict[str, Any]) -> None:
         if each["publishes"]:
-            head = _HEAD.pack(tokens[each["channel"]], each["channel"], who[0], life, next(churned))
+            head = _HEAD.pack(tokens[each["channel"]], each["channel"], who[0], incarnation_id, next(churned))
             station.advertise(each["name"], reliable=True).publish(head)
         else:
             takers[station.subscribe(each["name"])] = Reading(each["channel"], tokens[each["channel"]], out)

@@ -82,7 +82,7 @@ class Overlay:
         self._more = more or {}
         self._churn_hz = churn_hz
         self._at = {mover: plan.home(mover) for mover in (*plan.homes, *plan.members)}
-        self._lives: dict[str, int] = {}
+        self._incarnation_ids: dict[str, int] = {}
         self._processes: dict[str, Started] = {}
         self._frozen: set[str] = set()
         self._records: dict[tuple[str, int], RecordReader] = {}
@@ -113,7 +113,7 @@ class Overlay:
             for process in self._processes.values():
                 undo.enter_context(process)
                 with suppress(ProcessLookupError):  # it ended by itself
-                    living.append(Process.of(process.pid))
+                    living.append(Process.from_pid(process.pid))
             end_all(living)  # all at once, not one after the other
 
     def everybody(self) -> list[str]:
@@ -138,16 +138,16 @@ class Overlay:
     def start(self, who: str) -> None:
         """Start a process, with a new incarnation."""
         role, _, node = who.partition(" ")
-        life = self._lives[who] = self._lives.get(who, 0) + 1
+        incarnation_id = self._incarnation_ids[who] = self._incarnation_ids.get(who, 0) + 1
         if role == "switch":
             argv = ["gdp.cli.switch", "--json", "--data-plane", self._plane, "--config", str(self._switch_file(node))]
         elif role == "rib":
             argv = ["gdp.cli.rib", "--json", "--config", str(self._rib_file(node))]
         else:
-            argv = ["faults.member", json.dumps(self._settings(node, life))]
+            argv = ["faults.member", json.dumps(self._settings(node, incarnation_id))]
         clock = self._clocks.get(who)
         argv = ["-m", *argv] if clock is None else ["-m", "faults.clock", str(clock.path), *argv]
-        self._processes[who] = Started(self._run, f"{who} {life}", partial(self.spaces.command, node), argv)
+        self._processes[who] = Started(self._run, f"{who} {incarnation_id}", partial(self.spaces.command, node), argv)
 
     def await_ready(self, who: str) -> None:
         """Return when a started process reports that it is ready.
@@ -180,9 +180,9 @@ class Overlay:
         """Return the processes that ended by themselves."""
         return [who for who, process in self._processes.items() if process.code is not None]
 
-    def life(self, who: str) -> int:
+    def incarnation_id(self, who: str) -> int:
         """Return how often a process was started."""
-        return self._lives[who]
+        return self._incarnation_ids[who]
 
     def pid(self, who: str) -> int:
         """Return the id of a running process."""
@@ -206,10 +206,10 @@ class Overlay:
 
     def read(self, member: str) -> Iterator[tuple[int, Iterator[Record]]]:
         """Yield, by incarnation, what a member recorded since the last call."""
-        for life in range(1, self._lives.get(f"member {member}", 0) + 1):
-            if (member, life) not in self._records:
-                self._records[member, life] = RecordReader(self._record_file(member, life))
-            yield life, self._records[member, life].read()
+        for incarnation_id in range(1, self._incarnation_ids.get(f"member {member}", 0) + 1):
+            if (member, incarnation_id) not in self._records:
+                self._records[member, incarnation_id] = RecordReader(self._record_file(member, incarnation_id))
+            yield incarnation_id, self._records[member, incarnation_id].read()
 
     def signal(self, who: str, number: signal.Signals) -> None:
         """Send a signal.
@@ -220,7 +220,7 @@ class Overlay:
 
     def log_tail(self, who: str, lines: int = 15) -> str:
         """Return the end of a process's log, of its latest incarnation."""
-        path = self.directory / f"{who} {self._lives.get(who, 0)}".replace(" ", "-")
+        path = self.directory / f"{who} {self._incarnation_ids.get(who, 0)}".replace(" ", "-")
         with suppress(FileNotFoundError):
             text = path.with_name(path.name + ".log").read_text(encoding="utf-8", errors="replace")
             return "\n".join(text.splitlines()[-lines:])
@@ -232,9 +232,9 @@ class Overlay:
 
     def logs(self, who: str) -> Iterator[tuple[int, str]]:
         """Yield each incarnation of a process, and its whole log."""
-        for life in range(1, self._lives.get(who, 0) + 1):
-            path = self.directory / f"{who} {life}.log".replace(" ", "-")
-            yield life, path.read_text(encoding="utf-8", errors="replace")
+        for incarnation_id in range(1, self._incarnation_ids.get(who, 0) + 1):
+            path = self.directory / f"{who} {incarnation_id}.log".replace(" ", "-")
+            yield incarnation_id, path.read_text(encoding="utf-8", errors="replace")
 
     # links
 
@@ -323,7 +323,7 @@ class Overlay:
         path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
         return path
 
-    def _settings(self, member: str, life: int) -> dict[str, object]:
+    def _settings(self, member: str, incarnation_id: int) -> dict[str, object]:
         """Return the settings of a member process: its identity, and its flows and services."""
         parts = ("publish", "read", "serve", "call", "spare", "churn")
         settings: dict[str, list[dict[str, object]]] = {part: [] for part in parts}
@@ -340,15 +340,15 @@ class Overlay:
             settings["churn"].append(part)
         return {
             "config": str(self.directory / f"end-{member}.yaml"),
-            "records": str(self._record_file(member, life)),
+            "records": str(self._record_file(member, incarnation_id)),
             "index": self.plan.members.index(member),
-            "life": life,
+            "incarnation_id": incarnation_id,
             "tokens": {channel: self._token(channel).hex() for channel, _ in self._parts(member)},
             **settings,
         }
 
-    def _record_file(self, member: str, life: int) -> Path:
-        return self.directory / f"{member}-{life}.records"
+    def _record_file(self, member: str, incarnation_id: int) -> Path:
+        return self.directory / f"{member}-{incarnation_id}.records"
 
     def _parts(self, member: str) -> list[tuple[int, Flow | Service | Churn]]:
         return [*self.plan.channels(member), *self.plan.spares(member), *self.plan.churns(member)]

@@ -36,7 +36,7 @@ class Record(NamedTuple):
 
     kind: int
     channel: int
-    life: int
+    incarnation_id: int
     other: int
     number: int
     at_ns: int
@@ -49,9 +49,9 @@ class RecordWriter:
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
         self._waiting: list[bytes] = []
 
-    def add(self, kind: Kind, channel: int, life: int, other: int, number: int, at_ns: int) -> None:
+    def add(self, kind: Kind, channel: int, incarnation_id: int, other: int, number: int, at_ns: int) -> None:
         """Add one record."""
-        self._waiting.append(_FORM.pack(kind, channel, life, other, number, at_ns))
+        self._waiting.append(_FORM.pack(kind, channel, incarnation_id, other, number, at_ns))
 
     def flush(self) -> None:
         """Write the pending records."""

@@ -71,7 +71,7 @@ class Started:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         if self._process.poll() is None:
             with suppress(ProcessLookupError):  # it ended by itself just now
-                end_all([Process.of(self.pid)])
+                end_all([Process.from_pid(self.pid)])
         self._process.communicate()
 
     def read(self, patience_s: float) -> dict[str, object]:

@@ -18,7 +18,7 @@ from fog.cli.app import app
 from fog.cli.views import stage
 from fog.cluster import ClusterPlan
 from fog.site import open_site
-from fog.supervisor.journal import LAST_WORDS, Journal
+from fog.supervisor.journal import FINAL_LOGS, Journal
 from fog.supervisor.record import Outcome
 from tests.fog.supervisor.machines import record, serving
 from tests.fog.supervisor.test_journal import PLAN
@@ -47,7 +47,7 @@ def up(journal: Journal, plan: ClusterPlan = PLAN) -> None:
     now_s = time.time()
     journal.want(plan, now_s)
     for each in (serving("m1"), record("m2", "west")):
-        journal.put(replace(each, asked_unix_s=now_s - 1_800), now_s, "asked", "east")
+        journal.put(replace(each, asked_unix_s=now_s - 1_800), now_s, "requested", "east")
 
 
 @pytest.mark.parametrize("verb", VERBS)
@@ -75,7 +75,7 @@ def test_the_machine_that_is_the_gateway_is_reported(fog: Run, journal: Journal)
     journal.want(PLAN, time.time())
     for each in (replace(serving("m1"), gateway="edge"), serving("m2")):
         journal.put(each, time.time())
-    gone = replace(serving("m3"), gateway="edge").ended(Outcome.TAKEN, "killed", time.time())
+    gone = replace(serving("m3"), gateway="edge").ended(Outcome.PREEMPTED, "killed", time.time())
     journal.put(gone, time.time())
     reported = json.loads(fog("status", "--all", "--json").output)
     assert [each["gateway"] for each in reported["members"]] == ["edge", None, None]
@@ -111,7 +111,7 @@ def test_cost_is_price_by_time(fog: Run, journal: Journal) -> None:
 def test_events_are_printed_as_lines_of_json(fog: Run, journal: Journal) -> None:
     up(journal)
     events = [json.loads(line)["what"] for line in fog("status", "--events", "--json").output.splitlines()]
-    assert events == ["wanted", "asked", "asked"]
+    assert events == ["wanted", "requested", "requested"]
 
 
 def test_the_last_replica_is_not_scaled_away(fog: Run, journal: Journal) -> None:
@@ -148,13 +148,13 @@ def test_a_missing_launch_file_is_reported(fog: Run) -> None:
     assert (result.exit_code, "nowhere.py" in result.output) == (2, True)
 
 
-def test_the_last_words_of_a_machine_that_is_gone_are_shown(fog: Run, journal: Journal) -> None:
+def test_the_final_log_lines_of_a_machine_that_is_gone_are_shown(fog: Run, journal: Journal) -> None:
     up(journal)
-    gone = serving("m3").ended(Outcome.TAKEN, "killed", time.time())
-    journal.put(gone, time.time(), "taken", "killed", time.time() - 0.25)
-    journal.tell(time.time(), "c", "m3", LAST_WORDS, "node", lines="one\nout of memory")
+    gone = serving("m3").ended(Outcome.PREEMPTED, "killed", time.time())
+    journal.put(gone, time.time(), "preempted", "killed", time.time() - 0.25)
+    journal.tell(time.time(), "c", "m3", FINAL_LOGS, "node", lines="one\nout of memory")
     said = fog("logs", "m3", "node", "-n", "1").output.splitlines()
-    assert said == ["# m3 is gone: taken, killed; its last lines:", "out of memory"]
+    assert said == ["# m3 is gone: preempted, killed; its last lines:", "out of memory"]
     assert "kept are the last lines of node" in fog("logs", "m3", "switch").output
     assert "of node: out of memory" in fog("status", "--events").output
     assert "seen after 0.2" in fog("status", "--events").output
@@ -260,4 +260,4 @@ def test_a_missing_argument_is_named(fog: Run, verb: str, missing: str) -> None:
 
 
 def test_an_unwatched_machine_is_running_and_not_serving() -> None:
-    assert stage(serving("m1"), is_watched=False) == "up"
+    assert stage(serving("m1"), is_watched=False) == "running"

@@ -72,12 +72,12 @@ def test_a_machine_may_give_what_is_carried_and_nothing_else(desk: Desk, tmp_pat
 def test_no_two_machines_share_a_key(desk: Desk, tmp_path: Path) -> None:
     for name in ("m1", "m2"):
         desk.enrol(tmp_path / name, name)
-    papers = [each.papers for each in desk.tickets.news()]
-    assert papers[0] is not None
-    assert papers[1] is not None
-    assert papers[0].proxy != papers[1].proxy
-    assert not {*papers[0].fingerprints} & {*papers[1].fingerprints}
-    assert papers[0].until_unix_s == pytest.approx(time.time() + 86_400, abs=120)
+    issued_credentials = [each.issued_credentials for each in desk.tickets.news()]
+    assert issued_credentials[0] is not None
+    assert issued_credentials[1] is not None
+    assert issued_credentials[0].proxy != issued_credentials[1].proxy
+    assert not {*issued_credentials[0].fingerprints} & {*issued_credentials[1].fingerprints}
+    assert issued_credentials[0].until_unix_s == pytest.approx(time.time() + 86_400, abs=120)
 
 
 def test_a_machine_that_has_enrolled_does_not_ask_again(desk: Desk, tmp_path: Path) -> None:

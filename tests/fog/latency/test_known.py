@@ -42,9 +42,9 @@ def test_a_region_is_measured_once_in_its_lifetime_by_any_process(tmp_path: Path
 
 def test_what_is_known_says_where_it_comes_from(tmp_path: Path, probes: Probes) -> None:
     known = Latencies(tmp_path, CONFIG, {"stated": 7.0}, probes)
-    assert known.of(["near"], 1_000.0)["near"].source == "not measured yet: tcp://127.0.0.1:1"
+    assert known.lookup(["near"], 1_000.0)["near"].source == "not measured yet: tcp://127.0.0.1:1"
     known.refresh(["near", "far", "stated"], 1_000.0)
-    reported = {name: (each.ms, each.source) for name, each in known.of(["near", "far", "stated"], 1_030.0).items()}
+    reported = {name: (each.ms, each.source) for name, each in known.lookup(["near", "far", "stated"], 1_030.0).items()}
     assert reported == {
         "near": (1.5, "measured 30s ago, tcp://127.0.0.1:1"),
         "far": (None, "unreachable 30s ago: udp://far.example:7: Connection refused"),
@@ -57,7 +57,7 @@ def test_a_measurement_past_its_lifetime_is_worth_nothing(tmp_path: Path, probes
     known = Latencies(tmp_path, CONFIG, {}, probes)
     known.refresh(["near"], 1_000.0)
     assert known.ms(["near"], 1_100.0) == {"near": 1.5}
-    assert known.of(["near"], 1_101.0)["near"].source.startswith("too old")
+    assert known.lookup(["near"], 1_101.0)["near"].source.startswith("too old")
 
 
 def test_an_unreachable_endpoint_is_asked_again_after_a_minute(tmp_path: Path, probes: Probes) -> None:
@@ -70,7 +70,7 @@ def test_an_unreachable_endpoint_is_asked_again_after_a_minute(tmp_path: Path, p
 def test_another_endpoint_for_a_region_is_another_measurement(tmp_path: Path, probes: Probes) -> None:
     Latencies(tmp_path, CONFIG, {}, probes).refresh(["near"], 1_000.0)
     other = LatencyConfig(endpoints={"near": "127.0.0.1:2"})
-    assert Latencies(tmp_path, other, {}, probes).of(["near"], 1_001.0)["near"].ms is None
+    assert Latencies(tmp_path, other, {}, probes).lookup(["near"], 1_001.0)["near"].ms is None
 
 
 def test_a_cache_that_cannot_be_read_is_an_empty_one(tmp_path: Path, probes: Probes) -> None:

@@ -53,7 +53,7 @@ def state(provider: LocalProvider) -> tuple[MachineState, str]:
 
 
 def us() -> Process:
-    return Process.of(os.getpid())
+    return Process.from_pid(os.getpid())
 
 
 def test_what_is_known_of_a_machine_is_read_back(tmp_path: Path) -> None:

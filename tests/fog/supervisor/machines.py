@@ -102,8 +102,8 @@ class World:
                     self.made += 1
                     name = f"m{self.made}"
                     spec = MachineSpec("c", name, choice.offer)
-                    papers = IssuedCredentials(f"proxy-{name}", self.now_s + 1e6)
-                    self.records[name] = Record(spec, wanted, papers, self.now_s, id=f"id-{name}")
+                    issued_credentials = IssuedCredentials(f"proxy-{name}", self.now_s + 1e6)
+                    self.records[name] = Record(spec, wanted, issued_credentials, self.now_s, id=f"id-{name}")
                     self.machines[name] = Machine(f"id-{name}", spec, MachineState.BOOTING, self.now_s)
             case Drain(name, reason):
                 self.records[name] = replace(self.records[name], drained_unix_s=self.now_s, reason=reason)

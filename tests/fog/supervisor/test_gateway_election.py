@@ -27,7 +27,7 @@ def on_demand(machine: Record) -> Record:
     return replace(machine, spec=replace(machine.spec, offer=offer(is_spot=False)))
 
 
-GONE = gateway(serving("m1")).ended(Outcome.TAKEN, "killed", NOW_S)
+GONE = gateway(serving("m1")).ended(Outcome.PREEMPTED, "killed", NOW_S)
 NOTICED = replace(gateway(serving("m1")), noticed_unix_s=NOW_S - 1, reason="preempted")
 DRAINED = replace(gateway(serving("m1")), drained_unix_s=NOW_S - 1, reason="not needed")
 RELEASED = replace(gateway(serving("m1")), released_unix_s=NOW_S - 1, reason="not needed")

@@ -34,7 +34,7 @@ def test_what_is_written_another_process_reads(journal: Journal, tmp_path: Path)
 
 
 def test_a_machine_comes_back_as_it_was(journal: Journal) -> None:
-    ended = serving("m2").ended(Outcome.TAKEN, "preempted", NOW_S)
+    ended = serving("m2").ended(Outcome.PREEMPTED, "preempted", NOW_S)
     for each in (record("m1"), ended, replace(record("m10"), id="")):
         journal.put(each, NOW_S)
         assert each in journal.machines("c")
@@ -65,11 +65,11 @@ def test_an_unknown_cluster_is_reported_with_the_known_ones(journal: Journal) ->
 
 def test_events_are_reported_in_order_and_once(journal: Journal) -> None:
     journal.want(PLAN, NOW_S)
-    journal.put(record("m1"), NOW_S, "asked", "east")
+    journal.put(record("m1"), NOW_S, "requested", "east")
     journal.unwant("c", "idle", NOW_S)
     journal.unwant("c", "again", NOW_S)
     events = journal.events("c")
-    assert [each.what for each in events] == ["wanted", "asked", "down"]
+    assert [each.what for each in events] == ["wanted", "requested", "down"]
     assert journal.events("c", after=events[1].id) == events[2:]
     assert journal.events(last=1) == events[2:]
 
@@ -92,6 +92,6 @@ def test_a_journal_of_an_earlier_version_is_gone_on_with(tmp_path: Path) -> None
         file.execute("INSERT INTO events (unix_s, cluster, machine, what, detail) VALUES (1, 'c', 'm1', 'up', '')")
     file.close()
     journal = Journal(path)
-    journal.tell(NOW_S, "c", "m1", "taken", since_unix_s=NOW_S - 1)
-    assert [(each.what, each.since_unix_s) for each in journal.events()] == [("up", None), ("taken", NOW_S - 1)]
+    journal.tell(NOW_S, "c", "m1", "preempted", since_unix_s=NOW_S - 1)
+    assert [(each.what, each.since_unix_s) for each in journal.events()] == [("up", None), ("preempted", NOW_S - 1)]
     journal.close()

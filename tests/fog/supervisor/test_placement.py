@@ -28,7 +28,7 @@ def test_a_requested_region_is_taken_though_another_is_cheaper() -> None:
 
 
 def test_a_region_that_took_a_machine_is_avoided_even_if_it_was_requested() -> None:
-    lost = serving("m1", "west").ended(Outcome.TAKEN, "", NOW_S - 1)
+    lost = serving("m1", "west").ended(Outcome.PREEMPTED, "", NOW_S - 1)
     assert region_of(replace(SPOT, region="west"), OFFERS, [lost], NOW_S) != "west"
 
 
@@ -38,7 +38,7 @@ def test_a_region_that_is_about_to_take_a_machine_is_avoided() -> None:
 
 
 def test_a_region_that_took_a_machine_is_better_than_none() -> None:
-    lost = serving("m1", "east").ended(Outcome.TAKEN, "", NOW_S - 1)
+    lost = serving("m1", "east").ended(Outcome.PREEMPTED, "", NOW_S - 1)
     assert region_of(SPOT, [offer("east")], [lost], NOW_S) == "east"
 
 

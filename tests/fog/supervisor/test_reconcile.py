@@ -120,7 +120,7 @@ def world_of(states: list[str]) -> World:
             world.add(replace(serving(name), drained_unix_s=NOW_S), MachineState.RUNNING)
             world.drained[name] = NOW_S
         elif state == "gone":
-            world.records[name] = serving(name).ended(Outcome.TAKEN, "", NOW_S)
+            world.records[name] = serving(name).ended(Outcome.PREEMPTED, "", NOW_S)
         elif state == "missing":
             world.records[name] = serving(name)
         elif state == "old":

@@ -182,7 +182,7 @@ def test_a_lost_machine_is_replaced_and_reported(site: Site, journal: Journal) -
     del provider.machines["m1"]
     work(ours, lambda: serving(journal) == ["m2", "m3"])
     ours.close()
-    assert [each.what for each in journal.events("c") if each.machine == "m1"][-1] == "taken"
+    assert [each.what for each in journal.events("c") if each.machine == "m1"][-1] == "preempted"
 
 
 def test_a_refusal_is_reported_and_tried_elsewhere(site: Site, journal: Journal) -> None:
@@ -233,10 +233,10 @@ def test_what_the_programs_of_a_lost_machine_said_last_is_kept(site: Site, journ
     provider.said = {"node": "one\nout of memory\n"}
     lost = provider.machines["m1"]
     provider.machines["m1"] = replace(lost, state=MachineState.GONE, reason="killed", since_unix_s=7.0)
-    work(ours, lambda: journal.last_words("c", "m1"))
+    work(ours, lambda: journal.stored_logs("c", "m1"))
     ours.close()
-    assert journal.last_words("c", "m1") == {"node": "one\nout of memory"}
-    (taken,) = (each for each in journal.events("c") if each.what == "taken")
+    assert journal.stored_logs("c", "m1") == {"node": "one\nout of memory"}
+    (taken,) = (each for each in journal.events("c") if each.what == "preempted")
     assert (taken.detail, taken.since_unix_s) == ("killed", 7.0)
 
 
@@ -249,7 +249,7 @@ def test_what_a_machine_that_was_given_back_said_is_not_kept(site: Site, journal
     journal.unwant("c", "test", time.time())
     work(ours, lambda: ours.is_done)
     ours.close()
-    assert journal.last_words("c", "m1") == {}
+    assert journal.stored_logs("c", "m1") == {}
 
 
 def test_after_its_start_a_supervisor_says_when_all_was_looked_at(site: Site, journal: Journal) -> None:
@@ -269,7 +269,7 @@ def test_a_region_that_is_nearer_is_taken_and_said(site: Site, journal: Journal)
     journal.want(replace(PLAN, machines=(SPOT,)), time.time())
     work(ours, lambda: len(serving(journal)) == 1)
     ours.close()
-    (asked,) = (each for each in journal.events("c") if each.what == "asked")
+    (asked,) = (each for each in journal.events("c") if each.what == "requested")
     assert asked.detail.startswith("west")
     assert "12 ms away" in asked.detail
 

@@ -19,7 +19,7 @@ from gdp.frame.codec import decode
 from gdp.frame.kinds import Kind
 from gdp.message.reassembly_quota import ReassemblyQuota
 from gdp.names import Name
-from tests.gdp.client.lives import reader_of, source_of
+from tests.gdp.client.incarnation_ids import reader_of, source_of
 
 TOPIC = Name(b"t" * 32)
 WRITER = SigningKey.generate()

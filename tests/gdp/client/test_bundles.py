@@ -15,7 +15,7 @@ from gdp.frame.kinds import Flag, Kind
 from gdp.limits import MESSAGE_MAX_BYTES, WINDOW_BYTES
 from gdp.message.bundle import BUNDLE_BYTES, pack
 from gdp.names import Name
-from tests.gdp.client.lives import source_of
+from tests.gdp.client.incarnation_ids import source_of
 from tests.gdp.client.pipe import SECRETS, TOPIC, WRITER, End, Pipe, publisher_of, sequenced
 
 SMALL = [b"%d " % at * (at % 40) for at in range(2_000)]

@@ -17,7 +17,7 @@ from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
 from gdp.message.heartbeat import Heartbeat
 from gdp.message.renumbering import Renumbering
 from gdp.names import Name
-from tests.gdp.client.lives import Notes, reader_of
+from tests.gdp.client.incarnation_ids import Notes, reader_of
 from tests.gdp.client.pipe import SECRETS, TOPIC, WRITER, End, Pipe, publisher_of, sequenced
 
 PUBLISHER = Name(b"p" * 32)
@@ -193,14 +193,14 @@ def test_more_names_than_the_publisher_takes_are_refused() -> None:
 
 def test_what_an_outsider_sends_leaves_nothing_behind() -> None:
     pipe, end = live()
-    strange = {1: b"?" * 32}
-    sealer = Sealer(strange[1], 1, Kind.DATA, PUBLISHER, 1, TOPIC, MALLORY, urandom)
+    unexpected = {1: b"?" * 32}
+    sealer = Sealer(unexpected[1], 1, Kind.DATA, PUBLISHER, 1, TOPIC, MALLORY, urandom)
     held = end.budget.held_bytes
     for number in range(1, 200):
         give(pipe, end, list(sealer.seal(number, Flag.RELIABLE, bytes(3_000), 1500)))
     assert end.budget.held_bytes == held
     assert end.writer_proxy.drops == {DropReason.BAD_TAG: 3 * 199}
     for at in range(50):
-        pipe.tell(*Notes(reader_of(bytes([at])), pipe.source, TOPIC, strange).hello())
+        pipe.tell(*Notes(reader_of(bytes([at])), pipe.source, TOPIC, unexpected).hello())
     assert pipe.publisher.readers == 1
     assert pipe.publisher.drops == {DropReason.BAD_TAG: 50, DropReason.UNKNOWN_SENDER: 50}

@@ -14,7 +14,7 @@ from gdp.frame.codec import decode
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import READER_LEASE_S
 from gdp.names import Name
-from tests.gdp.client.lives import reader_of
+from tests.gdp.client.incarnation_ids import reader_of
 from tests.gdp.client.pipe import SECRETS, TOPIC, WRITER, Pipe, publisher_of, sequenced
 
 NOTES = (Kind.INTRODUCTION, Kind.ACKNACK)

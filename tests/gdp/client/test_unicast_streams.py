@@ -10,7 +10,7 @@ from gdp.client.unicast_streams import STREAMS_MAX, UnicastStreams
 from gdp.errors import LocalError
 from gdp.limits import READER_LEASE_S
 from gdp.names import Name
-from tests.gdp.client.lives import note_keys, source_of
+from tests.gdp.client.incarnation_ids import note_keys, source_of
 from tests.gdp.client.pipe import SECRETS, WRITER
 
 SERVICE = Name(b"s" * 32)

@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gdp.crypto.control_seal import JUMP_MAX, ControlOpener, ControlReplayWindow, ControlSealer, note_key, topic_of
+from gdp.crypto.control_seal import JUMP_MAX, ControlOpener, ControlReplayWindow, ControlSealer, control_key, topic_of
 from gdp.crypto.envelope import seal_key
 from gdp.errors import DropReason, EnvelopeError
 from gdp.frame.codec import HEADER_BYTES, HOPS_AT, Header, decode, encode
 from gdp.frame.kinds import Flag, Kind
 
 SHARED, SECRET, READER, PUBLISHER, TOPIC = b"x" * 32, b"s" * 32, b"r" * 32, b"p" * 32, b"t" * 32
-KEY = note_key(SHARED, SECRET, Kind.ACKNACK, READER, 5, PUBLISHER, 9, TOPIC)
+KEY = control_key(SHARED, SECRET, Kind.ACKNACK, READER, 5, PUBLISHER, 9, TOPIC)
 
 
 def sealer(topic: bytes = TOPIC, first: int = 1) -> ControlSealer:
@@ -50,7 +50,7 @@ def test_a_published_note_is_sealed_again_to_the_byte() -> None:
             key = seal_key(secret, note["kind"], source, incarnation, destination)
         else:
             shared = bytes.fromhex(note["shared"])
-            key = note_key(shared, secret, note["kind"], source, incarnation, destination, to_incarnation, topic)
+            key = control_key(shared, secret, note["kind"], source, incarnation, destination, to_incarnation, topic)
         assert key.hex() == note["key"]
         numbers = count(int(note["number"]))
         made = ControlSealer(
@@ -92,7 +92,7 @@ def test_a_note_about_another_topic_or_to_another_life_does_not_open() -> None:
 def test_whatever_differs_makes_another_key() -> None:
     base = (SHARED, SECRET, Kind.ACKNACK, READER, 5, PUBLISHER, 9, TOPIC)
     others = [b"X" * 32, b"S" * 32, Kind.DATA, b"q" * 32, 6, b"Q" * 32, 8, b"u" * 32]
-    keys = {note_key(*base[:at], other, *base[at + 1 :]) for at, other in enumerate(others)}  # type: ignore[arg-type]
+    keys = {control_key(*base[:at], other, *base[at + 1 :]) for at, other in enumerate(others)}  # type: ignore[arg-type]
     assert len(keys | {KEY}) == len(others) + 1
 
 

@@ -31,7 +31,7 @@ def running(program: str) -> Iterator[subprocess.Popen[bytes]]:
 
 def test_a_running_process_is_alive_and_an_ended_one_is_not() -> None:
     with running(WILLING) as process:
-        known = Process.of(process.pid)
+        known = Process.from_pid(process.pid)
         assert known.alive
         process.kill()
         os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
@@ -39,31 +39,31 @@ def test_a_running_process_is_alive_and_an_ended_one_is_not() -> None:
         process.wait()
         assert not known.alive
         with pytest.raises(ProcessLookupError):
-            Process.of(process.pid)
+            Process.from_pid(process.pid)
 
 
 def test_a_process_is_ended_by_sigterm() -> None:
     with running(WILLING) as process:
-        end_all([Process.of(process.pid)])
+        end_all([Process.from_pid(process.pid)])
         assert process.wait(5) == -signal.SIGTERM
 
 
 def test_a_process_that_takes_no_notice_is_killed() -> None:
     with running(STUBBORN) as process:
-        end_all([Process.of(process.pid)], patience_s=0.1)
+        end_all([Process.from_pid(process.pid)], patience_s=0.1)
         assert process.wait(5) == -signal.SIGKILL
 
 
 def test_an_id_that_another_process_has_now_is_left_alone() -> None:
     with running(WILLING) as process:
-        known = Process.of(process.pid)
+        known = Process.from_pid(process.pid)
         end_all([replace(known, started=known.started - 1)])
         assert known.alive
 
 
 def test_a_process_that_is_gone_is_no_error() -> None:
     with running(WILLING) as process:
-        known = Process.of(process.pid)
+        known = Process.from_pid(process.pid)
         process.kill()
         process.wait()
         end_all([known])

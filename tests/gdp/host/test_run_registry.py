@@ -109,11 +109,11 @@ def test_after_a_boot_no_process_is_touched_on_the_word_of_an_old_record(runs: R
 
 
 def test_a_record_that_cannot_be_read_is_left_alone(runs: RunRegistry, tmp_path: Path) -> None:
-    strange = tmp_path / "runs" / "abc.json"
+    unexpected = tmp_path / "runs" / "abc.json"
     for text in ("", "[]", "{}", json.dumps({"run": "abc", "owner": 1, "processes": []})):
-        strange.write_text(text)
+        unexpected.write_text(text)
         assert runs.sweep() == []
-    assert strange.exists()
+    assert unexpected.exists()
 
 
 def test_a_record_whose_writer_was_killed_is_swept(runs: RunRegistry, tmp_path: Path) -> None:

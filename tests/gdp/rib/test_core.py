@@ -85,7 +85,7 @@ def acks(letters: list[OutgoingStatement]) -> list[AdvertiseAck]:
     return [AdvertiseAck.from_fields(each.fields) for each in found if each.type is StatementType.ADVERTISE_ACK]
 
 
-def answer_from_above(
+def answer_from_upstream(
     to: RibCore, pending_advertisement: bytes, now: Timestamps = START, by: Identity = UPPER
 ) -> list[OutgoingStatement]:
     node = parse(pending_advertisement).signer if pending_advertisement else ROBOT.name
@@ -466,7 +466,7 @@ def test_a_switch_whose_node_is_withdrawn_elsewhere_is_informed() -> None:
 def test_a_switch_hears_from_above_that_its_node_has_moved_to_another_domain() -> None:
     at_rib = rib(UPPER.name)
     tell(at_rib, advertisement(sequence=1))
-    letters = answer_from_above(at_rib, advertisement(sequence=2))
+    letters = answer_from_upstream(at_rib, advertisement(sequence=2))
     assert [(outgoing.to, answers([outgoing])[0].domain) for outgoing in letters] == [(SWITCH.name, CLOUD.root.domain)]
 
 
@@ -498,7 +498,7 @@ def test_an_unknown_name_is_asked_for_above_and_answered_when_that_answers() -> 
     at_rib = rib(UPPER.name)
     asked = ask(at_rib)
     assert [(outgoing.to, parse(outgoing.statement).type) for outgoing in asked] == [(UPPER.name, StatementType.QUERY)]
-    letters = answer_from_above(at_rib, advertisement())
+    letters = answer_from_upstream(at_rib, advertisement())
     assert [outgoing.to for outgoing in letters] == [SWITCH.name]
     assert answers(letters)[0].domain == CLOUD.root.domain
 
@@ -513,8 +513,8 @@ def test_many_askers_cost_one_question_above_and_all_are_answered() -> None:
 def test_an_asker_hears_of_every_advertiser_that_the_tier_above_knows() -> None:
     at_rib = rib(UPPER.name)
     ask(at_rib)
-    first = answer_from_above(at_rib, advertisement())
-    second = answer_from_above(at_rib, advertisement(GATEWAY, chain=[adcert(GATEWAY)]))
+    first = answer_from_upstream(at_rib, advertisement())
+    second = answer_from_upstream(at_rib, advertisement(GATEWAY, chain=[adcert(GATEWAY)]))
     assert [outgoing.to for outgoing in (*first, *second)] == [SWITCH.name, SWITCH.name]
 
 
@@ -541,8 +541,8 @@ def test_a_tier_above_that_is_silent_is_asked_again_and_then_answered_for() -> N
 def test_a_name_gone_upstream_is_gone_here_and_watchers_are_informed() -> None:
     at_rib = rib(UPPER.name)
     ask(at_rib, watch_s=20.0)
-    answer_from_above(at_rib, advertisement())
-    letters = answer_from_above(at_rib, b"")
+    answer_from_upstream(at_rib, advertisement())
+    letters = answer_from_upstream(at_rib, b"")
     assert [(outgoing.to, answers([outgoing])[0].advertisement) for outgoing in letters] == [(SWITCH.name, b"")]
     assert at_rib.names == 0
 
@@ -550,7 +550,7 @@ def test_a_name_gone_upstream_is_gone_here_and_watchers_are_informed() -> None:
 def test_news_that_another_is_gone_answers_no_open_question() -> None:
     at_rib = rib(UPPER.name)
     ask(at_rib)
-    assert answer_from_above(at_rib, b"") == []
+    assert answer_from_upstream(at_rib, b"") == []
     assert [each.is_negative for each in answers(negative_upstream(at_rib))] == [True]
 
 
@@ -558,20 +558,20 @@ def test_an_answer_from_no_tier_above_is_refused() -> None:
     at_rib = rib(UPPER.name)
     ask(at_rib)
     other = NodeKeys.generate(Role.RIB, "other").join(CLOUD, DAY)
-    assert answer_from_above(at_rib, advertisement(), by=other) == []
+    assert answer_from_upstream(at_rib, advertisement(), by=other) == []
     assert at_rib.refusals == {DropReason.WRONG_DOMAIN: 1}
 
 
 def test_the_tier_above_cannot_forge_an_advertisement_either() -> None:
     at_rib = rib(UPPER.name)
     ask(at_rib)
-    assert answer_from_above(at_rib, REFUSED["forged"][0]) == []
+    assert answer_from_upstream(at_rib, REFUSED["forged"][0]) == []
     assert (at_rib.names, at_rib.refusals) == (0, {DropReason.BAD_SIGNATURE: 1})
 
 
 def test_a_tier_above_that_is_behind_does_not_undo_what_is_newer_here() -> None:
     at_rib = rib(UPPER.name)
     tell(at_rib, advertisement(sequence=5))
-    answer_from_above(at_rib, advertisement(sequence=4))
+    answer_from_upstream(at_rib, advertisement(sequence=4))
     assert at_rib.refusals == {DropReason.STALE: 1}
     assert answers(ask(at_rib))[0].domain == SCHOOL.root.domain

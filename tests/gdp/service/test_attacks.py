@@ -23,7 +23,7 @@ POOR = Replication(Mode.HEDGED, budget=0.0)
 def dispatch_to(replication: Replication, *servers: Name) -> Dispatch[str]:
     dispatch = Dispatch[str](replication, start=0)
     for server in servers:
-        dispatch.came(server, 0.0)
+        dispatch.replica_joined(server, 0.0)
     return dispatch
 
 
@@ -98,12 +98,12 @@ def test_one_that_goes_and_comes_back_is_asked_each_call_once() -> None:
     call = begin(dispatch, 0.0)
     dispatch.poll_effects()
     for now_s in (1.0, 2.0):
-        dispatch.gone(BAD, now_s, "it describes itself again")
-        dispatch.came(BAD, now_s)
-    dispatch.came(SLOW, 3.0)
+        dispatch.replica_lost(BAD, now_s, "it describes itself again")
+        dispatch.replica_joined(BAD, now_s)
+    dispatch.replica_joined(SLOW, 3.0)
     assert dispatch.poll_effects() == [Ask(call, b"request", (SLOW,))]
     for server in (FAST, SLOW):
-        dispatch.gone(server, 4.0, "gone")
+        dispatch.replica_lost(server, 4.0, "gone")
     assert dispatch.poll_effects() == [Ask(call, b"request", (BAD,))]  # when no other is left
 
 
@@ -153,8 +153,8 @@ def test_words_of_one_client_do_not_push_out_what_another_was_answered() -> None
 
 
 def test_a_replica_that_reports_more_than_the_log_has_does_not_break_it() -> None:
-    sequencer = Sequencer[str](life=lambda: 7)
-    sequencer.came(BAD, 0.0)
+    sequencer = Sequencer[str](incarnation_id=lambda: 7)
+    sequencer.replica_joined(BAD, 0.0)
     sequencer.positioned(BAD, ReplicaStatus(tells=True), 0.1)
     sequencer.handle_timer(2.0)
     sequencer.positioned(BAD, ReplicaStatus(sequencer.log, 0, 0, tells=True), 2.1)
@@ -163,7 +163,7 @@ def test_a_replica_that_reports_more_than_the_log_has_does_not_break_it() -> Non
     sequencer.answered(call_of(sequencer.log, 1_000), BAD, "far ahead", 2.3)
     sequencer.positioned(BAD, Snapshot(sequencer.log, 1_000, b"state"), 2.4)
     sequencer.positioned(BAD, ReplicaStatus(sequencer.log, 1_000, 1_000, tells=True), 2.5)
-    assert (sequencer.strange, ends) == (1, [])
+    assert (sequencer.unexpected, ends) == (1, [])
     sequencer.positioned(BAD, ReplicaStatus(sequencer.log, 0, 0, tells=True), 2.6)
     sequencer.answered(call, BAD, "the answer", 2.7)
     assert ends == ["the answer"]
@@ -174,7 +174,7 @@ def test_a_request_whose_call_has_ended_is_not_sent() -> None:
     begin(dispatch, 0.0)
     dispatch.poll_effects()
     for server in (FAST, SLOW):
-        dispatch.gone(server, 0.1, "both in one moment")
+        dispatch.replica_lost(server, 0.1, "both in one moment")
     assert dispatch.poll_effects() == []
 
 
@@ -186,10 +186,10 @@ def test_a_request_beyond_the_capacity_is_not_even_written() -> None:
         return b""
 
     dispatch = Dispatch[str](start=0, calls_max=1)
-    dispatch.came(FAST, 0.0)
+    dispatch.replica_joined(FAST, 0.0)
     begin(dispatch, 0.0)
     full = Dispatch[str](start=0, held_max_bytes=len(b"request"))
-    full.came(FAST, 0.0)
+    full.replica_joined(FAST, 0.0)
     begin(full, 0.0)
     for each in (dispatch, full):
         with pytest.raises(LocalError):
@@ -198,8 +198,8 @@ def test_a_request_beyond_the_capacity_is_not_even_written() -> None:
 
 
 def test_a_replica_cannot_report_a_log_after_which_there_is_none() -> None:
-    sequencer = Sequencer[str](life=lambda: 7)
-    sequencer.came(BAD, 0.0)
+    sequencer = Sequencer[str](incarnation_id=lambda: 7)
+    sequencer.replica_joined(BAD, 0.0)
     sequencer.positioned(BAD, ReplicaStatus(LogId((1 << 64) - 1, 5), 3, 3), 0.1)
     sequencer.handle_timer(2.0)
-    assert (sequencer.strange, sequencer.log.generation) == (1, 0)
+    assert (sequencer.unexpected, sequencer.log.generation) == (1, 0)

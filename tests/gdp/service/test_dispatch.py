@@ -30,7 +30,7 @@ class Bench:
     def __post_init__(self) -> None:
         self.dispatch = Dispatch(self.replication, start=0, calls_max=8, held_max_bytes=100)
         for server in self.servers:
-            self.dispatch.came(server, 0.0)
+            self.dispatch.replica_joined(server, 0.0)
 
     def begin(self, now_s: float = 0.0, timeout_s: float | None = 5.0, first: tuple[Name, ...] = ()) -> int:
         ends: list[str] = []
@@ -63,7 +63,7 @@ def test_an_answer_of_one_that_was_not_asked_is_not_taken() -> None:
     assert bench.asked() == [(A, B)]
     bench.dispatch.answered(call, C, "c", 0.1)
     bench.dispatch.answered(call, Name(bytes(32)), "forged", 0.1)
-    assert (bench.ends[call], bench.dispatch.strange) == ([], 2)
+    assert (bench.ends[call], bench.dispatch.unexpected) == ([], 2)
 
 
 def test_servers_that_owe_a_response_get_one_batched_message_a_little_later() -> None:
@@ -117,7 +117,7 @@ def test_one_that_refuses_or_goes_is_replaced_at_once() -> None:
     bench = Bench(Replication(Mode.SOME, copies=1))
     call = bench.begin()
     bench.dispatch.refused(call, A, "busy", 0.1)
-    bench.dispatch.gone(B, 0.2, "gone")
+    bench.dispatch.replica_lost(B, 0.2, "gone")
     assert bench.asked() == [(A,), (B,), (C,)]
     bench.dispatch.answered(call, C, "c", 0.3)
     assert bench.ends[call] == ["c"]
@@ -130,7 +130,7 @@ def test_a_call_fails_when_all_refused_or_went(replication: Replication) -> None
     for server in (A, B, C) * 3:  # responses of servers without a request are ignored
         bench.dispatch.refused(refused, server, "busy", 0.1)
     for server in (A, B, C):
-        bench.dispatch.gone(server, 0.2, "gone")
+        bench.dispatch.replica_lost(server, 0.2, "gone")
     assert bench.ends == {refused: ["refused by all"], left: ["no server"]}
     with pytest.raises(LocalError, match="no server"):
         bench.begin()
@@ -150,9 +150,9 @@ def test_a_negative_response_counts_if_no_server_sends_a_positive_one() -> None:
 def test_a_server_that_arrives_is_asked_what_is_under_way() -> None:
     bench = Bench(servers=(A,))
     call = bench.begin()
-    bench.dispatch.came(B, 0.1)
+    bench.dispatch.replica_joined(B, 0.1)
     assert bench.asked() == [None, (B,)]
-    bench.dispatch.gone(A, 0.2, "gone")
+    bench.dispatch.replica_lost(A, 0.2, "gone")
     bench.dispatch.answered(call, B, "b", 0.3)
     assert bench.ends[call] == ["b"]
 
@@ -160,11 +160,11 @@ def test_a_server_that_arrives_is_asked_what_is_under_way() -> None:
 def test_a_server_that_leaves_is_asked_last_and_its_answer_is_good() -> None:
     bench = Bench(Replication(Mode.SOME, copies=1), servers=(A, B))
     first = bench.begin()
-    bench.dispatch.leaves(A)
+    bench.dispatch.replica_leaving(A)
     second = bench.begin(0.1)
     assert bench.asked() == [(A,), (B,)]
     bench.dispatch.answered(first, A, "a", 0.2)
-    bench.dispatch.gone(B, 0.3, "gone")
+    bench.dispatch.replica_lost(B, 0.3, "gone")
     assert (bench.ends[first], bench.asked()) == (["a"], [(A,)])
     bench.dispatch.answered(second, A, "still here", 0.4)
     assert bench.ends[second] == ["still here"]
@@ -211,7 +211,7 @@ def test_named_servers_are_asked_first_and_not_hedged() -> None:
     bench = Bench(HEDGED)
     call = bench.begin(first=(C,))
     assert (bench.asked(), bench.dispatch.get_timer()) == ([(C,)], 5.0)
-    bench.dispatch.gone(C, 0.1, "gone")
+    bench.dispatch.replica_lost(C, 0.1, "gone")
     assert bench.asked() == [(A,)]
     bench.dispatch.answered(call, A, "a", 0.2)
 
@@ -248,7 +248,7 @@ servers = st.sampled_from([A, B, C])
 Step = st.one_of(
     st.tuples(st.just("begin"), st.sampled_from([0, 1, 3])),
     st.tuples(st.sampled_from(["answer", "refuse", "decline"]), st.tuples(st.integers(0, 9), servers)),
-    st.tuples(st.sampled_from(["came", "gone", "leaves"]), servers),
+    st.tuples(st.sampled_from(["joined", "lost", "leaving"]), servers),
     st.tuples(st.just("wait"), st.sampled_from([0.001, 0.004, 0.05, 1.0])),
 )
 
@@ -272,16 +272,16 @@ def test_each_call_ends_exactly_once(replication: Replication, steps: list[tuple
             if server not in owed.get(number, ()):
                 assert len(bench.ends.get(number, ())) == before
             owed.get(number, set()).discard(server)
-        elif isinstance(value, Name) and step == "came":
-            dispatch.came(value, now_s)
+        elif isinstance(value, Name) and step == "joined":
+            dispatch.replica_joined(value, now_s)
             live.add(value)
-        elif isinstance(value, Name) and step == "gone":
-            dispatch.gone(value, now_s, "gone")
+        elif isinstance(value, Name) and step == "lost":
+            dispatch.replica_lost(value, now_s, "gone")
             live.discard(value)
             for whom in owed.values():
                 whom.discard(value)
         elif isinstance(value, Name):
-            dispatch.leaves(value)
+            dispatch.replica_leaving(value)
         elif isinstance(value, float):
             now_s += value
             dispatch.handle_timer(now_s)

@@ -19,7 +19,7 @@ from gdp.service.replicated_log import ReplicatedLog
 from gdp.service.replication_messages import AttachReplica, ReplicaProbe, ReplicaStatus, Snapshot, SnapshotRequest
 from gdp.service.sequencer import Sequencer
 
-KEEPERS = tuple(Name(bytes([number]) * 32) for number in (1, 2))
+SEQUENCERS = tuple(Name(bytes([number]) * 32) for number in (1, 2))
 SERVERS = tuple(Name(bytes([number]) * 32) for number in (11, 12, 13))
 
 
@@ -59,16 +59,17 @@ class World:
         self.failing: set[Name] = set()
         for server in SERVERS[:replicas]:
             self.start(server)
-        self.open(KEEPERS[0])
+        self.open(SEQUENCERS[0])
 
     def open(self, name: Name) -> None:
         self.cut(name)
         sequencer = Sequencer[bytes](
-            life=lambda: self.dice.getrandbits(32), entries=partial(ReplicatedLog, state_every=8, entries_max=256)
+            incarnation_id=lambda: self.dice.getrandbits(32),
+            entries=partial(ReplicatedLog, state_every=8, entries_max=256),
         )
         self.clients[name] = Client(sequencer)
         for server in self.replicas:
-            sequencer.came(server, self.now_s)
+            sequencer.replica_joined(server, self.now_s)
 
     def start(self, server: Name, *, keeps_state: bool = False) -> None:
         """Start a replica, or restart only its proxy."""
@@ -76,13 +77,13 @@ class World:
         self.stop(server)
         self.replicas[server] = Replica(self.tells, before.done if before is not None and keeps_state else [])
         for client in self.clients.values():
-            client.sequencer.came(server, self.now_s)
+            client.sequencer.replica_joined(server, self.now_s)
 
     def stop(self, server: Name) -> None:
         self.cut(server)
         if self.replicas.pop(server, None) is not None:
             for client in self.clients.values():
-                client.sequencer.gone(server, self.now_s, "gone")
+                client.sequencer.replica_lost(server, self.now_s, "gone")
 
     def leave(self, name: Name) -> None:
         self.cut(name)
@@ -94,7 +95,7 @@ class World:
     def cut(self, name: Name) -> None:
         self.ways = {way: sent for way, sent in self.ways.items() if name not in way[:2]}
 
-    def ask(self, name: Name = KEEPERS[0]) -> str:
+    def ask(self, name: Name = SEQUENCERS[0]) -> str:
         """Let a client call; return the reason if it was refused at once."""
         client, text = self.clients[name], b"%d" % self.asked
         self.asked += 1
@@ -237,8 +238,8 @@ def test_whatever_replica_dies_those_that_live_hold_the_answered_requests_in_ord
         if server not in world.replicas:
             world.start(server)
     world.settle()
-    answered_are_done(world, world.clients[KEEPERS[0]])
-    assert world.clients[KEEPERS[0]].failed == []
+    answered_are_done(world, world.clients[SEQUENCERS[0]])
+    assert world.clients[SEQUENCERS[0]].failed == []
 
 
 @settings(max_examples=100, deadline=None)
@@ -250,8 +251,8 @@ def test_a_sequencer_that_restarts_goes_on_from_the_replica_that_is_furthest(see
         for _ in range(12):
             world.ask()
             world.run(world.dice.randrange(30), loss)
-        answered |= set(world.clients[KEEPERS[0]].answered)
-        world.open(KEEPERS[0])
+        answered |= set(world.clients[SEQUENCERS[0]].answered)
+        world.open(SEQUENCERS[0])
     world.settle()
     done = world.agreed()
     assert done == sorted(done, key=int)
@@ -265,14 +266,14 @@ def test_a_second_client_learns_the_sequencer_until_that_one_is_gone() -> None:
     world = World(1, tells=True)
     assert world.ask() == ""
     world.settle()
-    world.open(KEEPERS[1])
+    world.open(SEQUENCERS[1])
     world.run(400)
-    assert world.ask(KEEPERS[1]) == f"kept in order by {KEEPERS[0].short}"
+    assert world.ask(SEQUENCERS[1]) == f"kept in order by {SEQUENCERS[0].short}"
     assert world.ask() == ""
     world.settle()
-    world.leave(KEEPERS[0])
+    world.leave(SEQUENCERS[0])
     world.run(1000)
-    assert world.ask(KEEPERS[1]) == ""
+    assert world.ask(SEQUENCERS[1]) == ""
     world.settle()
     assert world.agreed() == [b"0", b"2", b"3"]
 
@@ -281,14 +282,14 @@ def test_a_second_client_learns_the_sequencer_until_that_one_is_gone() -> None:
 @given(seed=st.integers(0, 1 << 32))
 def test_of_two_clients_that_begin_at_once_one_keeps_the_order(seed: int) -> None:
     world = World(seed, tells=True)
-    world.open(KEEPERS[1])
+    world.open(SEQUENCERS[1])
     for _ in range(20):
-        for name in KEEPERS:
+        for name in SEQUENCERS:
             world.ask(name)
         world.run(50)
     world.settle()
     done = world.agreed()
-    answered = [set(world.clients[name].answered) for name in KEEPERS]
+    answered = [set(world.clients[name].answered) for name in SEQUENCERS]
     assert answered[0] | answered[1] <= set(done)
     assert min(map(len, answered)) == 0
 
@@ -317,13 +318,13 @@ def test_without_states_a_replica_that_is_unlike_the_others_stays_out() -> None:
     world = World(1, tells=False, replicas=2)
     world.ask()
     world.settle()
-    world.open(KEEPERS[0])  # its log is lost
+    world.open(SEQUENCERS[0])  # its log is lost
     world.run(1000)
     world.ask()
     world.settle()
     world.start(SERVERS[2])
     world.run(500)
-    assert list(world.clients[KEEPERS[0]].sequencer.outside) == [SERVERS[2]]
+    assert list(world.clients[SEQUENCERS[0]].sequencer.outside) == [SERVERS[2]]
     assert [replica.done for replica in world.replicas.values()] == [[b"0", b"1"], [b"0", b"1"], []]
 
 
@@ -333,7 +334,7 @@ def test_a_calls_time_runs_out_though_its_entry_stays() -> None:
     world.ask()
     world.now_s += 100
     world.settle()
-    client = world.clients[KEEPERS[0]]
+    client = world.clients[SEQUENCERS[0]]
     assert [reason for _, reason in client.failed] == [Failure.TIMED_OUT.value]
     assert world.agreed() == [b"0"]
 
@@ -341,8 +342,8 @@ def test_a_calls_time_runs_out_though_its_entry_stays() -> None:
 def test_unexpected_messages_of_replicas_change_nothing() -> None:
     world = World(1, tells=True, replicas=1)
     world.settle()
-    sequencer = world.clients[KEEPERS[0]].sequencer
+    sequencer = world.clients[SEQUENCERS[0]].sequencer
     sequencer.positioned(SERVERS[2], ReplicaStatus(), 0.0)
     sequencer.answered(7, SERVERS[0], b"", 0.0)
     sequencer.positioned(SERVERS[0], Snapshot(sequencer.log, 99, b"x"), 0.0)
-    assert sequencer.strange == 2
+    assert sequencer.unexpected == 2

@@ -328,7 +328,7 @@ def write_generations(path: Path, said: Connection) -> None:
 
 def slice_of(generation: int) -> list[tuple[Key, Entry | None]]:
     name = Name(b"n" * 32)
-    entry = Entry(generation.to_bytes(8, "big") * 64, b"", name, name, name, (), 60.0, is_from_above=False)
+    entry = Entry(generation.to_bytes(8, "big") * 64, b"", name, name, name, (), 60.0, is_from_upstream=False)
     return [((Name(at.to_bytes(32, "big")), name), entry) for at in range(1, SLICE + 1)]
 
 

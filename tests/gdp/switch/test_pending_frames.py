@@ -59,5 +59,5 @@ def test_what_waits_too_long_is_dropped_under_its_reason() -> None:
 def test_what_is_refused_is_dropped_under_that_reason() -> None:
     pending = PendingFrames()
     pending.park(A, b"1", 0.0)
-    pending.refuse(A, DropReason.NO_ROUTE)
+    pending.drop(A, DropReason.NO_ROUTE)
     assert (len(pending), pending.drops[DropReason.NO_ROUTE]) == (0, 1)

@@ -89,7 +89,7 @@ def test_a_backup_on_a_port_that_is_down_or_leads_back_up_is_no_alternate() -> N
     plain = ((0, NEAR[1] + MACS[0]), (1, FAR[1] + MACS[1]))
     made = with_backup()
     assert made.hops({port: mac for port, mac in MACS.items() if port != 2}) == plain
-    made.above = OTHER
+    made.upstream = OTHER
     assert made.hops(MACS) == plain
 
 

@@ -81,7 +81,7 @@ def test_no_change_of_links_takes_down_a_tree_that_grew_where_nothing_was_read()
     nuc1.unicast.refresh(world.network.now.mono_s)
     assert nuc1.table.entries[key] == standing
     nuc1.unicast._note(key, _Installed(flow.topic.name, robot, DropReason.NO_ROUTE))
-    nuc1.unicast.forget(flow.topic.name)
+    nuc1.unicast.remove(flow.topic.name)
     assert nuc1.table.entries[key] == standing
 
 

@@ -125,7 +125,7 @@ def test_a_proxy_that_exposes_next_to_one_that_imports_does_not_send_messages_ba
     assert "far" in ears[1].texts
     assert all(len(ear.texts) == len(set(ear.texts)) for ear in ears)
     # one direction stays closed
-    assert len([text for text in caplog.messages if text.startswith("/chatter: rival: ")]) == 1
+    assert len([text for text in caplog.messages if text.startswith("/chatter: other-bridge: ")]) == 1
 
 
 @pytest.mark.parametrize("is_killed", [False, True], ids=["goes", "dies"])

@@ -75,7 +75,7 @@ def test_a_talker_that_leaves_is_withdrawn_and_one_that_returns_goes_on_above_it
     assert [stats.duplicated for stats in server.bridge.stats] == [0]
 
 
-def test_the_last_words_of_a_talker_that_leaves_at_once_arrive(sites: Sites) -> None:
+def test_the_last_messages_of_a_publisher_that_leaves_at_once_arrive(sites: Sites) -> None:
     robot, _, talker, ear = flowing(sites)
     talker.publish(string("goodbye"))
     talker.close()

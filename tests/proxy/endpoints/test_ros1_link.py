@@ -32,7 +32,7 @@ def everything(sender: IpcLink, receiver: IpcLink) -> list[Frame]:
     frames: list[Frame] = []
     while True:
         was_behind = sender.is_behind
-        some = receiver.receive()
+        some = receiver.poll_frames()
         sender.flush()
         if not some and not was_behind:
             return frames
@@ -90,7 +90,7 @@ def test_the_end_is_reported_after_the_last_frame(pair: Pair) -> None:
     sender, receiver, _ = pair
     sender.send(Kind.ENDING, payload=b"why")
     sender.close()
-    assert receiver.receive() == [Frame(Kind.ENDING, 0, 0, b"why")]
+    assert receiver.poll_frames() == [Frame(Kind.ENDING, 0, 0, b"why")]
     with pytest.raises(LinkEndedError):
-        receiver.receive()
+        receiver.poll_frames()
     assert receiver.send(Kind.CLOSE, 1)

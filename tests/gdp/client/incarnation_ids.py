@@ -9,7 +9,7 @@ from os import urandom
 from gdp.client.control_keys import ControlKeys
 from gdp.client.identities import ReaderIdentity, WriterIdentity
 from gdp.client.key_epochs import Secrets
-from gdp.crypto.control_seal import ControlSealer, note_key
+from gdp.crypto.control_seal import ControlSealer, control_key
 from gdp.crypto.envelope import Signer, seal_key
 from gdp.crypto.exchange import EXCHANGE_KEY_BYTES, ExchangeKey
 from gdp.crypto.introduction import Introduction
@@ -68,24 +68,24 @@ class Notes:
         self._name = reader.name if as_name is None else as_name
 
     def introduction(self, epoch: int = 1, wire: bytes | None = None, *, incarnation: int | None = None) -> bytes:
-        life = self._reader.incarnation if incarnation is None else incarnation
-        key = seal_key(self._secrets[epoch], Kind.INTRODUCTION, self._name, life, self._publisher.name)
-        sealer = self._sealer(key, epoch, Kind.INTRODUCTION, life)
+        incarnation_id = self._reader.incarnation if incarnation is None else incarnation
+        key = seal_key(self._secrets[epoch], Kind.INTRODUCTION, self._name, incarnation_id, self._publisher.name)
+        sealer = self._sealer(key, epoch, Kind.INTRODUCTION, incarnation_id)
         return sealer.seal(self._reader.introduction() if wire is None else wire)
 
     def report(self, report: AckNack, epoch: int = 1, *, incarnation: int | None = None) -> bytes:
-        life = self._reader.incarnation if incarnation is None else incarnation
+        incarnation_id = self._reader.incarnation if incarnation is None else incarnation
         publisher = self._publisher
         shared = self._reader.notes.shared(publisher.notes.public)
-        ends = self._name, life, publisher.name, publisher.incarnation
-        key = note_key(shared, self._secrets[epoch], Kind.ACKNACK, *ends, self._topic)
-        return self._sealer(key, epoch, Kind.ACKNACK, life).seal(report.to_wire())
+        ends = self._name, incarnation_id, publisher.name, publisher.incarnation
+        key = control_key(shared, self._secrets[epoch], Kind.ACKNACK, *ends, self._topic)
+        return self._sealer(key, epoch, Kind.ACKNACK, incarnation_id).seal(report.to_wire())
 
     def hello(self, epoch: int = 1) -> list[bytes]:
         """Return the first frames of a reader."""
         return [self.introduction(epoch), self.report(AckNack(AckNackFlag.NEW, 0, 0, ()), epoch)]
 
-    def _sealer(self, key: bytes, epoch: int, kind: Kind, life: int) -> ControlSealer:
+    def _sealer(self, key: bytes, epoch: int, kind: Kind, incarnation_id: int) -> ControlSealer:
         publisher = self._publisher
         to = publisher.name, self._topic, publisher.incarnation
-        return ControlSealer(key, epoch, kind, self._name, life, *to, self._reader.note_numbers)
+        return ControlSealer(key, epoch, kind, self._name, incarnation_id, *to, self._reader.note_numbers)
