@@ -45,10 +45,12 @@ def is_indexed(path: Path) -> bool:
 
 def scan(path: Path) -> ScannedSource:
     """Return the readable part; errors as of ``Scan.source``."""
-    return _Found().source(path, MAGIC, "an MCAP file")
+    return _Found().source(path, MAGIC)
 
 
 class _Found(Scan):
+    form = "an MCAP file"
+
     def __init__(self) -> None:
         super().__init__()
         self._schemas: dict[int, tuple[str, DefinitionFormat, str]] = {}

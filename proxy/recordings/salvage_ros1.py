@@ -28,10 +28,13 @@ _TIME: Final = struct.Struct("<II")
 
 def scan(path: Path) -> ScannedSource:
     """Return the readable part; errors as of ``Scan.source``."""
-    return _Found().source(path, MAGIC, "a ROS 1 bag of format 2.0", "the recording was never closed")
+    return _Found().source(path, MAGIC, "the recording was never closed")
 
 
 class _Found(Scan):
+    form = "a ROS 1 bag of format 2.0"
+    empty = "no connection in it"
+
     def traverse(self, file: BinaryIO, size: int) -> str:
         """Read every record; return why it ended early, empty where it did not."""
         while True:

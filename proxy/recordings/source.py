@@ -128,7 +128,10 @@ class ScannedSource:
 
 
 class Scan:
-    """Contents of a file that is read from its beginning; a subclass knows the format."""
+    """Contents of a file that is read from its beginning; a subclass knows the format and its words."""
+
+    form: str
+    empty = "no channel in it"
 
     def __init__(self) -> None:
         self.channels: list[Channel] = []
@@ -141,7 +144,7 @@ class Scan:
         """Read every record; return why it ended early, empty where it did not."""
         raise NotImplementedError
 
-    def source(self, path: Path, magic: bytes, form: str, unclosed: str = "") -> ScannedSource:
+    def source(self, path: Path, magic: bytes, unclosed: str = "") -> ScannedSource:
         """Return the readable part of a file; ``unclosed``: why even a file that is read to its end lacks something.
 
         Raises:
@@ -152,10 +155,10 @@ class Scan:
             size = file.seek(0, os.SEEK_END)
             file.seek(0)
             if file.read(len(magic)) != magic:
-                raise SalvageError(f"not {form}")
+                raise SalvageError(f"not {self.form}")
             reason = self.traverse(file, size)
         if not self.channels:
-            raise SalvageError(reason or "no channel in it")
+            raise SalvageError(reason or self.empty)
         source = ScannedSource(path, self.channels, self.chunks, self.places)
         if reason or unclosed:
             source.unread = self.stats.text(reason or unclosed)
