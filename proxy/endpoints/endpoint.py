@@ -143,7 +143,7 @@ Event: TypeAlias = (
 
 
 class Endpoint(Protocol):
-    """One ROS graph, with this process in it as one virtual node."""
+    """One ROS graph, with this process in it as one virtual node; an unknown type raises ``LocalError``."""
 
     @property
     def ros(self) -> RosVersion:
@@ -178,21 +178,10 @@ class Endpoint(Protocol):
         """
 
     def service(self, name: str, type_name: str) -> Service:
-        """Return this machine's description of a service type.
-
-        Raises:
-            LocalError: it has none.
-        """
+        """Return this machine's description of a service type."""
 
     def subscribe(self, topic: str, type_name: str, qos: Qos | None) -> int:
-        """Subscribe to a topic.
-
-        Args:
-            qos: to request; None: the default of a reliable topic. ROS 1 ignores it.
-
-        Raises:
-            LocalError: the type is not known here.
-        """
+        """Subscribe to a topic; ``qos`` None: the default of a reliable topic. ROS 1 ignores it."""
 
     def advertise(self, channel: Channel) -> int:
         """Create a publisher of ``channel.topic`` with ``channel.qos[0]``, or latched as ``channel.latched`` states.
@@ -211,11 +200,7 @@ class Endpoint(Protocol):
         """
 
     def serve(self, service: Service) -> int:
-        """Create the server of ``service.name``; requests arrive as ``RequestReceived``.
-
-        Raises:
-            LocalError: the type is not known here.
-        """
+        """Create the server of ``service.name``; requests arrive as ``RequestReceived``."""
 
     def answer(self, handle: int, ticket: int, raw: bytes) -> None:
         """Answer a request; an unknown ticket is ignored: its client is gone."""
@@ -224,11 +209,7 @@ class Endpoint(Protocol):
         """Fail a request with a reason, as far as the dialect can express it; its client must not hang if possible."""
 
     def create_client(self, name: str, type_name: str) -> int:
-        """Create a client of a local service.
-
-        Raises:
-            LocalError: the type is not known here.
-        """
+        """Create a client of a local service."""
 
     def call(self, handle: int, call: int, raw: bytes) -> None:
         """Send a request under the caller's number; ``ResponseReceived`` or ``CallFailed`` follows.

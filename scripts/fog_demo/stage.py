@@ -52,9 +52,6 @@ class Stage:
 
     Args:
         run: registry that takes down the ring; ``end_all_of`` first takes down the resources of ``fog``.
-
-    Raises:
-        LocalError: the kernel refuses.
     """
 
     def __init__(self, run: Run) -> None:

@@ -71,22 +71,14 @@ class Child:
             yield Event.from_line(line.decode("utf-8", "replace"))
 
     async def wait_for(self, name: str, patience_s: float) -> Event:
-        """Return the next event of this name; others on the way are skipped.
-
-        Raises:
-            ChildError: the process ended, or ``patience_s`` seconds passed.
-        """
+        """Return the next event of this name; others on the way are skipped."""
         try:
             return await asyncio.wait_for(self._next(name), patience_s)
         except asyncio.TimeoutError:
             raise self.failed(f"did not say {name!r} within {patience_s:g} s") from None
 
     async def wait(self, patience_s: float) -> int:
-        """Return the exit code.
-
-        Raises:
-            ChildError: the process still runs after ``patience_s``.
-        """
+        """Return the exit code."""
         try:
             return await asyncio.wait_for(asyncio.shield(self.ended), patience_s)
         except asyncio.TimeoutError:

@@ -58,12 +58,7 @@ class SkyPilotProvider:
             raise LocalError("provider skypilot needs SkyPilot: pip install 'gdp-ros[skypilot]'") from missing
 
     def offers(self, hardware: Hardware, *, spot: bool) -> list[Offer]:
-        """Return the best fits in each place by SkyPilot's catalogue: a few types, not all.
-
-        Raises:
-            StoreError: the catalogue is missing and cannot be loaded now.
-            LocalError: a place is unknown to SkyPilot.
-        """
+        """Return the best fits in each place by SkyPilot's catalogue: a few types, not all."""
         lines = []
         for place in self._config.places:
             with self._asking(f"prices of {place}"):
@@ -77,12 +72,7 @@ class SkyPilotProvider:
         return sorted(lines, key=lambda each: each.usd_per_hour)
 
     def create(self, spec: MachineSpec, boot: MachineBundle) -> str:
-        """Request a machine. Missing capacity is detected later: ``describe`` then omits the machine.
-
-        Raises:
-            StoreError: the API server cannot be reached now.
-            LocalError: credentials, place or type are wrong, as far as SkyPilot checks beforehand.
-        """
+        """Request a machine. Missing capacity is detected later: ``describe`` then omits the machine."""
         name = cluster_name(spec)
         with self._asking(f"create {name}"):
             self._sky.launch(self._task(spec, boot), cluster_name=name)

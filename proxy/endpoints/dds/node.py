@@ -110,11 +110,7 @@ class Writer:
 
 
 class Node:
-    """A participant.
-
-    Raises:
-        LocalError: the domain cannot be joined.
-    """
+    """A participant."""
 
     def __init__(self, domain: int, name: str) -> None:
         self._name = name
