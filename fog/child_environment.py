@@ -29,7 +29,6 @@ def child_environment(environment: Mapping[str, str], *, has_desktop: bool = Fal
     """Return the part of an environment that a child process inherits.
 
     Args:
-        environment: of this process.
         has_desktop: also the variables that a window needs, for nodes on the robot's side such as RViz.
     """
     more = re.split(r"[\s,]+", environment.get(PASS_MORE, ""))

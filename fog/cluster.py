@@ -13,7 +13,7 @@ from typing import Literal
 from fog.hardware import Hardware
 from gdp.errors import LocalError
 
-__all__ = ["CloudNode", "ClusterPlan", "ExportedInterface", "MachineRequest"]
+__all__ = ["CloudNode", "ClusterPlan", "ExportedInterface", "MachineRequest", "RobotNode"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,3 +117,11 @@ class ClusterPlan:
             raise LocalError(f"line {error.lineno}: JSON is expected: {error.msg}") from error
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise LocalError(f"not the plan of a cluster: {error!r}") from error
+
+
+@dataclass(frozen=True, slots=True)
+class RobotNode:
+    """Node of the robot's side; ``output``: destination of its output: ``screen``, ``both`` or ``log``."""
+
+    node: CloudNode
+    output: str = "screen"

@@ -80,7 +80,6 @@ class Machine:
     """Provider's description of a machine.
 
     Args:
-        id: the provider's identifier.
         address: address for users; empty while there is none.
         leaves_at_unix_s: time of the preemption, after the provider gave notice.
         reason: why it is leaving or gone, in a few words.

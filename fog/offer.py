@@ -14,14 +14,7 @@ __all__ = ["Offer"]
 
 @dataclass(frozen=True, slots=True)
 class Offer:
-    """One line of a price list.
-
-    Args:
-        region: in the provider's notation.
-        type_name: machine type in the provider's notation.
-        hardware: hardware of the type.
-        is_spot: cheaper, and may be preempted.
-    """
+    """One line of a price list."""
 
     provider: str
     region: str

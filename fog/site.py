@@ -214,10 +214,8 @@ class Site:
     Args:
         id: six hex digits.
         file: its ``fog.yaml``; None: self-contained.
-        robots: configuration files of proxies.
         revocations: folder, and the switch's file that names it; None: revocations are not published.
         watch: directory of keys, and device; None: only the provider reports on machines.
-        devices: of the robot's side of a self-contained site.
     """
 
     id: str
@@ -320,11 +318,7 @@ def open_site(file: Path | None, state: Path | None = None) -> Site:
 
 @contextmanager
 def peek_site(file: Path | None, state: Path | None = None) -> Iterator[Site]:
-    """Yield the same site read-only: no file or key is created. A site that does not exist yet is empty.
-
-    Raises:
-        ConfigError, LocalError: as ``open_site``.
-    """
+    """Yield the same site read-only: no file or key is created. A site that does not exist yet is empty."""
     file, config, folder = _stands_where(file, state)
     if (folder / _SITE).exists():
         yield open_site(file, state)

@@ -12,9 +12,9 @@ __all__ = ["printable"]
 _CHARS_MAX: Final = 300
 
 
-def printable(text: str, chars_max: int = _CHARS_MAX) -> str:
-    """Return at most ``chars_max`` characters, and a mark where the text was cut; invisible ones are escaped."""
-    kept = text[:chars_max]
+def printable(text: str) -> str:
+    """Return at most 300 characters, and a mark where the text was cut; invisible ones are escaped."""
+    kept = text[:_CHARS_MAX]
     if not kept.isprintable():
         kept = "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in kept)
-    return kept[:chars_max] + (" ..." if len(text) > chars_max or len(kept) > chars_max else "")
+    return kept[:_CHARS_MAX] + (" ..." if len(text) > _CHARS_MAX or len(kept) > _CHARS_MAX else "")

@@ -92,12 +92,30 @@ class Drive:
         definition, md5 = self.store.generate_msgdef(type_name, ros_version=self.ros)
         latched = rate == 0
         if self.ros == 1:
-            return Channel(topic, type_name, 1, md5, definition, "msg", latched=latched, callerid="/robot")
+            return Channel(
+                topic,
+                type_name,
+                1,
+                hash=md5,
+                definition=definition,
+                definition_format="msg",
+                latched=latched,
+                callerid="/robot",
+            )
         durability = "transient_local" if latched else "volatile"
         never = (2_147_483_647, 4_294_967_295)
-        qos = Qos("keep_last", 10, "reliable", durability, never, never, "automatic", never, plain_names=False)
+        qos = Qos(depth=10, reliability="reliable", durability=durability, deadline=never, lifespan=never, lease=never)
         digest = self.store.hash_rihs01(type_name)
-        return Channel(topic, type_name, 2, digest, definition, "msg", qos=(qos,), latched=latched)
+        return Channel(
+            topic,
+            type_name,
+            2,
+            hash=digest,
+            definition=definition,
+            definition_format="msg",
+            qos=(qos,),
+            latched=latched,
+        )
 
     def raw(self, topic: str, at_ns: int) -> bytes:
         """Return the message of a topic at a moment, in wire form."""

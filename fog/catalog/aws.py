@@ -23,7 +23,6 @@ class AwsPrices:
     """Price list.
 
     Args:
-        sources: sources and their dates.
         bands: description of each interruption band, such as ``>20%`` of machines a month.
         band: by region and type, an index into ``bands``.
     """

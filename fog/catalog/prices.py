@@ -43,11 +43,7 @@ def price_list(
 
 
 def regions_of(provider: str) -> tuple[str, ...]:
-    """Return the regions of a provider's list.
-
-    Raises:
-        LocalError: no such provider.
-    """
+    """Return the regions of a provider's list."""
     return tuple(dict.fromkeys(offer.region for offer in _all(provider, ())))
 
 

@@ -1,4 +1,7 @@
-"""Verbs of the ``fog`` command."""
+"""Verbs of the ``fog`` command.
+
+Their parts raise ``GdpError`` where a verb cannot go on; ``options.opened`` ends the command with its text.
+"""
 
 from gdp.extras import require_extra
 

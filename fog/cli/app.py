@@ -59,12 +59,7 @@ def _fog(
 
 
 def main(arguments: Sequence[str] | None = None, *, name: str = "fog") -> None:
-    """Run the command and exit with its status.
-
-    Args:
-        arguments: after the program's name; default: those of this process.
-        name: of the program, for its help.
-    """
+    """Run the command and exit with its status."""
     app(args=None if arguments is None else list(arguments), prog_name=name)
 
 

@@ -77,11 +77,7 @@ def clear(site: Site, journal: Journal, *, whatever: bool = False) -> None:
 
 
 def end_cluster(site: Site, journal: Journal, name: str, why: str, *, as_json: bool) -> int:
-    """Release all machines of a cluster, wait until they are gone, and print their number.
-
-    Raises:
-        StoreError: the provider cannot be reached.
-    """
+    """Release all machines of a cluster, wait until they are gone, and print their number."""
     console = a_console(stderr=as_json)
     last = max((each.id for each in journal.events(last=1)), default=0)
     journal.unwant(name, why, time.time())

@@ -143,11 +143,7 @@ def _with(site: Site, gateway: GatewayKind | None) -> Site:
 
 
 def begin(site: Site, journal: Journal, plan: ClusterPlan) -> None:
-    """Store a cluster's plan in the journal, and ensure that a supervisor runs.
-
-    Raises:
-        LocalError: the infrastructure cannot be set up.
-    """
+    """Store a cluster's plan in the journal, and ensure that a supervisor runs."""
     set_up(site)
     save_topology(site)
     journal.want(plan, time.time())
@@ -155,11 +151,7 @@ def begin(site: Site, journal: Journal, plan: ClusterPlan) -> None:
 
 
 def follow(site: Site, journal: Journal, plan: ClusterPlan, after: int, patience_s: float, *, as_json: bool) -> None:
-    """Show events until all replicas serve; without a watch, until all machines are up.
-
-    Raises:
-        LocalError: they do not within ``patience_s``, or the cluster is taken down.
-    """
+    """Show events until all replicas serve; without a watch, until all machines are up."""
     console = a_console(stderr=as_json)
     end_s = time.monotonic() + patience_s
     wanted = len(plan.machines)

@@ -23,13 +23,13 @@ from fog.latency.known import Latency
 from fog.launch.interface_discovery import kept, offered
 from fog.launch.load import Loaded, key_values, load
 from fog.offer import Offer
+from fog.plan.cost import HOURS_A_MONTH
 from fog.plan.duration import duration_text
 from fog.plan.target import Target
 from fog.topology import Gateway
 
 __all__ = ["BY_HAND", "Priced", "loaded_from", "priced", "show_plan"]
 
-MONTH_H: Final = 730.0  # as cloud providers count
 BY_HAND: Final = "by fog down"
 
 
@@ -38,9 +38,6 @@ def loaded_from(path: Path, words: Sequence[str], *, dry_run: bool) -> Loaded:
 
     Args:
         dry_run: start no process; interface discovery uses cached results only.
-
-    Raises:
-        ConfigError, LocalError: see ``fog.launch.load.load``.
     """
     loaded = load(path, key_values(words), None if dry_run else offered)
     if loaded.is_known or kept(loaded.plan.nodes) is None:
@@ -53,8 +50,6 @@ class Priced:
     """A launch file's plan with the offers chosen for its machines.
 
     Args:
-        choice: for each machine of the plan.
-        latencies: of the regions that have offers.
         target: result for the plan's availability; None: the plan has no availability.
         topology: the gateways to the machines; None: their provider has none.
     """
@@ -98,7 +93,7 @@ def priced(said: Priced) -> dict[str, object]:
         "machines": machines,
         "latencies": {region: asdict(each) for region, each in said.latencies.items()},
         "usd_per_hour": per_hour,
-        "usd_per_month": None if per_hour is None else round(per_hour * MONTH_H, 2),
+        "usd_per_month": None if per_hour is None else round(per_hour * HOURS_A_MONTH, 2),
         "budget_usd": plan.budget_usd,
         "idle_s": plan.idle_s,
         "availability": target

@@ -24,12 +24,7 @@ __all__ = ["Market", "choices", "market", "reached", "refusal"]
 
 @dataclass(frozen=True, slots=True)
 class Market:
-    """Offers and latencies.
-
-    Args:
-        offers: with enough hardware for a machine of the plan.
-        latencies: of all regions with an offer.
-    """
+    """Offers and latencies."""
 
     offers: tuple[Offer, ...]
     latencies: Mapping[str, Latency]
@@ -41,11 +36,7 @@ class Market:
 
 
 def market(provider: Provider, machines: Sequence[MachineRequest], latencies: Latencies) -> Market:
-    """Query a provider, and measure the latency of regions where it is unknown.
-
-    Raises:
-        StoreError: the provider cannot be reached now.
-    """
+    """Query a provider, and measure the latency of regions where it is unknown."""
     offers: dict[Offer, None] = {}
     for hardware, is_spot in dict.fromkeys((each.hardware, each.is_spot) for each in machines):
         offers |= dict.fromkeys(provider.offers(hardware, spot=is_spot))
@@ -55,11 +46,7 @@ def market(provider: Provider, machines: Sequence[MachineRequest], latencies: La
 
 
 def reached(plan: ClusterPlan, found: Market) -> tuple[ClusterPlan, Target | None]:
-    """Return a plan with the machines that its availability needs, and the result; None: it has no availability.
-
-    Raises:
-        LocalError: no number of machines reaches it.
-    """
+    """Return a plan with the machines that its availability needs, and the result; None: it has no availability."""
     if plan.availability is None:
         return plan, None
     target = machines_for(plan.availability, plan.machines, found.offers, measured(), found.latency_ms)

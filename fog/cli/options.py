@@ -60,11 +60,7 @@ def peeked(file: Path | None, state: Path | None) -> Iterator[Site]:
 
 
 def the_cluster(journal: Journal, name: str | None) -> Cluster:
-    """Return the named cluster, or the only one that is up.
-
-    Raises:
-        LocalError: there is none, or several are up and none is named.
-    """
+    """Return the named cluster, or the only one that is up."""
     if name is not None:
         return journal.cluster(name)
     up = [each for each in journal.clusters() if each.is_up]

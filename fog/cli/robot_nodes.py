@@ -21,7 +21,7 @@ from fog.launch.resolve import PYTHON, command_line
 from gdp.errors import LocalError
 
 if TYPE_CHECKING:
-    from fog.launch.robot_node import RobotNode
+    from fog.cluster import RobotNode
 
 __all__ = ["INTERRUPTED", "Started", "resolved", "run"]
 
@@ -33,11 +33,7 @@ Started: TypeAlias = "tuple[RobotNode, tuple[str, ...]]"
 
 
 def resolved(each: RobotNode) -> Started:
-    """Return a node with its command line.
-
-    Raises:
-        LocalError: this host has no such node.
-    """
+    """Return a node with its command line."""
     words = command_line(each.node, os.environ)
     return each, tuple(sys.executable if word == PYTHON else word for word in words)
 
@@ -48,9 +44,6 @@ def run(nodes: Sequence[Started], logs: Path) -> int:
     Args:
         logs: folder for the output of nodes that do not print to the terminal. Their errors appear in the terminal, as
             with ``ros2 launch``.
-
-    Raises:
-        LocalError: a node cannot be started.
     """
     processes: list[subprocess.Popen[bytes]] = []
     try:

@@ -171,11 +171,7 @@ def supervise(
 
 
 def _machine(journal: Journal, cluster: str | None, name: str) -> Record:
-    """Return the record of a machine that has an id.
-
-    Raises:
-        LocalError: no machine has that name.
-    """
+    """Return the record of a machine that has an id."""
     plan = the_cluster(journal, cluster).plan
     records = journal.machines(plan.name)
     found = next((each for each in records if each.name == name), None)
@@ -186,11 +182,7 @@ def _machine(journal: Journal, cluster: str | None, name: str) -> Record:
 
 
 def _final_log_lines(journal: Journal, record: Record, program: str, lines: int) -> str:
-    """Return the final log lines of a machine that is gone.
-
-    Raises:
-        LocalError: none were kept.
-    """
+    """Return the final log lines of a machine that is gone."""
     kept = journal.stored_logs(record.spec.cluster, record.name)
     gone = f"{record.name} is gone: {stage(record)}, {record.reason}"
     if not kept:

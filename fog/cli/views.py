@@ -17,6 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from fog.latency.known import NO_ENDPOINT, Latency
+from fog.plan.cost import HOURS_A_MONTH
 from fog.plan.duration import duration_text
 from fog.supervisor.journal import Cluster, Entry
 from fog.supervisor.record import Record, cost_usd
@@ -38,7 +39,6 @@ __all__ = [
     "stage",
 ]
 
-MONTH_H: Final = 730.0
 _PIPE_COLUMNS: Final = 10_000  # a program that reads a pipe needs whole lines
 _STYLES: Final = {
     "serving": "green",
@@ -132,7 +132,7 @@ def cost_fields(cluster: Cluster, records: Sequence[Record], now_s: float) -> di
         "usd": round(this, 6),
         "usd_ever": round(spent, 6),
         "usd_per_hour": round(per_hour, 6),
-        "usd_per_month": round(per_hour * MONTH_H, 2),
+        "usd_per_month": round(per_hour * HOURS_A_MONTH, 2),
         "budget_usd": cluster.plan.budget_usd,
         "machines": len(records),
     }

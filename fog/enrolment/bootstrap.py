@@ -2,6 +2,7 @@
 
 I/O, through ``members``. A machine's bundle contains no key, only the ticket with which the machine enrols. Every file
 refers to others by relative paths, so a bundle works in any folder.
+Errors are those of ``Authority.enrol``.
 ::
 
     machine   [node ...] -- ROS graph of its own -- [proxy] -- [leaf] -- iface          towards the gateway
@@ -90,12 +91,6 @@ def machine_boot(
     """Return the bootstrap bundle of a machine; its only secret is the token.
 
     Args:
-        name: of the machine.
-        command: command line of a node on the machine.
-        ticket: for its ``machine_seats``.
-        iface: device of the machine towards the overlay.
-        shares_host: whether other machines run on the same host.
-        lease_s: of its advertisements.
         uplink: device that the machine has while it is the gateway of its group; empty: it never is the gateway.
     """
     domain = 1 + int(name[1:]) % _DOMAINS
@@ -132,22 +127,14 @@ def node_names(plan: ClusterPlan) -> list[str]:
 
 
 def gateway_boot(authority: Authority, label: str, ifaces: Sequence[str], *, days: float) -> MachineBundle:
-    """Enrol a gateway: a switch between its devices.
-
-    Raises:
-        LocalError: as ``Authority.enrol``.
-    """
+    """Enrol a gateway: a switch between its devices."""
     switch = authority.enrol(Role.SWITCH, f"gateway-{label}", days=days)
     content = _yaml({**_who("switch"), "ports": [{"iface": iface} for iface in ifaces]})
     return MachineBundle({**switch.below("switch"), "switch.yaml": content}, (_switch(),))
 
 
 def robot_boot(authority: Authority, devices: RobotDevices, *, days: float) -> MachineBundle:
-    """Enrol the robot's side of a site without ``fog.yaml``: switch, RIB and proxy.
-
-    Raises:
-        LocalError: as ``Authority.enrol``.
-    """
+    """Enrol the robot's side of a site without ``fog.yaml``: switch, RIB and proxy."""
     members = {role: authority.enrol(role, "robot", days=days) for role in (Role.SWITCH, Role.RIB, Role.PROXY)}
     watch = authority.enrol(Role.PROXY, "supervisor", days=days)
     attach = [devices.proxy, devices.rib, devices.watch]

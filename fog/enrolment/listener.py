@@ -37,7 +37,7 @@ _BURST: Final = 64  # connections accepted before open ones are served
 _FLUSH_S: Final = 60.0
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Connection:
     peer: socket.socket
     host: str
@@ -84,11 +84,7 @@ def bind_unix(path: Path) -> socket.socket:
 
 
 class Listener:
-    """Server that passes complete requests to a responder.
-
-    Args:
-        listening: listening socket; ``close`` closes it.
-    """
+    """Server that passes complete requests to a responder; ``close`` closes its listening socket too."""
 
     def __init__(self, listening: socket.socket, responder: Responder) -> None:
         self._listening = listening
@@ -169,7 +165,7 @@ class Listener:
             elif len(self._connections) >= CONNECTIONS_MAX:
                 self._end(next(iter(self._connections.values())))
             peer.setblocking(False)
-            self._connections[peer.fileno()] = _Connection(peer, host, now_s + CONNECTION_S)
+            self._connections[peer.fileno()] = _Connection(peer=peer, host=host, end_s=now_s + CONNECTION_S)
             self._selector.register(peer, selectors.EVENT_READ)
 
     def _pause(self, now_s: float) -> None:

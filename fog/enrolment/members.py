@@ -1,13 +1,14 @@
-"""Issuing of memberships in the site's domain and of the owner's delegations.
+"""Issuing of memberships in the site's domain and of the owner's delegations, and revocation of memberships.
 
-I/O; reads the domain's and the owner's private keys. Keys of members on this host are generated here and leave nothing
-on disk; machines generate their own keys.
+I/O; reads the domain's and the owner's private keys, and writes into the ``revocations`` folder of a switch. Keys of
+members on this host are generated here and leave nothing on disk; machines generate their own keys.
 """
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -15,17 +16,26 @@ from typing import Final
 from fog.cluster import ExportedInterface
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.kem import KemPublicKey
+from gdp.crypto.statements import parse
 from gdp.crypto.subject import Subject
+from gdp.errors import StatementError
+from gdp.limits import CLOCK_SKEW_S
 from gdp.metadata import Metadata
+from gdp.stores.audit_log import note_once
+from gdp.stores.files import public, read_public, write_all
 from gdp.stores.issue import DAY_S, admit, delegate, make_node
-from gdp.stores.keyring import CARD, OWNER_PUBLIC, save_delegation
+from gdp.stores.keyring import CARD, OWNER_PUBLIC, load_domain, save_delegation
+from gdp.trust.audit import Action
 from gdp.trust.enrolment import Application, Granted
+from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
 
-__all__ = ["Authority", "Enrolled", "metadata_of", "right_of"]
+__all__ = ["Authority", "Enrolled", "metadata_of", "revoke_credentials", "right_of"]
 
 _RIGHTS: Final = {"topic": (Right.PUBLISH, Right.READ)}
 _CALLS: Final = (Right.SERVE, Right.CALL)
+_SUFFIX: Final = ".revoke"
+_TITLE_CHARS: Final = 32  # of the fingerprint
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,3 +135,31 @@ def right_of(carried: ExportedInterface, *, gives: bool) -> Right:
     """Return the right needed to provide an interface, or to use it."""
     give, take = _RIGHTS.get(carried.kind, _CALLS)
     return give if gives else take
+
+
+def revoke_credentials(
+    domain: Path, folder: Path, fingerprints: Iterable[str], *, until_unix_s: float, unix_s: float
+) -> bool:
+    """Write a revocation for each membership and remove expired ones; return whether one is new.
+
+    Args:
+        fingerprints: in hex.
+
+    Raises:
+        LocalError: the domain is missing, or the folder cannot be written.
+    """
+    authority = load_domain(domain)
+    files = {}
+    for fingerprint in fingerprints:
+        name = fingerprint[:_TITLE_CHARS] + _SUFFIX
+        if not (folder / name).exists():
+            body = bytes.fromhex(fingerprint)
+            files[name] = public(Revocation.make(authority.key, authority.root.signer, body, int(until_unix_s)))
+            note_once(domain, Action.REVOKED, "membership", about=fingerprint, unix_s=unix_s)
+    write_all(folder, files)
+    for path in folder.glob(f"[!.]*{_SUFFIX}"):
+        with suppress(StatementError):  # not written by this function: left unchanged
+            old = Revocation.from_statement(parse(read_public(path)))
+            if old.until_unix_s + 2 * CLOCK_SKEW_S < unix_s:
+                path.unlink(missing_ok=True)
+    return bool(files)

@@ -175,11 +175,7 @@ class Responder:
 
 
 def _verified(identifier: bytes, kept: Kept, asked: Request) -> list[SubjectInfo]:
-    """Return the subjects of the applications: exactly the planned ones, each with a valid key proof.
-
-    Raises:
-        StatementError: a subject was not planned, or a proof is invalid.
-    """
+    """Return the subjects of the applications: exactly the planned ones, each with a valid key proof."""
     if len(asked.applications) != len(kept.seats):
         raise StatementError(DropReason.WRONG_NAME, "another number of members")
     holders = []

@@ -46,10 +46,6 @@ def add_rules(
 ) -> None:
     """Add rules and delegations with which a robot's proxy uses a cluster; the proxy need not run.
 
-    Args:
-        path: ``proxy.yaml`` of the robot.
-        days: validity of the delegations.
-
     Raises:
         ConfigError: the file is not a proxy configuration, or a new rule conflicts with an existing one.
         LocalError: keys are missing, or the drop-in cannot be written.
@@ -83,10 +79,6 @@ def remove_rules(path: Path, cluster: str) -> bool:
 def control_socket_of(identity: Path, configured: Path | None) -> Path:
     """Return the control socket of a node of this host.
 
-    Args:
-        identity: directory of its keys.
-        configured: ``control_socket`` of its configuration.
-
     Raises:
         LocalError: the directory does not belong to a node.
     """
@@ -97,10 +89,6 @@ def reload(identity: Path, configured: Path | None = None) -> bool:
     """Reload the configuration of a node of this host, if it runs; return whether it did.
 
     A node that rejects it keeps its old configuration; the reason is logged.
-
-    Args:
-        identity: directory of its keys.
-        configured: ``control_socket`` of its configuration.
     """
     try:
         answer = ask_node(control_socket_of(identity, configured), Command.RELOAD, _RELOAD_S)

@@ -139,11 +139,7 @@ class Tickets:
         expires_unix_s: float,
         until_unix_s: float,
     ) -> Ticket:
-        """Store and return a machine's ticket; expired tickets are deleted.
-
-        Args:
-            token: 32 random bytes.
-        """
+        """Store and return a machine's ticket; expired tickets are deleted; ``token``: 32 random bytes."""
         with self._writing() as file:
             file.execute(
                 "DELETE FROM tickets WHERE until_unix_s < ? OR (keys IS NULL AND expires_unix_s < ?)", (unix_s, unix_s)

@@ -104,13 +104,7 @@ def _ask(ticket: Ticket, applications: list[Application], patience_s: float) -> 
 
 
 def _exchange(address: str, request: bytes) -> bytes:
-    """Return the body of the response.
-
-    Raises:
-        OSError: the peer is unreachable, or the connection ends early.
-        StatementError: the response is malformed.
-            LocalError: the responder refuses the request.
-    """
+    """Return the body of the response."""
     with closing(_connected(address)) as peer:
         peer.settimeout(_TRY_S)
         peer.sendall(request)

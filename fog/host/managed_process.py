@@ -35,8 +35,6 @@ class ManagedProcess:
     Args:
         home: the machine's folder; working directory of the process, unless ``FOG_NODE_USER`` is set: then that user's
             home.
-        log: receives its output.
-        on_ready: called when it is up.
 
     Raises:
         OSError: it cannot be started, or the user in ``FOG_NODE_USER`` does not exist.

@@ -28,11 +28,7 @@ _END_PATIENCE_S: Final = 2.0
 
 
 class ProgramSupervisor:
-    """One program across restarts.
-
-    Args:
-        changed: called whenever ``status`` changes.
-    """
+    """One program across restarts; ``changed``: called whenever ``status`` changes."""
 
     def __init__(self, program: Program, home: Path, changed: Callable[[], None]) -> None:
         self.program = program

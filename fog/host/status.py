@@ -21,13 +21,7 @@ STATUS_FILE: Final = "status.json"
 
 @dataclass(frozen=True, slots=True)
 class ProgramStatus:
-    """Status of one program.
-
-    Args:
-        pid: process id, also of its process group; None: it does not run.
-        up: it reported that it is ready.
-        restarts: number of restarts.
-    """
+    """Status of one program; ``pid``: process id, also of its process group; None: it does not run."""
 
     pid: int | None = None
     up: bool = False

@@ -51,13 +51,7 @@ class _Kept:
 
 
 class Latencies:
-    """Latencies of a site's regions.
-
-    Args:
-        folder: state folder, which holds the measurements.
-        stated: region -> ms; takes precedence over measurements.
-        measure: probe function; replaced in tests.
-    """
+    """Latencies of a site's regions; ``stated``: region -> ms; takes precedence over measurements."""
 
     def __init__(
         self,

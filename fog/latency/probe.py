@@ -24,12 +24,7 @@ _NONCE_BYTES: Final = 16
 
 @dataclass(frozen=True, slots=True)
 class Probed:
-    """Result of a probe.
-
-    Args:
-        ms: minimum round trip of ``TRIES``; None: no answer.
-        reason: why there is none.
-    """
+    """Result of a probe; ``ms``: minimum round trip of ``TRIES``; None: no answer."""
 
     ms: float | None
     reason: str = ""

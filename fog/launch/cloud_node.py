@@ -22,11 +22,7 @@ _TUPLE: Final = "!!python/tuple"
 
 
 def cloud_node(node: Node, given: Mapping[str, str]) -> CloudNode:
-    """Return a node with the launch arguments substituted.
-
-    Raises:
-        LocalError: an argument is missing, or a parameter file cannot be used.
-    """
+    """Return a node with the launch arguments substituted."""
     name = None if node.name is None else written(node.name, given)
     namespace = None if node.namespace is None else written(node.namespace, given)
     ros = [written(each, given) for each in node.ros_arguments]
@@ -48,9 +44,6 @@ def parameters_in(path: Path, name: str | None, namespace: str | None, *, has_tu
 
     Args:
         has_tuples: launch_ros wrote the file; it writes every list as a tuple.
-
-    Raises:
-        LocalError: the file cannot be read or used.
     """
     try:
         with path.open("rb") as file:
@@ -67,11 +60,7 @@ def parameters_in(path: Path, name: str | None, namespace: str | None, *, has_tu
 
 
 def parameter_rule(rule: str) -> str:
-    """Return ``name:=value`` in the form that a node reads; launch_ros writes lists as tuples.
-
-    Raises:
-        LocalError: the value is not YAML.
-    """
+    """Return ``name:=value`` in the form that a node reads; launch_ros writes lists as tuples."""
     key, _, value = rule.partition(":=")
     if _TUPLE not in value:
         return rule

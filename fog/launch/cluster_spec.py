@@ -29,9 +29,7 @@ class ClusterSpec:
         name: empty: the name of the first node's executable.
         carried: exported interfaces; None: to be discovered.
         defaults: keys of rules on the robot's side for discovered interfaces.
-        keep: whether the cluster continues when the launch ends.
         availability: share of time for which at least one machine is to serve; None: ``machines`` is the full list.
-        notes: messages for the user.
     """
 
     name: str
@@ -61,11 +59,7 @@ class ClusterSpec:
         keep: bool,
         availability: float | None = None,
     ) -> ClusterSpec:
-        """Check the keywords of a ``FogCluster``.
-
-        Raises:
-            LocalError: a keyword is wrong; the text names it.
-        """
+        """Check the keywords of a ``FogCluster``."""
         if name and not re.fullmatch(_NAME, name):
             raise LocalError(f"name {name!r}: expected small letters, digits and hyphens, at most 32")
         if availability is not None and replicas is not None:
@@ -99,14 +93,7 @@ class ClusterSpec:
         )
 
     def plan(self, nodes: Sequence[CloudNode], found: Sequence[ExportedInterface] = ()) -> ClusterPlan:
-        """Return the cluster with its nodes.
-
-        Args:
-            found: discovered interfaces, if the launch file lists none.
-
-        Raises:
-            LocalError: there are no nodes.
-        """
+        """Return the cluster with its nodes; ``found``: discovered interfaces, if the launch file lists none."""
         if not nodes:
             raise LocalError("cloud_nodes is empty: expected at least one Node")
         name = self.name or re.sub("[^a-z0-9]+", "-", nodes[0].executable.lower()).strip("-")[:32] or "cluster"

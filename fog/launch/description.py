@@ -87,11 +87,7 @@ class LaunchDescription:
 
 
 def written(text: Text, given: Mapping[str, str]) -> str:
-    """Return a text with the launch arguments substituted.
-
-    Raises:
-        LocalError: an argument has neither a value nor a default.
-    """
+    """Return a text with the launch arguments substituted."""
     if isinstance(text, str):
         return text
     if not isinstance(text, LaunchConfiguration):

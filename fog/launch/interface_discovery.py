@@ -35,12 +35,6 @@ def offered(nodes: Sequence[CloudNode], *, cache: Path | None = None) -> Found:
     """Return (kind, name, type) of the services and actions of nodes; takes some seconds the first time.
 
     Topics are not discovered, because a launch file must select the topics to export.
-
-    Args:
-        cache: file of cached results; None: ``cache_file()``.
-
-    Raises:
-        LocalError: a node is not found, ends, or offers no interface; or ROS 2 is not installed.
     """
     cache = cache or cache_file()
     if (before := kept(nodes, cache=cache)) is not None:

@@ -43,9 +43,6 @@ def carried(kind: Kind, offered: Offered, defaults: Mapping[str, object]) -> lis
     Args:
         offered: full name -> type, or a map of ``type`` and further keys.
         defaults: keys of the robot's side for entries that do not set them; keys that a kind does not have are omitted.
-
-    Raises:
-        LocalError: a name is not a full name, a type is not of that kind, or a key is unknown.
     """
     return [_one(kind, name, said, defaults) for name, said in offered.items()]
 
@@ -55,9 +52,6 @@ def replication_rule(said: SomeReplication) -> dict[str, object]:
 
     Args:
         said: name of a mode, a map of ``mode``, ``copies`` and ``budget``, or a ``Replication``.
-
-    Raises:
-        LocalError: the mode or key does not exist.
     """
     if isinstance(said, Replication):
         said = {"mode": said.mode.value, "copies": said.copies, "budget": said.budget}

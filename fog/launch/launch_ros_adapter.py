@@ -26,11 +26,7 @@ _MADE: Final = "launch_params_"  # prefix of files that launch_ros creates for m
 
 
 def cloud_node(node: object, context: LaunchContext) -> CloudNode:
-    """Return a node with all substitutions performed.
-
-    Raises:
-        LocalError: the node has no package, or one of its parameter files cannot be used.
-    """
+    """Return a node with all substitutions performed."""
     if not isinstance(node, Node) or node.node_package is None:
         raise LocalError(f"cloud_nodes: expected launch_ros.actions.Node with a package, not {type(node).__name__}")
     node._perform_substitutions(context)

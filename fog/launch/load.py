@@ -15,13 +15,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Final, TypeAlias
 
-from fog.cluster import CloudNode, ClusterPlan, ExportedInterface
+from fog.cluster import CloudNode, ClusterPlan, ExportedInterface, RobotNode
 from fog.launch.cloud_node import cloud_node
 from fog.launch.cluster_spec import ClusterSpec
 from fog.launch.description import DeclareLaunchArgument, LaunchDescription, Node
 from fog.launch.entity import FogCluster
 from fog.launch.lazy_names import has_ros_launch
-from fog.launch.robot_node import RobotNode
 from fog.launch.unreturned import watch
 from gdp.errors import ConfigError, GdpError, LocalError
 
@@ -37,8 +36,6 @@ class Loaded:
     """Result of loading a launch file.
 
     Args:
-        keep: whether the cluster continues when the launch ends.
-        notes: messages for the user.
         is_known: whether the plan contains the exported interfaces; otherwise they are still to be discovered.
     """
 
@@ -50,11 +47,7 @@ class Loaded:
 
 
 def key_values(words: Sequence[str]) -> dict[str, str]:
-    """Read launch arguments, ``name:=value`` each.
-
-    Raises:
-        LocalError: an argument has another form or occurs twice.
-    """
+    """Read launch arguments, ``name:=value`` each."""
     given: dict[str, str] = {}
     for word in words:
         key, separator, value = word.partition(":=")

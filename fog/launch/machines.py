@@ -61,9 +61,6 @@ def filled(
 
     Args:
         replicas: required number; None: the length of the list, and at least ``REPLICAS``.
-
-    Raises:
-        LocalError: there are no deployments, or more deployments than replicas.
     """
     for each in deployments:
         if not isinstance(each, CloudMachine):

@@ -27,10 +27,6 @@ def read_parameters(text: str, where: str, *, has_tuples: bool = False) -> objec
     Args:
         where: file or subject of the text, for errors.
         has_tuples: ``!!python/tuple`` is read as a list; other Python tags are refused.
-
-    Raises:
-        LocalError: the text is too long, too deep, has an alias, or is not YAML; the error names ``where`` and the
-            line.
     """
     size = len(text.encode(errors="replace"))
     if size > BYTES_MAX:

@@ -27,9 +27,6 @@ def command_line(node: CloudNode, environment: Mapping[str, str]) -> tuple[str, 
 
     Args:
         environment: of the machine, for ``AMENT_PREFIX_PATH``.
-
-    Raises:
-        LocalError: neither the executable nor the module exists.
     """
     path = _program(node, environment)
     if path is not None:

@@ -49,11 +49,7 @@ class FogCluster(entity.FogCluster, Action):  # type: ignore[misc]  # launch has
     _is_begun = False  # set when a cluster may exist that must be ended
 
     def execute(self, context: LaunchContext) -> None:
-        """Start or join the cluster without waiting until it serves.
-
-        Raises:
-            LocalError: a node is invalid.
-        """
+        """Start or join the cluster without waiting until it serves."""
         if self._starting is not None:
             return  # the description contains it twice
         nodes = tuple(cloud_node(node, context) for node in self.cloud_nodes)
@@ -95,11 +91,7 @@ class FogCluster(entity.FogCluster, Action):  # type: ignore[misc]  # launch has
             gate.open(serving=True)
 
     async def _begin(self, context: LaunchContext, nodes: tuple[CloudNode, ...], file: Path) -> None:
-        """Start or join the cluster, and return when it serves.
-
-        Raises:
-            GdpError: it does not serve; the text states the reason.
-        """
+        """Start or join the cluster, and return when it serves."""
         plan = await self._plan(context, nodes)
         file.write_text(plan.to_json(), encoding="utf-8")
         ends = () if self.cluster_spec.keep else ("--ends-with", "this launch")

@@ -37,9 +37,6 @@ def parameters_of_map(parameters: Mapping[str, object], prefix: str = "") -> lis
 
     Args:
         prefix: text before each name, such as ``detector:`` to address only the node of that name.
-
-    Raises:
-        LocalError: a value is not of a parameter type.
     """
     words = []
     for key, value in _flat(parameters):
@@ -54,12 +51,7 @@ def parameters_of_file(document: object, where: str, name: str | None, namespace
     """Return the arguments that set a node's parameters from a parameter file.
 
     Args:
-        document: parsed YAML of the file.
-        where: its path, for errors.
         name, namespace: of the node; None: not given, so the node's code determines it.
-
-    Raises:
-        LocalError: the document is not a parameter file, or cannot be used without the node's name.
     """
     words = []
     for path, parameters in _sections(document, where, ()):

@@ -13,10 +13,9 @@ from launch.actions import ExecuteProcess
 from launch.utilities import perform_substitutions
 from launch_ros.actions import Node
 
-from fog.cluster import CloudNode
+from fog.cluster import CloudNode, RobotNode
 from fog.launch.cluster_spec import ClusterSpec
 from fog.launch.launch_ros_adapter import cloud_node
-from fog.launch.robot_node import RobotNode
 from fog.launch.ros_action import FogCluster
 from gdp.errors import LocalError
 
@@ -26,11 +25,7 @@ __all__ = ["gathered"]
 def gathered(
     description: object, arguments: Mapping[str, str]
 ) -> tuple[list[tuple[ClusterSpec, list[CloudNode]]], list[RobotNode]]:
-    """Return the clusters of a description and the nodes of the robot's side, includes and groups followed.
-
-    Raises:
-        LocalError: only ``ros2 launch`` can run an entity of it, or an argument is missing.
-    """
+    """Return the clusters of a description and the nodes of the robot's side, includes and groups followed."""
     if not isinstance(description, LaunchDescription):
         raise LocalError(f"expected a LaunchDescription, not {type(description).__name__}")
     context = LaunchContext(noninteractive=True)

@@ -55,7 +55,6 @@ class Answer:
         p_system: share of time for which all replicas are down, placed as chosen: different regions are independent,
             spot machines of one region are not.
         factor: ratio of joint failures of a pair in one region to independent failures.
-        choices: of the machines to be added.
         independent: result of the formula alone.
         as_recorded: the same with the uptime of the recorded traces.
     """

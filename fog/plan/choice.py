@@ -38,11 +38,7 @@ BY_PRICE: Final = Weights(usd_per_hour_per_ms=0.0)
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Chosen offer, and the reason.
-
-    Args:
-        score: USD per hour including the price of the latency; lower is better.
-    """
+    """Chosen offer, and the reason; ``score``: USD per hour including the price of the latency; lower is better."""
 
     offer: Offer
     score: float

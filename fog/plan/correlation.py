@@ -44,7 +44,6 @@ def more_in_one_region(machine: float, target: float, factor: float, have: Seque
 
     Args:
         machine: chance that a new machine is down, in (0, 1).
-        have: chances of the existing machines.
 
     Returns:
         None: no number is enough, because with ``factor`` each further machine is down whenever the others are.

@@ -17,11 +17,7 @@ HOURS_A_MONTH: Final = 730.0  # 365 days of 24 hours, over 12
 
 @dataclass(frozen=True, slots=True)
 class Bill:
-    """Configuration and its price.
-
-    Args:
-        of_single: ratio of its price to that of a single on-demand machine.
-    """
+    """Configuration and its price; ``of_single``: ratio of its price to that of a single on-demand machine."""
 
     what: str
     usd_per_hour: float

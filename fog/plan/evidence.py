@@ -37,7 +37,6 @@ class Measured:
     """Measurements of all zones.
 
     Args:
-        source: of the traces, with machine type, region and length.
         uptime_s: mean time until a machine was preempted, over all zones.
         back_s: mean time until the same zone had a machine again, over all zones.
         taken_share: zone -> share of time without an available machine.

@@ -40,7 +40,6 @@ class Mix:
     Args:
         more: number of each kind to add, in the order of the given kinds.
         chance: that all machines, old and new, are down at once.
-        usd_per_hour: price of the new machines.
     """
 
     more: tuple[int, ...]
@@ -53,8 +52,6 @@ def cheapest_mix(kinds: Sequence[Kind], target: float, have: Sequence[float] = (
 
     Args:
         target: largest joint chance accepted, in (0, 1).
-        have: chances of the existing machines.
-        least: minimum total number of machines.
 
     Raises:
         LocalError: there are no kinds, a chance or the target lies outside (0, 1), or there are too many combinations.

@@ -13,7 +13,7 @@ from typing import Final
 from fog.cluster import MachineRequest
 from fog.offer import Offer
 from fog.plan.answer import assumptions
-from fog.plan.choice import BY_BOTH, Choice, Weights, choose
+from fog.plan.choice import Choice, choose
 from fog.plan.correlation import joint_over_regions
 from fog.plan.evidence import Measured
 from fog.plan.failure import chance_down, joint
@@ -32,7 +32,6 @@ class Target:
 
     Args:
         availability: share of time, in (0, 1), for which at least one machine is to serve.
-        machines: requests.
         p_vm: share of time for which a spot machine is down.
         p_system: share of time for which all are down.
     """
@@ -50,7 +49,6 @@ def machines_for(
     offers: Sequence[Offer],
     seen: Measured,
     latency_ms: Mapping[str, float] | None = None,
-    weights: Weights = BY_BOTH,
 ) -> Target:
     """Return the listed machines, and as many copies in other regions as the target needs.
 
@@ -64,10 +62,10 @@ def machines_for(
     factor = seen.factors[1]
     allowed = 1 - availability
     machines = list(listed)
-    chance = _chance(choose(offers, machines, latency_ms, weights), down, factor)
+    chance = _chance(choose(offers, machines, latency_ms), down, factor)
     while chance > allowed * (1 + _ROUNDING):
         machines.append(replace(listed[(len(machines) - len(listed)) % len(listed)], region=""))
-        before, chance = chance, _chance(choose(offers, machines, latency_ms, weights), down, factor)
+        before, chance = chance, _chance(choose(offers, machines, latency_ms), down, factor)
         if chance >= before or len(machines) > MACHINES_MAX:
             raise LocalError(
                 f"availability={availability:g} is out of reach: the best that the regions there are allow is"

@@ -31,11 +31,7 @@ Steps = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """Trace of one zone.
-
-    Args:
-        taken: for each step, whether no spot machine was available.
-    """
+    """Trace of one zone; ``taken``: for each step, whether no spot machine was available."""
 
     zone: str
     step_s: float

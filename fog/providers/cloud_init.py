@@ -139,12 +139,7 @@ class Setup(Section):
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """File of the machine, owned by root.
-
-    Args:
-        path: absolute path.
-        mode: permission bits.
-    """
+    """File of the machine, owned by root; ``path``: absolute path."""
 
     path: str
     content: bytes
@@ -174,11 +169,7 @@ def placed(files: Mapping[str, bytes], setup: Setup) -> list[Placed]:
 
 
 def cloud_config(files: Mapping[str, bytes], setup: Setup) -> str:
-    """Return the machine's set-up as ``#cloud-config``. Text remains readable; other content is base64.
-
-    Raises:
-        LocalError: a path of ``files`` leads out of the machine's folder.
-    """
+    """Return the machine's set-up as ``#cloud-config``. Text remains readable; other content is base64."""
     written: list[dict[str, str]] = []
     for file in placed(files, setup):
         entry = {"path": file.path, "permissions": f"{file.mode:04o}"}
@@ -213,11 +204,7 @@ def user_data(files: Mapping[str, bytes], setup: Setup) -> bytes:
 
 
 def shell_script(files: Mapping[str, bytes], setup: Setup) -> str:
-    """Return a bash script with the effect of ``cloud_config``, for root or a user with ``sudo``.
-
-    Raises:
-        LocalError: a path of ``files`` leads out of the machine's folder.
-    """
+    """Return a bash script with the effect of ``cloud_config``, for root or a user with ``sudo``."""
     lines = [
         "set -euo pipefail",
         "base64 -d <<'EOF' | sudo tar --extract --gzip --no-same-owner --directory / --file -",

@@ -18,6 +18,8 @@ __all__ = ["GatewayProvider", "Provider"]
 class Provider(Protocol):
     """Provider of machines. All calls may block; none keeps state that a restart would lose.
 
+    A call raises ``StoreError`` if the provider cannot be reached now, and ``LocalError`` if it refuses.
+
     Attributes:
         name: as in offers and in ``fog.yaml``.
         poll_s: useful interval between calls of ``describe``.
@@ -27,11 +29,7 @@ class Provider(Protocol):
     poll_s: float
 
     def offers(self, hardware: Hardware, *, spot: bool) -> list[Offer]:
-        """Return the offers with enough hardware, cheapest first.
-
-        Raises:
-            StoreError: the provider cannot be reached now.
-        """
+        """Return the offers with enough hardware, cheapest first."""
         ...
 
     def create(self, spec: MachineSpec, boot: MachineBundle) -> str:
@@ -47,18 +45,11 @@ class Provider(Protocol):
         """Return all machines of a cluster in any state, also those that the journal does not contain.
 
         A machine that ended is reported as ``GONE`` for a while, or not at all.
-
-        Raises:
-            StoreError: the provider cannot be reached now.
         """
         ...
 
     def terminate(self, ids: Sequence[str]) -> None:
-        """Terminate machines; machines that are gone already are ignored.
-
-        Raises:
-            StoreError: the provider cannot be reached now.
-        """
+        """Terminate machines; machines that are gone already are ignored."""
         ...
 
     def drain(self, machine: str) -> None:

@@ -19,12 +19,7 @@ _MAX: Final = 8  # concurrent actions
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """Finished action.
-
-    Args:
-        result: result of the provider; empty if there is none.
-        error: why it failed.
-    """
+    """Finished action; ``result``: result of the provider; empty if there is none."""
 
     cluster: str
     machine: str
@@ -34,11 +29,7 @@ class Done:
 
 
 class ActionRunner:
-    """Running actions, at most one per machine.
-
-    Args:
-        wake: called when an action has ended, from its thread.
-    """
+    """Running actions, at most one per machine; ``wake``: called when an action has ended, from its thread."""
 
     def __init__(self, wake: Callable[[], None]) -> None:
         self._wake = wake

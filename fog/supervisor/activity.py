@@ -11,11 +11,7 @@ __all__ = ["Activity"]
 
 
 class Activity:
-    """Time since the last call of a cluster.
-
-    Args:
-        begun_unix_s: when the cluster was first observed.
-    """
+    """Time since the last call of a cluster, or since it was first observed."""
 
     def __init__(self, begun_unix_s: float) -> None:
         self._since_s = begun_unix_s

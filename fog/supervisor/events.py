@@ -23,11 +23,7 @@ class Change(NamedTuple):
 
 
 def changes(before: Record, after: Record, seen: Machine | None, now_s: float) -> Iterator[Change]:
-    """Yield the events between two records.
-
-    Args:
-        seen: the provider's present description.
-    """
+    """Yield the events between two records."""
     since = f"{now_s - after.asked_unix_s:.1f} s after it was asked for"
     if before.up_unix_s is None and after.up_unix_s is not None:
         yield Change("running", since)

@@ -25,7 +25,6 @@ def keep(provider: Provider, machine: str, nodes: Sequence[str]) -> str:
     """Return the text that ``kept`` reads; logs that cannot be read now are lost.
 
     Args:
-        machine: the provider's id.
         nodes: names of the programs in addition to switch and proxy.
     """
     found = {}

@@ -20,13 +20,7 @@ __all__ = ["Election", "elect", "is_settling"]
 
 @dataclass(frozen=True, slots=True)
 class Election:
-    """Change of the role.
-
-    Args:
-        new: machine that becomes the gateway.
-        old: previous gateway, if the machine still exists.
-        reason: why, in a few words.
-    """
+    """Change of the role; ``old``: previous gateway, if the machine still exists."""
 
     new: Record
     old: Record | None
@@ -40,7 +34,6 @@ def elect(group: Sequence[Record], label: str, now_s: float, patience: Timeouts)
 
     Args:
         group: machines of this gateway, of all clusters. Machines that are gone only explain a change.
-        label: of the gateway.
     """
     there = [each for each in group if not each.is_gone and each.id]
     old = next((each for each in there if each.gateway == label), None)

@@ -65,7 +65,7 @@ class GatewayUplinks:
             if is_settling(group, label, now_s, self._patience):
                 excused.update(each.name for each in group if each.spec.cluster == cluster)
         for record in records:
-            if record.id and record.name in seen and not self._actions.is_busy(cluster, record.name):
+            if record.id and record.name in seen and not self._actions.runner.is_busy(cluster, record.name):
                 self._reconcile_uplink(provider, record, seen[record.name])
         return frozenset(excused)
 
@@ -76,6 +76,6 @@ class GatewayUplinks:
         cluster, name = record.spec.cluster, record.name
         if record.gateway and not (seen.is_gateway and record.id in self._uplinks):
             self._uplinks.add(record.id)
-            self._actions.begin(cluster, name, ATTACH, partial(provider.attach_uplink, record.id))
+            self._actions.runner.begin(cluster, name, ATTACH, partial(provider.attach_uplink, record.id))
         elif seen.is_gateway and not record.gateway and not record.is_outgoing:
-            self._actions.begin(cluster, name, DETACH, partial(provider.detach_uplink, record.id))
+            self._actions.runner.begin(cluster, name, DETACH, partial(provider.detach_uplink, record.id))

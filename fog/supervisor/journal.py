@@ -10,7 +10,7 @@ import json
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from enum import Enum
 from pathlib import Path
 from typing import Final
@@ -62,7 +62,7 @@ class Cluster:
     begun_unix_s: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Entry:
     """Event. ``machine`` is empty for an event of the whole cluster.
 
@@ -80,6 +80,9 @@ class Entry:
     detail: str
     since_unix_s: float | None = None
     lines: str = ""
+
+
+_ENTRY_COLUMNS: Final = tuple(column.name for column in fields(Entry))
 
 
 class Journal:
@@ -165,11 +168,7 @@ class Journal:
                 _tell(file, now_s, spec.cluster, spec.name, what, detail, since_unix_s)
 
     def machines(self, cluster: str, *, gone: bool = True) -> list[Record]:
-        """Return the machines of a cluster in the order of their requests.
-
-        Args:
-            gone: include machines that are gone.
-        """
+        """Return the machines of a cluster in the order of their requests."""
         query = "SELECT name, record FROM machines WHERE cluster = ?" + ("" if gone else " AND is_gone = 0")
         with _translated(self._path):
             rows = self._file.execute(query, (cluster,)).fetchall()
@@ -200,17 +199,16 @@ class Journal:
         """Return events, oldest first.
 
         Args:
-            cluster: empty: events of all clusters.
             after: id of the last known event.
             last: maximum number; the newest are returned.
         """
         query = (
-            "SELECT id, unix_s, cluster, machine, what, detail, since_unix_s, lines FROM events"
+            f"SELECT {', '.join(_ENTRY_COLUMNS)} FROM events"
             " WHERE id > ? AND (? = '' OR cluster = ?) ORDER BY id DESC LIMIT ?"
         )
         with _translated(self._path):
             rows = self._file.execute(query, (after, cluster, cluster, -1 if last is None else last)).fetchall()
-        return [Entry(*row) for row in reversed(rows)]
+        return [Entry(**dict(zip(_ENTRY_COLUMNS, row, strict=True))) for row in reversed(rows)]
 
     def _plan(self, name: str, plan: str) -> ClusterPlan:
         try:

@@ -13,7 +13,9 @@ from typing import Final
 from fog.cluster import CloudNode, ClusterPlan, MachineRequest
 from fog.enrolment.bootstrap import machine_boot, node_names
 from fog.enrolment.credentials import IssuedCredentials
+from fog.latency.known import Latencies
 from fog.machine import Machine, MachineSpec, MachineState
+from fog.offer import Offer
 from fog.providers.provider import GatewayProvider, Provider
 from fog.site import Site
 from fog.supervisor.actions import ActionRunner
@@ -21,7 +23,6 @@ from fog.supervisor.event_log import EventLog
 from fog.supervisor.final_logs import keep, kept
 from fog.supervisor.journal import FINAL_LOGS, Journal
 from fog.supervisor.machine_credentials import MachineCredentials
-from fog.supervisor.offer_cache import OfferCache
 from fog.supervisor.placement import place
 from fog.supervisor.reconcile import Action, Drain, Launch
 from fog.supervisor.record import Outcome, Record
@@ -31,13 +32,34 @@ __all__ = ["ATTACH", "DETACH", "MachineActions"]
 ATTACH: Final = "attach uplink"
 DETACH: Final = "detach uplink"
 
+_OFFERS_S: Final = 60.0  # validity of a price list
+
+
+class OfferCache:
+    """A provider's offers by machine request."""
+
+    def __init__(self, latencies: Latencies) -> None:
+        self.latencies = latencies
+        self._offers: dict[MachineRequest, tuple[float, list[Offer]]] = {}
+
+    def clear(self) -> None:
+        """Drop all offers."""
+        self._offers.clear()
+
+    def get(self, provider: Provider, wanted: MachineRequest, now_s: float) -> list[Offer]:
+        """Return the provider's offers for a request, at most one minute old."""
+        at_s, offers = self._offers.get(wanted, (0.0, []))
+        if now_s - at_s >= _OFFERS_S or not offers:
+            offers = provider.offers(wanted.hardware, spot=wanted.is_spot)
+            self._offers[wanted] = now_s, offers
+            self.latencies.refresh_in_background((each.region for each in offers), now_s)
+        return offers
+
 
 class MachineActions:
     """Executor of actions on a site's machines, which writes their results.
 
     Args:
-        provider: provider of the machines; may be replaced.
-        command: returns the command line of a node.
         wake: called when an action has ended, from its thread.
     """
 
@@ -58,31 +80,14 @@ class MachineActions:
         self._events = events
         self._credentials = credentials
         self._command = command
-        self._acts = ActionRunner(wake)
+        self.runner = ActionRunner(wake)
         self._offers = OfferCache(site.latencies)
         self._swept: set[str] = set()  # machines without leftovers at the provider
-
-    @property
-    def running(self) -> int:
-        """Return the number of actions that have not ended."""
-        return self._acts.running
 
     def use(self, provider: Provider) -> None:
         """Use another adapter of the same provider from now on."""
         self.provider = provider
         self._offers.clear()
-
-    def is_busy(self, cluster: str, machine: str = "") -> bool:
-        """Return whether an action on a machine runs, or without a machine on any of the cluster."""
-        return self._acts.is_busy(cluster, machine)
-
-    def begin(self, cluster: str, machine: str, what: str, act: Callable[[], str | None]) -> None:
-        """Begin an action on a machine that is not busy."""
-        self._acts.begin(cluster, machine, what, act)
-
-    def close(self) -> None:
-        """Wait until all actions have ended."""
-        self._acts.close()
 
     def apply(self, plan: ClusterPlan, action: Action, records: list[Record], now_s: float) -> None:
         """Begin a decided action on a machine; a busy machine keeps its action."""
@@ -90,12 +95,12 @@ class MachineActions:
             self._launch(plan, action.wanted, records, now_s)
             return
         (record,) = (each for each in records if each.name == action.name)
-        if self.is_busy(plan.name, record.name):
+        if self.runner.is_busy(plan.name, record.name):
             return
         if isinstance(action, Drain):
             known = replace(record, drained_unix_s=now_s, reason=action.reason)
             self._events.put(known, "draining", action.reason, now_s)
-            self._acts.begin(plan.name, record.name, "drain", partial(self.provider.drain, record.id))
+            self.runner.begin(plan.name, record.name, "drain", partial(self.provider.drain, record.id))
         elif not record.id:
             self._events.put(
                 record.ended(action.ending, action.reason, now_s), action.ending.value, action.reason, now_s
@@ -108,7 +113,7 @@ class MachineActions:
 
     def collect_results(self, now_s: float) -> None:
         """Write the results of finished actions into the journal."""
-        for done in self._acts.poll_done():
+        for done in self.runner.poll_done():
             if done.what == "create":
                 record = next(each for each in self._journal.machines(done.cluster) if each.name == done.machine)
                 if done.error is not None:
@@ -134,7 +139,7 @@ class MachineActions:
             provider.terminate([machine])
             return words
 
-        self._acts.begin(plan.name, name, "release", act)
+        self.runner.begin(plan.name, name, "release", act)
 
     def release_orphans(
         self, plan: ClusterPlan, records: Sequence[Record], seen: Mapping[str, Machine], now_s: float
@@ -144,7 +149,7 @@ class MachineActions:
         known = {each.name for each in records if not each.is_gone}
         lost = {each.name for each in records if each.is_gone and each.ending is not Outcome.RELEASED}
         for name, machine in seen.items():
-            if name in known or machine.id in self._swept or self.is_busy(cluster, name):
+            if name in known or machine.id in self._swept or self.runner.is_busy(cluster, name):
                 continue
             if machine.state is MachineState.GONE:
                 self._swept.add(machine.id)
@@ -184,7 +189,7 @@ class MachineActions:
         records.append(record)
         detail = f"{offer.region} {offer.type_name}, {offer.usd_per_hour:.4f} USD an hour: {choice.why}"
         self._events.put(record, "requested", detail, now_s)
-        self._acts.begin(plan.name, spec.name, "create", partial(self.provider.create, spec, boot))
+        self.runner.begin(plan.name, spec.name, "create", partial(self.provider.create, spec, boot))
 
     def _uplink_iface(self, region: str) -> str:
         provider = self.provider

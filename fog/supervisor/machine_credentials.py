@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 from fog.cluster import ClusterPlan
 from fog.enrolment.bootstrap import machine_seats
-from fog.enrolment.revoking import revoke_credentials
+from fog.enrolment.members import revoke_credentials
 from fog.enrolment.robot_config import reload
 from fog.enrolment.tickets import News, Report, Tickets
 from fog.site import Site
@@ -35,11 +35,7 @@ Release: TypeAlias = "Callable[[ClusterPlan, str, str], None]"
 
 
 class MachineCredentials:
-    """Issuer of machine credentials, which also revokes them.
-
-    Args:
-        boot_s: seconds within which a machine must enrol.
-    """
+    """Issuer of machine credentials, which also revokes them; ``boot_s``: seconds within which a machine must enrol."""
 
     def __init__(self, site: Site, journal: Journal, events: EventLog, tickets: Tickets, *, boot_s: float) -> None:
         self._site = site
@@ -50,9 +46,6 @@ class MachineCredentials:
 
     def issue_ticket(self, plan: ClusterPlan, name: str, now_s: float, *, is_gateway: bool) -> tuple[Ticket, float]:
         """Return a new machine's ticket, and the end of validity of its credentials (Unix time).
-
-        Args:
-            is_gateway: the machine may become the gateway of its group.
 
         Raises:
             LocalError: the domain is missing, or its root certificate has expired.

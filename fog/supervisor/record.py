@@ -28,7 +28,6 @@ class Record:
     """Machine from the intention to request it until it is gone. Times are seconds since 1970.
 
     Args:
-        wanted: request for which it was launched.
         id: the provider's id; empty until it is known.
         up_unix_s: when its programs were up.
         served_unix_s: when its replica was observed for the first time.

@@ -18,11 +18,7 @@ _ROBOT_DAYS: Final = 365.0
 
 
 class RobotAccess:
-    """Access control of a site's robots to clusters.
-
-    Args:
-        on_names: called when the watch needs more names.
-    """
+    """Access control of a site's robots to clusters; ``on_names``: called when the watch needs more names."""
 
     def __init__(self, site: Site, on_names: Callable[[], None]) -> None:
         self._site = site

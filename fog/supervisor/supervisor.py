@@ -41,13 +41,10 @@ PATIENCE: Final = Timeouts()
 
 
 class Supervisor:
-    """Supervisor that keeps the clusters of a site in their desired state.
+    """Supervisor that keeps the clusters of a site in their desired state; ``StoreError``: the journal is unusable.
 
     Args:
-        tickets: store of enrolment tickets.
-        command: returns the command line of a node.
         heard: servers that the overlay reports; None: the overlay cannot be queried.
-        on_names: called when the watch needs more names.
     """
 
     def __init__(
@@ -93,7 +90,7 @@ class Supervisor:
     @property
     def running_actions(self) -> int:
         """Return the number of actions on machines that have not ended."""
-        return self._actions.running
+        return self._actions.runner.running
 
     def use(self, provider: Provider) -> None:
         """Use another adapter of the same provider from now on, such as one with more regions."""
@@ -110,15 +107,11 @@ class Supervisor:
 
     def close(self) -> None:
         """Wait for running actions and write their results; machines continue."""
-        self._actions.close()
+        self._actions.runner.close()
         self._actions.collect_results(time.time())
 
     def reconcile(self) -> None:
-        """Reconcile every cluster once.
-
-        Raises:
-            StoreError: the journal cannot be read or written.
-        """
+        """Reconcile every cluster once."""
         self._actions.collect_results(time.time())
         self._credentials.handle_reports(self._release_misused, time.time())
         for cluster in self._journal.clusters():
@@ -134,11 +127,7 @@ class Supervisor:
                 self._events.add_trouble(name, str(error))
 
     def reconciled(self, begun_unix_s: float) -> None:
-        """Write that clusters without trouble match the journal again after the start at ``begun_unix_s``.
-
-        Raises:
-            StoreError: the journal cannot be written.
-        """
+        """Write that clusters without trouble match the journal again after the start at ``begun_unix_s``."""
         now_s = time.time()
         for each in self._journal.clusters():
             name = each.plan.name
@@ -167,7 +156,7 @@ class Supervisor:
             self._actions.apply(plan, action, records, now_s)
         if is_new and not self._robots.has(plan):
             self._robots.grant(plan)
-        if not cluster.is_up and all(each.is_gone for each in records) and not self._actions.is_busy(plan.name):
+        if not cluster.is_up and all(each.is_gone for each in records) and not self._actions.runner.is_busy(plan.name):
             self._settled.add(plan.name)
             self._limits.reset(plan.name)
             self._robots.remove(plan.name)
@@ -183,7 +172,7 @@ class Supervisor:
         records = []
         for before in self._journal.machines(plan.name, gone=False):
             after, machine = before, seen.get(before.name)
-            if before.id or not self._actions.is_busy(plan.name, before.name):
+            if before.id or not self._actions.runner.is_busy(plan.name, before.name):
                 serves = (
                     None
                     if heard is None
@@ -203,7 +192,7 @@ class Supervisor:
 
     def _release_misused(self, plan: ClusterPlan, name: str, machine: str) -> None:
         """Release a machine whose token was misused, unless it is busy."""
-        if not self._actions.is_busy(plan.name, name):
+        if not self._actions.runner.is_busy(plan.name, name):
             self._actions.release(plan, name, machine, is_lost=True)
 
 

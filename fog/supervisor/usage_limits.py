@@ -36,11 +36,7 @@ class UsageLimits:
         self._activities.pop(cluster, None)
 
     def reached(self, provider: str, cluster: Cluster, records: Sequence[Record], now_s: float) -> str:
-        """Return which limit of the cluster is reached; empty: none.
-
-        Args:
-            provider: name of the provider of its machines.
-        """
+        """Return which limit of the cluster is reached; empty: none."""
         plan = cluster.plan
         if plan.budget_usd is not None:
             ours = (each for each in self._journal.machines(plan.name) if each.asked_unix_s >= cluster.begun_unix_s)

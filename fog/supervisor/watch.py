@@ -42,7 +42,6 @@ class Watch:
 
     Args:
         identity: directory of a proxy with delegations to call.
-        iface: name of the device.
     """
 
     def __init__(self, identity: Path, iface: str) -> None:

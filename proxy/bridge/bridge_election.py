@@ -22,11 +22,7 @@ _EMPTY: Final = "std_msgs/msg/Empty"
 
 
 class BridgeElection:
-    """Other proxies of a graph, as the graph shows them.
-
-    Args:
-        me: name of this proxy's virtual node.
-    """
+    """Other proxies of a graph, as the graph shows them; ``me``: name of this proxy's virtual node."""
 
     def __init__(self, me: str, graph: Graph) -> None:
         self._me = me

@@ -13,7 +13,7 @@ from gdp.telemetry.sources import Histogram
 __all__ = ["Traffic"]
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Traffic:
     """Counts of one proxy.
 

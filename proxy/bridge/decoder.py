@@ -20,7 +20,6 @@ class MessageDecoder:
 
     Args:
         source: description by the remote side.
-        target: description on this machine.
         twin: converter; None where both sides have the same wire form.
     """
 
@@ -39,7 +38,6 @@ class MessageDecoder:
 
         Args:
             known: this machine's description of the type; None where it has none.
-            ros: ROS version of the local graph.
 
         Raises:
             DefinitionError: the definitions differ, or this ROS has no such type.

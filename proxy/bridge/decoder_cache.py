@@ -23,9 +23,7 @@ class DecoderCache(Generic[_Ready]):
     """Entries by publisher and description; None is the entry of a description that was refused.
 
     Args:
-        count_max: entries.
         bytes_max: of their descriptions, with some overhead; the newest entry stays whatever its length.
-        each_max: entries of one publisher.
     """
 
     def __init__(self, count_max: int = _COUNT_MAX, bytes_max: int = _BYTES_MAX, each_max: int = _EACH_MAX) -> None:

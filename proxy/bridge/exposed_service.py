@@ -3,11 +3,10 @@
 I/O: endpoint and participant; ``gdp/service/serving.py`` keeps order. A service and an action differ in their parts.
 
 It combines these modules:
-- ``remote_clients.py``: decodes requests.
+- ``remote_clients.py``: decodes requests, and detects clients that left.
 - ``undescribed_requests.py``: holds requests that wait for their description.
 - ``response_sender.py``: sends responses to clients.
 - ``cancellation.py``: stops calls.
-- ``client_liveness.py``: detects clients that left.
 - ``ordered_server.py``: drives a server that keeps state.
 """
 
@@ -26,7 +25,6 @@ from gdp.service.serving import Asked, Serving
 from proxy.bridge.action_interface import CANCEL, GOAL, PROFILES, RESULT, ActionInterface
 from proxy.bridge.bridge_election import presence_of, sign
 from proxy.bridge.cancellation import TRIGGER, Cancellation
-from proxy.bridge.client_liveness import ClientLiveness
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.desired_flows import FlowSpec
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
@@ -34,7 +32,7 @@ from proxy.bridge.faults import Fault
 from proxy.bridge.goal_calls import GoalCalls
 from proxy.bridge.goals import cancel_of, goal_of
 from proxy.bridge.ordered_server import OrderedServer
-from proxy.bridge.remote_clients import RemoteClients
+from proxy.bridge.remote_clients import ClientLiveness, RemoteClients
 from proxy.bridge.response_sender import ResponseSender
 from proxy.bridge.undescribed_requests import UndescribedRequests
 from proxy.config.rule import CALL_MAX_S
@@ -61,9 +59,6 @@ _NOTICE_S: Final = 1.0
 
 class ExposedService:
     """Lets remote clients call one local server.
-
-    Args:
-        random_start: the first number of a call here, random.
 
     Raises:
         LocalError: this machine does not know a type.

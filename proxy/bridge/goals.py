@@ -1,6 +1,6 @@
 """Goals of an action with several servers: which server is the leader of each goal.
 
-Sans-I/O.
+Sans-I/O. Functions that read a message raise ``RemoteError`` (MALFORMED) where it is too short.
 Source: the interfaces of ``action_msgs`` and of the hidden services of an action, in CDR. A goal's id is the first 16
 bytes of its request, of its feedback, and of a request for its result. Responses begin with one byte: yes or no.
 
@@ -38,11 +38,7 @@ _ALL: Final = bytes(_ID)
 
 
 def goal_of(raw: bytes) -> bytes:
-    """Return the id of the goal that a message is about.
-
-    Raises:
-        RemoteError: MALFORMED, it is too short.
-    """
+    """Return the id of the goal that a message is about."""
     if len(raw) < _HEAD + _ID:
         raise RemoteError(DropReason.MALFORMED, "a message about a goal that names none")
     return raw[_HEAD : _HEAD + _ID]
@@ -60,7 +56,7 @@ def cancel_of(goal: bytes) -> bytes:
     return b"\0\1\0\0" + goal + bytes(_STAMP["<"].size)
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(slots=True, eq=False, kw_only=True)
 class _Goal:
     leader: Name | None = None
     holders: set[Name] = field(default_factory=set)
@@ -130,19 +126,11 @@ class Goals:
                 known.leader = None
 
     def may_feed(self, server: Name, raw: bytes) -> bool:
-        """Return whether feedback is passed on to the clients.
-
-        Raises:
-            RemoteError: MALFORMED.
-        """
+        """Return whether feedback is passed on to the clients."""
         return self._led(goal_of(raw), server) is not None
 
     def statuses(self, server: Name, raw: bytes) -> bytes | None:
-        """Return the status message for the clients after a server has sent this one; None: nothing new.
-
-        Raises:
-            RemoteError: MALFORMED.
-        """
+        """Return the status message for the clients after a server has sent this one; None: nothing new."""
         said = _read(raw)
         for goal, known in self._goals.items():
             is_its = known.led_by == server or (known.led_by is None and known.result is None)

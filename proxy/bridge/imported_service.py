@@ -56,11 +56,7 @@ class _Waiting:
 
 
 class ImportedService:
-    """Lets local clients call one remote service or action.
-
-    Args:
-        random_start: the first number of a call, random.
-    """
+    """Lets local clients call one remote service or action."""
 
     def __init__(
         self, site: BridgeContext, seat: EndpointDispatcher, flow_spec: FlowSpec, topic: Topic, random_start: int

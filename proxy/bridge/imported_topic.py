@@ -57,7 +57,9 @@ class ImportedTopic:
         self._past_losses = Losses()  # losses of earlier subscriptions
         self._pace = RateLimiter(flow_spec.rule.max_hz)
         samples = _SAMPLES_MAX if seat.endpoint.is_live else SAMPLES_MAX
-        self.stats = TopicStats(flow_spec.local, flow_spec.type_name, latencies_ms=deque(maxlen=samples))
+        self.stats = TopicStats(
+            topic=flow_spec.local, type_name=flow_spec.type_name, latencies_ms=deque(maxlen=samples)
+        )
         kind = MergedPublisher if seat.endpoint.is_live else ChannelPublishers
         self._output: LocalOutput = kind(seat, self, flow_spec)
 

@@ -39,11 +39,7 @@ class LocalOutput(Protocol):
         """Return whether messages can be published now."""
 
     def decoder(self, source: Channel, encoding: Encoding) -> MessageDecoder:
-        """Return the decoder that turns bodies of a remote channel into local messages.
-
-        Raises:
-            DefinitionError: the definitions differ, or there is no such type in this ROS.
-        """
+        """Return the decoder that turns bodies of a remote channel into local messages."""
 
     def add(self, publisher: bytes, sources: Sequence[Channel], targets: Sequence[Channel]) -> list[int]:
         """Add the channels of a remote publisher; return a handle for each.
@@ -74,11 +70,7 @@ class LocalOutput(Protocol):
 
 
 class MergedPublisher:
-    """One virtual publisher in a live graph.
-
-    Raises:
-        LocalError: this graph does not accept a publisher of the topic.
-    """
+    """One virtual publisher in a live graph."""
 
     refusal = Fault.UNKNOWN_TYPE
 

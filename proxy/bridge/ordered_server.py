@@ -32,9 +32,6 @@ class OrderedServer:
     Args:
         node: the node whose parameter is the server's state; None: it exports none.
         number: the first request number for the local server, random.
-        give: passes an entry to the local server.
-        tell: sends a message to a client.
-        complain: reports a fault of the node.
     """
 
     def __init__(

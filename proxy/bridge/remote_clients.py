@@ -1,22 +1,25 @@
-"""Remote clients of a local service: decoders of their requests, or the reason why there are none.
+"""Remote clients of a local service: decoders of their requests, or the reason why there are none; and their liveness.
 
-Sans-I/O.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Final
 
 from gdp.errors import DropReason, LocalError, RemoteError
+from gdp.names import Name
 from proxy.bridge.decoder import MessageDecoder
 from proxy.serial.channel import RosVersion
 from proxy.serial.schema import DefinitionError
 from proxy.wire.service import Exchange
 
-__all__ = ["RemoteClients"]
+__all__ = ["ClientLiveness", "RemoteClients"]
 
 REMOTE_CLIENTS_MAX: Final = 1_024  # clients whose decoders are kept; the oldest are dropped
+_AWAY_S: Final = 30.0  # a client that sends nothing for this long no longer waits
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,11 +33,7 @@ class _Caller:
 
 
 class RemoteClients:
-    """All clients of one service.
-
-    Args:
-        ours: the service on this machine.
-    """
+    """All clients of one service."""
 
     def __init__(self, ours: Exchange, ros: RosVersion) -> None:
         self._ours = ours
@@ -72,3 +71,27 @@ class RemoteClients:
             return _Caller(description, unlike=str(error))
         except RemoteError as error:
             return _Caller(description, unread=(error.reason, error.detail))
+
+
+class ClientLiveness:
+    """Time of the last sign of life of each client."""
+
+    def __init__(self) -> None:
+        self._heard_s: dict[Name, float] = {}
+
+    def update(
+        self, clients: Collection[Name], *, present: Collection[Name], known: Collection[bytes], now_s: float
+    ) -> list[Name]:
+        """Return the clients that have gone.
+
+        Args:
+            clients: those whose calls are under way.
+            present: those that are reachable now.
+            known: those that may become reachable again.
+        """
+        self._heard_s = {each: now_s if each in present else self._heard_s.get(each, now_s) for each in clients}
+        return [
+            client
+            for client, heard_s in self._heard_s.items()
+            if client not in present and (bytes(client) not in known or now_s - heard_s >= _AWAY_S)
+        ]

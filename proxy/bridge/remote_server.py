@@ -21,16 +21,13 @@ from proxy.wire.service import Exchange
 __all__ = ["RemoteServer"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RemoteServer:
     """One incarnation of a remote server.
 
     Args:
-        description: as the server sent it.
         exchange: the same, decoded; None where it has no valid form here.
         ours: the service as this machine describes it.
-        answers: decoders by service.
-        news: decoders by topic.
     """
 
     incarnation: int
@@ -58,12 +55,12 @@ class RemoteServer:
         services = zip(theirs.services, ours.services, strict=True)
         topics = zip(theirs.topics, ours.topics, strict=True)
         server = cls(
-            incarnation,
-            description,
-            theirs,
-            ours,
-            tuple(MessageDecoder.ready(a.response, theirs.encoding, b.response, ros) for a, b in services),
-            tuple(MessageDecoder.ready(a, theirs.encoding, b, ros) for a, b in topics),
+            incarnation=incarnation,
+            description=description,
+            exchange=theirs,
+            ours=ours,
+            answers=tuple(MessageDecoder.ready(a.response, theirs.encoding, b.response, ros) for a, b in services),
+            news=tuple(MessageDecoder.ready(a, theirs.encoding, b, ros) for a, b in topics),
         )
         for our, their in zip(ours.services, theirs.services, strict=True):
             MessageDecoder.ready(our.request, ours.encoding, their.request, their.ros)  # raises with the reason
@@ -85,11 +82,7 @@ class RemoteServer:
 
 
 def _ours(theirs: Exchange, parts: ActionInterface, endpoint: Endpoint, encoding: Encoding) -> Exchange:
-    """Return this machine's description of the service, built from the remote definitions where it has none.
-
-    Raises:
-        LocalError: it cannot be known here.
-    """
+    """Return this machine's description of the service, built from the remote definitions where it has none."""
     services = list[Service]()
     for (name, type_name), their in zip(parts.services, theirs.services, strict=True):
         try:

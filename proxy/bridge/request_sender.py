@@ -25,8 +25,6 @@ class RequestSender:
     """Sends the effects of the calls of each part; effects for all servers wait for capacity of their common stream.
 
     Args:
-        service: name of the service.
-        goals: of an action.
         publisher: the stream that all servers receive.
     """
 
@@ -57,11 +55,7 @@ class RequestSender:
         self._goal_of[part, call] = goal
 
     def discard(self, part: int, call: int, *, is_cancelled: bool) -> None:
-        """Forget a call that has ended.
-
-        Args:
-            is_cancelled: its request must not be sent any more.
-        """
+        """Forget a call that has ended; ``is_cancelled``: its request must not be sent any more."""
         self._goal_of.pop((part, call), None)
         if is_cancelled:
             self._for_all.end(part, call)

@@ -23,8 +23,6 @@ class ResponseSender:
     """Encodes and sends the messages of the local server.
 
     Args:
-        service: name of the service.
-        exchange: the service on this machine.
         serving: keeps responses for clients that repeat a request.
         publisher: the stream that all clients receive.
     """
@@ -77,7 +75,6 @@ class ResponseSender:
         """Send a message of an action's topic to all clients.
 
         Args:
-            at: index of the topic.
             stamp_ns: when the local server sent it, in nanoseconds since 1970.
         """
         what, publisher, services = self._flow_spec.local, self._publisher, len(self._responses)

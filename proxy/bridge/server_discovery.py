@@ -33,9 +33,7 @@ class ServerDiscovery:
     """Reachable remote servers, each as this machine decodes it.
 
     Args:
-        service: name of the service.
         calls: of each part; they get every change of the servers.
-        goals: of an action.
         opened: called with this machine's description of the service, when the first server has a valid description.
         closed: called with the reason when the last server is gone.
 
@@ -127,7 +125,7 @@ class ServerDiscovery:
                 self._is_open = True
         except GdpError as error:
             self._site.faults.report(self._flow_spec.local, Fault.OTHER_TYPE, str(error))
-            self.servers[name] = RemoteServer(incarnation, description)
+            self.servers[name] = RemoteServer(incarnation=incarnation, description=description)
             return
         self.servers[name] = server
         self._announce(name, server, now_s)

@@ -16,7 +16,7 @@ __all__ = ["SAMPLES_MAX", "TopicStats", "percentile"]
 SAMPLES_MAX: Final = 200_000  # latencies kept for percentiles; the oldest go
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class TopicStats:
     """Statistics of one topic."""
 

@@ -62,8 +62,6 @@ def explain(
     """Return one finding for each rule, in the order of the file.
 
     Args:
-        expose: the rules about this graph.
-        imports: the same.
         graph: live entities; None: there is no live endpoint, and missing entities are not reported.
         held: by the name that each is about.
     """

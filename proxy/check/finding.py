@@ -16,12 +16,11 @@ __all__ = ["Direction", "Finding", "Match"]
 Direction: TypeAlias = Literal["expose", "import"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Match:
     """One name under a rule.
 
     Args:
-        local: the name on this machine.
         type_name: empty while unknown.
         nodes: local nodes of the opposite role; empty: there are none.
         qos: what they offer or request, such as ``reliable, transient local``; empty where QoS does not apply.
@@ -63,11 +62,6 @@ class Finding:
     name: str
     matches: tuple[Match, ...]
     notes: tuple[str, ...]
-
-    @property
-    def is_faulty(self) -> bool:
-        """Return whether any part of it cannot cross."""
-        return any(match.faults for match in self.matches)
 
     def to_fields(self) -> dict[str, object]:
         """Return the JSON form."""

@@ -23,7 +23,6 @@ def look(ends: Sequence[RosGraphConfig], name_hex: str, purpose: str) -> list[tu
     """Return label and entities of each graph, after ``LOOK_S`` seconds.
 
     Args:
-        name_hex: GDP name of the proxy.
         purpose: suffix of the observing node's name.
 
     Raises:

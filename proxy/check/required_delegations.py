@@ -38,7 +38,6 @@ class Machine(NamedTuple):
     """Known state of one machine.
 
     Args:
-        held: delegations that its proxy already has.
         graphs: live graphs, in the order of the configuration's ``ros``; empty: they were not observed.
     """
 

@@ -78,11 +78,7 @@ def main() -> None:
 
 
 def _refuse_other_owners(owner: Path, key: PublicKey, files: Sequence[Path], configs: Sequence[ProxyConfig]) -> None:
-    """Refuse to delegate if no rule is of this owner; warn of a single file if other files have such rules.
-
-    Raises:
-        LocalError: none of the files has a rule of this owner.
-    """
+    """Refuse to delegate if no rule is of this owner; warn of a single file if other files have such rules."""
     missing = [
         f"no rule of {file} names this owner ({owner / OWNER_PUBLIC}); {_owners_named(file)}"
         for file, config in zip(files, configs, strict=True)

@@ -5,17 +5,41 @@ I/O. It imports only the modules of the requested function: imports take most of
 
 from __future__ import annotations
 
+import json
+from typing import Annotated
+
 import typer
 
 from gdp.cli.node import AwaitIface, Check, Config, Json, Verbose, failing_clearly, set_up_logging
 from gdp.cli.version import Version
 from gdp.nodes.uplink import wait_for_device
-from proxy.cli.schema import Schema
 from proxy.config.config import ProxyConfig
 
-__all__ = ["main"]
+__all__ = ["Schema", "main", "schema_text"]
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+
+def schema_text() -> str:
+    """Return the content of ``docs/proxy.schema.json``."""
+    return json.dumps(ProxyConfig.json_schema(), indent=2) + "\n"
+
+
+def _print_and_end(wanted: bool) -> None:
+    if wanted:
+        typer.echo(schema_text(), nl=False)
+        raise typer.Exit
+
+
+Schema = Annotated[
+    bool,
+    typer.Option(
+        "--schema",
+        is_eager=True,
+        callback=_print_and_end,
+        help="Print the JSON schema of the configuration, for editors, and end.",
+    ),
+]
 
 
 @app.command(epilog="Example: gdp-proxy --config proxy.yaml --check")

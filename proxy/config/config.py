@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Final, Literal, TypeAlias
 
 from pydantic import (
     AfterValidator,
@@ -28,12 +28,22 @@ from gdp.nodes.config import LeaseSeconds
 from gdp.nodes.schema import Directory, Domain, Ifname, Metrics, NewFile, Section, load
 from proxy.config.drop_ins import DROP_INS, DropIns, add_drop_in_rules
 from proxy.config.graph import RosGraphConfig
-from proxy.config.json_schema import JsonSchema, editor_schema
 from proxy.config.matching import Fault, clashes
 from proxy.config.rule import Rule
 from proxy.serial.serializer import Encoding
 
-__all__ = ["Encoding", "ProxyConfig", "Record", "RosGraphConfig", "Rule"]
+__all__ = ["DIALECT", "Encoding", "ProxyConfig", "Record", "RosGraphConfig", "Rule"]
+
+JsonSchema: TypeAlias = "dict[str, object]"
+
+DIALECT: Final = "https://json-schema.org/draft/2020-12/schema"
+
+_SHARED: Final = {  # keys of every node's file; docs/reference/configuration.md describes them in full
+    ("Domain", "root"): "Root certificate of the node's own trust domain.",
+    ("Domain", "trusts"): "Root certificates of other domains whose members are believed.",
+    ("Domain", "transit"): "Labels of the domains through which traffic may pass. `null`: every trusted one.",
+    ("Metrics", "port"): "TCP port on 127.0.0.1.",
+}
 
 
 def _one_or_several(value: object, validate: ValidatorFunctionWrapHandler, info: ValidationInfo) -> object:
@@ -177,3 +187,18 @@ class ProxyConfig(Section):
                     yield (side, index), str(error)
         yield from self._misplaced()
         yield from clashes(self.expose, self.imports, lambda rule: places[id(rule)])
+
+
+def editor_schema(model: type[Section], title: str) -> JsonSchema:
+    """Return the schema of a file; every key in it has a description."""
+    schema = model.model_json_schema(by_alias=True)
+    sections = schema.get("$defs", {})
+    for (section, key), text in _SHARED.items():
+        if section in sections:
+            sections[section]["properties"][key].setdefault("description", text)
+    for each in (schema, *sections.values()):
+        del each["title"]
+        each["description"] = each["description"].replace("``", "`")
+        for key in each["properties"].values():
+            key.pop("title", None)  # derived from Python's names, and displayed in place of the keys
+    return {"$schema": DIALECT, "title": title, **schema}

@@ -42,11 +42,7 @@ def imported(rules: Sequence[Rule], name: Name, metadata: Metadata) -> tuple[Rul
 def clashes(
     expose: Sequence[Rule], imports: Sequence[Rule], place_of: Callable[[Rule], Hashable | None]
 ) -> Iterator[Fault]:
-    """Yield the conflicts between rules: two of one direction, or a service on both sides, for one name.
-
-    Args:
-        place_of: returns the graph of a rule.
-    """
+    """Yield the conflicts between rules: two of one direction, or a service on both sides, for one name."""
     for side, rules in (("expose", expose), ("import", imports)):
         seen = _Seen(side, place_of)
         for index, rule in enumerate(rules):

@@ -284,11 +284,7 @@ class Rule(Section):
 
     @property
     def overlay_name(self) -> Name:
-        """Return the 256-bit overlay name.
-
-        Raises:
-            LocalError: as ``overlay_metadata``.
-        """
+        """Return the 256-bit overlay name."""
         return self.overlay_metadata.name(self.owner.compressed)
 
     @property

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from enum import Enum
 from typing import Final, NamedTuple, Protocol, TypeAlias
 
@@ -68,6 +68,7 @@ class GraphEntity:
     type_name: str
     node: str
     key: str
+    _: KW_ONLY
     hash: str = ""
     qos: Qos | None = None
 
@@ -142,7 +143,7 @@ Event: TypeAlias = (
 
 
 class Endpoint(Protocol):
-    """One ROS graph, with this process in it as one virtual node."""
+    """One ROS graph, with this process in it as one virtual node; an unknown type raises ``LocalError``."""
 
     @property
     def ros(self) -> RosVersion:
@@ -177,21 +178,10 @@ class Endpoint(Protocol):
         """
 
     def service(self, name: str, type_name: str) -> Service:
-        """Return this machine's description of a service type.
-
-        Raises:
-            LocalError: it has none.
-        """
+        """Return this machine's description of a service type."""
 
     def subscribe(self, topic: str, type_name: str, qos: Qos | None) -> int:
-        """Subscribe to a topic.
-
-        Args:
-            qos: to request; None: the default of a reliable topic. ROS 1 ignores it.
-
-        Raises:
-            LocalError: the type is not known here.
-        """
+        """Subscribe to a topic; ``qos`` None: the default of a reliable topic. ROS 1 ignores it."""
 
     def advertise(self, channel: Channel) -> int:
         """Create a publisher of ``channel.topic`` with ``channel.qos[0]``, or latched as ``channel.latched`` states.
@@ -209,15 +199,8 @@ class Endpoint(Protocol):
             LocalError: a recording cannot be written.
         """
 
-    def subscribers(self, handle: int) -> int:
-        """Return the present number of local subscriptions of a publisher."""
-
     def serve(self, service: Service) -> int:
-        """Create the server of ``service.name``; requests arrive as ``RequestReceived``.
-
-        Raises:
-            LocalError: the type is not known here.
-        """
+        """Create the server of ``service.name``; requests arrive as ``RequestReceived``."""
 
     def answer(self, handle: int, ticket: int, raw: bytes) -> None:
         """Answer a request; an unknown ticket is ignored: its client is gone."""
@@ -226,11 +209,7 @@ class Endpoint(Protocol):
         """Fail a request with a reason, as far as the dialect can express it; its client must not hang if possible."""
 
     def create_client(self, name: str, type_name: str) -> int:
-        """Create a client of a local service.
-
-        Raises:
-            LocalError: the type is not known here.
-        """
+        """Create a client of a local service."""
 
     def call(self, handle: int, call: int, raw: bytes) -> None:
         """Send a request under the caller's number; ``ResponseReceived`` or ``CallFailed`` follows.

@@ -9,11 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from proxy.serial.channel import Qos
+from proxy.serial.channel import NEVER, Qos
 
-__all__ = ["DEPTH_MAX", "NEVER", "default", "depth_of", "kept", "offer", "request", "unmatched"]
+__all__ = ["DEPTH_MAX", "default", "depth_of", "kept", "offer", "request", "unmatched"]
 
-NEVER: Final = (9_223_372_036, 854_775_807)  # ROS 2's form of an infinite duration
 DEPTH_MAX: Final = 64  # messages kept for late joiners of one topic
 _DEPTH: Final = 10  # where none is known; ROS 2's own default
 _OFFERED_MAX: Final = 1_000  # of the proxy's own publishers, whatever a remote one states
@@ -24,7 +23,7 @@ def default(*, reliable: bool = True, latched: bool = False, depth: int = _DEPTH
     """Return a profile that promises nothing about time."""
     reliability = "reliable" if reliable else "best_effort"
     durability = "transient_local" if latched else "volatile"
-    return Qos("keep_last", depth, reliability, durability, NEVER, NEVER, "automatic", NEVER, plain_names=False)
+    return Qos(depth=depth, reliability=reliability, durability=durability)
 
 
 def depth_of(profile: Qos) -> int:

@@ -138,11 +138,7 @@ def _tell_progress(node: ProxyNode, bridge: Bridge) -> None:
 
 
 def _reload(path: Path, first: ProxyConfig, node: ProxyNode, bridge: Bridge) -> None:
-    """Read the configuration and the delegations again; flows with an unchanged rule continue.
-
-    Raises:
-        GdpError: the old configuration stays in use.
-    """
+    """Read the configuration and the delegations again; flows with an unchanged rule continue."""
     settings = ProxyConfig.load(path)
     held = DelegationStore(settings.delegations, node.identity)
     for key in ("identity", "domain", "iface", "ros", "metrics", "sandbox", "state", "control_socket"):

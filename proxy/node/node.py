@@ -47,7 +47,7 @@ log = logging.getLogger(__name__)
 GOODBYE_S: Final = 0.2  # time in which a leaving node still sends
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class ProxyNode:
     """The running node, for the command that drives it.
 
@@ -174,7 +174,9 @@ def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[Pro
         runtime.every(LOOK_S, node_log.look)
         credentials = Credentials(config.identity, config.domain, identity, policy)
         runtime.every(LOOK_S, credentials.look)
-        node = ProxyNode(identity, member, runtime, plane, node_log, credentials)
+        node = ProxyNode(
+            identity=identity, member=member, runtime=runtime, plane=plane, node_log=node_log, credentials=credentials
+        )
         stack.callback(signal.signal, signal.SIGUSR1, signal.signal(signal.SIGUSR1, node.leave_soon))
         stack.enter_context(runtime.signals(node.reload_on_signal))
         control = config.control_socket or control_path(identity.name)

@@ -29,9 +29,6 @@ def open_recording_bridge(
 ) -> Iterator[Bridge]:
     """Begin every flow between a recording and the overlay; after a SIGHUP delegations are read again.
 
-    Args:
-        rules: those of ``settings`` that apply.
-
     Raises:
         LocalError: a rule of ``settings`` has no valid delegation, or a topic cannot be published.
     """
@@ -59,11 +56,7 @@ def work(node: ProxyNode, bridge: Bridge) -> None:
 
 
 def _renew(node: ProxyNode, settings: ProxyConfig, rules: RecordedRules, bridge: Bridge) -> None:
-    """Read the delegations again: new epochs and longer validity take effect without losing a message.
-
-    Raises:
-        GdpError: a delegation is missing or is invalid; the old ones stay in use.
-    """
+    """Read the delegations again: new epochs and longer validity take effect without losing a message."""
     held = DelegationStore(settings.delegations, node.identity)
     topics = open_topics(settings, held)
     bridge.reload(rules, held)

@@ -69,13 +69,7 @@ class ReplayedTopic:
 
 
 class Replay:
-    """One replay of a recording.
-
-    Args:
-        bridge: its flows exist.
-        rate: 1: as recorded, 2: twice as fast, 0: as fast as readers confirm.
-        report: called about twice a second while replaying.
-    """
+    """One replay of a recording; ``rate`` 1: as recorded, 2: twice as fast, 0: as fast as readers confirm."""
 
     def __init__(
         self, node: ProxyNode, bridge: Bridge, endpoint: ReplayEndpoint, rate: float, report: Callable[[], None]

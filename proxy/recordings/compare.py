@@ -23,7 +23,7 @@ _DIGEST_BYTES: Final = 16
 _Publisher: TypeAlias = "str | None"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TopicComparison:
     """Result for one topic.
 
@@ -72,8 +72,6 @@ def compare(sent: Path | str, received: Path | str, *, exact: bool) -> list[Topi
     """Compare two recordings; topics in the order of the first.
 
     Args:
-        sent: the replayed recording.
-        received: the recording at the receiver.
         exact: compare the exact bytes; otherwise topics whose bytes differ are compared in canonical form.
 
     Raises:

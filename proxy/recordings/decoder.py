@@ -29,10 +29,8 @@ from gdp.errors import ConfigError, LocalError
 from proxy.recordings import salvage_mcap, salvage_ros1, salvage_sqlite
 from proxy.recordings.channels import from_connection
 from proxy.recordings.plain_yaml import BoundedYaml, load_plain
-from proxy.recordings.source import Message, Source
-from proxy.recordings.split import JoinedSource
+from proxy.recordings.source import JoinedSource, Message, Source, UnpackedSource
 from proxy.recordings.sqlite_guard import guarded
-from proxy.recordings.unpacked import UnpackedSource
 from proxy.recordings.unpacking import bound_rosbags, check_file
 from proxy.serial.channel import Channel
 from proxy.serial.schema import DefinitionError, UnparsedError, parse

@@ -107,11 +107,7 @@ class _TopicsEndpoint:
 
 
 class ReplayEndpoint(_TopicsEndpoint):
-    """The publishers of a recording.
-
-    Args:
-        reader: open; its owner closes it.
-    """
+    """The publishers of a recording; ``reader``: open; its owner closes it."""
 
     def __init__(self, reader: BagReader) -> None:
         super().__init__(f"recording {reader.path}")
@@ -161,14 +157,7 @@ class ReplayEndpoint(_TopicsEndpoint):
         return self._numbers
 
     def messages(self, waiting: Callable[[], bool] | None = None) -> Iterator[RecordedMessage]:
-        """Yield the messages of subscribed topics in time order.
-
-        Args:
-            waiting: as for ``BagReader.messages``.
-
-        Raises:
-            ConfigError, RecordingError: the decoder failed.
-        """
+        """Yield the messages of subscribed topics in time order; ``waiting``: as for ``BagReader.messages``."""
         for index, stamp_ns, raw in self._reader.messages(waiting):
             subscribed = self._subscribed.get(index)
             if subscribed is not None:
@@ -186,11 +175,6 @@ class ReplayEndpoint(_TopicsEndpoint):
         """Refuse to publish; raises ``LocalError``."""
         del raw
         raise LocalError(f"{self.label}: handle {handle}: a recording that is replayed takes no messages")
-
-    def subscribers(self, handle: int) -> int:
-        """Return 0."""
-        del handle
-        return 0
 
     def close(self, handle: int) -> None:
         """Close a subscription."""
@@ -238,18 +222,9 @@ class RecordingEndpoint(_TopicsEndpoint):
         return 0 if self._writer is None else self._writer.add(channel)
 
     def publish(self, handle: int, raw: bytes) -> None:
-        """Record one message with the present time as its stamp.
-
-        Raises:
-            LocalError: it cannot be written.
-        """
+        """Record one message with the present time as its stamp."""
         if self._writer is not None:
             self._writer.write(handle, time.time_ns(), raw)
-
-    def subscribers(self, handle: int) -> int:
-        """Return 1: the recording."""
-        del handle
-        return 1
 
     def close(self, handle: int) -> None:
         """Do nothing: recorded messages stay."""

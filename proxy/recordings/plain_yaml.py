@@ -50,9 +50,5 @@ class BoundedYaml(YAML):
     """rosbags' reader of YAML, bounded."""
 
     def load(self, stream: Any) -> Any:
-        """Return the value of a text.
-
-        Raises:
-            SalvageError: it is not within the bounds.
-        """
+        """Return the value of a text."""
         return load_plain(stream)

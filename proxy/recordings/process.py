@@ -58,8 +58,6 @@ class Cost:
     """Limits of the process.
 
     Args:
-        memory_bytes: address space.
-        cpu_s: processor time.
         wait_s: how long it may send nothing while the caller waits.
         file_bytes: length of a file in its scratch folder.
     """
@@ -74,7 +72,6 @@ class BagProcess:
     """A running decoder.
 
     Args:
-        path: the recording.
         scratch: folder that it may write to.
 
     Raises:

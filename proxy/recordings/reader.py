@@ -36,7 +36,6 @@ class BagReader:
 
     Args:
         path: a ``.bag``, ``.mcap`` or ``.db3`` file, or a rosbag2 folder.
-        limits: of its decoder.
 
     Attributes:
         count: messages that ``messages`` will yield, as far as known in advance.

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import BinaryIO, Final
 
 from proxy.recordings.channels import from_ros2, offered_qos
-from proxy.recordings.source import Chunk, Place, ScannedSource, Tally
+from proxy.recordings.source import Chunk, Place, Scan, ScannedSource
 from proxy.recordings.unpacking import SalvageError, unpack
-from proxy.serial.channel import Channel, DefinitionFormat
+from proxy.serial.channel import DefinitionFormat
 
 __all__ = ["MAGIC", "is_indexed", "scan"]
 
@@ -44,35 +44,16 @@ def is_indexed(path: Path) -> bool:
 
 
 def scan(path: Path) -> ScannedSource:
-    """Return the readable part.
-
-    Raises:
-        SalvageError: nothing can be read.
-        OSError: the file cannot be opened.
-    """
-    found = _Found()
-    with path.open("rb") as file:
-        size = file.seek(0, os.SEEK_END)
-        file.seek(0)
-        if file.read(len(MAGIC)) != MAGIC:
-            raise SalvageError("not an MCAP file")
-        reason = found.traverse(file, size)
-    if not found.channels:
-        raise SalvageError(reason or "no channel in it")
-    source = ScannedSource(path, found.channels, found.chunks, found.places)
-    if reason:
-        source.unread = found.stats.text(reason)
-    return source
+    """Return the readable part; errors as of ``Scan.source``."""
+    return _Found().source(path, MAGIC)
 
 
-class _Found:
+class _Found(Scan):
+    form = "an MCAP file"
+
     def __init__(self) -> None:
-        self.channels: list[Channel] = []
-        self.chunks: list[Chunk] = []
-        self.places: list[Place] = []
-        self.stats = Tally()
+        super().__init__()
         self._schemas: dict[int, tuple[str, DefinitionFormat, str]] = {}
-        self._index: dict[int, int] = {}  # channel id to index
 
     def traverse(self, file: BinaryIO, size: int) -> str:
         """Read every record; return why it ended early, empty where it did not."""

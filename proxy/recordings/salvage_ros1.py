@@ -6,14 +6,13 @@ Source: ROS 1 bag format 2.0, http://wiki.ros.org/Bags/Format/2.0 (records of a 
 
 from __future__ import annotations
 
-import os
 import struct
 from pathlib import Path
 from typing import BinaryIO, Final
 
 from rosbags.typesys.msg import normalize_msgtype
 
-from proxy.recordings.source import Chunk, Place, ScannedSource, Tally
+from proxy.recordings.source import Chunk, Place, Scan, ScannedSource
 from proxy.recordings.unpacking import SalvageError, unpack
 from proxy.serial.channel import Channel
 
@@ -28,33 +27,13 @@ _TIME: Final = struct.Struct("<II")
 
 
 def scan(path: Path) -> ScannedSource:
-    """Return the readable part.
-
-    Raises:
-        SalvageError: nothing can be read.
-        OSError: the file cannot be opened.
-    """
-    found = _Found()
-    with path.open("rb") as file:
-        size = file.seek(0, os.SEEK_END)
-        file.seek(0)
-        if file.read(len(MAGIC)) != MAGIC:
-            raise SalvageError("not a ROS 1 bag of format 2.0")
-        reason = found.traverse(file, size)
-    if not found.channels:
-        raise SalvageError(reason or "no connection in it")
-    source = ScannedSource(path, found.channels, found.chunks, found.places)
-    source.unread = found.stats.text(reason or "the recording was never closed")
-    return source
+    """Return the readable part; errors as of ``Scan.source``."""
+    return _Found().source(path, MAGIC, "the recording was never closed")
 
 
-class _Found:
-    def __init__(self) -> None:
-        self.channels: list[Channel] = []
-        self.chunks: list[Chunk] = []
-        self.places: list[Place] = []
-        self.stats = Tally()
-        self._index: dict[int, int] = {}  # connection id to index
+class _Found(Scan):
+    form = "a ROS 1 bag of format 2.0"
+    empty = "no connection in it"
 
     def traverse(self, file: BinaryIO, size: int) -> str:
         """Read every record; return why it ended early, empty where it did not."""

@@ -1,19 +1,22 @@
-"""Source of a recording's messages: the interface of all decoders, and the positions found without an index.
+"""Source of a recording's messages: the interface of all decoders, and its general forms.
 
+Forms: positions found without an index, messages compressed one by one, and several storage files.
 I/O; files are opened for reading only.
 """
 
 from __future__ import annotations
 
+import heapq
+import os
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple, Protocol
 
-from proxy.recordings.unpacking import CHUNK_MAX_BYTES, unpack
+from proxy.recordings.unpacking import CHUNK_MAX_BYTES, SalvageError, unpack
 from proxy.serial.channel import Channel
 
-__all__ = ["Chunk", "Message", "Place", "ScannedSource", "Source", "Tally"]
+__all__ = ["Chunk", "JoinedSource", "Message", "Place", "Scan", "ScannedSource", "Source", "Tally", "UnpackedSource"]
 
 _CHUNKS_KEPT: Final = 4  # unpacked at a time; messages close in time are close in the file
 
@@ -122,3 +125,119 @@ class ScannedSource:
                 self._unpacked.popitem(last=False)
         self._unpacked.move_to_end(place.chunk)
         return self._unpacked[place.chunk][place.at : place.at + place.size]
+
+
+class Scan:
+    """Contents of a file that is read from its beginning; a subclass knows the format and its words."""
+
+    form: str
+    empty = "no channel in it"
+
+    def __init__(self) -> None:
+        self.channels: list[Channel] = []
+        self.chunks: list[Chunk] = []
+        self.places: list[Place] = []
+        self.stats = Tally()
+        self._index: dict[int, int] = {}  # the format's number of a channel, to its index
+
+    def traverse(self, file: BinaryIO, size: int) -> str:
+        """Read every record; return why it ended early, empty where it did not."""
+        raise NotImplementedError
+
+    def source(self, path: Path, magic: bytes, unclosed: str = "") -> ScannedSource:
+        """Return the readable part of a file; ``unclosed``: why even a file that is read to its end lacks something.
+
+        Raises:
+            SalvageError: nothing can be read.
+            OSError: the file cannot be opened.
+        """
+        with path.open("rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(0)
+            if file.read(len(magic)) != magic:
+                raise SalvageError(f"not {self.form}")
+            reason = self.traverse(file, size)
+        if not self.channels:
+            raise SalvageError(reason or self.empty)
+        source = ScannedSource(path, self.channels, self.chunks, self.places)
+        if reason or unclosed:
+            source.unread = self.stats.text(reason or unclosed)
+        return source
+
+
+class UnpackedSource:
+    """Messages unpacked as they are read; one that cannot be unpacked is omitted and reported."""
+
+    def __init__(self, packed: Source) -> None:
+        self.channels = packed.channels
+        self._packed = packed
+        self._refused = ""
+
+    @property
+    def count(self) -> int:
+        """Return the number of messages, compressed or not."""
+        return self._packed.count
+
+    @property
+    def unread(self) -> str:
+        """Return why some could not be read or unpacked."""
+        return "; ".join(text for text in (self._packed.unread, self._refused) if text)
+
+    def messages(self) -> Iterator[Message]:
+        """Yield messages in time order."""
+        for message in self._packed.messages():
+            try:
+                raw = unpack("zstd", message.raw)
+            except SalvageError as error:
+                self._refused = self._refused or f"a message could not be unpacked: {error}"
+                continue
+            yield message._replace(raw=raw)
+
+    def close(self) -> None:
+        """Close the files."""
+        self._packed.close()
+
+
+class JoinedSource:
+    """The parts of a split recording; equal channels become one."""
+
+    def __init__(self, parts: Sequence[Source]) -> None:
+        self.channels: list[Channel] = []
+        self._parts = parts
+        self._indexes: list[list[int]] = []
+        known: dict[Channel, int] = {}
+        for part in parts:
+            indexes = []
+            for channel in part.channels:
+                if channel not in known:
+                    known[channel] = len(self.channels)
+                    self.channels.append(channel)
+                indexes.append(known[channel])
+            self._indexes.append(indexes)
+
+    @property
+    def count(self) -> int:
+        """Return the messages of all parts."""
+        return sum(part.count for part in self._parts)
+
+    @property
+    def unread(self) -> str:
+        """Return the reports of the parts."""
+        return "; ".join(part.unread for part in self._parts if part.unread)
+
+    def messages(self) -> Iterator[Message]:
+        """Yield messages in time order."""
+        streams = [
+            _renumbered(part.messages(), indexes) for part, indexes in zip(self._parts, self._indexes, strict=True)
+        ]
+        return heapq.merge(*streams, key=lambda message: message.stamp_ns)
+
+    def close(self) -> None:
+        """Close the parts."""
+        for part in self._parts:
+            part.close()
+
+
+def _renumbered(messages: Iterator[Message], indexes: list[int]) -> Iterator[Message]:
+    for message in messages:
+        yield message._replace(channel=indexes[message.channel])

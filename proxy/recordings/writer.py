@@ -47,7 +47,7 @@ class BagWriter:
 
     def __init__(self, path: Path | str, ros: RosVersion) -> None:
         self.path = Path(path)
-        self._ros = ros
+        self.ros = ros
         if self.path.exists():
             raise LocalError(f"{self.path} exists already")
         try:
@@ -66,19 +66,14 @@ class BagWriter:
             self._writer2 = Writer2(self._folder / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
             self._writer2.open()
 
-    @property
-    def ros(self) -> RosVersion:
-        """Return the ROS version of the messages that it accepts."""
-        return self._ros
-
     def add(self, channel: Channel) -> int:
         """Return the handle of a channel, the same for an equal one.
 
         Raises:
             LocalError: a channel of the other ROS, one that the format cannot hold, or one too many.
         """
-        if channel.ros != self._ros:
-            raise LocalError(f"{channel.topic} is of ROS {channel.ros}, the recording of ROS {self._ros}")
+        if channel.ros != self.ros:
+            raise LocalError(f"{channel.topic} is of ROS {channel.ros}, the recording of ROS {self.ros}")
         reporter = _reporter(channel)
         if reporter not in self._handles:
             size = self._definitions_bytes + definition_bytes(channel.definition)
@@ -96,7 +91,6 @@ class BagWriter:
         """Record one message.
 
         Args:
-            handle: from ``add``.
             stamp_ns: Unix time; of ROS 1 at most 32 bits of seconds.
             raw: the message in its own wire form.
 
@@ -104,7 +98,7 @@ class BagWriter:
             LocalError: closed, a stamp out of range, or the disk is full.
         """
         connection = self._connections[handle]
-        if not 0 <= stamp_ns < _STAMPS_NS[self._ros]:
+        if not 0 <= stamp_ns < _STAMPS_NS[self.ros]:
             raise LocalError(f"{self.path}: a stamp of {stamp_ns} ns cannot be recorded")
         try:
             if self._writer1 is not None:

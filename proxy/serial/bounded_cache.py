@@ -26,12 +26,7 @@ def digest_of(*texts: str | int) -> bytes:
 
 
 class BoundedCache(Generic[_Result]):
-    """Keeps results, and errors of one kind.
-
-    Args:
-        count_max: results kept.
-        refusal: the error that is kept as a result.
-    """
+    """Keeps results, and errors of one kind; ``refusal``: the error that is kept as a result."""
 
     def __init__(self, count_max: int, refusal: type[Exception]) -> None:
         self._count_max = count_max

@@ -5,7 +5,7 @@ Sans-I/O. The wire form is a bounded CBOR map with one-letter keys; a malformed 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, astuple, dataclass
 from typing import Final, Literal, TypeAlias
 
 import cbor2
@@ -14,11 +14,12 @@ from gdp.errors import DropReason, LocalError, RemoteError
 from proxy.serial.cbor_bounds import check_bounds
 from proxy.serial.schema import DEFINITION_MAX_BYTES, definition_bytes
 
-__all__ = ["Channel", "DefinitionFormat", "Qos", "RosVersion"]
+__all__ = ["NEVER", "Channel", "DefinitionFormat", "Qos", "RosVersion"]
 
 RosVersion: TypeAlias = Literal[1, 2]
 DefinitionFormat: TypeAlias = Literal["msg", "idl", ""]
 
+NEVER: Final = (9_223_372_036, 854_775_807)  # ROS 2's form of an infinite duration
 _ITEMS_MAX: Final = 4_096
 CHANNEL_MAX_BYTES: Final = 128 << 10
 _TEXT_MAX: Final = 1024
@@ -26,19 +27,19 @@ _QOS_MAX: Final = 64
 _TIME_MAX: Final = 1 << 63
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Qos:
     """One offered QoS profile. Policies have ROS 2's names in lower case; durations are (seconds, nanoseconds)."""
 
-    history: str
+    history: str = "keep_last"
     depth: int
     reliability: str
     durability: str
-    deadline: tuple[int, int]
-    lifespan: tuple[int, int]
-    liveliness: str
-    lease: tuple[int, int]
-    plain_names: bool  # avoid_ros_namespace_conventions
+    deadline: tuple[int, int] = NEVER
+    lifespan: tuple[int, int] = NEVER
+    liveliness: str = "automatic"
+    lease: tuple[int, int] = NEVER
+    plain_names: bool = False  # avoid_ros_namespace_conventions
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,12 +47,9 @@ class Channel:
     """One publisher's topic, or one topic of a recording.
 
     Args:
-        topic: the local name.
         type_name: as ROS 2 writes it (``sensor_msgs/msg/Image``), for ROS 1 too.
-        ros: ROS version of the wire form.
         hash: md5 sum for ROS 1, ``RIHS01_...`` for ROS 2; empty where unknown.
         definition: full text, used types included; empty where unknown, or for a type without fields.
-        definition_format: of ``definition``; empty: there is none.
         qos: offered profiles, ROS 2 only.
         latched: late joiners get the last message.
         callerid: the publishing node, ROS 1 only, where known.
@@ -60,6 +58,7 @@ class Channel:
     topic: str
     type_name: str
     ros: RosVersion
+    _: KW_ONLY
     hash: str = ""
     definition: str = ""
     definition_format: DefinitionFormat = ""
@@ -83,7 +82,7 @@ class Channel:
             "l": self.latched,
         }
         if self.qos:
-            fields["q"] = [_qos_fields(profile) for profile in self.qos]
+            fields["q"] = [astuple(profile) for profile in self.qos]
         if self.callerid is not None:
             fields["c"] = self.callerid
         wire = cbor2.dumps(fields, canonical=True)
@@ -128,20 +127,6 @@ class Channel:
             latched=_flag(fields.get("l")),
             callerid=None if callerid is None else _text(callerid),
         )
-
-
-def _qos_fields(profile: Qos) -> list[object]:
-    return [
-        profile.history,
-        profile.depth,
-        profile.reliability,
-        profile.durability,
-        list(profile.deadline),
-        list(profile.lifespan),
-        profile.liveliness,
-        list(profile.lease),
-        profile.plain_names,
-    ]
 
 
 def _qos(fields: object) -> Qos:

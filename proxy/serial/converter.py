@@ -23,9 +23,8 @@ from proxy.serial.type_translation import bounds_of, md5_text, retyped, rihs01, 
 __all__ = ["MessageConverter", "translated_channel"]
 
 _NATIVE: Final = NativeDialect()
-_NEVER: Final = (9_223_372_036, 854_775_807)
 # QoS equivalent of a latching ROS 1 publisher: every late joiner gets its last message.
-_LATCHED: Final = Qos("keep_last", 1, "reliable", "transient_local", _NEVER, _NEVER, "automatic", _NEVER, False)
+_LATCHED: Final = Qos(depth=1, reliability="reliable", durability="transient_local")
 
 
 def translated_channel(channel: Channel, ros: RosVersion) -> Channel:

@@ -19,7 +19,6 @@ def items_of(kind: Type, known: dict[int, int]) -> int:
     """Return the number of records, lists and texts in one value, itself included; items of sequences are not counted.
 
     Args:
-        kind: a field's type.
         known: results so far, by the record's identity; extended.
     """
     if isinstance(kind, Number):

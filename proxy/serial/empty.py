@@ -35,9 +35,6 @@ _LEAVES: Final = _Leaves()
 class NoAnswer:
     """Response of a ROS 2 service that has no answer.
 
-    Args:
-        response: the service's response.
-
     Raises:
         DefinitionError: its definition cannot be read, or its fixed arrays are too large.
 

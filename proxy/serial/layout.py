@@ -77,7 +77,6 @@ def inline_codes(kind: Type, inline_max: int, known: dict[int, str | None]) -> s
     """Return the codes of a type that consists of numbers only and has a fixed size, None for any other.
 
     Args:
-        kind: a field's type.
         inline_max: longest fixed array that may count.
         known: results so far, by the record's identity; extended.
     """

@@ -134,7 +134,6 @@ def parse(type_name: str, definition: str, definition_format: str, ros: int) -> 
         type_name: as ROS 2 writes it, such as ``sensor_msgs/msg/Image``.
         definition: the full text, every used type after a line of 80 ``=``.
         definition_format: ``msg`` or ``idl``; empty means that there is no definition.
-        ros: 1 or 2.
 
     Raises:
         UnparsedError: the text cannot be read.

@@ -50,10 +50,6 @@ class Serializer:
 
     A message that does not fit the channel's definition, and every message of a channel without one, travels opaque:
     ``{"$raw": bytes}``. Nothing is lost; only the readable form is.
-
-    Args:
-        channel: description of the messages.
-        encoding: of the bodies.
     """
 
     __slots__ = ("_codec", "_encoding", "channel", "opaque")

@@ -25,7 +25,6 @@ class Service:
     """A service.
 
     Args:
-        name: the local name.
         type_name: as ROS 2 writes it (``std_srvs/srv/SetBool``), for ROS 1 too.
         hash: md5 sum of the ROS 1 service, ``RIHS01_...`` for ROS 2; empty where unknown.
         request: of type ``std_srvs/srv/SetBool_Request``, for ROS 1 too; its ``topic`` is the service's name.

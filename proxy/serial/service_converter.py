@@ -1,6 +1,6 @@
 """Converter of a service between ROS 1 and ROS 2: its description in the other ROS, its requests and responses.
 
-Sans-I/O.
+Sans-I/O. Errors are those of ``converter``, for either half.
 Source: ``genmsg.gentools`` (md5 of a service: over the md5 texts of request and response, one after the other);
 ``rosidl_generator_type_description`` (RIHS01 of a service: a structure of request, response and event).
 """
@@ -25,11 +25,7 @@ _EVENT_INFO: Final = "service_msgs/msg/ServiceEventInfo"
 
 
 def translated_service(service: Service, ros: RosVersion) -> Service:
-    """Return the service in ROS ``ros``.
-
-    Raises:
-        DefinitionError: as ``translated_channel``, of either half.
-    """
+    """Return the service in ROS ``ros``."""
     if service.ros == ros:
         return service
     converter = Service(
@@ -44,11 +40,7 @@ def translated_service(service: Service, ros: RosVersion) -> Service:
 
 
 class ServiceConverter:
-    """Converter between a client's description ``source`` and a server's description ``target`` of a service.
-
-    Raises:
-        DefinitionError: the definitions do not match; see ``MessageConverter``.
-    """
+    """Converter between a client's description ``source`` and a server's description ``target`` of a service."""
 
     __slots__ = ("request", "response")
 

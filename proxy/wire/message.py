@@ -2,6 +2,7 @@
 
 Sans-I/O. Wire form of a message, big-endian: ``version (1) | channel (2) | stamp in ns (8) | body``. A description is a
 map in deterministic CBOR: ``e`` the encoding of all bodies, ``c`` the channels to which the messages' numbers refer.
+Invalid bytes raise ``RemoteError`` (MALFORMED).
 """
 
 from __future__ import annotations
@@ -42,11 +43,7 @@ class RosMessage(NamedTuple):
 
     @classmethod
     def from_wire(cls, wire: bytes) -> RosMessage:
-        """Read the wire form.
-
-        Raises:
-            RemoteError: MALFORMED.
-        """
+        """Read the wire form."""
         if len(wire) < _HEAD.size:
             raise RemoteError(DropReason.MALFORMED, "parcel")
         version, channel, stamp_ns = _HEAD.unpack_from(wire)
@@ -85,11 +82,7 @@ class TopicDescription:
 
     @classmethod
     def from_wire(cls, wire: bytes) -> TopicDescription:
-        """Read the wire form.
-
-        Raises:
-            RemoteError: MALFORMED, for any invalid bytes.
-        """
+        """Read the wire form."""
         match decode(wire, DESCRIPTION_MAX_BYTES):
             case {"e": str(encoding), "c": [*channels]} if encoding in _ENCODINGS and 0 < len(channels) <= CHANNELS_MAX:
                 wires = [each for each in channels if isinstance(each, bytes)]

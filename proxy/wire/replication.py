@@ -1,6 +1,7 @@
 """Replication messages between the proxies of a service with state. The log's entries travel as requests do.
 
 Sans-I/O. Wire form: version (1) | 0x40 in the position of a part (1) | deterministic CBOR.
+Invalid bytes raise ``RemoteError`` (MALFORMED).
 """
 
 from __future__ import annotations
@@ -53,11 +54,7 @@ def to_wire(word: SequencerMessage | FollowerMessage) -> bytes:
 
 
 def sequencer_message(wire: bytes) -> SequencerMessage:
-    """Parse a sequencer's message.
-
-    Raises:
-        RemoteError: MALFORMED, for any invalid bytes.
-    """
+    """Parse a sequencer's message."""
     match _read(wire):
         case ["keep", int(incarnation_id)]:
             return ReplicaProbe(incarnation_id)
@@ -78,11 +75,7 @@ def sequencer_message(wire: bytes) -> SequencerMessage:
 
 
 def follower_message(wire: bytes) -> FollowerMessage:
-    """Parse a replica's message.
-
-    Raises:
-        RemoteError: MALFORMED, for any invalid bytes.
-    """
+    """Parse a replica's message."""
     match _read(wire):
         case ["position", int(g), int(incarnation_id), int(at), int(held), bool(is_lost), bool(tells), None]:
             return ReplicaStatus(LogId(g, incarnation_id), at, held, is_lost, tells)

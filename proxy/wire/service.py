@@ -1,6 +1,8 @@
 """Service protocol: wire forms of the calls of a service or an action inside sealed messages, and its description.
 
-Sans-I/O. A service has one part, itself. An action has five, in this order: the services ``send_goal``, ``cancel_goal``
+Sans-I/O. Every ``from_wire`` raises ``RemoteError`` (MALFORMED or BAD_VERSION) for any invalid bytes.
+
+A service has one part, itself. An action has five, in this order: the services ``send_goal``, ``cancel_goal``
 and ``get_result``, and the topics ``feedback`` and ``status``. Wire forms, big-endian::
 
     request   version (1) | part (1) | call (8) | patience in ms, 0: none (4) | body
@@ -61,11 +63,7 @@ class Request(NamedTuple):
 
     @classmethod
     def from_wire(cls, wire: bytes) -> Request:
-        """Read the wire form.
-
-        Raises:
-            RemoteError: MALFORMED or BAD_VERSION.
-        """
+        """Read the wire form."""
         part, call, patience_ms = _head(_REQUEST, wire)
         return cls(part, call, patience_ms, wire[_REQUEST.size :])
 
@@ -87,11 +85,7 @@ class Stop(NamedTuple):
 
     @classmethod
     def from_wire(cls, wire: bytes) -> Stop:
-        """Read the wire form.
-
-        Raises:
-            RemoteError: MALFORMED or BAD_VERSION.
-        """
+        """Read the wire form."""
         (part,) = _head(_STOP, wire)
         calls = wire[_STOP.size :]
         if not part & _STOPS or not calls or len(calls) % _CALL.size:
@@ -125,11 +119,7 @@ class Answer(NamedTuple):
 
     @classmethod
     def from_wire(cls, wire: bytes) -> Answer:
-        """Read the wire form.
-
-        Raises:
-            RemoteError: MALFORMED or BAD_VERSION.
-        """
+        """Read the wire form."""
         part, call, outcome = _head(_ANSWER, wire)
         if outcome not in Outcome.__members__.values():
             raise RemoteError(DropReason.MALFORMED, "an answer that says neither yes nor no")
@@ -149,11 +139,7 @@ class News(NamedTuple):
 
     @classmethod
     def from_wire(cls, wire: bytes) -> News:
-        """Read the wire form.
-
-        Raises:
-            RemoteError: MALFORMED or BAD_VERSION.
-        """
+        """Read the wire form."""
         part, stamp_ns = _head(_NEWS, wire)
         return cls(part, stamp_ns, wire[_NEWS.size :])
 
@@ -181,7 +167,6 @@ class Exchange:
     """Description of a service or an action by one side, with its encoding.
 
     Args:
-        services: by part.
         topics: of an action; their parts follow the services'.
         is_leaving: the server answers what is under way, and then leaves; clients use others.
         is_ordered: it keeps state, and executes requests in one order only.
@@ -206,11 +191,7 @@ class Exchange:
 
     @classmethod
     def from_wire(cls, wire: bytes) -> Exchange:
-        """Read the wire form.
-
-        Raises:
-            RemoteError: MALFORMED, for any invalid bytes.
-        """
+        """Read the wire form."""
         match decode(wire, 2 * PARTS_MAX * CHANNEL_MAX_BYTES):
             case {"e": str(encoding), "s": [*services], "c": [*topics], **more} if (
                 encoding in _ENCODINGS and services and len(services) + len(topics) <= PARTS_MAX

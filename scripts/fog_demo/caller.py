@@ -34,7 +34,7 @@ class _Answer(Protocol):
     message: str
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Tally:
     """Statistics of calls; only the newest latencies are kept."""
 

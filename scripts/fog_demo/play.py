@@ -36,13 +36,7 @@ _PATIENCE_S: Final = 60.0
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """Timing of the scenario.
-
-    Args:
-        rate_hz: requests a second.
-        calm_s: seconds of undisturbed traffic before, between and after the faults.
-        notice_s: between a preemption's notice and its end.
-    """
+    """Timing of the scenario; ``notice_s``: between a preemption's notice and its end."""
 
     rate_hz: float = 50.0
     calm_s: float = 6.0
@@ -112,23 +106,18 @@ class _Looking:
         left = event.count("under_way") if event.fields.get("done") else 0
         won = sorted((name, int(str(count))) for name, count in event.part("by_machine").fields.items())
         self.counts = Counts(
-            event.count("calls") + event.count("unserved"),
-            answered,
-            event.count("failed") + event.count("wrong") + event.count("unserved") + left,
-            event.number_or_none("median_ms"),
-            event.number_or_none("p99_ms"),
-            rate,
-            tuple(won),
+            requests=event.count("calls") + event.count("unserved"),
+            answered=answered,
+            failed=event.count("failed") + event.count("wrong") + event.count("unserved") + left,
+            median_ms=event.number_or_none("median_ms"),
+            p99_ms=event.number_or_none("p99_ms"),
+            rate=rate,
+            by_machine=tuple(won),
         )
 
 
 async def play(stage: Stage, launch_file: Path, pace: Pace, view: View) -> Outcome:
-    """Run the scenario on a new stage.
-
-    Raises:
-        ChildError: a process failed.
-        LocalError: an expected event did not occur in time.
-    """
+    """Run the scenario on a new stage."""
     view.step("a ring of five switches, the RIB at nuc3, the robot at nuc1, the site of fog beyond nuc5")
     plane = await stage.stand_up()
     site = open_site(stage.site_file, stage.state)
@@ -200,11 +189,7 @@ def _is_gone(looking: _Looking, machine: Record) -> bool:
 
 
 async def _until(is_met: Callable[[], bool], what: str) -> None:
-    """Poll until a condition without notification holds.
-
-    Raises:
-        LocalError: it does not hold in time.
-    """
+    """Poll until a condition without notification holds."""
     end_s = time.monotonic() + _PATIENCE_S
     while not is_met():
         if time.monotonic() > end_s:

@@ -52,9 +52,6 @@ class Stage:
 
     Args:
         run: registry that takes down the ring; ``end_all_of`` first takes down the resources of ``fog``.
-
-    Raises:
-        LocalError: the kernel refuses.
     """
 
     def __init__(self, run: Run) -> None:
@@ -73,11 +70,7 @@ class Stage:
         self.site_file = run.directory / SITE
 
     async def stand_up(self) -> str:
-        """Start switches, RIB and the robot's proxy; return the data plane of the switches.
-
-        Raises:
-            ChildError: a process failed.
-        """
+        """Start switches, RIB and the robot's proxy; return the data plane of the switches."""
         uplink = f"fog{self._run.id}-up"
         proxy, far_switch = self._write_proxy(), self._write_far_switch(uplink)
         self._write_site(uplink, proxy, far_switch)

@@ -26,14 +26,12 @@ _EVENTS: Final = 10  # number of the newest events shown
 _PLAIN_EVERY_S: Final = 4.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Counts:
     """Request statistics of the robot's node.
 
     Args:
         failed: requests without a response or with a wrong one, and requests that were not sent for lack of a server.
-        rate: recent responses a second.
-        by_machine: machine -> number of its first responses.
     """
 
     requests: int = 0
@@ -56,11 +54,7 @@ class Counts:
 
 
 class View:
-    """Display of steps, machines, events and counts; a context manager.
-
-    Args:
-        console: destination.
-    """
+    """Display of steps, machines, events and counts; a context manager."""
 
     def __init__(self, console: Console) -> None:
         self._console = console

@@ -26,7 +26,10 @@ _TAIL_LINES: Final = 12
 
 
 class ChildError(GdpError):
-    """A process ended too early, or did not report the awaited event in time; the text shows its last lines."""
+    """A process ended too early, or did not report the awaited event in time; the text shows its last lines.
+
+    Every method of the harness that waits for processes may raise it.
+    """
 
 
 class Child:
@@ -35,7 +38,6 @@ class Child:
     Args:
         label: display name, such as ``switch nuc1``.
         argv: the command line; inherited by exec, so that the process id stays.
-        log: a file to create.
         heard: False: its standard output is not read, and goes to the log too.
     """
 
@@ -69,22 +71,14 @@ class Child:
             yield Event.from_line(line.decode("utf-8", "replace"))
 
     async def wait_for(self, name: str, patience_s: float) -> Event:
-        """Return the next event of this name; others on the way are skipped.
-
-        Raises:
-            ChildError: the process ended, or ``patience_s`` seconds passed.
-        """
+        """Return the next event of this name; others on the way are skipped."""
         try:
             return await asyncio.wait_for(self._next(name), patience_s)
         except asyncio.TimeoutError:
             raise self.failed(f"did not say {name!r} within {patience_s:g} s") from None
 
     async def wait(self, patience_s: float) -> int:
-        """Return the exit code.
-
-        Raises:
-            ChildError: the process still runs after ``patience_s``.
-        """
+        """Return the exit code."""
         try:
             return await asyncio.wait_for(asyncio.shield(self.ended), patience_s)
         except asyncio.TimeoutError:

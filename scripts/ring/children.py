@@ -15,7 +15,7 @@ from gdp.simulation.namespaces import Namespaces
 from ring.child import Child
 from ring.events import Event
 
-__all__ = ["READY_S", "Children", "cancel"]
+__all__ = ["READY_S", "Children", "cancel", "gathered"]
 
 READY_S: Final = 60.0
 
@@ -60,12 +60,8 @@ class Children:
         return self.start(f"{role} {node}", argv, heard=heard)
 
     async def ready(self, children: Sequence[Child]) -> list[Event]:
-        """Wait until each has reported ``ready``, and return these events; from then on they are required.
-
-        Raises:
-            ChildError: one did not, or a required one ended.
-        """
-        said = await self.guarded(_all(child.wait_for("ready", READY_S) for child in children))
+        """Wait until each has reported ``ready``, and return these events; from then on they are required."""
+        said = await self.guarded(gathered(child.wait_for("ready", READY_S) for child in children))
         self._standing += children
         self._changed.set()
         return said
@@ -82,11 +78,7 @@ class Children:
         await child.ended
 
     async def guarded(self, work: Coroutine[None, None, T]) -> T:
-        """Run ``work``, but stop at once if a required process ends.
-
-        Raises:
-            ChildError: one ended.
-        """
+        """Run ``work``, but stop at once if a required process ends."""
         task = asyncio.ensure_future(work)
         fallen = asyncio.ensure_future(self._first_to_fall())
         try:
@@ -128,5 +120,6 @@ async def cancel(*tasks: asyncio.Future[T] | asyncio.Future[Child]) -> None:
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def _all(works: Iterable[Coroutine[None, None, Event]]) -> list[Event]:
+async def gathered(works: Iterable[Coroutine[None, None, Event]]) -> list[Event]:
+    """Run all at once; return their events in order."""
     return await asyncio.gather(*works)

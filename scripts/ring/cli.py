@@ -186,12 +186,12 @@ async def _go(options: Options, run: Run, errors: Console) -> int:
         try:
             result = await standing.result()
         finally:
-            standing.forget()
+            standing.overlay.children.forget()
     _show(result)
     _write(options, result, standing.recording)
     if options.keep:
         _hint(run, hints(standing, standing.start_again()), errors)
-        standing.forget()
+        standing.overlay.children.forget()
     return _PASSED if result.passed else _FAILED
 
 
@@ -201,13 +201,13 @@ async def _go_live(options: Options, live: Live, run: Run, errors: Console) -> i
         try:
             result = await standing.result()
         finally:
-            standing.forget()
+            standing.overlay.children.forget()
     _show(result)
     _write(options, result)
     if options.keep:
         standing.go_on()
         _hint(run, live_hints(standing), errors)
-        standing.forget()
+        standing.overlay.children.forget()
     return _PASSED if result.passed else _FAILED
 
 

@@ -28,10 +28,10 @@ _MIDDLE: Final = "nuc3"
 class Overlay:
     """The overlay of one run, from its creation; other modules start the proxies.
 
+    A fault that the kernel refuses raises ``LocalError``.
+
     Args:
-        options: of the run.
         run: removes what is created here.
-        teller: reports progress.
 
     Raises:
         LocalError: the kernel refuses namespaces.
@@ -62,11 +62,7 @@ class Overlay:
         return {**self.options.settings(), "data_plane": ", ".join(self._planes)}
 
     async def stand_up(self) -> None:
-        """Start switches and RIBs; return when all are ready.
-
-        Raises:
-            ChildError: a process failed.
-        """
+        """Start switches and RIBs; return when all are ready."""
         if self.options.pcap is not None:
             ifaces = [f"--iface={link.other(_MIDDLE)}" for link in self.topology.links_of(_MIDDLE)]
             capture = self.start(_MIDDLE, "capture", ["-m", "gdp.ports.capture", *ifaces, str(self.options.pcap)])
@@ -98,19 +94,11 @@ class Overlay:
         return self.children.start_in(self.namespaces, node, role, arguments, heard=heard, environment=environment)
 
     async def cut(self, cut: Cut) -> None:
-        """Take a link down.
-
-        Raises:
-            LocalError: the kernel refuses.
-        """
+        """Take a link down."""
         await asyncio.to_thread(self.namespaces.cut, cut.a, cut.b)
 
     async def heal(self, cut: Cut) -> None:
-        """Bring a link back.
-
-        Raises:
-            LocalError: the kernel refuses.
-        """
+        """Bring a link back."""
         await asyncio.to_thread(self.namespaces.restore_link, cut.a, cut.b)
 
     async def kill(self, kill: Kill) -> None:
@@ -120,11 +108,7 @@ class Overlay:
             await self.children.kill(running[node])
 
     async def restart(self, kill: Kill) -> None:
-        """Restart a killed process; return when it is ready.
-
-        Raises:
-            ChildError: it does not start.
-        """
+        """Restart a killed process; return when it is ready."""
         self._restarts += 1
         running, start = (self.switches, self._start_switch) if kill.role == "switch" else (self._ribs, self._start_rib)
         for node in kill.victims(self.topology):
@@ -132,11 +116,7 @@ class Overlay:
             await self.children.ready([child])
 
     async def roam(self, roam: Roam) -> None:
-        """Move a proxy's cable to another switch.
-
-        Raises:
-            LocalError: the kernel refuses.
-        """
+        """Move a proxy's cable to another switch."""
         home = roam.proxy(self.topology).switch
         await asyncio.to_thread(self.namespaces.unplug, home, roam.who)
         await asyncio.to_thread(self.namespaces.plug, home, roam.who, roam.to)
@@ -147,7 +127,3 @@ class Overlay:
     def _start_rib(self, node: str, config: Path, prefix: str = "") -> Child:
         argv = ["-m", "gdp.cli.rib", "--config", str(config), "--json", "--await-iface", f"{READY_S:g}"]
         return self.start(node, f"{prefix}rib", argv)
-
-    def forget(self) -> None:
-        """Close the descriptors of the processes here; they continue."""
-        self.children.forget()

@@ -1,6 +1,7 @@
 """Faults of a run, as data: links cut, proxies that roam, processes killed; and the check that a path remains.
 
-Sans-I/O. All seconds count from the time at which the first message may be sent.
+Sans-I/O. All seconds count from the time at which the first message may be sent. An unknown switch, RIB or proxy raises
+``LocalError``.
 """
 
 from __future__ import annotations
@@ -61,7 +62,6 @@ class Kill:
     """A process killed with SIGKILL after ``after_s`` and, unless ``until_s`` is None, restarted.
 
     Args:
-        role: of the process.
         of: a switch; for a RIB its domain, or the switch to which it is attached.
     """
 
@@ -91,11 +91,7 @@ class Kill:
         return frozenset((f"{self.role}:{self.of}",))
 
     def victims(self, topology: Topology) -> tuple[str, ...]:
-        """Return the switches at which a process of this role is killed.
-
-        Raises:
-            LocalError: there is no such process.
-        """
+        """Return the switches at which a process of this role is killed."""
         if self.role == "switch":
             topology.domain_of(self.of)
             return (self.of,)
@@ -112,11 +108,7 @@ class Kill:
 
 @dataclass(frozen=True, slots=True)
 class Roam:
-    """A proxy whose cable moves to another switch after ``after_s``.
-
-    Args:
-        who: the proxy's device, such as ``robot``.
-    """
+    """A proxy whose cable moves to another switch after ``after_s``; ``who``: the proxy's device, such as ``robot``."""
 
     who: str
     to: str
@@ -135,11 +127,7 @@ class Roam:
         return cls(found[1], found[2], float(found[3]))
 
     def proxy(self, topology: Topology) -> Attachment:
-        """Return the proxy that roams.
-
-        Raises:
-            LocalError: there is no such proxy.
-        """
+        """Return the proxy that roams."""
         proxies = topology.attached("proxy")
         for at in proxies:
             if at.ifname == self.who:
@@ -154,11 +142,7 @@ Fault: TypeAlias = "Cut | Kill | Roam"
 
 
 def roamers(faults: Iterable[Fault], topology: Topology) -> tuple[Attachment, ...]:
-    """Return the proxies that roam, each once.
-
-    Raises:
-        LocalError: there is no such proxy.
-    """
+    """Return the proxies that roam, each once."""
     return tuple(dict.fromkeys(fault.proxy(topology) for fault in faults if isinstance(fault, Roam)))
 
 
@@ -166,8 +150,6 @@ def check_faults(topology: Topology, faults: Sequence[Fault], duration_s: float 
     """Refuse impossible faults, and faults that separate both proxies permanently.
 
     Args:
-        topology: with two proxies.
-        faults: in any order.
         duration_s: of the traffic; None: unknown in advance.
 
     Raises:

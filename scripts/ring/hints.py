@@ -19,14 +19,9 @@ __all__ = ["common", "hints", "inside", "live_hints"]
 
 
 def hints(ring: Ring, again: Path) -> list[tuple[str, str]]:
-    """Return pairs of (effect, command line) in the recommended order.
-
-    Args:
-        ring: still running.
-        again: the file of its new receiver.
-    """
+    """Return pairs of (effect, command line) in the recommended order; ``again``: the file of its new receiver."""
     replay = Path(sys.executable).with_name("gdp-replay")
-    sender = f"{replay} {shlex.quote(str(ring.bag))} --config {ring.sender_config}"
+    sender = f"{replay} {shlex.quote(str(ring.bag))} --config {ring.overlay.materials.proxy_file(ring.overlay.robot)}"
     return [(f"send the recording again, into {again}", inside(ring.overlay, "nuc1", sender)), *common(ring.overlay)]
 
 

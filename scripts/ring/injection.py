@@ -49,12 +49,7 @@ class Injection:
         await cancel(*self._tasks.values())
 
     def complaints(self) -> list[str]:
-        """Return, after the stop, the faults that came too late.
-
-        Raises:
-            LocalError: a fault was due, and could not be injected.
-            ChildError: a process did not restart.
-        """
+        """Return, after the stop, the faults that came too late."""
         for task in self._tasks.values():
             if not task.cancelled():
                 task.result()

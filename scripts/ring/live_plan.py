@@ -115,7 +115,6 @@ class Graph:
 
         Args:
             logs: directory for ROS's logs.
-            profiles: file that holds ``FAST_DDS_PROFILES``.
         """
         if self.ros == 1:
             return {"ROS_MASTER_URI": self._master, "ROS_HOSTNAME": "127.0.0.1", "ROS_LOG_DIR": str(logs)}

@@ -31,7 +31,6 @@ def rows(heard: Heard, carried: Sequence[Event]) -> tuple[TopicResult, ...]:
     """Return the rows of the table.
 
     Args:
-        heard: reports of the nodes.
         carried: measurements of the server's proxy, one event a topic; latencies are the listener's.
     """
     reports = [_with_latency(each, _of(each.text("topic"), heard.listener.parts("topics"))) for each in carried]
@@ -64,7 +63,7 @@ def _lamp(heard: Heard) -> TopicResult:
     )
     latency = heard.caller.part("latency_ms")
     median_ms, p99_ms, max_ms = (latency.number_or_none(key) for key in ("median", "p99", "max"))
-    way = Journey(median_ms, p99_ms, max_ms, silent_ms=heard.caller.number_or_none("silent_ms"))
+    way = Journey(median_ms=median_ms, p99_ms=p99_ms, max_ms=max_ms, silent_ms=heard.caller.number_or_none("silent_ms"))
     return TopicResult(comparison, way, is_service=True)
 
 

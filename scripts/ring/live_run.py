@@ -37,10 +37,7 @@ class LiveRing:
     """The ring of one live run, from its creation.
 
     Args:
-        options: of the run.
-        live: ROS versions of the sides.
         run: removes what is created here.
-        teller: reports progress.
 
     Raises:
         LocalError: a ROS is missing, or the kernel refuses namespaces.
@@ -60,12 +57,7 @@ class LiveRing:
         self._nodes: list[Child] = []
 
     async def result(self) -> Result:
-        """Run the traffic between robot and server, and compare.
-
-        Raises:
-            ChildError: a process failed.
-            LocalError: a fault cannot be injected.
-        """
+        """Run the traffic between robot and server, and compare."""
         overlay, children = self.overlay, self.overlay.children
         await overlay.stand_up()
         await children.ready([self._start_master(at, graph) for at, graph, _ in self._ends if graph.ros == 1])
@@ -83,7 +75,7 @@ class LiveRing:
         traffic_s = time.monotonic() - begun_s
         self._reporter.step("comparing what was published with what was heard")
         result = await self._compare(heard, injection.complaints())
-        return replace(result, traffic_s=traffic_s, silent_s=session.silent_s)
+        return replace(result, traffic_s=traffic_s, silent_s=session.silence.longest_s)
 
     def go_on(self) -> None:
         """Replace the proxies that have reported by ones that outlive this process, and continue the nodes' traffic."""
@@ -100,10 +92,6 @@ class LiveRing:
     def environment(self, graph: Graph) -> Mapping[str, str]:
         """Return the environment of the processes in a graph."""
         return graph.environment(self._run.directory / "ros-logs", self._profiles)
-
-    def forget(self) -> None:
-        """Close the descriptors of the processes here; they continue."""
-        self.overlay.forget()
 
     async def _live_nodes(self) -> LiveNodes:
         """Start the nodes; return when all are ready."""

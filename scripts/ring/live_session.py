@@ -8,12 +8,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import Awaitable, Coroutine, Mapping
+from collections.abc import Awaitable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
 from ring.child import Child
-from ring.children import Children, cancel
+from ring.children import Children, cancel, gathered
 from ring.events import Event
 from ring.live_result import Heard
 from ring.nodes.content import LAMP
@@ -54,30 +54,17 @@ class LiveSession:
         self._received: dict[str, int] = {}
         self._asked = 0
         self._answered = 0
-        self._silence = Silence()
+        self.silence = Silence()
         self._latency_ms: float | None = None
         self._moved = asyncio.Event()
 
-    @property
-    def silent_s(self) -> float:
-        """Return the longest time in which something was due and nothing arrived, to half a second."""
-        return self._silence.longest_s
-
     async def meet(self) -> None:
-        """Wait until the remote side receives every topic and discovers the service.
-
-        Raises:
-            ChildError: a process failed, or it took too long.
-        """
+        """Wait until the remote side receives every topic and discovers the service."""
         far = (self._live_nodes.listener, self._live_nodes.caller)
-        await self._children.guarded(_all(*(child.wait_for("hears", MEET_S) for child in far)))
+        await self._children.guarded(gathered(child.wait_for("hears", MEET_S) for child in far))
 
     async def talk(self, seconds: float) -> Heard:
-        """Run the traffic for this long, wait for messages under way, and return each node's report.
-
-        Raises:
-            ChildError: a process failed, or did not report.
-        """
+        """Run the traffic for this long, wait for messages under way, and return each node's report."""
         live_nodes = self._live_nodes
         self._reporter.begin_traffic(live_nodes.messages + live_nodes.calls)
         ear = asyncio.ensure_future(self._follow(live_nodes.listener))
@@ -89,12 +76,13 @@ class LiveSession:
             speaking = [
                 _in_time(child, self._follow(child), patience_s) for child in (*live_nodes.talkers, live_nodes.caller)
             ]
-            *talkers, caller = await self._children.guarded(_all(*speaking))
+            *talkers, caller = await self._children.guarded(gathered(speaking))
             self._answered = caller.count("answered")
             await self._children.guarded(self._until_quiet())
             live_nodes.listener.interrupt()
             live_nodes.lamp.interrupt()
-            ending = _all(_in_time(live_nodes.listener, ear, ENDING_S), _in_time(live_nodes.lamp, lamp, ENDING_S))
+            nodes = ((live_nodes.listener, ear), (live_nodes.lamp, lamp))
+            ending = gathered(_in_time(node, report, ENDING_S) for node, report in nodes)
             listener_said, lamp_said = await self._children.guarded(ending)
         finally:
             await cancel(ear, lamp)
@@ -112,7 +100,7 @@ class LiveSession:
         raise child.failed(f"ended with code {await child.ended} before its report")
 
     def _note(self, child: Child, event: Event) -> None:
-        now_s, silence = time.monotonic(), self._silence
+        now_s, silence = time.monotonic(), self.silence
         if child is self._live_nodes.listener:
             received = {each.text("topic"): each.count("received") for each in event.parts("topics")}
             if received != self._received:
@@ -147,10 +135,6 @@ class LiveSession:
                 await asyncio.wait_for(self._moved.wait(), QUIET_S)
             except asyncio.TimeoutError:
                 return
-
-
-async def _all(*works: Coroutine[None, None, Event]) -> list[Event]:
-    return await asyncio.gather(*works)
 
 
 async def _in_time(child: Child, report: Awaitable[Event], patience_s: float) -> Event:

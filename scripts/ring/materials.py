@@ -38,11 +38,7 @@ class OverlayCredentials:
     """The files of one run. Its creation creates the domains and admits the switches and RIBs.
 
     Args:
-        topology: of the ring.
-        directory: the run's own.
-        metrics: whether nodes serve metrics on their loopback.
         roamers: proxies that will also be attached to other switches.
-        lease_s: of advertisements and watches.
     """
 
     def __init__(

@@ -25,20 +25,17 @@ LIVE_S: Final = 10.0
 _LIVE_MAX_S: Final = 3_600.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Options:
     """One run of the ring. Paths are absolute, because the processes that read them have other working directories.
 
     Args:
         bag: the recording; None: a generated robot drive.
         rate: 1 is the recorded pace, 0 as fast as possible.
-        keep: leave everything up afterwards.
         out: directory, created if necessary, for the received recording; None: it is deleted with the run.
-        pcap: file for a capture in the middle of the ring.
         live: real nodes instead of a recording; their ROS version. ``mixed``: ROS 1 at the robot, ROS 2 at the server.
         seconds: of traffic; a recording is replayed slower or faster to last this long, a generated one is created with
             this length. None: ``LIVE_S`` live, else the recording's own time.
-        lease_s: of every node's advertisements and watches.
 
     Raises:
         LocalError: an invalid rate, a fault that cannot be injected, a directory that is missing, a recording for a

@@ -148,12 +148,8 @@ def proxy_yaml(
     """Return ``proxy.yaml`` of one proxy.
 
     Args:
-        at: its attachment.
-        credentials: of the proxy.
-        delegations: directory of its delegations.
         ros: 1 or 2, the form of the recording.
         rules: by ``expose`` and ``import``.
-        record: the file for received messages.
     """
     form = "ros1" if ros == 1 else "mcap"
     return {

@@ -18,7 +18,7 @@ __all__ = ["ProgressReporter", "Traffic"]
 _PLAIN_EVERY_S: Final = 2.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Traffic:
     """State of the replay, combined from both sides.
 
@@ -51,11 +51,7 @@ class Traffic:
 
 
 class ProgressReporter:
-    """Reports steps and traffic.
-
-    Args:
-        console: on standard error.
-    """
+    """Reports steps and traffic; ``console``: on standard error."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -78,7 +74,7 @@ class ProgressReporter:
 
     def begin_traffic(self, total: int) -> None:
         """Begin the report of ``total`` messages."""
-        self._reported, self._reported_s = Traffic(total), time.monotonic()
+        self._reported, self._reported_s = Traffic(total=total), time.monotonic()
         if self._console.is_terminal:
             columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.fields[words]}"))
             self._bar = Progress(*columns, console=self._console, transient=True)

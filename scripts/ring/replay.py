@@ -51,10 +51,6 @@ class Replay:
 
     Args:
         children: supervised throughout; the receiver is released when it is requested to finish.
-        sender: ready.
-        receiver: ready.
-        total: messages expected.
-        teller: reports the traffic.
     """
 
     def __init__(
@@ -64,18 +60,13 @@ class Replay:
         self._sender = sender
         self._receiver = receiver
         self._reporter = reporter
-        self._traffic = Traffic(total)
+        self._traffic = Traffic(total=total)
         self._silence = Silence()
         self._unconfirmed = ""  # names of topics
         self._moved = asyncio.Event()
 
     async def report(self, inject: Callable[[], Injection]) -> Report:
-        """Follow the traffic to its end, while ``inject`` causes faults.
-
-        Raises:
-            ChildError: a process failed, nothing moved for long, or a side did not finish.
-            LocalError: a fault cannot be injected.
-        """
+        """Follow the traffic to its end, while ``inject`` causes faults."""
         self._reporter.begin_traffic(self._traffic.total)
         heard = asyncio.ensure_future(self._listen(self._receiver))
         injection, begun_s = inject(), time.monotonic()

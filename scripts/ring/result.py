@@ -6,7 +6,7 @@ Sans-I/O.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 
 from proxy.recordings.compare import TopicComparison
 from ring.events import Event
@@ -14,7 +14,7 @@ from ring.events import Event
 __all__ = ["Journey", "Result", "TopicResult", "put_together"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Journey:
     """Measurements of the receiver on one topic.
 
@@ -107,12 +107,12 @@ class Result:
     Args:
         unread: why the end of the recording could not be read; None if all of it was.
         complaints: other faults, such as a side that did not finish.
-        traffic_s: duration of the traffic.
         silent_s: the longest time in which something was due and nothing came, to half a second.
     """
 
     topics: tuple[TopicResult, ...]
     settings: Mapping[str, object]
+    _: KW_ONLY
     unread: str | None = None
     complaints: tuple[str, ...] = ()
     traffic_s: float = 0.0

@@ -36,10 +36,7 @@ class Ring:
     """The ring of one run, from its creation.
 
     Args:
-        options: of the run.
         run: removes what is created here.
-        teller: reports progress.
-        bag: the recording.
 
     Raises:
         ConfigError: the recording cannot be read or is empty.
@@ -70,12 +67,7 @@ class Ring:
         return (self.options.out or self._run.directory) / name
 
     async def result(self) -> Result:
-        """Send the recording through the ring, and compare.
-
-        Raises:
-            ChildError: a process failed.
-            LocalError: a link cannot be cut.
-        """
+        """Send the recording through the ring, and compare."""
         await self.overlay.stand_up()
         receiver = self._start_receiver(self.recording)
         await self._children.ready([receiver])
@@ -89,7 +81,12 @@ class Ring:
         comparisons = await self._children.guarded(asyncio.to_thread(compare, self.bag, self.recording, exact=exact))
         topics = put_together(comparisons, report.topics)
         return Result(
-            topics, self.overlay.settings, report.unread, report.complaints, report.traffic_s, report.silent_s
+            topics,
+            self.overlay.settings,
+            unread=report.unread,
+            complaints=report.complaints,
+            traffic_s=report.traffic_s,
+            silent_s=report.silent_s,
         )
 
     def start_again(self) -> Path:
@@ -97,15 +94,6 @@ class Ring:
         path = self.recording.with_name(f"again-{self.recording.name}")
         self._start_receiver(path, heard=False)
         return path
-
-    @property
-    def sender_config(self) -> Path:
-        """Return the ``proxy.yaml`` of the robot."""
-        return self.overlay.materials.proxy_file(self.overlay.robot)
-
-    def forget(self) -> None:
-        """Close the descriptors of the processes here; they continue."""
-        self.overlay.forget()
 
     def _start_receiver(self, record: Path, *, heard: bool = True) -> Child:
         at, encoding = self.overlay.server, self.options.encoding
@@ -126,11 +114,7 @@ def _recorded_s(reader: BagReader) -> float:
 
 
 async def make_demo(run: Run, seconds: float) -> Path:
-    """Generate a demonstration recording of this length in the run's directory; return the file.
-
-    Raises:
-        ChildError: the script fails.
-    """
+    """Generate a demonstration recording of this length in the run's directory; return the file."""
     path = run.directory / "demo.mcap"
     children = Children(run, kept=False)
     try:

@@ -11,11 +11,10 @@ import pytest
 
 from fog.child_environment import child_environment
 from fog.cli.robot_nodes import run
-from fog.cluster import CloudNode
+from fog.cluster import CloudNode, RobotNode
 from fog.host.bounded_log import BoundedLog
 from fog.host.managed_process import ManagedProcess
 from fog.launch.interface_discovery_worker import _started
-from fog.launch.robot_node import RobotNode
 from fog.machine import Program
 
 SECRETS = {"AWS_SECRET_ACCESS_KEY": "s", "AWS_PROFILE": "s", "SSH_AUTH_SOCK": "s", "GITHUB_TOKEN": "s"}

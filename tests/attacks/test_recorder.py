@@ -27,7 +27,6 @@ from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.wire.message import CHANNELS_MAX, RosMessage, TopicDescription
 
 TOPIC = Name(b"t" * 32)
-NEVER = (9_223_372_036, 854_775_807)
 
 
 class Sink:
@@ -83,7 +82,7 @@ def described(*channels: Channel) -> bytes:
 
 
 def channel(topic: str = "/chatter", definition: str = "int8 a\n", depth: int = 1) -> Channel:
-    qos = Qos("keep_last", depth, "reliable", "volatile", NEVER, NEVER, "automatic", NEVER, plain_names=False)
+    qos = Qos(depth=depth, reliability="reliable", durability="volatile")
     return Channel(topic, "a/msg/B", 2, definition=definition, definition_format="msg", qos=(qos,))
 
 

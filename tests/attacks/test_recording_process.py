@@ -33,7 +33,7 @@ from proxy.serial.channel import Channel
 from tests.attacks.test_recordings import BOMB_BYTES, MESSAGES, TOPICS, database, mcap, packed, ros1
 from tests.pages import ROOT
 
-TOPIC = Channel("/t", "a/msg/B", 2, "", "int8 a\n", "msg")
+TOPIC = Channel("/t", "a/msg/B", 2, hash="", definition="int8 a\n", definition_format="msg")
 ENDS_S = 20.0
 
 
@@ -167,7 +167,15 @@ DESCRIPTION = (Kind.CHANNEL, TOPIC.to_wire())
         frames((Kind.CHANNEL, b"\xa0")),
         struct.pack("<BI", Kind.CHANNEL, 1 << 31),
         struct.pack("<BI", Kind.BLOCK, (1 << 32) - 1),
-        frames(*[(Kind.CHANNEL, Channel("/t", "a/B", 2, "", "#" * 60_000, "msg").to_wire())] * 600),
+        frames(
+            *[
+                (
+                    Kind.CHANNEL,
+                    Channel("/t", "a/B", 2, hash="", definition="#" * 60_000, definition_format="msg").to_wire(),
+                )
+            ]
+            * 600
+        ),
         frames(DESCRIPTION, (Kind.OPENED, b"")),
         frames(DESCRIPTION, (Kind.OPENED, struct.pack("<Q?Q", 1, True, 1) + bytes(8))),
         frames(DESCRIPTION, NUMBERS, (Kind.OPENED, NUMBERS[1])),

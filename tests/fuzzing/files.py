@@ -95,7 +95,9 @@ def _recording(ros: int) -> bytes:
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
         path = Path(folder) / f"a.{suffix}"
         with BagWriter(path, 1 if ros == 1 else 2) as writer:
-            channel = Channel("/t", "a/msg/B", 1 if ros == 1 else 2, "0" * 32, "int8 a\n", "msg")
+            channel = Channel(
+                "/t", "a/msg/B", 1 if ros == 1 else 2, hash="0" * 32, definition="int8 a\n", definition_format="msg"
+            )
             handle = writer.add(channel)
             for stamp in range(3):
                 writer.write(handle, 10**18 + stamp, b"\x00\x01\x00\x00x" if ros == 2 else b"x")
@@ -135,7 +137,7 @@ _METADATA: Final = b"""rosbag2_bagfile_information:
     - {topic_metadata: {name: /t, type: a/msg/B, serialization_format: cdr, offered_qos_profiles: ""}, message_count: 0}
 """
 _PARTS: Final = (
-    (Kind.CHANNEL, Channel("/t", "a/msg/B", 2, "", "int8 a\n", "msg").to_wire()),
+    (Kind.CHANNEL, Channel("/t", "a/msg/B", 2, hash="", definition="int8 a\n", definition_format="msg").to_wire()),
     (Kind.OPENED, opened_to(2, [2])),
     (Kind.BLOCK, b"".join(message_head(Message(0, at, b"abc")) + b"abc" for at in range(2))),
     (Kind.END, b"the file ends"),

@@ -19,8 +19,7 @@ from tests.fuzzing.decoder import Decoder
 __all__ = ["DECODERS"]
 
 _RULE: Final = "=" * 80 + "\n"
-_NEVER: Final = (9_223_372_036, 854_775_807)
-_QOS: Final = Qos("keep_last", 5, "reliable", "volatile", _NEVER, _NEVER, "automatic", _NEVER, plain_names=False)
+_QOS: Final = Qos(depth=5, reliability="reliable", durability="volatile")
 _MSG: Final = f"""\
 # a comment
 bool flag

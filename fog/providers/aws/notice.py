@@ -91,12 +91,7 @@ class Metadata:
 
 
 class Watch:
-    """State of the watcher.
-
-    Args:
-        notice: called once with the time of the preemption (Unix time).
-        drain: called once.
-    """
+    """State of the watcher; ``notice``: called once with the time of the preemption (Unix time)."""
 
     def __init__(self, metadata: Metadata, notice: Callable[[float], None], drain: Callable[[], None]) -> None:
         self._metadata = metadata

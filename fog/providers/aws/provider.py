@@ -14,7 +14,8 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from datetime import datetime, timezone
+from typing import TYPE_CHECKING, Final, cast
 
 from fog.hardware import Hardware
 from fog.host.bundle import pack
@@ -24,7 +25,6 @@ from fog.providers.aws.clients import Clients, filters
 from fog.providers.aws.config import AwsConfig
 from fog.providers.aws.errors import asking, is_code
 from fog.providers.aws.instances import CLUSTER, DRAIN, MACHINE, machine_of
-from fog.providers.aws.prices import spot_prices
 from fog.providers.aws.region import ground_of
 from fog.providers.aws.run_request import order
 from fog.providers.cloud_init import lines_of, user_data
@@ -32,6 +32,7 @@ from gdp.errors import LocalError
 
 if TYPE_CHECKING:
     from types_boto3_ec2 import EC2Client
+    from types_boto3_ec2.literals import InstanceTypeType
     from types_boto3_ec2.type_defs import FilterTypeDef, InstanceTypeDef, SpotInstanceRequestTypeDef
 
 __all__ = ["WATCHER", "AwsProvider"]
@@ -41,6 +42,7 @@ log = logging.getLogger(__name__)
 WATCHER: Final = Program("notice", ("{python}", "-m", "fog.providers.aws.notice", "--home", "{home}"))
 _AT_ONCE: Final = 8
 _LIVING: Final = ("pending", "running", "stopping", "stopped")
+_LINUX: Final = ("Linux/UNIX", "Linux/UNIX (Amazon VPC)")
 
 
 class AwsProvider:
@@ -63,12 +65,7 @@ class AwsProvider:
         self._threads = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="aws")
 
     def offers(self, hardware: Hardware, *, spot: bool) -> list[Offer]:
-        """Return the catalogue's lines; spot machines have the current price if EC2 reports it.
-
-        Raises:
-            StoreError: EC2 cannot be reached now.
-            LocalError: EC2 refuses the credentials.
-        """
+        """Return the catalogue's lines; spot machines have the current price if EC2 reports it."""
         regions = self._clients.regions()
         lines = [each for each in self._prices(hardware, spot) if each.region in regions]
         if spot:
@@ -109,12 +106,7 @@ class AwsProvider:
         return sorted((each for part in parts for each in part), key=lambda each: each.started_unix_s)
 
     def terminate(self, ids: Sequence[str]) -> None:
-        """Terminate instances; their disks and spot requests end with them.
-
-        Raises:
-            StoreError: EC2 cannot be reached now.
-            LocalError: EC2 refuses, or an id is not of this provider.
-        """
+        """Terminate instances; their disks and spot requests end with them."""
         by_region: dict[str, list[str]] = defaultdict(list)
         for each in ids:
             region, instance = _split(each)
@@ -129,23 +121,13 @@ class AwsProvider:
                     client.terminate_instances(InstanceIds=known)
 
     def drain(self, machine: str) -> None:
-        """Tag the instance; its watcher reads the tag in the metadata within seconds and drains.
-
-        Raises:
-            StoreError: EC2 cannot be reached now.
-            LocalError: EC2 refuses, or the instance does not exist.
-        """
+        """Tag the instance; its watcher reads the tag in the metadata within seconds and drains."""
         region, instance = _split(machine)
         with asking(f"{region}: drain {instance}"):
             self._clients[region].create_tags(Resources=[instance], Tags=[{"Key": DRAIN, "Value": "1"}])
 
     def log(self, machine: str, program: str, lines: int) -> str:
-        """Return the last lines of a program in the instance's console, which EC2 updates a minute or more late.
-
-        Raises:
-            StoreError: EC2 cannot be reached now.
-            LocalError: EC2 refuses, or the instance does not exist.
-        """
+        """Return the last lines of a program in the instance's console, which EC2 updates a minute or more late."""
         region, instance = _split(machine)
         with asking(f"{region}: console of {instance}"):
             reported = self._clients[region].get_console_output(InstanceId=instance).get("Output", "")
@@ -212,3 +194,22 @@ def _split(machine: str) -> tuple[str, str]:
     if not slash or not instance.startswith("i-"):
         raise LocalError(f"aws: {machine!r} is no machine of EC2: expected region/i-...")
     return region, instance
+
+
+def spot_prices(client: EC2Client, type_names: Sequence[str]) -> dict[str, float]:
+    """Return type -> US dollars per hour in its cheapest zone; types that are not sold there are omitted.
+
+    Raises:
+        ClientError, BotoCoreError: boto3's own.
+    """
+    cheapest: dict[str, float] = {}
+    pages = client.get_paginator("describe_spot_price_history").paginate(
+        InstanceTypes=[cast("InstanceTypeType", each) for each in type_names],
+        ProductDescriptions=_LINUX,
+        StartTime=datetime.now(timezone.utc),  # EC2 then returns the current price of each zone
+    )
+    for page in pages:
+        for each in page["SpotPriceHistory"]:
+            usd = float(each["SpotPrice"])
+            cheapest[each["InstanceType"]] = min(usd, cheapest.get(each["InstanceType"], usd))
+    return cheapest

@@ -24,13 +24,7 @@ __all__ = ["Ground", "order"]
 
 @dataclass(frozen=True, slots=True)
 class Ground:
-    """Prerequisites of a region's machines.
-
-    Args:
-        image: id of the image.
-        root_device: name under which the image expects its disk.
-        security_groups: ids of the groups.
-    """
+    """Prerequisites of a region's machines; ``root_device``: name under which the image expects its disk."""
 
     image: str
     root_device: str

@@ -36,7 +36,6 @@ class DelayLine:
     """Delayed frames of both directions, ordered by due time.
 
     Args:
-        delay_ns: delay of each frame.
         most_bytes: limit of queued bytes; frames beyond it are dropped and counted.
     """
 
@@ -84,11 +83,7 @@ def _open(device: str) -> socket.socket:
 
 
 def _relay(sides: tuple[socket.socket, socket.socket], line: DelayLine) -> None:
-    """Relay until a device is removed.
-
-    Raises:
-        OSError: a device was removed.
-    """
+    """Relay until a device is removed."""
     while True:
         ready, _, _ = select.select(sides, (), (), line.pause_s(time.time_ns()))
         for source in ready:

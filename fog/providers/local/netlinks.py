@@ -1,6 +1,8 @@
 """Network devices between machines, gateways and the robot.
 
-I/O; needs CAP_NET_ADMIN in the affected namespaces. A gateway's namespace with two machines::
+I/O; needs CAP_NET_ADMIN in the affected namespaces. Functions raise ``LocalError`` if the kernel refuses.
+
+A gateway's namespace with two machines::
 
     up ---- towards the robot          to-LABEL ---- towards a gateway behind this one
 
@@ -72,33 +74,21 @@ def space_path(run: str, directory: Path, label: str) -> Path:
 
 
 def make_space(path: Path, address: str) -> None:
-    """Create a namespace whose loopback has this additional address; empty: none.
-
-    Raises:
-        LocalError: the kernel refuses.
-    """
+    """Create a namespace whose loopback has this additional address; empty: none."""
     netns_files.create(path)
     netns_files.inside(path, netns_files.disable_ipv6)
     _ask(path, partial(_raise_loopback, address))
 
 
 def join(near: Path | None, near_device: str, far: Path, far_device: str) -> None:
-    """Connect two namespaces by a veth pair; ``near`` None: the namespace of the caller.
-
-    Raises:
-        LocalError: the kernel refuses, or a device of that name exists.
-    """
+    """Connect two namespaces by a veth pair; ``near`` None: the namespace of the caller."""
     with _opened(far) as far_fd:
         _ask(near, partial(_add_pair, near_device, {"ifname": far_device, "net_ns_fd": far_fd}))
     _ask(far, partial(_set_up, far_device))
 
 
 def join_within(space: Path, device: str, other: str) -> None:
-    """Create a veth pair in one namespace.
-
-    Raises:
-        LocalError: the kernel refuses.
-    """
+    """Create a veth pair in one namespace."""
 
     def work(links: IPRoute) -> None:
         _add_pair(device, {"ifname": other}, links)
@@ -108,22 +98,14 @@ def join_within(space: Path, device: str, other: str) -> None:
 
 
 def make_segment(gateway: Path) -> None:
-    """Create a dedicated gateway's bridge and the gateway's port on it.
-
-    Raises:
-        LocalError: the kernel refuses.
-    """
+    """Create a dedicated gateway's bridge and the gateway's port on it."""
     make_bridge(gateway, SEGMENT)
     join_within(gateway, MACHINES, f"{MACHINES}-b")
     plug(gateway, f"{MACHINES}-b")
 
 
 def make_bridge(space: Path, name: str) -> None:
-    """Create a bridge.
-
-    Raises:
-        LocalError: the kernel refuses.
-    """
+    """Create a bridge."""
 
     def make(links: IPRoute) -> None:
         links.link("add", ifname=name, kind="bridge", br_mcast_snooping=0)
@@ -133,11 +115,7 @@ def make_bridge(space: Path, name: str) -> None:
 
 
 def plug(gateway: Path, device: str, *, into: bool = True, bridge: str = SEGMENT) -> None:
-    """Connect a device with a bridge in a gateway's namespace, or disconnect it.
-
-    Raises:
-        LocalError: the kernel refuses.
-    """
+    """Connect a device with a bridge in a gateway's namespace, or disconnect it."""
     _ask(gateway, partial(_enslave, device, bridge) if into else partial(_release, device))
 
 

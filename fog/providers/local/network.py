@@ -71,21 +71,15 @@ class Network:
     """The single network of a site.
 
     Args:
-        runs: registry with its record.
-        topology: its gateways.
         boot: returns a gateway's bundle for its label and its ports.
-        uplink: the robot's end of its link to the first gateway.
-        robot: namespace of that end; None: the namespace of the caller of ``open``.
+        uplink: the robot's end of its link to the first gateway, in the namespace of the caller of ``open``.
     """
 
-    def __init__(
-        self, runs: RunRegistry, topology: Gateway, boot: GatewayBoot, uplink: str, robot: Path | None
-    ) -> None:
+    def __init__(self, runs: RunRegistry, topology: Gateway, boot: GatewayBoot, uplink: str) -> None:
         self._runs = runs
         self._topology = topology
         self._boot = boot
         self._uplink = uplink
-        self._robot = robot
 
     def open(self) -> None:
         """Create missing devices and start gateways that do not run; existing ones are unchanged.
@@ -110,7 +104,7 @@ class Network:
         """Remove the network; no effect if there is none."""
         standing = self._find()
         if standing is not None:
-            delete(self._robot, self._uplink)  # otherwise the kernel removes it some time after its namespace
+            delete(None, self._uplink)  # otherwise the kernel removes it some time after its namespace
             self._runs.resume(standing.record.run).end()
 
     def gateway(self, region: str) -> Path:
@@ -143,7 +137,7 @@ class Network:
         return None
 
     def _make(self) -> None:
-        if exists(self._robot, self._uplink):
+        if exists(None, self._uplink):
             raise LocalError(f"the device {self._uplink} is there already, and not ours")
         run = self._runs.start()
         try:
@@ -159,7 +153,7 @@ class Network:
                     make_bridge(space, UPLINK_BRIDGE)
                 else:
                     make_segment(space)
-            join(self._robot, self._uplink, standing.space(self._topology.gateway), UP)
+            join(None, self._uplink, standing.space(self._topology.gateway), UP)
             for gateway in gateways:
                 for child in gateway.children:
                     ends = standing.space(gateway.gateway), standing.space(child.gateway)
@@ -173,7 +167,7 @@ class Network:
                 run.keep(passive=True)
         except BaseException:
             run.end()
-            delete(self._robot, self._uplink)
+            delete(None, self._uplink)
             raise
 
     def _start(self, run: Run, standing: _Standing, gateway: Gateway) -> None:

@@ -51,11 +51,8 @@ class LocalProvider:
     """``Provider`` of namespaces.
 
     Args:
-        directory: records of this site's machines and gateways; created if missing.
         gateway_boot: returns a gateway's bundle for its label and its ports.
-        topology: tree of gateways.
-        uplink: the robot's end of its link to the first gateway.
-        robot: namespace of that end; None: the namespace of the caller of ``open_network``.
+        uplink: the robot's end of its link to the first gateway, in the namespace of the caller of ``open_network``.
         regions: offered in addition to the provider's own; it simulates any region.
 
     Raises:
@@ -73,12 +70,11 @@ class LocalProvider:
         topology: Gateway = AUTOMATIC,
         *,
         uplink: str = UPLINK,
-        robot: Path | None = None,
         regions: Sequence[str] = (),
     ) -> None:
         self._directory = directory
-        self._runs = RunRegistry(directory)
-        self._network = Network(self._runs, topology, gateway_boot, uplink, robot)
+        self.runs = RunRegistry(directory)  # also for ``fault_injection``
+        self._network = Network(self.runs, topology, gateway_boot, uplink)
         named = [region for gateway in topology.traverse() for region in gateway.regions]
         self._regions = tuple(dict.fromkeys((*LOCAL_REGIONS, *named, *regions)))
 
@@ -88,9 +84,6 @@ class LocalProvider:
         """Create the gateways and the uplink, and start gateways that do not run; existing ones are unchanged.
 
         The uplink exists afterwards, so a switch with a port on it can start.
-
-        Raises:
-            LocalError: the kernel refuses; the uplink is a foreign device; another topology is up.
         """
         with self._alone():
             self._network.open()
@@ -102,10 +95,10 @@ class LocalProvider:
 
     def sweep(self) -> list[str]:
         """Remove runs that ended, or whose creator died before they were complete; return their ids."""
-        gone = [each.id for each in list_machines(self._runs) if not each.is_alive]
-        self._end(gone)
+        gone = [each.id for each in list_machines(self.runs) if not each.is_alive]
+        self.terminate(gone)
         with self._alone():
-            return [*gone, *self._runs.sweep()]
+            return [*gone, *self.runs.sweep()]
 
     # the Provider protocol
 
@@ -120,11 +113,11 @@ class LocalProvider:
         if not _NAME.fullmatch(spec.name):
             raise LocalError(f"machine {spec.name!r}: a name has letters, digits, '-' and '_'")
         with self._alone():
-            for each in list_machines(self._runs, spec.cluster):
+            for each in list_machines(self.runs, spec.cluster):
                 if each.file.spec.name == spec.name:
                     return each.id  # a repeated request: the requester was killed before it stored the id
             gateway = self._network.gateway(spec.offer.region)
-            run = self._runs.start()
+            run = self.runs.start()
             file = MachineFile(spec, time.time(), str(gateway))
             file.write(run.directory)
         try:
@@ -141,24 +134,38 @@ class LocalProvider:
         """Return the machines of a cluster as they are now."""
         now_unix_s = time.time()
         reported = []
-        for each in list_machines(self._runs, cluster):
+        for each in list_machines(self.runs, cluster):
             machine = each.describe()
             if machine.state is MachineState.GONE:
                 if self._is_forgotten(each, now_unix_s):
                     continue
             elif machine.leaves_at_unix_s is not None and machine.leaves_at_unix_s < now_unix_s:
-                kill(self._runs, each.id)  # a stopped machine cannot end itself
+                kill(self.runs, each.id)  # a stopped machine cannot end itself
                 machine = replace(machine, state=MachineState.GONE)
             reported.append(machine)
         return reported
 
     def terminate(self, ids: Sequence[str]) -> None:
-        """End machines and remove all their resources."""
-        self._end(ids)
+        """End machines in parallel and remove their resources; other processes may do the same concurrently."""
+        machines = [each for each in list_machines(self.runs) if each.id in ids]
+        if new := [each.id for each in machines if not (each.record.kept or each.record.dead)]:
+            raise StoreError(f"just being made: {', '.join(new)}")
+        for each in machines:
+            hold(each, held=False)
+        end_all([each.host for each in machines if each.host is not None], _END_PATIENCE_S)
+        for each in machines:
+            for device in (each.plug, each.uplink_plug, each.relay_out):
+                delete(each.gateway, device)  # otherwise the kernel removes it some time after its namespace
+            with self._alone():  # a command and the supervisor may end the same machine
+                if each.id in {record.run for record in self.runs.all()}:
+                    self.runs.resume(each.id).end()
 
     def drain(self, machine: str) -> None:
         """Let a machine finish its calls, and end its programs."""
-        self._tell(machine, signal.SIGUSR1)
+        found = find(self.runs, machine)
+        if found.host is not None and found.host.alive:
+            with suppress(ProcessLookupError):
+                os.kill(found.host.pid, signal.SIGUSR1)
 
     def replica_gateway(self, region: str) -> str:
         """Return the label of the replica gateway of a region's machines; empty: their gateway is dedicated."""
@@ -167,7 +174,7 @@ class LocalProvider:
     def attach_uplink(self, machine: str) -> None:
         """Connect a machine to the uplink of its group."""
         with self._alone():
-            found = find(self._runs, machine)
+            found = find(self.runs, machine)
             if not self.replica_gateway(found.file.spec.offer.region):
                 raise LocalError(f"machine {machine}: the gateway of {found.file.spec.offer.region} is dedicated")
             if not exists(found.gateway, found.uplink_plug):
@@ -178,7 +185,7 @@ class LocalProvider:
     def detach_uplink(self, machine: str) -> None:
         """Disconnect a machine from the uplink."""
         with self._alone():
-            for each in list_machines(self._runs):
+            for each in list_machines(self.runs):
                 if each.id == machine:
                     delete(each.gateway, each.uplink_plug)
                     each.gateway_mark.unlink(missing_ok=True)
@@ -187,21 +194,16 @@ class LocalProvider:
         """Return the last lines of a program's log; without a program, of the machine's own log."""
         if not _NAME.fullmatch(program or "machine"):
             raise LocalError(f"no program {program!r}")
-        return last_lines(find(self._runs, machine).home / "logs" / f"{program or 'machine'}.log", lines)
+        return last_lines(find(self.runs, machine).home / "logs" / f"{program or 'machine'}.log", lines)
 
     def shell(self, machine: str) -> list[str]:
         """Return the command line of a shell inside a machine."""
-        found = find(self._runs, machine)
+        found = find(self.runs, machine)
         inside = ["env", f"--chdir={found.home}", f"FOG_MACHINE={found.file.spec.name}", "bash"]
         return ["nsenter", f"--net={found.space}", "--", *inside]
 
     def close(self) -> None:
         """Do nothing; the provider holds no resources."""
-
-    @property
-    def runs(self) -> RunRegistry:
-        """Return the records of this site, for ``fault_injection``."""
-        return self._runs
 
     def _make(self, run: Run, file: MachineFile, boot: MachineBundle) -> None:
         machine = LocalMachine(run.record, file)
@@ -237,27 +239,6 @@ class LocalProvider:
             return False
         self.terminate([machine.id])
         return True
-
-    def _end(self, ids: Sequence[str]) -> None:
-        """End machines in parallel and remove their resources; other processes may do the same concurrently."""
-        machines = [each for each in list_machines(self._runs) if each.id in ids]
-        if new := [each.id for each in machines if not (each.record.kept or each.record.dead)]:
-            raise StoreError(f"just being made: {', '.join(new)}")
-        for each in machines:
-            hold(each, held=False)
-        end_all([each.host for each in machines if each.host is not None], _END_PATIENCE_S)
-        for each in machines:
-            for device in (each.plug, each.uplink_plug, each.relay_out):
-                delete(each.gateway, device)  # otherwise the kernel removes it some time after its namespace
-            with self._alone():  # a command and the supervisor may end the same machine
-                if each.id in {record.run for record in self._runs.all()}:
-                    self._runs.resume(each.id).end()
-
-    def _tell(self, machine: str, number: signal.Signals) -> None:
-        found = find(self._runs, machine)
-        if found.host is not None and found.host.alive:
-            with suppress(ProcessLookupError):
-                os.kill(found.host.pid, number)
 
     @contextmanager
     def _alone(self) -> Iterator[None]:

@@ -35,7 +35,6 @@ def spawn_detached(
     """Start a Python module with arguments in a namespace, as the leader of a session; return its process id.
 
     Args:
-        log: file for its output.
         confine: called with the process id before the process acts.
         is_heard: wait for the first output on its standard output, which must be the only one.
 

@@ -58,12 +58,7 @@ class SkyPilotProvider:
             raise LocalError("provider skypilot needs SkyPilot: pip install 'gdp-ros[skypilot]'") from missing
 
     def offers(self, hardware: Hardware, *, spot: bool) -> list[Offer]:
-        """Return the best fits in each place by SkyPilot's catalogue: a few types, not all.
-
-        Raises:
-            StoreError: the catalogue is missing and cannot be loaded now.
-            LocalError: a place is unknown to SkyPilot.
-        """
+        """Return the best fits in each place by SkyPilot's catalogue: a few types, not all."""
         lines = []
         for place in self._config.places:
             with self._asking(f"prices of {place}"):
@@ -77,12 +72,7 @@ class SkyPilotProvider:
         return sorted(lines, key=lambda each: each.usd_per_hour)
 
     def create(self, spec: MachineSpec, boot: MachineBundle) -> str:
-        """Request a machine. Missing capacity is detected later: ``describe`` then omits the machine.
-
-        Raises:
-            StoreError: the API server cannot be reached now.
-            LocalError: credentials, place or type are wrong, as far as SkyPilot checks beforehand.
-        """
+        """Request a machine. Missing capacity is detected later: ``describe`` then omits the machine."""
         name = cluster_name(spec)
         with self._asking(f"create {name}"):
             self._sky.launch(self._task(spec, boot), cluster_name=name)
@@ -124,23 +114,13 @@ class SkyPilotProvider:
                     self._sky.get(request)
 
     def drain(self, machine: str) -> None:
-        """Drain the machine by a SkyPilot job.
-
-        Raises:
-            StoreError: the machine cannot be reached now.
-            LocalError: the machine does not exist.
-        """
+        """Drain the machine by a SkyPilot job."""
         with self._asking(f"drain {machine}"):
             task = self._sky.Task("drain", run=f"sudo systemctl kill --kill-who=main --signal=USR1 {_SERVICE}")
             self._sky.get(self._sky.exec(task, cluster_name=machine))
 
     def log(self, machine: str, program: str, lines: int) -> str:
-        """Return the last lines of a program in the machine's journal.
-
-        Raises:
-            StoreError: it cannot be reached now.
-            LocalError: there is no such machine.
-        """
+        """Return the last lines of a program in the machine's journal."""
         with self._asking(f"log of {machine}"):
             reported = self._sky.tail_logs(machine, None, follow=False, preload_content=False)
             return lines_of((line for line in reported if line), program, lines)

@@ -35,11 +35,7 @@ _HANDLES: Final = 1 << 64
 
 
 class Discovery:
-    """Source of a graph cache's updates.
-
-    Args:
-        changed: called in the caller's thread after each batch of updates.
-    """
+    """Source of a graph cache's updates; ``changed``: called in the caller's thread after each batch of updates."""
 
     def __init__(self, node: Node, survey: GraphCache, changed: News) -> None:
         self._node = node

@@ -8,18 +8,17 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from itertools import count
-from typing import TypeVar
+from typing import Final, TypeVar
 
 from gdp.errors import LocalError
 from proxy.endpoints.dds.discovery import Discovery
 from proxy.endpoints.dds.graph_cache import GraphCache
-from proxy.endpoints.dds.node import Node
+from proxy.endpoints.dds.node import EntityContext, Node
 from proxy.endpoints.dds.services import Client, Server
 from proxy.endpoints.dds.topics import Publication, Subscription
 from proxy.endpoints.dds.types import hash_of, known_channel
 from proxy.endpoints.endpoint import Event, Graph, GraphChanged, Role
 from proxy.serial.channel import Channel, Qos, RosVersion
-from proxy.serial.empty import NoAnswer
 from proxy.serial.service import Service
 
 __all__ = ["DdsEndpoint"]
@@ -33,16 +32,16 @@ class DdsEndpoint:
 
     CYCLONEDDS_URI configures the network, as for every program with Cyclone DDS.
 
-    Args:
-        domain: the domain id.
-        node: the name of the virtual node.
-
     Raises:
         LocalError: the domain cannot be joined.
     """
 
+    ros: Final[RosVersion] = 2
+    is_live: Final = True
+    dropped: Final = 0  # messages wait in the middleware, which drops them by its QoS
+
     def __init__(self, domain: int, node: str) -> None:
-        self._domain = domain
+        self.label = f"dds domain {domain}"
         self._events = deque[Event]([GraphChanged()])
         self._is_taking = False
         self._open: dict[int, _Open] = {}
@@ -52,26 +51,6 @@ class DdsEndpoint:
         self._node = Node(domain, node)
         self._discovery = Discovery(self._node, self._survey, self._follow)
         self._node.watch.tell()
-
-    @property
-    def ros(self) -> RosVersion:
-        """Return the ROS version."""
-        return 2
-
-    @property
-    def is_live(self) -> bool:
-        """Return True: other nodes take part in the graph."""
-        return True
-
-    @property
-    def label(self) -> str:
-        """Return the display name."""
-        return f"dds domain {self._domain}"
-
-    @property
-    def dropped(self) -> int:
-        """Return 0: only the middleware drops messages."""
-        return 0  # messages wait in the middleware, which drops them by its QoS
 
     def fileno(self) -> int:
         """Return a descriptor that is readable while ``poll_events`` has events."""
@@ -91,28 +70,20 @@ class DdsEndpoint:
         return self._survey.graph()
 
     def channel(self, topic: str, type_name: str) -> Channel:
-        """Return a topic of a standard type, or one of the hidden topics of a local action, as bytes.
-
-        Raises:
-            LocalError: the type is neither.
-        """
+        """Return a topic of a standard type, or one of the hidden topics of a local action, as bytes."""
         known = known_channel(topic, type_name)
         if known is not None:
             return known
         for peer in self._survey.peers(Role.PUBLISHES, topic, type_name):
             if "/_action/" in topic:
-                return Channel(topic, type_name, 2, peer.hash)
+                return Channel(topic, type_name, 2, hash=peer.hash)
         raise LocalError(
             f"{type_name} is not known here: endpoint dds knows the types of ROS 2's own packages;"
             " use endpoint ros2, or publish it from a machine that has its package"
         )
 
     def service(self, name: str, type_name: str) -> Service:
-        """Return a service that a local node serves; its messages are opaque bytes.
-
-        Raises:
-            LocalError: no node serves it here.
-        """
+        """Return a service that a local node serves; its messages are opaque bytes."""
         for peer in self._survey.peers(Role.SERVES, name, type_name):
             request, response = (Channel(name, f"{type_name}_{part}", 2) for part in ("Request", "Response"))
             return Service(name, type_name, peer.hash, request, response)
@@ -121,7 +92,7 @@ class DdsEndpoint:
     def subscribe(self, topic: str, type_name: str, qos: Qos | None) -> int:
         """Subscribe to a topic of any type."""
         handle = next(self._numbers)
-        return self._keep(handle, Subscription(self._node, self._survey, handle, self._tell, topic, type_name, qos))
+        return self._keep(handle, Subscription(self._context(handle), topic, type_name, qos))
 
     def advertise(self, channel: Channel) -> int:
         """Create a publisher of a topic.
@@ -132,8 +103,7 @@ class DdsEndpoint:
         if channel.ros != 2:
             raise LocalError(f"{channel.topic}: messages of ROS {channel.ros} cannot be published in DDS")
         handle = next(self._numbers)
-        publication = Publication(self._node, self._survey, handle, self._tell, channel, hash_of(channel))
-        return self._keep(handle, publication)
+        return self._keep(handle, Publication(self._context(handle), channel, hash_of(channel)))
 
     def publish(self, handle: int, raw: bytes) -> None:
         """Publish one message."""
@@ -144,18 +114,11 @@ class DdsEndpoint:
         return self._find(handle, Publication).subscribers
 
     def serve(self, service: Service) -> int:
-        """Create a server for clients on Cyclone DDS; clients on other vendors raise ``EndpointError`` events.
-
-        Raises:
-            LocalError: it is not ROS 2's.
-        """
+        """Create a server for clients on Cyclone DDS; clients on other vendors raise ``EndpointError`` events."""
         if service.ros != 2:
             raise LocalError(f"{service.name}: a service of ROS {service.ros} cannot be served in DDS")
         handle, hashed = next(self._numbers), service.hash if service.hash.startswith("RIHS01_") else ""
-        what = (service.name, service.type_name, hashed)
-        no_answer = NoAnswer.of(service)
-        server = Server(self._node, self._survey, handle, self._tell, *what, no_answer, lambda: next(self._numbers))
-        return self._keep(handle, server)
+        return self._keep(handle, Server(self._context(handle), service, hashed, lambda: next(self._numbers)))
 
     def answer(self, handle: int, ticket: int, raw: bytes) -> None:
         """Answer a request."""
@@ -169,8 +132,7 @@ class DdsEndpoint:
         """Create a client for servers on Cyclone DDS; servers on other vendors raise ``EndpointError`` events."""
         handle = next(self._numbers)
         hashed = next((peer.hash for peer in self._survey.peers(Role.SERVES, name, type_name)), "")
-        client = Client(self._node, self._survey, handle, self._tell, name, type_name, hashed)
-        return self._keep(handle, client)
+        return self._keep(handle, Client(self._context(handle), name, type_name, hashed))
 
     def call(self, handle: int, call: int, raw: bytes) -> None:
         """Send a request."""
@@ -189,6 +151,9 @@ class DdsEndpoint:
         self._discovery.close()
         self._open.clear()
         self._node.leave()
+
+    def _context(self, handle: int) -> EntityContext:
+        return EntityContext(self._node, self._survey, handle, self._tell)
 
     def _keep(self, handle: int, opened: _Open) -> int:
         self._open[handle] = opened

@@ -110,4 +110,4 @@ class GraphCache:
             if peer.named is not None and (node or peer.gid[:_PREFIX] not in ros):
                 role, name, type_name = peer.named
                 qos = peer.qos if role in (Role.PUBLISHES, Role.SUBSCRIBES) else None
-                yield GraphEntity(role, name, type_name, node, peer.gid.hex(), peer.hash, qos)
+                yield GraphEntity(role, name, type_name, node, peer.gid.hex(), hash=peer.hash, qos=qos)

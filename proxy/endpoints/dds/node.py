@@ -1,6 +1,6 @@
 """Node: one DDS participant that appears as one ROS 2 node, with its readers and writers.
 
-I/O.
+I/O. What DDS refuses raises ``LocalError``.
 Source: rmw_dds_common for the announcement of nodes; the binding's own samples of built-in topics.
 """
 
@@ -19,14 +19,16 @@ from cyclonedds.sub import DataReader, Subscriber
 
 from gdp.errors import LocalError
 from proxy.endpoints.dds import library
+from proxy.endpoints.dds.graph_cache import GraphCache
 from proxy.endpoints.dds.naming import user_data
 from proxy.endpoints.dds.node_info import GID_BYTES, INFO_HASH, INFO_TOPIC, INFO_TYPE, write_info
 from proxy.endpoints.dds.opaque import OpaqueTopic
 from proxy.endpoints.dds.profile import offered
 from proxy.endpoints.dds.wait_thread import News, WaitThread
+from proxy.endpoints.endpoint import Event
 from proxy.endpoints.qos import default
 
-__all__ = ["ANY_STATE", "Node", "Reader", "Sample", "Writer"]
+__all__ = ["ANY_STATE", "EntityContext", "Node", "Reader", "Sample", "Writer"]
 
 ANY_STATE: Final = SampleState.Any | ViewState.Any | InstanceState.Any
 _BATCH: Final = 64  # samples read at once
@@ -108,11 +110,7 @@ class Writer:
 
 
 class Node:
-    """A participant.
-
-    Raises:
-        LocalError: the domain cannot be joined.
-    """
+    """A participant."""
 
     def __init__(self, domain: int, name: str) -> None:
         self._name = name
@@ -132,11 +130,7 @@ class Node:
         self.announce()
 
     def read(self, topic: str, type_name: str, qos: DdsQos, hear: Callable[[list[Sample]], None]) -> Reader:
-        """Open a reader of the node.
-
-        Raises:
-            LocalError: DDS does not accept such a reader.
-        """
+        """Open a reader of the node."""
         try:
             reader = Reader(self, topic, type_name, qos, hear)
         except DDSException as error:
@@ -146,11 +140,7 @@ class Node:
         return reader
 
     def write(self, topic: str, type_name: str, qos: DdsQos) -> Writer:
-        """Open a writer of the node.
-
-        Raises:
-            LocalError: DDS does not accept such a writer.
-        """
+        """Open a writer of the node."""
         try:
             writer = Writer(self, topic, type_name, qos)
         except DDSException as error:
@@ -185,6 +175,15 @@ class Node:
         self._writers.clear()
         self.watch.close()
         del self._info, self.publisher, self.subscriber, self.participant
+
+
+class EntityContext(NamedTuple):
+    """What an entity of the endpoint needs: the node, the graph, its handle, and where its events go."""
+
+    node: Node
+    survey: GraphCache
+    handle: int
+    tell: Callable[[Event], None]
 
 
 def _nothing(samples: list[Sample]) -> None:

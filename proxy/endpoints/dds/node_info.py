@@ -24,11 +24,7 @@ _PAD_MAX: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class NodeInfo:
-    """Announcement of one participant: the node of each of its entities.
-
-    Args:
-        gid_bytes: length of a GID in the message.
-    """
+    """Announcement of one participant: the node of each of its entities."""
 
     participant: bytes
     nodes: Mapping[bytes, str]
@@ -36,11 +32,7 @@ class NodeInfo:
 
 
 def write_info(participant: bytes, name: str, readers: Sequence[bytes], writers: Sequence[bytes], wide: int) -> bytes:
-    """Return the message of a participant with one node in the root namespace.
-
-    Args:
-        wide: bytes of a GID.
-    """
+    """Return the message of a participant with one node in the root namespace."""
     out = _Writer()
     out.gid(participant, wide)
     out.count(1)

@@ -11,8 +11,7 @@ from typing import Final, NamedTuple
 
 from cyclonedds.__library__ import library_path
 
-from proxy.endpoints.qos import NEVER
-from proxy.serial.channel import Qos
+from proxy.serial.channel import NEVER, Qos
 
 __all__ = ["Announced", "announced"]
 
@@ -56,7 +55,6 @@ def announced(policies: int) -> Announced:
         lifespan=_duration(lifespan.value),
         liveliness=_LIVELINESS[liveliness],
         lease=_duration(lease),
-        plain_names=False,
     )
     return Announced(qos, _user_data(policies))
 

@@ -10,8 +10,7 @@ from typing import Final
 from cyclonedds.core import Policy
 from cyclonedds.core import Qos as DdsQos
 
-from proxy.endpoints.qos import NEVER
-from proxy.serial.channel import Qos
+from proxy.serial.channel import NEVER, Qos
 
 __all__ = ["offered", "requested"]
 

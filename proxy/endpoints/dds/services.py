@@ -13,13 +13,13 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from proxy.endpoints.dds import library
-from proxy.endpoints.dds.graph_cache import GraphCache
 from proxy.endpoints.dds.naming import CYCLONE, dds_type, identity, identity_in, user_data, vendor
-from proxy.endpoints.dds.node import Node, Sample
+from proxy.endpoints.dds.node import EntityContext, Sample
 from proxy.endpoints.dds.profile import offered, requested
-from proxy.endpoints.endpoint import CallFailed, EndpointError, Event, RequestReceived, ResponseReceived, Role
+from proxy.endpoints.endpoint import CallFailed, EndpointError, RequestReceived, ResponseReceived, Role
 from proxy.endpoints.qos import default
 from proxy.serial.empty import NoAnswer
+from proxy.serial.service import Service
 
 __all__ = ["Client", "Server"]
 
@@ -32,10 +32,13 @@ _WAITING_MAX: Final = 1_000
 class _Halves:
     """The local halves of a service's request and reply topics."""
 
-    def __init__(self, node: Node, name: str, type_name: str, role: Role, number: int, type_hash: str) -> None:
+    def __init__(self, at: EntityContext, role: Role, name: str, type_name: str, type_hash: str) -> None:
+        node, self._survey, self._handle, self._tell = at
         self._node = node
+        self._name = name
+        self._fault = ""
         is_server = role is Role.SERVES
-        mark = identity("serviceid" if is_server else "clientid", node.gid, number)
+        mark = identity("serviceid" if is_server else "clientid", node.gid, at.handle)
         self.identity = identity_in(mark)
         data = user_data(type_hash, mark)
         halves = [(f"rq{name}Request", f"{type_name}_Request"), (f"rr{name}Reply", f"{type_name}_Response")]
@@ -56,6 +59,20 @@ class _Halves:
         """Close both halves."""
         self._node.close(self.reader, self.writer)
 
+    def _check_vendors(self, role: Role) -> None:
+        """Report once that a peer of another vendor is present."""
+        peers = self._survey.peers(role, self._name)
+        others = {vendor(peer.gid) for peer in peers if not peer.gid.startswith(CYCLONE)}
+        before, self._fault = self._fault, ""
+        if others:
+            who = "server" if role is Role.SERVES else "client"
+            self._fault = (
+                f"a {who} speaks {', '.join(sorted(others))}, whose way to mark requests endpoint dds does not have;"
+                " use endpoint ros2"
+            )
+            if self._fault != before:
+                self._tell(EndpointError(self._handle, self._fault))
+
 
 class _Ask(NamedTuple):
     header: bytes
@@ -65,35 +82,19 @@ class _Ask(NamedTuple):
 class Server(_Halves):
     """Serves a name to local clients."""
 
-    def __init__(
-        self,
-        node: Node,
-        survey: GraphCache,
-        handle: int,
-        tell: Callable[[Event], None],
-        name: str,
-        type_name: str,
-        type_hash: str,
-        no_answer: NoAnswer | None,
-        tickets: Callable[[], int],
-    ) -> None:
-        self._survey = survey
-        self._handle = handle
-        self._tell = tell
-        self._name = name
-        self._no_answer = no_answer
+    def __init__(self, at: EntityContext, service: Service, type_hash: str, tickets: Callable[[], int]) -> None:
+        self._no_answer = NoAnswer.of(service)
         self._tickets = tickets
         self._asks: dict[int, _Ask] = {}
         self._early = deque[Sample](maxlen=_WAITING_MAX)  # of clients that are not discovered yet
         self._late = deque[tuple[_Ask, bytes]](maxlen=_WAITING_MAX)  # whose clients do not match the reply writer yet
         self._matched: frozenset[bytes] = frozenset()
-        self._fault = ""
-        super().__init__(node, name, type_name, Role.SERVES, handle, type_hash)
+        super().__init__(at, Role.SERVES, service.name, service.type_name, type_hash)
         self.follow()
 
     def follow(self) -> None:
         """Update the clients."""
-        self._fault = _tell_fault(self._survey, Role.CALLS, self._name, self._fault, self._handle, self._tell)
+        self._check_vendors(Role.CALLS)
         gone = [ticket for ticket, ask in self._asks.items() if self._survey.peer(ask.client) is None]
         for ticket in gone:
             del self._asks[ticket]
@@ -162,32 +163,18 @@ class _Call(NamedTuple):
 class Client(_Halves):
     """Calls a local service."""
 
-    def __init__(
-        self,
-        node: Node,
-        survey: GraphCache,
-        handle: int,
-        tell: Callable[[Event], None],
-        name: str,
-        type_name: str,
-        type_hash: str,
-    ) -> None:
-        self._survey = survey
-        self._handle = handle
-        self._tell = tell
-        self._name = name
+    def __init__(self, at: EntityContext, name: str, type_name: str, type_hash: str) -> None:
         self._calls: dict[int, _Call] = {}  # under way, by sequence number
         self._sequence: dict[int, int] = {}  # of each call
         self._early = deque[tuple[int, bytes]]()
         self._last = 0
-        self._fault = ""
-        super().__init__(node, name, type_name, Role.CALLS, handle, type_hash)
+        super().__init__(at, Role.CALLS, name, type_name, type_hash)
         self._me = self.writer.handle.to_bytes(8, "little")
         self.follow()
 
     def follow(self) -> None:
         """Update the servers; calls fail when all their servers have left."""
-        self._fault = _tell_fault(self._survey, Role.SERVES, self._name, self._fault, self._handle, self._tell)
+        self._check_vendors(Role.SERVES)
         servers = self._servers()
         for sequence, call in list(self._calls.items()):
             if not call.servers & servers:
@@ -256,20 +243,3 @@ class Client(_Halves):
     def _servers(self) -> frozenset[bytes]:
         peers = self._survey.peers(Role.SERVES, self._name)
         return frozenset(peer.gid for peer in peers if peer.gid.startswith(CYCLONE))
-
-
-def _tell_fault(
-    survey: GraphCache, role: Role, name: str, before: str, handle: int, tell: Callable[[Event], None]
-) -> str:
-    """Report once that a peer of another vendor is present; return the present fault."""
-    others = {vendor(peer.gid) for peer in survey.peers(role, name) if not peer.gid.startswith(CYCLONE)}
-    if not others:
-        return ""
-    who = "server" if role is Role.SERVES else "client"
-    fault = (
-        f"a {who} speaks {', '.join(sorted(others))}, whose way to mark requests endpoint dds does not have;"
-        " use endpoint ros2"
-    )
-    if fault != before:
-        tell(EndpointError(handle, fault))
-    return fault

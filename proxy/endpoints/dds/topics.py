@@ -5,17 +5,15 @@ I/O, through the node.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 from gdp.errors import LocalError
 from proxy.endpoints.dds import library
-from proxy.endpoints.dds.graph_cache import GraphCache
 from proxy.endpoints.dds.naming import dds_type, user_data
-from proxy.endpoints.dds.node import Node, Sample
+from proxy.endpoints.dds.node import EntityContext, Sample
 from proxy.endpoints.dds.profile import offered, requested
 from proxy.endpoints.dds.types import known_channel
-from proxy.endpoints.endpoint import EndpointError, Event, MessageReceived, Role, TypeResolved
+from proxy.endpoints.endpoint import EndpointError, MessageReceived, Role, TypeResolved
 from proxy.endpoints.qos import default
 from proxy.serial.channel import Channel, Qos
 
@@ -25,27 +23,15 @@ __all__ = ["Publication", "Subscription"]
 class Subscription:
     """Subscribes to a topic; its type need not be known here."""
 
-    def __init__(
-        self,
-        node: Node,
-        survey: GraphCache,
-        handle: int,
-        tell: Callable[[Event], None],
-        topic: str,
-        type_name: str,
-        qos: Qos | None,
-    ) -> None:
-        self._node = node
-        self._handle = handle
-        self._tell = tell
+    def __init__(self, at: EntityContext, topic: str, type_name: str, qos: Qos | None) -> None:
+        self._node, self._survey, self._handle, self._tell = at
         self._bare = Channel(topic, type_name, 2)
         self._channel: Channel | None = None
         self._fault = ""
-        self._survey = survey
         self.follow()
         shown = self._channel.hash if self._channel is not None else ""
         profile = requested(qos or default(), user_data(shown))
-        self._reader = node.read(f"rt{topic}", dds_type(type_name), profile, self._hear)
+        self._reader = at.node.read(f"rt{topic}", dds_type(type_name), profile, self._hear)
 
     def follow(self) -> None:
         """Update the publishers, and with them the description of the messages."""
@@ -83,27 +69,17 @@ class Publication:
         LocalError: it has another type here, or is not ROS 2's.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        survey: GraphCache,
-        handle: int,
-        tell: Callable[[Event], None],
-        channel: Channel,
-        type_hash: str,
-    ) -> None:
+    def __init__(self, at: EntityContext, channel: Channel, type_hash: str) -> None:
         topic, type_name = channel.topic, channel.type_name
         roles = (Role.PUBLISHES, Role.SUBSCRIBES)
-        theirs = {peer.hash for role in roles for peer in survey.peers(role, topic, type_name)} - {""}
+        theirs = {peer.hash for role in roles for peer in at.survey.peers(role, topic, type_name)} - {""}
         if type_hash and theirs and type_hash not in theirs:
             raise LocalError(f"{topic}: {type_name} is {', '.join(sorted(theirs))} on this machine, not {type_hash}")
-        self._node = node
-        self._handle = handle
-        self._tell = tell
+        self._node, _, self._handle, self._tell = at
         self._is_late = False
         qos = channel.qos[0] if channel.qos else default(latched=channel.latched, depth=1 if channel.latched else 10)
         profile = offered(qos, user_data(type_hash))
-        self._writer = node.write(f"rt{topic}", dds_type(type_name), profile)
+        self._writer = at.node.write(f"rt{topic}", dds_type(type_name), profile)
 
     @property
     def subscribers(self) -> int:

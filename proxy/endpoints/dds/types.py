@@ -19,7 +19,9 @@ def known_channel(topic: str, type_name: str) -> Channel | None:
     text = standard_definition(type_name)
     if text is None:
         return None
-    return Channel(topic, type_name, 2, _hash(type_name, text), text, "msg" if text else "")
+    return Channel(
+        topic, type_name, 2, hash=_hash(type_name, text), definition=text, definition_format="msg" if text else ""
+    )
 
 
 def hash_of(channel: Channel) -> str:

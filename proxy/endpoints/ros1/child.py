@@ -29,7 +29,9 @@ def main() -> None:
         reason = error if isinstance(error, LocalError) else f"rospy does not load in this Python {version}: {error}"
         link.send(Kind.ENDING, payload=str(reason).encode())
         sys.exit(1)
-    Node(link, woken, master, node, int(incarnation_id), float(delay_s)).run()
+    Node(
+        link=link, woken=woken, master=master, node=node, incarnation_id=int(incarnation_id), delay_s=float(delay_s)
+    ).run()
 
 
 if __name__ == "__main__":

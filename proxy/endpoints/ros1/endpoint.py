@@ -15,7 +15,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
@@ -57,7 +57,6 @@ class _Held:
     Args:
         kind: of the frame that establishes it, with ``payload``.
         kept: last messages of a latched publisher.
-        calls: under way.
     """
 
     kind: Kind
@@ -70,6 +69,9 @@ class _Held:
 class Ros1Endpoint:
     """One ROS 1 graph, with one virtual node in it."""
 
+    ros: Final[RosVersion] = 1
+    is_live: Final = True
+
     def __init__(self, master_uri: str, node: str) -> None:
         """Start the rospy process; it joins the graph as soon as the master answers.
 
@@ -77,6 +79,7 @@ class Ros1Endpoint:
             LocalError: rospy is not installed.
         """
         rospy_folder()
+        self.label = f"ros1 {master_uri}"
         self._master_uri = master_uri
         self._node = node
         self._numbers = itertools.count(1)
@@ -96,21 +99,6 @@ class Ros1Endpoint:
         self._epoll.register(self._woken, select.EPOLLIN)
         self._ended: list[subprocess.Popen[bytes]] = []
         self._start(0.0)
-
-    @property
-    def ros(self) -> RosVersion:
-        """Return 1."""
-        return 1
-
-    @property
-    def is_live(self) -> bool:
-        """Return True: other nodes take part in the graph."""
-        return True
-
-    @property
-    def label(self) -> str:
-        """Return ``ros1`` and the master's URI."""
-        return f"ros1 {self._master_uri}"
 
     @property
     def dropped(self) -> int:
@@ -155,10 +143,7 @@ class Ros1Endpoint:
         """Create a publisher; if a local node contradicts, ``EndpointError`` follows."""
         if channel.ros != 1 or not (channel.hash or channel.definition):
             here = self.channel(channel.topic, channel.type_name)
-            channel = Channel(
-                channel.topic, channel.type_name, 1, here.hash, here.definition, here.definition_format,
-                channel.qos, channel.latched, channel.callerid,
-            )  # fmt: skip
+            channel = replace(here, qos=channel.qos, latched=channel.latched, callerid=channel.callerid)
         depth = max(1, channel.qos[0].depth) if channel.qos else 1
         kept: deque[bytes] | None = deque(maxlen=depth) if channel.latched else None
         return self._hold(_Held(Kind.ADVERTISE, channel.to_wire(), kept))
@@ -328,7 +313,7 @@ class Ros1Endpoint:
 
     def _look(self, payload: bytes) -> None:
         ends = frozenset(
-            GraphEntity(Role(role), name, type_name, node, node, md5)
+            GraphEntity(Role(role), name, type_name, node, node, hash=md5)
             for role, name, type_name, node, md5 in cbor2.loads(payload)
         )
         if ends != self._graph or self._is_graph_old:
@@ -368,11 +353,7 @@ class Ros1Endpoint:
             return  # no wake-up was needed
 
     def _ask(self, kind: Kind, name: str, type_name: str) -> bytes | None:
-        """Query the process, wait for its response, and keep events that arrive meanwhile for ``poll_events``.
-
-        Raises:
-            LocalError: it does not answer in time.
-        """
+        """Query the process, wait for its response, and keep events that arrive meanwhile for ``poll_events``."""
         known = self._known.get((kind, name, type_name))
         if known is not None:
             return known

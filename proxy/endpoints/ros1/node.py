@@ -50,7 +50,9 @@ _BACKLOG: Final = 128
 class Node:
     """One node on one master."""
 
-    def __init__(self, link: IpcLink, woken: int, master: str, node: str, incarnation_id: int, delay_s: float) -> None:
+    def __init__(
+        self, *, link: IpcLink, woken: int, master: str, node: str, incarnation_id: int, delay_s: float
+    ) -> None:
         self._link = link
         self._woken = woken
         self._master = master
@@ -287,7 +289,7 @@ def _to_others(connect: Callable[[object, str, str], _Connected]) -> Callable[[o
 
 
 def _channel(topic: str, type_name: str, md5: str, text: str) -> Channel:
-    return Channel(topic, type_name, 1, md5, text, "msg" if text else "")
+    return Channel(topic, type_name, 1, hash=md5, definition=text, definition_format="msg" if text else "")
 
 
 def _end(end: LocalEnd) -> list[str]:

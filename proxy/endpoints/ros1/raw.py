@@ -127,11 +127,7 @@ def known_message(channel: Channel) -> KnownMessage:
 
 
 def known_service(service: Service) -> KnownService:
-    """Return the type of a service, from its description or an installed package.
-
-    Raises:
-        LocalError: neither suffices, or they contradict each other.
-    """
+    """Return the type of a service, from its description or an installed package."""
     installed = installed_service(service.type_name)
     name = ros1_name(service.type_name)
     request, response = f"{name}Request", f"{name}Response"

@@ -38,7 +38,6 @@ class Ros2Endpoint:
 
     Args:
         domain: ROS domain id, 0 to 232.
-        node: name of the virtual node (``proxy_node_name``).
 
     Raises:
         LocalError: ROS 2 is not installed, or does not start; the text states what to do.
@@ -46,6 +45,7 @@ class Ros2Endpoint:
 
     ros: Final[RosVersion] = 2
     is_live: Final = True
+    dropped: Final = 0  # messages wait in the middleware, which drops them by its QoS
 
     def __init__(self, domain: int, node: str) -> None:
         self.label = f"ros2 domain {domain}"
@@ -57,11 +57,6 @@ class Ros2Endpoint:
         self._publisher_entity: dict[int, PublisherEntity] = {}
         self._serving: dict[int, ServiceEntity] = {}
         self._client_entity: dict[int, ClientEntity] = {}
-
-    @property
-    def dropped(self) -> int:
-        """Return 0: only the middleware drops messages."""
-        return 0  # messages wait in the middleware, which drops them by its QoS
 
     def fileno(self) -> int:
         """Return a descriptor that is readable while ``poll_events`` has events."""
@@ -99,7 +94,15 @@ class Ros2Endpoint:
                 event_callbacks=self._session.silence(publisher=False),
             )
         handle = cast("SubscriptionHandle", entity.handle)
-        subscription_entity = SubscriptionEntity(self._number(), topic, message, requested, channel, entity, handle)
+        subscription_entity = SubscriptionEntity(
+            number=self._number(),
+            topic=topic,
+            message=message,
+            qos=requested,
+            channel=channel,
+            entity=entity,
+            handle=handle,
+        )
         self._subscription_entity[subscription_entity.number] = subscription_entity
         self._tell_apart(topic)
         self._waiting.add(subscription_entity)
@@ -117,7 +120,9 @@ class Ros2Endpoint:
                 event_callbacks=self._session.silence(publisher=True),
             )
         handle = cast("PublisherHandle", entity.handle)
-        publisher_entity = PublisherEntity(self._number(), channel.topic, offered, known, entity, handle)
+        publisher_entity = PublisherEntity(
+            number=self._number(), topic=channel.topic, qos=offered, channel=known, entity=entity, handle=handle
+        )
         if offered.durability == "transient_local":
             publisher_entity.kept = deque(maxlen=offered.depth)
         self._publisher_entity[publisher_entity.number] = publisher_entity

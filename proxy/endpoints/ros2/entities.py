@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections import OrderedDict, deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from threading import Lock
 from typing import Final, Literal, Protocol, TypeAlias
@@ -66,7 +66,7 @@ class Source(Protocol):
         """Read the available data."""
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class SubscriptionEntity:
     """A subscription."""
 
@@ -103,13 +103,10 @@ class SubscriptionEntity:
         offers = {end.qos for end in graph if end.role is Role.PUBLISHES and end.qos is not None}
         ordered = tuple(sorted(offers, key=repr))
         latched = any(qos.durability == "transient_local" for qos in ordered)
-        known = self.channel
-        return Channel(
-            known.topic, known.type_name, 2, known.hash, known.definition, known.definition_format, ordered, latched
-        )
+        return replace(self.channel, qos=ordered, latched=latched)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class PublisherEntity:
     """A publisher; ``kept`` are messages for late joiners of a transient local one.
 

@@ -106,7 +106,7 @@ class GraphCache:
             digest = str(getattr(end, "topic_type_hash", ""))  # Iron and later
             digest = digest if digest.startswith("RIHS01_") else ""
             gid = bytes(end.endpoint_gid).hex()
-            yield GraphEntity(role, topic, end.topic_type, node, gid, digest, from_profile(end.qos_profile))
+            yield GraphEntity(role, topic, end.topic_type, node, gid, hash=digest, qos=from_profile(end.qos_profile))
 
     def _look_at_nodes(self) -> bool:
         services = [

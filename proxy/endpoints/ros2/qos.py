@@ -9,12 +9,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from proxy.serial.channel import Qos
+from proxy.endpoints.endpoint import Graph, GraphEntity, Role
+from proxy.serial.channel import Channel, Qos
 
 if TYPE_CHECKING:
     from rclpy.qos import QoSProfile
 
-__all__ = ["conflict", "filled", "from_profile", "service_profile", "to_profile"]
+__all__ = ["conflict", "filled", "from_profile", "incompatibility", "service_profile", "to_profile"]
 
 _INFINITE: Final = (9_223_372_036, 854_775_807)  # RMW_DURATION_INFINITE
 _DEPTH: Final = 10
@@ -33,9 +34,10 @@ def filled(qos: Qos | None, *, latched: bool = False) -> Qos:
     """
     if qos is None:
         durability, depth = ("transient_local", 1) if latched else ("volatile", _DEPTH)
-        return Qos("keep_last", depth, "reliable", durability, (0, 0), (0, 0), "automatic", (0, 0), plain_names=False)
+        return Qos(
+            depth=depth, reliability="reliable", durability=durability, deadline=(0, 0), lifespan=(0, 0), lease=(0, 0)
+        )
     return Qos(
-        history="keep_last",
         depth=_DEPTH_OF_ALL if qos.history == "keep_all" else qos.depth or _DEPTH,
         reliability="best_effort" if qos.reliability == "best_effort" else "reliable",
         durability="transient_local" if qos.durability == "transient_local" else "volatile",
@@ -113,3 +115,31 @@ def _limit(duration: tuple[int, int]) -> tuple[int, int]:
 def _seconds(nanoseconds: int) -> tuple[int, int]:
     seconds, rest = divmod(nanoseconds, 1_000_000_000)
     return seconds, rest
+
+
+def incompatibility(role: Role, channel: Channel, qos: Qos, ends: Graph) -> str:
+    """Return why some entity of the opposite role cannot be matched, empty where all can.
+
+    Args:
+        ends: the other entities of the topic; those of the same role are ignored.
+    """
+    for end in sorted((end for end in ends if end.role is not role), key=lambda end: (end.node, end.key)):
+        reason = _type_conflict(channel, end) or _qos_conflict(role, qos, end)
+        if reason:
+            return f"{channel.topic}: {end.node} {end.role.value} it with {reason}"
+    return ""
+
+
+def _type_conflict(channel: Channel, end: GraphEntity) -> str:
+    if end.type_name != channel.type_name:
+        return f"another type, {end.type_name} and not {channel.type_name}"
+    if end.hash and channel.hash and end.hash != channel.hash:
+        return f"another definition of {end.type_name}, {end.hash[:15]} and not {channel.hash[:15]}"
+    return ""
+
+
+def _qos_conflict(role: Role, qos: Qos, end: GraphEntity) -> str:
+    if end.qos is None:
+        return ""
+    reason = conflict(qos, end.qos) if role is Role.PUBLISHES else conflict(end.qos, qos)
+    return f"a QoS that does not fit ours ({reason})" if reason else ""

@@ -283,11 +283,7 @@ class Session:
 
 
 def open_session(domain: int, name: str) -> Session:
-    """Join a domain as a node without parameters, log topic or type service.
-
-    Raises:
-        LocalError: ROS 2 is not installed, or does not start; the text states what to do.
-    """
+    """Join a domain as a node without parameters, log topic or type service."""
     _check_rmw()
     try:
         import rclpy

@@ -48,23 +48,17 @@ def class_of(type_name: str) -> type:
 
 @lru_cache(maxsize=1024)
 def channel_of(topic: str, type_name: str) -> Channel:
-    """Return the local description of a topic's type, without any QoS.
-
-    Raises:
-        LocalError: the type is not installed.
-    """
+    """Return the local description of a topic's type, without any QoS."""
     interface = interface_of(type_name, class_of)
     text = definition_of(interface)
-    return Channel(topic, type_name, 2, type_hash_of(interface), text, "msg" if text else "")
+    return Channel(
+        topic, type_name, 2, hash=type_hash_of(interface), definition=text, definition_format="msg" if text else ""
+    )
 
 
 @lru_cache(maxsize=1024)
 def service_of(name: str, type_name: str) -> Service:
-    """Return the local description of a service's type.
-
-    Raises:
-        LocalError: the type is not installed, or is not a service.
-    """
+    """Return the local description of a service's type."""
     found = class_of(type_name)
     if not hasattr(found, "Request"):
         raise LocalError(f"{type_name} is not a service")

@@ -17,7 +17,7 @@ from typing import Final
 from proxy.endpoints.endpoint import EndpointError, Event, Graph, GraphChanged, MessageReceived, Role, TypeResolved
 from proxy.endpoints.ros2.entities import ClientEntity, Kind, PublisherEntity, Source, SubscriptionEntity
 from proxy.endpoints.ros2.graph_cache import LOOK_EVERY_S, GraphCache
-from proxy.endpoints.ros2.qos_compat import incompatibility
+from proxy.endpoints.ros2.qos import incompatibility
 from proxy.endpoints.ros2.session import Session
 
 __all__ = ["WaitThread"]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from functools import cache
 from hashlib import sha256, shake_128
 from typing import Final, NamedTuple, TypeAlias
@@ -47,6 +47,7 @@ class Talk:
     topic: str
     type_name: str
     hz: float
+    _: KW_ONLY
     fill: Callable[[object, int, int, Fit], None]  # a new message; its number; the wall clock in ns
     read: Callable[[object], Mark]
     latched: bool = False
@@ -133,9 +134,9 @@ def _look_at_map(message: object) -> Mark:
 
 
 TALKS: Final = (
-    Talk("talker", "/chatter", "std_msgs/msg/String", 10.0, _say, _listen),
-    Talk("camera", "/camera/image", "sensor_msgs/msg/Image", 15.0, _take_picture, _look_at_picture),
-    Talk("mapper", "/map", "nav_msgs/msg/OccupancyGrid", 1.0, _draw_map, _look_at_map, latched=True),
+    Talk("talker", "/chatter", "std_msgs/msg/String", 10.0, fill=_say, read=_listen),
+    Talk("camera", "/camera/image", "sensor_msgs/msg/Image", 15.0, fill=_take_picture, read=_look_at_picture),
+    Talk("mapper", "/map", "nav_msgs/msg/OccupancyGrid", 1.0, fill=_draw_map, read=_look_at_map, latched=True),
 )
 
 

@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from fog.cli.robot_nodes import Started, run
-from fog.cluster import CloudNode
-from fog.launch.robot_node import RobotNode
+from fog.cluster import CloudNode, RobotNode
 from gdp.errors import LocalError
 from tests.pages import ROOT
 

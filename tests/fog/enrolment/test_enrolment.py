@@ -12,8 +12,7 @@ import pytest
 from fog.cluster import ExportedInterface
 from fog.enrolment.bootstrap import gateway_boot
 from fog.enrolment.listener import bind_tcp
-from fog.enrolment.members import Authority, metadata_of
-from fog.enrolment.revoking import revoke_credentials
+from fog.enrolment.members import Authority, metadata_of, revoke_credentials
 from fog.enrolment.robot_config import add_rules, reload_proxy, remove_rules
 from fog.host.bundle import install
 from fog.host.enrolment import enrol

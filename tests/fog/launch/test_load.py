@@ -6,10 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from fog.cluster import CloudNode, ExportedInterface, MachineRequest
+from fog.cluster import CloudNode, ExportedInterface, MachineRequest, RobotNode
 from fog.hardware import Hardware
 from fog.launch.load import key_values, load
-from fog.launch.robot_node import RobotNode
 from gdp.errors import ConfigError, LocalError
 
 LISTING = """

@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from fog.cluster import CloudNode, ClusterPlan, MachineRequest
+from fog.cluster import CloudNode, ClusterPlan, MachineRequest, RobotNode
 from fog.hardware import Hardware
 from fog.launch.lazy_names import has_ros_launch
 from fog.launch.load import load
-from fog.launch.robot_node import RobotNode
 from gdp.errors import LocalError
 from tests.fog.launch.test_load import LISTING, WITH_ARGUMENTS, written
 

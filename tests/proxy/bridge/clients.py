@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from proxy.endpoints.fake import FakeGraph, Server
 from tests.proxy.bridge.known import SET_BOOL
+from tests.proxy.endpoints.fake import FakeGraph, Server
 
 __all__ = ["Client", "LocalServer"]
 

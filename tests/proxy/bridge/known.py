@@ -60,12 +60,19 @@ def channel(type_name: str, ros: RosVersion = 2) -> Channel:
     store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_JAZZY)
     text, md5 = store.generate_msgdef(type_name, ros)
     digest = md5 if ros == 1 else type_hash(type_name, text, "msg")
-    return Channel("", type_name, ros, digest, text, "msg")
+    return Channel("", type_name, ros, hash=digest, definition=text, definition_format="msg")
 
 
 def custom(type_name: str, text: str, ros: RosVersion = 2) -> Channel:
     """Return a type by its definition text."""
-    return Channel("", type_name, ros, type_hash(type_name, text, "msg") if ros == 2 else "", text, "msg")
+    return Channel(
+        "",
+        type_name,
+        ros,
+        hash=type_hash(type_name, text, "msg") if ros == 2 else "",
+        definition=text,
+        definition_format="msg",
+    )
 
 
 @cache
@@ -78,7 +85,7 @@ def channels(ros: RosVersion = 2) -> dict[str, Channel]:
 def service(type_name: str, request: str, response: str, ros: RosVersion = 2) -> Service:
     """Return a service type by its definition texts."""
     halves = (
-        Channel("", f"{type_name}_{half}", ros, "", text, "msg")
+        Channel("", f"{type_name}_{half}", ros, hash="", definition=text, definition_format="msg")
         for half, text in (("Request", request), ("Response", response))
     )
     known = Service("", type_name, "", *halves)

@@ -29,9 +29,9 @@ from proxy.bridge.faults import Faults
 from proxy.config.config import ProxyConfig, Rule
 from proxy.config.rule import Kind
 from proxy.endpoints.endpoint import proxy_node_name
-from proxy.endpoints.fake import FakeEndpoint, FakeGraph
 from proxy.serial.channel import Qos, RosVersion
 from tests.proxy.bridge import known
+from tests.proxy.endpoints.fake import FakeEndpoint, FakeGraph
 from tests.proxy.rule_files import OWNER, furnish, proxy, rules
 
 ROBOT: Final = "nuc1/robot"

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from proxy.endpoints.fake import FakeGraph, Publication
 from proxy.endpoints.qos import default
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import FIBONACCI
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
+from tests.proxy.endpoints.fake import FakeGraph, Publication
 
 RULE = f"kind: action, name: /count, type: {FIBONACCI}, timeout_s: 2"
 CDR = b"\0\1\0\0"

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from proxy.endpoints.fake import FakeGraph
 from tests.proxy.bridge import known
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import STRING, string, switch, switched
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
+from tests.proxy.endpoints.fake import FakeGraph
 
 CHATTER = f"name: /chatter, type: {STRING}"
 CONVERTER, FAR_CONVERTER = "nuc1/twin", "nuc5/twin"

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from gdp.client.participant import Topic
-from proxy.endpoints.fake import Publication
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, STRING, string, switch, switched
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Granted, Machine, Sites, named
+from tests.proxy.endpoints.fake import Publication
 
 CHATTER = f"name: /chatter, type: {STRING}"
 OTHER = f"name: /other, type: {STRING}"

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from proxy.endpoints.fake import FakeGraph
 from proxy.serial.channel import RosVersion
 from tests.proxy.bridge import known
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, switch, switched
 from tests.proxy.bridge.sites import ROBOT, SERVER, Machine, Sites
+from tests.proxy.endpoints.fake import FakeGraph
 
 SWITCH = f"kind: service, name: /switch, type: {SET_BOOL}"
 ECHO = "own_srvs/srv/Echo"

@@ -13,11 +13,11 @@ from rosbags.typesys import get_types_from_msg
 
 from proxy.bridge import state_parameter
 from proxy.bridge.imported_service import ImportedService
-from proxy.endpoints.fake import FakeGraph, Server
 from tests.proxy.bridge import known
 from tests.proxy.bridge.clients import Client
 from tests.proxy.bridge.known import SET_BOOL, switch, switched
 from tests.proxy.bridge.sites import ROBOT, Machine, Sites
+from tests.proxy.endpoints.fake import FakeGraph, Server
 
 RULE = f"kind: service, name: /switch, type: {SET_BOOL}, state: ordered"
 PLACES = ("nuc3/a", "nuc4/b", "nuc5/c")

@@ -14,6 +14,7 @@ from proxy.serial.channel import Qos, RosVersion
 from tests.proxy.bridge import known
 from tests.proxy.bridge.known import STRING, string
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
+from tests.proxy.endpoints.fake import FakeGraph
 
 CHATTER = f"name: /chatter, type: {STRING}"
 LATCHED = default(latched=True, depth=1)

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from proxy.endpoints.fake import FakeGraph
 from proxy.serial.channel import RosVersion
 from tests.proxy.bridge import known
 from tests.proxy.bridge.known import IMAGE, STRING, custom, image, string
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Sites, named
+from tests.proxy.endpoints.fake import FakeGraph
 
 CHATTER = f"name: /chatter, type: {STRING}"
 CUSTOM = "own_msgs/msg/Pose"

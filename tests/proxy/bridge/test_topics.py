@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from proxy.endpoints.fake import Publication
 from tests.proxy.bridge.known import STRING, string
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites, named
+from tests.proxy.endpoints.fake import Publication
 
 CHATTER = f"name: /chatter, type: {STRING}"
 

@@ -25,9 +25,13 @@ from proxy.serial.channel import Qos
 from tests.proxy.rule_files import OWNER, furnish, proxy, rules
 
 IMAGE, STRING = "sensor_msgs/msg/Image", "std_msgs/msg/String"
-RELIABLE = Qos("keep_last", 10, "reliable", "volatile", (0, 0), (0, 0), "automatic", (0, 0), plain_names=False)
-BEST_EFFORT = Qos("keep_last", 10, "best_effort", "volatile", (0, 0), (0, 0), "automatic", (0, 0), plain_names=False)
-LATCHED = Qos("keep_last", 1, "reliable", "transient_local", (0, 0), (0, 0), "automatic", (0, 0), plain_names=False)
+RELIABLE = Qos(depth=10, reliability="reliable", durability="volatile", deadline=(0, 0), lifespan=(0, 0), lease=(0, 0))
+BEST_EFFORT = Qos(
+    depth=10, reliability="best_effort", durability="volatile", deadline=(0, 0), lifespan=(0, 0), lease=(0, 0)
+)
+LATCHED = Qos(
+    depth=1, reliability="reliable", durability="transient_local", deadline=(0, 0), lifespan=(0, 0), lease=(0, 0)
+)
 
 
 @dataclass(frozen=True, slots=True)

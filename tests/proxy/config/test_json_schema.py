@@ -13,9 +13,8 @@ import typer
 import yaml
 from typer.testing import CliRunner
 
-from proxy.cli.schema import Schema, schema_text
-from proxy.config.config import ProxyConfig
-from proxy.config.json_schema import DIALECT
+from proxy.cli.proxy import Schema, schema_text
+from proxy.config.config import DIALECT, ProxyConfig
 from tests.proxy.rule_files import NODE, rules
 from tests.proxy.test_rules import BAD, GOOD
 

@@ -107,7 +107,7 @@ def test_an_image_goes_both_ways_unchanged(ears: Ears, robot: Peer) -> None:
 
 
 def test_a_late_joiner_gets_what_was_latched(ears: Ears, robot: Peer) -> None:
-    channel = Channel("/map", STRING, 2, STRING_HASH, qos=(default(latched=True, depth=2),))
+    channel = Channel("/map", STRING, 2, hash=STRING_HASH, qos=(default(latched=True, depth=2),))
     handle = ears.endpoint.advertise(channel)
     for text in (b"first", b"hello", b"world"):
         ears.endpoint.publish(handle, HELLO.replace(b"hello", text))
@@ -163,14 +163,14 @@ def test_an_unknown_type_is_received_as_bytes(ears: Ears, robot: Peer) -> None:
     robot.tell("publish", topic="/odd", hex="0001000000")
     events = ears.wait(lambda got: bool(heard(got)))
     assert end.hash.startswith("RIHS01_")
-    assert TypeResolved(handle, Channel("/odd", "test_msgs/msg/Empty", 2, end.hash)) in events
+    assert TypeResolved(handle, Channel("/odd", "test_msgs/msg/Empty", 2, hash=end.hash)) in events
 
 
 def test_another_definition_of_a_local_type_is_refused(ears: Ears, robot: Peer) -> None:
     robot.tell("advertise", topic="/other", type=STRING)
     ears.wait_end(Role.PUBLISHES, "/other")
     with pytest.raises(LocalError, match="on this machine, not RIHS01_00"):
-        ears.endpoint.advertise(Channel("/other", STRING, 2, "RIHS01_" + "00" * 32))
+        ears.endpoint.advertise(Channel("/other", STRING, 2, hash="RIHS01_" + "00" * 32))
 
 
 def test_a_service_with_a_peer_of_another_vendor_is_refused_with_a_reason(ears: Ears, robot: Peer) -> None:

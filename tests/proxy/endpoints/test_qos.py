@@ -7,8 +7,8 @@ from itertools import product
 
 import pytest
 
-from proxy.endpoints.qos import DEPTH_MAX, NEVER, default, depth_of, kept, offer, request, unmatched
-from proxy.serial.channel import Qos
+from proxy.endpoints.qos import DEPTH_MAX, default, depth_of, kept, offer, request, unmatched
+from proxy.serial.channel import NEVER, Qos
 
 LATCHED = default(latched=True, depth=5)
 EASY = default(reliable=False)

@@ -68,8 +68,24 @@ def string(text: str) -> bytes:
 
 
 def channel(topic: str, *, latched: bool = False, depth: int = 1, type_name: str = STRING) -> Channel:
-    qos = Qos("keep_last", depth, "reliable", "transient_local", (0, 0), (0, 0), "automatic", (0, 0), False)
-    return Channel(topic, type_name, 1, STRING_MD5, "string data\n", "msg", (qos,), latched)
+    qos = Qos(
+        depth=depth,
+        reliability="reliable",
+        durability="transient_local",
+        deadline=(0, 0),
+        lifespan=(0, 0),
+        lease=(0, 0),
+    )
+    return Channel(
+        topic,
+        type_name,
+        1,
+        hash=STRING_MD5,
+        definition="string data\n",
+        definition_format="msg",
+        qos=(qos,),
+        latched=latched,
+    )
 
 
 def test_a_talker_is_heard_byte_for_byte_after_its_description(net: Net, ear: Ear) -> None:
@@ -82,7 +98,15 @@ def test_a_talker_is_heard_byte_for_byte_after_its_description(net: Net, ear: Ea
     heard = next(index for index, event in enumerate(ear.events) if isinstance(event, MessageReceived))
     assert described < heard
     assert ear.of(TypeResolved)[0].channel == Channel(
-        "/chatter", STRING, 1, STRING_MD5, "string data\n", "msg", (), True, "/talker"
+        "/chatter",
+        STRING,
+        1,
+        hash=STRING_MD5,
+        definition="string data\n",
+        definition_format="msg",
+        qos=(),
+        latched=True,
+        callerid="/talker",
     )
     assert [event.raw for event in ear.of(MessageReceived, handle)] == [string("first of talker"), string("second")]
 
@@ -194,7 +218,7 @@ rospy.spin()
 
 
 def test_a_definition_that_differs_from_the_installed_one_is_a_fault(ear: Ear) -> None:
-    wrong = Channel("/wrong", STRING, 1, "0" * 32, "string text\n", "msg")
+    wrong = Channel("/wrong", STRING, 1, hash="0" * 32, definition="string text\n", definition_format="msg")
     handle = ear.endpoint.advertise(wrong)
     reason = ear.wait(EndpointError, 1, handle)[0].reason
     assert STRING_MD5 in reason
@@ -204,7 +228,7 @@ def test_a_definition_that_differs_from_the_installed_one_is_a_fault(ear: Ear) -
 def test_a_topic_of_another_local_type_is_a_fault_until_that_is_gone(net: Net, ear: Ear) -> None:
     talker = net.peer(TALKER.format(node="talker", topic="/taken", latch=False))
     ear.wait_end("/taken")
-    handle = ear.endpoint.advertise(Channel("/taken", "std_msgs/msg/Empty", 1, "d41d8cd98f00b204e9800998ecf8427e"))
+    handle = ear.endpoint.advertise(Channel("/taken", "std_msgs/msg/Empty", 1, hash="d41d8cd98f00b204e9800998ecf8427e"))
     assert "std_msgs/String" in ear.wait(EndpointError, 1, handle)[0].reason
     talker.end()
     listener = net.peer(LISTENER.format(node="listener", topic="/taken", type="AnyMsg"))
@@ -217,7 +241,9 @@ def test_a_type_that_is_not_installed_is_advertised_by_its_definition(net: Net, 
     text = (
         "Header header\nstring data\n" + "=" * 80 + "\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
     )
-    handle = ear.endpoint.advertise(Channel("/odd", "far_msgs/msg/Odd", 1, "", text, "msg"))
+    handle = ear.endpoint.advertise(
+        Channel("/odd", "far_msgs/msg/Odd", 1, hash="", definition=text, definition_format="msg")
+    )
     listener = net.peer(LISTENER.format(node="listener", topic="/odd", type="AnyMsg"))
     ear.until(lambda: ear.endpoint.subscribers(handle) == 1)
     ear.endpoint.publish(handle, bytes(20))

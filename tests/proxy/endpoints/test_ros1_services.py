@@ -74,8 +74,10 @@ def fine(text: str, *, success: bool = True) -> bytes:
 
 
 def set_bool(name: str = "/virtual", md5: str = SET_BOOL_MD5) -> Service:
-    request = Channel(name, f"{SET_BOOL}_Request", 1, "", "bool data\n", "msg")
-    response = Channel(name, f"{SET_BOOL}_Response", 1, "", "bool success\nstring message\n", "msg")
+    request = Channel(name, f"{SET_BOOL}_Request", 1, hash="", definition="bool data\n", definition_format="msg")
+    response = Channel(
+        name, f"{SET_BOOL}_Response", 1, hash="", definition="bool success\nstring message\n", definition_format="msg"
+    )
     return Service(name, SET_BOOL, md5, request, response)
 
 

@@ -8,12 +8,11 @@ import pytest
 
 from proxy.endpoints.endpoint import GraphEntity, Role
 from proxy.endpoints.ros2.loopback_filter import LoopbackFilter
-from proxy.endpoints.ros2.qos import conflict, filled
-from proxy.endpoints.ros2.qos_compat import incompatibility
+from proxy.endpoints.ros2.qos import conflict, filled, incompatibility
 from proxy.serial.channel import Channel, Qos
 
 RELIABLE = filled(None)
-STRING = Channel("/a", "std_msgs/msg/String", 2, "RIHS01_" + "a" * 64)
+STRING = Channel("/a", "std_msgs/msg/String", 2, hash="RIHS01_" + "a" * 64)
 
 
 @pytest.mark.parametrize(
@@ -38,7 +37,16 @@ def test_an_offer_that_does_not_meet_the_request_names_its_policy(offered: Qos, 
 
 
 def test_unknown_words_and_no_depth_become_the_defaults() -> None:
-    unknown = Qos("unknown", 0, "unknown", "unknown", (0, 0), (0, 0), "unknown", (0, 0), plain_names=False)
+    unknown = Qos(
+        history="unknown",
+        depth=0,
+        reliability="unknown",
+        durability="unknown",
+        deadline=(0, 0),
+        lifespan=(0, 0),
+        liveliness="unknown",
+        lease=(0, 0),
+    )
     assert filled(unknown) == RELIABLE
 
 
@@ -52,7 +60,7 @@ def test_every_way_to_say_infinite_is_left_unsaid(infinite: tuple[int, int]) -> 
 
 
 def test_a_qos_report_names_the_node_and_the_difference() -> None:
-    end = GraphEntity(Role.PUBLISHES, "/a", "std_msgs/msg/String", "/talker", "01", STRING.hash, RELIABLE)
+    end = GraphEntity(Role.PUBLISHES, "/a", "std_msgs/msg/String", "/talker", "01", hash=STRING.hash, qos=RELIABLE)
     assert incompatibility(Role.SUBSCRIBES, STRING, RELIABLE, frozenset({end})) == ""
     other = replace(end, hash="RIHS01_" + "b" * 64)
     assert "another definition of std_msgs/msg/String" in incompatibility(

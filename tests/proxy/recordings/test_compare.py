@@ -22,7 +22,7 @@ def message(value: int, rubbish: int = 0) -> bytes:
 
 
 def record(path: Path, messages: Sequence[bytes]) -> Path:
-    about = Channel("/a", TYPE, 2, "RIHS01_0", "uint8 a\nfloat64 b\n", "msg")
+    about = Channel("/a", TYPE, 2, hash="RIHS01_0", definition="uint8 a\nfloat64 b\n", definition_format="msg")
     with BagWriter(path, 2) as bag:
         handle = bag.add(about)
         for stamp, raw in enumerate(messages):
@@ -40,7 +40,18 @@ SENT = [message(value) for value in range(5)]
 
 def test_what_arrived_whole_is_identical_and_in_order(tmp_path: Path) -> None:
     size = sum(map(len, SENT))
-    assert judged(tmp_path, SENT, SENT) == TopicComparison("/a", TYPE, 5, size, 5, 0, 0, 0, True, True)
+    assert judged(tmp_path, SENT, SENT) == TopicComparison(
+        topic="/a",
+        type_name=TYPE,
+        messages=5,
+        bytes=size,
+        delivered=5,
+        lost=0,
+        duplicated=0,
+        altered=0,
+        identical=True,
+        in_order=True,
+    )
 
 
 def test_a_lost_message_is_counted(tmp_path: Path) -> None:
@@ -77,7 +88,7 @@ def test_rubbish_in_padding_counts_only_where_bytes_are_compared(tmp_path: Path)
 
 def test_a_topic_on_one_side_alone_is_listed(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "empty.mcap", 2) as bag:
-        bag.add(Channel("/other", TYPE, 2, "RIHS01_0", "uint8 data\n", "msg"))
+        bag.add(Channel("/other", TYPE, 2, hash="RIHS01_0", definition="uint8 data\n", definition_format="msg"))
     sent = record(tmp_path / "a.mcap", SENT)
     gone, none = compare(sent, tmp_path / "empty.mcap", exact=False)
     assert (gone.topic, gone.lost, gone.identical) == ("/a", 5, False)
@@ -88,7 +99,18 @@ def test_publishers_of_one_topic_are_in_order_each_by_itself(tmp_path: Path) -> 
     def bag(name: str, order: str) -> Path:
         with BagWriter(tmp_path / name, 1) as out:
             handles = {
-                who: out.add(Channel("/a", TYPE, 1, "7c81", "uint8 data\n", "msg", callerid=f"/{who}")) for who in "xy"
+                who: out.add(
+                    Channel(
+                        "/a",
+                        TYPE,
+                        1,
+                        hash="7c81",
+                        definition="uint8 data\n",
+                        definition_format="msg",
+                        callerid=f"/{who}",
+                    )
+                )
+                for who in "xy"
             }
             counts = dict.fromkeys("xy", 0)
             for stamp, who in enumerate(order):

@@ -16,7 +16,6 @@ from proxy.bridge.counters import Traffic
 from proxy.bridge.faults import Faults
 from proxy.config.recorded import RecordedRules
 from proxy.endpoints.endpoint import GraphChanged, MessageReceived, TypeResolved
-from proxy.endpoints.fake import FakeEndpoint, FakeGraph
 from proxy.recordings.endpoint import RecordingEndpoint, ReplayEndpoint
 from proxy.recordings.reader import BagReader
 from proxy.recordings.writer import BagWriter
@@ -24,6 +23,7 @@ from proxy.serial.channel import Channel, RosVersion
 from tests.proxy.bridge import known
 from tests.proxy.bridge.known import IMAGE, STRING
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
+from tests.proxy.endpoints.fake import FakeEndpoint, FakeGraph
 from tests.proxy.recordings.test_reader import LATCHED, PLAIN, START_NS, raw, string
 
 CHATTER = f"name: /chatter, type: {STRING}, encoding: cdr"

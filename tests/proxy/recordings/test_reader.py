@@ -21,9 +21,8 @@ from proxy.recordings.writer import BagWriter
 from proxy.serial.channel import Channel, Qos, RosVersion
 from tests.proxy.recordings.samples import READABLE, UNREADABLE, recording
 
-NEVER = (9_223_372_036, 854_775_807)
-LATCHED = Qos("keep_last", 1, "reliable", "transient_local", NEVER, NEVER, "automatic", NEVER, plain_names=False)
-PLAIN = Qos("keep_all", 0, "best_effort", "volatile", NEVER, NEVER, "automatic", NEVER, plain_names=True)
+LATCHED = Qos(depth=1, reliability="reliable", durability="transient_local")
+PLAIN = Qos(history="keep_all", depth=0, reliability="best_effort", durability="volatile", plain_names=True)
 START_NS = 1_700_000_000_000_000_000
 
 

@@ -10,13 +10,29 @@ from hypothesis import strategies as st
 from gdp.errors import DropReason, LocalError, RemoteError
 from proxy.serial.channel import Channel, Qos
 
-NEVER = (9_223_372_036, 854_775_807)
-QOS = Qos("keep_last", 10, "reliable", "transient_local", NEVER, NEVER, "automatic", NEVER, plain_names=False)
+QOS = Qos(depth=10, reliability="reliable", durability="transient_local")
 
 
 def test_a_description_comes_back_as_it_was() -> None:
-    ros2 = Channel("/a", "std_msgs/msg/String", 2, "RIHS01_ab", "string data\n", "msg", (QOS, QOS), latched=True)
-    ros1 = Channel("/b", "std_msgs/msg/String", 1, "992c", "string data\n", "msg", callerid="/talker")
+    ros2 = Channel(
+        "/a",
+        "std_msgs/msg/String",
+        2,
+        hash="RIHS01_ab",
+        definition="string data\n",
+        definition_format="msg",
+        qos=(QOS, QOS),
+        latched=True,
+    )
+    ros1 = Channel(
+        "/b",
+        "std_msgs/msg/String",
+        1,
+        hash="992c",
+        definition="string data\n",
+        definition_format="msg",
+        callerid="/talker",
+    )
     for channel in (ros1, ros2):
         assert Channel.from_wire(channel.to_wire()) == channel
 
@@ -68,7 +84,17 @@ def test_arbitrary_bytes_are_a_description_or_refused(wire: bytes) -> None:
 
 @given(st.integers(0, 400), st.integers(0, 255))
 def test_an_altered_description_is_one_or_refused(at: int, value: int) -> None:
-    wire = bytearray(Channel("/a", "std_msgs/msg/String", 2, "RIHS01", "string data\n", "msg", (QOS,)).to_wire())
+    wire = bytearray(
+        Channel(
+            "/a",
+            "std_msgs/msg/String",
+            2,
+            hash="RIHS01",
+            definition="string data\n",
+            definition_format="msg",
+            qos=(QOS,),
+        ).to_wire()
+    )
     wire[at % len(wire)] = value
     assert refusal(bytes(wire)) in (None, DropReason.MALFORMED)
 

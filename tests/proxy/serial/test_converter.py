@@ -17,8 +17,7 @@ from proxy.serial.serializer import canonical
 
 LITTLE = b"\x00\x01\x00\x00"
 RULE = "=" * 80 + "\n"
-NEVER = (9_223_372_036, 854_775_807)
-LASTING = Qos("keep_last", 5, "reliable", "transient_local", NEVER, NEVER, "automatic", NEVER, plain_names=False)
+LASTING = Qos(depth=5, reliability="reliable", durability="transient_local")
 HEADER1 = f"{RULE}MSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
 HEADER2 = f"{RULE}MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
 MIXED = f"""\
@@ -60,7 +59,7 @@ def channel(definition: str, ros: RosVersion, definition_format: DefinitionForma
 def standard(type_name: str, ros: RosVersion) -> Channel:
     store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_JAZZY)
     text, md5 = store.generate_msgdef(type_name, ros)
-    return Channel("/t", type_name, ros, md5 if ros == 1 else "", text, "msg")
+    return Channel("/t", type_name, ros, hash=md5 if ros == 1 else "", definition=text, definition_format="msg")
 
 
 def to_ros2(one: str, other: str, raw: bytes) -> bytes:
@@ -192,9 +191,9 @@ def test_a_tighter_bound_is_looked_after_within_ros_2_too() -> None:
 
 
 def test_an_equal_hash_stands_for_definitions_that_are_not_there() -> None:
-    blind = Channel("/t", "a/msg/B", 2, "RIHS01_ab")
+    blind = Channel("/t", "a/msg/B", 2, hash="RIHS01_ab")
     assert MessageConverter(blind, blind).convert(b"x") == b"x"
-    assert "no definition" in difference(blind, Channel("/t", "a/msg/B", 2, "RIHS01_cd"))
+    assert "no definition" in difference(blind, Channel("/t", "a/msg/B", 2, hash="RIHS01_cd"))
     assert "no definition" in difference(Channel("/t", "a/msg/B", 2), Channel("/t", "a/msg/B", 2))
 
 
@@ -302,11 +301,25 @@ def test_a_channel_without_a_definition_has_no_translation() -> None:
 
 
 def test_latched_is_transient_local_in_ros_2() -> None:
-    ros1 = Channel("/t", "std_msgs/msg/String", 1, "", "string data\n", "msg", latched=True, callerid="/talker")
+    ros1 = Channel(
+        "/t",
+        "std_msgs/msg/String",
+        1,
+        hash="",
+        definition="string data\n",
+        definition_format="msg",
+        latched=True,
+        callerid="/talker",
+    )
     ros2 = translated_channel(ros1, 2)
     assert [(qos.depth, qos.reliability, qos.durability) for qos in ros2.qos] == [(1, "reliable", "transient_local")]
     assert ros2.callerid is None
-    back = translated_channel(Channel("/t", "std_msgs/msg/String", 2, "", "string data\n", "msg", (LASTING,)), 1)
+    back = translated_channel(
+        Channel(
+            "/t", "std_msgs/msg/String", 2, hash="", definition="string data\n", definition_format="msg", qos=(LASTING,)
+        ),
+        1,
+    )
     assert back.latched
     assert back.qos == ()
     assert translated_channel(channel("", 1), 2).qos == ()

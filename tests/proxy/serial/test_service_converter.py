@@ -66,7 +66,7 @@ def installed_ros2_hashes() -> dict[str, str]:
 
 def service(type_name: str, request: str, response: str, ros: RosVersion = 1, digest: str = "") -> Service:
     halves = (
-        Channel("/s", f"{type_name}_{half}", ros, "", text, "msg")
+        Channel("/s", f"{type_name}_{half}", ros, hash="", definition=text, definition_format="msg")
         for half, text in (("Request", request), ("Response", response))
     )
     return Service("/s", type_name, digest, *halves)
@@ -92,7 +92,7 @@ def test_every_installed_ros_1_service_has_its_md5() -> None:
 
 def test_every_installed_ros_1_message_has_its_md5() -> None:
     for name, (md5, text) in installed_ros1()["msg"].items():
-        before = Channel("/t", name.replace("/", "/msg/"), 1, md5, text, "msg")
+        before = Channel("/t", name.replace("/", "/msg/"), 1, hash=md5, definition=text, definition_format="msg")
         assert translated_channel(translated_channel(before, 2), 1).hash == md5, name
 
 
@@ -113,7 +113,9 @@ def test_ros_1_messages_have_the_hashes_of_the_ros_2_messages_installed() -> Non
         type_name = name.replace("/", "/msg/")
         if type_name not in installed_ros2_hashes() or name == "sensor_msgs/Range":  # Iron added ``variance``
             continue
-        converter = translated_channel(Channel("/t", type_name, 1, md5, text, "msg"), 2)
+        converter = translated_channel(
+            Channel("/t", type_name, 1, hash=md5, definition=text, definition_format="msg"), 2
+        )
         assert converter.hash == installed_ros2_hashes()[type_name], name
         compared += 1
     assert compared > 80

@@ -298,13 +298,6 @@ class FakeEndpoint:
             raise LocalError(f"handle {handle} is no publisher")
         publication.publish(raw)
 
-    def subscribers(self, handle: int) -> int:
-        """Return the number of subscriptions of a publisher."""
-        publication = self._open[handle].publication
-        if publication is None:
-            raise LocalError(f"handle {handle} is no publisher")
-        return len(self._graph.subscriptions(publication.end.name, publication.end.type_name))
-
     def serve(self, service: Service) -> int:
         """Create a server."""
         opened = _Open(lambda: None)
