@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from proxy.endpoints.fake import FakeGraph, Publication
 from proxy.endpoints.qos import default
 from proxy.serial.channel import Qos, RosVersion
 from tests.proxy.bridge import known
