@@ -14,7 +14,7 @@ import queue
 import select
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Final, TypeAlias
 
@@ -255,7 +255,10 @@ class Node:
 
     def _remind(self, look: GraphSnapshot) -> None:
         """Announce connections again that are missing for long, see ``reconnect``."""
-        topics = {"subscribes": self._outlets, "publishes": self._inlets}
+        topics: dict[str, Mapping[int, Publisher | Subscriber]] = {
+            "subscribes": self._outlets,
+            "publishes": self._inlets,
+        }
         missing = set[LocalEnd]()
         for end in look.ends:
             ours = [each for each in list(topics.get(end.role, {}).values()) if each.topic == end.name]
