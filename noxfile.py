@@ -22,7 +22,7 @@ PYTHONS = ("3.10", "3.11", "3.12", "3.13", "3.14")
 PYTHON = ".venv/bin/python"
 FAST_TESTS = (
     *(f"tests/gdp/{each}" for each in ("control", "crypto", "frame", "message", "rib", "session", "switch", "trust")),
-    *(f"tests/proxy/{each}" for each in ("config", "serial", "wire")),
+    *(f"tests/proxy/{each}" for each in ("config", "wire")),
     *(f"tests/fog/{each}" for each in ("catalog", "host", "latency", "plan")),
 )  # without root, processes and sockets; most tests of the cores
 TEST_TOOLS = ("hypothesis", "jsonschema", "packaging", "pytest")
