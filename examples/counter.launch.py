@@ -1,4 +1,7 @@
-"""Counter replicated on two spot machines: if one fails, the other has the same count (docs/how-to/state.md)."""
+"""Counter replicated on two spot machines: if one fails, the other has the same count (docs/how-to/state.md).
+
+A rented machine needs the wheel of the node, as ``echo.launch.py`` says.
+"""
 
 from fog import FogCluster, LaunchDescription, Node, SpotMachine
 

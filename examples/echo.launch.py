@@ -1,6 +1,10 @@
-"""Service on two spot machines and a robot that calls it; this package contains all nodes.
+"""Service on two spot machines and a robot that calls it; ``scripts/fog_demo`` contains all nodes.
 
 ``fog launch examples/echo.launch.py rate:=50``
+
+Machines of the provider ``local`` have the robot's packages. A rented machine needs the wheel of the nodes:
+``.venv/bin/pip wheel --no-deps --wheel-dir dist scripts/fog_demo``. Serve it, and pin it in ``setup.requirements``
+next to the wheels of gdp-ros, rclpy and std_srvs (docs/reference/providers.md).
 """
 
 from fog import DeclareLaunchArgument, FogCluster, LaunchConfiguration, LaunchDescription, Node, SpotMachine

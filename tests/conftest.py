@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import signal
 
+import hypothesis
+
 from gdp.control.boundary import ErrorBoundary
 from tests.script_packages import share_script_packages
 
@@ -11,8 +13,11 @@ from tests.script_packages import share_script_packages
 def pytest_configure() -> None:
     """Accept Ctrl-C again: a shell starts background processes with it ignored, and children inherit that.
 
-    Errors that a node would contain fail the test that draws them.
+    Errors that a node would contain fail the test that draws them. No generated example has a time limit: how long it
+    takes depends on the machine's load.
     """
+    hypothesis.settings.register_profile("unhurried", deadline=None)
+    hypothesis.settings.load_profile("unhurried")
     ErrorBoundary.reraises = True
     share_script_packages()
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

@@ -202,4 +202,6 @@ def _is_served(standing: Channel, wanted: Channel) -> bool:
     if replace(standing, qos=()) != replace(wanted, qos=()):
         return False
     before, after = standing.qos[0], wanted.qos[0]
+    if standing.ros == 1:  # has no QoS, except how many messages a latched publisher keeps
+        return not standing.latched or before.depth >= after.depth
     return replace(before, depth=0) == replace(after, depth=0) and before.depth >= after.depth

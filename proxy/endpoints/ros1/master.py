@@ -132,6 +132,10 @@ class Master:
             self._proxy("close")()
             raise MasterError(str(error)[:_REASON_MAX] or type(error).__name__) from error
 
+    def close(self) -> None:
+        """Close the connection; the next request opens another."""
+        self._proxy("close")()
+
 
 class MasterWatch:
     """Periodic polling of the graph."""

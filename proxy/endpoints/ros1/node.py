@@ -13,14 +13,16 @@ import os
 import queue
 import select
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Final, TypeAlias
 
 import cbor2
 import rospy
 import rospy.core
 from rospy.impl import masterslave, tcpros_base
-from rospy.impl.registration import get_service_manager, get_topic_manager
+from rospy.impl.registration import RegManager, get_registration_listeners, get_service_manager, get_topic_manager
 
 from gdp.errors import LocalError, RemoteError
 from proxy.endpoints.ros1.ipc import Frame, IpcLink, Kind, LinkEndedError
@@ -33,6 +35,7 @@ from proxy.endpoints.ros1.raw import (
     ros1_name,
     ros2_name,
 )
+from proxy.endpoints.ros1.reconnect import MissingConnections
 from proxy.endpoints.ros1.services import Client, Server, tickets
 from proxy.endpoints.ros1.topics import Publisher, Subscriber
 from proxy.serial.channel import Channel
@@ -67,6 +70,7 @@ class Node:
         self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._refused: dict[int, str] = {}  # not on the graph, with the reason; owned by the registrar
         self._look: GraphSnapshot | None = None
+        self._missing = MissingConnections[LocalEnd]()  # owned by the watch
         self._stopped = threading.Event()
         self._lost = 0
 
@@ -246,9 +250,42 @@ class Node:
         self._look = look
         if is_news:
             self._todo.put(self._retry)
+        self._remind(look)
         if self._link.dropped != self._lost:
             self._lost = self._link.dropped
             self._link.send(Kind.LOST, number=self._lost)
+
+    def _remind(self, look: GraphSnapshot) -> None:
+        """Announce connections again that are missing for long, see ``reconnect``."""
+        topics: dict[str, Mapping[int, Publisher | Subscriber]] = {
+            "subscribes": self._outlets,
+            "publishes": self._inlets,
+        }
+        missing = set[LocalEnd]()
+        for end in look.ends:
+            ours = [each for each in list(topics.get(end.role, {}).values()) if each.topic == end.name]
+            if ours and not any(end.node in each.peers() for each in ours):
+                missing.add(end)
+        for end in self._missing.due(missing, time.monotonic()):
+            self._todo.put(partial(self._announce, end))
+
+    def _announce(self, end: LocalEnd) -> None:
+        """Let the subscriber of a missing connection learn of the publisher again."""
+        manager = get_topic_manager()
+        master = Master(self._master, self._id)
+        try:
+            if end.role == "subscribes" and manager.has_publication(end.name):
+                known = manager.get_publisher_impl(end.name).type
+                master.ask(("registerPublisher", end.name, known, rospy.core.get_node_uri()))
+            elif end.role == "publishes" and manager.has_subscription(end.name):
+                (uri,) = master.ask(("lookupNode", end.node))
+                for listener in get_registration_listeners().listeners:
+                    if uri is not None and isinstance(listener, RegManager):
+                        listener.publisher_update(end.name, [uri])
+        except MasterError:
+            return  # the watch reports it, and the reminder comes again
+        finally:
+            master.close()
 
     def _retry(self) -> None:
         for handle in list(self._refused):

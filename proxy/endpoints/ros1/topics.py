@@ -29,6 +29,7 @@ _QUEUE: Final = 100  # messages in the queue of one slow subscriber
 class _Connection(Protocol):
     header: dict[str, str] | None
     endpoint_id: str
+    callerid_pub: str
 
 
 class Subscriber:
@@ -37,7 +38,7 @@ class Subscriber:
     def __init__(self, link: IpcLink, handle: int, topic: str, node: str) -> None:
         self._link = link
         self._handle = handle
-        self._topic = topic
+        self.topic = topic
         self._node = node
         self._lock = threading.Lock()  # one connection's description must not overtake another's message
         # by identity; the reference keeps the identity valid
@@ -49,7 +50,7 @@ class Subscriber:
     def register(self) -> None:
         """Subscribe."""
         self._subscriber = rospy.Subscriber(
-            self._topic, rospy.AnyMsg, self._hear, queue_size=None, buff_size=1 << 18, tcp_nodelay=True
+            self.topic, rospy.AnyMsg, self._hear, queue_size=None, buff_size=1 << 18, tcp_nodelay=True
         )
 
     def close(self) -> None:
@@ -58,6 +59,12 @@ class Subscriber:
             impl = self._subscriber.impl
             self._subscriber.unregister()
             _free(impl)
+
+    def peers(self) -> set[str]:
+        """Return the nodes of the connected publishers."""
+        impl = get_topic_manager().get_subscriber_impl(self.topic)
+        connections: list[_Connection] = getattr(impl, "connections", None) or []
+        return {connection.callerid_pub for connection in connections}
 
     def _hear(self, message: Raw) -> None:
         stamp_ns = time.time_ns()
@@ -71,7 +78,7 @@ class Subscriber:
                 self._link.send(Kind.HEARD, self._handle, stamp_ns, message._buff)
 
     def _live(self) -> list[dict[str, str]]:
-        impl = get_topic_manager().get_subscriber_impl(self._topic)
+        impl = get_topic_manager().get_subscriber_impl(self.topic)
         connections: list[_Connection] = [] if impl is None else impl.connections
         return [connection.header for connection in connections if connection.header]
 
@@ -87,7 +94,7 @@ class Subscriber:
         if kind == self._type:
             return True
         text = "{} has publishers of {} (md5 {}) and of {} (md5 {}, {}): the latter are not heard"
-        reason = text.format(self._topic, *self._type, *kind, caller or "unnamed")
+        reason = text.format(self.topic, *self._type, *kind, caller or "unnamed")
         self._link.send(Kind.FAULTED, self._handle, 0, reason.encode())
         return False
 
@@ -97,7 +104,7 @@ class Subscriber:
             return
         text = headers[0].get("message_definition", "")
         channel = Channel(
-            topic=self._topic,
+            topic=self.topic,
             type_name=ros2_name(self._type[0], "msg"),
             ros=1,
             hash=self._type[1],
@@ -164,6 +171,12 @@ class Publisher(rospy.SubscribeListener):  # type: ignore[misc]  # rospy is unty
             impl.subscriber_listeners.remove(self)
             publisher.unregister()
             _free(impl)
+
+    def peers(self) -> set[str]:
+        """Return the nodes of the connected subscribers."""
+        impl = get_topic_manager().get_publisher_impl(self.topic)
+        connections: list[_Connection] = getattr(impl, "connections", None) or []
+        return {connection.endpoint_id for connection in connections}
 
     def peer_subscribe(
         self, _topic_name: str, _topic_publish: Callable[[Raw], None], peer_publish: Callable[[Raw], None]

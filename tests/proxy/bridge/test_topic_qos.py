@@ -13,7 +13,7 @@ from proxy.serial.channel import Qos, RosVersion
 from tests.proxy.bridge import known
 from tests.proxy.bridge.known import STRING, string
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
-from tests.proxy.endpoints.fake import FakeGraph
+from tests.proxy.endpoints.fake import FakeGraph, Publication
 
 CHATTER = f"name: /chatter, type: {STRING}"
 LATCHED = default(latched=True, depth=1)
@@ -33,10 +33,15 @@ def count_aloud(talker: Publication, number: int) -> None:
     talker.publish(string(str(number)))
 
 
+def virtual(machine: Machine) -> list[Publication]:
+    """Return the virtual publishers of the topic."""
+    return [each for each in machine.graph.publications if each.end.name == "/chatter"]
+
+
 def offered(machine: Machine) -> Qos:
     """Return the offer of the virtual publisher."""
-    (qos,) = (each.qos for each in machine.graph.publications if each.end.name == "/chatter")
-    return qos
+    (publication,) = virtual(machine)
+    return publication.qos
 
 
 @pytest.mark.parametrize("qos", [default(), BEST_EFFORT], ids=["reliable", "best effort"])
@@ -47,6 +52,28 @@ def test_the_virtual_publisher_offers_what_the_far_one_does(sites: Sites, qos: Q
     talker.publish(string("hello"))
     assert sites.run(1, lambda: ear.texts == ["hello"])
     assert offered(server).reliability == qos.reliability
+
+
+def test_a_ros_1_publisher_is_not_replaced_because_the_far_qos_differs(sites: Sites) -> None:
+    robot, server = sites.add(ROBOT, expose=[CHATTER]), sites.add(SERVER, imports=[CHATTER], ros=1)
+    ear = Ear(server.graph, "/chatter")
+    assert sites.run(3, lambda: virtual(server))
+    before = virtual(server)
+    talker = robot.graph.publish("/talker", "/chatter", STRING, BEST_EFFORT)
+    assert sites.run(3, robot.is_read)
+    talker.publish(string("hello"))
+    assert sites.run(1, lambda: ear.texts == ["hello"])
+    assert virtual(server) == before
+
+
+def test_a_ros_1_publisher_is_replaced_when_the_far_one_is_latched(sites: Sites) -> None:
+    robot, server = sites.add(ROBOT, expose=[CHATTER]), sites.add(SERVER, imports=[CHATTER], ros=1)
+    ear = Ear(server.graph, "/chatter")
+    assert sites.run(3, lambda: virtual(server))
+    before = virtual(server)
+    robot.graph.publish("/talker", "/chatter", STRING, LATCHED).publish(string("map"))
+    assert sites.run(3, lambda: ear.texts == ["map"])
+    assert virtual(server) != before
 
 
 def test_what_is_lost_is_repaired_for_a_reliable_publisher_only(sites: Sites) -> None:

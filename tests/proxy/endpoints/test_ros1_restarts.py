@@ -5,15 +5,58 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import time
+import xmlrpc.client
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
 from proxy.endpoints.endpoint import CallFailed, EndpointError, MessageReceived, RequestReceived, ResponseReceived
-from tests.proxy.endpoints.ros1_net import Ear, Net, ros1_net
+from tests.proxy.endpoints.ros1_net import PATIENCE_S, Ear, Net, ros1_net
 from tests.proxy.endpoints.test_ros1 import LISTENER, STRING, TALKER, channel, string
 from tests.proxy.endpoints.test_ros1_services import CLIENTS, SERVER, SET_BOOL, fine, set_bool
+
+SLOW_LISTENER = """
+import sys
+from rospy.impl import tcpros_base
+from std_msgs.msg import String
+plain = tcpros_base.TCPROSTransport.connect
+def connect(*words, **options):  # the first handshake waits for the test, between requestTopic and TCP
+    tcpros_base.TCPROSTransport.connect = plain
+    print("connecting")
+    sys.stdin.readline()
+    try: plain(*words, **options)
+    except Exception: print("refused"); raise
+tcpros_base.TCPROSTransport.connect = connect
+rospy.init_node("listener")
+rospy.Subscriber("/out", String, lambda message: print(message.data))
+print("ready")
+rospy.spin()
+"""
+SLOW_TALKER = """
+import sys
+from rospy.impl import tcpros_pubsub
+from std_msgs.msg import String
+plain = tcpros_pubsub.TCPROSHandler.topic_connection_handler
+is_first = True
+def handle(*words):  # the first handshake finds the publisher gone
+    global is_first
+    if is_first:
+        is_first = False
+        talker.unregister()
+        print("asked")
+    return plain(*words)
+tcpros_pubsub.TCPROSHandler.topic_connection_handler = handle
+rospy.init_node("talker")
+talker = rospy.Publisher("/in", String, queue_size=10, latch=True)
+print("ready")
+sys.stdin.readline()
+talker = rospy.Publisher("/in", String, queue_size=10, latch=True)
+talker.publish("again")
+rospy.spin()
+"""
 
 
 @pytest.fixture
@@ -124,3 +167,36 @@ def test_the_rospy_process_ends_with_the_proxy(net: Net) -> None:
     ear.endpoint.shut_down()
     assert process.returncode == 0
     other.wait_end("/out", gone=True)
+
+
+def wait_until_unpublished(net: Net, topic: str) -> None:
+    """Return when the master knows no publisher of a topic, which causes no event."""
+    until_s = time.monotonic() + PATIENCE_S
+    with xmlrpc.client.ServerProxy(net.uri) as master:
+        while topic in str(cast("list[Any]", master.getSystemState("/test"))[2][0]):
+            assert time.monotonic() < until_s
+            time.sleep(0.02)
+
+
+def test_a_listener_whose_handshake_met_a_publisher_under_replacement_is_connected_later(net: Net) -> None:
+    ear = net.endpoint()
+    listener = net.peer(SLOW_LISTENER)
+    first = ear.endpoint.advertise(channel("/out", latched=True))
+    listener.until("connecting")
+    ear.endpoint.close(first)
+    wait_until_unpublished(net, "/out")
+    listener.tell("go on")
+    listener.until("refused")
+    second = ear.endpoint.advertise(channel("/out", latched=True))
+    ear.endpoint.publish(second, string("heard"))
+    ear.until(lambda: ear.endpoint.subscribers(second) == 1)
+    listener.until("heard")
+
+
+def test_a_talker_whose_handshake_met_its_replacement_is_heard_later(net: Net) -> None:
+    ear = net.endpoint()
+    hears = ear.endpoint.subscribe("/in", STRING, None)
+    talker = net.peer(SLOW_TALKER)
+    talker.until("asked")
+    talker.tell("go on")
+    assert ear.wait(MessageReceived, 1, hears)[0].raw == string("again")
