@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.scripts.load_script import load_script
+from coverage_by_package import percentages
 
 SUMMARIES = {
     "gdp/frame/codec.py": (80, 20, 90, 30),
@@ -20,6 +20,5 @@ KEYS = ("covered_lines", "covered_branches", "num_statements", "num_branches")
     [("gdp.frame", 120 / 1.4), ("gdp", 130 / 1.8), ("fog.plan", 100.0), ("total", 150 / 2.0)],
 )
 def test_coverage_of_a_package_counts_its_statements_and_branches(package: str, percent: float) -> None:
-    script = load_script("coverage_by_package.py")
     files = {path: {"summary": dict(zip(KEYS, counts, strict=True))} for path, counts in SUMMARIES.items()}
-    assert script.percentages(files)[package] == pytest.approx(percent)
+    assert percentages(files)[package] == pytest.approx(percent)

@@ -57,7 +57,7 @@ def test_the_virtual_publisher_offers_what_the_far_one_does(sites: Sites, qos: Q
 def test_a_ros_1_publisher_is_not_replaced_because_the_far_qos_differs(sites: Sites) -> None:
     robot, server = sites.add(ROBOT, expose=[CHATTER]), sites.add(SERVER, imports=[CHATTER], ros=1)
     ear = Ear(server.graph, "/chatter")
-    assert sites.run(3, lambda: virtual(server))
+    assert sites.run(3, lambda: bool(virtual(server)))
     before = virtual(server)
     talker = robot.graph.publish("/talker", "/chatter", STRING, BEST_EFFORT)
     assert sites.run(3, robot.is_read)
@@ -69,7 +69,7 @@ def test_a_ros_1_publisher_is_not_replaced_because_the_far_qos_differs(sites: Si
 def test_a_ros_1_publisher_is_replaced_when_the_far_one_is_latched(sites: Sites) -> None:
     robot, server = sites.add(ROBOT, expose=[CHATTER]), sites.add(SERVER, imports=[CHATTER], ros=1)
     ear = Ear(server.graph, "/chatter")
-    assert sites.run(3, lambda: virtual(server))
+    assert sites.run(3, lambda: bool(virtual(server)))
     before = virtual(server)
     robot.graph.publish("/talker", "/chatter", STRING, LATCHED).publish(string("map"))
     assert sites.run(3, lambda: ear.texts == ["map"])
