@@ -165,7 +165,7 @@ def test_what_was_refused_until_the_end_is_counted(make_kernel: MakeKernel, ends
 def test_an_idle_poll_asks_no_device(make_kernel: MakeKernel, monkeypatch: pytest.MonkeyPatch) -> None:
     plane = make_kernel(filled())
     looks: list[object] = []
-    monkeypatch.setattr(TxDrops, "look", lambda *given: looks.append(given))
+    monkeypatch.setattr(TxDrops, "poll", lambda *given: looks.append(given))
     plane._next_upkeep_s = float("inf")
     for _ in range(5):
         plane.poll(0)

@@ -143,7 +143,7 @@ def test_a_killed_machine_is_gone_with_its_link(provider: LocalProvider) -> None
     fault_injection.kill(provider.runs, machine)
     until(lambda: machine_of(provider, machine).state is MachineState.GONE, "gone")
     assert machine_of(provider, machine).reason == "killed"
-    assert not exists(found.gateway, found.plug)
+    assert not exists(found.gateway, found.gateway_device)
 
 
 @pytest.mark.usefixtures("either")
@@ -190,7 +190,7 @@ def listen(device: str) -> socket.socket:
 def test_no_frame_of_a_delayed_link_is_early(provider: LocalProvider, away: bool) -> None:
     machine = booted(provider)
     found = find(provider.runs, machine)
-    ends = [netns_files.inside(found.space, partial(listen, "eth0"))]
+    ends = [netns_files.inside(found.netns_path, partial(listen, "eth0"))]
     ends.append(netns_files.inside(found.gateway, partial(listen, "machines")))
     source, sink = ends if away else reversed(ends)
     with source, sink:

@@ -92,12 +92,12 @@ def test_the_uplink_moves_from_machine_to_machine(provider: LocalProvider) -> No
     provider.attach_uplink(first)
     provider.attach_uplink(first)
     assert machine_of(provider, first).is_gateway
-    assert exists(find(provider.runs, first).space, UP)
+    assert exists(find(provider.runs, first).netns_path, UP)
     provider.attach_uplink(second)
     provider.detach_uplink(first)
     provider.detach_uplink(first)
     assert [machine_of(provider, each).is_gateway for each in (first, second)] == [False, True]
-    assert not exists(find(provider.runs, first).space, UP)
+    assert not exists(find(provider.runs, first).netns_path, UP)
     lost = find(provider.runs, second)
     fault_injection.kill(provider.runs, second)
     assert not exists(lost.gateway, lost.uplink_plug)

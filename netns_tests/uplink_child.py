@@ -54,7 +54,7 @@ class Robot:
         """Call one peer; return when the request has left."""
         server = self._member.peers(self._service)[0]
         for _ in self._paced():
-            self._member.ask(self._service, server, self._body)
+            self._member.send_request(self._service, server, self._body)
         self._runtime.run(lambda: False, time.monotonic() + 0.2)
 
     def _paced(self) -> Iterator[None]:

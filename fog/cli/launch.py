@@ -146,7 +146,7 @@ def begin(site: Site, journal: Journal, plan: ClusterPlan) -> None:
     """Store a cluster's plan in the journal, and ensure that a supervisor runs."""
     set_up(site)
     save_topology(site)
-    journal.want(plan, time.time())
+    journal.put_cluster(plan, time.time())
     ensure(site)
 
 

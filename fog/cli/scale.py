@@ -74,7 +74,7 @@ def up(
         last = max((each.id for each in journal.events(last=1)), default=0)
         wider = replace(plan, machines=(*plan.machines, *more))
         set_up(here)
-        journal.want(wider, time.time(), why=f"{len(plan.machines)} -> {len(wider.machines)} machines")
+        journal.put_cluster(wider, time.time(), why=f"{len(plan.machines)} -> {len(wider.machines)} machines")
         ensure(here)
         if not detach:
             follow(here, journal, wider, last, _WAIT_S, as_json=as_json)
@@ -102,7 +102,7 @@ def down(
         if left < 1:
             raise LocalError(f"{plan.name} has {len(plan.machines)} machines; to end it: fog down {plan.name}")
         smaller = replace(plan, machines=plan.machines[:left])
-        journal.want(smaller, time.time(), why=f"{len(plan.machines)} -> {left} machines")
+        journal.put_cluster(smaller, time.time(), why=f"{len(plan.machines)} -> {left} machines")
         ensure(here)
         _say({"cluster": plan.name, "machines": left}, as_json=as_json)
 

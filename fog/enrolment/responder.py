@@ -139,7 +139,7 @@ class Responder:
         if not self._tickets.complete(identifier, answer, issued_credentials, f"as {issued_credentials.proxy[:16]}"):
             self._refuse("a ticket that was taken back", about)
             return REFUSED
-        self._trail.note(Action.ACCEPTED, _WHAT, who=issued_credentials.proxy, about=about)
+        self._trail.record(Action.ACCEPTED, _WHAT, who=issued_credentials.proxy, about=about)
         return sealed
 
     def _issue(
@@ -171,7 +171,7 @@ class Responder:
         self._refuse("a token that somebody else knows", about)
 
     def _refuse(self, reason: str, about: str = "") -> None:
-        self._trail.note(Action.REFUSED, _WHAT, about=about, reason=reason)
+        self._trail.record(Action.REFUSED, _WHAT, about=about, reason=reason)
 
 
 def _verified(identifier: bytes, kept: Kept, asked: Request) -> list[SubjectInfo]:

@@ -211,12 +211,12 @@ class Tickets:
             ).rowcount:
                 _tell(file, identifier, Report.MISUSED, detail, None)
 
-    def take_back(self, cluster: str, machine: str) -> None:
+    def delete(self, cluster: str, machine: str) -> None:
         """Delete the ticket of a machine that is gone; no effect if there is none."""
         with self._writing() as file:
             file.execute("DELETE FROM tickets WHERE cluster = ? AND machine = ?", (cluster, machine))
 
-    def news(self) -> list[News]:
+    def pending_reports(self) -> list[News]:
         """Return the news that was not ``taken`` yet, oldest first."""
         with self._translated(), self._lock:
             rows = self._file.execute(

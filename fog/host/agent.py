@@ -65,7 +65,7 @@ class MachineAgent:
         self._take_notice()
         self._tell()
         ended, drained = asyncio.ensure_future(end.wait()), asyncio.ensure_future(drain.wait())
-        fallen = asyncio.ensure_future(self._stand())
+        fallen = asyncio.ensure_future(self._run_programs())
         try:
             await asyncio.wait([ended, drained, fallen], return_when=asyncio.FIRST_COMPLETED)
             if fallen.done():
@@ -91,9 +91,9 @@ class MachineAgent:
         loop.add_signal_handler(signal.SIGUSR2, self._take_notice)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
 
-    async def _stand(self) -> str:
+    async def _run_programs(self) -> str:
         """Start all programs, wait until all are up, then wait until one ends permanently."""
-        self._tasks = [asyncio.ensure_future(supervisor.keep()) for supervisor in self._supervisors]
+        self._tasks = [asyncio.ensure_future(supervisor.run()) for supervisor in self._supervisors]
         up = asyncio.create_task(self._all_up())
         await asyncio.wait([up, *self._tasks], return_when=asyncio.FIRST_COMPLETED)
         if up.done():
@@ -115,7 +115,7 @@ class MachineAgent:
         for task in self._tasks:
             task.cancel()
         for supervisor in self._supervisors:
-            if supervisor.program.name == DRAINS and (answered := supervisor.ask(signal.SIGUSR1)) is not None:
+            if supervisor.program.name == DRAINS and (answered := supervisor.send_signal(signal.SIGUSR1)) is not None:
                 answered.add_done_callback(lambda _: end.set())
                 with suppress(asyncio.TimeoutError):
                     await asyncio.wait_for(end.wait(), _DRAIN_S)

@@ -39,7 +39,7 @@ class ProgramSupervisor:
         self._incarnation_id: ManagedProcess | None = None
         self._log = BoundedLog(home / "logs" / f"{program.name}.log")
 
-    async def keep(self) -> str:
+    async def run(self) -> str:
         """Run the program until it ends permanently; return the reason. To stop it, cancel this, then call ``end``."""
         pause_s, restarts = PAUSE_MIN_S, 0
         while True:
@@ -55,7 +55,7 @@ class ProgramSupervisor:
             pause_s = min(2 * pause_s, PAUSE_MAX_S)
             restarts += 1
 
-    def ask(self, number: signal.Signals) -> asyncio.Future[int] | None:
+    def send_signal(self, number: signal.Signals) -> asyncio.Future[int] | None:
         """Send the program a signal; return a future of its exit status, or None if it does not run."""
         if self._incarnation_id is None or self._incarnation_id.ended.done():
             return None
@@ -68,7 +68,7 @@ class ProgramSupervisor:
             self._incarnation_id.kill()
 
     async def end(self) -> None:
-        """End the program with SIGTERM, after ``keep`` was cancelled."""
+        """End the program with SIGTERM, after ``run`` was cancelled."""
         if self._incarnation_id is not None:
             await self._incarnation_id.end(_END_PATIENCE_S)
         self._log.close()

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from fog.launch.cluster_spec import ClusterSpec
 from fog.launch.interfaces import Offered, SomeReplication
 from fog.launch.machines import CloudMachine
-from fog.launch.unreturned import note
+from fog.launch.unreturned import record
 
 __all__ = ["FogCluster"]
 
@@ -74,4 +74,4 @@ class FogCluster:
             keep=keep,
             availability=availability,
         )
-        note(self)
+        record(self)

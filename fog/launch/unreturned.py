@@ -21,7 +21,7 @@ from typing import Final
 
 from gdp.errors import LocalError
 
-__all__ = ["LaunchFile", "adopt", "note", "watch", "watch_ros_launch"]
+__all__ = ["LaunchFile", "adopt", "record", "watch", "watch_ros_launch"]
 
 _ENTRY: Final = "generate_launch_description"
 _MADE: Final = "__fog_clusters__"
@@ -71,7 +71,7 @@ def watch(module: ModuleType) -> None:
         module.__class__ = LaunchFile
 
 
-def note(cluster: object) -> None:
+def record(cluster: object) -> None:
     """Record a cluster for the launch file that constructs it; a cluster of any other code is not recorded.
 
     Raises:

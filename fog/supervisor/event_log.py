@@ -33,7 +33,7 @@ class EventLog:
         """Write a trouble of a cluster once; ``key`` distinguishes troubles of one cluster."""
         if self._troubles.get(key or cluster) != reason:
             self._troubles[key or cluster] = reason
-            self._journal.tell(time.time(), cluster, "", "trouble", reason)
+            self._journal.write_event(time.time(), cluster, "", "trouble", reason)
             log.warning("trouble cluster=%s reason=%s", cluster, reason)
 
     def clear_trouble(self, key: str) -> None:

@@ -14,15 +14,15 @@ from fog.enrolment.bootstrap import PROXY, SWITCH
 from fog.providers.provider import Provider
 from gdp.errors import GdpError
 
-__all__ = ["MACHINE", "keep", "kept"]
+__all__ = ["MACHINE", "decode_logs", "encode_logs"]
 
 MACHINE: Final = "machine"  # log of the machine agent, in addition to those of its programs
 _LINES: Final = 20
 _CHARS: Final = 4_000
 
 
-def keep(provider: Provider, machine: str, nodes: Sequence[str]) -> str:
-    """Return the text that ``kept`` reads; logs that cannot be read now are lost.
+def encode_logs(provider: Provider, machine: str, nodes: Sequence[str]) -> str:
+    """Return the text that ``decode_logs`` reads; logs that cannot be read now are lost.
 
     Args:
         nodes: names of the programs in addition to switch and proxy.
@@ -35,7 +35,7 @@ def keep(provider: Provider, machine: str, nodes: Sequence[str]) -> str:
     return json.dumps(found)
 
 
-def kept(words: str) -> Iterator[tuple[str, str]]:
+def decode_logs(words: str) -> Iterator[tuple[str, str]]:
     """Yield each program and its last lines."""
     if words:
         yield from json.loads(words).items()

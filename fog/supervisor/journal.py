@@ -108,7 +108,7 @@ class Journal:
         """Close the file."""
         self._file.close()
 
-    def want(self, plan: ClusterPlan, now_s: float, *, why: str = "") -> None:
+    def put_cluster(self, plan: ClusterPlan, now_s: float, *, why: str = "") -> None:
         """Write that a cluster is wanted; a running cluster of that name receives the new plan and continues."""
         with self._writing() as file:
             file.execute(
@@ -174,7 +174,7 @@ class Journal:
             rows = self._file.execute(query, (cluster,)).fetchall()
         return sorted((self._machine(cluster, *row) for row in rows), key=_number)
 
-    def tell(
+    def write_event(
         self,
         now_s: float,
         cluster: str,

@@ -20,7 +20,7 @@ from fog.providers.provider import GatewayProvider, Provider
 from fog.site import Site
 from fog.supervisor.actions import ActionRunner
 from fog.supervisor.event_log import EventLog
-from fog.supervisor.final_logs import keep, kept
+from fog.supervisor.final_logs import decode_logs, encode_logs
 from fog.supervisor.journal import FINAL_LOGS, Journal
 from fog.supervisor.machine_credentials import MachineCredentials
 from fog.supervisor.placement import place
@@ -126,16 +126,16 @@ class MachineActions:
                     done.cluster, f"{done.machine}: {done.what}: {done.error}", key=f"{done.cluster} uplink"
                 )
             elif done.error is not None:
-                self._journal.tell(now_s, done.cluster, done.machine, "trouble", f"{done.what}: {done.error}")
-            for program, lines in kept(done.result) if done.what == "release" else ():
-                self._journal.tell(now_s, done.cluster, done.machine, FINAL_LOGS, program, lines=lines)
+                self._journal.write_event(now_s, done.cluster, done.machine, "trouble", f"{done.what}: {done.error}")
+            for program, lines in decode_logs(done.result) if done.what == "release" else ():
+                self._journal.write_event(now_s, done.cluster, done.machine, FINAL_LOGS, program, lines=lines)
 
     def release(self, plan: ClusterPlan, name: str, machine: str, *, is_lost: bool) -> None:
         """Begin to release a machine; the final log lines of a lost machine are stored."""
         provider, programs = self.provider, node_names(plan)
 
         def act() -> str:
-            words = keep(provider, machine, programs) if is_lost else ""
+            words = encode_logs(provider, machine, programs) if is_lost else ""
             provider.terminate([machine])
             return words
 
@@ -154,7 +154,7 @@ class MachineActions:
             if machine.state is MachineState.GONE:
                 self._swept.add(machine.id)
             else:
-                self._journal.tell(now_s, cluster, name, "orphan", "no cluster wants it: returned")
+                self._journal.write_event(now_s, cluster, name, "orphan", "no cluster wants it: returned")
             self.release(plan, name, machine.id, is_lost=name in lost)
 
     def _launch(self, plan: ClusterPlan, wanted: MachineRequest, records: list[Record], now_s: float) -> None:

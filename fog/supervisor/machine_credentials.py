@@ -68,7 +68,7 @@ class MachineCredentials:
 
     def handle_reports(self, release: Release, now_s: float) -> None:
         """Record the machines that enrolled, and release machines whose token was misused."""
-        for news in self._tickets.news():
+        for news in self._tickets.pending_reports():
             record = next((each for each in self._journal.machines(news.cluster) if each.name == news.machine), None)
             if record is not None:
                 if news.issued_credentials is not None:
@@ -83,7 +83,7 @@ class MachineCredentials:
 
     def revoke(self, record: Record, now_s: float) -> None:
         """Revoke the memberships of a machine, and delete its ticket."""
-        self._tickets.take_back(record.spec.cluster, record.name)
+        self._tickets.delete(record.spec.cluster, record.name)
         if self._site.revocations is None:
             return
         folder, switch = self._site.revocations
@@ -100,7 +100,7 @@ class MachineCredentials:
                 config = SwitchConfig.load(switch)
                 reload(config.identity, config.control_socket)
         except LocalError as error:
-            self._journal.tell(now_s, record.spec.cluster, record.name, "trouble", f"not revoked: {error}")
+            self._journal.write_event(now_s, record.spec.cluster, record.name, "trouble", f"not revoked: {error}")
 
     def _handle_misused(self, record: Record, news: News, release: Release, now_s: float) -> None:
         log.error("token misused cluster=%s machine=%s: %s", news.cluster, news.machine, news.detail)

@@ -77,7 +77,7 @@ def _run(site: Site, journal: Journal, tickets: Tickets, *, stays: bool) -> None
         tickets=tickets,
         provider=provider,
         command=partial(command_of, site),
-        heard=watch.heard if watch is not None else lambda: None,
+        heard=watch.serving_proxies if watch is not None else lambda: None,
         on_names=watch.reload if watch is not None else lambda: None,
         patience=Timeouts() if provider.name == "local" else Timeouts(boot_s=_ELSEWHERE_S),
     )

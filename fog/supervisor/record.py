@@ -12,7 +12,7 @@ from fog.cluster import MachineRequest
 from fog.enrolment.credentials import IssuedCredentials
 from fog.machine import Machine, MachineSpec, MachineState
 
-__all__ = ["Outcome", "Record", "cost_usd", "learn"]
+__all__ = ["Outcome", "Record", "cost_usd", "update_record"]
 
 
 class Outcome(Enum):
@@ -98,7 +98,7 @@ def cost_usd(record: Record, now_s: float) -> float:
     return max(end_s - record.asked_unix_s, 0.0) / 3_600 * record.spec.offer.usd_per_hour
 
 
-def learn(record: Record, seen: Machine | None, serves: bool | None, now_s: float, *, grace_s: float) -> Record:
+def update_record(record: Record, seen: Machine | None, serves: bool | None, now_s: float, *, grace_s: float) -> Record:
     """Return a machine's record after an observation.
 
     Args:

@@ -25,7 +25,7 @@ from fog.supervisor.journal import Cluster, Journal
 from fog.supervisor.machine_actions import MachineActions
 from fog.supervisor.machine_credentials import MachineCredentials
 from fog.supervisor.reconcile import Timeouts, decide
-from fog.supervisor.record import Record, learn
+from fog.supervisor.record import Record, update_record
 from fog.supervisor.robot_access import RobotAccess
 from fog.supervisor.usage_limits import UsageLimits
 from gdp.errors import GdpError
@@ -133,7 +133,7 @@ class Supervisor:
             name = each.plan.name
             if each.is_up and not self._events.has_trouble(name):
                 liveness_known = f"{now_s - begun_unix_s:.2f} s after the supervisor's start"
-                self._journal.tell(now_s, name, "", "reconciled", liveness_known, since_unix_s=begun_unix_s)
+                self._journal.write_event(now_s, name, "", "reconciled", liveness_known, since_unix_s=begun_unix_s)
 
     def _reconcile_cluster(self, cluster: Cluster) -> None:
         plan = cluster.plan
@@ -180,7 +180,7 @@ class Supervisor:
                 )
                 if not names:  # topics have no calls: a machine that is up counts as serving
                     serves = machine is not None and machine.state is not MachineState.BOOTING
-                after = learn(before, machine, serves, now_s, grace_s=self._grace_s)
+                after = update_record(before, machine, serves, now_s, grace_s=self._grace_s)
             for change in changes(before, after, machine, now_s):
                 self._events.put(after, change.what, change.detail, now_s, change.since_unix_s)
             if after.is_gone and not before.is_gone:

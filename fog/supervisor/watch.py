@@ -54,7 +54,7 @@ class Watch:
         self._thread = threading.Thread(target=self._keep, name="watch", daemon=True)
         self._thread.start()
 
-    def heard(self) -> Mapping[str, frozenset[str]] | None:
+    def serving_proxies(self) -> Mapping[str, frozenset[str]] | None:
         """Return service (64 hex digits) -> proxies that serve it now; None: the overlay cannot be queried."""
         with self._lock:
             return self._heard
@@ -93,7 +93,7 @@ class Watch:
         plane = RawPlane([self._iface])
         try:
             runtime = Runtime(member, plane)
-            runtime.every(LOOK_S, Credentials(self._identity, domain, identity, policy).look)
+            runtime.every(LOOK_S, Credentials(self._identity, domain, identity, policy).reload_changed)
             called = self._call(member, DelegationStore(self._identity / DELEGATIONS, identity), [])
             attached_s: float | None = None
             while not self._ended.is_set() and any(port.up for port in plane.ports.values()):

@@ -105,7 +105,7 @@ class AckNackHandler:
         if name in self._readers:
             return
         if not self._readers.resume(name, now_s):
-            self._readers.know(name, incarnation, 0, exchange)
+            self._readers.record_key(name, incarnation, 0, exchange)
             self._readers.admit(name, incarnation, now_s).sequence = self._queue.first_waiting
         self._readers[name].behind_s = None
         if self._window.is_suspended(name):

@@ -216,7 +216,7 @@ class Attachment:
             return None
         assert switch is not None  # checked above
         if header.kind == Kind.ADVERTISE_ACK:
-            return self._take_ack(statement, switch, now)
+            return self._handle_ack(statement, switch, now)
         if header.kind in (Kind.JOIN, Kind.LEAVE):
             join = Join.from_fields(statement.expect(StatementType.JOIN))
             statement.verify(switch.key)
@@ -357,7 +357,7 @@ class Attachment:
                 raise StatementError(DropReason.REPLAYED, "a newer join overtook it")
             pending_advertisement.join_sequence = join.sequence
 
-    def _take_ack(self, statement: Statement, switch: Neighbour, now: Timestamps) -> Statement | None:
+    def _handle_ack(self, statement: Statement, switch: Neighbour, now: Timestamps) -> Statement | None:
         """Process the acknowledgement of an advertisement, or return a statement about a publisher's location."""
         fields = statement.fields
         member = self._policy.verify_membership(fields.bytes_("c"), now.unix_s)
@@ -376,10 +376,10 @@ class Attachment:
         check_sequence(ack.sequence, now.unix_s)
         for (name, _), each in self._advertisements.items():
             if name == ack.name and ack.advertiser == self._identity.name:
-                self._judge(each, ack, now.mono_s)
+                self._apply_ack(each, ack, now.mono_s)
         return None
 
-    def _judge(self, each: PendingAdvertisement, ack: AdvertiseAck, now_s: float) -> None:
+    def _apply_ack(self, each: PendingAdvertisement, ack: AdvertiseAck, now_s: float) -> None:
         if ack.refused is None:
             if not each.is_taken:
                 each.advertisement_at_s = now_s + self._lease_s / 3

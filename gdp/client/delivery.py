@@ -74,7 +74,7 @@ class DeliveryQueue:
         """Return the reason of losses for which no other reason is known."""
         return LossReason.GIVEN_UP if self.is_reliable else LossReason.GAP
 
-    def learn(self, sequence: int) -> None:
+    def record_published(self, sequence: int) -> None:
         """Note that messages before a sequence number were published."""
         self.known = max(self.known, sequence)
 

@@ -125,14 +125,14 @@ class Participant:
 
     def serve(self, topic: Topic, description: bytes, *, is_global: bool = True, urgent: bool = False) -> Publisher:
         """Serve a name; return the stream that all its clients receive. ``respond`` sends to one of them."""
-        return self._take_part(topic, Right.SERVE, description, is_global=is_global, urgent=urgent)
+        return self._join_service(topic, Right.SERVE, description, is_global=is_global, urgent=urgent)
 
     def call(self, topic: Topic, description: bytes, *, is_global: bool = True, urgent: bool = False) -> Publisher:
-        """Call a name from now on; return the stream of requests that all its servers receive. ``ask`` sends to one.
+        """Call a name from now on; return the stream of requests that all its servers receive. ``send_request`` sends to one.
 
         A request that is published while ``peers`` is empty reaches no server.
         """
-        return self._take_part(topic, Right.CALL, description, is_global=is_global, urgent=urgent)
+        return self._join_service(topic, Right.CALL, description, is_global=is_global, urgent=urgent)
 
     def respond(self, service: Name, client: Name, message: bytes) -> None:
         """Send a message to one client of a name that is served here.
@@ -143,7 +143,7 @@ class Participant:
         """
         self._tell(Right.SERVE, service, client, message)
 
-    def ask(self, service: Name, server: Name, message: bytes) -> None:
+    def send_request(self, service: Name, server: Name, message: bytes) -> None:
         """Send a request to one server of a name that is called here, apart from the stream to all of them.
 
         Raises:
@@ -160,9 +160,13 @@ class Participant:
         publisher = self._publications.get(service)
         if publisher is None:
             return []
-        return [party for party in self.heard(service) if publisher.is_followed_by(party, self._now_s, self._awake_s)]
+        return [
+            party
+            for party in self.connected_peers(service)
+            if publisher.is_followed_by(party, self._now_s, self._awake_s)
+        ]
 
-    def heard(self, service: Name) -> list[Name]:
+    def connected_peers(self, service: Name) -> list[Name]:
         """Return all connected peers, those that do not keep up included; ``peers`` returns a subset."""
         publisher = self._publications.get(service)
         writer_proxies = [
@@ -284,7 +288,7 @@ class Participant:
         except RemoteError as error:
             self._drops[error.reason] += 1
         except Exception as error:  # one frame must not end the node
-            self.boundary.note(error)
+            self.boundary.record(error)
             self._drops[DropReason.INTERNAL] += 1
 
     def port_changed(self, port: int, up: bool, now: Timestamps) -> None:
@@ -361,7 +365,9 @@ class Participant:
         delegation = topic.delegation
         self.attachment.advertisement(delegation.subject, right, delegation.chain, is_global=is_global)
 
-    def _take_part(self, topic: Topic, right: Right, description: bytes, *, is_global: bool, urgent: bool) -> Publisher:
+    def _join_service(
+        self, topic: Topic, right: Right, description: bytes, *, is_global: bool, urgent: bool
+    ) -> Publisher:
         is_free = topic.name not in self._publications and self._subscriptions.get(topic.name) is None
         self._check(topic, right, is_free=is_free)
         publisher = self._publications.add(

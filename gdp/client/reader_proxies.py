@@ -187,7 +187,7 @@ class ReaderProxies:
         reading.out_until_s = now_s + lags * self._patience.lag_s
         reading.suspensions = min(reading.suspensions + 1, _SUSPENSION_MAX_LAGS)
 
-    def know(self, name: bytes, incarnation: int, started: int, exchange: bytes) -> None:
+    def record_key(self, name: bytes, incarnation: int, started: int, exchange: bytes) -> None:
         """Note the key of one incarnation of a reader, proven by its introduction or advertisement.
 
         Raises:
@@ -234,7 +234,7 @@ class ReaderProxies:
         introduction = source.notes.introduced(body, Name(header.source), header.incarnation)
         if reading is not None and introduction.started <= reading.incarnation_id.started:
             raise StatementError(DropReason.STALE, "an introduction of an earlier life")
-        self.know(header.source, header.incarnation, introduction.started, introduction.exchange)
+        self.record_key(header.source, header.incarnation, introduction.started, introduction.exchange)
 
     def open(
         self, header: Header, frame: bytes, secret: bytes, now_s: float, *, may_begin: bool

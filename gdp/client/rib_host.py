@@ -59,11 +59,11 @@ class RibHost:
         statements: list[tuple[bytes, Name]] = []
         for arrival in arrivals:
             try:
-                statements += self._take(arrival, now)
+                statements += self._receive_statement(arrival, now)
             except RemoteError as error:
                 self._drops[error.reason] += 1
             except Exception as error:  # one frame must not end the RIB
-                self.rib.boundary.note(error)
+                self.rib.boundary.record(error)
                 self._drops[DropReason.INTERNAL] += 1
         self.rib.receive_all(statements, now)
         self._record_connection(now)
@@ -96,13 +96,13 @@ class RibHost:
         """Return, once, the frames to send."""
         return self.attachment.frames_to_send()
 
-    def _take(self, arrival: ReceivedFrame, now: Timestamps) -> list[tuple[bytes, Name]]:
+    def _receive_statement(self, arrival: ReceivedFrame, now: Timestamps) -> list[tuple[bytes, Name]]:
         """Return the statement for the RIB that a frame completes, with its sender."""
         header = decode(arrival.frame)
         if header.kind >= CONTROL_FROM:
             statement = self.attachment.receive_control(arrival, header, now)
             if statement is not None and statement.type is StatementType.REVOKE:
-                self._take_revocation(statement, now)
+                self._handle_revocation(statement, now)
             return []
         if header.destination != self.name:
             raise FrameError(DropReason.NOT_FOR_US)
@@ -119,7 +119,7 @@ class RibHost:
             raise FrameError(DropReason.NO_CHANNEL, "a statement that may be a recorded one")
         return [(opened.wire, sender)]
 
-    def _take_revocation(self, statement: Statement, now: Timestamps) -> None:
+    def _handle_revocation(self, statement: Statement, now: Timestamps) -> None:
         switch = self.attachment.switch
         if switch is not None:
             self.rib.revoke(statement.wire, switch.name, now)
@@ -137,7 +137,7 @@ class RibHost:
             return  # no switch carries them: the querying node will query again
         for outgoing in letters:
             if outgoing.kind is Kind.RIB_REQUEST:
-                self._channels.ask(outgoing.to, outgoing.statement, self._now_s)
+                self._channels.send_query(outgoing.to, outgoing.statement, self._now_s)
             elif not self._channels.send_response(outgoing.to, outgoing.statement):
                 self._send(outgoing.kind, outgoing.statement, outgoing.to)  # a presence query, to any switch
         for each in self._channels.records_to_send():

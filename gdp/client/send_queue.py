@@ -234,7 +234,7 @@ class SendQueue:
             return
         ledger.put(number, sequence, messages)
         evicted = self._window.add(number, frames, frames.size_bytes)
-        self.drops[DropReason.MEMORY_FULL] += ledger.let_go(evicted, LossReason.WINDOW_OVERFLOW)
+        self.drops[DropReason.MEMORY_FULL] += ledger.record_evicted(evicted, LossReason.WINDOW_OVERFLOW)
         ledger.forget(self.oldest)
 
     def _seal(self, number: int, body: bytes | Sealed, mtu: int, *, is_bundle: bool) -> Sealed:

@@ -104,7 +104,7 @@ class UnicastStream(Publisher):
         )
         self.tree_stands(MTU_MIN_BYTES if mtu is None else mtu)
 
-    def touch(self, now_s: float) -> None:
+    def mark_in_use(self, now_s: float) -> None:
         """Note that the stream is in use; a silent reader becomes active."""
         self._touched_s = now_s
         self.connect(*self.reader, self._exchange, now_s)
@@ -113,7 +113,7 @@ class UnicastStream(Publisher):
         """Process the reader's report, which reactivates a silent reader."""
         is_taken = super().receive_acknack(header, frame, now_s)
         if is_taken:
-            self.touch(now_s)
+            self.mark_in_use(now_s)
         return is_taken
 
     def is_idle(self, now_s: float) -> bool:

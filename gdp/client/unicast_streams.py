@@ -105,7 +105,7 @@ class UnicastStreams:
                 now_s=now_s,
             )
             stream.published = self._published
-        stream.touch(now_s)
+        stream.mark_in_use(now_s)
         return stream
 
     def forget(self, reader: PeerIncarnation) -> None:

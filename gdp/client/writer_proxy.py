@@ -324,7 +324,7 @@ class WriterProxy:
             order.expected = joined.number + 1
             self._deliver()
         elif order.put(joined):
-            delivery.learn(min(int.from_bytes(joined.head, "big"), NUMBER_MAX) + 1)
+            delivery.record_published(min(int.from_bytes(joined.head, "big"), NUMBER_MAX) + 1)
         elif self.state is WriterProxyState.NEW:
             self._data.drops[DropReason.MEMORY_FULL] += 1
         else:
@@ -379,7 +379,7 @@ class WriterProxy:
         self._deliver()
         if order.expected == status.sent_number:
             delivery.lose_until(status.sent_sequence, otherwise)
-        delivery.learn(status.sent_sequence)
+        delivery.record_published(status.sent_sequence)
         self._schedule.due_s = now_s
 
     def _begin(self, status: Heartbeat, start: StreamStart, *, is_latched: bool) -> None:

@@ -128,7 +128,7 @@ class Admission:
         """Return whether more hellos arrive than are verified without a cookie."""
         return now_s < self.loaded_until_s
 
-    def look(self, mac: bytes, now_s: float) -> None:
+    def check_quota(self, mac: bytes, now_s: float) -> None:
         """Refuse an address that has used up its share, before anything is parsed.
 
         Raises:

@@ -54,7 +54,7 @@ class ErrorBoundary:
         """
         return _Guard(self, origin, now_s)
 
-    def note(self, error: Exception) -> None:
+    def record(self, error: Exception) -> None:
         """Count an error; its text is logged the first time.
 
         Raises:
@@ -112,6 +112,6 @@ class _Guard:
     ) -> None:
         if not isinstance(error, Exception) or isinstance(error, RemoteError):
             return
-        self._boundary.note(error)
+        self._boundary.record(error)
         self._boundary.offend(self._origin, self._now_s)
         raise FrameError(DropReason.INTERNAL, type(error).__name__) from error

@@ -150,7 +150,7 @@ class Channels:
         self._out: list[Outgoing] = []
         self.drops: Counter[DropReason] = Counter()
 
-    def ask(self, peer: Name, statement: bytes, now_s: float) -> None:
+    def send_query(self, peer: Name, statement: bytes, now_s: float) -> None:
         """Send a statement to a peer that we query, once there is a channel."""
         asked = self._asked.setdefault(peer, _Asked())
         if asked.channel is None:

@@ -113,7 +113,7 @@ class HelloPort:
         """Return whether a neighbour that is up has this address."""
         return any(each.mac == mac and each.state is NeighbourState.UP for each in self.neighbours.values())
 
-    def heard(self) -> tuple[bytes, ...]:
+    def echoes(self) -> tuple[bytes, ...]:
         """Return the echoes that a hello carries: neighbours first, then candidates, the newest first."""
         proven = [each for each in self.neighbours.values() if each.is_proven]
         others = sorted(self.candidates(), key=lambda each: each.heard_s, reverse=True)

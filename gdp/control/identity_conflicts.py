@@ -65,7 +65,7 @@ class IdentityConflicts:
             del self._refused[name]
             self.changes += 1
 
-    def tell(self, port: int, nonce: bytes, name: Name, now_s: float) -> bool:
+    def schedule_notice(self, port: int, nonce: bytes, name: Name, now_s: float) -> bool:
         """Schedule the notice of a conflict for a session; return whether it is new for the session."""
         known = self._sessions.get((port, nonce))
         _put(self._sessions, (port, nonce), _Session(name, now_s + _REPORT_INTERVAL_S))

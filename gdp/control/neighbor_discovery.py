@@ -216,7 +216,7 @@ class HelloProtocol:
             return None
         if port.is_neighbour_at(arrival.mac):
             return self._reassembler.add(header, arrival.frame, now_s, arrival.via)
-        port.admission.look(arrival.mac, now_s)
+        port.admission.check_quota(arrival.mac, now_s)
         return self._strangers_reassembler.add(header, arrival.frame, now_s, arrival.via)
 
     def receive_cookie(self, arrival: ReceivedFrame, header: Header) -> None:
@@ -326,14 +326,14 @@ class HelloProtocol:
         try:
             member = self._policy.verify_membership(hello.membership, now.unix_s)
         except StatementError as error:
-            port.strangers.note(hello.membership, error.reason, now.mono_s)
+            port.strangers.record(hello.membership, error.reason, now.mono_s)
             raise
         if member.name != statement.signer:
             raise StatementError(DropReason.BAD_CERTIFICATE, "a hello under another's certificate")
         statement.verify(member.key)
         roles = member.role, self._identity.role
         if Role.LEAF in roles and all(each.is_switch for each in roles) and member.domain != self._identity.root.domain:
-            port.strangers.note(hello.membership, DropReason.THROUGH_LEAF, now.mono_s)
+            port.strangers.record(hello.membership, DropReason.THROUGH_LEAF, now.mono_s)
             raise StatementError(DropReason.THROUGH_LEAF, "a leaf joins switches of its own domain only")
         return hello, member
 
@@ -419,12 +419,12 @@ class HelloProtocol:
         elsewhere = self._incarnation_elsewhere(name)
         is_outlived_here = any(other.incarnation_id < hello.incarnation_id for other in others)
         is_proven = port.echo in hello.heard  # else it may be a replayed one
-        tell = self._tell_conflict if is_proven else self.conflicts.tell
+        tell = self._tell_conflict if is_proven else self.conflicts.schedule_notice
         for other in others:
             if is_outlived_here:
                 tell(other.port, other.nonce, name, now_s)
             elif is_proven:
-                self.let_go(other, now_s)
+                self.schedule_removal(other, now_s)
         if not is_outlived_here and (elsewhere is None or hello.incarnation_id <= elsewhere):
             return
         self.conflicts.record_refusal(name, hello.incarnation_id, now_s)
@@ -446,7 +446,7 @@ class HelloProtocol:
                     self._next_s = None
                     neighbour.heard_s = float("-inf")
 
-    def let_go(self, neighbour: Neighbour, now_s: float) -> None:
+    def schedule_removal(self, neighbour: Neighbour, now_s: float) -> None:
         """Have ``drop_silent`` remove a neighbour, because an older node with its identity is alive."""
         self._next_s = None
         self.conflicts.record_refusal(neighbour.name, neighbour.incarnation_id, now_s)
@@ -462,7 +462,7 @@ class HelloProtocol:
 
     def _tell_conflict(self, port: int, nonce: bytes, name: Name, now_s: float) -> None:
         """Have hellos notify a session of its conflict, soon if that is new to it."""
-        if self.conflicts.tell(port, nonce, name, now_s):
+        if self.conflicts.schedule_notice(port, nonce, name, now_s):
             self._next_s = None
             self.ports[port].hurry(now_s)
 
@@ -640,7 +640,7 @@ class HelloProtocol:
     def _hello(self, port: HelloPort, now_s: float) -> list[bytes]:
         port.sequence += 1
         port.said_s, port.answer_at_s = now_s, float("inf")
-        heard = port.heard()
+        heard = port.echoes()
         identity, timing = self._identity, self._timings.get(port.index, self._timing)
         hello = Hello(
             nonce=port.nonce,

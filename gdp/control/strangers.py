@@ -37,7 +37,7 @@ class Strangers:
     def __init__(self) -> None:
         self._by_membership: dict[bytes, Stranger] = {}
 
-    def note(self, membership: bytes, reason: DropReason, now_s: float) -> None:
+    def record(self, membership: bytes, reason: DropReason, now_s: float) -> None:
         """Remember that a hello with this certificate, DER, was refused."""
         known = self._by_membership.get(membership)
         if known is not None:

@@ -89,7 +89,7 @@ class Cgroup:
         nothing = "max" if path.name == "memory.max" else "-1"
         self._write(path, nothing if size_bytes is None else str(size_bytes))
 
-    def hold(self, *, held: bool) -> bool:
+    def set_frozen(self, *, held: bool) -> bool:
         """Freeze all processes, or resume them; return whether this host can do that."""
         path = self._find(("cgroup.freeze",))
         if path is not None:

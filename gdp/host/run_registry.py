@@ -141,7 +141,7 @@ class Run:
             self._record.processes.append(Process.from_pid(pid))
             self._save()
 
-    def keep(self, *, passive: bool = False) -> None:
+    def retain(self, *, passive: bool = False) -> None:
         """Keep all resources after this process ends, until ``RunRegistry.take_down``.
 
         Args:

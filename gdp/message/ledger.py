@@ -67,7 +67,7 @@ class Ledger:
         """Apply a renumbering."""
         self._of = {move.new_number(number): carried for number, carried in self._of.items()}
 
-    def let_go(self, numbers: Iterable[int], reason: LossReason) -> int:
+    def record_evicted(self, numbers: Iterable[int], reason: LossReason) -> int:
         """Note that message numbers are gone before every reader had them; return how many messages they carried."""
         gone = 0
         for number in numbers:

@@ -162,7 +162,7 @@ class Reassembler:
             wanted = min(len(arrivals) - at - taken, headers.count - part + headers.first)
             cost = message.header.length + _PART_OVERHEAD_BYTES
             if message.prepaid_bytes < wanted * cost:
-                if not self._take(_PREPAID_BYTES + wanted * cost):
+                if not self._reserve_memory(_PREPAID_BYTES + wanted * cost):
                     break
                 message.held_bytes += _PREPAID_BYTES + wanted * cost
                 message.prepaid_bytes += _PREPAID_BYTES + wanted * cost
@@ -280,7 +280,7 @@ class Reassembler:
             message.running.update(early)
             message.hashed += 1
             message.held_bytes -= len(early)
-            self._give_back(len(early))
+            self._release_memory(len(early))
 
     def _finish(self, header: Header, message: _PartialMessage) -> ReassembledMessage | None:
         number = header.number
@@ -308,7 +308,7 @@ class Reassembler:
         return True
 
     def _drop(self, number: int) -> None:
-        self._give_back(self._unfinished.pop(number).held_bytes)
+        self._release_memory(self._unfinished.pop(number).held_bytes)
 
     @property
     def unfinished_bytes(self) -> int:
@@ -321,12 +321,12 @@ class Reassembler:
             self._drop(max(self._unfinished))
             self.drops[DropReason.ABANDONED] += 1
 
-    def _take(self, size: int) -> bool:
+    def _reserve_memory(self, size: int) -> bool:
         is_taken = self._budget.reserve(self._source, size, self)
         self._unfinished_bytes += size if is_taken else 0
         return is_taken
 
-    def _give_back(self, size: int) -> None:
+    def _release_memory(self, size: int) -> None:
         self._unfinished_bytes -= size
         self._budget.release(self._source, size)
 
@@ -343,7 +343,7 @@ class Reassembler:
 
     def _reserve(self, number: int, cost: int) -> bool:
         """Reserve memory for a fragment of a message, if need be from messages with higher numbers."""
-        while not self._take(cost):
+        while not self._reserve_memory(cost):
             highest = max(self._unfinished, default=-1)
             if number >= highest:
                 return False

@@ -69,13 +69,13 @@ class NodeAudit:
         self._has_failed = False
         trail.begin()
 
-    def look(self, now: Timestamps) -> None:
+    def write_pending(self, now: Timestamps) -> None:
         """Write what has happened since the last call."""
         drops = self._drops()
         for reason, before in self._known.items():
             count = drops.get(reason, 0)
             if count > before:
-                self._trail.note(Action.REFUSED, "statements", reason=reason.label, count=count - before)
+                self._trail.record(Action.REFUSED, "statements", reason=reason.label, count=count - before)
                 self._known[reason] = count
         try:
             self._log.write(self._trail, now.mono_s, now.unix_s)
@@ -101,6 +101,6 @@ def keep_audit(
     folder = audit_folder(configured)
     if folder is not None:
         audit = NodeAudit(folder, trail, drops)
-        runtime.every(LOOK_S, audit.look)
-        stack.callback(lambda: audit.look(now()))
+        runtime.every(LOOK_S, audit.write_pending)
+        stack.callback(lambda: audit.write_pending(now()))
         log.info("audit log path=%s", folder)

@@ -48,7 +48,7 @@ class Credentials:
         self._failed = ""
         self._warned: bytes = b""
 
-    def look(self, now: Timestamps) -> None:
+    def reload_changed(self, now: Timestamps) -> None:
         """Reload what has changed since the last call, and warn of a membership that ends soon."""
         state = self._state()
         if state != self._seen:

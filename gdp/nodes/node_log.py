@@ -72,7 +72,7 @@ class NodeLog:
         self._neighbours: set[tuple[int, Name]] = set()
         self._wait_log = WaitLog()
 
-    def look(self, now: Timestamps) -> None:
+    def log_changes(self, now: Timestamps) -> None:
         """Log what changed since the last call."""
         for text in self._boundary.poll_tracebacks():
             log.error("a statement drew an error of this program and was dropped; the node goes on\n%s", text)
@@ -110,9 +110,9 @@ class NodeLog:
             if (port, name) not in self._neighbours:
                 ifname, domain = self._ifname(port), self._domain(each.domain)
                 log.info("neighbour up port=%s role=%s name=%s domain=%s", ifname, each.role.value, name.short, domain)
-                self._policy.audit.note(Action.ACCEPTED, f"neighbour {each.role.value}", who=name.to_text())
+                self._policy.audit.record(Action.ACCEPTED, f"neighbour {each.role.value}", who=name.to_text())
         for port, name in self._neighbours - now.keys():
-            self._policy.audit.note(Action.ENDED, "neighbour", who=name.to_text())
+            self._policy.audit.record(Action.ENDED, "neighbour", who=name.to_text())
             log.info("neighbour lost port=%s name=%s", self._ifname(port), name.short)
         self._neighbours = set(now)
 

@@ -88,13 +88,13 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
             lambda now_s: attachment_waits(host.attachment, now_s),
             on_wait=on_wait,
         )
-        runtime.every(LOOK_S, node_log.look)
+        runtime.every(LOOK_S, node_log.log_changes)
         credentials = Credentials(config.identity, config.domain, identity, policy)
-        runtime.every(LOOK_S, credentials.look)
-        stack.enter_context(runtime.signals(lambda: credentials.look(now())))
+        runtime.every(LOOK_S, credentials.reload_changed)
+        stack.enter_context(runtime.signals(lambda: credentials.reload_changed(now())))
         sources, begun_s = _sources(host, plane, node_log), now().mono_s
         handlers = ControlHandlers(
-            reload=lambda: credentials.look(now()),
+            reload=lambda: credentials.reload_changed(now()),
             status=lambda: node_status(
                 identity, sources, uptime_s=now().mono_s - begun_s, attached=host.attachment.switch is not None
             ),

@@ -99,13 +99,13 @@ def run_switch(
             rib=lambda: switch.rib,
             on_wait=on_wait,
         )
-        runtime.every(LOOK_S, node_log.look)
+        runtime.every(LOOK_S, node_log.log_changes)
         runtime.every(LOOK_S, lambda _: _end_if_displaced(switch))
         credentials = Credentials(config.identity, config.domain, identity, policy)
-        runtime.every(LOOK_S, credentials.look)
+        runtime.every(LOOK_S, credentials.reload_changed)
 
         def reload() -> None:
-            credentials.look(now())
+            credentials.reload_changed(now())
             _revoke(switch, config.revocations)
 
         stack.enter_context(runtime.signals(reload))

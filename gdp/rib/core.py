@@ -118,7 +118,7 @@ class RibCore:
         self._replication = self._replication_over(store.digests)
         self._answer_paces = TokenBuckets(ANSWER_BYTES_PER_S, ANSWER_BYTES_BURST)
         self._now_s = 0.0  # of the last call
-        self._letters: list[OutgoingStatement] = []
+        self._outgoing_statements: list[OutgoingStatement] = []
         self.boundary = ErrorBoundary()
         self.identities = IdentityChecks()
         self.refusals: Counter[DropReason] = Counter()
@@ -146,7 +146,7 @@ class RibCore:
             if statement.type is StatementType.RELAY:
                 self._take_relay(statement, now)
             elif statement.type is StatementType.QUERY:
-                self._take_query(statement, now)
+                self._handle_query(statement, now)
             elif statement.type is StatementType.ANSWER:
                 self._take_answer_from_above(statement, now)
             elif statement.type is StatementType.ADVERTISE_ACK:
@@ -162,7 +162,7 @@ class RibCore:
         except StoreError:
             self.refusals[DropReason.UNAVAILABLE] += 1  # no response: the sender will try again
         except Exception as error:  # one statement must not stop the RIB
-            self.boundary.note(error)
+            self.boundary.record(error)
             self.refusals[DropReason.INTERNAL] += 1
 
     def receive_all(self, wires: Sequence[tuple[bytes, Name]], now: Timestamps) -> None:
@@ -194,7 +194,7 @@ class RibCore:
         before = self.names
         for entry in entries:
             try:
-                self._take_entry(entry, now)
+                self._handle_entry(entry, now)
             except StatementError as error:
                 self.refusals[error.reason] += 1
         return self.names - before
@@ -209,7 +209,7 @@ class RibCore:
         """
         self._now_s = now.mono_s
         try:
-            self._take_revocation(parse(wire), origin, now)
+            self._handle_revocation(parse(wire), origin, now)
         except RemoteError as error:
             self.refusals[error.reason] += 1
         except StoreError:
@@ -244,8 +244,10 @@ class RibCore:
     def statements_to_send(self) -> list[OutgoingStatement]:
         """Return, once, the statements to send."""
         if refused := set(self._store.commit()):
-            self._letters = [outgoing for outgoing in self._letters if outgoing.about not in refused]
-        letters, self._letters = self._letters, []
+            self._outgoing_statements = [
+                outgoing for outgoing in self._outgoing_statements if outgoing.about not in refused
+            ]
+        letters, self._outgoing_statements = self._outgoing_statements, []
         if self._replication is not None:
             letters += [
                 OutgoingStatement(to, Kind.RIB_REQUEST, wire)
@@ -263,7 +265,7 @@ class RibCore:
         statement.verify(member.key)
         passed_on = parse(relay.statement)
         if passed_on.type is StatementType.REVOKE:
-            self._take_revocation(passed_on, member.name, now)
+            self._handle_revocation(passed_on, member.name, now)
             return
         if passed_on.type is StatementType.WITHDRAW:
             self._take_withdrawal(passed_on, member, now)
@@ -281,7 +283,7 @@ class RibCore:
                 advertisement.node, advertisement.incarnation, now.mono_s
             ):
                 route = self._route(advertisement, relay.transit, member, now)
-                self._pass_up(route, relay.statement, route.sequence, now.mono_s)
+                self._forward_upstream(route, relay.statement, route.sequence, now.mono_s)
                 raise StatementError(DropReason.IN_USE, "another node with this identity, says the tier above")
             known = self._check_news(advertisement, member)
         except StatementError as error:
@@ -293,12 +295,12 @@ class RibCore:
         self._store.put(route)
         self.accepted += 1
         if not isinstance(known, Route):
-            self._audit.note(Action.ACCEPTED, "name", who=route.advertiser.to_text(), about=route.name.to_text())
-        self._judge(route.name, route.advertiser, None, route.sequence, member.name)
+            self._audit.record(Action.ACCEPTED, "name", who=route.advertiser.to_text(), about=route.name.to_text())
+        self._acknowledge(route.name, route.advertiser, None, route.sequence, member.name)
         self._tell(route, known, now.mono_s)
         self._replicate(route.name, route.advertiser)
         if advertisement.is_global and not self._upstream.has(member.name):
-            self._pass_up(route, relay.statement, route.sequence, now.mono_s)
+            self._forward_upstream(route, relay.statement, route.sequence, now.mono_s)
 
     def _check_identity(self, advertisement: Advertisement, now: Timestamps) -> None:
         """Reject a node's own name in another incarnation while the older node lives at another switch.
@@ -318,7 +320,7 @@ class RibCore:
         if self.identities.must_ask(advertisement.node, older, held.switch, number, now.mono_s):
             question = Presence(node=advertisement.node, incarnation=older, other=advertisement.switch, question=number)
             wire = question.to_wire(self._identity.name, self._identity.key, self._identity.membership)
-            self._letters.append(OutgoingStatement(held.switch, Kind.RIB_ANSWER, wire))
+            self._outgoing_statements.append(OutgoingStatement(held.switch, Kind.RIB_ANSWER, wire))
         raise StatementError(DropReason.IN_USE, "another node with this identity")
 
     def _take_presence(self, statement: Statement, now: Timestamps) -> None:
@@ -382,17 +384,17 @@ class RibCore:
         pending_advertisement = UnverifiedAdvertisement.from_statement(parse(known.advertisement))
         withdrawal.verify(self._policy.verify_membership(pending_advertisement.membership, now.unix_s).key)
         self._withdraw(known, sequence, withdrawal.wire, pending_advertisement.membership)
-        self._judge(name, advertiser, None, sequence, member.name)
+        self._acknowledge(name, advertiser, None, sequence, member.name)
         self._tell_gone(known, now.mono_s, by=member.name)
         self._replicate(name, advertiser)
         if known.is_global and not self._upstream.has(member.name):
-            self._pass_up(known, withdrawal.wire, sequence, now.mono_s)
+            self._forward_upstream(known, withdrawal.wire, sequence, now.mono_s)
 
     def _withdraw(self, route: Route, sequence: int, proof: bytes, membership: bytes) -> None:
         gone = Withdrawn(route.sender, max(sequence, route.sequence), route.valid_until_unix_s, proof, membership)
         self._store.withdraw(route.name, route.advertiser, gone)
 
-    def _pass_up(self, route: Route, statement: bytes, sequence: int, now_s: float) -> None:
+    def _forward_upstream(self, route: Route, statement: bytes, sequence: int, now_s: float) -> None:
         if self._upstream.rib is not None:
             key = (route.name, route.advertiser)
             passed = Passed(
@@ -411,7 +413,7 @@ class RibCore:
         upper = self._upstream.rib
         assert upper is not None
         relay = Relay(passed.statement, passed.transit, self._identity.membership, passed.domain)
-        self._letters.append(
+        self._outgoing_statements.append(
             OutgoingStatement(upper, Kind.RIB_REQUEST, relay.to_wire(self._identity.name, self._identity.key))
         )
 
@@ -422,24 +424,24 @@ class RibCore:
         except StatementError:
             return  # not even an advertisement: a response could name nothing; the caller counts it
         who, reason = passed_on.signer.to_text(), error.reason.label
-        self._audit.note(Action.REFUSED, "name", who=who, about=name.to_text(), reason=reason)
+        self._audit.record(Action.REFUSED, "name", who=who, about=name.to_text(), reason=reason)
         known = self._store.get(name, passed_on.signer)
         if error.reason is DropReason.REVOKED:
             self._send_revocations(self._revocations.behind(_revocable(passed_on)), [member.name])
-        self._judge(name, passed_on.signer, error.reason, 0 if known is None else known.sequence, member.name)
+        self._acknowledge(name, passed_on.signer, error.reason, 0 if known is None else known.sequence, member.name)
         has_moved = error.reason is DropReason.STALE and isinstance(known, Route) and known.sender != member.name
         if has_moved and isinstance(known, Route) and self._may_tell(known, _asker(member)):
             self._answer(known, _asker(member), now_s)
 
-    def _judge(self, name: Name, advertiser: Name, refused: DropReason | None, sequence: int, to: Name) -> None:
+    def _acknowledge(self, name: Name, advertiser: Name, refused: DropReason | None, sequence: int, to: Name) -> None:
         ack = AdvertiseAck(name, advertiser, refused, sequence)
         wire = ack.to_wire(self._identity.name, self._identity.key, self._identity.membership)
         about = (name, advertiser) if refused is None else None
-        self._letters.append(OutgoingStatement(to, Kind.RIB_ANSWER, wire, about))
+        self._outgoing_statements.append(OutgoingStatement(to, Kind.RIB_ANSWER, wire, about))
 
     # -- queries
 
-    def _take_query(self, statement: Statement, now: Timestamps) -> None:
+    def _handle_query(self, statement: Statement, now: Timestamps) -> None:
         fields = statement.fields
         member = self._sender(fields.bytes_("c"), statement, now)
         if not (member.role.is_switch or member.role is Role.RIB):
@@ -462,7 +464,7 @@ class RibCore:
         for route in routes:
             self._answer(route, asker, now.mono_s)
         is_below = not self._upstream.has(member.name)
-        if is_below and self._upstream_queries.want(
+        if is_below and self._upstream_queries.request(
             query.name, asker, query.watch_s, now.mono_s, is_known=bool(routes)
         ):
             self._ask_upstream(query.name, self._upstream_queries.watch_s(query.name))
@@ -523,7 +525,7 @@ class RibCore:
 
     def _send(self, answer: Response, to: Name, about: Key | None = None) -> None:
         wire = answer.to_wire(self._identity.name, self._identity.key, self._identity.membership)
-        self._letters.append(OutgoingStatement(to, Kind.RIB_ANSWER, wire, about))
+        self._outgoing_statements.append(OutgoingStatement(to, Kind.RIB_ANSWER, wire, about))
 
     def _concerns(self, name: Name, now_s: float) -> bool:
         """Return whether any node is to be notified of a name."""
@@ -595,7 +597,7 @@ class RibCore:
         assert name is not None
         query = Query(name, watch_s, self._policy.revoked.digest_about(name) if watch_s > 0 else None)
         wire = query.to_wire(self._identity.name, self._identity.key, self._identity.membership)
-        self._letters.append(OutgoingStatement(upper, Kind.RIB_REQUEST, wire))
+        self._outgoing_statements.append(OutgoingStatement(upper, Kind.RIB_REQUEST, wire))
 
     def _upper_member(self, statement: Statement, now: Timestamps) -> Membership:
         """Return the signer of a statement from the tier above. Raises ``StatementError``: it is not from there."""
@@ -603,7 +605,7 @@ class RibCore:
         if not self._upstream.has(member.name) or member.role is not Role.RIB:
             raise StatementError(DropReason.WRONG_DOMAIN, "not from the tier above")
         statement.verify(member.key)
-        self._upstream.heard(member.name, now.mono_s)
+        self._upstream.record_alive(member.name, now.mono_s)
         return member
 
     def _take_ack_from_above(self, statement: Statement, now: Timestamps) -> None:
@@ -611,7 +613,7 @@ class RibCore:
         ack = AdvertiseAck.from_fields(statement.fields)
         key = ack.name, ack.advertiser
         if ack.refused in (None, DropReason.STALE):
-            self._upstream.settle(key, ack.sequence)
+            self._upstream.handle_ack(key, ack.sequence)
             self.identities.taken_above(ack.name)
             return
         self._upstream.refused(key)
@@ -621,7 +623,7 @@ class RibCore:
             self.identities.refused_above(ack.name, incarnation, now.mono_s)
             self._store.withdraw(*key)
             self._tell_gone(known, now.mono_s)
-            self._judge(*key, DropReason.IN_USE, known.sequence, known.sender)
+            self._acknowledge(*key, DropReason.IN_USE, known.sequence, known.sender)
 
     def _take_answer_from_above(self, statement: Statement, now: Timestamps) -> None:
         fields = statement.fields
@@ -639,9 +641,9 @@ class RibCore:
                 self._store.withdraw(answer.name, answer.advertiser)
                 self._tell_gone(known, now.mono_s)
             return
-        self._learn_from_above(answer, member, known, now)
+        self._learn_from_upstream(answer, member, known, now)
 
-    def _learn_from_above(
+    def _learn_from_upstream(
         self, answer: Response, member: Membership, known: Route | Withdrawn | None, now: Timestamps
     ) -> None:
         advertisement = self._verifier.verify(answer.advertisement, now.unix_s)
@@ -667,7 +669,7 @@ class RibCore:
 
     # -- revocations
 
-    def _take_revocation(self, statement: Statement, origin: Name, now: Timestamps) -> None:
+    def _handle_revocation(self, statement: Statement, origin: Name, now: Timestamps) -> None:
         """Handle a revocation from a neighbour or a relay.
 
         Raises:
@@ -684,7 +686,7 @@ class RibCore:
             self._pass_revocation_up(statement, origin, now)  # it is repeated for those that lacked it
             return
         who, about = revocation.issuer.name.to_text(), revocation.fingerprint.hex()
-        self._audit.note(Action.REVOKED, "certificate", who=who, about=about)
+        self._audit.record(Action.REVOKED, "certificate", who=who, about=about)
         reported: dict[Asker, None] = {}
         closed = self._revocations.closed(revocation, now)
         # switches flood revocations of roots everywhere
@@ -731,7 +733,7 @@ class RibCore:
         names = list(to)
         for wire in wires if names else ():
             relay = Relay(wire, (), self._identity.membership).to_wire(self._identity.name, self._identity.key)
-            self._letters += [OutgoingStatement(name, kind, relay) for name in names]
+            self._outgoing_statements += [OutgoingStatement(name, kind, relay) for name in names]
 
     # -- other RIBs of the domain
 
@@ -742,7 +744,7 @@ class RibCore:
 
     def _replicate(self, name: Name, advertiser: Name) -> None:
         if self._replication is not None:
-            self._replication.news((name, advertiser))
+            self._replication.push_entry((name, advertiser))
 
     def _rank_of(self, key: Key) -> int | None:
         known = self._store.get(*key)
@@ -787,11 +789,11 @@ class RibCore:
         message = _PEER_MESSAGES[statement.type].from_fields(statement.fields)
         for entry in self._replication.receive(message, member.name, now.mono_s):
             try:
-                self._take_entry(entry, now)
+                self._handle_entry(entry, now)
             except StatementError as error:
                 self.refusals[error.reason] += 1
 
-    def _take_entry(self, entry: Entry, now: Timestamps) -> None:
+    def _handle_entry(self, entry: Entry, now: Timestamps) -> None:
         """Handle an entry of a peer as if it had arrived here.
 
         Raises:

@@ -103,7 +103,7 @@ class Replication:
             self._peers[name] = _Peer()
         return True
 
-    def news(self, key: Key) -> None:
+    def push_entry(self, key: Key) -> None:
         """Push the stored entry of a key to all peers."""
         if self._peers:
             self._news[key] = None

@@ -110,7 +110,7 @@ class MemoryStore:
 
     def put(self, route: Route) -> None:
         """Add or replace a route."""
-        self._take(route.name, route.advertiser)
+        self._remove(route.name, route.advertiser)
         self._forget_withdrawn(route.name, route.advertiser)
         if self.changes is not None:
             self.changes.add((route.name, route.advertiser))
@@ -124,7 +124,7 @@ class MemoryStore:
 
     def withdraw(self, name: Name, advertiser: Name, withdrawn: Withdrawn | None = None) -> Route | None:
         """Remove a route and return it; store ``withdrawn``, by default its sequence number."""
-        route = self._take(name, advertiser)
+        route = self._remove(name, advertiser)
         if withdrawn is None:
             if route is None:
                 return None
@@ -173,7 +173,7 @@ class MemoryStore:
         """Return whether a route depends on a certificate that this key, 33 bytes, issued."""
         return self._evidence.has(key)
 
-    def _take(self, name: Name, advertiser: Name) -> Route | None:
+    def _remove(self, name: Name, advertiser: Name) -> Route | None:
         of_name = self._routes.get(name, {})
         route = of_name.pop(advertiser, None)
         if route is None:

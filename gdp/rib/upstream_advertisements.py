@@ -80,7 +80,7 @@ class UpstreamAdvertisements:
         self._waiting[passed.key] = _Waiting(passed, now_s)
         heapq.heappush(self._due, (now_s, passed.key))
 
-    def settle(self, key: Key, sequence: int) -> None:
+    def handle_ack(self, key: Key, sequence: int) -> None:
         """Record an AdvertiseAck for a sequence number, or for an older advertisement than one stored above."""
         waiting = self._waiting.get(key)
         if waiting is not None and sequence >= waiting.passed.sequence:
@@ -97,7 +97,7 @@ class UpstreamAdvertisements:
         self._asked_s = now_s
         return True
 
-    def heard(self, rib: Name, now_s: float) -> None:
+    def record_alive(self, rib: Name, now_s: float) -> None:
         """Record a sign of life of the RIB in use; after a long silence all pending advertisements are due."""
         if rib != self.rib:
             return

@@ -41,7 +41,7 @@ class UpstreamQueries:
         self._open: dict[Name, _Open] = {}
         self._due_s = float("inf")  # no query is due before
 
-    def want(self, name: Name, asker: Asker, watch_s: float, now_s: float, *, is_known: bool) -> bool:
+    def request(self, name: Name, asker: Asker, watch_s: float, now_s: float, *, is_known: bool) -> bool:
         """Record an asker's query; return whether a query to the tier above must be sent now.
 
         A known name is queried only when it is watched: others may advertise it elsewhere.

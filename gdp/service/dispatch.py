@@ -214,7 +214,7 @@ class Dispatch(Generic[A]):
 
     def answered(self, number: int, server: Name, answer: A, now_s: float) -> None:
         """Handle a valid response."""
-        call = self._take(number, server, now_s)
+        call = self._remove_owed(number, server, now_s)
         if call is None:
             return
         self._latencies.ended(now_s - call.begun_s)
@@ -226,14 +226,14 @@ class Dispatch(Generic[A]):
 
     def refused(self, number: int, server: Name, reason: str, now_s: float) -> None:
         """Handle a server's refusal: it has no response."""
-        call = self._take(number, server, now_s, says_no=True)
+        call = self._remove_owed(number, server, now_s, says_no=True)
         if call is not None:
             call.refused.add(server)
             self._go_on(number, call, Failure.REFUSED, reason, now_s)
 
     def declined(self, number: int, server: Name, answer: A, now_s: float) -> None:
         """Handle a response that declines: it counts if no server gives a better one."""
-        call = self._take(number, server, now_s, says_no=True)
+        call = self._remove_owed(number, server, now_s, says_no=True)
         if call is not None:
             call.refused.add(server)
             call.declined.append(answer)
@@ -270,7 +270,7 @@ class Dispatch(Generic[A]):
         effects, self._effects = self._effects, []
         return [each for each in effects if isinstance(each, Stop) or each.call in self._calls]
 
-    def _take(self, number: int, server: Name, now_s: float, *, says_no: bool = False) -> _Call[A] | None:
+    def _remove_owed(self, number: int, server: Name, now_s: float, *, says_no: bool = False) -> _Call[A] | None:
         """Return the call to which this server owed a response, and record that it owes none any more."""
         call = self._calls.get(number)
         if call is None:

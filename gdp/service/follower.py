@@ -108,7 +108,7 @@ class Follower:
         effects, self._effects = self._effects, []
         return effects
 
-    def heard(self, client: Name, word: ReplicaProbe | AttachReplica | SnapshotRequest) -> None:
+    def handle_message(self, client: Name, word: ReplicaProbe | AttachReplica | SnapshotRequest) -> None:
         """Handle a sequencer's message."""
         if isinstance(word, ReplicaProbe):
             if client == self._sequencer and word.incarnation_id != self._log.incarnation_id and self._follow is None:
@@ -173,7 +173,7 @@ class Follower:
         if follow is None:
             return
         if is_done:
-            self._stand(follow.log, follow.at)
+            self._set_log(follow.log, follow.at)
         else:
             self._can_tell = False
             self._lose()
@@ -192,7 +192,7 @@ class Follower:
         if self._sequencer is not None:
             self._say(self._sequencer)
 
-    def gone(self) -> None:
+    def sequencer_lost(self) -> None:
         """Record that the sequencer is gone: another may come. Held entries are still applied."""
         self._sequencer = None
 
@@ -205,7 +205,7 @@ class Follower:
             at = (self._log, self._index) == (word.log_before, word.at_before)
             if at and not self._is_lost and self.doing is Doing.NOTHING:
                 self._sequencer = client
-                self._stand(word.log, word.at)
+                self._set_log(word.log, word.at)
             else:
                 self._say(client)
         elif not self._can_tell or word.log < self._log or (word.log == self._log and word.at < self._index):
@@ -230,7 +230,7 @@ class Follower:
             # An entry whose client is gone is applied as well, without a response.
             self._effects.append(Apply(self._sequencer or _ABSENT, call, request))
 
-    def _stand(self, log: LogId, index: int) -> None:
+    def _set_log(self, log: LogId, index: int) -> None:
         """Set the log and the position in it; held entries of this log stay."""
         if log != self._log:
             self._clear()

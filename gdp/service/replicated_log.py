@@ -70,7 +70,7 @@ class ReplicatedLog:
         self._bytes += len(request)
         self._bytes_after_state += len(request)
 
-    def learn(self, state: Snapshot) -> None:
+    def restore_snapshot(self, state: Snapshot) -> None:
         """Store a snapshot, if it is newer."""
         if self.state is None or state.at > self.state.at:
             self.state = state

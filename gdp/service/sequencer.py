@@ -336,7 +336,7 @@ class Sequencer(Generic[A]):
                 replica.position = replica.position._replace(tells=False)
             self._ask(server, replica, now_s)
         else:
-            self._entries.learn(word)
+            self._entries.restore_snapshot(word)
         self._replication.trim()
         for name, each in self._replicas.items():
             if each.follows:

@@ -144,7 +144,7 @@ class Serving(Generic[R]):
             served = self._calls.get(number)
             if served is not None and served.request is not None:
                 turns.append(Turn(number, served.asked, served.request))
-                _take_off(self._waiting_bytes, served.asked.client, served.size_bytes)
+                _subtract(self._waiting_bytes, served.asked.client, served.size_bytes)
                 served.request = None
                 self._given += 1
         return turns
@@ -192,7 +192,7 @@ class Serving(Generic[R]):
         """Return the clients with calls under way here, still wanted or not."""
         return list(self._shares)
 
-    def gone(self, client: Name) -> list[Expired]:
+    def remove_client(self, client: Name) -> list[Expired]:
         """Remove a client; end and return its wanted calls. A repeated request is served again.
 
         A request that the local server has keeps its slot as after ``stop``.
@@ -238,11 +238,11 @@ class Serving(Generic[R]):
         if self._numbers.get(served.asked) == number:
             del self._numbers[served.asked]
         client = served.asked.client
-        _take_off(self._shares, client, 1)
+        _subtract(self._shares, client, 1)
         if served.request is None:
             self._given -= 1
         else:
-            _take_off(self._waiting_bytes, client, served.size_bytes)
+            _subtract(self._waiting_bytes, client, served.size_bytes)
             self._waiting.discard(client, number)
             if served.after is not None:
                 self._held_back.get(served.after, {}).pop(number, None)
@@ -252,7 +252,7 @@ class Serving(Generic[R]):
                 self._waiting.put(other.asked.client, each)
 
 
-def _take_off(counts: Counter[Name], client: Name, count: int) -> None:
+def _subtract(counts: Counter[Name], client: Name, count: int) -> None:
     counts[client] -= count
     if not counts[client]:
         del counts[client]

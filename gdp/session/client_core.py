@@ -154,7 +154,7 @@ class ClientCore:
         """Update the set of servers."""
         self._follow_at_s = now_s + _FOLLOW_S
         member = self._member
-        peers = set(member.peers(self._name) or member.heard(self._name))  # a slow server is better than none
+        peers = set(member.peers(self._name) or member.connected_peers(self._name))  # a slow server is better than none
         heard = {
             writer_proxy.publisher: writer_proxy
             for writer_proxy in member.writer_proxies_of(self._name)
@@ -237,7 +237,7 @@ class ClientCore:
 
     def _send_to(self, dispatch: Dispatch[Response], server: Name, effect: Effect, now_s: float) -> None:
         try:
-            self._member.ask(self._name, server, _wire_of(effect))
+            self._member.send_request(self._name, server, _wire_of(effect))
         except LocalError as error:
             self._not_sent(dispatch, effect, [server], str(error), now_s)
 

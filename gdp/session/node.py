@@ -104,8 +104,8 @@ def open_node(config: SessionConfig) -> SessionNode:
             conflict=lambda: member.attachment.conflict_at,
             local_name=lambda name: labels.get(name, name.short),
         )
-        runtime.every(LOOK_S, node_log.look)
-        runtime.every(LOOK_S, Credentials(config.identity, config.domain, identity, policy).look)
+        runtime.every(LOOK_S, node_log.log_changes)
+        runtime.every(LOOK_S, Credentials(config.identity, config.domain, identity, policy).reload_changed)
         revocations.start(runtime)
         return SessionNode(
             config=config,

@@ -157,10 +157,10 @@ class ServerCore:
 
     def _check_clients(self, now_s: float) -> None:
         """Drop the calls of clients that have gone."""
-        here = set(self._member.heard(self._name))
+        here = set(self._member.connected_peers(self._name))
         known = {writer_proxy.publisher for writer_proxy in self._member.writer_proxies_of(self._name)}
         clients = self._serving.clients
         self._seen_s = {each: now_s if each in here else self._seen_s.get(each, now_s) for each in clients}
         for client, seen_s in self._seen_s.items():
             if client not in here and (client not in known or now_s - seen_s >= _CLIENT_AWAY_S):
-                self._serving.gone(client)
+                self._serving.remove_client(client)

@@ -71,7 +71,7 @@ class Namespaces:
         """Bring a cut link back up."""
         self._set_link(a, b, "up")
 
-    def plug(self, home: str, ifname: str, switch: str) -> None:
+    def connect_device(self, home: str, ifname: str, switch: str) -> None:
         """Connect device ``ifname`` in one switch's namespace to a new ``ifname-s`` in another's, or its own."""
         self._plugged += 1
         mtu = max(link.mtu for link in self.topology.links)

@@ -161,7 +161,7 @@ class SimNetwork:
         """Run an action after a delay."""
         self._push(self._now_s + delay_s, action)
 
-    def touch(self, name: str) -> None:
+    def send_pending(self, name: str) -> None:
         """Send the frames of a core after a call from outside."""
         self._settle(name)
 

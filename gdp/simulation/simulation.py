@@ -70,7 +70,9 @@ class Simulation:
     cables: dict[frozenset[str], SimLink] = field(default_factory=dict)
     leads: dict[str, SimLink] = field(default_factory=dict)  # of members and RIBs, by label
     owner: Owner = field(init=False)
-    settled_s: float = field(init=False)  # when ``settle`` last ended; before that, when the simulation began
+    settled_s: float = field(
+        init=False
+    )  # when ``run_until_attached`` last ended; before that, when the simulation began
     _incarnation: int = 0
 
     def __post_init__(self) -> None:
@@ -168,7 +170,7 @@ class Simulation:
         at = self._rib_places()[label]
         return f"{at.switch}/{at.ifname}"
 
-    def settle(self, duration_s: float = 10.0) -> bool:
+    def run_until_attached(self, duration_s: float = 10.0) -> bool:
         """Let time pass until every member is attached; return whether that came true."""
         settled = self.network.run(duration_s, lambda: all(m.attachment.is_attached for m in self.members.values()))
         self.settled_s = self.network.now.mono_s

@@ -114,7 +114,7 @@ def note_once(
     """
     trail = AuditTrail()
     trail.begin()
-    trail.note(action, what, who=who, about=about, reason=reason)
+    trail.record(action, what, who=who, about=about, reason=reason)
     AuditLog(folder).write(trail, time.monotonic(), unix_s)
 
 

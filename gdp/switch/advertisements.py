@@ -107,7 +107,7 @@ class AdvertisementHandler:
         at = (neighbour.port, neighbour.mac)
         newest = self._sequence_of(advertisement.name, neighbour)
         if advertisement.sequence < newest:
-            self._judge(neighbour, advertisement.name, DropReason.STALE, newest)
+            self._acknowledge(neighbour, advertisement.name, DropReason.STALE, newest)
             raise StatementError(DropReason.STALE, "an advertisement that its signer has renewed")
         if advertisement.right in HEARS:
             cache = self._resolver.cache
@@ -127,7 +127,7 @@ class AdvertisementHandler:
             self._rib_client.rib is None and advertisement.previous != ZERO
         )  # no RIB sends an AdvertiseAck to a node that has moved
         if advertisement.right is Right.READ or is_alone:
-            self._judge(neighbour, advertisement.name, None, advertisement.sequence)
+            self._acknowledge(neighbour, advertisement.name, None, advertisement.sequence)
         if advertisement.right is not Right.READ:
             known = self._attached.get(advertisement.name, advertisement.node)
             try:
@@ -137,14 +137,14 @@ class AdvertisementHandler:
                 raise
             self._held.record_advertisement(advertisement, at)
             if known is None or (known.port, known.mac) != at:
-                self._audit.note(
+                self._audit.record(
                     Action.ACCEPTED, "name", who=advertisement.node.to_text(), about=advertisement.name.to_text()
                 )
                 self._unicast.remove(advertisement.name)
             self._unicast.release(advertisement.name, now.mono_s)
             self._multicast.publisher_attached(advertisement, now.mono_s)
         self._relocations.arrived(advertisement, now.mono_s)
-        self._rib_client.ask(now.mono_s)
+        self._rib_client.send_due(now.mono_s)
 
     def _check_fresh(self, neighbour: Neighbour, advertisement: Advertisement, now_s: float) -> None:
         """Record a verified advertisement; a neighbour that is far behind receives, now and then, by how much.
@@ -169,7 +169,7 @@ class AdvertisementHandler:
             ):
                 # The advertisement may be the node's own; the node sends nothing newer unless it receives this report.
                 session.reported_s = now_s
-                self._judge(neighbour, advertisement.name, DropReason.STALE, session.window.top)
+                self._acknowledge(neighbour, advertisement.name, DropReason.STALE, session.window.top)
             raise StatementError(DropReason.REPLAYED, "an advertisement")
         session.window.finish(advertisement.sequence)
         self._sessions.move_to_end(neighbour.nonce)
@@ -188,13 +188,13 @@ class AdvertisementHandler:
         except StatementError:
             return  # not even an advertisement: the caller counts it
         about, reason = body.subject.name.to_text(), error.reason.label
-        self._audit.note(Action.REFUSED, "name", who=neighbour.name.to_text(), about=about, reason=reason)
-        self._judge(neighbour, body.subject.name, error.reason, body.sequence)
+        self._audit.record(Action.REFUSED, "name", who=neighbour.name.to_text(), about=about, reason=reason)
+        self._acknowledge(neighbour, body.subject.name, error.reason, body.sequence)
 
-    def _judge(self, neighbour: Neighbour, name: Name, refused: DropReason | None, sequence: int) -> None:
+    def _acknowledge(self, neighbour: Neighbour, name: Name, refused: DropReason | None, sequence: int) -> None:
         ack = AdvertiseAck(name, neighbour.name, refused, sequence)
         wire = ack.to_wire(self._identity.name, self._identity.key, self._identity.membership)
-        self._outbox.say(neighbour, Kind.ADVERTISE_ACK, wire)
+        self._outbox.send_to_neighbour(neighbour, Kind.ADVERTISE_ACK, wire)
 
     def withdraw(self, neighbour: Neighbour, statement: Statement, now: Timestamps) -> None:
         """Handle a withdrawal.

@@ -94,7 +94,8 @@ class SwitchCore:
         self._held = Dependents(self.attached, self.resolver.cache, self.multicast)
         self._sync = RevocationSync(
             identity, policy.revoked, self.hello_protocol,
-            lambda neighbour, wire: self._outbox.say(neighbour, Kind.REVOKED, wire), settings.first_sequence,
+            lambda neighbour, wire: self._outbox.send_to_neighbour(neighbour, Kind.REVOKED, wire),
+            settings.first_sequence,
         )  # fmt: skip
         self._revoker = RevocationHandler(
             verifier=self._verifier, hello_protocol=self.hello_protocol, attached=self.attached,
@@ -208,11 +209,11 @@ class SwitchCore:
                     self._take_keepalive(arrival, header, now)
                 else:
                     has_others = True
-                    self._take(arrival, header, now)
+                    self._receive_frame(arrival, header, now)
             except RemoteError as error:
                 self._drops[error.reason] += 1
             except Exception as error:  # one frame must not stop the switch
-                self.boundary.note(error)
+                self.boundary.record(error)
                 self._drops[DropReason.INTERNAL] += 1
         if has_others:
             self._rest_due_s = None
@@ -243,7 +244,7 @@ class SwitchCore:
         for topic in self.multicast.handle_timer(now_s):
             self.resolver.unwatch(topic)
         self.relocations.handle_timer(now_s)
-        self.rib_client.ask(now_s)
+        self.rib_client.send_due(now_s)
         self._sync.handle_timer(now_s)
         self._tell_rib_of_revocations(now_s)
         self._presence.answer(now_s)
@@ -321,7 +322,7 @@ class SwitchCore:
         if neighbour.role.is_switch:
             self._flooding.compare(neighbour, now.mono_s)
 
-    def _take(self, arrival: ReceivedFrame, header: Header, now: Timestamps) -> None:
+    def _receive_frame(self, arrival: ReceivedFrame, header: Header, now: Timestamps) -> None:
         if header.kind >= CONTROL_FROM:
             if header.kind not in _CONTROL:
                 raise FrameError(DropReason.UNKNOWN_KIND, str(header.kind))
@@ -454,7 +455,7 @@ class SwitchCore:
                     self.unicast.remove(attachment.advertisement.name)
 
     def _send_link_state(self, neighbour: Neighbour, wire: bytes) -> None:
-        self._outbox.say(neighbour, Kind.LINK_STATE, wire)
+        self._outbox.send_to_neighbour(neighbour, Kind.LINK_STATE, wire)
 
     # -- moved nodes
 

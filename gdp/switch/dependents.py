@@ -53,16 +53,16 @@ class Dependents(Holdings[AttachedAdvertisement | KnownLocation | JoinedBranch])
 
     def record_advertisement(self, advertisement: Advertisement, at: Downstream) -> None:
         """Record the advertisement of an attached node."""
-        self.note(AttachedAdvertisement(advertisement.name, advertisement.node, at), advertisement)
+        self.record(AttachedAdvertisement(advertisement.name, advertisement.node, at), advertisement)
 
     def note_place(self, place: Location) -> None:
         """Record a location that a RIB or a switch proved."""
         if place.proof is not None:
-            self.note(KnownLocation(place.name, place.advertiser), place.proof)
+            self.record(KnownLocation(place.name, place.advertiser), place.proof)
 
     def note_branch(self, topic: Name, publisher: Name, at: Downstream, evidence: Advertisement) -> None:
         """Record the reader's advertisement that a join from downstream carried."""
-        self.note(JoinedBranch(topic, publisher, at), evidence)
+        self.record(JoinedBranch(topic, publisher, at), evidence)
 
     def _has(self, holder: AttachedAdvertisement | KnownLocation | JoinedBranch) -> bool:
         if isinstance(holder, AttachedAdvertisement):

@@ -95,7 +95,7 @@ class LocalAdvertisements:
         """Return all advertisements of one node."""
         return [advertisements[advertiser] for advertisements in self._by_name.values() if advertiser in advertisements]
 
-    def settle(self, name: Name, advertiser: Name, taken: int | None) -> LocalAdvertisement | None:
+    def handle_ack(self, name: Name, advertiser: Name, taken: int | None) -> LocalAdvertisement | None:
         """Record the RIB's AdvertiseAck; return the advertisement.
 
         Args:

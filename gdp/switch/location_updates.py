@@ -134,7 +134,7 @@ class LocationUpdates:
             raise StatementError(DropReason.UNKNOWN_SENDER, "a question that a neighbouring switch did not ask")
         statement.verify(neighbour.key)
         for known in self.proofs_of(query.name, now_s):
-            self._outbox.say(neighbour, Kind.REDIRECT, known)
+            self._outbox.send_to_neighbour(neighbour, Kind.REDIRECT, known)
 
     def receive_removal(self, answer: Response, now_s: float) -> None:
         """Remove an advertiser that has withdrawn.
@@ -171,7 +171,7 @@ class LocationUpdates:
             if HEARS.get(moved.right) is place.right:
                 statements.append(self._as_answer(place, now_s))
         for statement in statements:
-            frames = self._outbox.far(Kind.RIB_ANSWER, statement, moved.switch)
+            frames = self._outbox.remote_frames(Kind.RIB_ANSWER, statement, moved.switch)
             self._unicast.send(frames, moved.switch, identity.name, now_s)
 
     def proofs_of(self, name: Name, now_s: float) -> list[bytes]:

@@ -43,7 +43,7 @@ class _Past:
     incarnation_ids: dict[bytes, int] = field(default_factory=dict)
     minimum: int = -1  # minimum for all incarnations that are not listed
 
-    def note(self, incarnation_id: bytes, sequence: int, until_s: float) -> None:
+    def record(self, incarnation_id: bytes, sequence: int, until_s: float) -> None:
         self.until_s = until_s
         self.incarnation_ids[incarnation_id] = max(sequence, self.incarnation_ids.pop(incarnation_id, -1))
         if len(self.incarnation_ids) > _INCARNATIONS_MAX:
@@ -119,7 +119,7 @@ class LinkStateDatabase:
     def _bury(self, state: LinkState, now_s: float) -> None:
         key = state.origin, state.scope
         past = self._past.pop(key, None) or _Past(now_s)
-        past.note(state.incarnation_id, state.sequence, now_s + PAST_S)
+        past.record(state.incarnation_id, state.sequence, now_s + PAST_S)
         self._past[key] = past
         if len(self._past) > 2 * LINK_STATES_MAX:
             del self._past[next(iter(self._past))]

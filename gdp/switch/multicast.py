@@ -146,7 +146,7 @@ class MulticastTrees:
             if not self._put_branch(tree, at, branch):
                 self.drops[DropReason.QUOTA] += 1
                 continue
-            self._plant(tree)
+            self._install(tree)
             self._follow(tree, now_s)
             self._ask_upstream(tree, now_s)
 
@@ -233,7 +233,7 @@ class MulticastTrees:
             branch.active_until_s = None if before is None else before.active_until_s
         if not self._put_branch(tree, at, branch):
             raise StatementError(DropReason.QUOTA, "branches of one neighbour")
-        self._plant(tree)
+        self._install(tree)
         if not self._follow(tree, now_s):
             if (before is None and branch.is_active) or not is_same_place or tree.is_doubted:
                 self._ask_upstream(tree, now_s)
@@ -286,13 +286,13 @@ class MulticastTrees:
             branch.expires_s = min(branch.expires_s, until_s)
         if not proves(tree.shown):
             tree.is_doubted, tree.renew_at_s = True, now_s
-        self._plant(tree)
+        self._install(tree)
 
     def reroute(self, now_s: float) -> None:
         """Join again where the path to a publisher has changed."""
         for tree in self.trees.all():
             if not self._follow(tree, now_s) and self._backups.protection(tree) != tree.protection:
-                self._plant(tree)
+                self._install(tree)
 
     def handle_timer(self, now_s: float) -> list[Name]:
         """Prune and renew trees; return the topics that lost their last reader here."""
@@ -322,7 +322,7 @@ class MulticastTrees:
         for branch in rested:
             branch.active_until_s = None
         if rested:
-            self._plant(tree)
+            self._install(tree)
             self._restate(tree)
         if tree.renew_at_s <= now_s:
             self._ask_upstream(tree, now_s)
@@ -348,7 +348,7 @@ class MulticastTrees:
             self.trees.put(tree)
         return tree
 
-    def _plant(self, tree: Tree) -> None:
+    def _install(self, tree: Tree) -> None:
         tree.protection = self._backups.protection(tree)
         if not self._table.install(tree.key, tree.hops(self._outbox.mac_of()), tree.expires_s(), tree.sides):
             self.drops[DropReason.QUOTA] += 1
@@ -369,7 +369,7 @@ class MulticastTrees:
 
     def _after_cut(self, tree: Tree) -> None:
         if tree.branches:
-            self._plant(tree)
+            self._install(tree)
             self._restate(tree)
             return
         self._table.remove(tree.key)
@@ -404,7 +404,7 @@ class MulticastTrees:
                 tree.upstream, tree.upstream_name = upstream[:2], upstream[2]
                 if tree.backup is not None and tree.backup[0] == tree.upstream:
                     tree.backup = None  # an ordinary join replaces it
-            self._plant(tree)
+            self._install(tree)
         if upstream is None and self._paths.leads_through_leaf(tree.switch, tree.domain):
             self.drops[DropReason.THROUGH_LEAF] += 1
         if upstream is None or not tree.is_wanted_below:
@@ -419,7 +419,7 @@ class MulticastTrees:
             self._ask_for_backup(tree)
         if has_settled and tree.left:
             tree.left.clear()
-            self._plant(tree)
+            self._install(tree)
 
     def _restate(self, tree: Tree) -> None:
         """Send a join upstream at once: the tree's MTU, or whether it is only a backup, has changed."""
@@ -436,7 +436,7 @@ class MulticastTrees:
         if other != tree.backup:
             self._leave_backup(tree)
             tree.backup = other
-            self._plant(tree)
+            self._install(tree)
         evidence = self._evidence(tree)
         if other is not None and evidence:
             (port, _), _ = other

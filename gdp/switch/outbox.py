@@ -23,7 +23,7 @@ class Outbox:
         self._fragmenter = fragmenter
         self._waiting: list[OutgoingFrames] = []
 
-    def say(self, neighbour: Neighbour, kind: int, statement: bytes) -> None:
+    def send_to_neighbour(self, neighbour: Neighbour, kind: int, statement: bytes) -> None:
         """Send a statement to a neighbour itself."""
         self.say_at(neighbour.port, neighbour.mac, kind, statement)
 
@@ -33,7 +33,7 @@ class Outbox:
             frames = self._fragmenter.split(kind, statement, self._hello_protocol.ports[port].mtu)
             self._waiting.append(OutgoingFrames(port, mac, frames))
 
-    def far(self, kind: int, statement: bytes, destination: Name) -> list[bytes]:
+    def remote_frames(self, kind: int, statement: bytes, destination: Name) -> list[bytes]:
         """Return the frames of a statement that goes beyond a neighbour."""
         mtu = min((port.mtu for port in self._hello_protocol.ports.values()), default=1_500)
         return self._fragmenter.split(kind, statement, mtu, destination)

@@ -55,7 +55,7 @@ class PathUpdates:
     def plan(self, now_s: float) -> None:
         """Schedule an update if link states have changed."""
         if self._spf_delay.due_s is None and self._flooding.link_states.version != self._seen_version:
-            self._spf_delay.news(now_s)
+            self._spf_delay.record_change(now_s)
 
     def follow(self, now_s: float) -> None:
         """Update everything now if link states have changed."""
@@ -106,7 +106,7 @@ class PathUpdates:
         for neighbour in self._hello_protocol.all_up():
             elsewhere = self._paths.incarnation_elsewhere(neighbour.name) if neighbour.role is Role.RIB else None
             if elsewhere is not None and elsewhere < neighbour.incarnation_id:
-                self._hello_protocol.let_go(neighbour, now_s)
+                self._hello_protocol.schedule_removal(neighbour, now_s)
         for name in self._paths.refused_elsewhere():
             self._hello_protocol.tell_conflicts(name, now_s)
             if name == self._me:

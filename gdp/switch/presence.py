@@ -48,7 +48,7 @@ class PresenceAnswers:
         self._outbox = outbox
         self._open: dict[Name, _Question] = {}
 
-    def ask(self, presence: Presence, rib: Name, wire: bytes, now_s: float) -> None:
+    def handle_question(self, presence: Presence, rib: Name, wire: bytes, now_s: float) -> None:
         """Handle a RIB's verified question; the node receives it, too, if it is there."""
         if len(self._open) >= _OPEN_MAX and presence.node not in self._open:
             return  # the RIB repeats its question
@@ -66,7 +66,7 @@ class PresenceAnswers:
                 del self._open[question.presence.node]
                 answer = replace(question.presence, is_answer=True, is_there=is_there)
                 wire = answer.to_wire(self._identity.name, self._identity.key, self._identity.membership)
-                frames = self._outbox.far(Kind.RIB_REQUEST, wire, question.rib)
+                frames = self._outbox.remote_frames(Kind.RIB_REQUEST, wire, question.rib)
                 self._unicast.send(frames, question.rib, self._identity.name, now_s)
 
     def _is_there(self, question: _Question) -> bool | None:

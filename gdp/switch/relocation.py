@@ -152,14 +152,14 @@ class Relocations:
         if neighbour.role.is_switch and self._may_say(name, neighbour, now_s):
             identity = self._identity
             query = Query(name, 0.0).to_wire(identity.name, identity.key, identity.membership)
-            self._outbox.say(neighbour, Kind.WHERE, query)
+            self._outbox.send_to_neighbour(neighbour, Kind.WHERE, query)
 
     def handle_timer(self, now_s: float) -> None:
         """Send the notices that are due."""
         for key, notice in list(self._notices.items()):
             if notice.due_s > now_s:
                 continue
-            frames = self._outbox.far(Kind.RELOCATE, notice.statement, notice.to)
+            frames = self._outbox.remote_frames(Kind.RELOCATE, notice.statement, notice.to)
             self._unicast.send(frames, notice.to, self._identity.name, now_s)
             notice.sent += 1
             if notice.sent == len(_NOTICE_AT_S):
@@ -171,7 +171,7 @@ class Relocations:
 
     def _redirect(self, neighbour: Neighbour, name: Name, statement: bytes, now_s: float) -> None:
         if self._may_say(name, neighbour, now_s):
-            self._outbox.say(neighbour, Kind.REDIRECT, statement)
+            self._outbox.send_to_neighbour(neighbour, Kind.REDIRECT, statement)
 
     def _may_say(self, name: Name, neighbour: Neighbour, now_s: float) -> bool:
         """Return whether a message to a neighbour about a name is allowed now, and record it as sent."""

@@ -130,13 +130,13 @@ class RevocationHandler:
     ) -> list[Name]:
         for other in self._hello_protocol.all_up():
             if origin is None or (other.port, other.name) != (origin.port, origin.name):
-                self._outbox.say(other, Kind.REVOKE, statement.wire)
+                self._outbox.send_to_neighbour(other, Kind.REVOKE, statement.wire)
         return self._apply(revocation, now)
 
     def _apply(self, revocation: Revocation, now: Timestamps) -> list[Name]:
         """Close what carries the revoked certificate; return the topics that lost all readers here."""
         issuer, about = revocation.issuer.name.to_text(), revocation.fingerprint.hex()
-        self._verifier.policy.audit.note(Action.REVOKED, "certificate", who=issuer, about=about)
+        self._verifier.policy.audit.record(Action.REVOKED, "certificate", who=issuer, about=about)
         orphaned: list[Name] = []
         for holder in self._held.resting_on(revocation.fingerprint):
             if isinstance(holder, AttachedAdvertisement):

@@ -100,7 +100,7 @@ class RibClient:
                 self._channels.renew(rib)
             self._attached.relay_all(now_s)
             self._resolver.rib_changed(now_s, has_rib=rib is not None)
-        self.ask(now_s)
+        self.send_due(now_s)
 
     def _nearest_rib(self, now_s: float) -> Name | None:
         own, transit = self._policy.own, self._policy.transit
@@ -114,7 +114,7 @@ class RibClient:
                 reached.append((is_avoided, rib.domain != own, 0 if way is None else way.distance, name))
         return min(reached)[3] if reached else None
 
-    def ask(self, now_s: float) -> None:
+    def send_due(self, now_s: float) -> None:
         """Send the relays and queries that are due."""
         self._channels.handle_timer(now_s)
         self._send(now_s)
@@ -156,12 +156,12 @@ class RibClient:
         self._asked[self.rib] = None
         if len(self._asked) > 8:
             del self._asked[next(iter(self._asked))]
-        self._channels.ask(self.rib, statement, now_s)
+        self._channels.send_query(self.rib, statement, now_s)
         self._send(now_s)
 
     def _send(self, now_s: float) -> None:
         for each in self._channels.records_to_send():
-            frames = self._outbox.far(Kind.RIB_REQUEST, each.wire, each.to)
+            frames = self._outbox.remote_frames(Kind.RIB_REQUEST, each.wire, each.to)
             self._unicast.send(frames, each.to, self._identity.name, now_s)
 
     def open(self, wire: bytes, sender: Name, now: Timestamps) -> Opened | None:
@@ -189,7 +189,7 @@ class RibClient:
         member = self._policy.verify_membership(fields.bytes_("c"), now.unix_s)
         if statement.type is StatementType.PRESENCE and member.role is Role.RIB and member.name == statement.signer:
             statement.verify(member.key)
-            self._presence.ask(Presence.from_fields(fields), member.name, statement.wire, now.mono_s)
+            self._presence.handle_question(Presence.from_fields(fields), member.name, statement.wire, now.mono_s)
             return
         self._check_asked(statement, member, now.mono_s)
         if member.role.is_switch:
@@ -199,7 +199,7 @@ class RibClient:
             raise StatementError(DropReason.NO_CHANNEL, "an answer that may be a recorded one")
         self._rib_answered(member.name, now.mono_s)
         if statement.type is StatementType.ADVERTISE_ACK:
-            self._take_ack(statement)
+            self._handle_ack(statement)
             return
         statement.expect(StatementType.ANSWER)
         answer = Response.from_fields(fields)
@@ -279,10 +279,10 @@ class RibClient:
         if known is None or known.sequence < place.sequence:
             self._locations.receive(place, statement.wire, now.mono_s)
 
-    def _take_ack(self, statement: Statement) -> None:
+    def _handle_ack(self, statement: Statement) -> None:
         ack = AdvertiseAck.from_fields(statement.fields)
         taken = ack.sequence if ack.refused is None else None
-        attachment = self._attached.settle(ack.name, ack.advertiser, taken)
+        attachment = self._attached.handle_ack(ack.name, ack.advertiser, taken)
         if attachment is not None:
             self._outbox.say_at(attachment.port, attachment.mac, Kind.ADVERTISE_ACK, statement.wire)
             if ack.refused is DropReason.IN_USE:  # the older node with this identity is elsewhere

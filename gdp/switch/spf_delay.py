@@ -65,7 +65,7 @@ class SpfDelay:
         self._learned_s = float("inf")
         self._held_down_s = float("inf")
 
-    def news(self, now_s: float) -> None:
+    def record_change(self, now_s: float) -> None:
         """Record that link states have changed paths."""
         self._settle(now_s)
         if self.state is SpfState.QUIET:

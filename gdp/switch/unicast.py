@@ -207,7 +207,7 @@ class Unicast:
         if found is None:
             return destination
         if found.reason is not None:
-            self._install_nowhere(destination, source, found.reason, now_s)
+            self._install_negative(destination, source, found.reason, now_s)
             return None
         places = found.locations
         if all(place.domain == self._own_domain for place in places) and self._is_of_own_domain(source, now_s):
@@ -221,7 +221,7 @@ class Unicast:
             if origin is None:
                 return source
             if origin.reason is not None:
-                self._install_nowhere(destination, source, origin.reason, now_s)
+                self._install_negative(destination, source, origin.reason, now_s)
                 return None
             transit = origin.locations[0].transit | {origin.locations[0].domain}
         best = self._nearest(places, transit & self._transit)
@@ -279,7 +279,7 @@ class Unicast:
         """Install a path; where there is none, a negative entry with the reason ``otherwise``."""
         neighbour = None if way is None else self._outbox.neighbour(way.first)
         if neighbour is None:
-            self._install_nowhere(destination, source, otherwise, now_s)
+            self._install_negative(destination, source, otherwise, now_s)
         else:
             hop = self._outbox.protected_hop(neighbour, None if way is None else way.alternate)
             self._install(destination, source_key, hop, source, expires_s)
@@ -294,7 +294,7 @@ class Unicast:
         if self._table.install(key, (hop,), expires_s):
             self._note(key, _Installed(destination, source))
 
-    def _install_nowhere(self, destination: Name, source: Name, reason: DropReason, now_s: float) -> None:
+    def _install_negative(self, destination: Name, source: Name, reason: DropReason, now_s: float) -> None:
         """Make the data plane drop such frames briefly, unless a tree stands there."""
         key = destination + source
         if not self._table.entries.get(key) and self._table.install(key, NOWHERE, now_s + NEGATIVE_S):

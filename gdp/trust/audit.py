@@ -109,7 +109,7 @@ class AuditTrail:
         """Store events from now on: a writer polls them."""
         self._is_on = True
 
-    def note(
+    def record(
         self, action: Action, what: str, *, who: str = "", about: str = "", reason: str = "", count: int = 1
     ) -> None:
         """Record an event; costs about a microsecond.

@@ -68,7 +68,7 @@ class Holdings(Generic[_H]):
     def __len__(self) -> int:
         return len(self._of)
 
-    def note(self, holder: _H, advertisement: Advertisement) -> None:
+    def record(self, holder: _H, advertisement: Advertisement) -> None:
         """Record the present advertisement of a holder."""
         evidence = advertisement.fingerprints | advertisement.issuers
         before = self._of.get(holder)

@@ -71,7 +71,7 @@ class Cancellation:
     def handle_client_gone(self, client: Name) -> None:
         """Drop the calls of a client that left. Its goals continue: it may return and request their results."""
         is_working = False
-        for number, part, asked, is_given in self._serving.gone(client):
+        for number, part, asked, is_given in self._serving.remove_client(client):
             if asked is not None:
                 self._goals.end(asked)
             if is_given:

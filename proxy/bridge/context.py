@@ -23,6 +23,6 @@ class BridgeContext:
     traffic: Traffic
     faults: Faults
 
-    def tell(self, what: str, event: EndpointError, fault: Fault) -> None:
+    def report_error(self, what: str, event: EndpointError, fault: Fault) -> None:
         """Report an endpoint's error about a local name as ``fault``, unless the whole graph is unavailable."""
         self.faults.report(what, Fault.NO_GRAPH if event.is_graph else fault, event.reason)

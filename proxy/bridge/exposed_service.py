@@ -118,7 +118,7 @@ class ExposedService:
         try:
             if self._kept is not None and is_word(message.delivered.message):
                 client = Name(message.delivered.publisher)
-                self._kept.heard(client, sequencer_message(message.delivered.message), now_s)
+                self._kept.handle_message(client, sequencer_message(message.delivered.message), now_s)
             elif Stop.is_in(message.delivered.message):
                 client, stop = Name(message.delivered.publisher), Stop.from_wire(message.delivered.message)
                 self._cancellation.handle_stop(client, stop, now_s)
@@ -152,7 +152,7 @@ class ExposedService:
             at = self._topics.index(event.handle)
             self._responses.publish_news(at, event.raw, event.stamp_ns)
         elif isinstance(event, EndpointError):
-            self._site.tell(self._flow_spec.local, event, Fault.REFUSED)
+            self._site.report_error(self._flow_spec.local, event, Fault.REFUSED)
         else:
             assert isinstance(event, TypeResolved)  # the types of an action's topics are known beforehand
 
@@ -160,7 +160,7 @@ class ExposedService:
         """Process requests that waited for their description, and check which clients are still present."""
         self._look_at_clients(now_s)
         if self._kept is not None:
-            self._kept.look(self._site.member.peers(self._topic.name), now_s)
+            self._kept.update_sequencer(self._site.member.peers(self._topic.name), now_s)
         self.handle_timer(now_s)
 
     def follow(self, ends: Sequence[GraphEntity], now_s: float) -> None:
@@ -223,7 +223,7 @@ class ExposedService:
         for client, description in known.items():
             for message in self._early.poll_messages(client):
                 self.receive(message._replace(description=description), now_s)
-        here = {self._site.member.name, *self._site.member.heard(self._topic.name)}
+        here = {self._site.member.name, *self._site.member.connected_peers(self._topic.name)}
         for client in self._liveness.update(self._serving.clients, present=here, known=known.keys(), now_s=now_s):
             self._cancellation.handle_client_gone(client)
 

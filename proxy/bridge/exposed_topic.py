@@ -87,7 +87,7 @@ class ExposedTopic:
         elif isinstance(event, TypeResolved):
             self._describe((event.channel, *event.others))
         elif isinstance(event, EndpointError):
-            self._site.tell(self._flow_spec.local, event, Fault.QOS)
+            self._site.report_error(self._flow_spec.local, event, Fault.QOS)
 
     def close(self, now_s: float) -> None:
         """Close the subscription and the publisher."""

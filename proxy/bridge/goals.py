@@ -117,7 +117,7 @@ class Goals:
             known.status = (*known.status[:2], known.result)
         return self._news()
 
-    def gone(self, server: Name) -> None:
+    def remove_server(self, server: Name) -> None:
         """Remove a server: another one becomes the leader of its goals."""
         for known in self._goals.values():
             known.holders.discard(server)

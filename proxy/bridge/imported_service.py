@@ -126,7 +126,7 @@ class ImportedService:
             self._ask(event, now_s)
             self._sender.flush(now_s)
         elif isinstance(event, EndpointError):
-            self._site.tell(self._flow_spec.local, event, Fault.REFUSED)
+            self._site.report_error(self._flow_spec.local, event, Fault.REFUSED)
 
     def tick(self, now_s: float) -> None:
         """Open or close the virtual server as remote servers join and leave."""

@@ -88,7 +88,7 @@ class ImportedTopic:
         """Process an event of the local publisher."""
         del now_s
         if isinstance(event, EndpointError):
-            self._site.tell(self._flow_spec.local, event, Fault.QOS)
+            self._site.report_error(self._flow_spec.local, event, Fault.QOS)
 
     def close(self, now_s: float) -> None:
         """Close the subscription and the local publisher."""

@@ -62,9 +62,9 @@ class OrderedServer:
         """Return whether no operation is under way."""
         return self._follower.doing is Doing.NOTHING
 
-    def heard(self, client: Name, word: SequencerMessage, now_s: float) -> None:
+    def handle_message(self, client: Name, word: SequencerMessage, now_s: float) -> None:
         """Process a sequencer's message."""
-        self._follower.heard(client, word)
+        self._follower.handle_message(client, word)
         if client == self._follower.sequencer:
             self._heard_s = now_s
         self._act(now_s)
@@ -108,19 +108,19 @@ class OrderedServer:
         self._keys = keys
         self._act(now_s)
 
-    def look(self, clients: Sequence[Name], now_s: float) -> None:
+    def update_sequencer(self, clients: Sequence[Name], now_s: float) -> None:
         """Accept another client as the sequencer when the present one is gone."""
         if self._follower.sequencer in clients:
             self._heard_s = now_s
         elif self._follower.sequencer is not None and now_s - self._heard_s >= AWAY_S:
-            self._follower.gone()
+            self._follower.sequencer_lost()
 
     def _act(self, now_s: float) -> None:
         while effects := self._follower.poll_effects():
             for effect in effects:
-                self._do(effect, now_s)
+                self._apply_effect(effect, now_s)
 
-    def _do(self, effect: Effect, now_s: float) -> None:
+    def _apply_effect(self, effect: Effect, now_s: float) -> None:
         match effect:
             case Apply():
                 self._number += 1

@@ -38,7 +38,7 @@ class RemoteServer:
     news: tuple[MessageDecoder, ...] = ()
 
     @classmethod
-    def learn(
+    def set_description(
         cls, incarnation: int, description: bytes, parts: ActionInterface, endpoint: Endpoint, encoding: Encoding
     ) -> RemoteServer:
         """Prepare the decoders of a server's responses.

@@ -99,7 +99,7 @@ class RequestSender:
             self._record_holders(part, effect.call, {server})
         try:
             for wire in (*([] if again is None else [again]), wire_of(part, effect)):
-                self._site.member.ask(self._service, server, wire)
+                self._site.member.send_request(self._service, server, wire)
                 self._site.traffic.sent(len(wire))
         except LocalError as error:
             self._refuse(part, effect, [server], str(error), now_s)

@@ -70,7 +70,7 @@ class ServerDiscovery:
         """Compare the servers with those that are reachable now, and report each change to the calls."""
         member = self._site.member
         # If no server keeps up, waiting for one that may recover is better than giving up.
-        peers = set(member.peers(self._service) or member.heard(self._service))
+        peers = set(member.peers(self._service) or member.connected_peers(self._service))
         writer_proxies = member.writer_proxies_of(self._service) if peers else []
         heard = {
             writer_proxy.publisher: writer_proxy for writer_proxy in writer_proxies if writer_proxy.publisher in peers
@@ -108,7 +108,7 @@ class ServerDiscovery:
     def _remove(self, name: Name, now_s: float) -> None:
         del self.servers[name]
         if self._goals is not None:
-            self._goals.gone(name)
+            self._goals.remove_server(name)
         for dispatch in self._calls:
             dispatch.replica_lost(name, now_s, _SERVER_GONE)
 
@@ -116,7 +116,7 @@ class ServerDiscovery:
         """Prepare the decoders of a server's responses; an invalid description is reported."""
         rule = self._flow_spec.rule
         try:
-            server = RemoteServer.learn(incarnation, description, self._parts, self._endpoint, rule.encoding)
+            server = RemoteServer.set_description(incarnation, description, self._parts, self._endpoint, rule.encoding)
             if server.exchange is not None and server.exchange.is_ordered != rule.is_ordered:
                 side = "the far side's" if rule.is_ordered else "this side's"
                 raise LocalError(f"'state: ordered' is missing in {side} rule")

@@ -17,7 +17,7 @@ from gdp.nodes.membership import load_member
 from gdp.trust.delegation import Delegation
 from proxy.check.explain import explain
 from proxy.check.finding import Finding
-from proxy.check.graph_snapshot import look
+from proxy.check.graph_snapshot import read_graphs
 from proxy.check.table import table
 from proxy.config.config import ProxyConfig
 from proxy.config.rule import Rule
@@ -37,7 +37,7 @@ def check_proxy(settings: ProxyConfig, *, json: bool) -> None:
     held = DelegationStore(settings.delegations, identity)
     delegations = {topic.name: topic.delegation for topic in held}
     if settings.ros:
-        for at, (label, graph) in enumerate(look(settings.ros, identity.name.to_text(), "check")):
+        for at, (label, graph) in enumerate(read_graphs(settings.ros, identity.name.to_text(), "check")):
             _tell(label, _findings(settings, at, graph, delegations), json=json)
     else:
         open_topics(settings, held)

@@ -14,12 +14,12 @@ from proxy.config.graph import RosGraphConfig
 from proxy.endpoints.endpoint import Graph, proxy_node_name
 from proxy.endpoints.live import open_endpoints
 
-__all__ = ["LOOK_S", "look"]
+__all__ = ["LOOK_S", "read_graphs"]
 
 LOOK_S: Final = 4.0  # if the first announcement is missed, Fast DDS repeats it after 3 s
 
 
-def look(ends: Sequence[RosGraphConfig], name_hex: str, purpose: str) -> list[tuple[str, Graph]]:
+def read_graphs(ends: Sequence[RosGraphConfig], name_hex: str, purpose: str) -> list[tuple[str, Graph]]:
     """Return label and entities of each graph, after ``LOOK_S`` seconds.
 
     Args:

@@ -23,7 +23,7 @@ from gdp.stores.keyring import CARD, OWNER_PUBLIC, load_card, load_delegations, 
 from gdp.trust.adcert import AdCertCache, Chain
 from gdp.trust.delegation import Delegation
 from gdp.trust.node_descriptor import NodeDescriptor
-from proxy.check.graph_snapshot import look
+from proxy.check.graph_snapshot import read_graphs
 from proxy.check.required_delegations import Machine, RequiredDelegation, needs, unmet
 from proxy.config.config import ProxyConfig
 from proxy.endpoints.endpoint import Graph
@@ -100,7 +100,7 @@ def _owners_named(file: Path) -> str:
 
 
 def _graphs(config: ProxyConfig, card: NodeDescriptor) -> list[Graph]:
-    return [graph for _, graph in look(config.ros, card.name.to_text(), "delegate")]
+    return [graph for _, graph in read_graphs(config.ros, card.name.to_text(), "delegate")]
 
 
 def _held(delegations: Iterable[Delegation], card: NodeDescriptor, need: RequiredDelegation) -> Delegation | None:

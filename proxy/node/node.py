@@ -78,7 +78,7 @@ class ProxyNode:
         Raises:
             GdpError: the old configuration stays in use; the text states why.
         """
-        self.credentials.look(now())
+        self.credentials.reload_changed(now())
         if self.on_reload is not None:
             self.on_reload()
 
@@ -171,9 +171,9 @@ def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[Pro
             local_name=_local_names(config),
             on_wait=on_wait,
         )
-        runtime.every(LOOK_S, node_log.look)
+        runtime.every(LOOK_S, node_log.log_changes)
         credentials = Credentials(config.identity, config.domain, identity, policy)
-        runtime.every(LOOK_S, credentials.look)
+        runtime.every(LOOK_S, credentials.reload_changed)
         node = ProxyNode(
             identity=identity, member=member, runtime=runtime, plane=plane, node_log=node_log, credentials=credentials
         )

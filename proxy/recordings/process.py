@@ -111,7 +111,7 @@ class BagProcess:
         self._poll = select.poll()
         self._poll.register(self._output, select.POLLIN)
 
-    def ask(self) -> None:
+    def request_messages(self) -> None:
         """Request all messages."""
         with contextlib.suppress(BrokenPipeError):  # it has ended; reading its output detects that
             os.write(self._commands, b"m")

@@ -91,7 +91,7 @@ class BagReader:
         try:
             with self._checked():
                 self._frames.skip(take)
-                self._process.ask()
+                self._process.request_messages()
                 self.unread = printable((yield from self._frames.messages(take)))
         except StoppedError:
             self._is_stopped = True

@@ -210,7 +210,7 @@ class Domain:
         assert isinstance(world.network, RecordingNetwork)
         self.network = world.network
         self.network.records = self.records
-        assert world.settle(SETTLE_S)
+        assert world.run_until_attached(SETTLE_S)
         self._begin_flows()
         self._live_through()
         self._index(0)
@@ -236,14 +236,14 @@ class Domain:
             network.run(0.1)
         world.members[GHOST].withdraw(ghost.topic.name)
         world.members[READER].unsubscribe(ghost.topic.name)
-        network.touch(GHOST)
-        network.touch(READER)
+        network.send_pending(GHOST)
+        network.send_pending(READER)
         member, authority = world.identities[OUTCAST].member, world.authorities["home"]
         self.revocation = Revocation.make(
             authority.key, authority.root.subject, member.fingerprint, member.validity.not_after_unix_s
         )
         world.switches["a"].revoke(self.revocation, network.now)
-        network.touch("a")
+        network.send_pending("a")
         network.run(2.0)
         network.set_link(world.cables[frozenset("ab")], up=False)
         network.run(5.0)
@@ -324,7 +324,7 @@ class Domain:
         elif what == SERVER:
             self.server.begin()
         if what in world.members:
-            self.network.touch(what)
+            self.network.send_pending(what)
 
     def _snapshot(self, host: RibHost) -> list[Entry]:
         """Return what a RIB has on disk."""

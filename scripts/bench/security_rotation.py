@@ -53,7 +53,7 @@ class Rotation:
     def __init__(self, loss: float) -> None:
         self.world = Simulation(topology=ring5(), seed=5)
         self.world.add_member("nuc3/desk", "nuc3")
-        if not self.world.settle():
+        if not self.world.run_until_attached():
             raise SystemExit("the ring does not come up")
         self.epoch = 1
         self.streams = (Stream("/reliable", reliable=True), Stream("/best_effort", reliable=False))
@@ -65,7 +65,7 @@ class Rotation:
                 self.world.members[label].subscribe(self.topic(stream, label, Right.READ))
                 stream.got[label] = []
         for label in (ROBOT, *READERS):
-            self.world.network.touch(label)
+            self.world.network.send_pending(label)
         if not self.world.network.run(10.0, self._is_read):
             raise SystemExit("the readers do not begin")
         for sim_link in self.world.cables.values():
@@ -94,7 +94,7 @@ class Rotation:
 
     def _renew(self, topic: Topic) -> None:
         self.world.members[ROBOT].renew(topic)
-        self.world.network.touch(ROBOT)
+        self.world.network.send_pending(ROBOT)
 
     def publish(self, number: int) -> None:
         """Publish one message on each topic."""
@@ -102,7 +102,7 @@ class Rotation:
             assert stream.publisher is not None
             stream.publisher.publish(number.to_bytes(8, "big") + bytes(92))
         self.world.members[ROBOT].flush(self.world.network.now.mono_s)
-        self.world.network.touch(ROBOT)
+        self.world.network.send_pending(ROBOT)
 
     def collect(self) -> None:
         """Take the deliveries."""

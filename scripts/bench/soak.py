@@ -63,7 +63,7 @@ class Memory:
         self._world = Simulation(
             topology=chain(3), seed=1, hello_s=20.0, dead_s=70.0
         )  # hellos cost most of the time otherwise
-        if not self._world.settle():
+        if not self._world.run_until_attached():
             raise FailedError("the network in memory did not settle")
         self._names = 0
 
@@ -72,19 +72,19 @@ class Memory:
         world, left, right = self._world, self._world.members[LEFT], self._world.members[RIGHT]
         publisher = left.advertise(world.topic("/soak", left, [Right.PUBLISH]), b"soak", reliable=True)
         topic = world.topic("/soak", right, [Right.READ])
-        world.network.touch(LEFT)
+        world.network.send_pending(LEFT)
 
         def once() -> None:
             right.subscribe(topic)
-            world.network.touch(RIGHT)
+            world.network.send_pending(RIGHT)
             self._pass_one(publisher)
             right.unsubscribe(topic.name)
-            world.network.touch(RIGHT)
+            world.network.send_pending(RIGHT)
             self._until(lambda: not publisher.readers, "the reader's end")
 
         _repeat("subscribe, read, unsubscribe", once, cycles, samples)
         left.withdraw(topic.name)
-        world.network.touch(LEFT)
+        world.network.send_pending(LEFT)
 
     def publish(self, publishers: int, samples: Samples) -> None:
         """Start so many publishers in turn, each of a name of its own; each is read once and goes."""
@@ -96,13 +96,13 @@ class Memory:
             publisher = left.advertise(world.topic(name, left, [Right.PUBLISH]), b"soak", reliable=True)
             topic = world.topic(name, right, [Right.READ])
             right.subscribe(topic)
-            world.network.touch(LEFT)
-            world.network.touch(RIGHT)
+            world.network.send_pending(LEFT)
+            world.network.send_pending(RIGHT)
             self._pass_one(publisher)
             left.withdraw(topic.name)
             right.unsubscribe(topic.name)
-            world.network.touch(LEFT)
-            world.network.touch(RIGHT)
+            world.network.send_pending(LEFT)
+            world.network.send_pending(RIGHT)
             world.network.run(BETWEEN_S)  # the names of the warm-up expire within it
 
         if publishers > CACHES + SAMPLES:
@@ -116,7 +116,7 @@ class Memory:
         self._until(lambda: publisher.readers == 1, "a reader")
         publisher.publish(b"message")
         self._world.members[LEFT].flush(self._world.network.now.mono_s)
-        self._world.network.touch(LEFT)
+        self._world.network.send_pending(LEFT)
         self._until(lambda: bool(self._world.members[RIGHT].poll_messages()), "a message")
 
     def _until(self, is_met: Callable[[], bool], what: str) -> None:

@@ -164,7 +164,7 @@ def _run(options: Options, run: Run, errors: Console) -> int:
         code = interrupted.exit_code
     finally:
         if kept:
-            run.keep()
+            run.retain()
         else:
             let_nothing_interrupt()
             run.end()

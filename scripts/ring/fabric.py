@@ -46,7 +46,7 @@ class Overlay:
         self.namespaces = Namespaces(self.topology, run)
         roaming = roamers(options.faults, self.topology)
         for at in roaming:
-            self.namespaces.plug(at.switch, at.ifname, at.switch)
+            self.namespaces.connect_device(at.switch, at.ifname, at.switch)
         self.materials = OverlayCredentials(
             self.topology, run.directory, metrics=options.keep, roamers=roaming, lease_s=options.lease_s
         )
@@ -119,7 +119,7 @@ class Overlay:
         """Move a proxy's cable to another switch."""
         home = roam.proxy(self.topology).switch
         await asyncio.to_thread(self.namespaces.unplug, home, roam.who)
-        await asyncio.to_thread(self.namespaces.plug, home, roam.who, roam.to)
+        await asyncio.to_thread(self.namespaces.connect_device, home, roam.who, roam.to)
 
     def _start_switch(self, node: str, config: Path, prefix: str = "") -> Child:
         return self.start(node, f"{prefix}switch", ["-m", "gdp.cli.switch", "--config", str(config), "--json"])

@@ -70,7 +70,7 @@ def members(desk: Desk, machine: Machine, request: bytes, answer: bytes) -> list
 
 
 def reports(tickets: Tickets) -> list[Report]:
-    return [each.report for each in tickets.news()]
+    return [each.report for each in tickets.pending_reports()]
 
 
 # content of user data
@@ -152,7 +152,7 @@ def test_a52_a_token_admits_one_machine_as_it_was_planned(desk: Desk) -> None:
     got = members(desk, machine, request, asked(desk, request))
     assert [(each.role, each.label) for each in got] == [(Role.LEAF, "c-m7"), (Role.PROXY, "c-m7")]
     assert all(each.not_after_unix_s <= time.time() + 86_401 for each in got)
-    (news,) = desk.tickets.news()
+    (news,) = desk.tickets.pending_reports()
     assert news.report is Report.ENROLLED
     assert news.issued_credentials is not None
     assert news.issued_credentials.fingerprints == tuple(each.fingerprint.hex() for each in got)
@@ -162,10 +162,10 @@ def test_a52_a_token_admits_one_machine_as_it_was_planned(desk: Desk) -> None:
 def test_a52_who_uses_a_token_after_the_machine_gets_nothing_and_is_reported(desk: Desk) -> None:
     machine = Machine(desk.ticket())
     asked(desk, machine.request())
-    (enrolled,) = desk.tickets.news()
+    (enrolled,) = desk.tickets.pending_reports()
     thief = Machine(machine.ticket)
     assert asked(desk, thief.request()) == REFUSED
-    misused = desk.tickets.news()[-1]
+    misused = desk.tickets.pending_reports()[-1]
     assert misused.report is Report.MISUSED
     assert misused.issued_credentials == enrolled.issued_credentials
     assert enrolled.issued_credentials is not None
@@ -244,7 +244,7 @@ def test_a52_a_token_is_good_for_minutes(desk: Desk) -> None:
 
 def test_a52_the_token_of_a_machine_that_was_given_back_is_good_for_nothing(desk: Desk) -> None:
     machine = Machine(desk.ticket())
-    desk.tickets.take_back(CLUSTER.name, "m7")
+    desk.tickets.delete(CLUSTER.name, "m7")
     assert asked(desk, machine.request()) == b""
 
 
@@ -526,7 +526,7 @@ def test_a52_a_machine_whose_token_is_used_again_is_named_revoked_and_replaced(
 ) -> None:
     provider, responder = Recorded(), Responder(tickets, site.authority)
     ours = supervisor(site, journal, provider)
-    journal.want(replace(PLAN, machines=PLAN.machines[:1]), time.time())
+    journal.put_cluster(replace(PLAN, machines=PLAN.machines[:1]), time.time())
     work(ours, lambda: "m1" in provider.boots and journal.machines("c")[0].id)
     assert responder.answer(Machine(provider.ticket("m1")).request(), time.time()) != REFUSED
     work(ours, lambda: journal.machines("c")[0].issued_credentials.proxy)
@@ -547,7 +547,7 @@ def test_a52_a_machine_that_enrols_when_it_is_no_longer_wanted_is_revoked(
 ) -> None:
     provider, responder = Recorded(), Responder(tickets, site.authority)
     ours = supervisor(site, journal, provider)
-    journal.want(replace(PLAN, machines=PLAN.machines[:1]), time.time())
+    journal.put_cluster(replace(PLAN, machines=PLAN.machines[:1]), time.time())
     work(ours, lambda: "m1" in provider.boots and journal.machines("c")[0].id)
     assert responder.answer(Machine(provider.ticket("m1")).request(), time.time()) != REFUSED
     record = journal.machines("c")[0]
@@ -563,14 +563,14 @@ def test_a52_what_happened_while_no_supervisor_lived_is_acted_on_by_the_next(
 ) -> None:
     provider = Recorded()
     first = supervisor(site, journal, provider)
-    journal.want(replace(PLAN, machines=PLAN.machines[:1]), time.time())
+    journal.put_cluster(replace(PLAN, machines=PLAN.machines[:1]), time.time())
     work(first, lambda: "m1" in provider.boots and journal.machines("c")[0].id)
     first.close()
     Responder(tickets, site.authority).answer(Machine(provider.ticket("m1")).request(), time.time())
     second = supervisor(site, journal, provider)
     work(second, lambda: journal.machines("c")[0].issued_credentials.fingerprints)
     second.close()
-    assert tickets.news() == []
+    assert tickets.pending_reports() == []
 
 
 def test_a52_an_answer_of_a_wrong_form_is_refused() -> None:

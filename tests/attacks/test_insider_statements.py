@@ -13,7 +13,7 @@ def test_a_hello_of_an_older_life_from_another_address_ends_no_switch() -> None:
     world = ring()
     flow = flowing(world)
     world.add_member("nuc1/insider", "nuc1")
-    assert world.settle()
+    assert world.run_until_attached()
     insider, nuc1 = world.identities["nuc1/insider"], world.switches["nuc1"]
     world.network.connect("nuc1", "nuc1/insider").is_up = False  # a second port of the same node
     port = max(nuc1.hello_protocol.ports)

@@ -54,7 +54,7 @@ def detour(*, far: bool = False) -> Simulation:
         ),
     )  # fmt: skip
     world = Simulation(topology=topology, lease_s=LEASE_S, leaves=("leaf",))
-    assert world.settle()
+    assert world.run_until_attached()
     return world
 
 
@@ -254,7 +254,7 @@ def test_l08_a_leaf_that_advertises_for_another_switchs_node_is_refused_by_the_r
     rib = world.ribs["home"]
     before = rib.drops()[DropReason.NOT_DELEGATED]
     leaf.rib_client.relay(advertisement.advertisement.wire, world.network.now.mono_s)
-    world.network.touch("leaf")
+    world.network.send_pending("leaf")
     world.network.run(1)
     assert rib.drops()[DropReason.NOT_DELEGATED] == before + 1
     assert arrives(flow, LISTENER)
@@ -270,7 +270,7 @@ def test_two_leaves_that_are_joined_reach_each_others_nodes_and_pass_nothing_on(
         ),
     )  # fmt: skip
     world = Simulation(topology=topology, lease_s=LEASE_S, leaves=("one", "two"))
-    assert world.settle()
+    assert world.run_until_attached()
     assert first_to(world, "one", "two") == "two"
     assert first_to(world, "hub", "two") is None
     flow = flowing(world, source="hub/desk", readers=("one/first",))
@@ -311,7 +311,7 @@ def test_a_sim_link_to_a_leaf_from_a_second_switch_makes_no_way_through_it() -> 
     topic = world.topic(flow.name, world.members[ROBOT], [Right.READ])
     world.members[ROBOT].subscribe(topic)
     flow.got[ROBOT] = []
-    world.network.touch(ROBOT)
+    world.network.send_pending(ROBOT)
     assert world.network.run(5, lambda: flow.is_read_by(2))
     world.network.connect("middle", "leaf", SimLink(), CHEAP)
     world.network.run(3)

@@ -38,7 +38,7 @@ def test_a10_commands_of_an_hour_ago_are_not_delivered_to_a_restarted_reader(rel
     reader = world.restart_member(SERVER)
     assert world.network.run(10, lambda: reader.attachment.is_attached)
     reader.subscribe(world.topic(flow.name, reader, [Right.READ]))
-    world.network.touch(SERVER)
+    world.network.send_pending(SERVER)
     assert world.network.run(10, lambda: bool(reader.writer_proxies_of(flow.topic.name)))
     for frame in [each for each in tap.frames if each[1] in (Kind.HEARTBEAT, Kind.DATA)] * 2:
         world.network.inject(SERVER, 0, frame, mac_of(world, SERVER))
@@ -81,13 +81,13 @@ def test_a09_an_old_gone_of_a_publisher_that_came_back_silences_no_topic() -> No
     world.network.taps.append(tap)
     flow = flowing(world)
     world.members[ROBOT].leave()
-    world.network.touch(ROBOT)
+    world.network.send_pending(ROBOT)
     world.network.run(3)
     gone = [frame for frame in tap.frames if frame[1] == Kind.RIB_ANSWER]
     assert gone
     member = world.restart_member(ROBOT)
     flow = Flow(world, flow.name, ROBOT, flow.topic, member.advertise(flow.topic, b"", reliable=True), flow.got)
-    world.network.touch(ROBOT)
+    world.network.send_pending(ROBOT)
     assert world.network.run(20, lambda: flow.is_read_by(1))
     flow.collect()
     before = len(flow.got[SERVER])
@@ -114,7 +114,7 @@ def test_a39_a_recorded_advertisement_of_what_was_withdrawn_is_not_taken_again(r
         member.advertise(topic, b"described", reliable=True)
     else:
         member.subscribe(topic)
-    world.network.touch(ROBOT)
+    world.network.send_pending(ROBOT)
     world.network.run(1)
     nuc1 = world.switches["nuc1"]
     advertisements = [
@@ -125,7 +125,7 @@ def test_a39_a_recorded_advertisement_of_what_was_withdrawn_is_not_taken_again(r
         member.withdraw(topic.name)
     else:
         member.unsubscribe(topic.name)
-    world.network.touch(ROBOT)
+    world.network.send_pending(ROBOT)
     world.network.run(1)
     assert not _is_pending_advertisement(nuc1, topic.name, member.name)
     for frame in advertisements:

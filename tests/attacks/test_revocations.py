@@ -68,7 +68,7 @@ def with_thief(flow_of: Simulation | None = None) -> tuple[Simulation, Flow]:
     """Return the ring with a flow, and a hostile participant at the robot's switch."""
     world = flow_of or ring()
     world.add_member(THIEF, "nuc1")
-    assert world.settle()
+    assert world.run_until_attached()
     return world, flowing(world)
 
 
@@ -77,7 +77,7 @@ def revoke(world: Simulation, flow: Flow, at: str = "nuc3") -> None:
     fingerprint = parse(flow.topic.delegation.chain[-1]).fingerprint
     wire = world.owner.revoke(flow.topic.delegation.subject, fingerprint, until(world))
     world.switches[at].revoke(wire, world.network.now)
-    world.network.touch(at)
+    world.network.send_pending(at)
 
 
 @pytest.mark.parametrize("matters", [False, True])
@@ -109,7 +109,7 @@ def test_a04_a_switch_that_restarts_does_not_believe_a_revoked_member(tmp_path: 
     upkeep.start()
     member = world.identities[ROBOT].member
     world.switches["nuc2"].revoke(by_root(world, "school", member.fingerprint), world.network.now)
-    world.network.touch("nuc2")
+    world.network.send_pending("nuc2")
     world.network.run(1)
     for number in range(1_024):
         say(world, junk_of(MINE, number, until(world)), THIEF, "nuc1")
@@ -135,7 +135,7 @@ def test_a04_a_restarted_switch_learns_from_its_neighbour_whatever_junk_came_in_
     world, flow = with_thief()
     member = world.identities[ROBOT].member
     world.switches["nuc2"].revoke(by_root(world, "school", member.fingerprint), world.network.now)
-    world.network.touch("nuc2")
+    world.network.send_pending("nuc2")
     world.network.run(1)
     for number in range(1_024):
         say(world, junk_of(MINE, number, until(world)), THIEF, "nuc1")
@@ -153,7 +153,7 @@ def test_a05_a_junk_revocation_has_nothing_verified_again(monkeypatch: pytest.Mo
     world, flow = with_thief()
     for label in range(8):
         world.add_member(f"nuc1/reader{label}", "nuc1")
-    assert world.settle()
+    assert world.run_until_attached()
     for label in range(8):
         flow.read_by(f"nuc1/reader{label}")
     assert world.network.run(5, lambda: flow.is_read_by(9))
@@ -189,7 +189,7 @@ def test_a05_a_real_revocation_has_only_what_rests_on_it_verified_again(monkeypa
     world, flow = with_thief()
     for label in range(8):
         world.add_member(f"nuc1/reader{label}", "nuc1")
-    assert world.settle()
+    assert world.run_until_attached()
     for label in range(8):
         flow.read_by(f"nuc1/reader{label}")
     assert world.network.run(5, lambda: flow.is_read_by(9))
@@ -207,7 +207,7 @@ def test_a05_a_real_revocation_has_only_what_rests_on_it_verified_again(monkeypa
     wire = world.owner.revoke(delegation.subject, parse(delegation.chain[-1]).fingerprint, until(world))
     switch.revoke(wire, world.network.now)
     assert set(seen) == {reader.name}
-    world.network.touch("nuc1")
+    world.network.send_pending("nuc1")
     world.network.run(1)
     flow.outlive(*(label for label in flow.got if label != "nuc1/reader3"))
 
@@ -230,7 +230,7 @@ def test_a06_fresh_hellos_draw_no_more_bytes_than_they_cost(echoes: bool) -> Non
     world, flow = with_thief()
     for number in range(1_000):
         world.switches["nuc1"].revoke(by_root(world, "school", number.to_bytes(32, "big")), world.network.now)
-    world.network.touch("nuc1")
+    world.network.send_pending("nuc1")
     world.network.run(10)
     label = THIEF
     identity, port = world.identities[label], port_of(world, label)
@@ -267,7 +267,7 @@ def test_a06_a_proven_neighbour_draws_twice_all_there_is_at_most(monkeypatch: py
     for number in range(300):
         wire = by_root(world, "school", number.to_bytes(32, "big"))
         world.switches["nuc1"].revoke(wire, world.network.now)
-    world.network.touch("nuc1")
+    world.network.send_pending("nuc1")
     world.network.run(5)
     identity, port = world.identities[THIEF], port_of(world, THIEF)
     answered = Bytes(world, "nuc1", THIEF)
@@ -298,7 +298,7 @@ def test_only_what_is_lacking_is_sent_to_a_neighbour_that_comes_up() -> None:
     world, flow = with_thief()
     for number in range(100):
         world.switches["nuc1"].revoke(by_root(world, "school", bytes([number]) * 32), world.network.now)
-    world.network.touch("nuc1")
+    world.network.send_pending("nuc1")
     world.network.run(3)
     assert len(world.members[THIEF].attachment._policy.revoked) == 100
     world.network.set_link(world.leads[THIEF], up=False)
@@ -321,7 +321,7 @@ def test_a_reader_of_a_topic_whose_switch_restarted_is_refused_by_what_its_rib_k
     wire = world.owner.revoke(delegation.subject, parse(delegation.chain[-1]).fingerprint, until(world))
     world.network.stop("nuc5")
     world.switches["nuc1"].revoke(wire, world.network.now)
-    world.network.touch("nuc1")
+    world.network.send_pending("nuc1")
     world.network.run(3)
     world.restart_switch("nuc5")
     world.network.run(10)
@@ -335,9 +335,9 @@ def test_what_was_revoked_before_it_was_used_is_refused_within_a_minute() -> Non
     topic = world.topic("/early", member, [Right.PUBLISH])
     wire = world.owner.revoke(topic.delegation.subject, parse(topic.delegation.chain[-1]).fingerprint, until(world))
     world.switches["nuc1"].revoke(wire, world.network.now)
-    world.network.touch("nuc1")
+    world.network.send_pending("nuc1")
     world.network.run(5)
     member.advertise(topic, b"", reliable=True)
-    world.network.touch(SERVER)
+    world.network.send_pending(SERVER)
     world.network.run(75)
     assert all(rib.rib._store.routes(topic.name) == [] for rib in world.ribs.values())

@@ -68,7 +68,7 @@ def master(answer: bytes, head: bytes = b"HTTP/1.1 200 OK\r\nContent-Type: text/
 @pytest.mark.parametrize("answer", ANSWERS)
 def test_a66_an_answer_of_a_master_that_is_none_is_an_error_of_the_master(answer: str) -> None:
     with master(answer.encode()) as uri, pytest.raises(MasterError):
-        MasterWatch(uri, "/me").look()
+        MasterWatch(uri, "/me").poll()
 
 
 def test_a66_what_a_broken_answer_leaves_is_an_error_of_the_master() -> None:
@@ -81,7 +81,7 @@ def test_a66_what_a_broken_answer_leaves_is_an_error_of_the_master() -> None:
             broken[at : at + rng.randint(0, 9)] = bytes(rng.choices(b"<>/&;x0\xff\0value", k=rng.randint(0, 6)))
         with master(bytes(broken)) as uri:
             try:
-                Master(uri, "/me").ask(("getSystemState",))
+                Master(uri, "/me").call_batch(("getSystemState",))
             except MasterError:
                 continue
 
@@ -89,13 +89,13 @@ def test_a66_what_a_broken_answer_leaves_is_an_error_of_the_master() -> None:
 def test_a66_an_endless_answer_of_a_master_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("proxy.endpoints.ros1.master._ANSWER_MAX_BYTES", 100_000)
     with master(XML.format("x" * 200_000).encode()) as uri, pytest.raises(MasterError, match="more than"):
-        Master(uri, "/me").ask(("getSystemState",))
+        Master(uri, "/me").call_batch(("getSystemState",))
 
 
 def test_a66_a_packed_answer_of_a_master_is_refused() -> None:
     head = b"HTTP/1.1 200 OK\r\nContent-Encoding: gzip\r\n"
     with master(b"\x1f\x8b", head) as uri, pytest.raises(MasterError, match="encoding"):
-        Master(uri, "/me").ask(("getSystemState",))
+        Master(uri, "/me").call_batch(("getSystemState",))
 
 
 def reason() -> object:

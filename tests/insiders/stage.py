@@ -150,11 +150,11 @@ class Stage:
             trusts=dict.fromkeys(_TRUSTED, _TRUSTED) | {"stranger": ("stranger", *_TRUSTED)},
         )
         self._rib_nodes = {label: world.rib_node(label) for label in world.ribs}
-        world.settle(8.0)
+        world.run_until_attached(8.0)
         source, sink = GOOD
         topic = world.topic("/good", world.members[source], [Right.PUBLISH])
         publisher = world.members[source].advertise(topic, b"described", reliable=True)
-        world.network.touch(source)
+        world.network.send_pending(source)
         self.flow = Flow(world, "/good", source, topic, publisher)
         self.flow.read_by(sink)
         self.join_in()
@@ -184,7 +184,7 @@ class Stage:
                 member.serve(topic, b"served")
             else:
                 member.call(topic, b"called")
-        self.world.network.touch(label)
+        self.world.network.send_pending(label)
 
     def publish(self, message: bytes) -> None:
         """Let the insiders' publisher publish, and their server answer its clients."""
@@ -192,10 +192,10 @@ class Stage:
         for publisher in member.publishers():
             publisher.publish(message)
         service = self.topics["nuc1/insider serve"].name
-        for client in member.heard(service):
+        for client in member.connected_peers(service):
             member.respond(service, client, message)
         member.flush(self.world.network.now.mono_s)
-        self.world.network.touch("nuc1/insider")
+        self.world.network.send_pending("nuc1/insider")
 
     def revoke(self, label: str) -> None:
         """Let nuc1's operator revoke a member's membership."""
@@ -206,7 +206,7 @@ class Stage:
             authority.key, authority.root.subject, member.fingerprint, member.validity.not_after_unix_s
         )
         world.switches["nuc1"].revoke(wire, world.network.now)
-        world.network.touch("nuc1")
+        world.network.send_pending("nuc1")
 
     def identity(self, persona: Persona) -> Identity:
         """Return a persona's keys and membership."""

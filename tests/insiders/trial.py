@@ -299,7 +299,7 @@ class Trial:
         for pending_advertisement in member.attachment.advertisements:
             member.unsubscribe(pending_advertisement.subject.name)
             member.withdraw(pending_advertisement.subject.name)
-        self.stage.world.network.touch(label)
+        self.stage.world.network.send_pending(label)
 
     def _join_in(self, rng: random.Random) -> None:
         """Restore the participation of a node that left."""

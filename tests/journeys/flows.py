@@ -42,13 +42,13 @@ class Flow:
         reader = self.world.members[label]
         reader.subscribe(self.world.topic(self.name, reader, [Right.READ]))
         self.got[label] = []
-        self.world.network.touch(label)
+        self.world.network.send_pending(label)
 
     def publish(self, message: bytes) -> None:
         """Publish now."""
         self.publisher.publish(message)
         self.member.flush(self.world.network.now.mono_s)
-        self.world.network.touch(self.source)
+        self.world.network.send_pending(self.source)
 
     def stream(self, count: int, every_s: float, size: int = 3_000) -> None:
         """Publish numbered messages from now on, at a steady rate."""
@@ -126,7 +126,7 @@ def ring(
 ) -> Simulation:
     """Return the ring of five, with every member attached."""
     world = Simulation(topology=ring5(), seed=seed, transits=transits, lease_s=lease_s)
-    assert world.settle()
+    assert world.run_until_attached()
     return world
 
 
@@ -146,7 +146,7 @@ def advertise(
     publisher = member.advertise(
         topic, b"described", reliable=reliable, depth=depth, is_global=is_global, urgent=urgent
     )
-    world.network.touch(source)
+    world.network.send_pending(source)
     return Flow(world, name, source, topic, publisher)
 
 

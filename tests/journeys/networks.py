@@ -211,7 +211,7 @@ class Trial:
 
     def run(self) -> None:
         """Let all members publish to all others, inject the faults, and check the deliveries."""
-        assert self.world.settle(SETTLE_S), "not every member is attached"
+        assert self.world.run_until_attached(SETTLE_S), "not every member is attached"
         flows = [self._established(label) for label in self.world.members]
         count = int((self._faults_end_s() + 3.25 * LEASE_S) / PERIOD_S)
         for flow in flows:

@@ -43,7 +43,7 @@ class Party:
         self.service = topic.name
         take_part = self.member.serve if self.right is Right.SERVE else self.member.call
         self.stream = take_part(topic, f"{self.right.value} by {self.label}".encode())
-        self.world.network.touch(self.label)
+        self.world.network.send_pending(self.label)
 
     def publish(self, message: bytes) -> None:
         """Send a request to all servers, or news to all clients."""
@@ -73,7 +73,7 @@ class Party:
 
     def _flush(self) -> None:
         self.member.flush(self.world.network.now.mono_s)
-        self.world.network.touch(self.label)
+        self.world.network.send_pending(self.label)
 
 
 def outlive(world: Simulation, client: Party, *servers: Party, leases: float = 3.25) -> None:

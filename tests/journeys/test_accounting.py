@@ -116,7 +116,7 @@ class Books:
     def __init__(self, others: Counter[DropReason]) -> None:
         self._others = others
         self.world = Simulation(topology=chain(5))
-        assert self.world.settle()
+        assert self.world.run_until_attached()
         self.flow = flowing(self.world, source=A, readers=(B,), reliable=False)
         self.network = self.world.network
         self.network.run(1)
@@ -203,7 +203,7 @@ def test_a_reader_that_is_gone_adds_up(books: Books, says_goodbye: bool) -> None
         books.flow.collect()
         if says_goodbye:
             books.world.members[B].leave()
-            books.network.touch(B)
+            books.network.send_pending(B)
         else:
             books.network.stop(B)
 

@@ -173,7 +173,7 @@ def test_a_neighbour_that_looks_for_everything_is_bounded() -> None:
         world.network._nodes["nuc1"].machine.receive([ReceivedFrame(port, mac, encode(header))], world.network.now)
     assert nuc1.resolver.open_queries <= QUERIES_MAX + 8
     assert nuc1.drops()[DropReason.PENDING_FULL] > 0
-    world.network.touch("nuc1")
+    world.network.send_pending("nuc1")
     world.network.run(6)
     assert nuc1.resolver.pending_frames == 0
     still_flows(flow)
@@ -211,7 +211,7 @@ def test_recorded_leaves_played_back_again_and_again_cut_no_branch() -> None:
     tap = Tap("nuc2", "nuc1")
     world.network.taps.append(tap)
     world.members[SERVER].leave()
-    world.network.touch(SERVER)
+    world.network.send_pending(SERVER)
     world.network.run(10)
     leaves = recorded(tap, Kind.LEAVE)
     assert leaves
@@ -236,7 +236,7 @@ def test_a_recorded_withdrawal_takes_nothing_down_once_the_name_is_advertised_ag
     world.network.taps.append(tap)
     flow = flowing(world)
     world.members[ROBOT].leave()
-    world.network.touch(ROBOT)
+    world.network.send_pending(ROBOT)
     world.network.run(1)
     withdrawals = recorded(tap, Kind.WITHDRAW)
     assert withdrawals

@@ -39,7 +39,7 @@ def test_a_revocation_is_noted_where_it_is_taken() -> None:
     root = next(each for each in world.authorities.values() if each.root.domain == member.domain)
     wire = Revocation.make(root.key, root.root.signer, member.fingerprint, member.not_after_unix_s)
     world.switches["nuc1"].revoke(wire, world.network.now)
-    world.network.touch("nuc1")
+    world.network.send_pending("nuc1")
     world.network.run(5)
     for policy in switches:
         (reported,) = [each for each in lines(policy) if each.action == "revoked"]

@@ -27,7 +27,7 @@ def square(mtu: int = 1_500) -> Simulation:
         ),
     )
     world = Simulation(topology=topology, lease_s=LEASE_S)
-    assert world.settle()
+    assert world.run_until_attached()
     return world
 
 
@@ -103,7 +103,7 @@ def test_a_reader_that_leaves_takes_its_backup_along() -> None:
     assert [len(world.switches[each].multicast.trees) > 0 for each in ("s1", "s2", "s3", "s4")] == [True] * 4
     topic = flow.topic.name
     world.members[R].unsubscribe(topic)
-    world.network.touch(R)
+    world.network.send_pending(R)
     world.network.run(1.0)
     assert all(not switch.multicast.trees.of_topic(topic) for switch in world.switches.values())
     flow.outlive(negative=True)

@@ -25,7 +25,7 @@ def test_bursts_of_many_topics_arrive_once_and_in_order_under_few_seals() -> Non
         for number in range(first, first + 50):
             for flow in flows:
                 flow.publisher.publish(number.to_bytes(4, "big") + bytes(96))
-        world.network.touch(ROBOT)
+        world.network.send_pending(ROBOT)
 
     for at in range(4):
         world.network.call(at * 0.1, partial(burst, at * 50))
@@ -48,7 +48,7 @@ def test_bundles_survive_loss_and_links_that_narrow() -> None:
     def burst(first: int) -> None:
         for number in range(first, first + 500):
             flow.publisher.publish(number.to_bytes(4, "big") + bytes(96))
-        network.touch(ROBOT)
+        network.send_pending(ROBOT)
 
     for at in range(20):
         network.call(at * 0.01, partial(burst, at * 500))
@@ -83,7 +83,7 @@ def test_a_writer_proxy_that_was_closed_says_nothing_after_its_goodbye() -> None
     tap = Tap(SERVER, "nuc5")
     writer_proxies: list[WriterProxy] = list(reader.writer_proxies())
     reader.leave()
-    network.touch(SERVER)
+    network.send_pending(SERVER)
     network.run(0.01)
     network.taps.append(tap)
     network.run(5)

@@ -55,7 +55,7 @@ def test_a_reader_finds_the_epoch_that_its_publisher_uses(published: list[int], 
     reader = flow.world.members[SERVER]
     reader.subscribe(topic(flow, SERVER, Right.READ, read))
     flow.got[SERVER] = []
-    flow.world.network.touch(SERVER)
+    flow.world.network.send_pending(SERVER)
     assert flow.world.network.run(5, lambda: flow.is_read_by(1))
     flow.world.network.run(1)
     flow.publish(b"hello")

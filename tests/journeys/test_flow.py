@@ -106,7 +106,7 @@ def test_a_late_joiner_of_a_latched_topic_gets_the_last_messages() -> None:
 def test_two_publishers_of_one_topic_both_reach_its_reader() -> None:
     world = ring()
     world.add_member("nuc3/second", "nuc3")
-    assert world.settle()
+    assert world.run_until_attached()
     first = flowing(world, readers=(SERVER,))
     second = advertise(world, source="nuc3/second")
     second.got = first.got
@@ -134,7 +134,7 @@ def test_a_publisher_that_comes_after_its_reader_is_found() -> None:
 def test_two_readers_cost_a_shared_link_one_copy() -> None:
     world = ring()
     world.add_member("nuc4/second", "nuc4")
-    assert world.settle()
+    assert world.run_until_attached()
     flow = flowing(world, readers=(SERVER, "nuc4/second"))
     tap = Tap("nuc2", "nuc3")
     world.network.taps.append(tap)
@@ -150,7 +150,7 @@ def test_a_tree_without_readers_is_taken_down() -> None:
     world = flow.world
     assert any(switch.multicast.trees.all() for switch in world.switches.values())
     world.members[SERVER].leave()
-    world.network.touch(SERVER)
+    world.network.send_pending(SERVER)
     world.network.run(JOIN_LEASE_S + 1)
     assert not any(switch.multicast.trees.all() for switch in world.switches.values())
     flow.outlive(negative=True)
@@ -181,9 +181,9 @@ def test_the_network_settles_with_loss_from_the_beginning() -> None:
     world = Simulation(topology=ring5(), lease_s=LEASE_S)
     for sim_link in world.cables.values():
         sim_link.loss = 0.1
-    assert world.settle(30)
+    assert world.run_until_attached(30)
     world.network.run(3.25 * world.lease_s)
-    assert world.settle(1)
+    assert world.run_until_attached(1)
     world.network.run(3.25 * world.lease_s)
 
 

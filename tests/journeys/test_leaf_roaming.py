@@ -26,7 +26,7 @@ def corridor() -> Simulation:
         ),
     )  # fmt: skip
     world = Simulation(topology=topology, lease_s=LEASE_S, leaves=("leaf",))
-    assert world.settle()
+    assert world.run_until_attached()
     return world
 
 

@@ -16,7 +16,7 @@ EVERY_S = 0.25
 
 def flow_of(*, reliable: bool = True) -> Flow:
     world = Simulation(topology=chain(2))
-    assert world.settle()
+    assert world.run_until_attached()
     flow = flowing(world, source=SOURCE, readers=(READER,), reliable=reliable)
     world.network.run(1)
     return flow
@@ -115,7 +115,7 @@ def test_reading_again_on_purpose_is_no_loss() -> None:
     flow.stream(40, 0.25, 100)
     world.network.run(2.1)
     world.members[READER].unsubscribe(flow.topic.name)
-    world.network.touch(READER)
+    world.network.send_pending(READER)
     world.network.run(3)
     flow.read_by(READER)
     world.network.run(3 * ADVERTISEMENT_LEASE_S)
@@ -125,7 +125,7 @@ def test_reading_again_on_purpose_is_no_loss() -> None:
 
 def test_a_latched_topic_without_earlier_readers_has_lost_nothing_for_its_first_reader() -> None:
     world = Simulation(topology=chain(2))
-    assert world.settle()
+    assert world.run_until_attached()
     flow = advertise(world, source=SOURCE, depth=2)
     for number in range(5):
         flow.publish(number.to_bytes(4, "big"))

@@ -43,7 +43,7 @@ def wide(seed: int = 1) -> Topology:
 def test_two_hundred_switches_settle_and_deliver() -> None:
     world = Simulation(topology=wide(), hello_s=5.0, dead_s=18.0, lease_s=5.0)
     assert len(world.switches) == 200
-    assert world.settle(30)
+    assert world.run_until_attached(30)
     label = f"d{DOMAINS - 1}s{SWITCHES - 1}/proxy"
     flow = flowing(world, source="d1s24/proxy", readers=(label, "d4s24/proxy"))
     flow.stream(20, 0.01)

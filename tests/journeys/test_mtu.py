@@ -44,7 +44,7 @@ def wide(topology: Topology, mtu: int = JUMBO, **links: int) -> Simulation:
     narrow = {frozenset(ends.split("_")): size for ends, size in links.items()}
     made = tuple(replace(link, mtu=narrow.get(link.ends(), mtu)) for link in topology.links)
     world = Simulation(topology=replace(topology, links=made), lead_mtu=mtu, lease_s=LEASE_S)
-    assert world.settle()
+    assert world.run_until_attached()
     return world
 
 
@@ -138,13 +138,13 @@ def test_a_reader_behind_a_narrow_link_shrinks_all_frames_while_it_is_there() ->
     world, network = flow.world, flow.world.network
     world.lead_mtu = 1_000
     world.add_member("nuc3/narrow", "nuc3")
-    assert world.settle()
+    assert world.run_until_attached()
     before = largest(flow)
     flow.read_by("nuc3/narrow")
     assert network.run(2, lambda: flow.is_read_by(2))
     neighbouring = largest(flow)
     world.members["nuc3/narrow"].leave()
-    network.touch("nuc3/narrow")
+    network.send_pending("nuc3/narrow")
     del flow.got["nuc3/narrow"]
     network.run(NEWS_S)
     assert (before, neighbouring, largest(flow)) == (JUMBO, 1_000, JUMBO)
@@ -157,7 +157,7 @@ def test_a_narrow_reader_whose_link_is_lost_no_longer_counts() -> None:
     world, network = flow.world, flow.world.network
     world.lead_mtu = 1_000
     world.add_member("nuc3/narrow", "nuc3")
-    assert world.settle()
+    assert world.run_until_attached()
     flow.read_by("nuc3/narrow")
     assert network.run(2, lambda: flow.is_read_by(2))
     network.set_link(world.leads["nuc3/narrow"], up=False)
@@ -226,7 +226,7 @@ def test_what_was_sealed_too_large_for_its_link_arrives_all_the_same() -> None:
 def test_of_two_readers_neither_gets_a_refragmented_message_twice() -> None:
     world = wide(ring5())
     world.add_member("nuc2/near", "nuc2")
-    assert world.settle()
+    assert world.run_until_attached()
     flow = flowing(world, readers=(SERVER, "nuc2/near"))
     flow.stream(20, 0.002, size=20_000)
     world.network.call(0.0123, partial(world.network.set_mtu, world.cables[MIDDLE], 1_000))
@@ -241,7 +241,7 @@ def test_a_late_joiner_behind_a_narrow_link_gets_what_was_kept_for_it() -> None:
     world = wide(ring5())
     world.lead_mtu = 1_000
     world.add_member("nuc3/narrow", "nuc3")
-    assert world.settle()
+    assert world.run_until_attached()
     flow = advertise(world, depth=3)
     flow.read_by(SERVER)
     assert world.network.run(5, lambda: flow.is_read_by(1))

@@ -96,11 +96,11 @@ def test_a_member_without_a_delegation_to_read_cannot_even_ask() -> None:
 def test_a_reader_whose_delegation_is_anothers_gets_nothing() -> None:
     world = ring()
     world.add_member("nuc4/thief", "nuc4")
-    assert world.settle()
+    assert world.run_until_attached()
     flow = flowing(world)
     thief = world.members["nuc4/thief"]
     thief.subscribe(world.topic(flow.name, world.members[SERVER], [Right.READ]))
-    world.network.touch("nuc4/thief")
+    world.network.send_pending("nuc4/thief")
     tap = Tap("nuc4", "nuc4/thief")
     world.network.taps.append(tap)
     flow.stream(20, 0.01)
@@ -122,7 +122,7 @@ def test_a_local_topic_is_not_found_from_another_domain() -> None:
 def test_a_local_topic_is_found_within_its_domain() -> None:
     world = ring()
     world.add_member("nuc2/near", "nuc2")
-    assert world.settle()
+    assert world.run_until_attached()
     flow = advertise(world, is_global=False)
     flow.read_by("nuc2/near")
     assert world.network.run(5, lambda: flow.is_read_by(1))

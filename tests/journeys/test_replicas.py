@@ -27,7 +27,7 @@ def cluster(*labels: str, lease_s: float = LEASE_S) -> tuple[Simulation, Party, 
     world = Simulation(topology=chain(3), lease_s=lease_s)
     for label in labels:
         world.add_member(label, "s3")
-    assert world.settle()
+    assert world.run_until_attached()
     servers = [Party(world, label, Right.SERVE, answers=False) for label in labels]
     client = Party(world, CLIENT, Right.CALL)
     assert meet(world, client, *servers)
@@ -35,8 +35,8 @@ def cluster(*labels: str, lease_s: float = LEASE_S) -> tuple[Simulation, Party, 
 
 
 def ask(client: Party, server: Party, message: bytes) -> None:
-    client.member.ask(client.service, server.member.name, message)
-    client.world.network.touch(client.label)
+    client.member.send_request(client.service, server.member.name, message)
+    client.world.network.send_pending(client.label)
 
 
 class Load:
@@ -96,7 +96,7 @@ def test_a_request_to_one_server_reaches_that_one_alone_and_at_once() -> None:
 @pytest.mark.parametrize("lossy", [False, True])
 def test_a_request_to_a_server_that_has_just_become_a_peer_is_not_lost(first: Right, *, lossy: bool) -> None:
     world = Simulation(topology=chain(3), lease_s=LEASE_S)
-    assert world.settle()
+    assert world.run_until_attached()
     if lossy:
         for sim_link in world.cables.values():
             sim_link.loss, sim_link.jitter_s = 0.1, 0.002
@@ -127,17 +127,17 @@ def test_requests_to_one_server_are_complete_and_in_order_over_links_that_lose()
 def test_who_is_not_heard_cannot_be_asked() -> None:
     world, client, (one, _) = cluster(*SERVERS[:2])
     with pytest.raises(LocalError, match="is not heard"):
-        client.member.ask(client.service, world.members["s3/right"].name, b"?")
+        client.member.send_request(client.service, world.members["s3/right"].name, b"?")
     with pytest.raises(LocalError, match="no call of"):
-        one.member.ask(client.service, client.member.name, b"?")
+        one.member.send_request(client.service, client.member.name, b"?")
     with pytest.raises(LocalError, match="no serve of"):
         client.member.respond(client.service, one.member.name, b"?")
     gone = one.member.name
     one.member.withdraw(one.service)
-    world.network.touch(one.label)
+    world.network.send_pending(one.label)
     assert world.network.run(1, lambda: len(client.member.writer_proxies_of(client.service)) == 1)
     with pytest.raises(LocalError, match="is not heard"):
-        client.member.ask(client.service, gone, b"?")
+        client.member.send_request(client.service, gone, b"?")
 
 
 def test_requests_to_a_former_life_of_a_server_do_not_reach_the_new_one() -> None:
@@ -302,7 +302,7 @@ def test_the_clients_link_carries_one_copy_of_a_request_whatever_the_number_of_s
         ),
         lease_s=LEASE_S,
     )
-    assert world.settle()
+    assert world.run_until_attached()
     servers = [Party(world, f"{name}/proxy", Right.SERVE, answers=False) for name in names]
     client = Party(world, "robot/proxy", Right.CALL)
     assert meet(world, client, *servers)
@@ -334,7 +334,7 @@ def test_a_new_server_is_a_peer_at_once_though_its_advertisements_and_questions_
         world.add_member(label, label.partition("/")[0])
     spare = world.cables[frozenset(("g", "m2"))]
     world.network.set_link(spare, up=False)
-    assert world.settle()
+    assert world.run_until_attached()
     clients = [Party(world, label, Right.CALL) for label in ("r/proxy", "r/watch")]
     old = Party(world, "m1/old", Right.SERVE).member.name
     assert world.network.run(10.0, lambda: all(old in each.member.peers(each.service) for each in clients))

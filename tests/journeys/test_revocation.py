@@ -31,7 +31,7 @@ def three_tiers() -> Simulation:
         ),
     )
     world = Simulation(topology=topology, lease_s=LEASE_S)
-    assert world.settle()
+    assert world.run_until_attached()
     return world
 
 
@@ -61,7 +61,7 @@ def test_a_revocation_closes_a_flow_in_all_of_three_tiers(end: str, at: str) -> 
         fingerprint = parse(delegation.chain[-1]).fingerprint
         wire = world.owner.revoke(delegation.subject, fingerprint, until)
     world.switches[at].revoke(wire, world.network.now)
-    world.network.touch(at)
+    world.network.send_pending(at)
     world.network.run(WITHIN_S)
     expected = {"L", "M", "T", "N", "R", "l1", "r1"} if end == "publisher" else {"R", "r1"}
     if end == "member":
@@ -80,7 +80,7 @@ def revoke(world: Simulation, delegation: Delegation) -> None:
     fingerprint = parse(delegation.chain[-1]).fingerprint
     until = int(world.network.now.unix_s) + 100_000
     world.switches[HERE].revoke(world.owner.revoke(delegation.subject, fingerprint, until), world.network.now)
-    world.network.touch(HERE)
+    world.network.send_pending(HERE)
 
 
 def test_a_publisher_whose_delegation_is_revoked_is_gone_from_every_tier() -> None:
@@ -133,7 +133,7 @@ def test_a_reader_whose_delegation_is_revoked_gets_no_frame_more() -> None:
 def test_another_reader_behind_the_same_link_reads_on_without_a_gap() -> None:
     world = ring()
     world.add_member("nuc4/other", "nuc4")
-    assert world.settle()
+    assert world.run_until_attached()
     flow = flowing(world, readers=(SERVER, "nuc4/other"))
     flow.stream(100, 0.05)
     reader = next(s for s in world.members[SERVER].subscribed() if s.name == flow.topic.name)
@@ -153,7 +153,7 @@ def test_a_revoked_member_is_cut_off_by_its_switch() -> None:
         authority.key, authority.root.subject, member.fingerprint, int(world.network.now.unix_s) + 100_000
     )
     world.switches["nuc4"].revoke(wire, world.network.now)
-    world.network.touch("nuc4")
+    world.network.send_pending("nuc4")
     world.network.run(1.5)  # a hello, and the silence that follows it
     assert world.ribs["backbone"].rib.names == 1
     assert flow.member.name not in {each.name for each in world.switches["nuc1"].hello_protocol.all_up()}
@@ -177,14 +177,14 @@ def test_a_switch_that_was_away_learns_what_was_revoked_meanwhile() -> None:
 def test_the_whole_way_to_another_reader_stands_while_one_is_taken_back(revoked: int) -> None:
     world = ring()
     world.add_member("nuc5/other", "nuc5")
-    assert world.settle()
+    assert world.run_until_attached()
     readers = (SERVER, "nuc5/other")
     flow = flowing(world, readers=readers)
     reader = next(s for s in world.members[readers[revoked]].subscribed() if s.name == flow.topic.name)
     until = int(world.network.now.unix_s) + 100_000
     fingerprint = parse(reader.delegation.chain[-1]).fingerprint
     world.switches["nuc5"].revoke(world.owner.revoke(reader.delegation.subject, fingerprint, until), world.network.now)
-    world.network.touch("nuc5")
+    world.network.send_pending("nuc5")
     way = [world.switches[node] for node in ("nuc1", "nuc2", "nuc3", "nuc4", "nuc5")]
     assert not world.network.run(3, lambda: not all(switch.multicast.trees.all() for switch in way))
     flow.outlive(readers[1 - revoked])

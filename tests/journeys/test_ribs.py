@@ -20,7 +20,7 @@ def doubled() -> Simulation:
     ring = ring5()
     second = (Attachment("nuc1", "rib", "rib2"), Attachment("nuc3", "rib", "rib2"), Attachment("nuc5", "rib", "rib2"))
     world = Simulation(topology=replace(ring, attachments=ring.attachments + second))
-    assert world.settle()
+    assert world.run_until_attached()
     return world
 
 
@@ -68,7 +68,7 @@ def test_two_ribs_that_were_parted_agree_again() -> None:
     kept = advertise(world, "/kept")
     network.run(LEASES_S)
     gone.member.withdraw(gone.topic.name)
-    network.touch(ROBOT)
+    network.send_pending(ROBOT)
     network.run(1)
     assert not agree(world, "school")
     network.set_link(lead, up=True)

@@ -114,6 +114,6 @@ def _again(flow: Flow) -> Flow:
     member = world.restart_member(ROBOT)
     world.roam(ROBOT, "nuc2")
     again = Flow(world, flow.name, ROBOT, flow.topic, member.advertise(flow.topic, b"", reliable=True), flow.got)
-    world.network.touch(ROBOT)
+    world.network.send_pending(ROBOT)
     assert world.network.run(5, lambda: again.is_read_by(1))
     return again

@@ -25,7 +25,7 @@ def ring_of_three() -> Simulation:
     """Return the ring with a third member."""
     world = ring()
     world.add_member(OTHER, "nuc4")
-    assert world.settle()
+    assert world.run_until_attached()
     return world
 
 
@@ -111,7 +111,7 @@ def test_a_server_that_withdraws_is_no_peer_at_once() -> None:
     world = ring()
     server, client = pair(world)
     server.member.withdraw(server.service)
-    world.network.touch(SERVER)
+    world.network.send_pending(SERVER)
     assert world.network.run(1, lambda: not list(client.member.writer_proxies()))
     assert client.member.peers(client.service) == []
     with pytest.raises(LocalError):
@@ -215,10 +215,10 @@ def test_a_node_that_may_only_call_reaches_no_client_however_it_advertises() -> 
     server, client = pair(world)
     world.add_member(OTHER, "nuc4")
     liar = world.members[OTHER]
-    assert world.settle()
+    assert world.run_until_attached()
     topic = world.topic(SERVICE, liar, [Right.CALL], kind="service")
     liar.attachment.advertisement(topic.delegation.subject, Right.SERVE, topic.delegation.chain, is_global=True)
-    world.network.touch(OTHER)
+    world.network.send_pending(OTHER)
     world.network.run(2)
     assert liar.attachment.refusals[DropReason.NOT_DELEGATED] >= 1
     assert client.member.peers(client.service) == [server.member.name]
@@ -367,7 +367,7 @@ def test_a_client_whose_delegation_is_revoked_is_answered_no_more() -> None:
     world.switches["nuc5"].revoke(
         world.owner.revoke(delegation.subject, link.fingerprint, link.validity.not_after_unix_s), world.network.now
     )
-    world.network.touch("nuc5")
+    world.network.send_pending("nuc5")
     assert world.network.run(1, lambda: not server.member.peers(server.service))
     with pytest.raises(LocalError, match="is not heard"):
         server.answer(client.member.name, b"?")

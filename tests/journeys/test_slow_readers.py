@@ -79,7 +79,7 @@ def world_with_a_slow_one(frames_s: float) -> tuple[Simulation, Behind]:
     world.add_member(NEAR, "s1")
     slow = Behind(world.add_member(SLOW, "s2"), frames_s)
     world.network.replace(SLOW, slow)
-    assert world.settle()
+    assert world.run_until_attached()
     return world, slow
 
 

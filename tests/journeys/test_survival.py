@@ -69,7 +69,7 @@ A, C = "a1/robot", "c2/server"
 def sites(lease_s: float = LEASE_S) -> Simulation:
     """Return the sites, settled."""
     world = Simulation(topology=three_sites(), lease_s=lease_s)
-    assert world.settle()
+    assert world.run_until_attached()
     return world
 
 
@@ -151,7 +151,7 @@ def test_a_transit_domain_needs_no_rib_of_its_own() -> None:
         ),
     )
     world = Simulation(topology=topology)
-    assert world.settle()
+    assert world.run_until_attached()
     world.network.run(9)
     flow = flowing(world, source="a1/robot", readers=("b1/server",))
     count = int(LONG_S / 0.1)

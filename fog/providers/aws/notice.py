@@ -99,7 +99,7 @@ class Watch:
         self._drain = drain
         self._leaves_at: float | None = None
 
-    def look(self, now_unix_s: float) -> bool:
+    def poll(self, now_unix_s: float) -> bool:
         """Poll once; return whether watching has ended because the machine drains.
 
         Raises:
@@ -142,7 +142,7 @@ def watch(
     is_over, trouble = False, ""
     while not ended.wait(poll_s):
         try:
-            is_over = is_over or seen.look(time.time())
+            is_over = is_over or seen.poll(time.time())
             trouble = ""
         except OSError as error:
             if str(error) != trouble:

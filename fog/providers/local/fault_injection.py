@@ -43,7 +43,7 @@ def kill(runs: RunRegistry, machine: str) -> None:
     for group in groups:
         with suppress(ProcessLookupError):
             os.killpg(group, signal.SIGKILL)
-    for device in (found.plug, found.uplink_plug):
+    for device in (found.gateway_device, found.uplink_plug):
         delete(found.gateway, device)
 
 
@@ -83,19 +83,19 @@ def delay(runs: RunRegistry, machine: str, ms: float) -> None:
     if ms:
         if not exists(found.gateway, found.relay_out):
             join_within(found.gateway, found.relay_out, found.relay_in)
-        argv = ["fog.providers.local.delay", found.plug, found.relay_out, f"{ms:g}"]
+        argv = ["fog.providers.local.delay", found.gateway_device, found.relay_out, f"{ms:g}"]
         spawn_detached(run, found.gateway, argv, found.directory / "delay.log", is_heard=True)
-        plug(found.gateway, found.plug, into=False)
+        plug(found.gateway, found.gateway_device, into=False)
         plug(found.gateway, found.relay_in)
     else:
         delete(found.gateway, found.relay_out)
-        plug(found.gateway, found.plug)
+        plug(found.gateway, found.gateway_device)
     end_all(before)
 
 
 def hold(machine: LocalMachine, *, held: bool) -> None:
     """Stop all processes of a machine, or continue them; no effect if it has none."""
-    if machine.cgroup.hold(held=held):
+    if machine.cgroup.set_frozen(held=held):
         return
     for group in _groups(machine):  # without cgroups; child processes in their own session continue
         with suppress(ProcessLookupError):

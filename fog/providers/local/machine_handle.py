@@ -48,12 +48,12 @@ class LocalMachine:
         return self.directory / "home"
 
     @property
-    def space(self) -> Path:
+    def netns_path(self) -> Path:
         """Return the path of the machine's network namespace."""
         return space_path(self.id, self.directory, self.file.spec.name)
 
     @property
-    def plug(self) -> str:
+    def gateway_device(self) -> str:
         """Return the device name of its link's other end, in its gateway's namespace."""
         return f"m-{self.id}"
 

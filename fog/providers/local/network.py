@@ -52,7 +52,7 @@ class _Standing:
     record: Record
     topology: Gateway
 
-    def space(self, label: str) -> Path:
+    def netns_path(self, label: str) -> Path:
         return space_path(self.record.run, Path(self.record.files[0]), label)
 
     def home(self, label: str) -> Path:
@@ -116,7 +116,7 @@ class Network:
         standing = self._find()
         if standing is None or not standing.record.kept:
             raise LocalError("the local network is not open")
-        return standing.space(standing.topology.serving(region).gateway)
+        return standing.netns_path(standing.topology.serving(region).gateway)
 
     def replica_gateway(self, region: str) -> str:
         """Return the label of the replica gateway of a region's machines; empty: their gateway is dedicated."""
@@ -145,7 +145,7 @@ class Network:
             standing = _Standing(run.record, self._topology)
             gateways = list(self._topology.traverse())
             for gateway in gateways:
-                space = standing.space(gateway.gateway)
+                space = standing.netns_path(gateway.gateway)
                 run.plan_namespace(space)
                 make_space(space, "")
                 if gateway.replica:
@@ -153,18 +153,18 @@ class Network:
                     make_bridge(space, UPLINK_BRIDGE)
                 else:
                     make_segment(space)
-            join(None, self._uplink, standing.space(self._topology.gateway), UP)
+            join(None, self._uplink, standing.netns_path(self._topology.gateway), UP)
             for gateway in gateways:
                 for child in gateway.children:
-                    ends = standing.space(gateway.gateway), standing.space(child.gateway)
+                    ends = standing.netns_path(gateway.gateway), standing.netns_path(child.gateway)
                     join(ends[0], f"to-{child.gateway}", ends[1], UP)
             for gateway in gateways:
                 if gateway.replica:
-                    plug(standing.space(gateway.gateway), UP, bridge=UPLINK_BRIDGE)
+                    plug(standing.netns_path(gateway.gateway), UP, bridge=UPLINK_BRIDGE)
                 else:
                     self._start(run, standing, gateway)
             if self._topology.replica:
-                run.keep(passive=True)
+                run.retain(passive=True)
         except BaseException:
             run.end()
             delete(None, self._uplink)
@@ -182,4 +182,4 @@ class Network:
             (home / "process.json").write_text(json.dumps([process.pid, process.started]), encoding="ascii")
 
         argv = ["fog.host.cli", "--home", str(home), "--await-go"]
-        spawn_detached(run, standing.space(gateway.gateway), argv, home / "logs" / "machine.log", note)
+        spawn_detached(run, standing.netns_path(gateway.gateway), argv, home / "logs" / "machine.log", note)

@@ -154,7 +154,7 @@ class LocalProvider:
             hold(each, held=False)
         end_all([each.host for each in machines if each.host is not None], _END_PATIENCE_S)
         for each in machines:
-            for device in (each.plug, each.uplink_plug, each.relay_out):
+            for device in (each.gateway_device, each.uplink_plug, each.relay_out):
                 delete(each.gateway, device)  # otherwise the kernel removes it some time after its namespace
             with self._alone():  # a command and the supervisor may end the same machine
                 if each.id in {record.run for record in self.runs.all()}:
@@ -178,7 +178,7 @@ class LocalProvider:
             if not self.replica_gateway(found.file.spec.offer.region):
                 raise LocalError(f"machine {machine}: the gateway of {found.file.spec.offer.region} is dedicated")
             if not exists(found.gateway, found.uplink_plug):
-                join(found.gateway, found.uplink_plug, found.space, UP)
+                join(found.gateway, found.uplink_plug, found.netns_path, UP)
             plug(found.gateway, found.uplink_plug, bridge=UPLINK_BRIDGE)
             found.gateway_mark.touch()
 
@@ -200,17 +200,17 @@ class LocalProvider:
         """Return the command line of a shell inside a machine."""
         found = find(self.runs, machine)
         inside = ["env", f"--chdir={found.home}", f"FOG_MACHINE={found.file.spec.name}", "bash"]
-        return ["nsenter", f"--net={found.space}", "--", *inside]
+        return ["nsenter", f"--net={found.netns_path}", "--", *inside]
 
     def close(self) -> None:
         """Do nothing; the provider holds no resources."""
 
     def _make(self, run: Run, file: MachineFile, boot: MachineBundle) -> None:
         machine = LocalMachine(run.record, file)
-        run.plan_namespace(machine.space)
-        make_space(machine.space, machine.address)
-        join(machine.gateway, machine.plug, machine.space, MACHINE_DEVICE)
-        plug(machine.gateway, machine.plug)
+        run.plan_namespace(machine.netns_path)
+        make_space(machine.netns_path, machine.address)
+        join(machine.gateway, machine.gateway_device, machine.netns_path, MACHINE_DEVICE)
+        plug(machine.gateway, machine.gateway_device)
         install(machine.home, boot)
         (machine.home / "logs").mkdir(mode=0o700, exist_ok=True)
 
@@ -227,7 +227,7 @@ class LocalProvider:
             replace(file, is_bounded=is_bounded).write(run.directory)
 
         argv = ["fog.host.cli", "--home", str(machine.home), "--await-go"]
-        spawn_detached(run, machine.space, argv, machine.home / "logs" / "machine.log", confine)
+        spawn_detached(run, machine.netns_path, argv, machine.home / "logs" / "machine.log", confine)
 
     def _is_forgotten(self, machine: LocalMachine, now_unix_s: float) -> bool:
         """Record when it was first observed as gone, and remove it after ``_GONE_S``; return whether it was removed."""

@@ -52,7 +52,7 @@ def spawn_detached(
         try:
             confine(process.pid)
             run.note_process(process.pid)
-            run.keep()
+            run.retain()
             os.write(says, b"go\n")
             if is_heard and not os.read(answer, 1):
                 raise BrokenPipeError

@@ -110,7 +110,7 @@ class TxDrops:
         """Frames refused since the first query of each device."""
         return self._total
 
-    def look(self, ask: NetlinkSocket, ifindexes: Iterable[int]) -> None:
+    def poll(self, ask: NetlinkSocket, ifindexes: Iterable[int]) -> None:
         """Query these devices, and forget the others. Costs a dump of all queues: 4 ms with 32 ports.
 
         Raises:

@@ -137,7 +137,7 @@ class MapSync:
                 gone.append(key)
             self._waiting.pop(key, None)
             self._unfit.discard(key)
-        self._take_out(gone)
+        self._remove_entries(gone)
         if self._zero_sources:
             freed = {key[:NAME_BYTES] for key in keys if len(key) > NAME_BYTES} & self._zero_sources
             freed = {name for name in freed if name + EVERY_SOURCE not in self._table}
@@ -175,14 +175,14 @@ class MapSync:
                 self._entries.put(kernel_key, value)
             except BpfError as error:
                 is_full = is_full or error.number == errno.E2BIG
-                self._take_out([key])  # an older entry there would be wrong now
+                self._remove_entries([key])  # an older entry there would be wrong now
                 self._wait(key)
 
     def _wait(self, key: bytes) -> None:
         self._unfit.discard(key)
         self._waiting[key] = None
 
-    def _take_out(self, keys: Sequence[bytes]) -> None:
+    def _remove_entries(self, keys: Sequence[bytes]) -> None:
         """Remove entries from the kernel, then free the counters and groups that they used."""
         self._entries.remove_many([*map(_kernel_key, keys)])
         self._give_back(keys)
@@ -198,7 +198,7 @@ class MapSync:
                 self._leave_group(left)
 
     def _leave_out(self, key: bytes) -> None:
-        self._take_out([key])
+        self._remove_entries([key])
         self._waiting.pop(key, None)
         self._unfit.add(key)
 

@@ -170,7 +170,7 @@ class KernelPlane(RawPlane):
 
     def _look_at_devices(self) -> None:
         try:
-            self._refusals.look(self._questions, self._devices)
+            self._refusals.poll(self._questions, self._devices)
         except LocalError:  # nothing is lost: devices continue to count, and the next upkeep queries again
             return
 

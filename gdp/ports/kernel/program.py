@@ -99,7 +99,7 @@ class ForwarderProgram(Assembler):
         places = layout()
         self._at = {name: ETHER_BYTES + offset for name, (offset, _) in places.items()}
 
-    def tell(self) -> bytes:
+    def build(self) -> bytes:
         """Return the instructions of the whole program; call it once."""
         self._only_ours()
         if self._maps.lease is not None:
@@ -376,4 +376,4 @@ class ForwarderProgram(Assembler):
 
 def forwarder(maps: Descriptors, side: int = 0) -> bytes:
     """Return the instructions of the program for a port; ``side``: its bit in an entry's mask."""
-    return ForwarderProgram(maps, side).tell()
+    return ForwarderProgram(maps, side).build()

@@ -50,7 +50,7 @@ class DdsEndpoint:
         self._shown: Graph = frozenset()
         self._node = Node(domain, node)
         self._discovery = Discovery(self._node, self._survey, self._follow)
-        self._node.watch.tell()
+        self._node.watch.wake()
 
     def fileno(self) -> int:
         """Return a descriptor that is readable while ``poll_events`` has events."""
@@ -167,7 +167,7 @@ class DdsEndpoint:
 
     def _tell(self, event: Event) -> None:
         if not self._events and not self._is_taking:
-            self._node.watch.tell()
+            self._node.watch.wake()
         self._events.append(event)
 
     def _follow(self) -> None:

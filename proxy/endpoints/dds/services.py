@@ -45,13 +45,13 @@ class _Halves:
         heard, said = halves if is_server else reversed(halves)
         self.writer = node.write(said[0], dds_type(said[1]), offered(_QOS, data))
         self.writer.tell_matches(self.matched)
-        self.reader = node.read(heard[0], dds_type(heard[1]), requested(_QOS, data), self.heard)
+        self.reader = node.read(heard[0], dds_type(heard[1]), requested(_QOS, data), self.receive_samples)
 
     def matched(self) -> None:
         """Process a change of the matched readers."""
         raise NotImplementedError
 
-    def heard(self, samples: list[Sample]) -> None:
+    def receive_samples(self, samples: list[Sample]) -> None:
         """Process received samples."""
         raise NotImplementedError
 
@@ -102,7 +102,7 @@ class Server(_Halves):
             self._ask(self._early.popleft())
         self.matched()
 
-    def heard(self, samples: list[Sample]) -> None:
+    def receive_samples(self, samples: list[Sample]) -> None:
         """Process requests."""
         for sample in samples:
             self._ask(sample)
@@ -212,7 +212,7 @@ class Client(_Halves):
             while self._early:
                 self._send(*self._early.popleft())
 
-    def heard(self, samples: list[Sample]) -> None:
+    def receive_samples(self, samples: list[Sample]) -> None:
         """Process responses; those for other clients arrive too."""
         for raw, _, _ in samples:
             if raw[_PREFIX : _PREFIX + 8] != self._me or len(raw) < _PREFIX + _HEADER:

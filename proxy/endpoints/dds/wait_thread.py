@@ -65,7 +65,7 @@ class WaitThread:
         """Return a descriptor that is readable while ``catch_up`` has work."""
         return self._wake
 
-    def tell(self) -> None:
+    def wake(self) -> None:
         """Make the descriptor readable: the caller has news of its own."""
         os.eventfd_write(self._wake, 1)
 
@@ -79,7 +79,7 @@ class WaitThread:
             self._queue.popleft()()
             self._capacity.set()
         if self._queue:
-            self.tell()
+            self.wake()
 
     def close(self) -> None:
         """End the thread and free everything."""
@@ -98,9 +98,9 @@ class WaitThread:
             for number in numbers:
                 drain = self._drains.get(number)
                 if drain is not None:
-                    self._take(drain)
+                    self._read_available(drain)
 
-    def _take(self, drain: Drain) -> None:
+    def _read_available(self, drain: Drain) -> None:
         try:
             news = drain()
         except Exception as error:  # the binding may fail in any way on a peer's announcement
@@ -112,7 +112,7 @@ class WaitThread:
     def _put(self, news: News) -> None:
         self._queue.append(news)
         if len(self._queue) == 1:
-            self.tell()
+            self.wake()
         self._capacity.clear()
         if len(self._queue) >= _QUEUE_MAX and not self._is_closing:
             self._capacity.wait()

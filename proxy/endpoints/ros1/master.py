@@ -113,7 +113,7 @@ class Master:
         self._proxy = xmlrpc.client.ServerProxy(uri, transport=_Transport())
         self._node = node
 
-    def ask(self, *calls: tuple[str, ...]) -> list[object]:
+    def call_batch(self, *calls: tuple[str, ...]) -> list[object]:
         """Return the responses to a batch of calls, each (method, argument...); None for a refused call.
 
         Raises:
@@ -148,13 +148,13 @@ class MasterWatch:
         self._dead: frozenset[str] = frozenset()
         self._next_liveness_s = 0.0
 
-    def look(self) -> GraphSnapshot:
+    def poll(self) -> GraphSnapshot:
         """Query the master, and probe new servers for their types.
 
         Raises:
             MasterError: the master does not answer.
         """
-        state, named = self._master.ask(("getSystemState",), ("getTopicTypes",))
+        state, named = self._master.call_batch(("getSystemState",), ("getTopicTypes",))
         publishers, subscribers, servers = _state(state)
         types = dict(_pairs(named))
         ours = any(self._node in nodes for _, nodes in servers)
@@ -186,7 +186,7 @@ class MasterWatch:
         is_silent = False
         while not stopped.is_set():
             try:
-                look = self.look()
+                look = self.poll()
             except MasterError as error:
                 if not is_silent:
                     failed(str(error))
@@ -208,7 +208,7 @@ class MasterWatch:
             doubtful = frozenset(nodes)
         if doubtful:
             order = sorted(doubtful)
-            uris = self._master.ask(*(("lookupNode", node) for node in order))
+            uris = self._master.call_batch(*(("lookupNode", node) for node in order))
             refused = self._probes.map(_refuses, uris)
             dead = frozenset(node for node, is_refused in zip(order, refused, strict=True) if is_refused)
         self._dead = dead
@@ -218,7 +218,7 @@ class MasterWatch:
         now_s = time.monotonic()
         order = sorted(key for key in offered if key not in self._services or now_s >= self._services[key].next_probe_s)
         if order:
-            uris = self._master.ask(*(("lookupService", service) for service, _ in order))
+            uris = self._master.call_batch(*(("lookupService", service) for service, _ in order))
             for key, server in zip(order, self._probes.map(_probed, (name for name, _ in order), uris), strict=True):
                 self._services[key] = server
 

@@ -93,11 +93,11 @@ class Node:
             except LinkEndedError:
                 self._leave()
             for frame in frames:
-                self._take(frame)
+                self._handle_frame(frame)
 
     # the link
 
-    def _take(self, frame: Frame) -> None:
+    def _handle_frame(self, frame: Frame) -> None:
         kind, handle, number, payload = frame
         if kind is Kind.PUBLISH:
             if handle in self._outlets:
@@ -196,7 +196,7 @@ class Node:
         is_reported = False
         while not self._stopped.is_set():
             try:
-                master.ask(("getPid",))
+                master.call_batch(("getPid",))
                 return
             except MasterError as error:
                 if not is_reported:
@@ -276,9 +276,9 @@ class Node:
         try:
             if end.role == "subscribes" and manager.has_publication(end.name):
                 known = manager.get_publisher_impl(end.name).type
-                master.ask(("registerPublisher", end.name, known, rospy.core.get_node_uri()))
+                master.call_batch(("registerPublisher", end.name, known, rospy.core.get_node_uri()))
             elif end.role == "publishes" and manager.has_subscription(end.name):
-                (uri,) = master.ask(("lookupNode", end.node))
+                (uri,) = master.call_batch(("lookupNode", end.node))
                 for listener in get_registration_listeners().listeners:
                     if uri is not None and isinstance(listener, RegManager):
                         listener.publisher_update(end.name, [uri])

@@ -202,12 +202,12 @@ class Ros2Endpoint:
         try:
             request = deserialize_message(raw, client_entity.request)
         except (RuntimeError, ValueError) as error:
-            self._waiting.tell(CallFailed(handle, call, f"a request that cannot be read: {error}"))
+            self._waiting.add_event(CallFailed(handle, call, f"a request that cannot be read: {error}"))
             return
         is_there = any(end.role is Role.SERVES and end.name == client_entity.name for end in self.graph())
         failed = client_entity.begin(call, request, is_there=is_there, now_s=time.monotonic())
         if failed is not None:
-            self._waiting.tell(failed)
+            self._waiting.add_event(failed)
         elif client_entity.is_holding:
             self._waiting.wake()
 

@@ -52,7 +52,7 @@ class GraphCache:
         self._by_node: dict[tuple[str, str], Graph] = {}
         self.graph: Graph = frozenset()
 
-    def look(self) -> bool:
+    def refresh(self) -> bool:
         """Refresh the cache; return whether ``graph`` changed."""
         self._turn = (self._turn + 1) % _TURNS
         changed = self._look_at_topics()
@@ -65,7 +65,7 @@ class GraphCache:
         """Return the publishers and subscriptions of a topic."""
         return self._by_topic.get(topic, frozenset())
 
-    def ask(self, topic: str) -> Graph:
+    def query_topic(self, topic: str) -> Graph:
         """Query one topic now, including entities of nodes that are not known yet."""
         return frozenset(self._asked(topic))
 

@@ -34,7 +34,7 @@ class WaitThread:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._survey = GraphCache(session)
-        self._survey.look()
+        self._survey.refresh()
         self._guard = session.guard()
         self._lock = Lock()
         self._sources: dict[int, Source] = {}
@@ -83,7 +83,7 @@ class WaitThread:
             self._events = kept
         self._guard.trigger_guard_condition()
 
-    def tell(self, event: Event) -> None:
+    def add_event(self, event: Event) -> None:
         """Add an event of the caller."""
         self._post([event])
 
@@ -168,13 +168,13 @@ class WaitThread:
         except (RuntimeError, ValueError) as error:  # rclpy's own errors, and text that is not UTF-8
             return [EndpointError(source.number, f"cannot be taken: {error}")]
         if isinstance(source, SubscriptionEntity) and source.described is None and events:
-            source.described = source.describe(self._survey.ask(source.topic))
+            source.described = source.describe(self._survey.query_topic(source.topic))
             events.insert(0, TypeResolved(source.number, source.described))
         return events
 
     def _look(self) -> None:
         try:
-            has_changed = self._survey.look()
+            has_changed = self._survey.refresh()
         except RuntimeError as error:
             log.warning("the graph cannot be looked at error=%s", error)
             return
@@ -188,10 +188,10 @@ class WaitThread:
             self._unjudged.clear()
         events: list[Event] = [GraphChanged()] if has_changed else []
         for end in judged:
-            events += self._judge(end)
+            events += self._check_qos(end)
         self._post(events)
 
-    def _judge(self, end: SubscriptionEntity | PublisherEntity) -> list[Event]:
+    def _check_qos(self, end: SubscriptionEntity | PublisherEntity) -> list[Event]:
         events: list[Event] = []
         ends = self._survey.ends_of(end.topic)
         if (

@@ -91,7 +91,7 @@ class Caller:
 
     def go_on(self, now_s: float) -> None:
         """Discover servers, make the calls that are due, end those that time out."""
-        peers = set(self._station.member.peers(self._name)) or set(self._station.member.heard(self._name))
+        peers = set(self._station.member.peers(self._name)) or set(self._station.member.connected_peers(self._name))
         for server in set(self._dispatch.servers) - peers:
             self._dispatch.replica_lost(server, now_s, "gone")
         for server in peers:
@@ -140,7 +140,7 @@ class Caller:
                 self._stream.publish(effect.request)
             for server in effect.servers or ():
                 try:
-                    self._station.member.ask(self._name, server, effect.request)
+                    self._station.member.send_request(self._name, server, effect.request)
                 except LocalError as error:
                     self._dispatch.refused(effect.call, server, str(error), now_s)
 

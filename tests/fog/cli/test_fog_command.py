@@ -44,7 +44,7 @@ def journal(tmp_path: Path, fog: Run) -> Iterator[Journal]:
 
 def up(journal: Journal, plan: ClusterPlan = PLAN) -> None:
     now_s = time.time()
-    journal.want(plan, now_s)
+    journal.put_cluster(plan, now_s)
     for each in (serving("m1"), record("m2", "west")):
         journal.put(replace(each, asked_unix_s=now_s - 1_800), now_s, "requested", "east")
 
@@ -71,7 +71,7 @@ def test_machines_and_their_stage_are_reported(fog: Run, journal: Journal) -> No
 
 
 def test_the_machine_that_is_the_gateway_is_reported(fog: Run, journal: Journal) -> None:
-    journal.want(PLAN, time.time())
+    journal.put_cluster(PLAN, time.time())
     for each in (replace(serving("m1"), gateway="edge"), serving("m2")):
         journal.put(each, time.time())
     gone = replace(serving("m3"), gateway="edge").ended(Outcome.PREEMPTED, "killed", time.time())
@@ -151,7 +151,7 @@ def test_the_final_log_lines_of_a_machine_that_is_gone_are_shown(fog: Run, journ
     up(journal)
     gone = serving("m3").ended(Outcome.PREEMPTED, "killed", time.time())
     journal.put(gone, time.time(), "preempted", "killed", time.time() - 0.25)
-    journal.tell(time.time(), "c", "m3", FINAL_LOGS, "node", lines="one\nout of memory")
+    journal.write_event(time.time(), "c", "m3", FINAL_LOGS, "node", lines="one\nout of memory")
     said = fog("logs", "m3", "node", "-n", "1").output.splitlines()
     assert said == ["# m3 is gone: preempted, killed; its last lines:", "out of memory"]
     assert "kept are the last lines of node" in fog("logs", "m3", "switch").output

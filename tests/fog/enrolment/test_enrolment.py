@@ -72,7 +72,7 @@ def test_a_machine_may_give_what_is_carried_and_nothing_else(desk: Desk, tmp_pat
 def test_no_two_machines_share_a_key(desk: Desk, tmp_path: Path) -> None:
     for name in ("m1", "m2"):
         desk.enrol(tmp_path / name, name)
-    issued_credentials = [each.issued_credentials for each in desk.tickets.news()]
+    issued_credentials = [each.issued_credentials for each in desk.tickets.pending_reports()]
     assert issued_credentials[0] is not None
     assert issued_credentials[1] is not None
     assert issued_credentials[0].proxy != issued_credentials[1].proxy

@@ -102,33 +102,33 @@ def interrupt(service: Service) -> None:
 
 def test_a_machine_that_may_stay_hears_nothing(service: Service) -> None:
     seen = Seen(service)
-    assert not seen.watch.look(LEAVES_AT)
+    assert not seen.watch.poll(LEAVES_AT)
     assert (seen.notices, seen.drains, service.tokens_given) == ([], 0, 1)
 
 
 def test_a_notice_is_reported_at_once_and_the_machine_drains_in_time(service: Service) -> None:
     seen = Seen(service)
     interrupt(service)
-    assert not seen.watch.look(LEAVES_AT - 120)
-    assert not seen.watch.look(LEAVES_AT - 90)
+    assert not seen.watch.poll(LEAVES_AT - 120)
+    assert not seen.watch.poll(LEAVES_AT - 90)
     assert (seen.notices, seen.drains) == ([LEAVES_AT], 0)
-    assert seen.watch.look(LEAVES_AT - DRAIN_BEFORE_S)
+    assert seen.watch.poll(LEAVES_AT - DRAIN_BEFORE_S)
     assert (seen.notices, seen.drains) == ([LEAVES_AT], 1)
 
 
 def test_the_owners_tag_drains_at_once(service: Service) -> None:
     seen = Seen(service)
     service.reported[DRAIN] = "1"
-    assert seen.watch.look(0.0)
+    assert seen.watch.poll(0.0)
     assert (seen.notices, seen.drains) == ([], 1)
 
 
 def test_an_expired_token_is_replaced(service: Service) -> None:
     seen = Seen(service)
-    seen.watch.look(0.0)
+    seen.watch.poll(0.0)
     service.token = "second"
     interrupt(service)
-    seen.watch.look(0.0)
+    seen.watch.poll(0.0)
     assert seen.notices == [LEAVES_AT]
     assert service.tokens_given == 2
 
@@ -138,9 +138,9 @@ def test_nonsense_is_an_error_that_may_pass(service: Service, text: str) -> None
     seen = Seen(service)
     service.reported[ACTION] = text
     with pytest.raises(OSError, match=r"makes no sense|metadata"):
-        seen.watch.look(0.0)
+        seen.watch.poll(0.0)
     interrupt(service)
-    seen.watch.look(0.0)
+    seen.watch.poll(0.0)
     assert seen.notices == [LEAVES_AT]
 
 

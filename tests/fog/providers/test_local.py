@@ -43,7 +43,7 @@ def machine(provider: LocalProvider, process: Process | None = None) -> Run:
     MachineFile(SPEC, 1.0, "/run/netns/none").write(run.directory)
     (run.directory / "home").mkdir()
     run.record.processes.append(process or Process(os.getpid(), 1))
-    run.keep()
+    run.retain()
     return run
 
 

@@ -11,7 +11,7 @@ from fog.machine import Machine, MachineSpec, MachineState
 from fog.offer import Offer
 from fog.supervisor.placement import place
 from fog.supervisor.reconcile import Drain, Launch, Release, Timeouts, decide
-from fog.supervisor.record import Record, learn
+from fog.supervisor.record import Record, update_record
 
 NOW_S = 1_000_000.0
 SPOT = MachineRequest(Hardware(cpus=2), is_spot=True)
@@ -44,7 +44,7 @@ def serving(name: str, region: str = "east", **more: float) -> Record:
 
 @dataclass
 class World:
-    """Provider, overlay and clock, played against ``learn``, ``place`` and ``decide``."""
+    """Provider, overlay and clock, played against ``update_record``, ``place`` and ``decide``."""
 
     now_s: float = NOW_S
     boot_s: float = 3.0
@@ -85,7 +85,7 @@ class World:
                 del self.machines[name]
         heard = self.serving()
         for name, known in self.records.items():
-            learnt = learn(known, self.machines.get(name), name in heard, self.now_s, grace_s=2.0)
+            learnt = update_record(known, self.machines.get(name), name in heard, self.now_s, grace_s=2.0)
             self.records[name] = learnt
         for name in self.machines.keys() - {each.name for each in self.records.values() if not each.is_gone}:
             del self.machines[name]  # orphans are given back

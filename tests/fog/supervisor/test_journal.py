@@ -28,7 +28,7 @@ def journal(tmp_path: Path) -> Iterator[Journal]:
 
 
 def test_what_is_written_another_process_reads(journal: Journal, tmp_path: Path) -> None:
-    journal.want(PLAN, NOW_S)
+    journal.put_cluster(PLAN, NOW_S)
     other = Journal(tmp_path / "journal.sqlite3")
     assert other.cluster("c").plan == PLAN
     other.close()
@@ -44,28 +44,28 @@ def test_a_machine_comes_back_as_it_was(journal: Journal) -> None:
 
 
 def test_no_name_of_a_machine_comes_twice(journal: Journal) -> None:
-    journal.want(PLAN, NOW_S)
+    journal.put_cluster(PLAN, NOW_S)
     names = [journal.next_machine("c")]
     journal.unwant("c", "test", NOW_S)
-    journal.want(PLAN, NOW_S)
+    journal.put_cluster(PLAN, NOW_S)
     assert [*names, journal.next_machine("c")] == ["m1", "m2"]
 
 
 def test_a_new_plan_of_a_cluster_that_is_up_does_not_restart_it(journal: Journal) -> None:
-    journal.want(PLAN, NOW_S)
-    journal.want(replace(PLAN, machines=(SPOT,)), NOW_S + 5)
+    journal.put_cluster(PLAN, NOW_S)
+    journal.put_cluster(replace(PLAN, machines=(SPOT,)), NOW_S + 5)
     assert journal.cluster("c").begun_unix_s == NOW_S
     assert len(journal.cluster("c").plan.machines) == 1
 
 
 def test_an_unknown_cluster_is_reported_with_the_known_ones(journal: Journal) -> None:
-    journal.want(PLAN, NOW_S)
+    journal.put_cluster(PLAN, NOW_S)
     with pytest.raises(LocalError, match="there are c"):
         journal.cluster("d")
 
 
 def test_events_are_reported_in_order_and_once(journal: Journal) -> None:
-    journal.want(PLAN, NOW_S)
+    journal.put_cluster(PLAN, NOW_S)
     journal.put(record("m1"), NOW_S, "requested", "east")
     journal.unwant("c", "idle", NOW_S)
     journal.unwant("c", "again", NOW_S)
@@ -93,6 +93,6 @@ def test_a_journal_of_an_earlier_version_is_gone_on_with(tmp_path: Path) -> None
         file.execute("INSERT INTO events (unix_s, cluster, machine, what, detail) VALUES (1, 'c', 'm1', 'up', '')")
     file.close()
     journal = Journal(path)
-    journal.tell(NOW_S, "c", "m1", "preempted", since_unix_s=NOW_S - 1)
+    journal.write_event(NOW_S, "c", "m1", "preempted", since_unix_s=NOW_S - 1)
     assert [(each.what, each.since_unix_s) for each in journal.events()] == [("up", None), ("preempted", NOW_S - 1)]
     journal.close()

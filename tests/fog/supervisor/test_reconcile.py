@@ -11,7 +11,7 @@ from fog.cluster import MachineRequest
 from fog.hardware import Hardware
 from fog.machine import Machine, MachineState
 from fog.supervisor.reconcile import Drain, Launch, Release, Timeouts, decide
-from fog.supervisor.record import Outcome, learn
+from fog.supervisor.record import Outcome, update_record
 from tests.fog.supervisor.machines import NOW_S, SPOT, World, record, serving
 
 PATIENCE = Timeouts()
@@ -94,14 +94,14 @@ def test_a_machine_counts_only_for_what_its_hardware_does() -> None:
 
 def test_an_intention_without_a_machine_is_given_up_after_a_grace() -> None:
     intended = replace(record("m1", asked_s=NOW_S - 3), id="")
-    assert learn(intended, None, None, NOW_S, grace_s=5.0) == intended
-    assert learn(intended, None, None, NOW_S, grace_s=2.0).ending is Outcome.FAILED
+    assert update_record(intended, None, None, NOW_S, grace_s=5.0) == intended
+    assert update_record(intended, None, None, NOW_S, grace_s=2.0).ending is Outcome.FAILED
 
 
 def test_an_intention_whose_machine_is_seen_takes_its_id() -> None:
     intended = replace(record("m1", asked_s=NOW_S - 3), id="")
     seen = Machine("i-7", intended.spec, MachineState.BOOTING, NOW_S)
-    assert learn(intended, seen, None, NOW_S, grace_s=2.0).id == "i-7"
+    assert update_record(intended, seen, None, NOW_S, grace_s=2.0).id == "i-7"
 
 
 STATES = st.sampled_from(["booting", "serving", "frozen", "noticed", "drained", "missing", "gone", "orphan", "old"])

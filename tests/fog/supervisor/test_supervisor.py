@@ -142,7 +142,7 @@ def serving(journal: Journal) -> list[str]:
 def test_what_is_wanted_is_launched_and_what_is_not_is_given_back(site: Site, journal: Journal) -> None:
     provider = Memory()
     ours = supervisor(site, journal, provider)
-    journal.want(PLAN, time.time())
+    journal.put_cluster(PLAN, time.time())
     work(ours, lambda: len(serving(journal)) == 2)
     journal.unwant("c", "test", time.time())
     work(ours, lambda: ours.is_done)
@@ -153,7 +153,7 @@ def test_what_is_wanted_is_launched_and_what_is_not_is_given_back(site: Site, jo
 def test_a_machine_whose_supervisor_died_before_noting_its_id_is_found_again(site: Site, journal: Journal) -> None:
     provider = Memory()
     first = supervisor(site, journal, provider)
-    journal.want(PLAN, time.time())
+    journal.put_cluster(PLAN, time.time())
     work(first, lambda: len(serving(journal)) == 2)
     first.close()
     record = journal.machines("c")[0]
@@ -169,7 +169,7 @@ def test_a_machine_that_no_journal_knows_is_given_back(site: Site, journal: Jour
     provider = Memory()
     provider.create(MachineSpec("c", "m99", OFFERS[0]), MachineBundle({}, ()))
     ours = supervisor(site, journal, provider)
-    journal.want(PLAN, time.time())
+    journal.put_cluster(PLAN, time.time())
     work(ours, lambda: len(serving(journal)) == 2 and "m99" not in provider.machines)
     ours.close()
 
@@ -177,7 +177,7 @@ def test_a_machine_that_no_journal_knows_is_given_back(site: Site, journal: Jour
 def test_a_lost_machine_is_replaced_and_reported(site: Site, journal: Journal) -> None:
     provider = Memory()
     ours = supervisor(site, journal, provider)
-    journal.want(PLAN, time.time())
+    journal.put_cluster(PLAN, time.time())
     work(ours, lambda: len(serving(journal)) == 2)
     del provider.machines["m1"]
     work(ours, lambda: serving(journal) == ["m2", "m3"])
@@ -189,7 +189,7 @@ def test_a_refusal_is_reported_and_tried_elsewhere(site: Site, journal: Journal)
     provider = Memory()
     provider.refuses = 1
     ours = supervisor(site, journal, provider)
-    journal.want(PLAN, time.time())
+    journal.put_cluster(PLAN, time.time())
     work(ours, lambda: len(serving(journal)) == 2)
     ours.close()
     assert next(each for each in journal.events("c") if each.what == "refused").detail == "no capacity"
@@ -197,7 +197,7 @@ def test_a_refusal_is_reported_and_tried_elsewhere(site: Site, journal: Journal)
 
 def test_a_spent_budget_ends_a_cluster(site: Site, journal: Journal) -> None:
     ours = supervisor(site, journal, Memory())
-    journal.want(replace(PLAN, budget_usd=1e-6), time.time())
+    journal.put_cluster(replace(PLAN, budget_usd=1e-6), time.time())
     work(ours, lambda: not journal.cluster("c").is_up and ours.is_done)
     ours.close()
     assert "budget" in journal.cluster("c").why
@@ -211,7 +211,7 @@ def test_a_cluster_without_calls_is_ended_and_one_that_is_called_is_not(
     received = [1]
     monkeypatch.setattr("fog.supervisor.usage_limits.received_by", lambda proxy: received[-1])
     ours = supervisor(site, journal, provider)
-    journal.want(replace(PLAN, idle_s=60.0), now_s)
+    journal.put_cluster(replace(PLAN, idle_s=60.0), now_s)
     work(ours, lambda: len(serving(journal)) == 2)
     for later_s, count in ((40.0, 2), (80.0, 3), (120.0, 3)):
         received.append(count)
@@ -228,7 +228,7 @@ def test_a_cluster_without_calls_is_ended_and_one_that_is_called_is_not(
 def test_what_the_programs_of_a_lost_machine_said_last_is_kept(site: Site, journal: Journal) -> None:
     provider = Memory()
     ours = supervisor(site, journal, provider)
-    journal.want(PLAN, time.time())
+    journal.put_cluster(PLAN, time.time())
     work(ours, lambda: len(serving(journal)) == 2)
     provider.said = {"node": "one\nout of memory\n"}
     lost = provider.machines["m1"]
@@ -244,7 +244,7 @@ def test_what_a_machine_that_was_given_back_said_is_not_kept(site: Site, journal
     provider = Memory()
     provider.said = {"node": "word"}
     ours = supervisor(site, journal, provider)
-    journal.want(PLAN, time.time())
+    journal.put_cluster(PLAN, time.time())
     work(ours, lambda: len(serving(journal)) == 2)
     journal.unwant("c", "test", time.time())
     work(ours, lambda: ours.is_done)
@@ -254,7 +254,7 @@ def test_what_a_machine_that_was_given_back_said_is_not_kept(site: Site, journal
 
 def test_after_its_start_a_supervisor_says_when_all_was_looked_at(site: Site, journal: Journal) -> None:
     ours = supervisor(site, journal, Memory())
-    journal.want(PLAN, time.time())
+    journal.put_cluster(PLAN, time.time())
     ours.reconcile()
     begun_s = time.time() - 1.5
     ours.reconciled(begun_s)
@@ -266,7 +266,7 @@ def test_after_its_start_a_supervisor_says_when_all_was_looked_at(site: Site, jo
 def test_a_region_that_is_nearer_is_taken_and_said(site: Site, journal: Journal) -> None:
     near = replace(site, latency_ms={"east": 90.0, "west": 12.0, "south": 80.0})
     ours = supervisor(near, journal, Memory())
-    journal.want(replace(PLAN, machines=(SPOT,)), time.time())
+    journal.put_cluster(replace(PLAN, machines=(SPOT,)), time.time())
     work(ours, lambda: len(serving(journal)) == 1)
     ours.close()
     (asked,) = (each for each in journal.events("c") if each.what == "requested")
@@ -282,7 +282,7 @@ def test_of_machines_elsewhere_the_robots_counters_decide_and_without_them_a_clu
     provider.name = "aws"
     monkeypatch.setattr("fog.supervisor.usage_limits.sent_by", lambda path: sent)
     ours = supervisor(site, journal, provider)
-    journal.want(replace(PLAN, idle_s=60.0), now_s)
+    journal.put_cluster(replace(PLAN, idle_s=60.0), now_s)
     work(ours, lambda: len(serving(journal)) == 2)
     for later_s in (30.0, 60.0, 100.0):
         monkeypatch.setattr(time, "time", lambda at_s=now_s + later_s: at_s)
@@ -294,7 +294,7 @@ def test_of_machines_elsewhere_the_robots_counters_decide_and_without_them_a_clu
 def test_one_machine_becomes_the_gateway_and_every_machine_can(site: Site, journal: Journal) -> None:
     provider = Grouped()
     ours = supervisor(site, journal, provider)
-    journal.want(PLAN, time.time())
+    journal.put_cluster(PLAN, time.time())
     work(ours, lambda: len(serving(journal)) == 2 and provider.gateways() == elected(journal) != [])
     ours.close()
     assert len(elected(journal)) == 1
@@ -305,7 +305,7 @@ def test_one_machine_becomes_the_gateway_and_every_machine_can(site: Site, journ
 def test_a_lost_gateway_is_succeeded_in_the_same_look(site: Site, journal: Journal) -> None:
     provider = Grouped()
     ours = supervisor(site, journal, provider)
-    journal.want(PLAN, time.time())
+    journal.put_cluster(PLAN, time.time())
     work(ours, lambda: len(serving(journal)) == 2 and provider.gateways())
     (lost,) = elected(journal)
     provider.machines[lost] = replace(provider.machines[lost], state=MachineState.GONE, reason="killed")
@@ -320,7 +320,7 @@ def test_a_lost_gateway_is_succeeded_in_the_same_look(site: Site, journal: Journ
 def test_a_gateway_with_a_notice_hands_over_and_keeps_its_uplink_until_it_is_gone(site: Site, journal: Journal) -> None:
     provider = Grouped()
     ours = supervisor(site, journal, provider)
-    journal.want(PLAN, time.time())
+    journal.put_cluster(PLAN, time.time())
     work(ours, lambda: len(serving(journal)) == 2 and provider.gateways())
     (old,) = elected(journal)
     noticed = replace(provider.machines[old], state=MachineState.LEAVING, leaves_at_unix_s=time.time() + 60)
@@ -336,7 +336,7 @@ def test_a_gateway_with_a_notice_hands_over_and_keeps_its_uplink_until_it_is_gon
 def test_a_supervisor_that_begins_again_finds_the_gateway(site: Site, journal: Journal, written: str) -> None:
     provider = Grouped()
     first = supervisor(site, journal, provider)
-    journal.want(PLAN, time.time())
+    journal.put_cluster(PLAN, time.time())
     work(first, lambda: len(serving(journal)) == 2 and provider.gateways())
     first.close()
     (kept,) = elected(journal)
@@ -354,7 +354,7 @@ def test_an_uplink_that_cannot_be_attached_is_reported_once_and_tried_again(site
     provider = Grouped()
     provider.fails = 5
     ours = supervisor(site, journal, provider)
-    journal.want(PLAN, time.time())
+    journal.put_cluster(PLAN, time.time())
     work(ours, provider.gateways)
     ours.close()
     assert [each.detail for each in journal.events("c") if each.what == "trouble"] == ["m1: attach uplink: not now"]
@@ -368,8 +368,8 @@ def test_the_gateway_is_one_for_all_clusters_of_a_site(site: Site, journal: Jour
     numbers = iter(range(1, 9))
     journal.next_machine = lambda cluster: f"m{next(numbers)}"  # type: ignore[method-assign]
     ours = supervisor(site, journal, provider)
-    journal.want(PLAN, time.time())
-    journal.want(replace(PLAN, name="d"), time.time())
+    journal.put_cluster(PLAN, time.time())
+    journal.put_cluster(replace(PLAN, name="d"), time.time())
     work(ours, lambda: len(serving(journal)) == 2 and len(provider.machines) == 4 and provider.gateways())
     assert len(provider.gateways()) == 1
     journal.unwant("c", "test", time.time())

@@ -21,7 +21,7 @@ def advertisement_without_delegation(world: Simulation) -> None:
     """Let the robot advertise a name of an owner that delegated nothing to it."""
     subject = world.owner.subject(Metadata({"kind": "topic", "name": "/not/mine"}))
     world.members[ROBOT].attachment.advertisement(subject, Right.PUBLISH, (), is_global=True)
-    world.network.touch(ROBOT)
+    world.network.send_pending(ROBOT)
 
 
 def of(world: Simulation, right: Right) -> PendingAdvertisement:
@@ -76,7 +76,7 @@ def test_a_node_that_starts_is_attached_as_soon_as_both_ends_have_heard_each_oth
     world.network.stop(ROBOT)
     world.network.run(away_s)
     member = world.restart_member(ROBOT)
-    world.network.touch(ROBOT)
+    world.network.send_pending(ROBOT)
     assert world.network.run(0.1, lambda: member.attachment.is_attached)
 
 
@@ -85,7 +85,7 @@ def test_who_leaves_is_gone_in_every_tier() -> None:
     flow = advertise(world)
     world.network.run(1)
     world.members[ROBOT].leave()
-    world.network.touch(ROBOT)
+    world.network.send_pending(ROBOT)
     world.network.run(1)
     for host in world.ribs.values():
         assert host.rib._store.routes(flow.topic.name) == []
@@ -101,7 +101,7 @@ def test_who_falls_silent_is_gone_when_its_lease_ends() -> None:
 @pytest.mark.parametrize("lease_s", [2.0, 60.0])
 def test_the_lease_is_what_the_settings_say(lease_s: float) -> None:
     world = Simulation(topology=ring5(), lease_s=lease_s)
-    assert world.settle()
+    assert world.run_until_attached()
     world.network.run(lease_s + 1)
     assert world.ribs["school"].rib.names == 1  # it was renewed
     world.network.stop(ROBOT)
@@ -148,6 +148,6 @@ def test_a_delegation_of_another_node_is_refused_with_its_reason() -> None:
     topic = world.topic("/x", server, [Right.READ])
     robot = world.members[ROBOT]
     robot.subscribe(Topic(topic.delegation, topic.secrets))
-    world.network.touch(ROBOT)
+    world.network.send_pending(ROBOT)
     world.network.run(1)
     assert of(world, Right.READ).refused is DropReason.NOT_DELEGATED

@@ -20,7 +20,7 @@ ROUNDS = 10_000
 def again(flow: Flow, *, reliable: bool = True, depth: int = 0, description: bytes = b"described again") -> None:
     """Advertise a withdrawn topic again."""
     flow.publisher = flow.member.advertise(flow.topic, description, reliable=reliable, depth=depth)
-    flow.world.network.touch(flow.source)
+    flow.world.network.send_pending(flow.source)
 
 
 def test_a_topic_advertised_again_goes_on_above_all_numbers() -> None:
@@ -28,7 +28,7 @@ def test_a_topic_advertised_again_goes_on_above_all_numbers() -> None:
     flow.publish(b"first")
     assert flow.world.network.run(1, lambda: flow.has(SERVER, 1))
     flow.member.withdraw(flow.topic.name)
-    flow.world.network.touch(ROBOT)
+    flow.world.network.send_pending(ROBOT)
     again(flow)
     assert flow.world.network.run(5, lambda: flow.is_read_by(1))
     flow.publish(b"second")
@@ -41,7 +41,7 @@ def test_a_topic_may_come_back_as_something_else() -> None:
     flow.publish(b"reliable")
     assert flow.world.network.run(1, lambda: flow.has(SERVER, 1))
     flow.member.withdraw(flow.topic.name)
-    flow.world.network.touch(ROBOT)
+    flow.world.network.send_pending(ROBOT)
     assert flow.world.network.run(1, lambda: not flow.world.members[SERVER].writer_proxies_of(flow.topic.name))
     again(flow, reliable=False, depth=2)
     for number in range(4):
@@ -68,10 +68,10 @@ def test_withdrawing_does_not_end_reading_the_same_name() -> None:
     reader = world.members[SERVER]
     both = world.topic(flow.name, reader, [Right.PUBLISH, Right.READ])
     reader.advertise(both, b"", reliable=True)
-    world.network.touch(SERVER)
+    world.network.send_pending(SERVER)
     world.network.run(1)
     reader.withdraw(both.name)
-    world.network.touch(SERVER)
+    world.network.send_pending(SERVER)
     world.network.run(1)
     tap = Tap("nuc5", SERVER)
     world.network.taps.append(tap)
@@ -89,12 +89,12 @@ def test_a_topic_is_read_again_from_what_is_new_then_and_replays_are_refused() -
     assert network.run(1, lambda: flow.has(SERVER, 1))
     network.run(1)
     reader.unsubscribe(flow.topic.name)
-    network.touch(SERVER)
+    network.send_pending(SERVER)
     assert network.run(1, lambda: flow.publisher.readers == 0)
     network.taps.clear()
     flow.publish(b"unheard")
     reader.subscribe(flow.world.topic(flow.name, reader, [Right.READ]))
-    network.touch(SERVER)
+    network.send_pending(SERVER)
     assert network.run(1, lambda: bool(reader.writer_proxies_of(flow.topic.name)))
     switch = reader.attachment.switch
     assert switch is not None
@@ -113,7 +113,7 @@ def test_the_last_messages_of_a_latched_topic_come_again_to_who_reads_it_again()
     assert flow.world.network.run(1, lambda: flow.has(SERVER, 1))
     got, reader = flow.got[SERVER], flow.world.members[SERVER]
     reader.unsubscribe(flow.topic.name)
-    flow.world.network.touch(SERVER)
+    flow.world.network.send_pending(SERVER)
     assert flow.world.network.run(1, lambda: flow.publisher.readers == 0)
     flow.read_by(SERVER)
     assert flow.world.network.run(5, lambda: flow.has(SERVER, 1))
@@ -134,7 +134,7 @@ def test_a_new_description_reaches_who_reads_already_though_frames_are_lost() ->
     assert network.run(1, lambda: writer_proxy.description == b"described")
     flow.world.leads[SERVER].loss = 1.0
     flow.publisher.describe(b"another")
-    network.touch(ROBOT)
+    network.send_pending(ROBOT)
     network.run(0.5)
     assert writer_proxy.description == b"described"
     flow.world.leads[SERVER].loss = 0.0
@@ -148,7 +148,7 @@ def test_a_new_description_reaches_who_reads_already_though_frames_are_lost() ->
 def test_late_joiners_get_as_many_messages_as_the_depth_is_now(before: int, after: int, *, reliable: bool) -> None:
     world = ring()
     world.add_member("nuc4/other", "nuc4")
-    assert world.settle()
+    assert world.run_until_attached()
     flow = advertise(world, reliable=reliable, depth=before)
     flow.read_by(SERVER)
     assert world.network.run(5, lambda: flow.is_read_by(1))
@@ -194,15 +194,15 @@ def rounds(world: Simulation, member: Participant, times: int) -> None:
         member.subscribe(reads)
         member.serve(serves, b"")
         if number % 50 == 0:
-            world.network.touch(ROBOT)
+            world.network.send_pending(ROBOT)
             world.network.run(0.1)
         member.withdraw(publishes.name)
         member.unsubscribe(reads.name)
         member.withdraw(serves.name)
         if number % 50 == 0:
-            world.network.touch(ROBOT)
+            world.network.send_pending(ROBOT)
             world.network.run(0.05)
-    world.network.touch(ROBOT)
+    world.network.send_pending(ROBOT)
     world.network.run(40)
 
 

@@ -68,7 +68,7 @@ def pair() -> Pair:
 
 def opened() -> Pair:
     both = pair()
-    both.asker.ask(RIB.name, SAID, 0.0)
+    both.asker.send_query(RIB.name, SAID, 0.0)
     assert both.exchange() == ([SAID], [])
     return both
 
@@ -76,8 +76,8 @@ def opened() -> Pair:
 def test_what_waits_for_a_channel_is_sent_once_it_is_open_and_answered_over_it() -> None:
     both = pair()
     assert not both.rib.send_response(SWITCH.name, b"an answer")
-    both.asker.ask(RIB.name, b"first", 0.0)
-    both.asker.ask(RIB.name, b"second", 0.0)
+    both.asker.send_query(RIB.name, b"first", 0.0)
+    both.asker.send_query(RIB.name, b"second", 0.0)
     assert both.exchange() == ([b"first", b"second"], [])
     assert both.rib.send_response(SWITCH.name, b"an answer")
     assert both.exchange() == ([], [b"an answer"])
@@ -86,7 +86,7 @@ def test_what_waits_for_a_channel_is_sent_once_it_is_open_and_answered_over_it()
 def test_nothing_that_was_said_can_be_read_or_altered_on_the_way() -> None:
     both = opened()
     assert not any(SAID in wire for wire in both.asked)
-    both.asker.ask(RIB.name, SAID, 0.0)
+    both.asker.send_query(RIB.name, SAID, 0.0)
     (record,) = both.asker.records_to_send()
     for at in range(17, len(record.wire)):
         altered = record.wire[:at] + bytes([record.wire[at] ^ 1]) + record.wire[at + 1 :]
@@ -100,7 +100,7 @@ def test_nothing_that_was_said_can_be_read_or_altered_on_the_way() -> None:
 def test_records_may_come_out_of_order_and_each_once() -> None:
     both = opened()
     for number in range(50):
-        both.asker.ask(RIB.name, b"%d" % number, 0.0)
+        both.asker.send_query(RIB.name, b"%d" % number, 0.0)
     records = both.asker.records_to_send()
     random.Random(3).shuffle(records)
     found = [both.rib.receive(each.wire, SWITCH.name, both.now) for each in records]
@@ -134,7 +134,7 @@ def test_no_recording_of_an_earlier_life_is_taken_after_a_restart(restarted: str
         both.rib.records_to_send()
         both.asker.records_to_send()
         both.asker.renew(RIB.name)
-        both.asker.ask(RIB.name, b"again", both.now_s)
+        both.asker.send_query(RIB.name, b"again", both.now_s)
         assert both.exchange() == ([b"again"], [])
 
 
@@ -149,30 +149,30 @@ def test_a_recorded_offer_draws_no_more_than_its_own_bytes_and_displaces_no_chan
             both.rib.receive(offer, SWITCH.name, both.now)
         drawn += sum(len(each.wire) for each in both.rib.records_to_send())
     assert 0 < drawn <= spent
-    both.asker.ask(RIB.name, SAID, both.now_s)
+    both.asker.send_query(RIB.name, SAID, both.now_s)
     assert both.exchange() == ([SAID], [])
 
 
 def test_a_channel_is_opened_by_members_for_whom_it_names_only() -> None:
     both = opened()
     foreign = node(STRANGER, 5)
-    foreign.ask(RIB.name, SAID, 0.0)
+    foreign.send_query(RIB.name, SAID, 0.0)
     (offer,) = foreign.records_to_send()
     assert both.refused(both.rib, offer.wire, STRANGER) is DropReason.WRONG_DOMAIN
     assert both.refused(both.rib, offer.wire) is DropReason.UNKNOWN_SENDER
     assert both.refused(node(RIB, 2, accepts=False), offer.wire, STRANGER) is DropReason.NOT_FOR_US
     for_another = node(SWITCH, 6)
-    for_another.ask(ROBOT.name, SAID, 0.0)
+    for_another.send_query(ROBOT.name, SAID, 0.0)
     assert both.refused(both.rib, for_another.records_to_send()[0].wire) is DropReason.NOT_FOR_US
     proxy = node(ROBOT, 7)
-    proxy.ask(RIB.name, SAID, 0.0)
+    proxy.send_query(RIB.name, SAID, 0.0)
     assert both.refused(both.rib, proxy.records_to_send()[0].wire, ROBOT) is DropReason.NOT_DELEGATED
 
 
 def test_an_acceptance_of_another_offer_opens_nothing() -> None:
     both, other = opened(), opened()
     both.asker.renew(RIB.name)
-    both.asker.ask(RIB.name, SAID, 0.0)
+    both.asker.send_query(RIB.name, SAID, 0.0)
     both.asker.records_to_send()
     for accept in (both.answered[0], other.answered[0]):
         assert both.refused(both.asker, accept, RIB) is DropReason.REPLAYED
@@ -182,14 +182,14 @@ def test_a_rib_that_was_restarted_says_so_and_is_asked_for_a_channel_at_once() -
     both = opened()
     both.rib = node(RIB, 9, accepts=True)
     both.now_s = 5.0
-    both.asker.ask(RIB.name, b"lost", 5.0)
+    both.asker.send_query(RIB.name, b"lost", 5.0)
     (record,) = both.asker.records_to_send()
     assert both.refused(both.rib, record.wire) is DropReason.NO_CHANNEL
     (hint,) = both.rib.records_to_send()
     assert len(hint.wire) < len(record.wire)
     both.asker.receive(hint.wire, RIB.name, both.now)
     both.exchange()
-    both.asker.ask(RIB.name, SAID, 5.0)
+    both.asker.send_query(RIB.name, SAID, 5.0)
     assert both.exchange() == ([SAID], [])
 
 
@@ -200,7 +200,7 @@ def test_forged_hints_end_no_channel_and_cost_one_offer_each_third_of_a_second()
         hint = b"\x02" + both.asked[-1][1:9]
         with contextlib.suppress(RemoteError):  # it names the channel before
             both.asker.receive(hint, RIB.name, both.now)
-        both.asker.ask(RIB.name, SAID, both.now_s)
+        both.asker.send_query(RIB.name, SAID, both.now_s)
         assert SAID in both.exchange()[0]
     offers = sum(1 for wire in both.asked if wire[0] == 0xD2)
     assert offers <= 5
@@ -208,21 +208,21 @@ def test_forged_hints_end_no_channel_and_cost_one_offer_each_third_of_a_second()
 
 def test_an_offer_that_is_not_answered_is_repeated_and_given_up() -> None:
     both = pair()
-    both.asker.ask(RIB.name, SAID, 0.0)
+    both.asker.send_query(RIB.name, SAID, 0.0)
     sent = len(both.asker.records_to_send())
     while (due_s := both.asker.get_timer()) is not None:
         both.asker.handle_timer(due_s)
         sent += len(both.asker.records_to_send())
     assert (sent, both.asker.drops[DropReason.NO_CHANNEL]) == (4, 1)
-    both.asker.ask(RIB.name, SAID, 9.0)
+    both.asker.send_query(RIB.name, SAID, 9.0)
     assert both.exchange() == ([SAID], [])
 
 
 def test_what_waited_too_long_is_not_sent_for_its_sender_has_sent_it_again() -> None:
     both = pair()
-    both.asker.ask(RIB.name, b"old", 0.0)
+    both.asker.send_query(RIB.name, b"old", 0.0)
     both.asker.records_to_send()
     both.now_s = 1.5
     both.asker.handle_timer(1.5)
-    both.asker.ask(RIB.name, b"new", 1.5)
+    both.asker.send_query(RIB.name, b"new", 1.5)
     assert both.exchange() == ([b"new"], [])

@@ -94,7 +94,7 @@ def test_a_neighbour_of_a_domain_that_is_not_trusted_is_named_while_it_is_heard(
 def test_what_is_kept_of_strangers_is_bounded_and_unreadable_ones_are_kept_too() -> None:
     strangers = Strangers()
     for at_s in range(3 * STRANGERS_MAX):
-        strangers.note(at_s.to_bytes(1, "big"), DropReason.BAD_CERTIFICATE, float(at_s))
+        strangers.record(at_s.to_bytes(1, "big"), DropReason.BAD_CERTIFICATE, float(at_s))
     kept = strangers.since(0.0)
     assert [each.heard_s for each in kept] == [*range(2 * STRANGERS_MAX, 3 * STRANGERS_MAX)]
     assert {each.domain for each in kept} == {""}

@@ -93,7 +93,7 @@ def test_a_run_takes_its_group_down(
     run = runs.start()
     run.plan_cgroup(group.name)
     group.add(sleeper.pid)
-    run.keep()
+    run.retain()
     assert [record.cgroups for record in runs.all()] == [[group.name]]
     runs.resume(run.id).end()
     assert sleeper.wait(_PATIENCE_S) == -signal.SIGKILL

@@ -84,7 +84,7 @@ def test_a_kept_run_outlives_its_process_until_it_is_taken_down(runs: RunRegistr
     run = runs.start()
     with subprocess.Popen([sys.executable, "-c", "import signal; signal.pause()"], start_new_session=True) as left:
         run.note_process(left.pid)
-        run.keep()
+        run.retain()
         rewrite(run, tmp_path, orphan)
         assert runs.sweep() == []
         assert left.poll() is None
@@ -94,7 +94,7 @@ def test_a_kept_run_outlives_its_process_until_it_is_taken_down(runs: RunRegistr
 
 def test_a_kept_run_whose_processes_all_died_is_swept(runs: RunRegistry) -> None:
     run = runs.start()
-    run.keep()
+    run.retain()
     assert runs.sweep() == [run.id]
 
 

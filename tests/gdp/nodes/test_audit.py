@@ -30,7 +30,7 @@ def test_refused_statements_are_counted_and_losses_on_the_way_are_not(tmp_path: 
     for second in range(5):
         drops[DropReason.BAD_SIGNATURE] += 100_000
         drops[DropReason.NO_READER] += 1
-        audit.look(Timestamps(float(second), 1_800_000_000.0 + second))
+        audit.write_pending(Timestamps(float(second), 1_800_000_000.0 + second))
     found = verify_audit(tmp_path / "audit")
     assert dict(found.events) == {("refused", "statements"): 500_000}
     assert found.lines == 5
@@ -44,5 +44,5 @@ def test_a_folder_that_is_gone_is_reported_once_and_the_node_goes_on(
     (tmp_path / "audit").rmdir()
     for second in range(3):
         drops[DropReason.REPLAYED] += 1
-        audit.look(Timestamps(float(second), 1_800_000_000.0))
+        audit.write_pending(Timestamps(float(second), 1_800_000_000.0))
     assert [each.levelno for each in caplog.records] == [logging.ERROR]

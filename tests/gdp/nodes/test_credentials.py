@@ -32,7 +32,7 @@ class Site:
         self.credentials = Credentials(self.node, self.config, self.identity, self.policy)
 
     def look(self, unix_s: float = NOW) -> None:
-        self.credentials.look(Timestamps(0.0, unix_s))
+        self.credentials.reload_changed(Timestamps(0.0, unix_s))
 
 
 @pytest.fixture

@@ -90,7 +90,7 @@ class World:
         self.clients.pop(name, None)
         for replica in self.replicas.values():
             if replica.follower.sequencer == name:
-                replica.follower.gone()
+                replica.follower.sequencer_lost()
 
     def cut(self, name: Name) -> None:
         self.ways = {way: sent for way, sent in self.ways.items() if name not in way[:2]}
@@ -152,7 +152,7 @@ class World:
                 replica.follower.entry(here, what.call, what.request)
             else:
                 assert isinstance(what, ReplicaProbe | AttachReplica | SnapshotRequest)
-                replica.follower.heard(here, what)
+                replica.follower.handle_message(here, what)
             return
         client = self.clients.get(there)
         if client is None or here not in self.replicas:

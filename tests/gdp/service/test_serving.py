@@ -57,8 +57,8 @@ def test_what_a_client_that_left_waits_for_is_never_given_and_what_the_server_ha
     other = Asked(Name(bytes([1]) * 32), 0, 1)
     serving.begin(0.0, 5.0, other, "other")
     assert given(serving) == ["request 1"]
-    assert serving.gone(CLIENT) == [Expired(first, 0, asked(1), True), Expired(second, 0, asked(2), False)]
-    assert (given(serving), serving.gone(CLIENT)) == ([], [])
+    assert serving.remove_client(CLIENT) == [Expired(first, 0, asked(1), True), Expired(second, 0, asked(2), False)]
+    assert (given(serving), serving.remove_client(CLIENT)) == ([], [])
     assert (serving.end(first), given(serving), serving.clients) == (None, ["other"], [other.client])
 
 
@@ -66,7 +66,7 @@ def test_a_client_that_left_and_comes_back_may_ask_the_same_again() -> None:
     serving: Serving[str] = Serving(7)
     (first,) = begun(serving, 1)
     serving.poll_turns()
-    serving.gone(CLIENT)
+    serving.remove_client(CLIENT)
     assert (len(serving), serving.end(first), asked(1) in serving) == (0, None, False)
     assert serving.answer_of(asked(1)) is None
     begun(serving, 1)

@@ -82,7 +82,7 @@ class Simulated:
             topics = [self.world.topic(name, member, given) for name, given in names.items()]
             core = self.cores[label] = SessionCore(member, topics, lambda: next(starts))
             self.sessions[label] = Session(_Node(core), _Driver(self, label))
-        assert self.world.settle()
+        assert self.world.run_until_attached()
 
     @property
     def now_s(self) -> float:
@@ -92,7 +92,7 @@ class Simulated:
     def send(self, label: str) -> None:
         """Send the pending frames of a session."""
         self.cores[label].member.flush(self.now_s)
-        self.world.network.touch(f"s/{label}")
+        self.world.network.send_pending(f"s/{label}")
 
     def run(self, duration_s: float, is_ready: Callable[[], bool] = lambda: False) -> bool:
         """Advance time; return whether ``is_ready`` came true."""

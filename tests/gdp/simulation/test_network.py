@@ -68,7 +68,7 @@ def two(sim_link: SimLink) -> tuple[SimNetwork, Talker, Talker]:
 
 def send(network: SimNetwork, a: Talker, *frames: bytes) -> None:
     a.say(*frames)
-    network.touch("a")
+    network.send_pending("a")
 
 
 def test_a_frame_arrives_after_the_cables_delay() -> None:
@@ -156,7 +156,7 @@ def test_a_timer_comes_at_its_second_and_no_sooner() -> None:
     network, a, _ = two(SimLink())
     due_s = network.now.mono_s + 3.0
     a.due_s = due_s
-    network.touch("a")
+    network.send_pending("a")
     network.run(2.9)
     assert a.called_s == []
     network.run(0.2)
@@ -168,7 +168,7 @@ def test_a_machine_that_is_never_satisfied_is_named() -> None:
     spinner = Spinner(network)
     network.add("spinner", spinner)
     spinner.due_s = 0.0
-    network.touch("spinner")
+    network.send_pending("spinner")
     with pytest.raises(LocalError, match="spinner"):
         network.run(1)
 
@@ -176,7 +176,7 @@ def test_a_machine_that_is_never_satisfied_is_named() -> None:
 def test_who_was_killed_neither_hears_nor_is_called() -> None:
     network, a, b = two(SimLink())
     b.due_s = network.now.mono_s + 0.5
-    network.touch("b")
+    network.send_pending("b")
     network.stop("b")
     send(network, a, b"frame")
     network.run(1)
@@ -204,4 +204,4 @@ def test_an_invalid_port_is_the_callers_mistake() -> None:
     network, a, _ = two(SimLink())
     a.out.append(OutgoingFrames(9, BROADCAST, [b"x"]))
     with pytest.raises(LocalError):
-        network.touch("a")
+        network.send_pending("a")

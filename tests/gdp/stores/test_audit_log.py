@@ -57,7 +57,7 @@ def test_the_chain_goes_on_over_rotation_and_the_disk_stays_bounded(tmp_path: Pa
     log, trail = AuditLog(tmp_path, file_max_bytes=2_000, files_max=4), AuditTrail()
     trail.begin()
     for second in range(3_000):
-        trail.note(Action.REFUSED, "name", who=f"{second}", reason="stale")
+        trail.record(Action.REFUSED, "name", who=f"{second}", reason="stale")
         log.write(trail, second * 10.0, NOW + second)
     files = sorted(tmp_path.iterdir())
     assert len(files) <= 4

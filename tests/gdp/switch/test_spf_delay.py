@@ -25,7 +25,7 @@ LINK = (1, Name(b"n" * 32))
 
 def delay_after(spf: SpfDelay, now_s: float) -> float:
     """Return the delay from news to path computation, and compute the paths."""
-    spf.news(now_s)
+    spf.record_change(now_s)
     assert spf.due_s is not None
     delay_s = spf.due_s - now_s
     spf.computed()
@@ -58,8 +58,8 @@ def test_news_after_a_quiet_time_are_followed_at_once_again() -> None:
 
 def test_news_while_paths_wait_to_be_computed_put_nothing_off() -> None:
     spf = SpfDelay()
-    spf.news(10.0)
-    spf.news(10.004)
+    spf.record_change(10.0)
+    spf.record_change(10.004)
     assert spf.due_s == pytest.approx(10.0 + INITIAL_S)
 
 

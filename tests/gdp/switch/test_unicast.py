@@ -20,7 +20,7 @@ def send(world: Simulation, destination: Name, source: str = ROBOT, kind: int = 
     member = world.members[source]
     frame = encode(Header(kind, Flag.LAST, HOPS_MAX, 1, 0, 1, 0, 1, 9, destination, member.name))
     member.attachment.send([frame])
-    world.network.touch(source)
+    world.network.send_pending(source)
 
 
 def test_an_unadvertised_name_is_answered_and_then_dropped_by_the_data_plane() -> None:
@@ -61,10 +61,10 @@ def test_who_is_found_is_reached_though_it_was_missed_a_moment_ago() -> None:
     world = ring()
     nuc1, robot = world.switches["nuc1"], world.members[ROBOT].name
     server = world.members[SERVER].name
-    nuc1.unicast._install_nowhere(server, robot, DropReason.NO_ROUTE, world.network.now.mono_s)
+    nuc1.unicast._install_negative(server, robot, DropReason.NO_ROUTE, world.network.now.mono_s)
     assert nuc1.table.entries[server + robot] == NOWHERE
     nuc1.resolver.resolve(server, world.network.now.mono_s)
-    world.network.touch("nuc1")
+    world.network.send_pending("nuc1")
     world.network.run(1.0)
     send(world, server)
     world.network.run(0.1)

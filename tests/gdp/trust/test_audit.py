@@ -23,8 +23,8 @@ def taken(from_: AuditTrail, mono_s: float, after: list[AuditLine] | None = None
 
 def test_lines_are_numbered_and_each_holds_the_hash_of_the_one_before() -> None:
     of = trail()
-    of.note(Action.ACCEPTED, "name", who="aa", about="bb")
-    of.note(Action.REFUSED, "name", who="cc", reason="stale")
+    of.record(Action.ACCEPTED, "name", who="aa", about="bb")
+    of.record(Action.REFUSED, "name", who="cc", reason="stale")
     one, two = taken(of, 0.0)
     assert (one.seq, one.previous, two.seq, two.previous) == (1, BEGIN, 2, one.hash)
     assert AuditLine.from_line(two.to_line() + b"\n") == two
@@ -33,7 +33,7 @@ def test_lines_are_numbered_and_each_holds_the_hash_of_the_one_before() -> None:
 
 def test_an_unread_trail_keeps_nothing() -> None:
     of = AuditTrail()
-    of.note(Action.ACCEPTED, "name")
+    of.record(Action.ACCEPTED, "name")
     assert not of.is_due(1e9)
 
 
@@ -42,7 +42,7 @@ def test_a_flood_is_bounded_in_memory_and_in_lines() -> None:
     lines: list[AuditLine] = []
     for second in range(3_600):
         for number in range(100):
-            of.note(Action.REFUSED, "name", who=f"{number}", reason=f"reason {number % 5}")
+            of.record(Action.REFUSED, "name", who=f"{number}", reason=f"reason {number % 5}")
         lines += taken(of, float(second), lines)
         assert len(of._lines) <= 200
         assert len(of._counts) <= 256
@@ -54,7 +54,7 @@ def test_a_flood_is_bounded_in_memory_and_in_lines() -> None:
 def test_kinds_beyond_the_bound_are_counted_together() -> None:
     of = trail()
     for number in range(10_000):
-        of.note(Action.REFUSED, f"kind {number}")
+        of.record(Action.REFUSED, f"kind {number}")
     lines = taken(of, 100.0)
     assert len(lines) <= 200 + 257
     assert sum(line.count for line in lines if line.what == "others") > 9_000
@@ -63,13 +63,13 @@ def test_kinds_beyond_the_bound_are_counted_together() -> None:
 def test_after_a_flood_single_lines_come_again() -> None:
     of = trail()
     for _ in range(1_000):
-        of.note(Action.REFUSED, "name")
+        of.record(Action.REFUSED, "name")
     lines = taken(of, 0.0)
     lines += taken(of, 70.0, lines)
     lines += taken(of, 1_000.0, lines)
-    of.note(Action.ACCEPTED, "name", who="somebody")
+    of.record(Action.ACCEPTED, "name", who="somebody")
     lines += taken(of, 1_200.0, lines)
-    of.note(Action.ACCEPTED, "name", who="somebody else")
+    of.record(Action.ACCEPTED, "name", who="somebody else")
     (last,) = taken(of, 1_201.0, lines)
     assert (last.who, last.count) == ("somebody else", 1)
 
@@ -82,7 +82,7 @@ def test_what_is_no_line_is_our_own_mistake(text: bytes) -> None:
 
 def test_a_line_in_another_form_is_refused() -> None:
     of = trail()
-    of.note(Action.ACCEPTED, "name")
+    of.record(Action.ACCEPTED, "name")
     (line,) = taken(of, 0.0)
     assert dataclasses.replace(line, seq=2).hash != line.hash
     with pytest.raises(LocalError, match="as the audit log writes it"):

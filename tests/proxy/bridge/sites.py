@@ -136,7 +136,7 @@ class Sites:
         self.machines: list[Machine] = []
         self._folder = folder
         furnish(folder)
-        assert self.world.settle()
+        assert self.world.run_until_attached()
         self._look()
 
     @property
@@ -168,7 +168,7 @@ class Sites:
         """
         if label not in self.world.members:
             self.world.add_member(label, label.partition("/")[0])
-            assert self.world.settle()
+            assert self.world.run_until_attached()
         graph = graph or FakeGraph(ros, known.channels(ros), known.services(ros))
         graphs = [graph] if more is None else [graph, more]
         machine = self._start(label, graphs, self.config(expose, imports, *(each.ros for each in graphs)), holds)
@@ -179,7 +179,7 @@ class Sites:
         """Restart a machine's proxy without its memory; its graph stays."""
         self.kill(machine)
         self.world.restart_member(machine.label)
-        assert self.world.settle()
+        assert self.world.run_until_attached()
         again = self._start(machine.label, [machine.graph], cast(ProxyConfig, machine.bridge._config), None)
         self.machines.append(again)
         return again
@@ -188,7 +188,7 @@ class Sites:
         """End a proxy like its command, with a goodbye."""
         machine.bridge.close()
         machine.member.leave()
-        self.world.network.touch(machine.label)
+        self.world.network.send_pending(machine.label)
         for endpoint in machine.endpoints:
             endpoint.shut_down()
         self.machines.remove(machine)
@@ -263,7 +263,7 @@ class Sites:
                 machine.tick_at_s = self.now_s + _TICK_S
                 machine.bridge.work(self.now_s)
                 machine.member.flush(self.now_s)
-                self.world.network.touch(machine.label)
+                self.world.network.send_pending(machine.label)
         self.world.network.call(_LOOK_S, self._look)
 
 

@@ -40,7 +40,7 @@ def look(sites: Sites, machine: Machine) -> None:
     now_s = sites.now_s
     machine.bridge.work(now_s)
     machine.member.flush(now_s)
-    sites.world.network.touch(machine.label)
+    sites.world.network.send_pending(machine.label)
 
 
 def assert_it_stays(sites: Sites, machine: Machine, once: Callable[[], None], warm: int = WARM) -> None:

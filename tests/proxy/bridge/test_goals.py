@@ -43,7 +43,7 @@ def test_feedback_comes_from_the_one_whose_acceptance_the_client_got() -> None:
 def test_when_that_one_goes_the_next_who_speaks_takes_over() -> None:
     goals = Goals()
     goals.accepted(ONE, A)
-    goals.gone(A)
+    goals.remove_server(A)
     assert [goals.may_feed(server, feedback(ONE)) for server in (B, A)] == [True, False]
 
 
@@ -67,7 +67,7 @@ def test_goal_statuses_of_several_servers_come_as_one_message_each_goal_by_its_s
 def test_what_a_server_said_that_is_gone_ends_when_another_speaks_and_does_not_know_the_goal() -> None:
     goals = Goals()
     goals.statuses(A, statuses((ONE, EXECUTING)))
-    goals.gone(A)
+    goals.remove_server(A)
     assert goals.statuses(B, statuses()) == statuses()
 
 
@@ -78,7 +78,7 @@ def test_nothing_contradicts_the_result_that_the_client_got() -> None:
     assert goals.ended(ONE, B, CDR + bytes([SUCCEEDED])) == statuses((ONE, SUCCEEDED))
     assert goals.statuses(A, statuses((ONE, CANCELED))) is None
     assert goals.statuses(B, statuses((ONE, EXECUTING))) is None
-    goals.gone(B)
+    goals.remove_server(B)
     assert goals.statuses(A, statuses((ONE, CANCELED))) is None
 
 
@@ -90,7 +90,7 @@ def test_a_goal_is_sent_again_until_it_ends_or_is_cancelled() -> None:
     assert (goals.again(ONE), goals.holders(ONE)) == (b"goal", {A})
     goals.ended(ONE, A, CDR + bytes([SUCCEEDED]))
     goals.cancelled(bytes(16))  # all
-    goals.gone(A)
+    goals.remove_server(A)
     assert (goals.again(ONE), goals.again(TWO), goals.holders(TWO), goals.again(bytes(16))) == (None, None, set(), None)
     goals.sent(ONE, bytes(GOAL_KEPT_MAX_BYTES + 1))
     assert goals.again(ONE) is None

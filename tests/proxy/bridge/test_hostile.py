@@ -41,11 +41,11 @@ def listening(sites: Sites) -> tuple[Machine, Machine, Ear]:
 def say(sites: Sites, robot: Machine, channel: Channel, body: bytes) -> None:
     robot.stream.describe(TopicDescription("cdr", (channel,)).to_wire())
     robot.member.flush(sites.now_s)
-    sites.world.network.touch(robot.label)
+    sites.world.network.send_pending(robot.label)
     sites.run(0.5)
     robot.stream.publish(RosMessage(0, 1, body).to_wire())
     robot.member.flush(sites.now_s)
-    sites.world.network.touch(robot.label)
+    sites.world.network.send_pending(robot.label)
     sites.run(0.5)
 
 
@@ -128,7 +128,7 @@ def test_a_server_that_describes_itself_falsely_is_reported_and_opens_nothing(si
     server, client = sites.add(SERVER), sites.add(ROBOT, imports=[SWITCH])
     held = sites.held(server.member, sites.config([SWITCH], []))
     server.member.serve(next(iter(held)), description)
-    sites.world.network.touch(SERVER)
+    sites.world.network.send_pending(SERVER)
     caller = Client(client.graph)
     sites.run(5)
     assert not caller.sees_server()

@@ -135,7 +135,7 @@ def test_those_that_live_agree_though_any_are_killed_and_come_back(sites: Sites,
         sites.run(dice.uniform(0.1, 1.5))
         counter = Counter(FakeGraph(2, known.channels(), known.services()), tells)
         sites.world.restart_member(place)
-        assert sites.world.settle()
+        assert sites.world.run_until_attached()
         live[place] = sites.add(place, expose=[rule(tells=tells)], graph=counter.graph), counter
     assert sites.run(30, lambda: len(caller.outcomes) == 120)
     assert sites.run(30, lambda: [each.count for _, each in live.values()] == [120] * 3)

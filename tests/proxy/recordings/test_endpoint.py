@@ -79,7 +79,7 @@ def join(
 ) -> Machine:
     """Start a bridge between a recording and the overlay."""
     sites.world.add_member(label, label.partition("/")[0])
-    assert sites.world.settle()
+    assert sites.world.run_until_attached()
     member, config = sites.world.members[label], sites.config(expose, imports)
     site = BridgeContext(member, Traffic(), Faults())
     rules = RecordedRules.of(expose=config.expose, imports=config.imports)
