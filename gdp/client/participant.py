@@ -128,7 +128,7 @@ class Participant:
         return self._join_service(topic, Right.SERVE, description, is_global=is_global, urgent=urgent)
 
     def call(self, topic: Topic, description: bytes, *, is_global: bool = True, urgent: bool = False) -> Publisher:
-        """Call a name from now on; return the stream of requests that all its servers receive. ``send_request`` sends to one.
+        """Call a name from now on; return the stream of requests to all its servers. ``send_request`` sends to one.
 
         A request that is published while ``peers`` is empty reaches no server.
         """

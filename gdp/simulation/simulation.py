@@ -72,7 +72,7 @@ class Simulation:
     owner: Owner = field(init=False)
     settled_s: float = field(
         init=False
-    )  # when ``run_until_attached`` last ended; before that, when the simulation began
+    )  # when ``run_until_attached`` last ended; at first, when it began
     _incarnation: int = 0
 
     def __post_init__(self) -> None:
