@@ -70,9 +70,7 @@ class Simulation:
     cables: dict[frozenset[str], SimLink] = field(default_factory=dict)
     leads: dict[str, SimLink] = field(default_factory=dict)  # of members and RIBs, by label
     owner: Owner = field(init=False)
-    settled_s: float = field(
-        init=False
-    )  # when ``run_until_attached`` last ended; at first, when it began
+    settled_s: float = field(init=False)  # when ``run_until_attached`` last ended; at first, when it began
     _incarnation: int = 0
 
     def __post_init__(self) -> None:
