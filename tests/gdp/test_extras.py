@@ -27,7 +27,7 @@ sys.meta_path.insert(0, Blocker())
 _NETWORK = """
 from gdp.simulation.topology import ring5
 from gdp.simulation.simulation import Simulation
-assert Simulation(topology=ring5()).settle()
+assert Simulation(topology=ring5()).run_until_attached()
 """
 
 

@@ -155,7 +155,7 @@ class Forge:
         if channels is None or to == ZERO:
             return None
         if not channels.send_response(to, wire):
-            channels.ask(to, wire, self._stage.world.network.now.mono_s)
+            channels.send_query(to, wire, self._stage.world.network.now.mono_s)
         frames: list[bytes] = []
         for each in channels.records_to_send():
             kind = Kind.RIB_ANSWER if each.is_answer else Kind.RIB_REQUEST

@@ -31,7 +31,7 @@ def test_a_goal_whose_servers_all_die_in_one_moment_fails_and_breaks_nothing(sit
     caller.goals.call(goal(1, 10))
     sites.run(0.1)
     with pytest.MonkeyPatch.context() as patch:
-        for who in ("peers", "heard"):
+        for who in ("peers", "connected_peers"):
             patch.setattr(client.member, who, lambda _: [])
         assert sites.run(2, lambda: len(caller.goals.outcomes) == 1)
     sites.run(1)
