@@ -26,7 +26,7 @@ from fog.supervisor.background import pid_of
 from fog.supervisor.infrastructure import local_provider
 from fog.supervisor.journal import Journal
 from fog.supervisor.record import Record
-from fog_demo.stage import ENVIRONMENT, STATE, end_all_of, fog_command, standing_runs, sweep
+from fog_demo.environment import ENVIRONMENT, STATE, end_all_of, fog_command, standing_runs, sweep
 
 __all__ = ["Cluster"]
 

@@ -26,7 +26,7 @@ from gdp.simulation.topology import Topology
 from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE
 from gdp.trust.right import Right
-from ring.materials import OverlayCredentials
+from ring.credentials import OverlayCredentials
 
 SOCKET_BUFFER_BYTES: Final = 4 << 20
 _PROFILE: Final = f"""<?xml version="1.0" encoding="UTF-8" ?>

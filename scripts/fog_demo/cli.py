@@ -16,9 +16,9 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from fog_demo.play import Outcome, Pace, play
-from fog_demo.stage import Stage, end_all_of, standing_runs, sweep
-from fog_demo.view import View
+from fog_demo.display import Display
+from fog_demo.environment import Environment, end_all_of, standing_runs, sweep
+from fog_demo.scenario import Outcome, Pace, run_scenario
 from gdp.errors import GdpError
 from gdp.host.interruption import Interrupted, interruptible, let_nothing_interrupt
 from gdp.host.run_registry import Run
@@ -96,12 +96,12 @@ def _run(run: Run, launch_file: Path, pace: Pace, console: Console, *, as_json: 
 
 
 async def _play(run: Run, launch_file: Path, pace: Pace, console: Console) -> Outcome:
-    stage = Stage(run)
+    environment = Environment(run)
     try:
-        with View(console) as view:
-            return await play(stage, launch_file, pace, view)
+        with Display(console) as display:
+            return await run_scenario(environment, launch_file, pace, display)
     finally:
-        stage.children.forget()
+        environment.children.forget()
 
 
 def _tell(outcome: Outcome, console: Console, *, as_json: bool) -> None:

@@ -10,8 +10,8 @@ import sys
 from pathlib import Path
 
 from gdp.host.run_registry import in_first_user_namespace
-from ring.fabric import Overlay
 from ring.live_run import LiveRing
+from ring.overlay import Overlay
 from ring.plan import METRICS_PORTS
 from ring.run import Ring
 

@@ -18,12 +18,12 @@ from gdp.simulation.topology import Attachment
 from proxy.endpoints.ros1.install import rospy_folder
 from ring.child import Child
 from ring.events import Event
-from ring.fabric import Overlay
 from ring.injection import Injection
 from ring.live_plan import CARRIED, FAST_DDS_PROFILES, MASTER_PORT, Graph, Side, calls_in, graphs_of, messages_in
 from ring.live_result import Heard, rows
 from ring.live_session import ENDING_S, LiveNodes, LiveSession
 from ring.options import Live, Options
+from ring.overlay import Overlay
 from ring.progress import ProgressReporter
 from ring.result import Result
 

@@ -17,9 +17,9 @@ from proxy.recordings.reader import BagReader
 from proxy.serial.channel import RosVersion
 from ring.child import Child
 from ring.children import READY_S, Children
-from ring.fabric import Overlay
 from ring.injection import Injection
 from ring.options import Options
+from ring.overlay import Overlay
 from ring.plan import Topic, topics_of
 from ring.progress import ProgressReporter
 from ring.replay import Replay

@@ -35,7 +35,7 @@ from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, ROOT_CERTIFICATE, load_domain, load_identity
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
-from ring.materials import OverlayCredentials
+from ring.credentials import OverlayCredentials
 
 __all__ = ["Overlay"]
 

@@ -11,8 +11,8 @@ from gdp.stores.keyring import load_delegations
 from gdp.trust.right import Right
 from proxy.config.config import ProxyConfig
 from proxy.config.rule import DOMAIN_MAX
+from ring.credentials import OverlayCredentials
 from ring.live_plan import CARRIED, Graph, graphs_of, messages_in
-from ring.materials import OverlayCredentials
 from ring.nodes.content import TALKS
 from ring.options import Live
 

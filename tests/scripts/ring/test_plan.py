@@ -13,7 +13,7 @@ from gdp.stores.keyring import load_delegations, load_identity
 from gdp.trust.right import Right
 from proxy.config.config import ProxyConfig
 from proxy.serial.channel import Channel
-from ring.materials import OverlayCredentials
+from ring.credentials import OverlayCredentials
 from ring.plan import Topic, topics_of
 
 RING = ring5()

@@ -28,9 +28,9 @@ from gdp.simulation.topology import Attachment, DomainPlan, Topology, ring5
 from gdp.stores.keyring import CARD, DELEGATIONS, ROOT_CERTIFICATE
 from ring.child import Child
 from ring.children import Children
-from ring.materials import OverlayCredentials
+from ring.credentials import OverlayCredentials
 
-__all__ = ["ENVIRONMENT", "SITE", "STATE", "Stage", "end_all_of", "fog_command", "standing_runs", "sweep"]
+__all__ = ["ENVIRONMENT", "SITE", "STATE", "Environment", "end_all_of", "fog_command", "standing_runs", "sweep"]
 
 ROBOT: Final = "nuc1"
 FAR: Final = "nuc5"
@@ -47,7 +47,7 @@ ENVIRONMENT: Final = {
 }
 
 
-class Stage:
+class Environment:
     """Ring of one run and its site.
 
     Args:

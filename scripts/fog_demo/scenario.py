@@ -19,14 +19,14 @@ from fog.site import Site, open_site
 from fog.supervisor.infrastructure import local_provider
 from fog.supervisor.journal import Entry, Journal
 from fog.supervisor.record import Record
-from fog_demo.stage import Stage
-from fog_demo.view import Counts, View
+from fog_demo.display import Counts, Display
+from fog_demo.environment import Environment
 from gdp.errors import LocalError
 from ring.child import Child
 from ring.children import cancel
 from ring.events import Event
 
-__all__ = ["Outcome", "Pace", "play"]
+__all__ = ["Outcome", "Pace", "run_scenario"]
 
 _LOOK_S: Final = 0.2
 _BOOT_S: Final = 90.0
@@ -66,9 +66,9 @@ class Outcome:
 class _Looking:
     """Poller of the journal and the caller's lines, which displays both until it is cancelled."""
 
-    def __init__(self, journal: Journal, view: View) -> None:
+    def __init__(self, journal: Journal, display: Display) -> None:
         self._journal = journal
-        self._view = view
+        self._display = display
         self.counts = Counts()
         self.events: list[Entry] = []
         self._reported_s = 0.0
@@ -92,8 +92,8 @@ class _Looking:
         """Poll once."""
         news = self._journal.events(after=self.events[-1].id if self.events else 0)
         self.events += news
-        self._view.happened(news)
-        self._view.show(self.machines(), self.counts)
+        self._display.happened(news)
+        self._display.show(self.machines(), self.counts)
 
     def first_event(self, machine: str, what: set[str]) -> Entry | None:
         """Return the first event of a machine that is one of these."""
@@ -116,22 +116,22 @@ class _Looking:
         )
 
 
-async def play(stage: Stage, launch_file: Path, pace: Pace, view: View) -> Outcome:
-    """Run the scenario on a new stage."""
-    view.step("a ring of five switches, the RIB at nuc3, the robot at nuc1, the site of fog beyond nuc5")
-    plane = await stage.stand_up()
-    site = open_site(stage.site_file, stage.state)
+async def run_scenario(environment: Environment, launch_file: Path, pace: Pace, display: Display) -> Outcome:
+    """Run the scenario on a new environment."""
+    display.step("a ring of five switches, the RIB at nuc3, the robot at nuc1, the site of fog beyond nuc5")
+    plane = await environment.stand_up()
+    site = open_site(environment.site_file, environment.state)
     with closing(Journal(site.journal)) as journal:
-        looking = _Looking(journal, view)
+        looking = _Looking(journal, display)
         shown = asyncio.ensure_future(looking.run())
         try:
-            view.step(f"data plane {plane}; fog launch {launch_file.name} --detach")
-            await stage.fog("launch", str(launch_file), "--detach", patience_s=_BOOT_S)
-            caller = stage.start_caller(pace.rate_hz)
+            display.step(f"data plane {plane}; fog launch {launch_file.name} --detach")
+            await environment.fog("launch", str(launch_file), "--detach", patience_s=_BOOT_S)
+            caller = environment.start_caller(pace.rate_hz)
             heard = asyncio.ensure_future(looking.hear(caller))
             try:
-                steps_s = await stage.children.guarded(_befall(site, looking, pace, view))
-                view.step("that was all; the robot's node makes no further request")
+                steps_s = await environment.children.guarded(_befall(site, looking, pace, display))
+                display.step("that was all; the robot's node makes no further request")
                 caller.go()
                 await asyncio.wait_for(heard, _END_S)
             finally:
@@ -143,23 +143,23 @@ async def play(stage: Stage, launch_file: Path, pace: Pace, view: View) -> Outco
         return Outcome(looking.counts, steps_s, looking.events, complaints)
 
 
-async def _befall(site: Site, looking: _Looking, pace: Pace, view: View) -> dict[str, float]:
+async def _befall(site: Site, looking: _Looking, pace: Pace, display: Display) -> dict[str, float]:
     """Preempt one machine, then kill the other; return the durations in seconds."""
     runs = local_provider(site).runs
     steps_s: dict[str, float] = {}
     await _until(lambda: looking.counts.answered > 0, "the first answer")
-    view.step(f"requests flow, {pace.rate_hz:g} a second; each goes to both machines, the first answer wins")
+    display.step(f"requests flow, {pace.rate_hz:g} a second; each goes to both machines, the first answer wins")
     await asyncio.sleep(pace.calm_s)
     first, second = looking.machines()[:2]
 
-    view.step(f"{first.name} is preempted, with a notice of {pace.notice_s:g} s")
+    display.step(f"{first.name} is preempted, with a notice of {pace.notice_s:g} s")
     at_s = time.time()
     notice(runs, first.id, pace.notice_s)
     steps_s |= await _replaced(looking, first, {"notice"}, at_s, "preemption")
     await _until(lambda: _is_gone(looking, first), f"the end of {first.name}")
     await asyncio.sleep(pace.calm_s)
 
-    view.step(f"{second.name} is killed: SIGKILL to all of it, its link gone")
+    display.step(f"{second.name} is killed: SIGKILL to all of it, its link gone")
     at_s = time.time()
     kill(runs, second.id)
     steps_s |= await _replaced(looking, second, {"preempted", "unreachable"}, at_s, "death")

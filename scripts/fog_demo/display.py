@@ -20,7 +20,7 @@ from fog.cli.views import event_line, machine_fields, machines_table, stage
 from fog.supervisor.journal import Entry
 from fog.supervisor.record import Record
 
-__all__ = ["Counts", "View"]
+__all__ = ["Counts", "Display"]
 
 _EVENTS: Final = 10  # number of the newest events shown
 _PLAIN_EVERY_S: Final = 4.0
@@ -53,7 +53,7 @@ class Counts:
         return Text.assemble(failed, rest)
 
 
-class View:
+class Display:
     """Display of steps, machines, events and counts; a context manager."""
 
     def __init__(self, console: Console) -> None:
@@ -63,7 +63,7 @@ class View:
         self._events: deque[Entry] = deque(maxlen=_EVENTS)
         self._live = Live(console=console, auto_refresh=False, transient=False) if console.is_terminal else None
 
-    def __enter__(self) -> View:
+    def __enter__(self) -> Display:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:

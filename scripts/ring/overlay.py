@@ -15,8 +15,8 @@ from gdp.host.run_registry import Run
 from gdp.simulation.namespaces import Namespaces
 from ring.child import Child
 from ring.children import READY_S, Children
+from ring.credentials import OverlayCredentials
 from ring.faults import Cut, Kill, Roam, roamers
-from ring.materials import OverlayCredentials
 from ring.options import Options
 from ring.progress import ProgressReporter
 
