@@ -160,7 +160,7 @@ def _output(tree: Path, *argv: str) -> str:
     """
     done = subprocess.run(
         [sys.executable, *argv],
-        env=_environment(tree), capture_output=True, text=True, timeout=_PATIENCE_S, check=False,
+        env=_environment(tree), cwd=tree, capture_output=True, text=True, timeout=_PATIENCE_S, check=False,
     )  # fmt: skip
     if done.returncode:
         raise FailedError(f"{' '.join(argv)}: {done.stderr[-300:]}")
@@ -279,13 +279,14 @@ def _trips(tree: Tree, _: argparse.Namespace) -> Figures:
     sizes = [word for size in (100, 10_000) for word in ("--size", str(size))]
     cut = ["--only", "gdp-raw", "--mtu", "1500", "--offloads", "off", "--encoding", "cdr", "--count", "100"]
     found = _own_bench(tree.path, "messages.py", *cut, *sizes)
-    return {
-        (case, column): value
-        for cases in found.values()
-        for case, columns in cases.items()
-        for column, (value,) in columns.items()
-        if column == MEDIAN and value is not None
-    }
+    figures: Figures = {}
+    for cases in found.values():
+        for case, columns in cases.items():
+            (value,) = columns[MEDIAN]
+            if value is None:
+                raise FailedError(f"messages.py of {tree.path} has no {MEDIAN} of {case}")
+            figures[case, MEDIAN] = value
+    return figures
 
 
 def _one_by_one(measure: Callable[[Tree, argparse.Namespace], Figures]) -> Part:
