@@ -257,15 +257,15 @@ class Node:
 
     def _remind(self, look: GraphSnapshot) -> None:
         """Announce connections again that are missing for long, see ``reconnect``."""
-        topics: dict[str, Mapping[int, Publisher | Subscriber]] = {
-            "subscribes": self._outlets,
-            "publishes": self._inlets,
-        }
-        missing = set[LocalEnd]()
-        for end in look.ends:
-            ours = [each for each in list(topics.get(end.role, {}).values()) if each.topic == end.name]
-            if ours and not any(end.node in each.peers() for each in ours):
-                missing.add(end)
+        peers: dict[tuple[str, str], set[str]] = {}  # connected nodes by the other end's role and topic
+        ours: tuple[tuple[str, Mapping[int, Publisher | Subscriber]], ...] = (
+            ("subscribes", self._outlets),
+            ("publishes", self._inlets),
+        )
+        for role, subjects in ours:
+            for each in list(subjects.values()):
+                peers.setdefault((role, each.topic), set()).update(each.peers())
+        missing = {end for end in look.ends if end.node not in peers.get((end.role, end.name), {end.node})}
         for end in self._missing.due(missing, time.monotonic()):
             self._todo.put(partial(self._announce, end))
 
