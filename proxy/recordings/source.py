@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import heapq
 import os
+from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -127,7 +128,7 @@ class ScannedSource:
         return self._unpacked[place.chunk][place.at : place.at + place.size]
 
 
-class Scan:
+class Scan(ABC):
     """Contents of a file that is read from its beginning; a subclass knows the format and its words."""
 
     form: str
@@ -140,9 +141,9 @@ class Scan:
         self.stats = Tally()
         self._index: dict[int, int] = {}  # the format's number of a channel, to its index
 
+    @abstractmethod
     def traverse(self, file: BinaryIO, size: int) -> str:
         """Read every record; return why it ended early, empty where it did not."""
-        raise NotImplementedError
 
     def source(self, path: Path, magic: bytes, unclosed: str = "") -> ScannedSource:
         """Return the readable part of a file; ``unclosed``: why even a file that is read to its end lacks something.

@@ -8,6 +8,7 @@ Source: rmw_cyclonedds_cpp, ``cdds_request_header_t`` and ``clientid``/``service
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from typing import Final, NamedTuple
@@ -29,7 +30,7 @@ _QOS: Final = default(depth=1_000)  # a thousand calls at once without eviction
 _WAITING_MAX: Final = 1_000
 
 
-class _Halves:
+class _Halves(ABC):
     """The local halves of a service's request and reply topics."""
 
     def __init__(self, at: EntityContext, role: Role, name: str, type_name: str, type_hash: str) -> None:
@@ -47,13 +48,13 @@ class _Halves:
         self.writer.tell_matches(self.matched)
         self.reader = node.read(heard[0], dds_type(heard[1]), requested(_QOS, data), self.receive_samples)
 
+    @abstractmethod
     def matched(self) -> None:
         """Process a change of the matched readers."""
-        raise NotImplementedError
 
+    @abstractmethod
     def receive_samples(self, samples: list[Sample]) -> None:
         """Process received samples."""
-        raise NotImplementedError
 
     def close(self) -> None:
         """Close both halves."""
