@@ -109,10 +109,10 @@ def test_behind_a_dedicated_gateway_no_machine_is_one(tmp_path: Path, space: Spa
     provider = LocalProvider(tmp_path / "local", plain_gateway, Gateway(gateway="edge", children=(west,)))
     provider.open_network()
     try:
-        neighbouring, behind = (provider.create(spec(name, region), ticking()) for name, region in
+        outside, behind = (provider.create(spec(name, region), ticking()) for name, region in
                           (("m1", "mars-1"), ("m2", "us-west-1")))  # fmt: skip
         with pytest.raises(LocalError, match="mars-1 is dedicated"):
-            provider.attach_uplink(neighbouring)
+            provider.attach_uplink(outside)
         provider.attach_uplink(behind)
         assert (provider.replica_gateway("mars-1"), provider.replica_gateway("us-west-1")) == ("", "west")
     finally:

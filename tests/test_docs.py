@@ -119,8 +119,8 @@ def test_source_files_that_a_page_names_exist() -> None:
 
 
 def _constant(dotted: str) -> float:
-    capacity, _, name = dotted.rpartition(".")
-    path = capacity if capacity.startswith(("proxy.", "ring.")) else f"gdp.{capacity or 'limits'}"
+    module, _, name = dotted.rpartition(".")
+    path = module if module.startswith(("proxy.", "ring.")) else f"gdp.{module or 'limits'}"
     value: float = getattr(importlib.import_module(path), name)
     return value
 

@@ -190,10 +190,10 @@ def _verified(identifier: bytes, kept: Kept, asked: Request) -> list[SubjectInfo
 
 
 def _keys_digest(asked: Request, holders: list[SubjectInfo]) -> bytes:
-    reported = hashlib.sha256()
+    hashed = hashlib.sha256()
     for application, holder in zip(asked.applications, holders, strict=True):
-        reported.update(holder.key.compressed + application.kem.wire)
-    return reported.digest()
+        hashed.update(holder.key.compressed + application.kem.wire)
+    return hashed.digest()
 
 
 def _remember(kept: OrderedDict[bytes, _T], identifier: bytes, value: _T) -> None:

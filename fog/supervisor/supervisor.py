@@ -132,8 +132,8 @@ class Supervisor:
         for each in self._journal.clusters():
             name = each.plan.name
             if each.is_up and not self._events.has_trouble(name):
-                liveness_known = f"{now_s - begun_unix_s:.2f} s after the supervisor's start"
-                self._journal.write_event(now_s, name, "", "reconciled", liveness_known, since_unix_s=begun_unix_s)
+                took = f"{now_s - begun_unix_s:.2f} s after the supervisor's start"
+                self._journal.write_event(now_s, name, "", "reconciled", took, since_unix_s=begun_unix_s)
 
     def _reconcile_cluster(self, cluster: Cluster) -> None:
         plan = cluster.plan

@@ -534,12 +534,12 @@ class RibCore:
 
     def _tell(self, route: Route, known: Route | Withdrawn | None, now_s: float, askers: Sequence[Asker] = ()) -> None:
         """Send a route to ``askers``, to watchers, and after a move to holders and the sender of the old location."""
-        reported = dict.fromkeys((*askers, *self._watches.watchers(route.name, now_s)))
+        recipients = dict.fromkeys((*askers, *self._watches.watchers(route.name, now_s)))
         if isinstance(known, Route) and known.place != route.place:
-            reported |= dict.fromkeys(self._holders.watchers(route.name, now_s))
+            recipients |= dict.fromkeys(self._holders.watchers(route.name, now_s))
             if known.sender != route.sender:
-                reported |= self._sender_of(known)
-        for asker in reported:
+                recipients |= self._sender_of(known)
+        for asker in recipients:
             if self._may_tell(route, asker):
                 self._answer(route, asker, now_s)
 
@@ -550,12 +550,12 @@ class RibCore:
 
     def _tell_gone(self, route: Route, now_s: float, by: Name | None = None) -> None:
         """Notify a name's watchers, holders and sender that a route is gone, except ``by``, which knows."""
-        reported = dict.fromkeys(
+        recipients = dict.fromkeys(
             (*self._watches.watchers(route.name, now_s), *self._holders.watchers(route.name, now_s))
         )
         if by not in (None, route.sender):
-            reported |= self._sender_of(route)
-        for asker in reported:
+            recipients |= self._sender_of(route)
+        for asker in recipients:
             if self._may_tell(route, asker):
                 gone = Response(
                     name=route.name,
@@ -687,20 +687,20 @@ class RibCore:
             return
         who, about = revocation.issuer.name.to_text(), revocation.fingerprint.hex()
         self._audit.record(Action.REVOKED, "certificate", who=who, about=about)
-        reported: dict[Asker, None] = {}
+        recipients: dict[Asker, None] = {}
         closed = self._revocations.closed(revocation, now)
         # switches flood revocations of roots everywhere
         if not self._policy.revoked.is_root(revocation.issuer.owner_key):
             for name in dict.fromkeys((revocation.issuer.name, *(route.name for route in closed))):
-                reported |= self._concerned_by(name, now.mono_s)
-            if not reported:  # the issuer signs in its own name: an owner's successor, or a delegate
+                recipients |= self._concerned_by(name, now.mono_s)
+            if not recipients:  # the issuer signs in its own name: an owner's successor, or a delegate
                 others = self._store.resting_on(revocation.issuer.owner_key)
                 for name in list(dict.fromkeys(route.name for route in others))[:_NAMES_OF_ISSUER_MAX]:
-                    reported |= self._concerned_by(name, now.mono_s)
+                    recipients |= self._concerned_by(name, now.mono_s)
             ribs = self._upstream_and_peers(origin)
             self._send_revocations([statement.wire], ribs, Kind.RIB_REQUEST)
             self._send_revocations(
-                [statement.wire], [each.name for each in reported if each.name not in (origin, *ribs)]
+                [statement.wire], [each.name for each in recipients if each.name not in (origin, *ribs)]
             )
         for route in closed:
             self._store.withdraw(route.name, route.advertiser)
@@ -717,10 +717,10 @@ class RibCore:
 
     def _concerned_by(self, name: Name, now_s: float) -> dict[Asker, None]:
         """Return the nodes that advertised, hold or watch a name."""
-        reported = dict.fromkeys((*self._watches.watchers(name, now_s), *self._holders.watchers(name, now_s)))
+        recipients = dict.fromkeys((*self._watches.watchers(name, now_s), *self._holders.watchers(name, now_s)))
         for route in self._store.routes(name):
-            reported |= self._sender_of(route)
-        return reported
+            recipients |= self._sender_of(route)
+        return recipients
 
     def _upstream_and_peers(self, origin: Name) -> list[Name]:
         """Return the RIBs that receive every revocation: the tier above, and peers."""

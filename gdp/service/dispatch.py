@@ -350,14 +350,14 @@ class Dispatch(Generic[A]):
             if ended.stop_at_s > now_s:
                 break
             due.append((number, ended.owing))
-        reported: dict[Name | None, list[int]] = {}
+        stops: dict[Name | None, list[int]] = {}
         for number, owing in due:
             del self._ended[number]
             for server, since_s in owing.items():
                 self._latencies.stopped(server, now_s - since_s, now_s)
             by_tree = self._replication.mode is Mode.ALL and bool(owing)
             for each in [None] if by_tree else owing:
-                reported.setdefault(each, []).append(number)
-        for whom, calls in reported.items():
+                stops.setdefault(each, []).append(number)
+        for whom, calls in stops.items():
             for at in range(0, len(calls), STOP_MAX):
                 self._effects.append(Stop(tuple(calls[at : at + STOP_MAX]), whom))

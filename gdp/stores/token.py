@@ -208,8 +208,8 @@ def _public_key(uri: TokenUri, key: _PrivateKey) -> PublicKey:
     """Return the public key that the token stores with the private one, under the same id or label."""
     library = _library()
     names = library.Attribute
-    neighbouring = {names.ID: key.id} if key.id else {names.LABEL: key.label}
-    found = list(key.session.get_objects({**neighbouring, names.CLASS: library.ObjectClass.PUBLIC_KEY}))
+    key_attributes = {names.ID: key.id} if key.id else {names.LABEL: key.label}
+    found = list(key.session.get_objects({**key_attributes, names.CLASS: library.ObjectClass.PUBLIC_KEY}))
     if len(found) != 1:
         raise LocalError(f"{len(found)} public keys match the private key in the token, not one: {uri.label!r}")
     encoded = bytes(found[0][names.EC_POINT])

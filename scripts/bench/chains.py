@@ -73,8 +73,8 @@ class Chain(Lab):
 
     def worker(self, node: str, role: str, *, cpu: int | None = None, **settings: object) -> Started:
         """Start a role of ``roles.py``; ``cpu``: the core to run on, None: any."""
-        reported = json.dumps({"role": role, "cpu": cpu, **settings})
-        return self.start(node, role, [str(self.roles), reported], has_orders=True)
+        orders = json.dumps({"role": role, "cpu": cpu, **settings})
+        return self.start(node, role, [str(self.roles), orders], has_orders=True)
 
     @property
     def middles(self) -> Sequence[str]:

@@ -131,9 +131,9 @@ def targets_of(over: Rounds, cases: Sequence[str]) -> list[Target]:
     floods = [flood for flood in FLOODS if flood != IDLE]
     targets = [over.target(f"{case}: {flood}, {OF_BOUND}", flood, case, OF_BOUND, 1.0, at_most=True)
              for case in cases for flood in floods]  # fmt: skip
-    reported = [over.ratio(f"{case}: {flood} / {IDLE}, p99", flood, IDLE, case, P99, None)
-            for case in cases for flood in floods]  # fmt: skip
-    return targets + reported
+    ratios = [over.ratio(f"{case}: {flood} / {IDLE}, p99", flood, IDLE, case, P99, None)
+              for case in cases for flood in floods]  # fmt: skip
+    return targets + ratios
 
 
 def panels_of(over: Rounds, cases: Sequence[str]) -> list[Panel]:

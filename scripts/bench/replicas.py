@@ -151,8 +151,8 @@ class Bench:
         """Call three replicas while two of them are killed repeatedly."""
         served = [Served("/number", TYPE, _MACHINES, imports={"timeout_s": _CALL_S})]
         with self._field(served) as here, Kills(here, self._draw) as kills:
-            reported = {"lanes": _LANES, "rate": self._rate, "counts_answers": True}
-            said = _ask(here, ["/number"], count, reported)
+            series = {"lanes": _LANES, "rate": self._rate, "counts_answers": True}
+            said = _ask(here, ["/number"], count, series)
         counts = figures_of(said)
         figures = {column: counts.get(key) for column, key in COUNTS.items()}
         figures |= {COUNT: count, KILLS: kills.count, **_latencies(_times(said, "/number"))}
@@ -249,9 +249,9 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
     )
 
 
-def _ask(here: Field, services: Sequence[str], count: int, reported: Mapping[str, object]) -> Said:
+def _ask(here: Field, services: Sequence[str], count: int, series: Mapping[str, object]) -> Said:
     """Return the final report of the robot's client."""
-    own = {"services": " ".join(services), "count": count, "patience_s": _CALL_S, **reported}
+    own = {"services": " ".join(services), "count": count, "patience_s": _CALL_S, **series}
     with here.client(ROBOT, "ask", _END, **own) as client:
         client.read(READY_S)
         reported_s = time.monotonic()

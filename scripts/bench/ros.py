@@ -66,10 +66,10 @@ def measure(kind: str, seconds: float, first_s: float, row: Row, encoding: Encod
     seconds = first_s if number == 1 else seconds
     every_s, is_direct = EVERY_S[kind], encoding is None
     topics = topics_of(kind, encoding or "cdr")
-    reported = {"kind": kind, "topics": topics, "count": round(seconds / every_s), "every_s": every_s}
+    settings = {"kind": kind, "topics": topics, "count": round(seconds / every_s), "every_s": every_s}
     with (
-        row.node(RIGHT, MODULE, "listen", direct=is_direct, **reported) as listener,
-        row.node(LEFT, MODULE, "talk", direct=is_direct, **reported) as talker,
+        row.node(RIGHT, MODULE, "listen", direct=is_direct, **settings) as listener,
+        row.node(LEFT, MODULE, "talk", direct=is_direct, **settings) as talker,
     ):
         listener.read(READY_S)
         cpu_s = row.proxies_cpu_s()

@@ -69,8 +69,8 @@ class Carried:
 
     def rule(self, owner: Path) -> dict[str, object]:
         """Return its rule in either proxy's configuration."""
-        reported = {"name": self.name, "kind": self.kind, "type": self.type_name, "encoding": self.encoding}
-        return {**reported, "owner": str(owner)}
+        keys = {"name": self.name, "kind": self.kind, "type": self.type_name, "encoding": self.encoding}
+        return {**keys, "owner": str(owner)}
 
 
 class Row:

@@ -259,25 +259,25 @@ def _flooding(run: Run, overlay: Overlay, kind: str, rate: float, seconds: float
     if kind not in _HOSTILE:
         path = run.directory / f"{kind}.frames"
         path.write_bytes(b"".join(struct.pack("!I", len(frame)) + frame for frame in hellos(kind, overlay)))
-        reported: dict[str, object] = {
+        orders: dict[str, object] = {
             "iface": _VICTIM, "frames": str(path), "rate": rate, "seconds": seconds,
             "source": _address_of(overlay) if spoof else "",
         }  # fmt: skip
-        argv = ["-m", "faults.hello_flood", json.dumps(reported)]
+        argv = ["-m", "faults.hello_flood", json.dumps(orders)]
         with overlay.start_other(_NEAR, f"flood {kind}", argv) as flood:
             flood.read(30)
             yield flood
         return
     who = _HOSTILE[kind]
     role, _, node = who.partition(" ")
-    reported = {"what": kind, "frames": _FRAMES, "rate": rate, "seconds": seconds}
+    orders = {"what": kind, "frames": _FRAMES, "rate": rate, "seconds": seconds}
     if role == "switch":
-        reported["config"] = str(overlay.directory / f"switch-{node}.yaml")
+        orders["config"] = str(overlay.directory / f"switch-{node}.yaml")
     else:
-        reported |= {"config": str(overlay.directory / f"end-{node}.yaml"), "reads": FLOW.topic, "publishes": OWN.topic}
+        orders |= {"config": str(overlay.directory / f"end-{node}.yaml"), "reads": FLOW.topic, "publishes": OWN.topic}
     overlay.kill(who)
     try:
-        argv = ["-m", "faults.hostile", json.dumps(reported)]
+        argv = ["-m", "faults.hostile", json.dumps(orders)]
         with overlay.start_other(node, f"flood {kind}", argv) as flood:
             flood.read(_HOSTILE_READY_S)
             os.kill(flood.pid, signal.SIGUSR1)

@@ -203,5 +203,5 @@ class MemberRow:
 
     def endpoint(self, node: str, role: str, **settings: str | float) -> Started:
         """Start a role of the endpoint module at a member."""
-        reported = json.dumps({"config": str(self._configs[node]), **settings})
-        return self._lab.start(node, role, ["-m", self._endpoint, role, reported])
+        orders = json.dumps({"config": str(self._configs[node]), **settings})
+        return self._lab.start(node, role, ["-m", self._endpoint, role, orders])

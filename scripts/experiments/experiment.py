@@ -128,8 +128,8 @@ class Report:
         parts += [markdown_table(("", *_COLUMNS), self.rows())]
         parts += [markdown_table(_FIGURES, [each.cells() for each in self.findings])]
         parts += ["\n".join(f"- {note}" for note in self.notes)]
-        reported = "; ".join(f"{key}: {value}" for key, value in self.settings.items())
-        return "\n\n".join([*parts, f"Measured on {state}. {reported}."]) + "\n"
+        stated = "; ".join(f"{key}: {value}" for key, value in self.settings.items())
+        return "\n\n".join([*parts, f"Measured on {state}. {stated}."]) + "\n"
 
     def show(self, state: MachineState) -> None:
         """Print the tables and the notes."""
@@ -173,9 +173,9 @@ class Asking:
         """Yield each sample as it comes; raises FailedError if none comes in time."""
         self._client.read(_BEGIN_S)
         while "sample" in (said := self._client.read(max(2 * self._series.patience_s, _SILENT_S))):
-            reported = said["sample"]
-            if isinstance(reported, dict):
-                yield Sample(**reported)
+            fields = said["sample"]
+            if isinstance(fields, dict):
+                yield Sample(**fields)
         twice, heard = said["twice"], said["heard"]
         self.twice, self.heard = (each if isinstance(each, int) else None for each in (twice, heard))
 

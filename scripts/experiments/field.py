@@ -64,8 +64,8 @@ class Served:
 
     def rule(self, owner: Path, further: Mapping[str, object]) -> dict[str, object]:
         """Return a rule for it."""
-        reported = {"name": self.name, "kind": "service", "type": self.type_name, "encoding": "cdr"}
-        return {**reported, "owner": str(owner), **further}
+        keys = {"name": self.name, "kind": "service", "type": self.type_name, "encoding": "cdr"}
+        return {**keys, "owner": str(owner), **further}
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,10 +89,10 @@ class Server:
 
     def begin(self) -> None:
         """Start both."""
-        reported = {**self._work.settings, "machine": self.label}
+        orders = {**self._work.settings, "machine": self.label}
         self._running = [
             self._place.process(self.label, "proxy", ["-m", "proxy.cli.proxy", "--config", self._config]),
-            self._place.process(self.label, "node", [str(self._work.program), self._work.role, json.dumps(reported)]),
+            self._place.process(self.label, "node", [str(self._work.program), self._work.role, json.dumps(orders)]),
         ]
 
     def wait(self) -> None:

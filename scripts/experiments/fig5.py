@@ -81,12 +81,12 @@ def measure(options: Options) -> Report:
         _check(counts, planner, options.meshes)
     groups: dict[str, list[Sample]] = {}
     findings: list[Finding] = []
-    reported = {
+    plan = {
         "folder": str(options.meshes), "problems": " ".join(counts), "planner": planner, "patience_s": timeout
     }  # fmt: skip
     if counts:
         stop = _STOP if options.stop else {}
-        with field_of(*_fleet("plan", dict.fromkeys(_MACHINES, reported), stop, timeout + _SLACK_S)) as here:
+        with field_of(*_fleet("plan", dict.fromkeys(_MACHINES, plan), stop, timeout + _SLACK_S)) as here:
             for name, count in counts.items():
                 found = _ask(here, name, count, patience_s=timeout + _SLACK_S)
                 groups |= _named(f"{name}, computed", found)
@@ -205,7 +205,7 @@ def _lists(count: int, problems: Collection[str]) -> dict[str, tuple[list[float]
 
 
 def _notes(counts: Mapping[str, int], timeout_s: float, planner: str) -> list[str]:
-    reported = ", ".join(f"{count} of {name}" for name, count in counts.items())
+    counted = ", ".join(f"{count} of {name}" for name, count in counts.items())
     runs = ", ".join(f"{len(each)} of {name}" for name, each in load().items())
     return [
         f"The paper ran 100 trials with a timeout of {LIMIT_S:g} s. The trials of waits are as many; recorded runs"
@@ -216,7 +216,7 @@ def _notes(counts: Mapping[str, int], timeout_s: float, planner: str) -> list[st
         "Waits of Home and Twistycool are shortened, so that a hundred trials take minutes. The network's time is"
         " not: it"
         " weighs more here than in the paper (last figure of each).",
-        f"Computed trials: {reported or 'none in this run'}, timeout {timeout_s:g} s. Of fewer than a hundred trials"
+        f"Computed trials: {counted or 'none in this run'}, timeout {timeout_s:g} s. Of fewer than a hundred trials"
         " the p99 is"
         " the slowest one. A problem without a solution counts with its timeout, as failed."
         " The replicas share two cores"

@@ -77,11 +77,11 @@ def main() -> None:
     with clean_exit():
         for name in [_QUICK] if quick else options.task or COMPUTED:
             machine = {"machine": asdict(machine_state())}
-            reported = tasks.setdefault(name, {})
+            figures = tasks.setdefault(name, {})
             if options.part != "alone":
-                reported["network"] = _network(name, 1 if quick else options.rounds, quick=quick) | machine
+                figures["network"] = _network(name, 1 if quick else options.rounds, quick=quick) | machine
             if options.part != "network":
-                reported["alone"] = _alone(name, quick=quick) | machine
+                figures["alone"] = _alone(name, quick=quick) | machine
     document = {"experiment": "offload", "slower": SLOWER, "tasks": tasks}
     page = page_of(document)
     print(json.dumps(document) if options.json else page)
@@ -105,9 +105,9 @@ def _network(name: str, rounds: int, *, quick: bool) -> dict[str, object]:
         for at in range(1, rounds + 1):
             for who, middleware in BASELINES.items():
                 progress(f"{name}, round {at} of {rounds}: {who}")
-                reported = {"task": name, "prefix": prefix, "middleware": middleware, "domain": DIRECT_DOMAIN}
-                reported |= {"at_once": at_once, "count": at_once + computed}
-                size = _trip(row, found[who], reported, at_once, direct=who != OVERLAY)
+                orders = {"task": name, "prefix": prefix, "middleware": middleware, "domain": DIRECT_DOMAIN}
+                orders |= {"at_once": at_once, "count": at_once + computed}
+                size = _trip(row, found[who], orders, at_once, direct=who != OVERLAY)
     return {
         "request_bytes": size,
         "rounds": rounds,
@@ -117,12 +117,12 @@ def _network(name: str, rounds: int, *, quick: bool) -> dict[str, object]:
     }
 
 
-def _trip(row: Row, found: Measured, reported: Mapping[str, object], at_once: int, *, direct: bool) -> int:
+def _trip(row: Row, found: Measured, orders: Mapping[str, object], at_once: int, *, direct: bool) -> int:
     """Run one series between a robot and a server; return the size of a request, in bytes."""
     there_s = []
-    with row.process(RIGHT, "cloud", [_END, "cloud", json.dumps(reported)], direct=direct) as cloud:
+    with row.process(RIGHT, "cloud", [_END, "cloud", json.dumps(orders)], direct=direct) as cloud:
         cloud.read(READY_S)
-        with row.process(LEFT, "robot", [_END, "robot", json.dumps(reported)], direct=direct) as robot:
+        with row.process(LEFT, "robot", [_END, "robot", json.dumps(orders)], direct=direct) as robot:
             size = int(str(robot.read(READY_S)["request_bytes"]))
             while "number" in (said := robot.read(_ANSWER_S)):
                 number, asked_s, answered_s = (

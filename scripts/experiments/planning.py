@@ -98,8 +98,8 @@ class Problem:
         setup.setStartAndGoalStates(*ends)
         setup.setPlanner(getattr(geometric, planner)(setup.getSpaceInformation()))
         timed = base.timedPlannerTerminationCondition(patience_s)
-        reported = base.PlannerTerminationCondition(is_over)
-        setup.solve(base.plannerOrTerminationCondition(timed, reported))
+        stopped = base.PlannerTerminationCondition(is_over)
+        setup.solve(base.plannerOrTerminationCondition(timed, stopped))
         if not setup.haveExactSolutionPath():
             return Solved(None, next(checks))
         states = setup.getSolutionPath().getStates()
@@ -131,9 +131,9 @@ def limits(folder: Path, name: str) -> tuple[Place, Place, Place, Place]:
     parser = configparser.ConfigParser(strict=False, allow_no_value=True)
     with (folder / f"{PROBLEMS[name]}.cfg").open(encoding="utf-8") as file:
         parser.read_file(file)
-    reported = parser["problem"]
+    problem = parser["problem"]
     start, goal, low, high = (
-        tuple(float(reported[f"{what}.{axis}"]) for axis in _AXES)
+        tuple(float(problem[f"{what}.{axis}"]) for axis in _AXES)
         for what in ("start", "goal", "volume.min", "volume.max")
     )
     return start, goal, low, high

@@ -114,9 +114,9 @@ class _Client:
             say(sample=asdict(sample))
 
 
-def ask(node: Node, executor: SingleThreadedExecutor, reported: Mapping[str, object]) -> None:
+def ask(node: Node, executor: SingleThreadedExecutor, settings: Mapping[str, object]) -> None:
     """Call so often, and print what came of each call, in a line of its own."""
-    series = Series(**reported)  # type: ignore[arg-type]
+    series = Series(**settings)  # type: ignore[arg-type]
     client = _Client(node, TASKS[series.task](series.problem), series.services)
     answers = client.count_answers() if series.counts_answers else None
     done: Future[None] = Future()
@@ -153,9 +153,9 @@ def ask(node: Node, executor: SingleThreadedExecutor, reported: Mapping[str, obj
     say(event="over", heard=heard, twice=None if answers is None or heard is None else heard - len(answers))
 
 
-def busy(node: Node, executor: SingleThreadedExecutor, reported: Mapping[str, object]) -> None:
+def busy(node: Node, executor: SingleThreadedExecutor, settings: Mapping[str, object]) -> None:
     """Run as the second client, until killed."""
-    contention = Contention(**reported)  # type: ignore[arg-type]
+    contention = Contention(**settings)  # type: ignore[arg-type]
     client = _Client(node, TASKS[contention.task](""), [contention.service])
     client.wait_for_servers()
     begun_s = time.monotonic()

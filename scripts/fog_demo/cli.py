@@ -110,7 +110,7 @@ def _tell(outcome: Outcome, console: Console, *, as_json: bool) -> None:
     for what, seconds in outcome.steps_s.items():
         console.print(f"{what}: {seconds:.2f} s", highlight=False)
     if as_json:
-        reported = {
+        document = {
             "requests": outcome.counts.requests,
             "failed": outcome.counts.failed,
             "median_ms": outcome.counts.median_ms,
@@ -119,7 +119,7 @@ def _tell(outcome: Outcome, console: Console, *, as_json: bool) -> None:
             "steps_s": outcome.steps_s,
             "events": [asdict(each) for each in outcome.events],
         }
-        json.dump(reported, sys.stdout, indent=1)
+        json.dump(document, sys.stdout, indent=1)
         sys.stdout.write("\n")
     else:
         console.print(outcome.summary, style="bold red" if outcome.counts.failed else "bold green", highlight=False)

@@ -100,8 +100,8 @@ class Environment:
 
     def start_caller(self, rate_hz: float) -> Child:
         """Start the robot's node: it calls ``/echo`` at this rate until SIGINT."""
-        reported = ["-p", f"rate_hz:={rate_hz}", "-p", "report_s:=0.5"]
-        return self._start(ROBOT, "caller", ["-m", "fog_demo.caller", "--ros-args", *reported])
+        options = ["-p", f"rate_hz:={rate_hz}", "-p", "report_s:=0.5"]
+        return self._start(ROBOT, "caller", ["-m", "fog_demo.caller", "--ros-args", *options])
 
     def _start(self, node: str, role: str, arguments: list[str], *, heard: bool = True) -> Child:
         return self.children.start_in(self._namespaces, node, role, arguments, heard=heard, environment=ENVIRONMENT)
@@ -189,5 +189,5 @@ def end_all_of(run: Run) -> None:
 def fog_command(run: Run, words: Sequence[str]) -> list[str]:
     """Return Python's arguments to run ``fog`` in a run's folder."""
     site = run.directory / SITE
-    reported = ["--site", str(site)] if site.exists() else []
-    return ["-m", "fog.cli.app", *words, *reported, "--state", str(run.directory / STATE)]
+    options = ["--site", str(site)] if site.exists() else []
+    return ["-m", "fog.cli.app", *words, *options, "--state", str(run.directory / STATE)]

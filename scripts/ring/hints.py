@@ -33,8 +33,8 @@ def live_hints(ring: LiveRing) -> list[tuple[str, str]]:
             found.append((f"the topics at {at}", inside(ring.overlay, at, "rostopic list")))
             found.append((f"what is said at {at}", inside(ring.overlay, at, "rostopic echo -n 5 /chatter")))
         else:
-            reported = " ".join(f"{name}={value}" for name, value in ring.environment(graph).items())
-            listener = f"env {reported} timeout 5 {sys.executable} -m ring.nodes 2 listener 0"
+            variables = " ".join(f"{name}={value}" for name, value in ring.environment(graph).items())
+            listener = f"env {variables} timeout 5 {sys.executable} -m ring.nodes 2 listener 0"
             found.append((f"one more listener at {at}, for five seconds", inside(ring.overlay, at, listener)))
     proxy = inside(ring.overlay, "nuc5", _metrics("proxy"))
     logs = f"tail -n 3 {ring.directory}/*.log"

@@ -63,9 +63,9 @@ def guided(decoder: Decoder, seconds: float, seed: int) -> Outcome:
         outcome.executions, outcome.refused, outcome.foreign, *rest = _NUMBERS.unpack_from(shared)
         outcome.slowest_ms, outcome.memory_ratio = rest
         for path in sorted((folder / "findings").glob("*.json")):
-            reported = json.loads(path.read_text())
-            outcome.findings[reported["place"]] = Finding(
-                bytes.fromhex(reported["data"]), reported["error"], reported["excess"]
+            finding = json.loads(path.read_text())
+            outcome.findings[finding["place"]] = Finding(
+                bytes.fromhex(finding["data"]), finding["error"], finding["excess"]
             )
         if status != 0:
             log = (folder / "log").read_text(errors="replace")[-400:]

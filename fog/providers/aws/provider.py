@@ -130,8 +130,8 @@ class AwsProvider:
         """Return the last lines of a program in the instance's console, which EC2 updates a minute or more late."""
         region, instance = _split(machine)
         with asking(f"{region}: console of {instance}"):
-            reported = self._clients[region].get_console_output(InstanceId=instance).get("Output", "")
-        return lines_of(reported.splitlines(), program, lines)
+            output = self._clients[region].get_console_output(InstanceId=instance).get("Output", "")
+        return lines_of(output.splitlines(), program, lines)
 
     def shell(self, machine: str) -> list[str]:
         """Return an ssh command line.

@@ -133,7 +133,7 @@ class LocalProvider:
     def describe(self, cluster: str) -> list[Machine]:
         """Return the machines of a cluster as they are now."""
         now_unix_s = time.time()
-        reported = []
+        machines = []
         for each in list_machines(self.runs, cluster):
             machine = each.describe()
             if machine.state is MachineState.GONE:
@@ -142,8 +142,8 @@ class LocalProvider:
             elif machine.leaves_at_unix_s is not None and machine.leaves_at_unix_s < now_unix_s:
                 kill(self.runs, each.id)  # a stopped machine cannot end itself
                 machine = replace(machine, state=MachineState.GONE)
-            reported.append(machine)
-        return reported
+            machines.append(machine)
+        return machines
 
     def terminate(self, ids: Sequence[str]) -> None:
         """End machines in parallel and remove their resources; other processes may do the same concurrently."""

@@ -96,9 +96,9 @@ class SkyPilotProvider:
             LocalError: the labels of a machine were changed.
         """
         with self._asking(f"machines of {cluster}"):
-            reported = self._sky.get(self._sky.status(refresh=self._sky.StatusRefreshMode.AUTO))
+            statuses = self._sky.get(self._sky.status(refresh=self._sky.StatusRefreshMode.AUTO))
             requests = self._sky.api_status()  # unfinished requests
-        found = [machine for each in reported if (machine := machine_of(each, cluster))]
+        found = [machine for each in statuses if (machine := machine_of(each, cluster))]
         return found + being_made(requests, cluster, [each.id for each in found])
 
     def terminate(self, ids: Sequence[str]) -> None:
@@ -122,8 +122,8 @@ class SkyPilotProvider:
     def log(self, machine: str, program: str, lines: int) -> str:
         """Return the last lines of a program in the machine's journal."""
         with self._asking(f"log of {machine}"):
-            reported = self._sky.tail_logs(machine, None, follow=False, preload_content=False)
-            return lines_of((line for line in reported if line), program, lines)
+            printed = self._sky.tail_logs(machine, None, follow=False, preload_content=False)
+            return lines_of((line for line in printed if line), program, lines)
 
     def shell(self, machine: str) -> list[str]:
         """Return an ssh command line; SkyPilot writes its configuration to ``~/.ssh`` of the launching user."""

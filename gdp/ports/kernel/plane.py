@@ -84,8 +84,8 @@ class KernelPlane(RawPlane):
         """
         here, there = self._counters, self._loaded.counters()
         drops = [a + b for a, b in zip(here.drops, there.drops, strict=True)]
-        reported = drops[DropReason.PORT_FULL] - self._unread
-        drops[DropReason.PORT_FULL] += max(self._refusals.total - reported, 0)
+        counted = drops[DropReason.PORT_FULL] - self._unread
+        drops[DropReason.PORT_FULL] += max(self._refusals.total - counted, 0)
         return Counters(
             here.frames_in + there.frames_in,
             here.frames_out + there.frames_out,

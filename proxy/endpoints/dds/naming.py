@@ -45,13 +45,13 @@ def named(topic: str, type_name: str, *, is_writer: bool) -> Named | None:
 
 def dds_type(ros_type: str) -> str:
     """Return ``std_msgs::msg::dds_::String_`` for ``std_msgs/msg/String``."""
-    capacity, _, name = ros_type.rpartition("/")
-    return f"{capacity.replace('/', '::')}::dds_::{name}_"
+    namespace, _, name = ros_type.rpartition("/")
+    return f"{namespace.replace('/', '::')}::dds_::{name}_"
 
 
 def _ros_type(type_name: str) -> str:
-    capacity, infix, name = type_name.partition("::dds_::")
-    return f"{capacity.replace('::', '/')}/{name[:-1]}" if infix and name.endswith("_") else ""
+    namespace, infix, name = type_name.partition("::dds_::")
+    return f"{namespace.replace('::', '/')}/{name[:-1]}" if infix and name.endswith("_") else ""
 
 
 def vendor(gid: bytes) -> str:

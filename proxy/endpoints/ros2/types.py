@@ -31,10 +31,10 @@ def class_of(type_name: str) -> type:
     match = _NAME.match(type_name)
     if match is None:
         raise LocalError(f"{type_name!r} is not the name of a ROS 2 interface (package/msg/Name)")
-    package, capacity, name, outer = match.groups()
+    package, subpackage, name, outer = match.groups()
     try:
         # The generated module of the outer interface holds the classes of its parts, under their full names.
-        module = sys.modules[getattr(importlib.import_module(f"{package}.{capacity}"), outer).__module__]
+        module = sys.modules[getattr(importlib.import_module(f"{package}.{subpackage}"), outer).__module__]
         found = getattr(module, name)
     except (ImportError, AttributeError) as error:
         raise LocalError(

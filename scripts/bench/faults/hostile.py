@@ -57,8 +57,8 @@ _Frames = Iterator[bytes]
 class HostileSwitch:
     """A switch of the domain."""
 
-    def __init__(self, reported: dict[str, Any]) -> None:
-        config = SwitchConfig.load(Path(reported["config"]))
+    def __init__(self, orders: dict[str, Any]) -> None:
+        config = SwitchConfig.load(Path(orders["config"]))
         self._identity, policy = load_member(config.identity, config.domain, Role.SWITCH)
         settings = NodeSettings(
             incarnation=incarnation(), first_sequence=wall_clock_ms(), random_bytes=secrets.token_bytes
@@ -106,12 +106,12 @@ class HostileSwitch:
 class HostileProxy:
     """A member that reads a topic, and publishes one that others read."""
 
-    def __init__(self, reported: dict[str, Any]) -> None:
-        self._end = End(Path(reported["config"]), 0.0)
+    def __init__(self, orders: dict[str, Any]) -> None:
+        self._end = End(Path(orders["config"]), 0.0)
         self.plane, self.runtime = self._end.plane, self._end.runtime
-        self._topic = self._end.subscribe(reported["reads"])
-        self._own = self._end.topics[reported["publishes"]]
-        self._publisher = self._end.advertise(reported["publishes"], reliable=True)
+        self._topic = self._end.subscribe(orders["reads"])
+        self._own = self._end.topics[orders["publishes"]]
+        self._publisher = self._end.advertise(orders["publishes"], reliable=True)
 
     def is_ready(self) -> bool:
         """Return whether it reads a topic and has a reader."""
@@ -174,22 +174,22 @@ def _flood(node: HostileSwitch | HostileProxy, frames: list[bytes], rate: float,
 
 def main() -> None:
     """Take part, then flood until the time is over."""
-    reported: dict[str, Any] = json.loads(sys.argv[1])
-    node: HostileSwitch | HostileProxy = HostileProxy(reported) if "reads" in reported else HostileSwitch(reported)
+    orders: dict[str, Any] = json.loads(sys.argv[1])
+    node: HostileSwitch | HostileProxy = HostileProxy(orders) if "reads" in orders else HostileSwitch(orders)
     is_reported = list[bool]()
     signal.signal(signal.SIGUSR1, lambda *_: is_reported.append(True))
     with node.runtime.signals():
         if not node.runtime.run(node.is_ready, time.monotonic() + _READY_S):
             sys.exit("it did not come to take part")
-        make: Callable[[], _Frames] = getattr(node, reported["what"])
+        make: Callable[[], _Frames] = getattr(node, orders["what"])
         source, frames = make(), list[bytes]()
-        while len(frames) < reported["frames"]:
+        while len(frames) < orders["frames"]:
             frames += [frame for frame, _ in zip(source, range(100), strict=False)]
             node.runtime.step(time.monotonic())
         say(ready=True)
         while not is_reported and not node.runtime.is_stopped:
             node.runtime.step(time.monotonic() + 0.1)
-        sent, took_s = _flood(node, frames, reported["rate"], reported["seconds"])
+        sent, took_s = _flood(node, frames, orders["rate"], orders["seconds"])
         say(sent=sent, seconds=took_s)
 
 

@@ -7,7 +7,7 @@ import pytest
 from gdp.control.link_state import Scope
 from gdp.errors import DropReason, StatementError
 from gdp.limits import LINK_STATE_LEASE_S
-from gdp.switch import lsdb as capacity
+from gdp.switch import lsdb
 from gdp.switch.lsdb import LinkStateDatabase
 from tests.gdp.switch.net import AWAY, HOME, known, link, name, state
 
@@ -60,7 +60,7 @@ def test_the_digest_for_another_domain_leaves_our_inside_out() -> None:
 
 
 def test_a_full_database_refuses_whom_it_does_not_know(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(capacity, "LINK_STATES_MAX", 1)
+    monkeypatch.setattr(lsdb, "LINK_STATES_MAX", 1)
     states: LinkStateDatabase = known(state("a"))
     with pytest.raises(StatementError) as caught:
         states.put(state("b"), b"", 0.0)

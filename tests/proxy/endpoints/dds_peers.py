@@ -189,8 +189,8 @@ def _rclpy_peer() -> None:
     publishers, keep = {}, []
 
     def kind(name: str) -> type:
-        package, capacity, short = name.split("/")
-        found = getattr(importlib.import_module(f"{package}.{capacity}"), short)
+        package, subpackage, short = name.split("/")
+        found = getattr(importlib.import_module(f"{package}.{subpackage}"), short)
         assert isinstance(found, type)
         return found
 
