@@ -14,7 +14,7 @@ import queue
 import select
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import Final, TypeAlias
 
@@ -258,13 +258,10 @@ class Node:
     def _remind(self, look: GraphSnapshot) -> None:
         """Announce connections again that are missing for long, see ``reconnect``."""
         peers: dict[tuple[str, str], set[str]] = {}  # connected nodes by the other end's role and topic
-        ours: tuple[tuple[str, Mapping[int, Publisher | Subscriber]], ...] = (
-            ("subscribes", self._outlets),
-            ("publishes", self._inlets),
-        )
-        for role, subjects in ours:
-            for each in list(subjects.values()):
-                peers.setdefault((role, each.topic), set()).update(each.peers())
+        for outlet in list(self._outlets.values()):
+            peers.setdefault(("subscribes", outlet.topic), set()).update(outlet.peers())
+        for inlet in list(self._inlets.values()):
+            peers.setdefault(("publishes", inlet.topic), set()).update(inlet.peers())
         missing = {end for end in look.ends if end.node not in peers.get((end.role, end.name), {end.node})}
         for end in self._missing.due(missing, time.monotonic()):
             self._todo.put(partial(self._announce, end))
