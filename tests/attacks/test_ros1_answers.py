@@ -41,6 +41,17 @@ ANSWERS = [
 ]
 
 
+def _read_request(peer: socket.socket) -> None:
+    """Read a whole HTTP request: closing a socket with unread bytes would reset the connection under the response."""
+    with peer.makefile("rb") as request:
+        length = 0
+        while (line := request.readline()).strip():
+            key, _, value = line.partition(b":")
+            if key.lower() == b"content-length":
+                length = int(value)
+        request.read(length)
+
+
 @contextmanager
 def master(answer: bytes, head: bytes = b"HTTP/1.1 200 OK\r\nContent-Type: text/xml\r\n") -> Iterator[str]:
     """Serve one response to every request."""
@@ -53,7 +64,7 @@ def master(answer: bytes, head: bytes = b"HTTP/1.1 200 OK\r\nContent-Type: text/
                 except OSError:
                     return
                 with peer:
-                    peer.recv(65_536)
+                    _read_request(peer)
                     peer.sendall(head + f"Content-Length: {len(answer)}\r\n\r\n".encode() + answer)
 
         thread = threading.Thread(target=serve)
