@@ -100,6 +100,9 @@ if [[ "$extras" == "$dev" ]]; then
         RUNLEVEL=1 package redis-server "tests of RIBs that share a cluster start it"
     fi
     command -v softhsm2-util >/dev/null || package softhsm2 "tests keep keys in its tokens"
+    command -v wireguard-go >/dev/null || package wireguard-go "tests make tunnels with it; no kernel module is needed"
+    command -v nft >/dev/null || [[ -x /usr/sbin/nft ]] || package nftables "tests of NAT make it with nft"
+    command -v mmdebstrap >/dev/null || package mmdebstrap "tests boot a cloud machine from a minimal Debian"
     command -v openssl >/dev/null || package openssl "tests read our certificates with it"
 fi
 

@@ -53,6 +53,7 @@ class StatementType(str, Enum):
     REPLICAS = "replicas"
     OPEN = "open"  # switch or RIB to a RIB: a channel
     ACCEPT = "accept"
+    ENDPOINTS = "endpoints"  # of a switch: where it can be reached across IP networks
 
 
 _TYPES: Final[dict[Value, StatementType]] = {member.value: member for member in StatementType}
