@@ -35,6 +35,8 @@ __all__ = [
     "LinkAttribute",
     "Message",
     "NetlinkSocket",
+    "RefusedError",
+    "attribute",
     "listen",
     "messages",
     "nested",
@@ -57,7 +59,7 @@ _NLMSG_ERROR, _NLMSG_DONE = 2, 3
 _RTM_GETLINK: Final = 18
 _RTM_NEWQDISC, _RTM_GETQDISC = 36, 38
 _RTM_NEWTFILTER, _RTM_GETTFILTER = 44, 46
-_NLM_F_REQUEST, _NLM_F_DUMP = 0x1, 0x300
+_NLM_F_REQUEST, _NLM_F_ACK, _NLM_F_DUMP = 0x1, 0x4, 0x300
 _NESTED: Final = 0x8000  # NLA_F_NESTED
 _TCA_KIND, _TCA_OPTIONS, _TCA_BPF_NAME = 1, 2, 7
 _FOREVER_S: Final = 5.0  # the kernel replies at once; the limit only keeps a bug from blocking a node
@@ -72,6 +74,7 @@ class LinkAttribute(IntEnum):
     LINK = 5  # ifindex of the other end of a pair, in its namespace
     QDISC = 6
     LINKINFO = 18
+    IFALIAS = 20
     STATS64 = 23
     LINK_NETNSID = 37
     XDP = 43
@@ -101,8 +104,8 @@ class DeviceInfo(NamedTuple):
         return cls(family, ifindex, flags, nested(body[_INFO.size :]))
 
 
-class _RefusedError(LocalError):
-    """The kernel replied with an error."""
+class RefusedError(LocalError):
+    """The kernel replied with an error, of this ``errno``."""
 
     def __init__(self, number: int) -> None:
         super().__init__(f"netlink question: {os.strerror(number)}")
@@ -135,12 +138,10 @@ class NetlinkSocket:
 
     def link_named(self, ifname: str) -> list[Message]:
         """Return the message about the device of this name; none if it does not exist."""
-        name = ifname.encode() + b"\0"
-        body = _INFO.pack(socket.AF_UNSPEC, 0, 0, 0, 0)
-        body += _ATTRIBUTE.pack(_ATTRIBUTE.size + len(name), LinkAttribute.IFNAME) + name + bytes(-len(name) % 4)
+        body = _INFO.pack(socket.AF_UNSPEC, 0, 0, 0, 0) + attribute(LinkAttribute.IFNAME, ifname.encode() + b"\0")
         try:
             return self._ask(_RTM_GETLINK, body, 0)
-        except _RefusedError as error:
+        except RefusedError as error:
             if error.number in (errno.ENODEV, errno.ERANGE, errno.EINVAL):  # ERANGE, EINVAL: an invalid name
                 return []
             raise
@@ -157,12 +158,33 @@ class NetlinkSocket:
             body += _NUMBER.pack(namespace)
         try:
             answers = self._ask(_RTM_GETLINK, body, 0)
-        except _RefusedError as error:
+        except RefusedError as error:
             if error.number == errno.ENODEV:
                 return {}
             raise
         found = (DeviceInfo.from_body(each.body).attributes for each in answers if each.kind == RTM_NEWLINK)
         return next(found, {})
+
+    def change(self, kind: int, body: bytes, flags: int = 0) -> None:
+        """Send a request that changes something, and wait until the kernel has done so.
+
+        Args:
+            kind: ``RTM_`` type of the message.
+            body: the bytes after the netlink header.
+            flags: ``NLM_F_`` flags in addition to those of every request.
+
+        Raises:
+            RefusedError: the kernel refuses.
+        """
+        self._ask(kind, body, _NLM_F_ACK | flags)
+
+    def question(self, kind: int, body: bytes) -> list[Message]:
+        """Return the reply to a request for one object.
+
+        Raises:
+            RefusedError: the kernel refuses, or there is no such object.
+        """
+        return self._ask(kind, body, 0)
 
     def queues(self) -> list[tuple[int, int, dict[int, bytes]]]:
         """Return ifindex, parent and attributes of every queueing discipline of the namespace."""
@@ -205,7 +227,7 @@ class NetlinkSocket:
                 if message.kind in (_NLMSG_DONE, _NLMSG_ERROR):
                     number = _NUMBER.unpack_from(message.body)[0] if len(message.body) >= _NUMBER.size else 0
                     if number:
-                        raise _RefusedError(-number)
+                        raise RefusedError(-number)
                     return answers
                 answers.append(message)
             if answers and not is_dump:
@@ -243,6 +265,11 @@ def nested(body: bytes) -> dict[int, bytes]:
         found[kind & ~_NESTED] = body[at + _ATTRIBUTE.size : at + length]
         at += max(length, _ATTRIBUTE.size) + 3 & ~3
     return found
+
+
+def attribute(kind: int, value: bytes) -> bytes:
+    """Return an attribute with its padding; the value of a nested one is further attributes."""
+    return _ATTRIBUTE.pack(_ATTRIBUTE.size + len(value), kind) + value + bytes(-len(value) % 4)
 
 
 def listen(groups: int) -> socket.socket:

@@ -1,0 +1,4 @@
+"""Tunnels: WireGuard devices, VXLAN devices in them, and the MTU that they leave.
+
+I/O.
+"""

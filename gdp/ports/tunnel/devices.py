@@ -1,0 +1,207 @@
+"""Network devices, addresses and routes of tunnels, made and removed through netlink.
+
+I/O. Source: rtnetlink(7); ``include/uapi/linux/if_link.h``, ``if_addr.h``, ``rtnetlink.h``. Every device carries the
+alias of its switch. The alias tells the devices of a dead run of the same switch from those of other programs::
+
+    ifaddrmsg  family (1)  prefix length (1)  flags (1)  scope (1)  index (4)
+    rtmsg      family (1)  destination length (1)  source length (1)  tos (1)  table (1)  protocol (1)  scope (1)
+               type (1)  flags (4)
+"""
+
+from __future__ import annotations
+
+import errno
+import ipaddress
+import os
+import socket
+import struct
+import sys
+from contextlib import closing
+from typing import Final, NamedTuple
+
+from gdp.errors import LocalError
+from gdp.ports.netlink import DeviceInfo, LinkAttribute, NetlinkSocket, RefusedError, attribute, nested
+from gdp.ports.sockets import AS_ROOT
+
+__all__ = [
+    "Device",
+    "add_address",
+    "add_device",
+    "add_route",
+    "find_device",
+    "make_up",
+    "refusal_text",
+    "remove_device",
+    "remove_own_device",
+    "remove_route",
+    "set_alias",
+    "set_mtu",
+    "without_addresses",
+]
+
+_INFO: Final = struct.Struct("=BxHiII")
+_ADDRESS: Final = struct.Struct("=BBBBI")
+_ROUTE: Final = struct.Struct("=BBBBBBBBI")
+_NUMBER: Final = struct.Struct("=I")
+_RTM_NEWLINK, _RTM_DELLINK, _RTM_SETLINK = 16, 17, 19
+_RTM_NEWADDR, _RTM_NEWROUTE, _RTM_DELROUTE = 20, 24, 25
+_CREATE, _EXCLUSIVE = 0x400, 0x200  # NLM_F_CREATE, NLM_F_EXCL
+_IFF_UP: Final = 1
+_INFO_KIND, _INFO_DATA = 1, 2  # IFLA_INFO_KIND, IFLA_INFO_DATA
+_AF_SPEC, _ADDR_GEN_MODE, _MODE_NONE = 26, 8, 1  # IFLA_AF_SPEC, IFLA_INET6_ADDR_GEN_MODE, IN6_ADDR_GEN_MODE_NONE
+_IFA_ADDRESS, _IFA_LOCAL = 1, 2
+_IFA_F_NODAD: Final = 0x02  # the address follows from a name: a duplicate is an error that DAD would not find
+_RTA_DST, _RTA_OIF = 1, 4
+_TABLE_MAIN: Final = 254
+_PROTOCOL_STATIC: Final = 4
+_UNICAST: Final = 1
+_NESTED: Final = 0x8000  # NLA_F_NESTED
+
+
+class Device(NamedTuple):
+    """A device of this namespace.
+
+    Attributes:
+        kind: driver, such as ``tun`` or ``wireguard``; empty for a physical device.
+        data: attributes of the driver, by their number.
+    """
+
+    ifindex: int
+    ifname: str
+    mtu: int
+    alias: str
+    kind: str
+    data: dict[int, bytes]
+
+
+def find_device(ifname: str) -> Device | None:
+    """Return the device of this name, or None."""
+    with closing(NetlinkSocket()) as netlink:
+        for message in netlink.link_named(ifname):
+            info = DeviceInfo.from_body(message.body)
+            driver = nested(info.attributes.get(LinkAttribute.LINKINFO, b""))
+            return Device(
+                ifindex=info.ifindex,
+                ifname=ifname,
+                mtu=int.from_bytes(info.attributes.get(LinkAttribute.MTU, b""), sys.byteorder),
+                alias=_text(info.attributes.get(LinkAttribute.IFALIAS, b"")),
+                kind=_text(driver.get(_INFO_KIND, b"")),
+                data=nested(driver.get(_INFO_DATA, b"")),
+            )
+    return None
+
+
+def add_device(ifname: str, kind: str, data: bytes = b"", attributes: bytes = b"") -> None:
+    """Make a device.
+
+    Args:
+        data: attributes of its driver.
+        attributes: further attributes of the device.
+
+    Raises:
+        RefusedError: the kernel refuses.
+    """
+    driver = attribute(_INFO_KIND, kind.encode() + b"\0") + (attribute(_INFO_DATA | _NESTED, data) if data else b"")
+    body = _INFO.pack(socket.AF_UNSPEC, 0, 0, 0, 0) + attribute(LinkAttribute.IFNAME, ifname.encode() + b"\0")
+    body += attributes + attribute(LinkAttribute.LINKINFO | _NESTED, driver)
+    _change(_RTM_NEWLINK, body, _CREATE | _EXCLUSIVE)
+
+
+def set_alias(ifindex: int, alias: str) -> None:
+    """Set the alias of a device. Raises ``RefusedError``."""
+    _set(ifindex, attribute(LinkAttribute.IFALIAS, alias.encode()))
+
+
+def set_mtu(ifindex: int, mtu: int) -> None:
+    """Set the MTU of a device, in bytes. Raises ``RefusedError``."""
+    _set(ifindex, attribute(LinkAttribute.MTU, _NUMBER.pack(mtu)))
+
+
+def make_up(ifindex: int) -> None:
+    """Switch a device on. Raises ``RefusedError``."""
+    _change(_RTM_SETLINK, _INFO.pack(socket.AF_UNSPEC, 0, ifindex, _IFF_UP, _IFF_UP))
+
+
+def without_addresses(ifindex: int) -> None:
+    """Keep the kernel from giving a device an IPv6 address of its own; it then sends nothing by itself."""
+    inet6 = attribute(socket.AF_INET6 | _NESTED, attribute(_ADDR_GEN_MODE, bytes([_MODE_NONE])))
+    _set(ifindex, attribute(_AF_SPEC | _NESTED, inet6))
+
+
+def remove_device(ifindex: int) -> None:
+    """Remove a device; does nothing if it is gone. Raises ``RefusedError``."""
+    try:
+        _change(_RTM_DELLINK, _INFO.pack(socket.AF_UNSPEC, 0, ifindex, 0, 0))
+    except RefusedError as error:
+        if error.number != errno.ENODEV:
+            raise
+
+
+def remove_own_device(ifname: str, alias: str) -> bool:
+    """Remove the device of this name if it carries this alias; return whether there was one.
+
+    Raises:
+        LocalError: a device of that name belongs to another program; it is left alone.
+    """
+    device = find_device(ifname)
+    if device is None:
+        return False
+    if device.alias != alias:
+        raise LocalError(f"the device {ifname} exists and is not ours; remove it with: ip link del {ifname}")
+    remove_device(device.ifindex)
+    return True
+
+
+def add_address(ifindex: int, address: str) -> None:
+    """Add an IPv6 address without a prefix to a device; does nothing if it has it. Raises ``RefusedError``."""
+    packed = ipaddress.IPv6Address(address).packed
+    body = _ADDRESS.pack(socket.AF_INET6, 128, _IFA_F_NODAD, 0, ifindex)
+    _change_once(_RTM_NEWADDR, body + attribute(_IFA_LOCAL, packed) + attribute(_IFA_ADDRESS, packed))
+
+
+def add_route(ifindex: int, address: str) -> None:
+    """Lead an IPv6 address through a device; routes of it through other devices stay. Raises ``RefusedError``."""
+    _change_once(_RTM_NEWROUTE, _route(ifindex, address, _PROTOCOL_STATIC))
+
+
+def remove_route(ifindex: int, address: str) -> None:
+    """Undo ``add_route``; does nothing if there is none. Raises ``RefusedError``."""
+    try:
+        _change(_RTM_DELROUTE, _route(ifindex, address, _PROTOCOL_STATIC))
+    except RefusedError as error:
+        if error.number not in (errno.ESRCH, errno.ENODEV):
+            raise
+
+
+def refusal_text(error: RefusedError) -> str:
+    """Return what the kernel refused, and what to do if this user lacks a right."""
+    if error.number in (errno.EPERM, errno.EACCES):
+        return f"not permitted; {AS_ROOT}"
+    return os.strerror(error.number)
+
+
+def _route(ifindex: int, address: str, protocol: int) -> bytes:
+    body = _ROUTE.pack(socket.AF_INET6, 128, 0, 0, _TABLE_MAIN, protocol, 0, _UNICAST, 0)
+    destination = attribute(_RTA_DST, ipaddress.IPv6Address(address).packed)
+    return body + destination + attribute(_RTA_OIF, _NUMBER.pack(ifindex))
+
+
+def _set(ifindex: int, attributes: bytes) -> None:
+    _change(_RTM_SETLINK, _INFO.pack(socket.AF_UNSPEC, 0, ifindex, 0, 0) + attributes)
+
+
+def _change_once(kind: int, body: bytes) -> None:
+    try:
+        _change(kind, body, _CREATE)
+    except RefusedError as error:
+        if error.number != errno.EEXIST:
+            raise
+
+
+def _change(kind: int, body: bytes, flags: int = 0) -> None:
+    with closing(NetlinkSocket()) as netlink:
+        netlink.change(kind, body, flags)
+
+
+def _text(value: bytes) -> str:
+    return value.rstrip(b"\0").decode(errors="replace")

@@ -1,0 +1,123 @@
+"""Owner's end of a keeper: starts the process, reads its reports, and ends it.
+
+I/O. The process is started before the owner confines itself. Afterwards the owner may neither start programs nor send
+signals, so it ends the keeper by closing the socket pair.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import socket
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from gdp.errors import LocalError
+
+__all__ = ["KeeperProcess", "Report"]
+
+log = logging.getLogger(__name__)
+
+_MODULE: Final = "gdp.ports.tunnel.keeper"
+_ROOT: Final = Path(__file__).resolve().parents[3]
+_START_S: Final = 20.0
+_END_S: Final = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """Report of a keeper.
+
+    Args:
+        event: ``ready``, ``failed``, ``died`` or ``restarted``; ``lost`` is the end of the keeper itself.
+        backend: of ``ready``.
+        text: why the device is not the kernel's (``ready``), or what happened.
+        is_same: of ``restarted``: the device is still the same, so its addresses and routes stayed.
+    """
+
+    event: str
+    backend: str = ""
+    text: str = ""
+    is_same: bool = True
+
+
+class KeeperProcess:
+    """A keeper of one device.
+
+    Args:
+        ifname: name of the device.
+        alias: of all devices of this switch.
+        backend: ``auto``, ``kernel`` or ``wireguard-go``.
+
+    Raises:
+        LocalError: the device cannot be made; the text says why and what to do.
+    """
+
+    def __init__(self, ifname: str, alias: str, backend: str) -> None:
+        self._socket, theirs = socket.socketpair()
+        self._buffer = b""
+        self._is_lost = False
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", _MODULE, ifname, alias, backend, str(os.getpid())],
+                stdin=theirs.fileno(),
+                env={**os.environ, "PYTHONPATH": os.pathsep.join([str(_ROOT), *filter(None, sys.path)])},
+                start_new_session=True,  # Ctrl-C in a terminal goes to the owner only, which ends the keeper in order
+            )
+        self._socket.settimeout(_START_S)
+        first = Report("lost")
+        with contextlib.suppress(TimeoutError):
+            while not (reports := self._received()):
+                pass
+            first = reports[0]
+        self._socket.setblocking(False)
+        if first.event != "ready":
+            self.close()
+            raise LocalError(first.text or f"tunnel {ifname}: the process that keeps the device did not start")
+        self.ready = first
+
+    def fileno(self) -> int:
+        """Return the descriptor that is readable when there are reports."""
+        return self._socket.fileno()
+
+    @property
+    def is_lost(self) -> bool:
+        """Return whether the keeper ended; the device does not work then."""
+        return self._is_lost
+
+    def reports(self) -> list[Report]:
+        """Return the reports since the last call, without waiting."""
+        try:
+            return [] if self._is_lost else self._received()
+        except BlockingIOError:
+            return []
+
+    def close(self) -> None:
+        """End the keeper, and return when the device is gone."""
+        self._socket.close()
+        try:
+            self._process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            log.error("the keeper of a tunnel device does not end pid=%d", self._process.pid)
+
+    def _received(self) -> list[Report]:
+        data = self._socket.recv(1 << 16)
+        if not data:
+            self._is_lost = True
+            return [Report("lost")]
+        *lines, self._buffer = (self._buffer + data).split(b"\n")
+        return [_report(json.loads(line)) for line in lines]
+
+
+def _report(fields: dict[str, object]) -> Report:
+    return Report(
+        str(fields["event"]),
+        str(fields.get("backend", "")),
+        str(fields.get("text", fields.get("reason", ""))),
+        bool(fields.get("is_same", True)),
+    )
