@@ -189,6 +189,8 @@ def _furnish(folder: Path, text: str) -> None:
         (folder / file).write_bytes(SigningKey.generate().public.to_pem())
     for key in {"identity", "delegations", "revocations"} & example.keys():
         (folder / example[key]).mkdir(parents=True, exist_ok=True)
+    if "peers" in (links := example.get("links", {})):
+        (folder / links["peers"]).mkdir(parents=True, exist_ok=True)
 
 
 def _every_example() -> Iterator[Any]:

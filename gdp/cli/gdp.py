@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import typer
 
 from gdp.cli import audit, cert, control, delegate, domain, key, keygen
+from gdp.cli.endpoints import endpoints
 from gdp.cli.lab import lab
 from gdp.cli.name import name
 from gdp.cli.version import Version
@@ -34,6 +35,7 @@ def _gdp(version: Version = False) -> None:
 
 app.command("name", no_args_is_help=True)(name)
 app.command("lab", no_args_is_help=True)(lab)
+app.command("endpoints", no_args_is_help=True)(endpoints)
 for command in (control.reload, control.status, control.drain):
     app.command(command.__name__, no_args_is_help=True)(command)
 app.add_typer(keygen.app, name="keygen")

@@ -1,7 +1,7 @@
 """Endpoints of tunnels: where a node can be reached across IP networks, and what follows from its name alone.
 
 Sans-I/O. A tunnel is VXLAN (RFC 7348) inside WireGuard. Its inner IPv6 address is a unique local one (RFC 4193) that
-follows from the node's name, so nobody configures it and two nodes never share it by mistake.
+follows from the node's name, so it needs no configuration, and two nodes never share it by mistake.
 """
 
 from __future__ import annotations

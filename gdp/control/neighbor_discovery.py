@@ -521,6 +521,13 @@ class HelloProtocol:
             return []
         return self._lose(port, list(port.neighbours.values()), NeighbourEvent.LINK_LOST)
 
+    def remove_port(self, index: int) -> None:
+        """Forget a port that is down; does nothing if no port has this index."""
+        self._next_s = None
+        self.ports.pop(index, None)
+        self._timings.pop(index, None)
+        self._reported_addresses.pop(index, None)
+
     def drop_silent(self, now_s: float) -> list[Change]:
         """Remove silent neighbours; return them. What waits at the sockets must have been received before."""
         if float("-inf") < self._due_s < now_s - _LATE_S:  # a neighbour to remove is due at once: that is no lateness

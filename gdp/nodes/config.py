@@ -11,7 +11,10 @@ from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
 
+from gdp.control.endpoint_record import UPLINKS_MAX
+from gdp.control.endpoints import Endpoint
 from gdp.control.hello import INTERVAL_MAX_MS, Timing
+from gdp.errors import LocalError
 from gdp.limits import (
     ADVERTISEMENT_LEASE_S,
     DEAD_S,
@@ -40,7 +43,7 @@ from gdp.ports.kernel.abi import ENTRIES_DEFAULT
 from gdp.stores.cluster_address import ClusterAddress
 from gdp.stores.files import read_private
 
-__all__ = ["DataPlane", "LeaseSeconds", "PortConfig", "Quotas", "RibConfig", "SwitchConfig"]
+__all__ = ["DataPlane", "LeaseSeconds", "LinksConfig", "PortConfig", "Quotas", "RibConfig", "SwitchConfig"]
 
 
 def _server(text: str) -> str:
@@ -50,10 +53,19 @@ def _server(text: str) -> str:
     return text
 
 
+def _endpoint(text: str) -> str:
+    try:
+        return Endpoint.from_text(text).to_text()
+    except LocalError as error:
+        raise ValueError(f"{error}; the address is numeric") from error
+
+
+EndpointText = Annotated[str, AfterValidator(_endpoint)]
 ServerText = Annotated[str, AfterValidator(_server)]
 DataPlane = Literal["auto", "kernel", "raw", "scapy"]
 
 COST_DEFAULT: Final = 10
+LISTEN_DEFAULT: Final = 51_820  # UDP; the usual port of WireGuard
 _KEEPALIVE_MIN_MS: Final = 10
 _ATTACH_MAX: Final = 13  # leaves space for the "-s" of the switch's end
 
@@ -91,6 +103,29 @@ class PortConfig(Section):
     detect_multiplier: DetectMultiplier | None = None
 
 
+TunnelBackend = Literal["auto", "kernel", "wireguard-go"]
+
+
+class LinksConfig(Section):
+    """Tunnels across IP networks: VXLAN inside WireGuard, one for each peer.
+
+    ``peers`` holds an endpoint record for each peer, in files ``*.endpoints``; files may come and go. ``public`` states
+    where this switch can be reached from everywhere: it is a border, and others dial it.
+    """
+
+    listen: int = Field(default=LISTEN_DEFAULT, ge=0, le=65_535)
+    public: Annotated[tuple[EndpointText, ...], Unique] = ()
+    uplinks: Annotated[tuple[Ifname, ...], Unique] = Field(default=(), max_length=UPLINKS_MAX)
+    peers: Directory | None = None
+    direct: bool = True
+    backend: TunnelBackend = "auto"
+    keepalive_s: int = Field(default=25, ge=1, le=65_535)
+
+    def public_endpoints(self) -> tuple[Endpoint, ...]:
+        """Return the stated endpoints."""
+        return tuple(map(Endpoint.from_text, self.public))
+
+
 class SwitchConfig(Section):
     """``switch.yaml``.
 
@@ -103,6 +138,7 @@ class SwitchConfig(Section):
     domain: Domain
     ports: tuple[PortConfig, ...] = ()
     attach: Annotated[tuple[AttachName, ...], Unique] = ()
+    links: LinksConfig | None = None
     data_plane: DataPlane = "auto"
     table_max: int = Field(default=ENTRIES_DEFAULT, ge=1, le=TABLE_MAX)
     revocations: Directory | None = None

@@ -44,6 +44,7 @@ def confine_switch(config: SwitchConfig, plane: str) -> None:
     """
     again = watched_folders(config.identity, config.domain)
     again += () if config.revocations is None else (config.revocations,)
+    again += () if config.links is None or config.links.peers is None else (config.links.peers,)
     state = () if config.state is None else (config.state,)
     kept = (*state, *_folder_of(config.control_socket), *_audits(config.audit), *config.token_folders)
     is_kernel = plane == "kernel"

@@ -126,6 +126,27 @@ class Runtime:
             self.unwatch(server)
             server.close()
 
+    def add_port(self, ifname: str, cost: int) -> int:
+        """Begin to use a device, which may be missing yet; return its port index.
+
+        Raises:
+            LocalError: as ``Plane.add_port``.
+        """
+        self._costs[ifname] = cost
+        index = self._plane.add_port(ifname, may_be_absent=True)
+        self._add(index, now())
+        self._deadline_s = time.monotonic()
+        return index
+
+    def remove_port(self, index: int) -> None:
+        """Stop using a port; its neighbours are lost at once."""
+        self._machine.port_changed(index, False, now())
+        port = self._plane.ports.get(index)
+        if port is not None:
+            self._costs.pop(port.ifname, None)
+        self._plane.remove_port(index)
+        self._deadline_s = time.monotonic()
+
     def drain(self, is_finished: Callable[[], bool], timeout_s: float) -> None:
         """End ``run`` when ``is_finished`` and nothing is left to send, or after ``timeout_s`` seconds."""
         self._drain_until_s = time.monotonic() + timeout_s

@@ -21,6 +21,7 @@ from gdp.nodes.control_socket import ControlHandlers
 from gdp.nodes.control_status import node_status
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.data_plane import Chosen, choose_plane
+from gdp.nodes.links import LINKS_LOOK_S, TunnelLinks, open_underlays
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
 from gdp.nodes.revocation_upkeep import load_revocations
@@ -31,9 +32,11 @@ from gdp.nodes.uplink import refuse_loopback
 from gdp.nodes.veth import attach_pairs, switch_end
 from gdp.ports.plane import MAC_BYTES, Plane
 from gdp.ports.rtnetlink import LinkMonitor
+from gdp.ports.tunnel.wireguard import WireGuardDevice
 from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table
 from gdp.telemetry.sources import Sources, count_list
+from gdp.trust.domain import Policy
 
 __all__ = ["run_switch"]
 
@@ -56,8 +59,8 @@ def run_switch(
             been touched then.
     """
     identity, policy = load_member(config.identity, config.domain, Role.SWITCH)
-    if not config.ports and not config.attach:
-        raise LocalError("a switch needs at least one port: --iface, or ports in the configuration")
+    if not config.ports and not config.attach and config.links is None:
+        raise LocalError("a switch needs at least one port: --iface, or ports or links in the configuration")
     refuse_loopback(ifaces := [port.iface for port in config.ports])
     table = Table()
     settings = NodeSettings(
@@ -78,24 +81,23 @@ def run_switch(
         stack.enter_context(attach_pairs(config.attach, identity.name, _widest(ifaces)))
         wanted = [port.iface for port in config.ports if not port.optional]
         devices = [*wanted, *map(switch_end, config.attach)]
+        underlays = () if config.links is None else stack.enter_context(open_underlays(config.links, identity))
         chosen = choose_plane(config.data_plane, devices, table, config.table_max)
         plane = chosen.plane
         stack.callback(plane.close)
-        for iface in ifaces:
-            if iface not in wanted:
-                plane.add_port(iface, may_be_absent=True)
-        for port in config.ports:
-            index = next(each.index for each in plane.ports.values() if each.ifname == port.iface)
-            switch.hello_protocol.set_timing(index, config.timing_of(port))
+        _add_ports(config, plane, switch)
         optional = {port.index for port in plane.ports.values() if port.ifname in ifaces and port.ifname not in wanted}
         runtime = Runtime(switch, plane, {port.iface: port.cost for port in config.ports})
         attachments = {port.index for port in plane.ports.values() if port.ifname not in ifaces}
+        links = _open_links(config, identity, policy, switch, runtime, underlays)
         node_log = NodeLog(
             switch.hello_protocol,
             policy,
             plane,
             switch.boundary,
-            lambda now_s: switch.waits(attachments | _absent(plane, optional), now_s),
+            lambda now_s: switch.waits(
+                attachments | _absent(plane, optional) | (frozenset() if links is None else links.ports), now_s
+            ),
             rib=lambda: switch.rib,
             on_wait=on_wait,
         )
@@ -110,13 +112,14 @@ def run_switch(
 
         stack.enter_context(runtime.signals(reload))
         sources = _sources(switch, chosen, node_log)
-        handlers = _control_handlers(identity, switch, chosen, runtime, reload, sources)
+        handlers = _control_handlers(identity, switch, chosen, runtime, reload, sources, links)
         stack.enter_context(runtime.control(config.control_socket or control_path(identity.name), handlers))
         _revoke(switch, config.revocations)
         keep_audit(config.audit, policy.audit, switch.drops, runtime, stack)
         if config.sandbox:
             confine_switch(config, chosen.name)
         revocations.start(runtime)
+        _start_links(links, runtime, stack)
         if config.metrics is not None:
             stack.callback(_serve_metrics(sources, config.metrics.port))
         said = identity.name.short, identity.role.value, chosen.name, len(plane.ports)
@@ -125,6 +128,37 @@ def run_switch(
             log.warning("not the best data plane plane=%s reason=%s", chosen.name, chosen.reason)
         ready(identity, chosen.name, chosen.reason)
         runtime.run()
+
+
+def _add_ports(config: SwitchConfig, plane: Plane, switch: SwitchCore) -> None:
+    """Add the optional ports, and set the keepalive timing of each configured one."""
+    for port in config.ports:
+        if port.optional:
+            plane.add_port(port.iface, may_be_absent=True)
+        index = next(each.index for each in plane.ports.values() if each.ifname == port.iface)
+        switch.hello_protocol.set_timing(index, config.timing_of(port))
+
+
+def _start_links(links: TunnelLinks | None, runtime: Runtime, stack: contextlib.ExitStack) -> None:
+    if links is not None:
+        runtime.every(LINKS_LOOK_S, links.look)
+        stack.callback(links.close)
+
+
+def _open_links(
+    config: SwitchConfig,
+    identity: Identity,
+    policy: Policy,
+    switch: SwitchCore,
+    runtime: Runtime,
+    underlays: tuple[WireGuardDevice, ...],
+) -> TunnelLinks | None:
+    """Return the tunnels of a switch; None: none are configured."""
+    if config.links is None:
+        return None
+    return TunnelLinks(
+        config=config.links, identity=identity, policy=policy, switch=switch, runtime=runtime, underlays=underlays
+    )
 
 
 def _serve_metrics(sources: Sources, port: int) -> Callable[[], None]:
@@ -143,13 +177,20 @@ def _control_handlers(
     runtime: Runtime,
     reload: Callable[[], None],
     sources: Sources,
+    links: TunnelLinks | None,
 ) -> ControlHandlers:
     begun_s = now().mono_s
 
     def status() -> dict[str, object]:
         """Return the JSON fields of this switch."""
         neighbours = len(list(switch.hello_protocol.all_up()))
-        more = {"data_plane": chosen.name, "ports": len(chosen.plane.ports), "neighbours": neighbours}
+        more: dict[str, object] = {
+            "data_plane": chosen.name,
+            "ports": len(chosen.plane.ports),
+            "neighbours": neighbours,
+        }
+        if links is not None:
+            more["links"] = links.status(now())
         return node_status(identity, sources, uptime_s=now().mono_s - begun_s, **more)
 
     return ControlHandlers(
