@@ -34,10 +34,12 @@ __all__ = ["Action", "Close", "DirectTunnels", "Open", "Retry", "Slot", "slots_b
 
 SLOT_S: Final = 1.0  # each pair is tried for this time
 _PAIRS_MAX: Final = 4  # of one type
-_PAUSE_FIRST_S: Final = 2.0  # after the first round; it doubles
+_ROUNDS_AT_ONCE: Final = 3  # before the first pause: the first packet of one end opens its NAT for the other's second
+_PAUSE_FIRST_S: Final = 2.0  # it doubles with each round
 _PAUSE_MAX_S: Final = 60.0
 _JITTER: Final = 0.25  # of a pause, up or down
 _RECOVER_S: Final = 1.0  # a tunnel that was up may recover by itself: WireGuard follows a peer that moves
+_MOVED_S: Final = 5.0  # ... but not if a record has changed so shortly before: an end has moved
 _HOLD_S: Final = 2.5  # after a handshake, for the hello protocol
 _REDUNDANT_S: Final = 30.0  # a tunnel beside a local link is closed after this time
 _IPV4_PRIVATE_BITS: Final = 16  # two private addresses with this prefix may be in one network
@@ -63,8 +65,8 @@ class Retry(NamedTuple):
     """Send a handshake to another candidate, or to the same once more; None: only configure this pair of uplinks.
 
     Pairs of uplinks that were tried before stay configured until ``Close``. WireGuard repeats a handshake to a peer
-    after 5 s at the earliest, so that the peer must be replaced. It must not be replaced if it has just completed a
-    handshake: ``DirectTunnels.answered`` then delays the next attempt. Arguments as in ``Open``.
+    after 5 s at the earliest, so that the peer must be replaced. That ends its session: report a completed handshake by
+    ``DirectTunnels.answered``, which delays the next attempt. Arguments as in ``Open``.
     """
 
     record: EndpointRecord
@@ -178,6 +180,7 @@ class _Attempt:
     round: int = 0
     configured: set[tuple[int, int]] = field(default_factory=set)  # pairs of uplinks
     is_up: bool = False
+    changed_s: float = float("-inf")  # when either record changed
     linked_s: float | None = None  # since when there is another link to the peer
 
 
@@ -265,7 +268,7 @@ class DirectTunnels:
         attempt.record = record
         if not is_changed:
             return
-        attempt.slots = slots_between(own, record)
+        attempt.slots, attempt.changed_s = slots_between(own, record), now_s
         if is_rekeyed and attempt.configured:
             actions.append(Close(record.name))
             attempt.configured.clear()
@@ -276,7 +279,8 @@ class DirectTunnels:
     @staticmethod
     def _watch(attempt: _Attempt, now_s: float, *, is_up: bool, is_linked: bool) -> None:
         if attempt.is_up and not is_up:
-            attempt.due_s, attempt.at, attempt.round = now_s + _RECOVER_S, 0, 0
+            wait_s = 0.0 if now_s - attempt.changed_s <= _MOVED_S else _RECOVER_S
+            attempt.due_s, attempt.at, attempt.round = now_s + wait_s, 0, 0
         attempt.is_up = is_up and bool(attempt.configured)
         if not is_linked:
             attempt.linked_s = None
@@ -316,8 +320,11 @@ class DirectTunnels:
 
     def _pause_s(self, peer: Name, round_: int) -> float:
         """Return the pause after a round, the same at both ends."""
+        doublings = round_ + 1 - _ROUNDS_AT_ONCE
+        if doublings < 0:
+            return 0.0
         draw = int.from_bytes(self._hash(peer, round_.to_bytes(4, "big"))[:4], "big") / (1 << 32)
-        pause_s = min(_PAUSE_FIRST_S * 2.0 ** min(round_, 16), _PAUSE_MAX_S)
+        pause_s = min(_PAUSE_FIRST_S * 2.0 ** min(doublings, 16), _PAUSE_MAX_S)
         return pause_s * (1 - _JITTER + 2 * _JITTER * draw)
 
     def _rank(self, peer: Name) -> bytes:

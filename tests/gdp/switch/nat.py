@@ -17,7 +17,7 @@ from enum import Enum
 from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
 from gdp.control.endpoints import Endpoint
 from gdp.names import Name
-from gdp.switch.direct_tunnels import Close, DirectTunnels, Retry
+from gdp.switch.direct_tunnels import Close, DirectTunnels
 
 BORDER = Endpoint("203.0.113.1", 51_820)
 MAPPING_S = 30.0
@@ -90,7 +90,7 @@ class End:
         self.endpoint: Endpoint | None = None
         self.offer = 0
         self.sessions: deque[int] = deque(maxlen=3)  # the newest last
-        self.sent_s = self.heard_s = self.answered_s = float("-inf")
+        self.sent_s = self.heard_s = float("-inf")
         self.is_heard = False
 
     def observe(self) -> EndpointRecord:
@@ -122,7 +122,7 @@ class End:
                 self.sessions.clear()
                 continue
             self.is_configured = True
-            if action.candidate is None or (isinstance(action, Retry) and now_s - self.answered_s < 2.5):
+            if action.candidate is None:
                 continue
             self.endpoint = action.candidate.endpoint
             self.sessions.clear()
@@ -152,7 +152,7 @@ class End:
         if packet.kind == "response" and packet.session != self.offer:
             return
         self.sessions.append(packet.session)
-        self.endpoint, self.answered_s, self.heard_s, self.is_heard = source, now_s, now_s, False
+        self.endpoint, self.heard_s, self.is_heard = source, now_s, False
         self.tunnels.answered(next(iter(self.records), self.name), now_s)
         if packet.kind == "init":
             self.world.send(self, source, Packet("response", packet.session))
