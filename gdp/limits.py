@@ -112,6 +112,14 @@ RIB_WATCHES_MAX: Final = 500_000
 # of responses that one sender's queries may cause at a RIB; some 2,000 responses
 ANSWER_BYTES_PER_S: Final = 4.0 * (1 << 20)
 ANSWER_BYTES_BURST: Final = 64.0 * (1 << 20)  # ... at once: all that a switch queries at a RIB that is new
+ENDPOINT_LEASE_S: Final = 60.0  # for which a RIB keeps an endpoint record; renewed after a third
+ENDPOINT_RECORDS_MAX: Final = 8_192  # at one RIB, one of each switch
+ENDPOINT_RECORDS_OF_OTHERS_MAX: Final = 2_048  # ... of other domains
+ENDPOINT_RECORDS_PER_S: Final = 4.0  # of one switch that a RIB verifies
+ENDPOINT_RECORDS_BURST: Final = 16.0
+ENDPOINT_QUERIES_PER_S: Final = 8.0  # of one switch or RIB
+ENDPOINT_QUERIES_BURST: Final = 64.0
+DIRECT_TUNNELS_MAX: Final = 32  # of one switch to others that are behind a NAT, too
 LINK_STATES_PER_S: Final = 10.0  # of one origin that are accepted, and flooded
 LINK_STATES_BURST: Final = 100.0
 

@@ -9,6 +9,7 @@ import hashlib
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
+from gdp.control.endpoints import Endpoint
 from gdp.crypto.exchange import EXCHANGE_KEY_BYTES
 from gdp.crypto.fields import Fields
 from gdp.crypto.keys import SigningKey
@@ -29,6 +30,7 @@ __all__ = [
     "MULTIPLIER_MAX",
     "NONCE_BYTES",
     "NO_KEEPALIVES",
+    "OBSERVED_MAX",
     "RTCERTS_MAX",
     "Hello",
     "Timing",
@@ -43,6 +45,7 @@ COOKIE_BYTES: Final = 16
 HEARD_MAX: Final = 128  # NEIGHBOURS_MAX of a port, and as many that have not proved themselves yet
 CONFLICTS_MAX: Final = 32
 COOKIES_MAX: Final = 16
+OBSERVED_MAX: Final = 16
 HELLO_MAX_BYTES: Final = 10 << 10  # a certificate, ``RTCERTS_MAX`` RtCerts and all nonces fit
 RTCERTS_MAX: Final = 8
 INTERVAL_MAX_MS: Final = 60_000
@@ -95,6 +98,7 @@ class Hello:
         rtcerts: of a RIB, one for each switch that it receives here: permission to attract its traffic.
         conflicts: echoes of those here whose identity another node has, too; those not in ``heard`` are refused.
         cookies: for each receiver that required one, the nonce of its port and the tag that proves the cookie.
+        observed: on a tunnel, for each receiver the nonce of its port, and its endpoint as the sender sees it.
     """
 
     nonce: bytes
@@ -109,6 +113,7 @@ class Hello:
     conflicts: tuple[bytes, ...] = ()
     rtcerts: tuple[bytes, ...] = ()
     cookies: tuple[tuple[bytes, bytes], ...] = ()
+    observed: tuple[tuple[bytes, Endpoint], ...] = ()
 
     def to_wire(self, signer: Name, key: SigningKey) -> bytes:
         """Return the signed statement."""
@@ -125,6 +130,7 @@ class Hello:
             "u": list(self.conflicts[:CONFLICTS_MAX]),
             "r": list(self.rtcerts[:RTCERTS_MAX]),
             "y": [asker + tag for asker, tag in self.cookies[:COOKIES_MAX]],
+            "o": [nonce + endpoint.to_wire() for nonce, endpoint in self.observed[:OBSERVED_MAX]],
         }
         return sign(StatementType.HELLO, body, signer, key)
 
@@ -147,7 +153,18 @@ class Hello:
                 (each[:NONCE_BYTES], each[NONCE_BYTES:])
                 for each in fields.byte_strings("y", COOKIES_MAX, NONCE_BYTES + COOKIE_BYTES)
             ),
+            observed=_observed(fields),
         )
+
+
+def _observed(fields: Fields) -> tuple[tuple[bytes, Endpoint], ...]:
+    try:
+        return tuple(
+            (each[:NONCE_BYTES], Endpoint.from_wire(each[NONCE_BYTES:]))
+            for each in (fields.byte_strings("o", OBSERVED_MAX) if "o" in fields else ())
+        )
+    except ValueError as error:
+        raise StatementError(DropReason.MALFORMED, "an observed endpoint") from error
 
 
 def _timing(fields: Fields) -> Timing:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gdp.control.admission import Admission
+from gdp.control.endpoints import Endpoint
 from gdp.control.hello import echo_of
 from gdp.control.join import Join
 from gdp.control.neighbour import Neighbour, NeighbourState
@@ -56,6 +57,7 @@ class HelloPort:
     joins: dict[bytes, ReplayWindow] = field(default_factory=dict)
     said_mtus: dict[Name, int] = field(default_factory=dict)  # what each neighbour's end accepts
     addresses: dict[bytes, None] = field(default_factory=dict)  # of neighbours, former ones too; the last proven last
+    observed: dict[Name, Endpoint] = field(default_factory=dict)  # where this end of a tunnel sees its neighbours
     strangers: Strangers = field(default_factory=Strangers)  # nodes whose hellos were refused
 
     @property

@@ -32,6 +32,7 @@ from gdp.control.admission import (
     read_cookie,
     seal_cookie,
 )
+from gdp.control.endpoints import Endpoint
 from gdp.control.fragments import ControlFragmenter, ControlReassembler
 from gdp.control.hello import (
     DIGEST_BYTES,
@@ -177,6 +178,24 @@ class HelloProtocol:
         found = on.neighbours.get(name) if on is not None else None
         return found if found is not None and found.state is NeighbourState.UP else None
 
+    def set_observed(self, index: int, name: Name, endpoint: Endpoint | None) -> None:
+        """Report to a neighbour on a tunnel's port the endpoint at which this end sees it; None: it is unknown.
+
+        A change is sent at once. A node that is no neighbour there is ignored.
+        """
+        port = self.ports.get(index)
+        if port is None or self.neighbour(index, name) is None or port.observed.get(name) == endpoint:
+            return
+        port.observed.pop(name, None)
+        if endpoint is not None:
+            port.observed[name] = endpoint
+        self._next_s = None
+        port.hurry(port.said_s + ANSWER_S)
+
+    def observed_addresses(self) -> dict[tuple[int, Name], Endpoint]:
+        """Return our own endpoints as neighbours that are up see them, by port and neighbour."""
+        return {(n.port, n.name): n.observed for n in self.all_up() if n.observed is not None}
+
     def poll_addresses(self) -> Mapping[int, frozenset[bytes]]:
         """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
         if not self._has_moved:
@@ -292,6 +311,7 @@ class HelloProtocol:
         known.sequence, known.digest, known.greeted_s = hello.sequence, hello.digest, now.mono_s
         known.member, known.checked_s, known.incarnation_id = member, now.mono_s, hello.incarnation_id
         known.role = member.role  # a root may have changed a switch into a leaf
+        known.observed = next((endpoint for nonce, endpoint in hello.observed if nonce == port.nonce), None)
         had_proof, known.proof = known.proof is not None, proof
         self._note_clash(port, known, hello, now.mono_s)
         self._alive(known, now.mono_s)
@@ -666,6 +686,11 @@ class HelloProtocol:
                 for each in port.neighbours.values()
                 if each.cookie
             ),
+            observed=tuple(
+                (each.nonce, port.observed[each.name])
+                for each in port.neighbours.values()
+                if each.name in port.observed and each.is_proven
+            ),
         )
         return self._fragmenter.split(Kind.HELLO, hello.to_wire(identity.name, identity.key), port.hello_mtu)
 
@@ -680,6 +705,7 @@ class HelloProtocol:
     def _lose(self, port: HelloPort, lost: list[Neighbour], event: NeighbourEvent) -> list[Change]:
         for neighbour in lost:
             del port.neighbours[neighbour.name], port.said_mtus[neighbour.name]
+            port.observed.pop(neighbour.name, None)
             port.end(neighbour)
         return [change for neighbour in lost if (change := self._step(neighbour, event)) is not None]
 

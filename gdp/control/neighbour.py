@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
+from gdp.control.endpoints import Endpoint
 from gdp.control.hello import INCARNATION_BYTES, echo_of
 from gdp.control.keepalive import KeepaliveSession
 from gdp.crypto.certificates import Membership, Role
@@ -88,6 +89,7 @@ class Neighbour:
     refuses_us: bool = False  # its last hello reported that an older node has our identity
     is_proven: bool = False  # its present session has echoed our nonce: it is on this link now
     cookie: bytes = b""  # received from it: it verifies strangers' hellos with one only
+    observed: Endpoint | None = None  # ours, as its last hello states it: where it sees this end of a tunnel
     hellos: TokenBucket | None = None  # how many of its hellos are verified, once it is proven
 
     @property

@@ -54,6 +54,8 @@ class StatementType(str, Enum):
     OPEN = "open"  # switch or RIB to a RIB: a channel
     ACCEPT = "accept"
     ENDPOINTS = "endpoints"  # of a switch: where it can be reached across IP networks
+    ENDPOINTS_QUERY = "endpoints-query"  # to a RIB: which endpoint records of these switches are kept?
+    ENDPOINTS_ANSWER = "endpoints-answer"
 
 
 _TYPES: Final[dict[Value, StatementType]] = {member.value: member for member in StatementType}

@@ -40,6 +40,7 @@ from gdp.limits import (
 )
 from gdp.names import Name
 from gdp.rib.digest_tree import DigestTree
+from gdp.rib.endpoints import RibEndpoints
 from gdp.rib.replication import Message, Replication
 from gdp.rib.revocations import RibRevocations
 from gdp.rib.route import Route, Withdrawn
@@ -116,6 +117,7 @@ class RibCore:
         self._upstream_queries = UpstreamQueries(is_top=not settings.upper)
         self._upstream = UpstreamAdvertisements(settings.upper)
         self._replication = self._replication_over(store.digests)
+        self._endpoints = RibEndpoints(identity, policy, self._other_ribs, settings.watches)
         self._answer_paces = TokenBuckets(ANSWER_BYTES_PER_S, ANSWER_BYTES_BURST)
         self._now_s = 0.0  # of the last call
         self._outgoing_statements: list[OutgoingStatement] = []
@@ -155,6 +157,10 @@ class RibCore:
                 self._take_presence(statement, now)
             elif statement.type in _PEER_MESSAGES:
                 self._take_peer_message(statement, now)
+            elif statement.type is StatementType.ENDPOINTS:
+                self._endpoints.receive_record(statement, now)
+            elif statement.type in (StatementType.ENDPOINTS_QUERY, StatementType.ENDPOINTS_ANSWER):
+                self._take_endpoint_message(statement, now)
             else:
                 raise StatementError(DropReason.MALFORMED, f"a RIB takes no {statement.type.value}")
         except RemoteError as error:
@@ -224,6 +230,7 @@ class RibCore:
         self._holders.expire(now.mono_s)
         if self._replication is not None:
             self._replication.handle_timer(now.mono_s)
+        self._endpoints.handle_timer(now)
         self._ask_what_is_due(now.mono_s)
         for passed in self._upstream.due(now.mono_s):
             self._send_up(passed)
@@ -233,12 +240,14 @@ class RibCore:
         self._now_s = now.mono_s
         if self._replication is not None:
             self._replication.connected(now.mono_s)
+        self._endpoints.connected()
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         times = [self._store.next_expiry(), self._upstream_queries.next_due(), self._upstream.next_due()]
         if self._replication is not None:
             times.append(self._replication.next_due())
+        times.append(self._endpoints.get_timer())
         return min((time for time in times if time is not None), default=None)
 
     def statements_to_send(self) -> list[OutgoingStatement]:
@@ -253,7 +262,7 @@ class RibCore:
                 OutgoingStatement(to, Kind.RIB_REQUEST, wire)
                 for to, wire in self._replication.statements_to_send(self._now_s)
             ]
-        return letters
+        return letters + [OutgoingStatement(*each) for each in self._endpoints.poll_statements()]
 
     # -- advertisements
 
@@ -269,6 +278,9 @@ class RibCore:
             return
         if passed_on.type is StatementType.WITHDRAW:
             self._take_withdrawal(passed_on, member, now)
+            return
+        if passed_on.type is StatementType.ENDPOINTS:
+            self._endpoints.receive_relayed(passed_on, member, now)
             return
         try:
             advertisement = self._verifier.verify_statement(passed_on, now.unix_s)
@@ -685,6 +697,7 @@ class RibCore:
         if revocation is None:
             self._pass_revocation_up(statement, origin, now)  # it is repeated for those that lacked it
             return
+        self._endpoints.recheck(now)
         who, about = revocation.issuer.name.to_text(), revocation.fingerprint.hex()
         self._audit.record(Action.REVOKED, "certificate", who=who, about=about)
         recipients: dict[Asker, None] = {}
@@ -734,6 +747,25 @@ class RibCore:
         for wire in wires if names else ():
             relay = Relay(wire, (), self._identity.membership).to_wire(self._identity.name, self._identity.key)
             self._outgoing_statements += [OutgoingStatement(name, kind, relay) for name in names]
+
+    # -- endpoints of switches
+
+    @property
+    def endpoints(self) -> int:
+        """Return how many endpoint records are kept."""
+        return len(self._endpoints)
+
+    def _other_ribs(self) -> tuple[Name, ...]:
+        peers = self._settings.peers if self._replication is None else self._replication.peers
+        return tuple(peer for peer in peers if peer != self._identity.name)
+
+    def _take_endpoint_message(self, statement: Statement, now: Timestamps) -> None:
+        member = self._sender(statement.fields.bytes_("c"), statement, now)
+        statement.verify(member.key)
+        if statement.type is StatementType.ENDPOINTS_QUERY:
+            self._endpoints.handle_query(statement, member, now)
+        else:
+            self._endpoints.receive_response(statement, member, now)
 
     # -- other RIBs of the domain
 

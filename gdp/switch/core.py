@@ -17,6 +17,8 @@ from typing import Final
 
 from gdp.control.boundary import ErrorBoundary
 from gdp.control.channel import Channels, Opened
+from gdp.control.endpoint_record import EndpointRecord
+from gdp.control.endpoints import Endpoint
 from gdp.control.fragments import ControlFragmenter, ControlReassembler
 from gdp.control.hello_port import HelloPort
 from gdp.control.join import Join
@@ -36,6 +38,8 @@ from gdp.names import Name
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
 from gdp.switch.advertisements import AdvertisementHandler
 from gdp.switch.dependents import Dependents
+from gdp.switch.direct_tunnels import Action, DirectTunnels
+from gdp.switch.endpoint_exchange import EndpointExchange, Refusal
 from gdp.switch.evidence import Evidence
 from gdp.switch.flooding import Flooding
 from gdp.switch.local_advertisements import LocalAdvertisements
@@ -110,10 +114,15 @@ class SwitchCore:
             identity=identity, policy=policy, attached=self.attached, resolver=self.resolver, multicast=self.multicast,
             unicast=self.unicast, relocations=self.relocations, held=self._held, outbox=self._outbox,
         )  # fmt: skip
+        self._endpoints = EndpointExchange(identity, policy)
+        self._tunnels = DirectTunnels(identity.name)
+        self._tunnel_ports: dict[int, Name] = {}  # ports of direct tunnels
+        self._tunnel_peers: frozenset[Name] = frozenset()  # that the operator configured
         self.rib_client = RibClient(
             identity=identity, policy=policy, paths=self._paths, attached=self.attached, resolver=self.resolver,
             multicast=self.multicast, unicast=self.unicast, relocations=self.relocations, evidence=self._evidence,
             locations=self._locations, outbox=self._outbox, presence=self._presence, channels=self._channels,
+            endpoints=self._endpoints,
         )  # fmt: skip
         self._path_updates = PathUpdates(
             me=identity.name, flooding=self._flooding, hello_protocol=self.hello_protocol, multicast=self.multicast,
@@ -314,6 +323,63 @@ class SwitchCore:
         self._rest_due_s = None
         self._unwatch(self._revoker.hand_in(parse(wire), now))
         self._tell_rib_of_revocations(now.mono_s)
+
+    # -- direct tunnels
+
+    @property
+    def endpoint_refusal(self) -> Refusal | None:
+        """Return why the RIB refused this switch's endpoint record, or None; STALE: publish with a higher sequence."""
+        return self._endpoints.refusal
+
+    def publish_endpoints(self, record: EndpointRecord) -> None:
+        """Publish this switch's endpoint record to the RIB; from the first one on, it learns those of other switches.
+
+        Raises:
+            StatementError: STALE, its sequence is not higher than that of the one before.
+        """
+        self._endpoints.publish(record)
+        self._rest_due_s = None
+
+    def set_tunnel_peers(self, names: Collection[Name]) -> None:
+        """Set the switches to which the operator configured a tunnel: no direct tunnel to them is opened."""
+        self._tunnel_peers = frozenset(names)
+
+    def set_tunnel_port(self, index: int, peer: Name | None) -> None:
+        """State that a port is the direct tunnel to a switch; None: it is an ordinary port."""
+        self._tunnel_ports.pop(index, None)
+        if peer is not None:
+            self._tunnel_ports[index] = peer
+
+    def tunnel_answered(self, name: Name, now: Timestamps) -> None:
+        """Record that WireGuard completed a handshake with a peer of ``poll_tunnel_actions``."""
+        self._tunnels.answered(name, now.mono_s)
+
+    def observed_addresses(self) -> dict[tuple[int, Name], Endpoint]:
+        """Return our own endpoints as neighbours over tunnels see them, by port and neighbour."""
+        return self.hello_protocol.observed_addresses()
+
+    def poll_tunnel_actions(self, now: Timestamps) -> list[Action]:
+        """Return, once, what to do about direct tunnels; to be called about ten times a second.
+
+        Empty until ``publish_endpoints``.
+        """
+        own = self._endpoints.own
+        if own is None:
+            return []
+        up = self.hello_protocol.all_up()
+        linked = {each.name for each in up if each.port not in self._tunnel_ports} | self._tunnel_peers
+        wanted = self._tunnels.peers(self._paths.members(), linked)
+        due_s = self._endpoints.get_timer()
+        self._endpoints.want(wanted, now.mono_s)
+        if self._endpoints.get_timer() != due_s:
+            self._rest_due_s = None
+        return self._tunnels.poll_actions(
+            own=own,
+            records=self._endpoints.records(now),
+            linked=linked,
+            up={each.name for each in up if self._tunnel_ports.get(each.port) == each.name},
+            now_s=now.mono_s,
+        )
 
     # -- frames
 

@@ -14,6 +14,7 @@ from typing import Final
 
 from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.channel import Channels, Opened
+from gdp.control.endpoint_query import EndpointResponse
 from gdp.control.presence import Presence
 from gdp.control.query import Query, Response
 from gdp.control.relay import Relay, relayed
@@ -24,6 +25,7 @@ from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
 from gdp.names import Name
 from gdp.sansio import Timestamps
+from gdp.switch.endpoint_exchange import EndpointExchange
 from gdp.switch.evidence import Evidence
 from gdp.switch.local_advertisements import LocalAdvertisements
 from gdp.switch.location_updates import LocationUpdates
@@ -67,6 +69,7 @@ class RibClient:
         outbox: Outbox,
         presence: PresenceAnswers,
         channels: Channels,
+        endpoints: EndpointExchange,
     ) -> None:
         self._identity = identity
         self._policy = policy
@@ -81,6 +84,7 @@ class RibClient:
         self._outbox = outbox
         self._presence = presence
         self._channels = channels
+        self._endpoints = endpoints
         self.rib: Name | None = None
         self._session = b""  # of that RIB with its switch: another one means that it restarted or moved
         self._chosen_s = float("-inf")
@@ -100,6 +104,7 @@ class RibClient:
                 self._channels.renew(rib)
             self._attached.relay_all(now_s)
             self._resolver.rib_changed(now_s, has_rib=rib is not None)
+            self._endpoints.rib_changed(now_s)
         self.send_due(now_s)
 
     def _nearest_rib(self, now_s: float) -> Name | None:
@@ -127,6 +132,8 @@ class RibClient:
             self._leave_silent_rib(now_s)
         for attachment in self._attached.due(now_s):
             self.relay(attachment.advertisement.wire, now_s)
+        for statement in self._endpoints.statements_to_send(now_s):
+            self._to_rib(statement, now_s)
         for name, watch_s in self._resolver.queries_to_send(now_s):
             is_heard = bool(self._multicast.readers(name))
             query = Query(name, watch_s, self._policy.revoked.digest_about(name) if is_heard else None)
@@ -200,6 +207,9 @@ class RibClient:
         self._rib_answered(member.name, now.mono_s)
         if statement.type is StatementType.ADVERTISE_ACK:
             self._handle_ack(statement)
+            return
+        if statement.type is StatementType.ENDPOINTS_ANSWER:
+            self._endpoints.receive(EndpointResponse.from_fields(fields), now)
             return
         statement.expect(StatementType.ANSWER)
         answer = Response.from_fields(fields)
@@ -297,6 +307,7 @@ class RibClient:
             self._resolver.next_query(),
             owed_s,
             self._review_s,
+            self._endpoints.get_timer(),
             self._channels.get_timer(),
         ]
         return None if self.rib is None else min((time for time in times if time is not None), default=None)

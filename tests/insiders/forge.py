@@ -496,6 +496,32 @@ class Forge:
             "q": rng.random() < 0.5, "y": rng.random() < 0.5, "c": identity.membership,
         }  # fmt: skip
 
+    def _endpoints(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        kinds = ("host", "srflx", "public", "tls", "guess")
+        endpoints = (b"\xc0\0\x02\x07\xca\x6c", bytes(18), b"\0" * 5, rng.randbytes(18))
+        candidates = [
+            [rng.randrange(3), rng.choice(kinds), rng.choice(endpoints)] for _ in range(rng.choice((0, 1, 17)))
+        ]
+        return {
+            "k": [rng.randbytes(32) for _ in range(rng.choice((0, 1, 2, 5)))], "a": candidates,
+            "s": self._number(rng), "u": self._number(rng), "c": identity.membership,
+        }  # fmt: skip
+
+    def _endpoints_query(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        def item() -> bytes:
+            return rng.choice((*self._nodes, bytes(32))) + rng.choice((0, 1, _U64)).to_bytes(8, "big")
+
+        names = [item() for _ in range(rng.choice((0, 1, 64, 65)))]
+        return {"n": names, "w": rng.choice((0.0, 30.0, 3_600.0, 9e9)), "c": identity.membership}
+
+    def _endpoints_answer(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        body = self._endpoints(rng, identity, place)
+        record = identity.sign(StatementType.ENDPOINTS, body) if rng.random() < 0.7 else rng.randbytes(40)
+        return {
+            "e": [record] * rng.choice((0, 1, 2)), "s": self._number(rng), "r": rng.choice((255, 28, 31, 200)),
+            "c": identity.membership,
+        }  # fmt: skip
+
     def _digest(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
         return {
             "p": rng.choice((b"", b"\x00", bytes(2))), "h": rng.choice((rng.randbytes(8), rng.randbytes(2_048))),
@@ -747,6 +773,8 @@ _BODIES: Final[dict[StatementType, _Make]] = {
     _T.INVENTORY: Forge._inventory, _T.REPLICAS: Forge._replicas, _T.REVOKE: Forge._revoke,
     _T.OPEN: Forge._open, _T.ACCEPT: Forge._accept, _T.REVOKED: Forge._revoked, _T.LACKING: Forge._lacking,
     _T.ADCERT: Forge._adcert, _T.RTCERT: Forge._rtcert, _T.CARD: Forge._card, _T.GRANT: Forge._grant,
+    _T.ENDPOINTS: Forge._endpoints, _T.ENDPOINTS_QUERY: Forge._endpoints_query,
+    _T.ENDPOINTS_ANSWER: Forge._endpoints_answer,
 }  # fmt: skip
 _K = Kind
 _KINDS: Final[dict[StatementType, tuple[Kind, ...]]] = {
@@ -759,7 +787,8 @@ _KINDS: Final[dict[StatementType, tuple[Kind, ...]]] = {
     _T.FETCH: (_K.RIB_REQUEST,), _T.INVENTORY: (_K.RIB_REQUEST,), _T.REPLICAS: (_K.RIB_REQUEST,),
     _T.REVOKE: (_K.REVOKE,), _T.ADCERT: (_K.ADVERTISE,), _T.RTCERT: (_K.ADVERTISE,), _T.CARD: (_K.ADVERTISE,),
     _T.GRANT: (_K.ADVERTISE_ACK,), _T.OPEN: (_K.RIB_REQUEST,), _T.ACCEPT: (_K.RIB_ANSWER,),
-    _T.REVOKED: (_K.REVOKED,), _T.LACKING: (_K.REVOKED,),
+    _T.REVOKED: (_K.REVOKED,), _T.LACKING: (_K.REVOKED,), _T.ENDPOINTS: (_K.RIB_REQUEST,),
+    _T.ENDPOINTS_QUERY: (_K.RIB_REQUEST,), _T.ENDPOINTS_ANSWER: (_K.RIB_ANSWER, _K.RIB_REQUEST),
 }  # fmt: skip
 _RARE: Final = {_T.ADCERT, _T.RTCERT, _T.CARD, _T.GRANT}
 _SPOKEN: Final = tuple(each for each in _BODIES for _ in range(1 if each in _RARE else 6))

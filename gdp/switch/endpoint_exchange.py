@@ -1,0 +1,171 @@
+"""Endpoint exchange of a switch with its RIB: it publishes its own record, and learns those of other switches.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds) or ``Timestamps``. A record is sent again until a response
+states that the RIB keeps it, then each third of its lease. A RIB that is new here receives record and query at once.
+Queries watch the wanted switches, so that the RIB sends a new record when it comes; they are repeated for losses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from gdp.control.endpoint_query import ENDPOINT_NAMES_MAX, EndpointQuery, EndpointResponse
+from gdp.control.endpoint_record import EndpointRecord
+from gdp.crypto.certificates import Membership
+from gdp.crypto.identity import Identity
+from gdp.errors import DropReason, StatementError
+from gdp.limits import ENDPOINT_LEASE_S
+from gdp.names import Name
+from gdp.sansio import Timestamps
+from gdp.trust.domain import Policy
+
+__all__ = ["EndpointExchange", "Refusal"]
+
+_RENEW_S: Final = ENDPOINT_LEASE_S / 3
+_AGAIN_S: Final = (0.3, 0.6, 1.2, 2.4, 4.8)  # until a response comes; the last one from then on
+_QUERY_S: Final = 5.0
+_WATCH_S: Final = 30.0
+
+
+class Refusal(NamedTuple):
+    """Why the RIB refused this switch's record, and the sequence of the one that it keeps instead; 0: none."""
+
+    reason: DropReason
+    kept_sequence: int
+
+
+@dataclass(slots=True)
+class _Schedule:
+    """When a statement is due, until it is answered; infinity: never."""
+
+    due_s: float = float("inf")
+    tries: int = 0
+
+    def sent(self, now_s: float) -> None:
+        self.due_s = now_s + _AGAIN_S[min(self.tries, len(_AGAIN_S) - 1)]
+        self.tries += 1
+
+    def restart(self, now_s: float) -> None:
+        self.due_s, self.tries = now_s, 0
+
+    def answered(self, again_s: float) -> None:
+        self.due_s, self.tries = again_s, 0
+
+
+class EndpointExchange:
+    """Endpoint records of one switch's domain.
+
+    Attributes:
+        own: this switch's record, or None while it publishes none.
+        refusal: of the RIB's last response.
+    """
+
+    def __init__(self, identity: Identity, policy: Policy) -> None:
+        self._identity = identity
+        self._policy = policy
+        self._wanted: dict[Name, None] = {}
+        self._known: dict[Name, tuple[EndpointRecord, Membership]] = {}
+        self._publication = _Schedule()
+        self._query = _Schedule()
+        self.own: EndpointRecord | None = None
+        self.refusal: Refusal | None = None
+
+    def publish(self, record: EndpointRecord) -> None:
+        """Publish this switch's record, instead of the one before.
+
+        Raises:
+            StatementError: STALE, its sequence is not higher.
+        """
+        if self.own is not None and record.sequence <= self.own.sequence:
+            raise StatementError(DropReason.STALE, "own endpoint record")
+        self.own, self.refusal = record, None
+        self._publication.restart(float("-inf"))
+
+    def want(self, names: Iterable[Name], now_s: float) -> None:
+        """Learn the records of these switches, the first ``ENDPOINT_NAMES_MAX``, and of no others."""
+        wanted = dict.fromkeys(list(names)[:ENDPOINT_NAMES_MAX])
+        if wanted.keys() - self._wanted.keys():
+            self._query.restart(now_s)
+        self._wanted = wanted
+        if not wanted:
+            self._query = _Schedule()
+        for name in self._known.keys() - wanted.keys():
+            del self._known[name]
+
+    def rib_changed(self, now_s: float) -> None:
+        """Publish and query again: another RIB is used, or it was restarted."""
+        if self.own is not None:
+            self._publication.restart(now_s)
+        if self._wanted:
+            self._query.restart(now_s)
+
+    def statements_to_send(self, now_s: float) -> list[bytes]:
+        """Return the statements that are due at the RIB."""
+        wires = []
+        if self.own is not None and self._publication.due_s <= now_s:
+            self._publication.sent(now_s)
+            wires.append(self.own.wire)
+        if self._query.due_s <= now_s:
+            self._query.sent(now_s)
+            known = tuple((name, self._sequence_of(name)) for name in self._wanted)
+            query = EndpointQuery(known, _WATCH_S)
+            wires.append(query.to_wire(self._identity.name, self._identity.key, self._identity.membership))
+        return wires
+
+    def get_timer(self) -> float | None:
+        """Return the monotonic second of the next statement, or None."""
+        due_s = min(self._publication.due_s, self._query.due_s)
+        return None if due_s == float("inf") else due_s
+
+    def receive(self, response: EndpointResponse, now: Timestamps) -> None:
+        """Process a response of the RIB in use.
+
+        Raises:
+            StatementError: a record in it is not valid; the others count.
+        """
+        own = self.own
+        if own is not None:
+            if response.refused is not None:
+                self.refusal = Refusal(response.refused, response.kept_sequence)
+                self._publication.answered(now.mono_s + _QUERY_S)
+            elif response.kept_sequence == own.sequence:
+                self.refusal = None
+                if self._publication.tries:
+                    self._publication.answered(now.mono_s + _RENEW_S)
+            elif not self._publication.tries:
+                self._publication.restart(now.mono_s)  # the RIB has lost it
+        if self._wanted and self._query.tries:
+            self._query.answered(now.mono_s + _QUERY_S)
+        refused: StatementError | None = None
+        for wire in response.records:
+            try:
+                self._learn(wire, now)
+            except StatementError as error:
+                refused = error
+        if refused is not None:
+            raise refused
+
+    def _learn(self, wire: bytes, now: Timestamps) -> None:
+        record, member = EndpointRecord.verified(wire, self._policy, now.unix_s)
+        if member.domain != self._policy.own or not member.role.is_switch:
+            raise StatementError(DropReason.WRONG_DOMAIN, "endpoints of another than a switch of this domain")
+        if record.name in self._wanted and record.sequence > self._sequence_of(record.name):
+            self._known[record.name] = record, member
+
+    def _sequence_of(self, name: Name) -> int:
+        known = self._known.get(name)
+        return 0 if known is None else known[0].sequence
+
+    def records(self, now: Timestamps) -> Mapping[Name, EndpointRecord]:
+        """Return the records of wanted switches; those void or of a revoked membership are removed."""
+        for name, (record, member) in list(self._known.items()):
+            try:
+                self._policy.check_member(member, now.unix_s)
+            except StatementError:
+                del self._known[name]
+                continue
+            if record.until_unix_s < now.unix_s:
+                del self._known[name]
+        return {name: record for name, (record, _) in self._known.items()}
