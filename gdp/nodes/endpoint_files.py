@@ -21,18 +21,21 @@ __all__ = ["RECORD_SUFFIX", "own_record", "public_candidates", "record_files"]
 RECORD_SUFFIX: Final = ".endpoints"
 
 
-def own_record(identity: Identity, uplinks: int, candidates: Sequence[Candidate]) -> EndpointRecord:
+def own_record(
+    identity: Identity, uplinks: int, candidates: Sequence[Candidate], *, sequence: int | None = None
+) -> EndpointRecord:
     """Return the record that a switch signs about itself; it is valid as long as its membership.
 
     Args:
         uplinks: how many of them have tunnels, at least 1.
+        sequence: None: milliseconds since 1970.
     """
     keys = tuple(TunnelKey.derive(identity.kem, uplink).public for uplink in range(uplinks))
     return EndpointRecord.make(
         identity,
         keys,
         tuple(candidates),
-        sequence=time.time_ns() // 1_000_000,
+        sequence=time.time_ns() // 1_000_000 if sequence is None else sequence,
         until_unix_s=identity.member.not_after_unix_s,
     )
 

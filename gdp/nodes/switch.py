@@ -21,13 +21,14 @@ from gdp.nodes.control_socket import ControlHandlers
 from gdp.nodes.control_status import node_status
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.data_plane import Chosen, choose_plane
-from gdp.nodes.links import LINKS_LOOK_S, TunnelLinks, open_underlays
+from gdp.nodes.links import LINKS_LOOK_S, TunnelLinks
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
 from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.nodes.rights import confine_switch
 from gdp.nodes.runtime import DRAIN_MAX_S, Runtime, now
 from gdp.nodes.single_instance import own_devices, run_alone
+from gdp.nodes.tunnels import open_underlays
 from gdp.nodes.uplink import refuse_loopback
 from gdp.nodes.veth import attach_pairs, switch_end
 from gdp.ports.plane import MAC_BYTES, Plane
@@ -142,7 +143,7 @@ def _add_ports(config: SwitchConfig, plane: Plane, switch: SwitchCore) -> None:
 def _start_links(links: TunnelLinks | None, runtime: Runtime, stack: contextlib.ExitStack) -> None:
     if links is not None:
         runtime.every(LINKS_LOOK_S, links.look)
-        stack.callback(links.close)
+        stack.callback(lambda: links.close(now().mono_s))
 
 
 def _open_links(

@@ -15,8 +15,13 @@ _UNIVERSE: Final = 0  # RT_SCOPE_UNIVERSE: neither of a link nor of the host alo
 _NOT_READY: Final = 0x08 | 0x20 | 0x40  # IFA_F_DADFAILED, IFA_F_DEPRECATED, IFA_F_TENTATIVE
 
 
-def host_addresses(excluded: Collection[str] = ()) -> list[str]:
-    """Return the numeric addresses of global scope, of devices other than the excluded ones; IPv6 last."""
+def host_addresses(excluded: Collection[str] = (), only: str | None = None) -> list[str]:
+    """Return the numeric addresses of global scope, IPv6 last.
+
+    Args:
+        excluded: names of devices that do not count.
+        only: name of the one device that counts; None: all do.
+    """
     from pyroute2 import IPRoute
 
     found: list[str] = []
@@ -24,6 +29,8 @@ def host_addresses(excluded: Collection[str] = ()) -> list[str]:
         names = {link["index"]: link.get_attr("IFLA_IFNAME") for link in routes.get_links()}
         for each in routes.get_addr():
             flags = each.get_attr("IFA_FLAGS") or 0
-            if each["scope"] == _UNIVERSE and not flags & _NOT_READY and names.get(each["index"]) not in excluded:
+            name = names.get(each["index"])
+            is_counted = name not in excluded and only in (None, name)
+            if is_counted and each["scope"] == _UNIVERSE and not flags & _NOT_READY:
                 found.append(each.get_attr("IFA_LOCAL") or each.get_attr("IFA_ADDRESS"))
     return sorted(found, key=lambda text: (ipaddress.ip_address(text).version, ipaddress.ip_address(text).packed))

@@ -1,0 +1,299 @@
+"""Tunnel devices of a switch: WireGuard for each uplink, and for each tunnel a VXLAN device with a port on it.
+
+I/O. A tunnel that cannot be made is logged; it ends neither the switch nor another tunnel.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections import deque
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from types import MappingProxyType
+from typing import Final
+
+from gdp.control.endpoint_record import EndpointRecord
+from gdp.control.endpoints import Endpoint, inner_address, tunnel_vni
+from gdp.control.tunnel_plan import TunnelId, tunnel_ifname, underlay_ifname
+from gdp.crypto.identity import Identity
+from gdp.crypto.tunnel_key import TunnelKey
+from gdp.errors import LocalError
+from gdp.names import Name
+from gdp.nodes.config import COST_DEFAULT, LinksConfig
+from gdp.nodes.runtime import Runtime
+from gdp.ports.tunnel.path_mtu import route_mtu, tunnel_mtu
+from gdp.ports.tunnel.vxlan import make_vxlan, remove_link, set_link_mtu
+from gdp.ports.tunnel.wireguard import PeerState, WireGuardDevice, open_wireguard
+from gdp.sansio import Timestamps
+from gdp.switch.core import SwitchCore
+
+__all__ = ["Tunnel", "Tunnels", "open_underlays"]
+
+log = logging.getLogger(__name__)
+
+_OUTER_MTU: Final = 1_500  # until a route to an endpoint is known
+_MTU_LOOK_S: Final = 1.0
+_DEVICE_LOOK_S: Final = 1.0
+_FORGET_S: Final = 60.0  # after this time no tree and no table entry names a removed port
+
+
+@dataclass(slots=True, kw_only=True)
+class Tunnel:
+    """A tunnel that exists.
+
+    Attributes:
+        inner: inner address of the far end.
+        key: WireGuard public key of the far end.
+        mtu: of the VXLAN device, bytes after the Ethernet header.
+        endpoint: where WireGuard sends to; None: it waits for the peer's packets.
+        handshake_unix_s: of the last handshake; 0: there was none.
+        is_direct: opened by decision of the switch, not by configuration.
+    """
+
+    ifname: str
+    inner: str
+    key: bytes
+    port: int
+    mtu: int
+    wireguard_mtu: int
+    keepalive_s: int
+    begun_s: float
+    is_direct: bool
+    endpoint: Endpoint | None = None
+    handshake_unix_s: float = 0.0
+    mtu_look_s: float = float("-inf")
+
+
+@contextlib.contextmanager
+def open_underlays(config: LinksConfig, identity: Identity) -> Iterator[tuple[WireGuardDevice, ...]]:
+    """Make the WireGuard device of each uplink until the context ends.
+
+    Raises:
+        LocalError: there is no WireGuard here, the port is taken, or the process may not make devices.
+    """
+    wireguard_mtu, _ = tunnel_mtu(_OUTER_MTU, is_ipv6=True)
+    with contextlib.ExitStack() as stack:
+        devices = []
+        for uplink in range(max(len(config.uplinks), 1)):
+            device = open_wireguard(
+                ifname=underlay_ifname(identity.name, uplink),
+                private_key=TunnelKey.derive(identity.kem, uplink).private,
+                listen_port=config.listen + uplink if config.listen else 0,
+                inner=inner_address(identity.name, uplink),
+                mtu=wireguard_mtu,
+                alias=_alias(identity.name),
+                backend=config.backend,
+            )
+            stack.callback(device.close)
+            devices.append(device)
+            log.info("tunnels over ifname=%s backend=%s port=%d", device.ifname, device.backend, device.listen_port)
+            if device.reason:
+                log.info("not the kernel's WireGuard reason=%s", device.reason)
+        yield tuple(devices)
+
+
+def _alias(name: Name) -> str:
+    return f"gdp-switch {name.to_text()}"
+
+
+class Tunnels:
+    """The tunnels of a running switch.
+
+    Args:
+        underlays: a WireGuard device for each uplink.
+    """
+
+    def __init__(
+        self, *, identity: Identity, switch: SwitchCore, runtime: Runtime, underlays: tuple[WireGuardDevice, ...]
+    ) -> None:
+        self._me = identity.name
+        self._switch = switch
+        self._runtime = runtime
+        self._underlays = underlays
+        self._tunnels: dict[TunnelId, Tunnel] = {}
+        self._device_look_s = float("-inf")
+        self._closed: deque[tuple[float, int]] = deque()  # ports that the control plane may still name
+        for device in underlays:
+            runtime.watch(device, partial(self._handle_events, device))
+
+    @property
+    def underlays(self) -> tuple[WireGuardDevice, ...]:
+        """Return the WireGuard devices, by uplink."""
+        return self._underlays
+
+    @property
+    def all(self) -> Mapping[TunnelId, Tunnel]:
+        """Return the tunnels that exist."""
+        return MappingProxyType(self._tunnels)
+
+    def is_up(self, tunnel: TunnelId) -> bool:
+        """Return whether the peer is a neighbour over a tunnel."""
+        found = self._tunnels.get(tunnel)
+        return found is not None and self._switch.hello_protocol.neighbour(found.port, tunnel.peer) is not None
+
+    def open(
+        self,
+        tunnel: TunnelId,
+        record: EndpointRecord,
+        endpoint: Endpoint | None,
+        *,
+        keepalive_s: int,
+        now_s: float,
+        is_direct: bool = False,
+    ) -> bool:
+        """Make a tunnel; return whether it was made.
+
+        Args:
+            endpoint: to dial; None: the peer dials this switch.
+            now_s: monotonic seconds.
+        """
+        underlay = self._underlays[tunnel.uplink]
+        ifname, key = tunnel_ifname(self._me, tunnel), record.keys[tunnel.peer_uplink]
+        inner = inner_address(tunnel.peer, tunnel.peer_uplink)
+        wireguard_mtu, mtu = _mtus(endpoint)
+        try:
+            underlay.set_peer(key, inner=inner, endpoint=endpoint, keepalive_s=keepalive_s)
+            self._widen(tunnel.uplink, wireguard_mtu)
+            self._make_vxlan(tunnel, ifname, mtu)
+            port = self._runtime.add_port(ifname, COST_DEFAULT)
+        except LocalError as error:
+            log.error("tunnel not made peer=%s reason=%s; it is tried again", tunnel.peer.short, error)
+            remove_link(ifname, _alias(self._me))
+            return False
+        self._tunnels[tunnel] = Tunnel(
+            ifname=ifname,
+            inner=inner,
+            key=key,
+            port=port,
+            mtu=mtu,
+            wireguard_mtu=wireguard_mtu,
+            keepalive_s=keepalive_s,
+            begun_s=now_s,
+            is_direct=is_direct,
+            endpoint=endpoint,
+        )
+        at = "where it dials from" if endpoint is None else endpoint.to_text()
+        log.info("tunnel made peer=%s ifname=%s endpoint=%s", tunnel.peer.short, ifname, at)
+        return True
+
+    def dial(self, tunnel: TunnelId, endpoint: Endpoint | None) -> None:
+        """Send a handshake to an endpoint, or to the last one again."""
+        found, device = self._tunnels[tunnel], self._underlays[tunnel.uplink]
+        try:
+            device.set_peer(found.key, inner=found.inner, endpoint=endpoint, keepalive_s=found.keepalive_s)
+            device.retry_handshake(found.key)
+        except LocalError as error:
+            at = "?" if endpoint is None else endpoint.to_text()
+            log.warning("not dialled peer=%s endpoint=%s reason=%s", tunnel.peer.short, at, error)
+
+    def close(self, tunnel: TunnelId, now_s: float) -> None:
+        """Remove a tunnel with its port; its neighbour is lost at once."""
+        found = self._tunnels.pop(tunnel)
+        self._runtime.remove_port(found.port)
+        self._switch.set_tunnel_port(found.port, None)
+        self._closed.append((now_s + _FORGET_S, found.port))
+        remove_link(found.ifname, _alias(self._me))
+        if not any(each.key == found.key for each in self._tunnels.values()):
+            self._underlays[tunnel.uplink].remove_peer(found.key)
+        log.info("tunnel removed peer=%s ifname=%s", tunnel.peer.short, found.ifname)
+
+    def close_peer(self, peer: Name, now_s: float) -> None:
+        """Remove all tunnels to a peer."""
+        for tunnel in [each for each in self._tunnels if each.peer == peer]:
+            self.close(tunnel, now_s)
+
+    def close_all(self, now_s: float) -> None:
+        """Remove all tunnels, and stop watching the devices."""
+        for tunnel in list(self._tunnels):
+            self.close(tunnel, now_s)
+        for device in self._underlays:
+            self._runtime.unwatch(device)
+
+    def look(self, now: Timestamps) -> list[TunnelId]:
+        """Follow where WireGuard hears each peer, and the MTU of the paths; return tunnels with a new handshake."""
+        if now.mono_s >= self._device_look_s:
+            self._device_look_s = now.mono_s + _DEVICE_LOOK_S
+            for device in self._underlays:
+                if device.poll():
+                    self._remake(device)
+        states = [device.peers() for device in self._underlays]
+        answered = []
+        for tunnel, found in self._tunnels.items():
+            state = states[tunnel.uplink].get(found.key)
+            if state is not None and self._observe(tunnel, found, state):
+                answered.append(tunnel)
+            if now.mono_s >= found.mtu_look_s:
+                found.mtu_look_s = now.mono_s + _MTU_LOOK_S
+                self._follow_mtu(tunnel, found)
+        while self._closed and now.mono_s >= self._closed[0][0]:
+            self._switch.hello_protocol.remove_port(self._closed.popleft()[1])
+        return answered
+
+    def _observe(self, tunnel: TunnelId, found: Tunnel, state: PeerState) -> bool:
+        """Record what WireGuard reports about a peer; return whether there is a new handshake."""
+        if state.handshake_unix_s and state.endpoint not in (None, found.endpoint):
+            log.info("peer seen at another address peer=%s endpoint=%s", tunnel.peer.short, state.endpoint)
+        found.endpoint = state.endpoint or found.endpoint
+        if state.handshake_unix_s:
+            self._switch.hello_protocol.set_observed(found.port, tunnel.peer, state.endpoint)
+        is_new = state.handshake_unix_s > found.handshake_unix_s
+        found.handshake_unix_s = state.handshake_unix_s
+        return is_new
+
+    # devices
+
+    def _handle_events(self, device: WireGuardDevice) -> None:
+        if device.handle_events():
+            self._remake(device)
+
+    def _remake(self, device: WireGuardDevice) -> None:
+        """Make the VXLAN devices on a device that was made again; their ports open when they appear."""
+        for tunnel, found in self._tunnels.items():
+            if self._underlays[tunnel.uplink] is device:
+                try:
+                    self._make_vxlan(tunnel, found.ifname, found.mtu)
+                except LocalError as error:
+                    log.error("tunnel not made again peer=%s reason=%s", tunnel.peer.short, error)
+
+    def _make_vxlan(self, tunnel: TunnelId, ifname: str, mtu: int) -> None:
+        local, remote = inner_address(self._me, tunnel.uplink), inner_address(tunnel.peer, tunnel.peer_uplink)
+        make_vxlan(
+            ifname=ifname,
+            vni=tunnel_vni(local, remote),
+            local=local,
+            remote=remote,
+            underlay=self._underlays[tunnel.uplink].ifname,
+            mtu=mtu,
+            alias=_alias(self._me),
+        )
+
+    def _follow_mtu(self, tunnel: TunnelId, found: Tunnel) -> None:
+        wireguard_mtu, mtu = _mtus(found.endpoint)
+        if (wireguard_mtu, mtu) == (found.wireguard_mtu, found.mtu):
+            return
+        found.wireguard_mtu, found.mtu = wireguard_mtu, mtu
+        try:
+            self._widen(tunnel.uplink, wireguard_mtu)
+            set_link_mtu(found.ifname, mtu)
+        except LocalError as error:
+            log.warning("MTU kept ifname=%s wanted=%d reason=%s", found.ifname, mtu, error)
+            return
+        log.info("MTU follows the path peer=%s ifname=%s mtu=%d", tunnel.peer.short, found.ifname, mtu)
+
+    def _widen(self, uplink: int, wireguard_mtu: int) -> None:
+        """Set the MTU of a WireGuard device to that of its widest tunnel; each VXLAN device has its own."""
+        others = (each.wireguard_mtu for tunnel, each in self._tunnels.items() if tunnel.uplink == uplink)
+        self._underlays[uplink].set_mtu(max([wireguard_mtu, *others]))
+
+
+def _mtus(endpoint: Endpoint | None) -> tuple[int, int]:
+    """Return the MTU of WireGuard and of VXLAN towards an endpoint; without a route, those of usual links."""
+    if endpoint is None:
+        return tunnel_mtu(_OUTER_MTU, is_ipv6=True)
+    try:
+        outer = route_mtu(endpoint)
+    except LocalError:
+        outer = _OUTER_MTU
+    return tunnel_mtu(outer, is_ipv6=":" in endpoint.address)
