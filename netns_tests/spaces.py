@@ -21,6 +21,15 @@ def _call(result: int) -> None:
         raise OSError(number, os.strerror(number))
 
 
+def enter_namespace(descriptor: int) -> None:
+    """Move this thread into the network namespace of an open descriptor.
+
+    Raises:
+        OSError: not allowed here.
+    """
+    _call(_LIBRARY.setns(descriptor, _CLONE_NEWNET))
+
+
 class Space:
     """Entering moves the thread (and the processes it starts) into a new namespace; leaving moves it back.
 
@@ -39,7 +48,7 @@ class Space:
         return self
 
     def __exit__(self, *_: object) -> None:
-        _call(_LIBRARY.setns(self._before, _CLONE_NEWNET))
+        enter_namespace(self._before)
         os.close(self._before)
 
     def ip(self, *words: str) -> None:

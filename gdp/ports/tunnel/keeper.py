@@ -41,6 +41,7 @@ from gdp.ports.tunnel.devices import (
     find_device,
     make_up,
     refusal_text,
+    remove_device,
     remove_own_device,
     set_alias,
     set_mtu,
@@ -86,9 +87,9 @@ class _Child:
 
     @property
     def reason(self) -> str:
-        """Return its last line, or how it ended."""
-        lines = [line for line in self.said.decode(errors="replace").splitlines() if line.strip()]
-        return lines[-1].strip() if lines else f"it ended with status {self.process.returncode}"
+        """Return its last line about an error, or how it ended."""
+        lines = [line for line in self.said.decode(errors="replace").splitlines() if line.startswith("ERROR")]
+        return lines[-1] if lines else f"it ended with status {self.process.returncode}"
 
     def read(self) -> None:
         """Read what it printed, without waiting."""
@@ -175,14 +176,14 @@ class _Keeper:
         self._tun = -1  # descriptor of the TUN device; the kernel removes the device with its last descriptor
         self._tun_flags = 0
         self._child: _Child | None = None
-        self._is_kernel_device = False
+        self._kernel_ifindex = 0
 
     def run(self, backend: str) -> None:
         """Make the device, report it, and keep it until the owner ends."""
         if remove_own_device(self._ifname, self._alias):  # its wireguard-go ends with it
             _wait_until(lambda: not _is_listening(self._ifname))
         reason = "" if backend == "wireguard-go" else self._make_kernel_device()
-        if self._is_kernel_device:
+        if self._kernel_ifindex:
             self.owner.report(event="ready", backend="kernel", reason="")
             self.owner.wait()
             return
@@ -199,12 +200,12 @@ class _Keeper:
         """Remove everything that was made."""
         if self._child is not None:
             self._child.end()
-            socket_path(self._ifname).unlink(missing_ok=True)
+            if not _is_listening(self._ifname):  # else the next run of this switch has it already
+                socket_path(self._ifname).unlink(missing_ok=True)
         if self._tun >= 0:
             os.close(self._tun)
-        if self._is_kernel_device:
-            with contextlib.suppress(LocalError):  # another program's device of that name stays
-                remove_own_device(self._ifname, self._alias)
+        if self._kernel_ifindex:
+            remove_device(self._kernel_ifindex)
 
     def _make_kernel_device(self) -> str:
         """Make the device in the kernel; return why that is not possible."""
@@ -215,8 +216,8 @@ class _Keeper:
                 raise
             return "this kernel has no WireGuard"
         device = self._found()
+        self._kernel_ifindex = device.ifindex
         set_alias(device.ifindex, self._alias)
-        self._is_kernel_device = True
         self._prepare(device)
         return ""
 
@@ -231,6 +232,11 @@ class _Keeper:
             )
         if _is_listening(self._ifname):
             raise LocalError(f"another {_PROGRAM} serves {socket_path(self._ifname)}; end it first")
+        try:
+            SOCKET_FOLDER.mkdir(mode=0o755, parents=True, exist_ok=True)
+            socket_path(self._ifname).unlink(missing_ok=True)  # of a killed process
+        except OSError as error:
+            raise LocalError(f"{_PROGRAM} needs to write to {SOCKET_FOLDER} ({error.strerror}); {AS_ROOT}") from error
         return program
 
     def _probe(self, program: str) -> int:
@@ -344,7 +350,6 @@ class _Keeper:
         return device
 
     def _spawn(self, program: str, environment: dict[str, str]) -> _Child:
-        SOCKET_FOLDER.mkdir(mode=0o755, parents=True, exist_ok=True)
         keeper_pid = os.getpid()
 
         def die_with_keeper() -> None:

@@ -72,8 +72,9 @@ class KeeperProcess:
         self._socket.settimeout(_START_S)
         first = Report("lost")
         with contextlib.suppress(TimeoutError):
-            while not (reports := self._received()):
-                pass
+            reports: list[Report] = []
+            while not reports:
+                reports = self._received()
             first = reports[0]
         self._socket.setblocking(False)
         if first.event != "ready":
@@ -106,9 +107,13 @@ class KeeperProcess:
             log.error("the keeper of a tunnel device does not end pid=%d", self._process.pid)
 
     def _received(self) -> list[Report]:
-        data = self._socket.recv(1 << 16)
+        try:
+            data = self._socket.recv(1 << 16)
+        except ConnectionResetError:
+            data = b""
         if not data:
             self._is_lost = True
+            self._process.poll()
             return [Report("lost")]
         *lines, self._buffer = (self._buffer + data).split(b"\n")
         return [_report(json.loads(line)) for line in lines]

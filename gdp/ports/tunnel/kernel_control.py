@@ -70,6 +70,8 @@ class KernelControl:
                     " or end its user (ss -ulpn)"
                 ) from error
             raise LocalError(f"tunnel {self._ifname}: WireGuard refused: {self._text(error.code)}") from error
+        except OSError as error:  # an endpoint with a scope, which pyroute2 does not encode
+            raise LocalError(f"tunnel {self._ifname}: WireGuard refused: {error}") from error
 
     @staticmethod
     def _text(number: int) -> str:
@@ -97,7 +99,7 @@ def parse_messages(messages: Iterable[Any]) -> DeviceState:
     for message in messages:
         listen_port = message.get_attr("WGDEVICE_A_LISTEN_PORT") or listen_port
         for peer in message.get_attr("WGDEVICE_A_PEERS") or ():
-            key = b64decode(peer.get_attr("WGPEER_A_PUBLIC_KEY")["value"])
+            key = b64decode(peer.get_attr("WGPEER_A_PUBLIC_KEY"))
             endpoint = peer.get_attr("WGPEER_A_ENDPOINT")
             handshake = peer.get_attr("WGPEER_A_LAST_HANDSHAKE_TIME") or {"tv_sec": 0, "tv_nsec": 0}
             peers[key] = PeerState(

@@ -135,6 +135,11 @@ class RouteMonitor:
         known, self._known = self._known, found
         return {each: (known[each], now) for each, now in found.items() if each in known and known[each] != now}
 
+    def watch(self, endpoint: Endpoint) -> None:
+        """Store the route of one more endpoint, so that the next ``poll`` reports a change of it."""
+        if endpoint not in self._known:
+            self._known[endpoint] = route_to(self._netlink, endpoint, self._fwmark)
+
     def route(self, endpoint: Endpoint) -> Route | None:
         """Return the route of an endpoint at the last ``poll``."""
         return self._known.get(endpoint)

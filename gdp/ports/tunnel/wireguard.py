@@ -136,7 +136,8 @@ class WireGuardDevice:
         if before is not None and before.inner != inner:
             self._with_device(lambda device: remove_route(device.ifindex, before.inner))
         self._with_device(lambda device: add_route(device.ifindex, inner))
-        self._follow_routes()
+        if known is not None:
+            self._routes.watch(known)
 
     def remove_peer(self, public_key: bytes) -> None:
         """Remove a peer with its session and its route; does nothing if there is none."""
@@ -172,6 +173,16 @@ class WireGuardDevice:
         self._states = {key: found.get(key, PeerState(peer.endpoint, 0.0, 0, 0)) for key, peer in self._peers.items()}
         return dict(self._states)
 
+    def path_mtu(self, public_key: bytes) -> int | None:
+        """Return the MTU of the path to a peer's endpoint in bytes, as of the last ``poll``; None: not known now.
+
+        ``tunnel_mtu`` translates it to the MTUs inside.
+        """
+        peer = self._peers.get(public_key)
+        endpoint = None if peer is None else self._endpoint(public_key)
+        route = None if endpoint is None else self._routes.route(endpoint)
+        return None if route is None else route.mtu
+
     def set_mtu(self, mtu: int) -> None:
         """Set the MTU of the device in bytes, at least 1280. Raises ``LocalError``: the kernel refuses."""
         self._mtu = mtu
@@ -199,11 +210,15 @@ class WireGuardDevice:
             else:
                 log.warning("wireguard-go ended ifname=%s reason=%s", self.ifname, report.text)
         if self._has_news():
+            self.peers()
             self._follow_routes()
         return is_new
 
     def poll(self) -> bool:
-        """Look at what no event reports: learnt endpoints. Call it each second; returns as ``handle_events``."""
+        """Look at what no event reports: learnt endpoints and path MTUs.
+
+        Call it each second. Returns as ``handle_events``.
+        """
         self.peers()
         self._follow_routes()
         return self.handle_events()

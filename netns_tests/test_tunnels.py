@@ -1,0 +1,400 @@
+"""Tunnel devices between two namespaces: traffic, restarts, changes of addresses, and what a dead owner leaves."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from gdp.control.endpoints import Endpoint
+from gdp.crypto.certificates import Role
+from gdp.errors import LocalError
+from gdp.ports.tunnel.devices import find_device
+from gdp.ports.tunnel.path_mtu import RouteMonitor, route_mtu
+from gdp.ports.tunnel.uapi import socket_path
+from gdp.ports.tunnel.vxlan import remove_link, set_link_mtu
+from gdp.ports.tunnel.wireguard import WireGuardDevice, open_wireguard
+from gdp.stores.issue import make_domain, make_node
+from netns_tests.tunnel_sites import PATIENCE_S, PORT, Site, children, crosses, numbers, payload, two_sites, until
+from tests.pages import ROOT
+
+pytestmark = [
+    pytest.mark.netns,
+    pytest.mark.momentary("about devices, no lease matters"),
+    pytest.mark.skipif(shutil.which("wireguard-go") is None, reason="wireguard-go is not installed"),
+    pytest.mark.skipif(os.geteuid() != 0, reason="wireguard-go needs root for its control socket"),
+]
+
+Ends = tuple[WireGuardDevice, WireGuardDevice]
+
+
+@pytest.fixture
+def sites() -> Iterator[tuple[Site, Site]]:
+    with two_sites() as made:
+        yield made
+
+
+@pytest.fixture
+def ends(sites: tuple[Site, Site]) -> Ends:
+    """Devices of both sites, the second dials, with a VXLAN link between them."""
+    one, two = sites
+    first, second = one.open(), two.open()
+    one.connect(first, two, is_dialling=False)
+    two.connect(second, one, is_dialling=True)
+    return first, second
+
+
+def process_of(ifname: str) -> int:
+    """Return the process id of the wireguard-go of a device."""
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.connect(str(socket_path(ifname)))
+        credentials = probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
+    return int.from_bytes(credentials[:4], sys.byteorder)
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text()
+    except OSError:
+        return False
+
+
+def test_frames_cross_a_link_in_both_directions(sites: tuple[Site, Site], ends: Ends) -> None:
+    one, two = sites[0].frames(), sites[1].frames()
+    until(crosses(one, two), *ends)
+    until(crosses(two, one), *ends)
+    ends[0].poll()
+    assert ends[0].path_mtu(sites[1].public_key) == 1500
+    assert ends[0].backend == "wireguard-go"
+    assert ends[0].reason
+    assert ends[0].peers()[sites[1].public_key].endpoint == sites[1].endpoint
+
+
+def test_a_link_sends_nothing_by_itself(sites: tuple[Site, Site], ends: Ends) -> None:
+    with sites[0].entered(), socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(3)) as every:
+        every.bind((sites[0].link, 3))
+        every.setblocking(False)
+        until(crosses(sites[0].frames(), sites[1].frames()), *ends)
+        heard = []
+        while select.select([every], [], [], 1.0)[0]:
+            heard.append(every.recv(2_000))
+    assert {frame[12:14].hex() for frame in heard} == {"88b5"}
+
+
+@pytest.mark.parametrize("is_dialler", [False, True], ids=["the end that answers", "the end that dials"])
+def test_a_session_survives_a_change_of_address(sites: tuple[Site, Site], ends: Ends, is_dialler: bool) -> None:
+    one, two = sites[0].frames(), sites[1].frames()
+    until(crosses(one, two), *ends)
+    before = ends[1].peers()[sites[0].public_key].handshake_unix_s
+    for end in ends:
+        end.poll()
+    site = sites[is_dialler]
+    site.ip("address", "add", "10.9.0.50/24", "dev", "u0")
+    site.ip("address", "del", f"{site.address}/24", "dev", "u0")
+    until(crosses(one, two), *ends)
+    until(crosses(two, one), *ends)
+    assert ends[1].peers()[sites[0].public_key].handshake_unix_s == before
+    assert ends[not is_dialler].peers()[site.public_key].endpoint == Endpoint("10.9.0.50", PORT)
+
+
+def test_a_killed_wireguard_go_heals_and_the_link_stays(sites: tuple[Site, Site], ends: Ends) -> None:
+    one, two = sites[0].frames(), sites[1].frames()
+    until(crosses(one, two), *ends)
+    for end in ends:
+        end.poll()
+    for site in sites:
+        pid = process_of(site.ifname)
+        os.kill(pid, signal.SIGKILL)
+        until(lambda pid=pid: not is_alive(pid))  # type: ignore[misc]
+        until(crosses(one, two), *ends)  # the same packet sockets: the devices are the same
+        until(crosses(two, one), *ends)
+
+
+def test_changes_during_a_restart_are_applied_after_it(sites: tuple[Site, Site], ends: Ends) -> None:
+    one, two = sites
+    until(crosses(one.frames(), two.frames()), *ends)
+    os.kill(process_of(two.ifname), signal.SIGKILL)
+    with two.entered():
+        ends[1].remove_peer(one.public_key)
+        ends[1].set_peer(one.public_key, inner=one.inner, endpoint=one.endpoint, keepalive_s=25)
+    until(crosses(one.frames(), two.frames()), *ends)
+
+
+def test_a_device_that_another_program_removed_is_made_again(sites: tuple[Site, Site], ends: Ends) -> None:
+    one, two = sites
+    until(crosses(one.frames(), two.frames()), *ends)
+    two.ip("link", "delete", two.ifname)
+    end_s = time.monotonic() + PATIENCE_S
+    with two.entered():
+        while not ends[1].handle_events():
+            assert time.monotonic() < end_s
+            select.select([ends[1]], [], [], 1.0)
+        two.make_link(two.ifname, one)
+    until(crosses(one.frames(), two.frames()), *ends)
+
+
+def test_two_devices_lead_to_one_peer(sites: tuple[Site, Site]) -> None:
+    one, two = sites
+    first, second = one.open(), one.open(0, f"{one.ifname}b")
+    for device in (first, second):
+        with one.entered():
+            device.set_peer(two.public_key, inner=two.inner, endpoint=two.endpoint, keepalive_s=0)
+    routes = one.ip("-6", "route", "show", two.inner)
+    assert {one.ifname, f"{one.ifname}b"} == {line.split()[2] for line in routes.splitlines()}
+    with one.entered():
+        first.remove_peer(two.public_key)
+    assert f"{one.ifname}b" in one.ip("-6", "route", "show", two.inner)
+
+
+def test_a_stranger_gets_no_answer(sites: tuple[Site, Site], ends: Ends) -> None:
+    one, two = sites
+    other = Site(9, one.ifname[1:-1])
+    other.fd, previous = os.dup(two.fd), other.fd
+    os.close(previous)
+    try:
+        stranger = other.open(0)
+        with two.entered(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.connect((one.address, PORT))
+            for size in (1, 92, 148, 1_000):
+                probe.send(b"\1\0\0\0" + os.urandom(size))
+            stranger.set_peer(one.public_key, inner=one.inner, endpoint=one.endpoint, keepalive_s=1)
+            two_links = two.frames()
+            until(lambda: stranger.peers()[one.public_key].sent_bytes >= 148, *ends)
+            until(crosses(one.frames(), two_links), *ends)  # whatever came before was handled by now
+            assert stranger.peers()[one.public_key].received_bytes == 0
+            probe.setblocking(False)
+            with pytest.raises(BlockingIOError):
+                probe.recv(2_000)
+    finally:
+        other.close()
+
+
+def test_a_handshake_starts_at_once_although_one_went_unanswered(sites: tuple[Site, Site]) -> None:
+    one, two = sites
+    second = two.open()
+    with two.entered():
+        second.set_peer(one.public_key, inner=one.inner, endpoint=one.endpoint, keepalive_s=25)
+    until(lambda: second.peers()[one.public_key].sent_bytes > 0)
+    first = one.open()
+    with one.entered():
+        first.set_peer(two.public_key, inner=two.inner, endpoint=None, keepalive_s=0)
+    begun_s = time.monotonic()
+    second.retry_handshake(one.public_key)
+    until(lambda: second.peers()[one.public_key].handshake_unix_s > 0)
+    assert time.monotonic() - begun_s < 4.0  # by itself it would wait five seconds
+
+
+def test_a_taken_port_is_refused_and_nothing_is_left(sites: tuple[Site, Site]) -> None:
+    one, _ = sites
+    with one.entered(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("0.0.0.0", PORT))
+        with pytest.raises(LocalError, match=f"UDP port {PORT} is in use"):
+            one.open()
+    assert not one.has(one.ifname)
+    assert not socket_path(one.ifname).exists()
+
+
+def test_a_foreign_device_is_refused_and_left_alone(sites: tuple[Site, Site]) -> None:
+    one, _ = sites
+    one.ip("link", "add", one.ifname, "type", "veth", "peer", "name", "other")
+    with pytest.raises(LocalError, match=f"{one.ifname} exists and is not ours"):
+        one.open()
+    with one.entered(), pytest.raises(LocalError, match="is not ours"):
+        remove_link(one.ifname, one.alias)
+    assert one.has(one.ifname)
+
+
+def test_the_device_of_an_orphaned_wireguard_go_is_replaced(sites: tuple[Site, Site]) -> None:
+    one, _ = sites
+    with one.entered():
+        orphan = subprocess.Popen(["wireguard-go", "-f", one.ifname], stdout=subprocess.DEVNULL)
+    until(lambda: one.has(one.ifname) and socket_path(one.ifname).exists())
+    one.ip("link", "set", one.ifname, "alias", one.alias)
+    device = one.open()
+    assert orphan.wait(PATIENCE_S) is not None
+    assert device.listen_port == PORT
+    assert process_of(one.ifname) != orphan.pid
+
+
+def test_the_kernel_reports_the_mtu_of_a_route_and_a_change_of_it(sites: tuple[Site, Site]) -> None:
+    one, two = sites
+    with one.entered():
+        monitor = RouteMonitor()
+        try:
+            assert monitor.poll([two.endpoint]) == {}
+            assert route_mtu(two.endpoint) == 1500
+            one.ip("route", "replace", f"{two.address}/32", "dev", "u0", "mtu", "1380")
+            ((before, now),) = monitor.poll([two.endpoint]).values()
+            assert before is not None
+            assert now is not None
+            assert monitor.route(two.endpoint) == now
+            assert (before.mtu, now.mtu, route_mtu(two.endpoint)) == (1500, 1380, 1380)
+            with pytest.raises(LocalError, match=r"no route to 198\.51\.100\.1:1"):
+                route_mtu(Endpoint("198.51.100.1", 1))
+        finally:
+            monitor.close()
+
+
+def test_a_path_mtu_that_a_router_reports_is_followed(sites: tuple[Site, Site]) -> None:
+    one, two = sites
+    one.ip("route", "add", "10.8.0.1", "via", two.address)
+    two.ip("link", "add", "far", "mtu", "1300", "type", "veth", "peer", "name", "beyond")
+    for end in ("far", "beyond"):
+        two.ip("link", "set", end, "up")
+    two.ip("route", "add", "10.8.0.1", "dev", "far")
+    two.write("ipv4/ip_forward", "1")
+    far = Endpoint("10.8.0.1", PORT)
+    with one.entered(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        assert route_mtu(far) == 1500
+        sender.setsockopt(socket.IPPROTO_IP, 10, 2)  # IP_MTU_DISCOVER, IP_PMTUDISC_DO
+        sender.connect((far.address, far.port))
+        sender.send(bytes(1_400))
+        until(lambda: route_mtu(far) == 1300)
+
+
+class Owner:
+    """The process of ``tunnel_child``."""
+
+    def __init__(self, site: Site, folder: Path) -> None:
+        self.site = site
+        words = [str(folder / "switch.yaml"), site.ifname, site.private_key.hex(), site.inner, site.alias]
+        with site.entered():
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "netns_tests.tunnel_child", *words],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+                cwd=ROOT,
+                env={**os.environ, "PYTHONPATH": str(ROOT)},
+            )
+        self.started = self.read("confined")
+
+    def read(self, key: str) -> dict[str, object]:
+        """Return the next line with this key."""
+        assert self.process.stdout is not None
+        while True:
+            line = self.process.stdout.readline()
+            assert line, "the child ended"
+            fields: dict[str, object] = json.loads(line)
+            if key in fields or "error" in fields:
+                return fields
+
+    def ask(self, *words: str) -> object:
+        """Return the result of a command."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(json.dumps(words) + "\n")
+        self.process.stdin.flush()
+        return self.read("result")["result"]
+
+    def close(self) -> None:
+        """End it."""
+        self.process.kill()
+        self.process.wait()
+        for pipe in (self.process.stdin, self.process.stdout):
+            assert pipe is not None
+            pipe.close()
+
+
+@pytest.fixture
+def owner(sites: tuple[Site, Site], tmp_path: Path) -> Iterator[Owner]:
+    make_domain(tmp_path / "lab", "lab")
+    make_node(tmp_path / "switch", Role.SWITCH, "lab", tmp_path / "lab")
+    (tmp_path / "switch.yaml").write_text("identity: switch\ndomain: {root: switch/root.crt}\nports: [{iface: u0}]\n")
+    made = Owner(sites[1], tmp_path)
+    yield made
+    made.close()
+
+
+def test_a_confined_switch_still_serves_its_tunnels(sites: tuple[Site, Site], owner: Owner) -> None:
+    one, two = sites
+    assert "Permission denied" in str(owner.started["confined"])
+    first = one.open()
+    one.connect(first, two, is_dialling=False)
+    owner.ask("set_peer", one.public_key.hex(), one.inner, one.address, str(PORT))
+    owner.ask("link", two.link, two.inner, one.inner)
+    receiving, sending = one.frames(), two.frames()
+    until(crosses(sending, receiving), first)
+    os.kill(process_of(two.ifname), signal.SIGKILL)
+    until(crosses(sending, receiving), first)
+    assert owner.ask("route", one.address, str(PORT)) == 1500
+    owner.ask("mtu", two.link, "1400")
+    with two.entered():
+        device = find_device(two.link)
+        assert device is not None
+        assert device.mtu == 1330
+    owner.ask("retry", one.public_key.hex())
+    owner.ask("unlink", two.link)
+    owner.ask("remove_peer", one.public_key.hex())
+    assert owner.ask("peers") == {}
+    assert not two.has(two.link)
+    owner.ask("set_peer", one.public_key.hex(), one.inner, one.address, str(PORT))
+    owner.ask("link", two.link, two.inner, one.inner)
+    until(crosses(two.frames(), receiving), first)
+    assert owner.process.stdin is not None
+    owner.process.stdin.close()
+    assert owner.process.wait(PATIENCE_S) == 0
+    assert not two.has(two.ifname)
+    assert not two.has(two.link)
+
+
+@pytest.mark.parametrize("whom", ["the owner", "the keeper", "all at once"])
+def test_a_kill_leaves_no_device_no_process_and_no_socket(sites: tuple[Site, Site], owner: Owner, whom: str) -> None:
+    one, two = sites
+    owner.ask("set_peer", one.public_key.hex(), one.inner, one.address, str(PORT))
+    owner.ask("link", two.link, two.inner, one.inner)
+    (keeper,) = children(owner.process.pid)
+    (program,) = children(keeper)
+    victims = {"the owner": [owner.process.pid], "the keeper": [keeper]}.get(whom, [owner.process.pid, keeper, program])
+    for pid in victims:
+        os.kill(pid, signal.SIGKILL)
+    begun_s = time.monotonic()
+    until(lambda: not any(map(is_alive, (keeper, program))) and not two.has(two.ifname))
+    assert not two.has(two.link)
+    if whom != "all at once":  # no process is left that could remove it; the next start does
+        until(lambda: not socket_path(two.ifname).exists())
+    assert time.monotonic() - begun_s < 5.0
+    device = two.open()
+    assert device.listen_port == PORT
+
+
+def test_an_mtu_of_a_missing_device_is_refused(sites: tuple[Site, Site]) -> None:
+    with sites[0].entered(), pytest.raises(LocalError, match="no such device"):
+        set_link_mtu("gdp-none", 1_300)
+
+
+def test_without_wireguard_the_error_says_what_to_install(
+    sites: tuple[Site, Site], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    one, _ = sites
+    with one.entered(), pytest.raises(LocalError, match=r"kernel has no WireGuard; modprobe wireguard, or apt-get"):
+        open_wireguard(
+            ifname=one.ifname,
+            private_key=one.private_key,
+            listen_port=0,
+            inner=one.inner,
+            mtu=1440,
+            alias=one.alias,
+            backend="kernel",
+        )
+    assert not one.has(one.ifname)
+
+
+def test_numbered_frames_arrive_once_and_in_order(sites: tuple[Site, Site], ends: Ends) -> None:
+    one, two = sites[0].frames(), sites[1].frames()
+    until(crosses(one, two), *ends)
+    numbers(two)
+    for number in range(1, 201):
+        one.send(payload(number))
+    arrived: list[int] = []
+    until(lambda: arrived.extend(number for number in numbers(two) if number) or len(arrived) >= 200, *ends)  # type: ignore[func-returns-value]
+    assert arrived == list(range(1, 201))
