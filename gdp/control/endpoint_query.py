@@ -86,8 +86,8 @@ class EndpointResponse:
         reason = fields.uint("r", _TAKEN)
         try:
             refused = None if reason == _TAKEN else DropReason(reason)
-        except ValueError as error:
-            raise StatementError(DropReason.MALFORMED, "a reason that is unknown here") from error
+        except ValueError:
+            refused = DropReason.MALFORMED  # a reason of a later version is a refusal all the same
         records = fields.byte_strings("e", RECORDS_MAX)
         if any(len(each) > RECORD_MAX_BYTES for each in records):
             raise StatementError(DropReason.TOO_BIG, "endpoint record")

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gdp.control.advertise_ack import AdvertiseAck
+from gdp.control.endpoint_query import EndpointQuery, EndpointResponse
+from gdp.control.endpoints import Endpoint
 from gdp.control.hello import Hello
 from gdp.control.join import Join
 from gdp.control.link_state import Adjacency, AttachedRib, LinkState, Scope
@@ -23,6 +26,7 @@ from tests.gdp.control.members import node
 NODE = node("n")
 A, B, C = Name(b"a" * 32), Name(b"b" * 32), Name(b"c" * 32)
 HELLO = Hello(nonce=b"n" * 8, sequence=7, heard=(b"h" * 16,), mtu=1_500, digest=b"d" * 8, membership=b"cert")
+OBSERVING = replace(HELLO, observed=((b"m" * 8, Endpoint("192.0.2.1", 40_000)), (b"o" * 8, Endpoint("2001:db8::1", 1))))
 JOIN = Join(
     topic=A,
     publisher=B,
@@ -47,6 +51,19 @@ LACKING = Lacking(b"s" * 16, 9, A, (1, 200), (b"i" * 8, b"j" * 8))
 Read = Callable[[Fields], object]
 BODIES: dict[str, tuple[bytes, object, Read]] = {
     "hello": (HELLO.to_wire(NODE.name, NODE.key), HELLO, Hello.from_fields),
+    "hello of a tunnel": (OBSERVING.to_wire(NODE.name, NODE.key), OBSERVING, Hello.from_fields),
+    "endpoints query": (
+        EndpointQuery(((A, 7), (B, 0)), 30.0).to_wire(NODE.name, NODE.key, b"cert"),
+        EndpointQuery(((A, 7), (B, 0)), 30.0),
+        EndpointQuery.from_fields,
+    ),
+    "endpoints answer": (
+        EndpointResponse(records=(b"record",), kept_sequence=3, refused=DropReason.STALE).to_wire(
+            NODE.name, NODE.key, b"cert"
+        ),
+        EndpointResponse(records=(b"record",), kept_sequence=3, refused=DropReason.STALE),
+        EndpointResponse.from_fields,
+    ),
     "join": (JOIN.to_wire(NODE.name, NODE.key), JOIN, Join.from_fields),
     "link state": (STATE.to_wire(NODE.key, b"cert"), STATE, lambda fields: LinkState.from_fields(fields, NODE.name, A)),
     "query": (Query(A, 20.0).to_wire(NODE.name, NODE.key, b"cert"), Query(A, 20.0), Query.from_fields),
