@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import socket
+import tempfile
 from collections.abc import Callable, Generator, Iterator
+from pathlib import Path
 
 import pytest
 
 from gdp.errors import LocalError
+from gdp.host.run_registry import RunRegistry
 from gdp.ports.kernel.plane import KernelPlane
 from gdp.switch.table import Table
+from internet.laboratory import Laboratory
+from internet.space import TOOLS
 from netns_tests import lifetimes
 from netns_tests.spaces import Space
 from tests.fixtures_forwarding import IN, IN_MAC, MTUS, NARROW, NARROW_MAC, PEER_MACS, WIDE, WIDE_MAC
@@ -73,3 +80,18 @@ def make_kernel(space: Space) -> Iterator[MakeKernel]:
     yield make
     for plane in made:
         plane.close()
+
+
+@pytest.fixture
+def laboratory() -> Iterator[Laboratory]:
+    """Internet without a site, in namespaces of its own; what a killed run left is removed first."""
+    if missing := [tool for tool in TOOLS if shutil.which(tool) is None]:
+        pytest.skip(f"not installed: {', '.join(missing)}")
+    runs = RunRegistry(Path(tempfile.gettempdir()) / f"gdp-laboratories-{os.getuid()}")
+    runs.sweep()
+    run = runs.start()
+    try:
+        with Laboratory(run) as made:
+            yield made
+    finally:
+        run.end()

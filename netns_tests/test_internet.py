@@ -1,0 +1,381 @@
+"""Laboratory of networks: each kind of access maps, filters and loses what it claims, by UDP between real sockets."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from itertools import product
+from pathlib import Path
+
+import pytest
+
+from gdp.control.endpoints import Endpoint
+from gdp.errors import LocalError
+from gdp.host.run_registry import RunRegistry
+from internet.access import TRAITS, Access, allows_direct
+from internet.host import ETHERNET, Host
+from internet.laboratory import Laboratory
+from internet.probe import UdpProbe, observe, open_paths
+
+pytestmark = pytest.mark.netns
+
+NATS = (Access.FULL_CONE, Access.PORT_RESTRICTED, Access.SYMMETRIC, Access.DOUBLE_NAT)
+PATIENCE_S = 10.0
+IP_RECVERR = 11
+
+
+@pytest.fixture
+def borders(laboratory: Laboratory) -> tuple[Host, Host]:
+    """Two hosts with public addresses."""
+    site = laboratory.add_site("dc", Access.PUBLIC)
+    return laboratory.add_host("border1", site), laboratory.add_host("border2", site)
+
+
+def attach(laboratory: Laboratory, access: Access, label: str = "robot", **options: bool) -> Host:
+    return laboratory.add_host(label, laboratory.add_site(f"of-{label}", access, **options))
+
+
+@pytest.mark.parametrize("access", NATS, ids=lambda each: each.value)
+def test_a_nat_maps_a_socket_to_one_endpoint_unless_it_is_symmetric(
+    laboratory: Laboratory, borders: tuple[Host, Host], access: Access
+) -> None:
+    robot = attach(laboratory, access)
+    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as a, UdpProbe(borders[0]) as b, UdpProbe(borders[1]) as c:
+        seen = [observe(probe, each) for each in (a, b, c)]
+    assert {each.address for each in seen if each} == {robot.site().address}
+    assert (len(set(seen)) == 1) is TRAITS[access].is_mapping_stable
+    assert len(set(seen)) in (1, 3)
+
+
+@pytest.mark.parametrize("access", NATS, ids=lambda each: each.value)
+def test_a_nat_lets_in_whom_the_socket_wrote_to_and_a_full_cone_lets_in_all(
+    laboratory: Laboratory, borders: tuple[Host, Host], access: Access
+) -> None:
+    robot = attach(laboratory, access)
+    with (
+        UdpProbe(robot) as probe,
+        UdpProbe(borders[0]) as known,
+        UdpProbe(borders[0]) as port,
+        UdpProbe(borders[1]) as stranger,
+    ):
+        public = observe(probe, known)
+        assert public is not None
+        arrived = [observe(each, probe, public) is not None for each in (stranger, port, known)]
+    assert arrived == [not TRAITS[access].is_filtering, not TRAITS[access].is_filtering, True]
+
+
+def test_a_full_cone_has_no_mapping_for_a_socket_that_never_sent(
+    laboratory: Laboratory, borders: tuple[Host, Host]
+) -> None:
+    robot = attach(laboratory, Access.FULL_CONE)
+    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as stranger:
+        assert observe(stranger, probe, Endpoint(robot.site().address, probe.local.port)) is None
+
+
+@pytest.mark.parametrize("hairpin", [True, False])
+@pytest.mark.parametrize("access", [Access.FULL_CONE, Access.PORT_RESTRICTED], ids=lambda each: each.value)
+def test_hosts_of_a_site_reach_each_other_by_public_endpoints_if_the_nat_hairpins(
+    laboratory: Laboratory, borders: tuple[Host, Host], access: Access, hairpin: bool
+) -> None:
+    site = laboratory.add_site("home", access, hairpin=hairpin)
+    one, other = laboratory.add_host("one", site), laboratory.add_host("other", site)
+    with UdpProbe(one) as a, UdpProbe(other) as b, UdpProbe(borders[0]) as border:
+        seen_a, seen_b = observe(a, border), observe(b, border)
+        assert seen_b is not None
+        source = observe(a, b, seen_b)
+        assert observe(a, b) is not None  # by its own address it always does
+    assert source == (seen_a if hairpin else None)
+
+
+def test_where_udp_is_blocked_only_tcp_to_port_443_passes(laboratory: Laboratory, borders: tuple[Host, Host]) -> None:
+    robot = attach(laboratory, Access.UDP_BLOCKED)
+    with UdpProbe(robot) as probe, UdpProbe(borders[0], port=443) as border:
+        assert observe(probe, border) is None
+    assert connects(robot, borders[0], 443)
+    assert not connects(robot, borders[0], 80)
+
+
+def connects(client: Host, server: Host, port: int) -> bool:
+    """Return whether a TCP connection is made."""
+    with server.space.inside(socket.socket) as listener, client.space.inside(socket.socket) as caller:
+        listener.bind(("", port))
+        listener.listen()
+        caller.settimeout(0.5)
+        try:
+            caller.connect((server.lease().address.partition("/")[0], port))
+        except TimeoutError:
+            return False
+        return True
+
+
+def test_an_ipv6_only_host_shows_its_own_address_and_lets_no_stranger_in(
+    laboratory: Laboratory, borders: tuple[Host, Host]
+) -> None:
+    robot = attach(laboratory, Access.IPV6_ONLY)
+    assert not robot.lease().has(4)
+    with UdpProbe(robot, 6) as probe, UdpProbe(borders[0], 6) as border, UdpProbe(borders[1], 6) as stranger:
+        assert observe(stranger, probe) is None
+        assert observe(probe, border) == probe.local
+        assert observe(border, probe) == border.local
+
+
+def test_a_public_host_is_reached_by_a_stranger_over_both_ip_versions(laboratory: Laboratory) -> None:
+    one, other = (attach(laboratory, Access.PUBLIC, label) for label in ("one", "other"))
+    for version in (4, 6):
+        with UdpProbe(one, version) as a, UdpProbe(other, version) as b:
+            assert observe(a, b) == a.local
+
+
+@pytest.mark.parametrize("access", [Access.FULL_CONE, Access.DOUBLE_NAT], ids=lambda each: each.value)
+def test_a_nat_that_forgets_its_mappings_lets_its_peer_in_after_the_next_datagram_from_inside(
+    laboratory: Laboratory, borders: tuple[Host, Host], access: Access
+) -> None:
+    robot = attach(laboratory, access)
+    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
+        before = observe(probe, border)
+        robot.site().flush_mappings()
+        assert observe(border, probe, before) is None
+        after = observe(probe, border)
+        assert observe(border, probe, after) is not None
+
+
+def test_a_symmetric_nat_that_forgets_a_mapping_makes_another(
+    laboratory: Laboratory, borders: tuple[Host, Host]
+) -> None:
+    robot = attach(laboratory, Access.SYMMETRIC)
+    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
+        before = observe(probe, border)
+        assert observe(probe, border) == before
+        robot.site().flush_mappings()
+        assert observe(probe, border) not in (before, None)
+
+
+def test_mappings_end_after_the_timeout_of_the_site(laboratory: Laboratory, borders: tuple[Host, Host]) -> None:
+    robot = attach(laboratory, Access.PORT_RESTRICTED)
+    robot.site().set_mapping_timeout(1)
+    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
+        public = observe(probe, border)
+        time.sleep(1.5)
+        assert observe(border, probe, public) is None
+
+
+@pytest.mark.parametrize("access", [*NATS, Access.PUBLIC], ids=lambda each: each.value)
+def test_a_renumbered_site_shows_a_new_address_to_the_same_socket(
+    laboratory: Laboratory, borders: tuple[Host, Host], access: Access
+) -> None:
+    robot = attach(laboratory, access)
+    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
+        before = observe(probe, border)
+        robot.site().renumber()
+        after = observe(probe, border)
+        assert before is not None
+        assert after is not None
+        assert before.address != after.address
+        assert observe(border, probe, after) is not None
+        assert observe(border, probe, before) is None
+
+
+def test_a_renumbered_ipv6_site_gives_its_hosts_another_prefix(
+    laboratory: Laboratory, borders: tuple[Host, Host]
+) -> None:
+    robot = attach(laboratory, Access.IPV6_ONLY)
+    with UdpProbe(robot, 6) as probe, UdpProbe(borders[0], 6) as border:
+        before = observe(probe, border)
+        robot.site().renumber()
+        assert observe(probe, border) not in (before, None)
+
+
+def test_a_new_lease_gives_a_host_another_address_behind_the_same_nat(
+    laboratory: Laboratory, borders: tuple[Host, Host]
+) -> None:
+    robot = attach(laboratory, Access.PORT_RESTRICTED)
+    before = robot.lease().address
+    robot.renumber()
+    assert robot.lease().address != before
+    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
+        seen = observe(probe, border)
+        assert seen is not None
+        assert seen.address == robot.site().address
+
+
+def test_a_socket_outlives_the_move_of_its_host_to_another_site(
+    laboratory: Laboratory, borders: tuple[Host, Host]
+) -> None:
+    robot = attach(laboratory, Access.PORT_RESTRICTED)
+    mobile = laboratory.add_site("mobile", Access.SYMMETRIC)
+    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
+        assert observe(probe, border) is not None
+        robot.attach(mobile)
+        after = observe(probe, border)
+    assert after is not None
+    assert after.address == mobile.address
+    robot.attach(laboratory.add_site("v6", Access.IPV6_ONLY))
+    with UdpProbe(robot, 6) as probe, UdpProbe(borders[0], 6) as border:
+        assert observe(probe, border) == probe.local
+
+
+def test_a_host_with_two_uplinks_uses_the_first_and_may_choose(
+    laboratory: Laboratory, borders: tuple[Host, Host]
+) -> None:
+    home, mobile = (laboratory.add_site(label, Access.PORT_RESTRICTED) for label in ("home", "mobile"))
+    robot = laboratory.add_host("robot", home, "wlan0")
+    robot.attach(mobile, "wwan0")
+    with UdpProbe(borders[0]) as border:
+        for device, address in (("", home.address), ("wlan0", home.address), ("wwan0", mobile.address)):
+            with UdpProbe(robot, device=device) as probe:
+                seen = observe(probe, border)
+                assert seen is not None
+                assert seen.address == address
+
+
+def test_a_silent_cut_loses_datagrams_without_an_error_until_it_ends(
+    laboratory: Laboratory, borders: tuple[Host, Host]
+) -> None:
+    robot = attach(laboratory, Access.PORT_RESTRICTED)
+    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
+        public = observe(probe, border)
+        robot.site().cut()
+        assert observe(probe, border) is None
+        assert observe(border, probe, public) is None
+        assert all(probe.send(border.local, b"no error") for _ in range(3))
+        robot.site().restore()
+        assert observe(probe, border) == public
+
+
+def test_a_router_without_carrier_answers_that_the_network_is_unreachable(
+    laboratory: Laboratory, borders: tuple[Host, Host]
+) -> None:
+    robot = attach(laboratory, Access.PORT_RESTRICTED)
+    robot.site().cut(is_silent=False)
+    with robot.space.inside(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as connected:
+        connected.settimeout(PATIENCE_S)
+        connected.setsockopt(socket.IPPROTO_IP, IP_RECVERR, 1)
+        connected.connect((borders[0].lease().address.partition("/")[0], 9))
+        connected.send(b"to a router without a route")
+        with pytest.raises(OSError, match="unreachable"):
+            connected.recv(1)
+    robot.site().restore()
+    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
+        assert observe(probe, border) is not None
+
+
+def test_an_unplugged_host_sees_its_carrier_go_and_come(laboratory: Laboratory) -> None:
+    robot = attach(laboratory, Access.PORT_RESTRICTED)
+    seen = []
+    for action in (robot.unplug, robot.plug):
+        action()
+        link = subprocess.run(robot.space.command(["ip", "link", "show", ETHERNET]), capture_output=True, check=True)
+        seen.append(b"NO-CARRIER" in link.stdout)
+    assert seen == [True, False]
+
+
+@pytest.mark.parametrize("access", [Access.SYMMETRIC, Access.DOUBLE_NAT, Access.IPV6_ONLY], ids=lambda each: each.value)
+def test_a_router_that_restarts_forgets_its_mappings_and_serves_again(
+    laboratory: Laboratory, borders: tuple[Host, Host], access: Access
+) -> None:
+    robot = attach(laboratory, access)
+    version = min(TRAITS[access].versions)
+    with UdpProbe(robot, version) as probe, UdpProbe(borders[0], version) as border:
+        public = observe(probe, border)
+        robot.site().power_off()
+        assert observe(probe, border) is None
+        robot.site().power_on()
+        assert observe(border, probe, public) is None
+        assert observe(probe, border) is not None
+
+
+def test_a_delay_line_delays_both_directions_and_loses_nothing(
+    laboratory: Laboratory, borders: tuple[Host, Host]
+) -> None:
+    robot = attach(laboratory, Access.PORT_RESTRICTED, has_line=True)
+    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
+        public = observe(probe, border)
+        robot.site().set_delay(30.0, jitter_ms=5.0)
+        started_s = time.monotonic()
+        probe.send(border.local, b"there")
+        assert border.wait(b"there", PATIENCE_S) == public
+        assert public is not None
+        border.send(public, b"back")
+        assert probe.wait(b"back", PATIENCE_S) is not None
+        assert time.monotonic() - started_s >= 0.06
+        send_many(probe, border, 500)
+        assert border.wait(b"499", PATIENCE_S) is not None
+        assert len(border.sources) == 502
+
+
+def send_many(sender: UdpProbe, receiver: UdpProbe, count: int) -> None:
+    for number in range(count):
+        sender.send(receiver.local, b"%d" % number)
+
+
+def test_a_delay_without_a_delay_line_is_refused(laboratory: Laboratory) -> None:
+    with pytest.raises(LocalError, match="no delay line"):
+        laboratory.add_site("home", Access.PUBLIC).set_delay(1.0)
+
+
+@pytest.mark.parametrize(("share", "least", "most"), [(0.0, 400, 400), (0.25, 200, 370), (1.0, 0, 0)])
+def test_a_site_loses_the_share_of_packets_that_is_set(
+    laboratory: Laboratory, borders: tuple[Host, Host], share: float, least: int, most: int
+) -> None:
+    robot = attach(laboratory, Access.PORT_RESTRICTED)
+    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
+        assert observe(probe, border) is not None
+        robot.site().set_loss(share)
+        send_many(probe, border, 400)
+        robot.site().set_loss(0.0)
+        assert observe(probe, border) is not None  # the last, so all others are there
+    assert least <= len(border.sources) - 2 <= most
+
+
+def test_a_limited_uplink_drops_what_exceeds_its_queue(laboratory: Laboratory, borders: tuple[Host, Host]) -> None:
+    robot = attach(laboratory, Access.PUBLIC)
+    with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
+        for mbit, is_whole in ((1.0, False), (0.0, True)):
+            robot.site().set_rate(mbit)
+            border.sources.clear()
+            for number in range(90):
+                probe.send(border.local, b"%2d" % number + bytes(1_200))
+            border.wait(b"never sent")
+            assert (len(border.sources) == 90) is is_whole
+
+
+def test_the_pairs_that_reach_each_other_directly_are_those_that_the_traits_allow(
+    laboratory: Laboratory, borders: tuple[Host, Host]
+) -> None:
+    sides = [{access: attach(laboratory, access, f"{side}{n}") for n, access in enumerate(Access)} for side in "ab"]
+    pairs = list(product(Access, Access))
+    found = open_paths([(sides[0][one], sides[1][other]) for one, other in pairs], borders[0])
+    assert dict(zip(pairs, found, strict=True)) == {pair: allows_direct(*pair) for pair in pairs}
+
+
+ORPHAN = """
+import sys, signal
+from pathlib import Path
+from gdp.host.run_registry import RunRegistry
+from internet.access import Access
+from internet.laboratory import Laboratory
+run = RunRegistry(Path(sys.argv[1])).start()
+laboratory = Laboratory(run)
+site = laboratory.add_site("home", Access.DOUBLE_NAT, has_line=True)
+laboratory.add_host("robot", site)
+print(run.directory, *run.record.namespaces, flush=True)
+signal.pause()
+"""
+
+
+def test_what_a_killed_laboratory_left_is_removed_by_the_next_start(laboratory: Laboratory, tmp_path: Path) -> None:
+    argv = [sys.executable, "-c", ORPHAN, str(tmp_path / "runs")]
+    where = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True, env=where) as process:
+        assert process.stdout is not None
+        left = [Path(word) for word in process.stdout.readline().split()]
+        process.send_signal(signal.SIGKILL)
+    assert len(left) == 6
+    assert all(path.exists() for path in left[1:])
+    assert len(RunRegistry(tmp_path / "runs").sweep()) == 1
+    assert not any(path.exists() for path in left)
+    assert laboratory.core.path.exists()

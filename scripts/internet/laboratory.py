@@ -1,0 +1,106 @@
+"""Laboratory of networks: an internet's core in a namespace, sites around it, hosts at the sites.
+
+I/O; needs root of the machine or of a user namespace, nft(8) and conntrack(8). ``run.end()``, or the next start after
+a crash, removes everything. Addresses are those for documentation (RFC 5737, RFC 3849), used inside only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from ipaddress import IPv4Network, IPv6Network
+from itertools import chain, count
+from typing import Final
+
+from gdp.errors import LocalError
+from gdp.host.run_registry import Run
+from internet.access import Access
+from internet.host import ETHERNET, Host
+from internet.rules import core_rules
+from internet.site import Site
+from internet.space import Space
+
+__all__ = ["Laboratory"]
+
+_PUBLIC: Final = (IPv4Network("198.51.100.0/24"), IPv4Network("203.0.113.0/24"), IPv4Network("192.0.2.0/24"))
+_PUBLIC6: Final = IPv6Network("2001:db8::/32")
+_BLOCK_BITS, _PREFIX_BITS = 29, 48
+_FIRST_INDEX: Final = 1_000  # ends of a pair differ in index; see ``gdp.simulation.namespaces``
+
+
+class Laboratory:
+    """The core and what is attached to it; a context manager that ends the processes of delay lines.
+
+    Raises:
+        LocalError: the kernel refuses; the run's record names what was made before.
+    """
+
+    def __init__(self, run: Run) -> None:
+        self.run = run
+        self.core = Space(run, "core", forwards=True)
+        self.sites: dict[str, Site] = {}
+        self.hosts: dict[str, Host] = {}
+        self._blocks: Iterator[IPv4Network] = chain.from_iterable(
+            zip(*(each.subnets(new_prefix=_BLOCK_BITS) for each in _PUBLIC), strict=True)
+        )
+        self._prefixes = _PUBLIC6.subnets(new_prefix=_PREFIX_BITS)
+        self._indices, self._devices = count(_FIRST_INDEX), count()
+        self.core.ip(f"route add blackhole {network}" for network in (*_PUBLIC, _PUBLIC6))
+
+    def __enter__(self) -> Laboratory:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for site in self.sites.values():
+            site.close()
+
+    def add_site(self, label: str, access: Access, *, hairpin: bool = False, has_line: bool = False) -> Site:
+        """Attach a site.
+
+        Args:
+            label: at most 10 letters, unique among sites and hosts.
+            hairpin: whether its NAT forwards between its own hosts by their public endpoints.
+            has_line: whether packets can be delayed, which costs a process.
+        """
+        site = self.sites[label] = Site(self, label, access, hairpin=hairpin, has_line=has_line)
+        return site
+
+    def add_host(self, label: str, site: Site, device: str = ETHERNET) -> Host:
+        """Attach a host to a site; more devices follow by ``Host.attach``."""
+        host = self.hosts[label] = Host(self, label)
+        host.attach(site, device)
+        return host
+
+    def next_index(self) -> int:
+        """Return an interface index that no device of the laboratory has."""
+        return next(self._indices)
+
+    def next_device(self) -> str:
+        """Return a device name that no device of the laboratory has."""
+        return f"port{next(self._devices)}"
+
+    def take_block(self) -> IPv4Network:
+        """Return eight public addresses that no site had before. Raises ``LocalError``: none are left."""
+        block = next(self._blocks, None)
+        if block is None:
+            raise LocalError("no public IPv4 address is left")
+        return block
+
+    def take_prefix(self) -> IPv6Network:
+        """Return an IPv6 prefix that no site had before."""
+        return next(self._prefixes)
+
+    def renew_leases(self, site: Site) -> None:
+        """Give each host of a site the addresses that the site has for it now."""
+        for host in self.hosts.values():
+            for device in host.devices_at(site):
+                host.renew_lease(device)
+
+    def set_ports(self, site: Site, *, is_up: bool) -> None:
+        """Give the carrier to every host of a site, or take it away."""
+        for host in self.hosts.values():
+            for device in host.devices_at(site):
+                (host.plug if is_up else host.unplug)(device)
+
+    def apply_faults(self) -> None:
+        """Apply the faults that the sites' uplinks have now."""
+        self.core.nft(core_rules({site.uplink: site.fault for site in self.sites.values()}))

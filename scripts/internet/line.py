@@ -1,0 +1,151 @@
+"""Delay line of a site's uplink: a process that passes frames between two devices after a delay with jitter.
+
+I/O; two AF_PACKET sockets. Run as ``python -m internet.line DEVICE DEVICE``. Each line on its standard input holds a
+delay and a jitter in milliseconds; it ends with its input. It replaces netem, which not every kernel has. Frames pass
+with their offload header, so that a large segment of TCP costs no more than a small one, and no checksum is lost.
+Source: packet(7), PACKET_VNET_HDR; Linux, include/uapi/linux/if_packet.h, for the numbers.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+import random
+import select
+import socket
+import subprocess
+import sys
+import time
+from typing import Final
+
+from fog.providers.local.delay import DelayLine
+from gdp.errors import LocalError
+from gdp.host.run_registry import Run
+from internet.space import Space
+
+__all__ = ["LineProcess", "main"]
+
+log = logging.getLogger(__name__)
+
+_ALL: Final = 3  # ETH_P_ALL
+_SOL_PACKET, _OFFLOAD_HEADER, _IGNORE_OUTGOING, _BUFFER_FORCE = 263, 15, 23, 33
+_BUFFER_BYTES: Final = 16 << 20
+_FRAME_BYTES: Final = (1 << 16) + 64
+_BATCH: Final = 32
+_MS_NS: Final = 1_000_000
+_TIMER_SLACK: Final = 29  # PR_SET_TIMERSLACK
+_READY: Final = b"ready\n"
+
+
+class LineProcess:
+    """A running delay line between two devices of a namespace; it starts without delay.
+
+    Raises:
+        LocalError: it does not start.
+    """
+
+    def __init__(self, run: Run, space: Space, one: str, other: str) -> None:
+        argv = [sys.executable, "-m", "internet.line", one, other]
+        self._process = subprocess.Popen(
+            space.command(argv), stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True, bufsize=0
+        )
+        run.note_process(self._process.pid)
+        try:
+            self.set_delay(0.0)
+        except LocalError:
+            self.close()
+            raise
+
+    def set_delay(self, ms: float, jitter_ms: float = 0.0) -> None:
+        """Delay frames that arrive from now on."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        try:
+            self._process.stdin.write(f"{ms} {jitter_ms}\n".encode())
+            answer = self._process.stdout.readline()
+        except BrokenPipeError as error:
+            raise LocalError("the delay line has ended") from error
+        if answer != _READY:
+            raise LocalError("the delay line has ended")
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.communicate()
+
+
+class _Delay:
+    """Due times of frames: each direction keeps its order."""
+
+    def __init__(self) -> None:
+        self.delay_ns = self.jitter_ns = 0
+        self._last_ns = [0, 0]
+
+    def due_ns(self, side: int, now_ns: int) -> int:
+        """Return when a frame that arrived now on a side is due."""
+        due_ns = now_ns + self.delay_ns + (random.randrange(self.jitter_ns) if self.jitter_ns else 0)
+        self._last_ns[side] = max(self._last_ns[side], due_ns)
+        return self._last_ns[side]
+
+
+def _open(device: str) -> socket.socket:
+    opened = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
+    opened.setsockopt(_SOL_PACKET, _IGNORE_OUTGOING, 1)
+    opened.setsockopt(_SOL_PACKET, _OFFLOAD_HEADER, 1)
+    for option in (socket.SO_RCVBUF, _BUFFER_FORCE):
+        try:
+            opened.setsockopt(socket.SOL_SOCKET, option, _BUFFER_BYTES)
+        except PermissionError:
+            log.warning("a short buffer: not root of the machine device=%s", device)
+    opened.bind((device, _ALL))
+    opened.setblocking(False)
+    return opened
+
+
+def _relay(sides: tuple[socket.socket, socket.socket], line: DelayLine) -> None:
+    """Relay until the input ends."""
+    delay = _Delay()
+    control = sys.stdin.fileno()
+    while True:
+        ready, _, _ = select.select((*sides, control), (), (), line.pause_s(time.monotonic_ns()))
+        for side, source in enumerate(sides):
+            if source in ready:
+                _receive(source, side, line, delay)
+        if control in ready:
+            words = os.read(control, 1 << 10).split()
+            if not words:
+                return
+            delay.delay_ns, delay.jitter_ns = (round(float(word) * _MS_NS) for word in words[-2:])
+            os.write(sys.stdout.fileno(), _READY)
+        for side, frame in line.poll_frames(time.monotonic_ns()):
+            try:
+                sides[side].send(frame)
+            except OSError:  # the device is down, or its queue is full
+                line.dropped += 1
+
+
+def _receive(source: socket.socket, side: int, line: DelayLine, delay: _Delay) -> None:
+    for _ in range(_BATCH):
+        try:
+            frame = source.recv(_FRAME_BYTES)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            log.info("a device went down reason=%s", error)
+            return
+        line.put(delay.due_ns(side, time.monotonic_ns()), side, frame)
+
+
+def main() -> None:
+    """Run the relay of the command line."""
+    logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(levelname)s %(name)s %(message)s")
+    ctypes.CDLL(None).prctl(_TIMER_SLACK, 1, 0, 0, 0)  # the default adds 50 us to each pause
+    line = DelayLine(0)
+    with _open(sys.argv[1]) as one, _open(sys.argv[2]) as other:
+        _relay((one, other), line)
+    if line.dropped:
+        log.warning("frames dropped count=%d", line.dropped)
+
+
+if __name__ == "__main__":
+    main()

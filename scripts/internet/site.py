@@ -1,0 +1,275 @@
+"""Site of a laboratory: one router, or two for a double NAT, between its hosts and the core.
+
+I/O. ::
+
+    hosts ---- lan [home router] wan ---- lan [carrier's router] wan ---- uplink [core]
+                                          only for a double NAT           |
+                                                       a delay line of two devices, where asked for
+
+Links between routers and the core have link-local addresses only. A site of public access owns a block of eight
+addresses. Behind a NAT the outermost router has one, and all sites use the same private addresses. An IPv6 site has
+a prefix of 48 bits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from ipaddress import IPv4Network
+from typing import TYPE_CHECKING, Final
+
+from gdp.errors import LocalError
+from internet.access import TRAITS, Access
+from internet.line import LineProcess
+from internet.rules import FLUSH_MAPPINGS, LAN, WAN, Fault, router_rules
+from internet.space import Space
+
+if TYPE_CHECKING:
+    from internet.laboratory import Laboratory
+
+__all__ = ["Lease", "Site"]
+
+_CORE_END, _ROUTER_END = "169.254.0.1", "169.254.0.2"  # RFC 3927, on every link towards the core
+_CORE_END6, _ROUTER_END6 = "fe80::1", "fe80::2"
+_HOME: Final = IPv4Network("192.168.1.0/24")
+_CARRIER: Final = IPv4Network("100.64.0.0/24")  # RFC 6598
+_BRIDGE_MAC: Final = b"\x02gdp"  # fixed, because a bridge otherwise takes the address of one of its ports
+_FIRST_HOST: Final = 10
+_MAPPING_TIMEOUTS: Final = ("nf_conntrack_udp_timeout", "nf_conntrack_udp_timeout_stream")
+
+
+@dataclass(frozen=True, slots=True)
+class Lease:
+    """Configuration that a host of the site gets: addresses with prefix length, gateways; empty: none."""
+
+    address: str = ""
+    gateway: str = ""
+    address6: str = ""
+    gateway6: str = ""
+
+    def has(self, version: int) -> bool:
+        """Return whether there is an address of this IP version."""
+        return bool(self.address if version == 4 else self.address6)
+
+
+class Site:
+    """Access of some hosts to the core; ``Laboratory.add_site`` makes it.
+
+    Attributes:
+        access: its kind.
+        routers: from its hosts outwards.
+    """
+
+    def __init__(self, laboratory: Laboratory, label: str, access: Access, *, hairpin: bool, has_line: bool) -> None:
+        self.label, self.access, self._hairpin = label, access, hairpin
+        self._laboratory = laboratory
+        self._core = laboratory.core
+        self.fault = Fault()
+        self.uplink = laboratory.next_device()  # the core's device
+        self._leases = 0
+        self._line: LineProcess | None = None
+        count = 2 if access is Access.DOUBLE_NAT else 1
+        self.routers = tuple(
+            Space(laboratory.run, f"{label}-{name}", forwards=True) for name in ("router", "carrier")[:count]
+        )
+        self._block, self._prefix = laboratory.take_block(), laboratory.take_prefix()
+        for router in self.routers:
+            mac = (_BRIDGE_MAC + laboratory.next_index().to_bytes(2, "big")).hex(":")
+            router.ip(
+                [f"link add {LAN} address {mac} type bridge forward_delay 0 mcast_snooping 0", f"link set {LAN} up"]
+            )
+        if count == 2:
+            home, carrier = self.routers
+            port = laboratory.next_device()
+            carrier.ip([f"link add {port} index {laboratory.next_index()} type veth peer {WAN} netns {home.path}"])
+            carrier.ip([f"link set {port} master {LAN} up"])
+        self._join_core(has_line=has_line)
+        self._configure()
+
+    @property
+    def address(self) -> str:
+        """The public IPv4 address of the NAT; empty: there is no NAT."""
+        return str(self._block[1]) if self._is_nat else ""
+
+    @property
+    def _is_nat(self) -> bool:
+        return self.access is not Access.PUBLIC and self._has4
+
+    @cached_property
+    def _has4(self) -> bool:
+        return 4 in TRAITS[self.access].versions
+
+    @cached_property
+    def _has6(self) -> bool:
+        return 6 in TRAITS[self.access].versions
+
+    @property
+    def _outer(self) -> Space:
+        return self.routers[-1]
+
+    def lease(self, number: int) -> Lease:
+        """Return the configuration of the host with this number, from 0 on, under the site's current addresses."""
+        lan = self._lan
+        own = lan[2 + number] if self.access is Access.PUBLIC else lan[_FIRST_HOST + number]
+        lease = Lease(f"{own}/{lan.prefixlen}", str(lan[1])) if self._has4 else Lease()
+        if not self._has6:
+            return lease
+        return replace(lease, address6=f"{self._prefix[_FIRST_HOST + number]}/64", gateway6=_CORE_END6)
+
+    def next_host(self) -> int:
+        """Return the number of one more host."""
+        self._leases += 1
+        return self._leases - 1
+
+    def renumber(self) -> None:
+        """Give the site other public addresses, as a provider does: its hosts' too, where these are public."""
+        old, old_prefix, old_lan = self._block, self._prefix, self._lan
+        self._block, self._prefix = self._laboratory.take_block(), self._laboratory.take_prefix()
+        core, outer = [], []
+        if self._has4:
+            core.append(f"route del {old} dev {self.uplink}")
+            is_public = self.access is Access.PUBLIC
+            outer.append(
+                f"addr del {old_lan[1]}/{old_lan.prefixlen} dev {LAN}"
+                if is_public
+                else f"addr del {old[1]}/32 dev {WAN}"
+            )
+        if self._has6:
+            core.append(f"route del {old_prefix} dev {self.uplink}")
+            outer.append(f"addr del {old_prefix[1]}/64 dev {LAN}")
+        self._core.ip(core)
+        self._outer.ip(outer)
+        self._configure()
+        self._laboratory.renew_leases(self)
+
+    def cut(self, *, is_silent: bool = True) -> None:
+        """Cut the uplink.
+
+        Args:
+            is_silent: packets vanish; otherwise the router's device goes down, and the router answers that the
+                network is unreachable.
+        """
+        if is_silent:
+            self._set_fault(replace(self.fault, is_cut=True))
+        else:
+            self._outer.ip([f"link set {WAN} down"])
+
+    def restore(self) -> None:
+        """End a cut of either kind."""
+        self._set_fault(replace(self.fault, is_cut=False))
+        self._configure()
+
+    def flush_mappings(self) -> None:
+        """Let the NATs of the site forget their mappings; those that new datagrams make may have the same ports."""
+        for router in self.routers:
+            router.flush_connections()
+            if self.access is not Access.PUBLIC:
+                router.nft(FLUSH_MAPPINGS)
+
+    def set_mapping_timeout(self, seconds: int) -> None:
+        """Let UDP mappings end after so many seconds without a datagram."""
+        for router in self.routers:
+            router.set({f"netfilter/{name}": seconds for name in _MAPPING_TIMEOUTS})
+
+    def power_off(self) -> None:
+        """Switch the routers off: all their links lose the carrier, and they forget their mappings."""
+        self._laboratory.set_ports(self, is_up=False)
+        for router in self.routers:
+            router.ip([f"link set {WAN} down"])
+        self.flush_mappings()
+
+    def power_on(self) -> None:
+        """Switch the routers on again, under the same addresses."""
+        self._configure()
+        self._laboratory.set_ports(self, is_up=True)
+
+    def set_loss(self, share: float) -> None:
+        """Lose this share of the packets, 0 to 1, in each direction."""
+        self._set_fault(replace(self.fault, loss=share))
+
+    def set_rate(self, mbit: float) -> None:
+        """Limit the uplink in each direction, in Mbit/s; 0: unlimited."""
+        self._outer.shape(WAN, mbit)
+        self._core.shape(self.uplink, mbit)
+
+    def set_delay(self, ms: float, jitter_ms: float = 0.0) -> None:
+        """Delay packets by ``ms``, and up to ``jitter_ms`` more, in each direction; their order stays.
+
+        Raises:
+            LocalError: the site was made without a delay line.
+        """
+        if self._line is None:
+            raise LocalError(f"site {self.label} has no delay line")
+        self._line.set_delay(ms, jitter_ms)
+
+    def close(self) -> None:
+        """End the process of the delay line."""
+        if self._line is not None:
+            self._line.close()
+
+    def _join_core(self, *, has_line: bool) -> None:
+        number, outer = self._laboratory.next_index(), self._outer
+        if not has_line:
+            self._core.ip([f"link add {self.uplink} index {number} type veth peer {WAN} netns {outer.path}"])
+            return
+        line = Space(self._laboratory.run, f"{self.label}-line")
+        self._core.ip([f"link add {self.uplink} index {number} type veth peer core netns {line.path}"])
+        outer.ip([f"link add {WAN} index {number} type veth peer site netns {line.path}"])
+        line.set({f"ipv6/conf/{device}/disable_ipv6": 1 for device in ("core", "site")})
+        line.ip(["link set core up", "link set site up"])
+        self._line = LineProcess(self._laboratory.run, line, "core", "site")
+
+    def _configure(self) -> None:
+        """Set all links up, and addresses, routes and rules; harmless where they are so."""
+        core = [
+            f"link set {self.uplink} up",
+            f"addr replace {_CORE_END}/32 dev {self.uplink} scope link",
+            f"addr replace {_CORE_END6}/64 dev {self.uplink} nodad",
+        ]
+        outer = [
+            f"link set {WAN} up",
+            f"addr replace {_ROUTER_END}/32 dev {WAN} scope link",
+            f"addr replace {_ROUTER_END6}/64 dev {WAN} nodad",
+        ]
+        if self._has4:
+            core.append(f"route replace {self._block} via {_ROUTER_END} dev {self.uplink} onlink")
+            outer += [f"addr replace {self._block[1]}/32 dev {WAN}"] if self._is_nat else []
+            outer.append(f"route replace default via {_CORE_END} dev {WAN} onlink")
+        if self._has6:
+            core.append(f"route replace {self._prefix} via {_ROUTER_END6} dev {self.uplink}")
+            outer.append(f"route replace default via {_CORE_END6} dev {WAN}")
+        self._core.ip(core)
+        self._outer.ip(outer)
+        if len(self.routers) == 2:
+            self._outer.ip([f"addr replace {_CARRIER[1]}/{_CARRIER.prefixlen} dev {LAN}"])
+            wan = f"addr replace {_CARRIER[2]}/{_CARRIER.prefixlen} dev {WAN}"
+            self.routers[0].ip([f"link set {WAN} up", wan, f"route replace default via {_CARRIER[1]}"])
+            self.routers[0].wait_for_carrier(WAN)
+        self._core.wait_for_carrier(self.uplink)
+        self._outer.wait_for_carrier(WAN)
+        self._configure_lan()
+        for router, address in zip(self.routers, self._wan_addresses, strict=True):
+            if rules := router_rules(self.access, address, hairpin=self._hairpin):
+                router.nft(rules)
+
+    @property
+    def _lan(self) -> IPv4Network:
+        return self._block if self.access is Access.PUBLIC else _HOME
+
+    @property
+    def _wan_addresses(self) -> tuple[str, ...]:
+        return (str(_CARRIER[2]), self.address) if len(self.routers) == 2 else (self.address,)
+
+    def _configure_lan(self) -> None:
+        lines = [f"addr replace {self._lan[1]}/{self._lan.prefixlen} dev {LAN}"] if self._has4 else []
+        if self._has6:
+            lines += [
+                f"addr replace {_CORE_END6}/64 dev {LAN} nodad",
+                f"addr replace {self._prefix[1]}/64 dev {LAN} nodad",
+            ]
+        self.routers[0].ip(lines)
+
+    def _set_fault(self, fault: Fault) -> None:
+        if fault != self.fault:
+            self.fault = fault
+            self._laboratory.apply_faults()
