@@ -37,7 +37,7 @@ _BROKEN: Final = select.EPOLLERR | select.EPOLLHUP
 
 
 def prepare_socket(opened: socket.socket, dead_ms: int) -> None:
-    """Make a TCP socket non-blocking, without delay, with a small buffer of unsent bytes, and dead after ``dead_ms``."""
+    """Make a TCP socket non-blocking, with few unsent bytes in the kernel, and dead ``dead_ms`` after the path is."""
     opened.setblocking(False)
     opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, _UNSENT_BYTES)
