@@ -4,7 +4,7 @@ I/O. A switch continues to open ports that come back and to remove its veth pair
 kernel data plane it also loads and attaches its program there (CAP_BPF, CAP_PERFMON). A RIB or proxy opens its device
 again when it comes back. A node reads the operator's folders again on SIGHUP, or when its certificates are replaced. If
 another user owns these, as in a shell of sudo, the node keeps the capability to read or write past the owner, and
-Landlock bounds it.
+Landlock bounds it. A relay makes TAP devices while it runs (CAP_NET_ADMIN).
 """
 
 from __future__ import annotations
@@ -22,16 +22,19 @@ from typing import Final
 from gdp.nodes.audit import audit_folder
 from gdp.nodes.config import ClusterConfig, RibConfig, SwitchConfig
 from gdp.nodes.credentials import watched_folders
+from gdp.nodes.relay_config import RelayConfig
 from gdp.nodes.single_instance import lock_directory
 from gdp.ports.sandbox import Capability, Needs, confine
 
-__all__ = ["confine_proxy", "confine_rib", "confine_switch"]
+__all__ = ["confine_proxy", "confine_relay", "confine_rib", "confine_switch"]
 
 log = logging.getLogger(__name__)
 
 _DEVICE: Final = frozenset({Capability.NET_RAW, Capability.NET_ADMIN})
 _PROGRAMS: Final = frozenset({Capability.BPF, Capability.PERFMON})
 _SYSTEM: Final = tuple(map(Path, ("/usr", "/lib", "/lib64", "/lib32", "/etc", "/proc", "/sys", "/dev", "/opt")))
+_RESOLVER: Final = Path("/run/systemd/resolve")  # where /etc/resolv.conf may lead
+_DEVICE_SETTINGS: Final = Path("/proc/sys/net/ipv6/conf")
 _CHANGED: Final = (Path("/dev"),)  # null, and the terminal
 _WRITABLE_BY_ALL: Final = stat.S_IWOTH
 
@@ -74,6 +77,22 @@ def confine_rib(config: RibConfig) -> None:
             writes=(*_CHANGED, lock_directory(), *kept),
             reads=None if is_shared else (*_code(), *again),
             tcp_ports=None if is_shared else ports,
+        )
+    )
+
+
+def confine_relay(config: RelayConfig) -> None:
+    """Drop the rights that a relay does not need; it listens on its port, or opens connections to borders."""
+    again = watched_folders(config.identity, config.domain)
+    again += () if config.revocations is None else (config.revocations,)
+    kept = _folder_of(config.control_socket)
+    ports = tuple(each.port for each in (config.metrics, config.server) if each is not None)
+    _confine(
+        Needs(
+            capabilities=frozenset({Capability.NET_ADMIN}) | _past_owners(again, kept),
+            writes=(*_CHANGED, _DEVICE_SETTINGS, lock_directory(), *kept),
+            reads=(*_code(), _RESOLVER, *again),
+            tcp_ports=None if config.borders else ports,
         )
     )
 

@@ -23,6 +23,7 @@ from typing import Final, NamedTuple
 from gdp.errors import LocalError
 
 __all__ = [
+    "ADDRESS_GROUPS",
     "CLSACT_EGRESS",
     "CLSACT_INGRESS",
     "LINK_GROUP",
@@ -46,6 +47,7 @@ CLSACT_INGRESS: Final = 0xFFFFFFF2  # TC_H_MAKE(TC_H_CLSACT, TC_H_MIN_INGRESS)
 CLSACT_EGRESS: Final = 0xFFFFFFF3
 ROOT: Final = 0xFFFFFFFF
 LINK_GROUP: Final = 1  # RTMGRP_LINK: devices that change
+ADDRESS_GROUPS: Final = 0x10 | 0x40 | 0x100 | 0x400  # RTMGRP_IPV4_IFADDR, IPV4_ROUTE, IPV6_IFADDR, IPV6_ROUTE
 TRAFFIC_GROUP: Final = 8  # RTMGRP_TC: queues and filters that change
 READ_BYTES: Final = 1 << 16
 RTM_NEWLINK, RTM_DELLINK = 16, 17
@@ -273,7 +275,7 @@ def attribute(kind: int, value: bytes) -> bytes:
 
 
 def listen(groups: int) -> socket.socket:
-    """Return a non-blocking socket that receives notifications of these groups: ``LINK_GROUP``, ``TRAFFIC_GROUP``.
+    """Return a non-blocking socket that receives notifications of these groups, such as ``LINK_GROUP``.
 
     Raises:
         LocalError: the kernel opens no such socket.

@@ -1,0 +1,227 @@
+"""Relay node (``gdp-relay``): carries a switch's frames through TLS where UDP is blocked.
+
+I/O. On a border it is a server, on a member it dials borders; both ends have one TAP device for each connection, which
+is an ordinary port of the switch. It is slower than a tunnel, because each byte passes this process and TCP.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import logging
+import select
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Final
+
+from gdp.crypto.certificates import Role
+from gdp.crypto.identity import Identity
+from gdp.errors import DROP_COUNTERS, DropReason
+from gdp.names import Name
+from gdp.nodes.control_client import control_path
+from gdp.nodes.control_socket import ControlHandlers, ControlServer
+from gdp.nodes.control_status import node_status
+from gdp.nodes.credentials import Credentials
+from gdp.nodes.membership import load_member
+from gdp.nodes.node_log import LOOK_S
+from gdp.nodes.relay_config import RelayConfig
+from gdp.nodes.relay_context import RelayContext
+from gdp.nodes.relay_dialer import BorderDialer
+from gdp.nodes.relay_loop import RelayLoop
+from gdp.nodes.relay_server import BorderServer, listen_tls
+from gdp.nodes.rights import confine_relay
+from gdp.nodes.runtime import now
+from gdp.nodes.single_instance import run_alone
+from gdp.ports.address_monitor import AddressMonitor
+from gdp.ports.tap import TapDevice, tap_name
+from gdp.relay.connection import ConnectionCounters
+from gdp.telemetry.sources import Sources
+
+__all__ = ["VIA", "Relay", "relay_control_path", "run_relay"]
+
+log = logging.getLogger(__name__)
+
+VIA: Final = "tls (slower)"
+
+
+def relay_control_path(config: RelayConfig, switch: Name) -> Path:
+    """Return the control socket of the relay of a switch, which has one of its own."""
+    return config.control_socket or control_path(_instance(switch))
+
+
+def run_relay(config: RelayConfig, ready: Callable[[Identity, Relay], None]) -> None:
+    """Run a relay until a signal or a drain ends it.
+
+    Args:
+        ready: called once after the start.
+
+    Raises:
+        LocalError: keys, the port or the system's rights do not allow it, or this relay already runs.
+    """
+    identity, policy = load_member(config.identity, config.domain, Role.SWITCH)
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(run_alone("relay", _instance(identity.name)))
+        loop = RelayLoop()
+        stack.callback(loop.close)
+        context = RelayContext(config=config, identity=identity, policy=policy, loop=loop)
+        relay = Relay(context)
+        stack.callback(relay.close)
+        credentials = Credentials(config.identity, config.domain, identity, policy)
+        relay.on_look(lambda: credentials.reload_changed(now()))
+
+        def reload() -> None:
+            credentials.reload_changed(now())
+            relay.check_members()
+
+        stack.enter_context(loop.signals(reload))
+        path = relay_control_path(config, identity.name)
+        handlers = ControlHandlers(reload=reload, status=relay.status, drain=loop.stop)
+        stack.enter_context(_control(loop, path, handlers))
+        if config.sandbox:
+            confine_relay(config)
+        if config.metrics is not None:
+            stack.callback(_serve_metrics(relay.sources(), config.metrics.port))
+        log.info(
+            "relay up name=%s role=%s server=%s", identity.name.short, identity.role.value, relay.server is not None
+        )
+        ready(identity, relay)
+        loop.run()
+
+
+class Relay:
+    """The server and the dialers of one process.
+
+    Raises:
+        LocalError: the port, a TAP device or TLS cannot be had.
+    """
+
+    def __init__(self, context: RelayContext) -> None:
+        self._context = context
+        self._loop = context.loop
+        self._begun_s = time.monotonic()
+        self._looks: list[Callable[[], None]] = [self.check_members]
+        self._is_closed = False
+        context.load_revocations(now())
+        context.tls(is_server=False)
+        self.server: BorderServer | None = None
+        self.dialers: list[BorderDialer] = []
+        with contextlib.ExitStack() as opened:
+            config = context.config
+            self._monitor = opened.enter_context(contextlib.closing(AddressMonitor()))
+            for border in config.borders:
+                dialer = BorderDialer(border, context)
+                opened.callback(dialer.close)
+                self.dialers.append(dialer)
+            if config.server is not None:
+                own = context.identity.name
+                TapDevice(tap_name(own, own), context.alias, config.mtu).close()  # fails now, not at the first client
+                listener = opened.enter_context(listen_tls(config.server))
+                self.server = BorderServer(config, config.server, listener, context)
+            opened.pop_all()
+        self._loop.register(self._monitor.fileno(), select.EPOLLIN, self._addresses_changed)
+        self._loop.add_timed(self)
+
+    def on_look(self, look: Callable[[], None]) -> None:
+        """Call ``look`` from within the loop each ``LOOK_S``, before the members are checked."""
+        self._looks.insert(0, look)
+
+    def handle_timer(self, now_s: float) -> float:
+        """Look at files and memberships; return the second of the next call."""
+        for look in self._looks:
+            look()
+        return now_s + LOOK_S
+
+    def check_members(self) -> None:
+        """Read new revocations, and end connections of members that are no longer valid."""
+        moment = now()
+        self._context.load_revocations(moment)
+        if self.server is not None:
+            self.server.check_members(moment)
+        for dialer in self.dialers:
+            dialer.check_member(moment)
+
+    def close(self) -> None:
+        """End all connections, and remove their devices."""
+        if self._is_closed:
+            return
+        self._is_closed = True
+        self._loop.remove_timed(self)
+        self._loop.unregister(self._monitor.fileno())
+        self._monitor.close()
+        for dialer in self.dialers:
+            dialer.close()
+        if self.server is not None:
+            self.server.close()
+
+    def counters(self) -> ConnectionCounters:
+        """Return the sum over all connections since the start."""
+        total = ConnectionCounters()
+        for part in (*self.dialers, *(() if self.server is None else (self.server,))):
+            total.add(part.counters())
+        return total
+
+    def sources(self) -> Sources:
+        """Return the functions that metrics read."""
+
+        def frames() -> dict[str, int]:
+            """Return the frames by direction, as the switch sees it."""
+            total = self.counters()
+            return {"in": total.frames_in, "out": total.frames_out}
+
+        return Sources(frames=frames, drops=[self._drops])
+
+    def status(self) -> dict[str, object]:
+        """Return the JSON fields of this relay."""
+        now_s, total = time.monotonic(), self.counters()
+        more: dict[str, object] = {"via": VIA, "bytes_in": total.bytes_in, "bytes_out": total.bytes_out}
+        if self.server is not None:
+            more["server"] = self.server.status(now_s)
+        more["borders"] = [dialer.status(now_s) for dialer in self.dialers]
+        uptime_s = now_s - self._begun_s
+        return {**node_status(self._context.identity, self.sources(), uptime_s=uptime_s, **more), "role": "relay"}
+
+    def _addresses_changed(self, events: int) -> None:
+        del events
+        if self._monitor.poll():
+            for dialer in self.dialers:
+                dialer.network_changed()
+
+    def _drops(self) -> list[int]:
+        total = self.counters()
+        drops = [0] * DROP_COUNTERS
+        drops[DropReason.BAD_ETHERTYPE] = total.foreign
+        drops[DropReason.TOO_BIG] = total.too_big
+        drops[DropReason.PORT_FULL] = total.full
+        drops[DropReason.PORT_DOWN] = total.refused
+        return drops
+
+
+@contextlib.contextmanager
+def _control(loop: RelayLoop, path: Path, handlers: ControlHandlers) -> Iterator[None]:
+    """Serve the control socket from within the loop until the context ends."""
+    if not path.parent.is_dir():  # locks are not possible here either, which was logged
+        log.warning("no control socket: no such directory path=%s", path.parent)
+        yield
+        return
+    server = ControlServer(path, handlers)
+    loop.register(server.fileno(), select.EPOLLIN, lambda _: server.handle_events())
+    try:
+        yield
+    finally:
+        loop.unregister(server.fileno())
+        server.close()
+
+
+def _instance(switch: Name) -> Name:
+    """Return the name under which the relay of a switch holds its lock, for the switch itself holds its own."""
+    return Name(hashlib.sha256(b"gdp-relay-instance-1" + switch).digest())
+
+
+def _serve_metrics(sources: Sources, port: int) -> Callable[[], None]:
+    """Serve metrics on a loopback port; return the function that ends it."""
+    from gdp.telemetry.metrics import Metrics
+
+    metrics = Metrics(sources)
+    metrics.serve(port)
+    return metrics.close

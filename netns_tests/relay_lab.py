@@ -1,0 +1,179 @@
+"""Border and member that only a routed IPv4 cable joins, with the files and processes of relays and switches."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from gdp.crypto.certificates import Role
+from gdp.names import Name
+from gdp.nodes.control_client import ask_node
+from gdp.nodes.control_protocol import Command
+from gdp.ports.tap import tap_name
+from gdp.stores.issue import make_domain, make_node
+from gdp.stores.keyring import load_card
+from netns_tests.spaces import Space
+
+PORT = 443
+BORDER_ADDRESS, MEMBER_ADDRESS, LATER_ADDRESS = "192.0.2.1", "192.0.2.2", "192.0.2.3"
+_PATIENCE_S = 30.0
+
+
+class Node:
+    """One machine: a folder, a namespace and its processes."""
+
+    def __init__(self, home: Path, label: str, pid: int, peers: list[str]) -> None:
+        self.home, self.label, self._pid = home, label, pid
+        self.enter = ["nsenter", f"--net=/proc/{pid}/ns/net"]
+        self.running: list[subprocess.Popen[bytes]] = []
+        self.identity = home / label
+        self.name: Name = load_card(self.identity / "node.card").name
+        del peers
+
+    def ip(self, *words: str) -> None:
+        """Run ``ip`` here."""
+        subprocess.run([*self.enter, "ip", *words], check=True, capture_output=True)
+
+    def links(self) -> list[dict[str, Any]]:
+        """Return the devices as ``ip -j`` describes them."""
+        done = subprocess.run([*self.enter, "ip", "-j", "link", "show"], check=True, capture_output=True)
+        found: list[dict[str, Any]] = json.loads(done.stdout)
+        return found
+
+    def write(self, file: str, **keys: object) -> Path:
+        """Write a configuration of this machine's identity."""
+        path = self.home / f"{self.label}-{file}"
+        domain = {"root": f"{self.label}/root.crt"}
+        path.write_text(yaml.safe_dump({"identity": self.label, "domain": domain, **keys}))
+        return path
+
+    def start(self, module: str, config: Path, *words: str) -> subprocess.Popen[bytes]:
+        """Start a node, and return when it is ready."""
+        process = subprocess.Popen(
+            [*self.enter, sys.executable, "-m", module, "--config", str(config), "--json", *words],
+            stdout=subprocess.PIPE,
+            stderr=(self.home / f"{self.label}-{module}.log").open("ab"),
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+            bufsize=0,
+        )
+        self.running.append(process)
+        assert process.stdout is not None
+        assert select.select([process.stdout], [], [], _PATIENCE_S)[0], self.log(module)
+        line = process.stdout.readline()
+        assert b'"ready"' in line, (line, self.log(module))
+        return process
+
+    def log(self, module: str) -> str:
+        """Return what the node logged so far."""
+        return (self.home / f"{self.label}-{module}.log").read_text()
+
+    def status(self, socket: Path) -> dict[str, Any]:
+        """Return the status over a control socket."""
+        return dict(ask_node(socket, Command.STATUS, _PATIENCE_S).result)
+
+    def end(self) -> None:
+        """End all processes with Ctrl-C, or at last with a kill."""
+        while self.running:
+            process = self.running.pop()
+            process.send_signal(signal.SIGINT)
+            try:
+                process.wait(10.0)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+            if process.stdout is not None:
+                process.stdout.close()
+
+
+class RelayLab:
+    """The two machines."""
+
+    def __init__(self, home: Path, pids: tuple[int, int]) -> None:
+        self.home, self.domain = home, home / "domain"
+        make_domain(self.domain, "lab", unix_s=time.time())
+        for label in ("border", "member"):
+            make_node(home / label, Role.SWITCH, label, self.domain, days=30, unix_s=time.time())
+        self.border, self.member = (
+            Node(home, label, pid, []) for label, pid in zip(("border", "member"), pids, strict=True)
+        )
+        self.border_device = tap_name(self.border.name, self.member.name)
+        self.member_device = tap_name(self.member.name, self.border.name)
+
+    def relay_config(self, node: Node, **more: object) -> Path:
+        """Write ``relay.yaml`` of one machine."""
+        border = {"peer": self.border.name.to_text(), "endpoints": [f"{BORDER_ADDRESS}:{PORT}"]}
+        part: dict[str, object] = {"server": {"port": PORT}} if node is self.border else {"borders": [border]}
+        return node.write("relay.yaml", control_socket=f"{node.label}-relay.sock", **{**part, **more})
+
+    def start_relay(self, node: Node, **more: object) -> subprocess.Popen[bytes]:
+        """Start the relay of one machine."""
+        return node.start("gdp.cli.relay", self.relay_config(node, **more))
+
+    def start_switch(self, node: Node, **more: object) -> subprocess.Popen[bytes]:
+        """Start the switch of one machine, whose only link is the relay's device."""
+        device = self.border_device if node is self.border else self.member_device
+        config = node.write(
+            "switch.yaml",
+            ports=[{"iface": device, "optional": True, "cost": 100}],
+            control_socket=f"{node.label}-switch.sock",
+            data_plane="raw",
+            **more,
+        )
+        return node.start("gdp.cli.switch", config)
+
+    def neighbours(self, node: Node) -> int:
+        """Return how many neighbours the switch of a machine has."""
+        return int(node.status(self.home / f"{node.label}-switch.sock")["neighbours"])
+
+    def relay_status(self, node: Node) -> dict[str, Any]:
+        """Return the status of the relay of a machine."""
+        return node.status(self.home / f"{node.label}-relay.sock")
+
+    def is_joined(self) -> bool:
+        """Return whether both switches see each other."""
+        return self.neighbours(self.border) == self.neighbours(self.member) == 1
+
+
+def wait_for(holds: Callable[[], bool], patience_s: float = _PATIENCE_S) -> float:
+    """Return the seconds until something holds, asked again and again, because another process causes it."""
+    begun_s = time.monotonic()
+    while not holds():
+        assert time.monotonic() - begun_s < patience_s, "it did not come true"
+        select.select([], [], [], 0.01)
+    return time.monotonic() - begun_s
+
+
+@contextmanager
+def relay_lab(space: Space, home: Path) -> Iterator[RelayLab]:
+    """Yield a border in this namespace and a member in another one."""
+    with Space() as other:
+        other.ip("set", "lo", "up")
+        far = subprocess.Popen(["cat"], stdin=subprocess.PIPE)
+    near = subprocess.Popen(["cat"], stdin=subprocess.PIPE)
+    lab = None
+    try:
+        space.ip("set", "lo", "up")
+        space.ip("add", "eth0", "type", "veth", "peer", "name", "eth0", "netns", str(far.pid))
+        lab = RelayLab(home, (near.pid, far.pid))
+        for node, address in ((lab.border, BORDER_ADDRESS), (lab.member, MEMBER_ADDRESS)):
+            node.ip("addr", "add", f"{address}/24", "dev", "eth0")
+            node.ip("link", "set", "eth0", "up")
+        space.ready("eth0")
+        yield lab
+    finally:
+        if lab is not None:
+            lab.member.end()
+            lab.border.end()
+        for anchor in (near, far):
+            anchor.communicate()
