@@ -1,8 +1,8 @@
 """TAP device: frames of a switch's port through a file descriptor, for the relay.
 
 I/O. Source: Documentation/networking/tuntap.rst. The device is not persistent: the kernel removes it with its
-descriptor, however the process ends. It has a carrier only while the relay's connection is open, so that the switch treats the port
-as down at once.
+descriptor, however the process ends. It has a carrier only while the relay's connection is open, so that the switch
+treats the port as down at once.
 """
 
 from __future__ import annotations

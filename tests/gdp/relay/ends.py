@@ -60,9 +60,7 @@ class Ends:
 
     def server(self, settings: ConnectionSettings = SETTINGS) -> RelayConnection:
         context = tls_context(self.border, self.border_policy, is_server=True)
-        return RelayConnection(
-            context=context, is_server=True, settings=settings, authenticate=self.admit, now_s=0.0
-        )
+        return RelayConnection(context=context, is_server=True, settings=settings, authenticate=self.admit, now_s=0.0)
 
     def client(
         self,

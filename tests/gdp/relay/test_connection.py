@@ -165,7 +165,9 @@ def test_a_slow_end_costs_a_bounded_queue_and_no_more(pair: tuple[RelayConnectio
     assert counters.full + counters.frames_out == 20_000
 
 
-def test_a_reliable_frame_waits_where_a_best_effort_one_gives_way(pair: tuple[RelayConnection, RelayConnection]) -> None:
+def test_a_reliable_frame_waits_where_a_best_effort_one_gives_way(
+    pair: tuple[RelayConnection, RelayConnection],
+) -> None:
     client, server = pair
     server.queue_frame(frame(1, Flag.RELIABLE))
     for number in range(2, 2_000):

@@ -61,7 +61,8 @@ def test_frames_of_an_ended_connection_count_as_dropped() -> None:
 
 @given(
     st.lists(
-        st.tuples(st.sampled_from([Flag.NONE, Flag.RELIABLE, Flag.URGENT]), st.integers(21, 900)) | st.integers(1, 2_000),
+        st.tuples(st.sampled_from([Flag.NONE, Flag.RELIABLE, Flag.URGENT]), st.integers(21, 900))
+        | st.integers(1, 2_000),
         max_size=60,
     )
 )
