@@ -28,8 +28,9 @@ from gdp.crypto.certificates import Membership
 from gdp.crypto.identity import Identity
 from gdp.crypto.tunnel_key import TunnelKey
 from gdp.errors import GdpError, LocalError
+from gdp.limits import COST_AUTO
 from gdp.names import Name
-from gdp.nodes.config import COST_DEFAULT, LinksConfig
+from gdp.nodes.config import LinksConfig
 from gdp.nodes.endpoint_files import record_files
 from gdp.nodes.runtime import Runtime
 from gdp.ports.tunnel.path_mtu import route_mtu, tunnel_mtu
@@ -269,7 +270,7 @@ class TunnelLinks:
             underlay.set_peer(key, inner=remote, endpoint=endpoint, keepalive_s=keepalive_s)
             self._widen(tunnel.uplink, wireguard_mtu)
             self._make_vxlan(tunnel, ifname, mtu)
-            port = self._runtime.add_port(ifname, COST_DEFAULT)
+            port = self._runtime.add_port(ifname, COST_AUTO)
         except LocalError as error:
             log.error("tunnel not made peer=%s reason=%s; it is tried again", tunnel.peer.short, error)
             self._retry_s[tunnel] = now.mono_s + _RETRY_S
