@@ -51,6 +51,7 @@ class ProtocolCore(Protocol):
 
         Args:
             mtu: bytes after the Ethernet header.
+            cost: of its links; ``COST_AUTO``: measured.
         """
 
     def receive(self, arrivals: Sequence[ReceivedFrame], now: Timestamps) -> None:

@@ -74,6 +74,16 @@ def test_a_running_node_shows_its_status(nodes: Nodes, name: str) -> None:
     assert shown["counters"]["frames"]["in"] > 0
 
 
+def test_a_switch_shows_each_link_with_its_measured_quality(nodes: Nodes) -> None:
+    _, text = nodes.gdp("status", "switch", "--json")
+    shown = json.loads(text)
+    assert len(shown["link_quality"]) == shown["neighbours"] > 0
+    assert {key for row in shown["link_quality"] for key in row} == {
+        "port", "neighbour", "rtt_ms", "rtt_var_ms", "loss_in", "loss_out", "cost",
+    }  # fmt: skip
+    assert {row["cost"] for row in shown["link_quality"]} == {10}
+
+
 def test_nodes_that_drain_end_and_leave_no_socket(nodes: Nodes) -> None:
     sockets = [nodes.socket(name) for name in ("proxy", "rib", "switch")]
     assert all(path.stat().st_mode & 0o777 == 0o600 for path in sockets)

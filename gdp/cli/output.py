@@ -134,8 +134,10 @@ def epochs_from_text(text: str) -> list[int]:
 
 
 def _text(value: object) -> str:
+    if isinstance(value, list) and value and all(isinstance(each, dict) for each in value):
+        return "".join(f"\n  {_text(each)}" for each in value)
     if isinstance(value, list | tuple):
         return ", ".join(map(str, value)) or "-"
     if isinstance(value, dict):
-        return "  ".join(f"{key}={each}" for key, each in value.items())
+        return "  ".join(f"{key}={'-' if each is None else each}" for key, each in value.items())
     return "-" if value is None else str(value)

@@ -291,9 +291,9 @@ class Attachment:
         return out
 
     def _choose_switch(self, now_s: float) -> None:
-        """Attach to the switch over the cheapest port; a new or restarted one receives every advertisement."""
+        """Attach to the switch over the cheapest link; a new or restarted one receives every advertisement."""
         switches = [each for each in self.hello_protocol.all_up() if each.role.is_switch]
-        best = min(switches, key=lambda each: (self.hello_protocol.ports[each.port].cost, each.port), default=None)
+        best = min(switches, key=lambda each: (each.cost, each.port), default=None)
         is_same = best is not None and best is self._switch and best.nonce == self._switch_nonce
         if not is_same:
             if self._switch is not None:

@@ -12,10 +12,12 @@ from gdp.control.admission import Admission
 from gdp.control.endpoints import Endpoint
 from gdp.control.hello import echo_of
 from gdp.control.join import Join
+from gdp.control.link_quality import LinkQuality
 from gdp.control.neighbour import Neighbour, NeighbourState
 from gdp.control.strangers import Strangers
 from gdp.crypto.exchange import ExchangeKey
 from gdp.errors import DropReason, StatementError
+from gdp.limits import COST_AUTO
 from gdp.message.replay import ReplayWindow
 from gdp.names import Name
 
@@ -23,6 +25,7 @@ __all__ = ["ANSWER_S", "UNREACHABLE", "HelloPort"]
 
 _ADDRESSES_MAX: Final = 96  # of neighbours and former ones, whose frames the data plane keeps apart from strangers'
 _CREDIT_MAX_BYTES: Final = 16 << 10
+_QUALITIES_MAX: Final = 128  # neighbours and former ones; above all that a port has at once
 _ENDED_MAX: Final = 1_024  # sessions of the far ends, remembered for one session of a port
 _JOINS_WINDOW: Final = 1_024  # how far joins may overtake each other
 ANSWER_S: Final = 0.02  # a stranger's hello is answered at once, but not more often than this
@@ -38,7 +41,7 @@ class HelloPort:
     index: int
     mac: bytes
     own_mtu: int  # what our end accepts, in bytes after the Ethernet header
-    cost: int
+    cost: int  # COST_AUTO: measured for each neighbour
     nonce: bytes
     exchange_key: ExchangeKey
     admission: Admission
@@ -58,6 +61,7 @@ class HelloPort:
     said_mtus: dict[Name, int] = field(default_factory=dict)  # what each neighbour's end accepts
     addresses: dict[bytes, None] = field(default_factory=dict)  # of neighbours, former ones too; the last proven last
     observed: dict[Name, Endpoint] = field(default_factory=dict)  # where this end of a tunnel sees its neighbours
+    qualities: dict[Name, LinkQuality] = field(default_factory=dict)  # of links to neighbours, former ones too
     strangers: Strangers = field(default_factory=Strangers)  # nodes whose hellos were refused
 
     @property
@@ -106,6 +110,18 @@ class HelloPort:
         if len(self.addresses) > _ADDRESSES_MAX:
             del self.addresses[next(iter(self.addresses))]
         return is_new
+
+    def cost_to(self, name: Name) -> int:
+        """Return the cost of the link to a neighbour: the port's, or the damped one that was measured."""
+        return self.quality_of(name).cost.advertised if self.cost == COST_AUTO else self.cost
+
+    def quality_of(self, name: Name) -> LinkQuality:
+        """Return the measurements of the link to a neighbour; a link that comes back keeps its own."""
+        known = self.qualities.pop(name, None) or LinkQuality()
+        self.qualities[name] = known
+        if len(self.qualities) > _QUALITIES_MAX:
+            del self.qualities[next(each for each in self.qualities if each not in self.neighbours)]
+        return known
 
     def candidates(self) -> list[Neighbour]:
         """Return the nodes that were heard, and have not echoed our nonce."""

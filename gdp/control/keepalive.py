@@ -6,21 +6,25 @@ with a meticulously rising sequence number, section 6.7.4. Two points differ. Se
 
 The payload of a frame of kind KEEPALIVE, whose message number is the sequence number::
 
-    0 flags (1)  1 detect multiplier (1)  2 digest of link states (8)  10 tag (16)
+    0 flags (1)   1 detect multiplier (1)  2 digest of link states (8)
+   10 count (8)  18 echoed count (8)  26 held, microseconds (4)  30 loss, in 255ths (1)  31 tag (16)
 
 The tag is HMAC-SHA256 over header and payload up to the tag, cut to 16 bytes. An overloaded node requests a larger
-multiplier (``Slowness``), so that its neighbours wait longer for it while its machine is busy.
+multiplier (``Slowness``), so that its neighbours wait longer for it while its machine is busy. The second line measures
+the link (``link_quality.py``).
 """
 
 from __future__ import annotations
 
 import hmac
 import math
-from dataclasses import dataclass
+import struct
+from dataclasses import dataclass, field
 from enum import IntFlag
 from typing import Final
 
 from gdp.control.hello import DIGEST_BYTES, MULTIPLIER_MAX, Timing
+from gdp.control.link_quality import LinkQuality, LinkReport
 from gdp.crypto.exchange import ExchangeKey
 from gdp.errors import DropReason, FrameError
 from gdp.frame.codec import HEADER_BYTES, Header, encode
@@ -28,12 +32,16 @@ from gdp.frame.kinds import Flag, Kind
 from gdp.limits import HOPS_MAX
 from gdp.names import ZERO
 
-__all__ = ["KeepaliveFlag", "KeepaliveSession", "Slowness", "open_keepalive", "seal_keepalive"]
+__all__ = ["PAYLOAD_BYTES", "KeepaliveFlag", "KeepaliveSession", "Slowness", "open_keepalive", "seal_keepalive"]
 
 _TAG_BYTES: Final = 16
 _DIGEST_AT: Final = HEADER_BYTES + 2
-_TAGGED_BYTES: Final = _DIGEST_AT + DIGEST_BYTES
+_REPORT: Final = struct.Struct(">QQIB")  # LinkReport
+_REPORT_AT: Final = _DIGEST_AT + DIGEST_BYTES
+_TAGGED_BYTES: Final = _REPORT_AT + _REPORT.size
 _FRAME_BYTES: Final = _TAGGED_BYTES + _TAG_BYTES
+PAYLOAD_BYTES: Final = _FRAME_BYTES - HEADER_BYTES
+_NO_REPORT: Final = LinkReport()
 _DIGEST: Final = "sha256"
 _PURPOSE: Final = b"gdp-keepalive-1"
 _SUSPECT_AFTER: Final = 1.25  # intervals without a frame, after which the neighbour is polled
@@ -54,14 +62,16 @@ class KeepaliveFlag(IntFlag):
 _POLL, _FINAL, _HEARD = (int(each) for each in (KeepaliveFlag.POLL, KeepaliveFlag.FINAL, KeepaliveFlag.HEARD))
 
 
-def seal_keepalive(key: bytes, header: Header, flags: int, multiplier: int, digest: bytes) -> bytes:
-    """Return a keepalive frame."""
-    tagged = encode(header) + bytes((flags, multiplier)) + digest
+def seal_keepalive(
+    key: bytes, header: Header, flags: int, multiplier: int, digest: bytes, report: LinkReport = _NO_REPORT
+) -> bytes:
+    """Return a keepalive frame; the header's length counts ``PAYLOAD_BYTES``."""
+    tagged = encode(header) + bytes((flags, multiplier)) + digest + _REPORT.pack(*report)
     return tagged + hmac.digest(key, tagged, _DIGEST)[:_TAG_BYTES]
 
 
-def open_keepalive(key: bytes, frame: bytes) -> tuple[int, int, bytes]:
-    """Return flags, detect multiplier and digest of a frame, which may end in padding.
+def open_keepalive(key: bytes, frame: bytes) -> tuple[int, int, bytes, LinkReport]:
+    """Return flags, detect multiplier, digest and link report of a frame, which may end in padding.
 
     Raises:
         FrameError: BAD_TAG, it was not sealed by this key, or TRUNCATED.
@@ -71,7 +81,8 @@ def open_keepalive(key: bytes, frame: bytes) -> tuple[int, int, bytes]:
     tag = hmac.digest(key, frame[:_TAGGED_BYTES], _DIGEST)[:_TAG_BYTES]
     if not hmac.compare_digest(tag, frame[_TAGGED_BYTES:_FRAME_BYTES]):
         raise FrameError(DropReason.BAD_TAG, "keepalive")
-    return frame[HEADER_BYTES], frame[HEADER_BYTES + 1], frame[_DIGEST_AT:_TAGGED_BYTES]
+    report = LinkReport(*_REPORT.unpack_from(frame, _REPORT_AT))
+    return frame[HEADER_BYTES], frame[HEADER_BYTES + 1], frame[_DIGEST_AT:_REPORT_AT], report
 
 
 class Slowness:
@@ -113,6 +124,8 @@ class KeepaliveSession:
         received: highest sequence number that came.
         is_alive: one has come.
         hears_us: the neighbour reports that it receives ours.
+        quality: measurements of the link.
+        has_new_cost: the keepalive opened last changed the cost that follows from them.
     """
 
     out_key: bytes
@@ -126,6 +139,8 @@ class KeepaliveSession:
     is_final_due: bool = False
     is_alive: bool = False
     hears_us: bool = False
+    quality: LinkQuality = field(default_factory=LinkQuality)
+    has_new_cost: bool = False
 
     @classmethod
     def begin(
@@ -135,6 +150,7 @@ class KeepaliveSession:
         ends: tuple[bytes, bytes],
         timings: tuple[Timing, Timing],
         received: int,
+        quality: LinkQuality,
         now_s: float,
     ) -> KeepaliveSession | None:
         """Return a session, or None if one of the ends wants none.
@@ -143,6 +159,7 @@ class KeepaliveSession:
             ends: nonce and name, ours and the neighbour's.
             timings: ours and the neighbour's.
             received: the sequence number above which its keepalives are new.
+            quality: measurements of the link, those of earlier sessions too.
 
         Raises:
             StatementError: MALFORMED, the neighbour's key is invalid.
@@ -153,6 +170,7 @@ class KeepaliveSession:
             return None
         out_key, in_key = key.agree(far_key, _PURPOSE + ends[0] + ends[1], _PURPOSE + ends[1] + ends[0])
         detect_s = in_interval_s * far.multiplier
+        quality.begin_session()
         return cls(
             out_key=out_key,
             in_key=in_key,
@@ -161,6 +179,7 @@ class KeepaliveSession:
             detect_s=detect_s,
             received=received,
             send_at_s=now_s,
+            quality=quality,
         )
 
     def seal(
@@ -180,23 +199,26 @@ class KeepaliveSession:
         """
         flags = _POLL * poll | _FINAL * self.is_final_due | _HEARD * self.is_alive
         self.is_final_due = False
-        length = _FRAME_BYTES - HEADER_BYTES
         name, incarnation = source
-        header = Header(Kind.KEEPALIVE, Flag.LAST, HOPS_MAX, 0, length, sequence, 0, 1, incarnation, ZERO, name)
-        frame = seal_keepalive(self.out_key, header, flags, multiplier, digest)
+        header = Header(Kind.KEEPALIVE, Flag.LAST, HOPS_MAX, 0, PAYLOAD_BYTES, sequence, 0, 1, incarnation, ZERO, name)
+        frame = seal_keepalive(self.out_key, header, flags, multiplier, digest, self.quality.report_to_send(now_s))
         self.send_at_s = now_s + self.out_interval_s * (1 - frame[-1] * _JITTER)
         self.poll_at_s = now_s + self.in_interval_s / _POLLS_PER_INTERVAL
         return frame
 
-    def open(self, header: Header, frame: bytes, now_s: float) -> bytes:
+    def open(self, header: Header, frame: bytes, now_s: float, waited_s: float = 0.0) -> bytes:
         """Process a keepalive of the neighbour; return the digest that it carries.
+
+        Args:
+            waited_s: since its arrival.
 
         Raises:
             FrameError: REPLAYED, it or a later one came before; or as ``open_keepalive``.
         """
         if header.number <= self.received:
             raise FrameError(DropReason.REPLAYED, "keepalive")
-        flags, multiplier, digest = open_keepalive(self.in_key, frame)
+        flags, multiplier, digest, report = open_keepalive(self.in_key, frame)
+        self.has_new_cost = self.quality.receive(report, now_s - waited_s)
         self.detect_s = self.in_interval_s * max(multiplier, 1)
         self.received, self.is_alive = header.number, True
         self.hears_us = bool(flags & _HEARD)

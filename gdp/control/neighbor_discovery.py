@@ -54,7 +54,7 @@ from gdp.crypto.statements import Statement, StatementType
 from gdp.errors import DropReason, FrameError, StatementError
 from gdp.frame.codec import HEADER_BYTES, Header, decode
 from gdp.frame.kinds import Kind
-from gdp.limits import HELLO_IDLE, MTU_MIN_BYTES
+from gdp.limits import COST_AUTO, HELLO_IDLE, MTU_MIN_BYTES
 from gdp.names import Name
 from gdp.sansio import BROADCAST, OutgoingFrames, ReceivedFrame, Timestamps
 from gdp.token_bucket import TokenBucket
@@ -128,6 +128,7 @@ class HelloProtocol:
         self._replies: list[OutgoingFrames] = []
         self._reply_at_s = float("inf")
         self._has_moved = False  # there is a new address
+        self._recosted: list[Neighbour] = []  # not polled yet
         self._reported_addresses: dict[int, frozenset[bytes]] = {}
         self._reassembler = ControlReassembler()  # of neighbours' hellos
         self._strangers_reassembler = ControlReassembler()
@@ -142,7 +143,7 @@ class HelloProtocol:
         self._next_s = None
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now_s: float) -> list[Change]:
-        """Begin to send hellos on a port, or update the MTU or cost of one that is up.
+        """Begin to send hellos on a port, or update the MTU or cost (``COST_AUTO``: measured) of one that is up.
 
         Returns the neighbours to which the link has changed, and those that another address of ours removes.
         """
@@ -162,6 +163,7 @@ class HelloProtocol:
                 admission=Admission(),
                 hello_at_s=now_s,
                 addresses={} if port is None else port.addresses,
+                qualities={} if port is None else port.qualities,
             )
             return lost
         if (port.own_mtu, port.cost) == (own_mtu, cost):
@@ -169,6 +171,7 @@ class HelloProtocol:
         port.own_mtu, port.cost = own_mtu, cost
         port.hurry(now_s)  # the other ends must know
         for neighbour in port.neighbours.values():
+            neighbour.cost = port.cost_to(neighbour.name)
             neighbour.mtu = min(port.said_mtus[neighbour.name], own_mtu)
         return [(each, each.state) for each in port.neighbours.values() if each.state is NeighbourState.UP]
 
@@ -207,6 +210,13 @@ class HelloProtocol:
             if macs != self._reported_addresses.get(index, frozenset()):
                 changed[index] = self._reported_addresses[index] = macs
         return changed
+
+    def poll_costs(self) -> list[Change]:
+        """Return, once, the neighbours that are up and to which the measured cost has changed."""
+        if not self._recosted:
+            return []
+        recosted, self._recosted = self._recosted, []
+        return [(each, each.state) for each in recosted if each.state is NeighbourState.UP]
 
     def all_up(self) -> list[Neighbour]:
         """Return every neighbour that is up."""
@@ -310,6 +320,7 @@ class HelloProtocol:
         known.cookie = b"" if is_new_session else known.cookie
         known.sequence, known.digest, known.greeted_s = hello.sequence, hello.digest, now.mono_s
         known.member, known.checked_s, known.incarnation_id = member, now.mono_s, hello.incarnation_id
+        known.cost = port.cost_to(known.name)
         known.role = member.role  # a root may have changed a switch into a leaf
         known.observed = next((endpoint for nonce, endpoint in hello.observed if nonce == port.nonce), None)
         had_proof, known.proof = known.proof is not None, proof
@@ -519,7 +530,10 @@ class HelloProtocol:
         if known.member is not None and now.mono_s >= known.checked_s + _RECHECK_S:
             self._policy.check_member(known.member, now.unix_s)
             known.checked_s = now.mono_s
-        known.digest = known.keepalives.open(header, arrival.frame, now.mono_s)
+        known.digest = known.keepalives.open(header, arrival.frame, now.mono_s, arrival.waited_s)
+        if known.keepalives.has_new_cost and port is not None and port.cost == COST_AUTO:
+            known.cost = port.cost_to(known.name)
+            self._recosted.append(known)
         if known.keepalives.is_final_due:
             self._next_s = None  # any other change only delays timers
         self._alive(known, now.mono_s - arrival.waited_s)
@@ -640,7 +654,13 @@ class HelloProtocol:
         ends = port.nonce + self._identity.name, neighbour.nonce + neighbour.name
         _, received = port.ended.get((neighbour.name, neighbour.nonce), UNREACHABLE)
         neighbour.keepalives = KeepaliveSession.begin(
-            port.exchange_key, hello.exchange_key, ends, (timing, hello.timing), received, now_s
+            port.exchange_key,
+            hello.exchange_key,
+            ends,
+            (timing, hello.timing),
+            received,
+            port.quality_of(neighbour.name),
+            now_s,
         )
 
     def _scheduled_hello(self, port: HelloPort, now_s: float) -> list[bytes]:

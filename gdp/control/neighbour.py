@@ -19,6 +19,7 @@ from gdp.control.hello import INCARNATION_BYTES, echo_of
 from gdp.control.keepalive import KeepaliveSession
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.keys import PublicKey
+from gdp.limits import COST_DEFAULT
 from gdp.names import Name
 from gdp.token_bucket import TokenBucket
 
@@ -75,6 +76,7 @@ class Neighbour:
     digest: bytes
     heard_s: float  # when its last valid frame came
     state: NeighbourState = NeighbourState.GONE
+    cost: int = COST_DEFAULT  # of the link to it: the port's, or the measured one
     candidate: bytes = b""  # nonce of a session that has not proved itself yet
     candidate_sequence: int = -1  # of its last hello
     member: Membership | None = None

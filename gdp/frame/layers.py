@@ -48,7 +48,7 @@ _STATEMENTS: Final = frozenset(
 _ANSWER_TO: Final = {Kind.RIB_ANSWER: Kind.RIB_REQUEST, Kind.ECHO_REPLY: Kind.ECHO_REQUEST}
 _COSE_SIGN1: Final = 0xD284  # tag 18, an array of four
 _LENGTH_AT: Final = 6
-_KEEPALIVE_BYTES: Final = 26
+_KEEPALIVE_BYTES: Final = 47
 _COOKIE_BYTES: Final = 32
 
 
@@ -176,6 +176,10 @@ class Keepalive(Packet):
         FlagsField("flags", 0, 8, ["poll", "final", "heard", "bit3", "bit4", "bit5", "bit6", "bit7"]),
         ByteField("multiplier", 3),
         XStrFixedLenField("digest", bytes(8), length=8),
+        LongField("sent", 0),
+        LongField("echo", 0),
+        IntField("held_us", 0),
+        ByteField("loss", 0),
         XStrFixedLenField("tag", bytes(16), length=16),
     ]
 

@@ -9,14 +9,25 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+    field_validator,
+    model_validator,
+)
 
 from gdp.control.endpoint_record import UPLINKS_MAX
 from gdp.control.endpoints import Endpoint
 from gdp.control.hello import INTERVAL_MAX_MS, Timing
+from gdp.control.link_cost import COST_MAX
 from gdp.errors import LocalError
 from gdp.limits import (
     ADVERTISEMENT_LEASE_S,
+    COST_AUTO,
+    COST_DEFAULT,
     DEAD_S,
     DETECT_MULTIPLIER,
     HELLO_S,
@@ -64,7 +75,6 @@ EndpointText = Annotated[str, AfterValidator(_endpoint)]
 ServerText = Annotated[str, AfterValidator(_server)]
 DataPlane = Literal["auto", "kernel", "raw", "scapy"]
 
-COST_DEFAULT: Final = 10
 LISTEN_DEFAULT: Final = 51_820  # UDP; the usual port of WireGuard
 _KEEPALIVE_MIN_MS: Final = 10
 _ATTACH_MAX: Final = 13  # leaves space for the "-s" of the switch's end
@@ -90,15 +100,23 @@ KeepaliveMs = Annotated[int, Field(ge=0, le=INTERVAL_MAX_MS), AfterValidator(_in
 DetectMultiplier = Annotated[int, Field(ge=2, le=50)]
 
 
+def _cost(value: object, number: ValidatorFunctionWrapHandler) -> int:
+    return COST_AUTO if value == "auto" else int(number(value))
+
+
+LinkCost = Annotated[int, Field(ge=1, le=COST_MAX), WrapValidator(_cost)]
+
+
 class PortConfig(Section):
     """A layer-2 device towards neighbours; an ``optional`` one may appear later.
 
-    Keepalive settings that are absent here come from the switch.
+    Keepalive settings that are absent here come from the switch. A ``cost`` of ``auto`` is
+    ``COST_AUTO``: measured.
     """
 
     iface: Ifname
     optional: bool = False
-    cost: int = Field(default=COST_DEFAULT, ge=1, le=1_000_000)
+    cost: LinkCost = COST_DEFAULT
     keepalive_ms: KeepaliveMs | None = None
     detect_multiplier: DetectMultiplier | None = None
 

@@ -25,7 +25,7 @@ def node_status(identity: Identity, sources: Sources, *, uptime_s: float, **more
         source = getattr(sources, each.name)
         if each.name == "drops":
             counters["drops"] = sum(sum(part()) for part in source)
-        elif source is not None and each.name not in ("entries", "latency"):
+        elif source is not None and each.name not in ("entries", "latency", "links"):
             value = source()
             counters[each.name] = value if isinstance(value, int | float) else dict(value)
     return {

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
+from gdp.limits import COST_DEFAULT
 from gdp.nodes.busy_poll import BusyPoll
 from gdp.nodes.control_socket import ControlHandlers, ControlServer
 from gdp.nodes.memory_tuning import tune_memory
@@ -27,7 +28,6 @@ __all__ = ["DRAIN_MAX_S", "Runtime", "now"]
 
 log = logging.getLogger(__name__)
 
-COST_DEFAULT = 10
 DRAIN_MAX_S = 2.0  # a draining switch or RIB ends after this time, finished or not
 _STREAK_MAX = 8
 _DRAIN_LOOK_S = 0.05  # between checks of the remaining work, if nothing else wakes the loop
@@ -49,7 +49,7 @@ class Runtime:
     """Loop that drives a protocol core over a plane.
 
     Args:
-        costs: of ports by device name; others cost ``COST_DEFAULT``.
+        costs: of ports by device name, ``COST_AUTO``: measured; others cost ``COST_DEFAULT``.
         spin_s: seconds to poll before sleeping, if frames follow each other closely; 0: never.
     """
 

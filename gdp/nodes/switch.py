@@ -21,6 +21,7 @@ from gdp.nodes.control_socket import ControlHandlers
 from gdp.nodes.control_status import node_status
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.data_plane import Chosen, choose_plane
+from gdp.nodes.link_rows import LinkRows, link_status
 from gdp.nodes.links import LINKS_LOOK_S, TunnelLinks
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
@@ -112,7 +113,7 @@ def run_switch(
             _revoke(switch, config.revocations)
 
         stack.enter_context(runtime.signals(reload))
-        sources = _sources(switch, chosen, node_log)
+        sources = _sources(switch, chosen, node_log, runtime)
         handlers = _control_handlers(identity, switch, chosen, runtime, reload, sources, links)
         stack.enter_context(runtime.control(config.control_socket or control_path(identity.name), handlers))
         _revoke(switch, config.revocations)
@@ -184,11 +185,12 @@ def _control_handlers(
 
     def status() -> dict[str, object]:
         """Return the JSON fields of this switch."""
-        neighbours = len(list(switch.hello_protocol.all_up()))
+        rows = sources.links() if sources.links is not None else ()
         more: dict[str, object] = {
             "data_plane": chosen.name,
             "ports": len(chosen.plane.ports),
-            "neighbours": neighbours,
+            "neighbours": len(list(switch.hello_protocol.all_up())),
+            "link_quality": [link_status(row) for row in rows],
         }
         if links is not None:
             more["links"] = links.status(now())
@@ -229,8 +231,10 @@ def _widest(ifaces: Sequence[str]) -> int:
     return max(mtus, default=_MTU_FALLBACK)
 
 
-def _sources(switch: SwitchCore, chosen: Chosen, node_log: NodeLog) -> Sources:
+def _sources(switch: SwitchCore, chosen: Chosen, node_log: NodeLog, runtime: Runtime) -> Sources:
     plane = chosen.plane
+    links = LinkRows(switch.hello_protocol, plane.ports)
+    runtime.every(LOOK_S, links.refresh)
 
     def frames() -> dict[str, int]:
         """Return the frame counts by direction."""
@@ -244,5 +248,6 @@ def _sources(switch: SwitchCore, chosen: Chosen, node_log: NodeLog) -> Sources:
         entries=chosen.entry_counts,
         pending_frames=lambda: switch.resolver.pending_frames,
         waiting=node_log.metrics,
+        links=lambda: links.rows,
         clashes=lambda: switch.hello_protocol.clashes,
     )

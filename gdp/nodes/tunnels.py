@@ -20,8 +20,9 @@ from gdp.control.tunnel_plan import TunnelId, tunnel_ifname, underlay_ifname
 from gdp.crypto.identity import Identity
 from gdp.crypto.tunnel_key import TunnelKey
 from gdp.errors import LocalError
+from gdp.limits import COST_AUTO
 from gdp.names import Name
-from gdp.nodes.config import COST_DEFAULT, LinksConfig
+from gdp.nodes.config import LinksConfig
 from gdp.nodes.runtime import Runtime
 from gdp.ports.tunnel.path_mtu import route_mtu, tunnel_mtu
 from gdp.ports.tunnel.vxlan import make_vxlan, remove_link, set_link_mtu
@@ -157,7 +158,7 @@ class Tunnels:
             underlay.set_peer(key, inner=inner, endpoint=endpoint, keepalive_s=keepalive_s)
             self._widen(tunnel.uplink, wireguard_mtu)
             self._make_vxlan(tunnel, ifname, mtu)
-            port = self._runtime.add_port(ifname, COST_DEFAULT)
+            port = self._runtime.add_port(ifname, COST_AUTO)
         except LocalError as error:
             log.error("tunnel not made peer=%s reason=%s; it is tried again", tunnel.peer.short, error)
             remove_link(ifname, _alias(self._me))

@@ -224,6 +224,10 @@ class SwitchCore:
             except Exception as error:  # one frame must not stop the switch
                 self.boundary.record(error)
                 self._drops[DropReason.INTERNAL] += 1
+        if recosted := self.hello_protocol.poll_costs():
+            has_others = True
+            for change in recosted:
+                self._neighbour_changed(change, now.mono_s)
         if has_others:
             self._rest_due_s = None
             self._presence.answer(now.mono_s)

@@ -313,6 +313,5 @@ class Flooding:
                 self._send(neighbour, wire)
 
     def _cost(self, neighbour: Neighbour) -> int:
-        cost = self._hello_protocol.ports[neighbour.port].cost
-        cost += _STUB_COST if self._stub_until_s is not None else 0
+        cost = neighbour.cost + (_STUB_COST if self._stub_until_s is not None else 0)
         return cost + (_FLAPPING_COST if self.damping.suppresses((neighbour.port, neighbour.name)) else 0)

@@ -47,11 +47,11 @@ class Outbox:
         self._waiting.append(transmit)
 
     def neighbour(self, name: Name) -> Neighbour | None:
-        """Return the neighbour of this name over the cheapest port, or None."""
+        """Return the neighbour of this name over the cheapest link, or None."""
         found = [
             n for port in self._hello_protocol.ports if (n := self._hello_protocol.neighbour(port, name)) is not None
         ]
-        return min(found, key=lambda n: (self._hello_protocol.ports[n.port].cost, n.port), default=None)
+        return min(found, key=lambda n: (n.cost, n.port), default=None)
 
     def sessions_with(self, port: int, name: Name) -> tuple[bytes, bytes] | None:
         """Return our port's nonce and a neighbour's echo, of their present sessions; None when it is not up."""
@@ -69,7 +69,7 @@ class Outbox:
         for name in (neighbour.name, alternate or neighbour.name):
             found = [n for port in others if (n := self._hello_protocol.neighbour(port, name)) is not None]
             if found:
-                return *hop, *self.hop(min(found, key=lambda n: (self._hello_protocol.ports[n.port].cost, n.port)))
+                return *hop, *self.hop(min(found, key=lambda n: (n.cost, n.port)))
         return hop
 
     def hop_at(self, port: int, mac: bytes) -> Hop:

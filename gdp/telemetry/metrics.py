@@ -7,7 +7,7 @@ Source: Prometheus text exposition format, version 0.0.4.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import accumulate
 from typing import Final
 
@@ -18,7 +18,7 @@ from prometheus_client.registry import Collector
 from gdp.errors import DropReason, LocalError
 from gdp.names import NAME_BYTES, Name
 from gdp.telemetry.scraping import ScrapeServer
-from gdp.telemetry.sources import Counts, EntryCounts, Gauge, Histogram, Sources
+from gdp.telemetry.sources import Counts, EntryCounts, Gauge, Histogram, LinkRow, Sources
 
 __all__ = ["Metrics"]
 
@@ -58,6 +58,8 @@ class Metrics(Collector):
         yield from _counter("gdp_proxy_faults", "What was not carried as it should be, by fault", "fault", of.faults)
         yield from _counter("gdp_calls", "Calls of several servers by what came of it", "event", of.calls)
         yield from _gauges("gdp_waiting", "1: the node makes no progress for this reason", "reason", of.waiting)
+        if of.links is not None:
+            yield from _links(of.links())
         if of.clashes is not None:
             yield CounterMetricFamily(
                 "gdp_identity_clashes", "Signs of another node with this identity", value=of.clashes()
@@ -120,6 +122,23 @@ def _entries(source: EntryCounts | None) -> Iterator[Metric]:
         sizes.add_metric(names, size)
     yield frames
     yield sizes
+
+
+def _links(rows: Sequence[LinkRow]) -> Iterator[Metric]:
+    labels = ["port", "neighbour"]
+    costs = GaugeMetricFamily("gdp_link_cost", "Cost of the link to a neighbour", labels=labels)
+    rtts = GaugeMetricFamily("gdp_link_rtt_seconds", "Its smoothed round-trip time", labels=labels)
+    losses = GaugeMetricFamily("gdp_link_loss", "Share of keepalives lost", labels=[*labels, "direction"])
+    for row in rows:
+        ends = [row.port, row.neighbour]
+        costs.add_metric(ends, row.cost)
+        if row.rtt_s is not None:
+            rtts.add_metric(ends, row.rtt_s)
+        losses.add_metric([*ends, "in"], row.loss_in)
+        losses.add_metric([*ends, "out"], row.loss_out)
+    yield costs
+    yield rtts
+    yield losses
 
 
 def _gauge(name: str, text: str, source: Gauge | None) -> Iterator[Metric]:

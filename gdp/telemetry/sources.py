@@ -8,11 +8,11 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from gdp.errors import DropReason
 
-__all__ = ["LATENCY_BOUNDS_S", "Counts", "EntryCounts", "Gauge", "Histogram", "Sources", "count_list"]
+__all__ = ["LATENCY_BOUNDS_S", "Counts", "EntryCounts", "Gauge", "Histogram", "LinkRow", "Sources", "count_list"]
 
 LATENCY_BOUNDS_S: Final = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 
@@ -41,6 +41,30 @@ class Histogram:
 
 Counts = Callable[[], Mapping[str, int]]  # label value to count
 Gauge = Callable[[], float]
+
+
+class LinkRow(NamedTuple):
+    """Link to one neighbour that is up.
+
+    Attributes:
+        port: device name.
+        neighbour: short name.
+        rtt_s: smoothed round-trip time, seconds; None before the first measurement.
+        rtt_var_s: its mean deviation.
+        loss_in: share of frames lost on the way here, 0 to 1.
+        loss_out: share lost on the way to the neighbour.
+        cost: what a path pays.
+    """
+
+    port: str
+    neighbour: str
+    rtt_s: float | None
+    rtt_var_s: float
+    loss_in: float
+    loss_out: float
+    cost: int
+
+
 EntryCounts = Callable[[], Mapping[bytes, tuple[int, int]]]  # table key to frames and bytes
 
 
@@ -64,6 +88,7 @@ class Sources:
         faults: what a proxy could not carry, or not correctly, by fault.
         calls: events of services with several servers: late and unexpected responses, hedged requests.
         waiting: 1 for each reason for which the node makes no progress, 0 for the others.
+        links: to neighbours that are up.
         clashes: signs of another node with this identity.
         latency: one-way, from the source's stamp to delivery.
     """
@@ -83,6 +108,7 @@ class Sources:
     faults: Counts | None = None
     calls: Counts | None = None
     waiting: Counts | None = None
+    links: Callable[[], Sequence[LinkRow]] | None = None
     clashes: Gauge | None = None
     latency: Callable[[], Histogram] | None = None
 

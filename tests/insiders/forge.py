@@ -18,7 +18,8 @@ from gdp.client.rib_host import RibHost
 from gdp.client.writer_proxy import WriterProxyState
 from gdp.control.fragments import ControlFragmenter
 from gdp.control.hello import CONFLICTS_MAX, COOKIE_BYTES, COOKIES_MAX, HEARD_MAX, RTCERTS_MAX
-from gdp.control.keepalive import seal_keepalive
+from gdp.control.keepalive import PAYLOAD_BYTES, seal_keepalive
+from gdp.control.link_quality import LinkReport
 from gdp.control.link_state import COST_MAX, LINKS_MAX, MEMBERS_MAX, RIBS_MAX
 from gdp.control.query import TRANSIT_MAX
 from gdp.control.replica import ENTRIES_MAX, FETCH_KEYS_MAX, FETCH_PREFIXES_MAX, INVENTORY_MAX
@@ -651,9 +652,12 @@ class Forge:
             return []
         number = rng.choice((*_INTEGERS, next(self._counters)))
         source = self._stage.identity(persona).name
-        header = Header(Kind.KEEPALIVE, Flag.LAST, HOPS_MAX, 0, 26, number, 0, 1, 77, ZERO, source)
+        header = Header(Kind.KEEPALIVE, Flag.LAST, HOPS_MAX, 0, PAYLOAD_BYTES, number, 0, 1, 77, ZERO, source)
         key = rng.choice(sessions).out_key
-        return [seal_keepalive(key, header, rng.randrange(256), rng.choice((0, 1, 3, 255)), rng.randbytes(8))]
+        counts = 0, 1, next(self._counters), 2**64 - 1
+        report = LinkReport(rng.choice(counts), rng.choice(counts), rng.choice((0, 1, 2**32 - 1)), rng.randrange(256))
+        multiplier = rng.choice((0, 1, 3, 255))
+        return [seal_keepalive(key, header, rng.randrange(256), multiplier, rng.randbytes(8), report)]
 
     def _miss(self, rng: random.Random, persona: Persona, place: Place) -> list[bytes]:
         """Return a frame to some name, in the persona's or another's name."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from gdp.control.fragments import ControlFragmenter
 from gdp.control.hello import Hello, Timing
 from gdp.control.keepalive import KeepaliveFlag, Slowness, open_keepalive
+from gdp.control.link_quality import LinkQuality
 from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.neighbour import NeighbourState
 from gdp.control.settings import NodeSettings
@@ -19,7 +21,7 @@ from gdp.crypto.validity import Validity
 from gdp.errors import DropReason, FrameError, RemoteError, StatementError
 from gdp.frame.codec import HEADER_BYTES, decode
 from gdp.frame.kinds import Kind
-from gdp.limits import CLOCK_SKEW_S, DEAD_S, HELLO_IDLE, HELLO_S
+from gdp.limits import CLOCK_SKEW_S, COST_AUTO, DEAD_S, HELLO_IDLE, HELLO_S
 from gdp.sansio import ReceivedFrame
 from tests.gdp.control.members import POLICY, UNIX_S, YEAR, Nonces, at, node
 
@@ -326,3 +328,93 @@ def test_a_neighbour_that_is_up_by_hellos_alone_is_given_their_time() -> None:
     pair.run(5.0)
     assert pair.gone_s == {}
     assert [n.state for n in pair.ends["a"].all_up()] == [NeighbourState.UP]
+
+
+def quality(pair: Pair, name: str) -> LinkQuality:
+    end = pair.ends[name]
+    (neighbour,) = end.all_up()
+    return end.ports[0].quality_of(neighbour.name)
+
+
+def test_keepalives_measure_the_round_trip_time_and_the_loss_of_each_direction() -> None:
+    pair = up(Pair())
+    chance = random.Random(1)
+    pair.passes = lambda sender, frame: decode(frame).kind == Kind.HELLO or sender == "a" or chance.random() >= 0.2
+    pair.run(30.0)
+    for name, lost in ("a", "loss_in"), ("b", "loss_out"):
+        assert getattr(quality(pair, name), lost) == pytest.approx(0.2, abs=0.1)
+    assert quality(pair, "b").loss_in == 0
+    assert (quality(pair, "a").rtt.srtt_s or 0.0) <= STEP_S
+
+
+def test_a_forged_echo_or_loss_makes_no_link_look_better() -> None:
+    pair = up(Pair())
+    pair.passes = lambda sender, _frame: sender == "a"
+    pair.run(0.1)
+    frame = keepalives_of(pair, "b")[-1]
+    here = quality(pair, "a")
+    before = here.rtt.srtt_s, here.loss_out, here.loss_in
+    report_at = HEADER_BYTES + 2 + 8
+    for at_byte in range(report_at, report_at + 21):
+        forged = frame[:at_byte] + bytes([frame[at_byte] ^ 0x80]) + frame[at_byte + 1 :]
+        assert refusal(pair, forged) == [DropReason.BAD_TAG]
+    assert (here.rtt.srtt_s, here.loss_out, here.loss_in) == before
+
+
+def test_a_replayed_keepalive_makes_no_link_look_better() -> None:
+    pair = up(Pair())
+    pair.run(1.0)
+    here = quality(pair, "a")
+    before = here.rtt.srtt_s, here.loss_in
+    for frame in keepalives_of(pair, "b"):
+        assert refusal(pair, frame) == [DropReason.REPLAYED]
+    assert (here.rtt.srtt_s, here.loss_in) == before
+
+
+def test_a_delayed_keepalive_makes_a_link_look_slower_only() -> None:
+    pair = up(Pair())
+    here = quality(pair, "a")
+    before_s = here.rtt.srtt_s or 0.0
+    for _ in range(10):
+        pair.passes = lambda *_: True
+        pair.run(0.2)
+        pair.passes = lambda sender, _frame: sender == "a"  # for less than the detection time
+        pair.run(0.08)
+        frame = keepalives_of(pair, "b")[-1]
+        pair.run(0.03)
+        assert refusal(pair, frame) == []
+    assert (here.rtt.srtt_s or 0.0) >= before_s - 1e-6  # below the resolution of a report
+
+
+def test_a_fixed_cost_is_not_changed_by_what_is_measured() -> None:
+    pair = up(Pair())
+    pair.run(1.0)
+    end = pair.ends["a"]
+    assert [each.cost for each in end.all_up()] == [10]
+    assert end.poll_costs() == []
+
+
+def test_an_automatic_cost_is_reported_once_and_follows_the_measurement() -> None:
+    pair = up(Pair())
+    end = pair.ends["a"]
+    end.add_port(0, end.ports[0].mac, 1_500, COST_AUTO, pair.now_s)
+    end.ports[0].qualities.clear()
+    for each in end.all_up():
+        each.keepalives = None
+    pair.run(5.0)
+    assert [(each.cost, before) for each, before in end.poll_costs()] == [(10, NeighbourState.UP)]
+    assert end.poll_costs() == []
+
+
+def test_a_link_that_comes_back_keeps_its_cost() -> None:
+    pair = up(Pair())
+    end = pair.ends["a"]
+    end.add_port(0, end.ports[0].mac, 1_500, COST_AUTO, pair.now_s)
+    measured = quality(pair, "a")
+    pair.passes = lambda _sender, _frame: False
+    pair.run(1.0)
+    assert not pair.is_up("a")
+    pair.passes = lambda _sender, _frame: True
+    pair.run(0.5)
+    assert quality(pair, "a") is measured
+    assert [each.cost for each in end.all_up()] == [measured.cost.advertised]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from typing import Any
 
 import cbor2
@@ -224,10 +225,12 @@ def test_every_kind_that_carries_a_statement_shows_it(kind: Kind) -> None:
 
 
 def test_a_keepalive_is_shown_field_by_field() -> None:
-    packet = Ether(bytes(Ether() / GDP(kind=Kind.KEEPALIVE) / Raw(b"\x05\x03" + b"d" * 8 + b"t" * 16)))
+    payload = b"\x05\x03" + b"d" * 8 + struct.pack(">QQIB", 9, 8, 70_000, 7) + b"t" * 16
+    packet = Ether(bytes(Ether() / GDP(kind=Kind.KEEPALIVE) / Raw(payload)))
     shown = packet[Keepalive]
     said = str(shown.flags), shown.multiplier, shown.digest, shown.tag
     assert said == ("poll+heard", 3, b"d" * 8, b"t" * 16)
+    assert (shown.sent, shown.echo, shown.held_us, shown.loss) == (9, 8, 70_000, 7)
 
 
 def test_a_statement_can_be_built() -> None:

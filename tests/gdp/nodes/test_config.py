@@ -8,7 +8,7 @@ from typing import ClassVar
 import pytest
 
 from gdp.errors import ConfigError
-from gdp.limits import DEAD_S, HELLO_S, RIB_NAMES_PER_SENDER
+from gdp.limits import COST_AUTO, COST_DEFAULT, DEAD_S, HELLO_S, RIB_NAMES_PER_SENDER
 from gdp.names import Name
 from gdp.nodes.config import PortConfig, RibConfig, SwitchConfig
 from gdp.nodes.schema import Section, load
@@ -62,6 +62,11 @@ def test_ports_carry_their_cost(place: Path) -> None:
 def test_devices_of_the_command_line_are_added_once(place: Path) -> None:
     config = switch(place, SWITCH + "ports: [{iface: eth0, cost: 5}]\n").with_ifaces(["eth0", "eth1", "eth1"])
     assert [(port.iface, port.cost) for port in config.ports] == [("eth0", 5), ("eth1", 10)]
+
+
+def test_the_cost_of_a_port_may_be_measured(place: Path) -> None:
+    config = switch(place, SWITCH + "ports: [{iface: eth0, cost: auto}, {iface: eth1}]\n")
+    assert [port.cost for port in config.ports] == [COST_AUTO, COST_DEFAULT]
 
 
 def test_a_configuration_does_not_change(place: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 from gdp.errors import DROP_COUNTERS, DropReason, LocalError
 from gdp.names import Name
 from gdp.telemetry.metrics import Metrics
-from gdp.telemetry.sources import Histogram, Sources
+from gdp.telemetry.sources import Histogram, LinkRow, Sources
 
 
 def drops(**counts: int) -> list[int]:
@@ -137,3 +137,17 @@ def test_entries_are_reported_by_short_names_and_those_that_look_alike_together(
     assert f'gdp_entry_frames_total{{destination="{short}",source="any"}} 4.0' in text
     assert f'gdp_entry_bytes_total{{destination="{short}",source="{short}"}} 200.0' in text
     assert one.hex() not in text
+
+
+def test_each_link_shows_its_cost_its_round_trip_time_and_its_loss() -> None:
+    slow = LinkRow("wg0", "abcd", 0.02, 0.001, 0.25, 0.5, 30)
+    text = Metrics(Sources(links=lambda: [slow, slow._replace(port="wg1", rtt_s=None, cost=100)])).text()
+    for line in (
+        'gdp_link_cost{neighbour="abcd",port="wg0"} 30.0',
+        'gdp_link_cost{neighbour="abcd",port="wg1"} 100.0',
+        'gdp_link_rtt_seconds{neighbour="abcd",port="wg0"} 0.02',
+        'gdp_link_loss{direction="in",neighbour="abcd",port="wg0"} 0.25',
+        'gdp_link_loss{direction="out",neighbour="abcd",port="wg0"} 0.5',
+    ):
+        assert line in text.splitlines()
+    assert text.count("gdp_link_rtt_seconds{") == 1

@@ -1,0 +1,98 @@
+"""Paths over links of measured cost: the faster one wins, and noise moves no route."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+
+from gdp.limits import COST_AUTO
+from gdp.simulation.simulation import Simulation
+from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+
+CABLES = ("s1", "left"), ("left", "s4"), ("s1", "right"), ("right", "s4")
+JITTER_S = 0.01
+WINS_S = 15.0
+SETTLED_S = 30.0
+STEP_S = 0.5
+
+
+def diamond(seed: int = 1, left_s: float = 0.01, right_s: float = 0.01) -> Simulation:
+    """Return two parallel paths of noisy links from s1 to s4, each link with this delay one way."""
+    nodes = ("s1", "left", "right", "s4")
+    world = Simulation(
+        topology=Topology(
+            tuple(Link(a, b) for a, b in CABLES),
+            (DomainPlan("lab", nodes),),
+            (Attachment("s4", "rib", "rib"), Attachment("s1", "proxy", "robot")),
+        ),
+        seed=seed,
+    )
+    for a, b in CABLES:
+        cable = world.cables[frozenset((a, b))]
+        cable.delay_s, cable.jitter_s = (left_s if "left" in (a, b) else right_s), JITTER_S
+        world.network.set_cost(cable, COST_AUTO)
+    assert world.run_until_attached()
+    return world
+
+
+def next_hop(world: Simulation) -> str:
+    """Return the switch through which s1 reaches s4."""
+    s1, s4 = world.switches["s1"], world.switches["s4"]
+    path = s1._paths.to_switch(s4.name, s1._policy.own, frozenset((s1._policy.own,)))
+    assert path is not None
+    return next(label for label, each in world.switches.items() if each.name == path.first)
+
+
+def next_hops(world: Simulation, duration_s: float) -> list[str]:
+    """Let time pass; return the next hop at each step."""
+    found = []
+    for _ in range(int(duration_s / STEP_S)):
+        world.network.run(STEP_S)
+        found.append(next_hop(world))
+    return found
+
+
+def slow_down(world: Simulation, via: str, delay_s: float) -> None:
+    for a, b in CABLES:
+        if via in (a, b):
+            world.cables[frozenset((a, b))].delay_s = delay_s
+
+
+@pytest.mark.parametrize("seed", range(1, 4))
+def test_a_route_over_two_paths_of_equal_noisy_delay_changes_at_most_once_in_two_minutes(seed: int) -> None:
+    world = diamond(seed)
+    world.network.run(SETTLED_S)
+    assert sum(before != after for before, after in pairwise(next_hops(world, 120.0))) <= 1
+
+
+@pytest.mark.parametrize(("left_s", "right_s", "fast"), [(0.01, 0.03, "left"), (0.03, 0.01, "right")])
+def test_a_path_three_times_as_fast_wins_as_soon_as_it_is_measured(left_s: float, right_s: float, fast: str) -> None:
+    assert set(next_hops(diamond(left_s=left_s, right_s=right_s), 75.0)[2:]) == {fast}
+
+
+def test_a_path_that_becomes_three_times_as_slow_is_left_within_fifteen_seconds_and_not_taken_again() -> None:
+    world = diamond()
+    world.network.run(SETTLED_S)
+    before = next_hop(world)
+    slow_down(world, before, 0.03)
+    world.network.run(WINS_S)
+    assert before not in next_hops(world, 60.0)
+
+
+def test_a_path_that_loses_a_third_of_its_frames_is_left() -> None:
+    world = diamond()
+    world.network.run(SETTLED_S)
+    before = next_hop(world)
+    for a, b in CABLES:
+        if before in (a, b):
+            world.cables[frozenset((a, b))].loss = 0.3
+    world.network.run(30.0)
+    assert before not in next_hops(world, 30.0)
+
+
+def test_a_fixed_cost_is_used_whatever_the_delay() -> None:
+    world = diamond(left_s=0.05)
+    for a, b in CABLES:
+        world.network.set_cost(world.cables[frozenset((a, b))], 10 if "left" in (a, b) else 20)
+    assert set(next_hops(world, 75.0)[2:]) == {"left"}
