@@ -22,7 +22,7 @@ from gdp.errors import LocalError
 from gdp.ports.tunnel.devices import find_device
 from gdp.ports.tunnel.path_mtu import RouteMonitor, route_mtu
 from gdp.ports.tunnel.uapi import socket_path
-from gdp.ports.tunnel.vxlan import remove_link, set_link_mtu
+from gdp.ports.tunnel.vxlan import make_vxlan, remove_link, set_link_mtu
 from gdp.ports.tunnel.wireguard import WireGuardDevice, open_wireguard
 from gdp.stores.issue import make_domain, make_node
 from netns_tests.tunnel_sites import PATIENCE_S, PORT, Site, children, crosses, numbers, payload, two_sites, until
@@ -387,6 +387,47 @@ def test_without_wireguard_the_error_says_what_to_install(
             backend="kernel",
         )
     assert not one.has(one.ifname)
+
+
+def test_a_peer_that_the_device_refuses_is_not_kept(sites: tuple[Site, Site], ends: Ends) -> None:
+    one, two = sites
+    with one.entered(), pytest.raises(LocalError, match="refused a change"):
+        ends[0].set_peer(bytes(31), inner=two.inner, endpoint=None, keepalive_s=0)
+    assert list(ends[0].peers()) == [two.public_key]
+
+
+def test_a_link_is_never_wider_than_its_tunnel(sites: tuple[Site, Site], ends: Ends) -> None:
+    one, two = sites
+    with one.entered(), pytest.raises(LocalError, match="MTU 1400: Invalid argument"):
+        set_link_mtu(one.link, 1_400)
+    one.ip("link", "delete", one.link)
+    with one.entered():
+        make_vxlan(
+            ifname=one.link, vni=1, local=one.inner, remote=two.inner, underlay=one.ifname, mtu=1_400, alias=one.alias
+        )
+        made = find_device(one.link)
+    assert made is not None
+    assert made.mtu == 1370
+
+
+def test_without_the_right_to_make_devices_the_error_says_what_to_do(sites: tuple[Site, Site]) -> None:
+    one, _ = sites
+    words = (
+        f"from gdp.ports.tunnel.wireguard import open_wireguard; open_wireguard(ifname={one.ifname!r}, listen_port=0,"
+        f" private_key=bytes(32), inner={one.inner!r}, mtu=1440, alias={one.alias!r})"
+    )
+    with one.entered():
+        ended = subprocess.run(
+            ["setpriv", "--bounding-set=-net_admin", "--", sys.executable, "-c", words],
+            capture_output=True,
+            text=True,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            check=False,
+        )
+    assert ended.stderr.splitlines()[-1] == (
+        f"gdp.errors.LocalError: tunnel {one.ifname}: the device cannot be made: not permitted;"
+        " run this as root, or with scripts/privileged.sh"
+    )
 
 
 def test_numbered_frames_arrive_once_and_in_order(sites: tuple[Site, Site], ends: Ends) -> None:

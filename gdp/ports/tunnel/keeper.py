@@ -88,6 +88,8 @@ class _Child:
     @property
     def reason(self) -> str:
         """Return its last line about an error, or how it ended."""
+        if self.process.returncode is not None and self.process.returncode < 0:
+            return f"it was ended by signal {-self.process.returncode}"
         lines = [line for line in self.said.decode(errors="replace").splitlines() if line.startswith("ERROR")]
         return lines[-1] if lines else f"it ended with status {self.process.returncode}"
 
@@ -127,6 +129,10 @@ class _Owner:
         """Return its descriptor; it is readable once the owner is gone."""
         return self._socket.fileno()
 
+    def forget(self) -> None:
+        """Treat the owner as gone: it died while another process holds its end of the socket pair."""
+        self._socket.shutdown(socket.SHUT_RDWR)
+
     def report(self, **fields: object) -> None:
         """Write one report; an owner that is gone is seen by ``poll`` afterwards."""
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
@@ -149,12 +155,13 @@ def main(words: Sequence[str]) -> None:
             owner's process id.
     """
     ifname, alias, backend, owner_pid = words[0], words[1], words[2], int(words[3])
-    signal.signal(signal.SIGTERM, _end)
+    owner = _Owner()
+    signal.signal(signal.SIGTERM, lambda *_: owner.forget())
     prctl(_DEATH_SIGNAL, signal.SIGTERM)
     if os.getppid() != owner_pid:
         return
     prctl(_NO_NEW_PRIVS, 1)
-    keeper = _Keeper(ifname, alias, _Owner())
+    keeper = _Keeper(ifname, alias, owner)
     try:
         keeper.run(backend)
     except RefusedError as error:
@@ -295,7 +302,7 @@ class _Keeper:
                 raise LocalError(f"{_PROGRAM} does not start: {child.reason}")
             if not self.owner.wait(child.pidfd, timeout_s=_LOOK_S):  # no event says that it serves
                 child.end()
-                raise SystemExit(0)
+                raise SystemExit
         self._child = child
         set_mtu(self._found().ifindex, mtu)  # the program sets its own default
 
@@ -387,12 +394,6 @@ def _wait_until(is_true: Callable[[], bool]) -> None:
     end_s = time.monotonic() + 1.0
     while not is_true() and time.monotonic() < end_s:
         time.sleep(_LOOK_S)
-
-
-def _end(number: int, frame: object) -> None:
-    """End in order, also when the owner was killed."""
-    del number, frame
-    raise SystemExit(0)
 
 
 if __name__ == "__main__":

@@ -66,7 +66,9 @@ class KeeperProcess:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", _MODULE, ifname, alias, backend, str(os.getpid())],
                 stdin=theirs.fileno(),
-                env={**os.environ, "PYTHONPATH": os.pathsep.join([str(_ROOT), *filter(None, sys.path)])},
+                stdout=subprocess.DEVNULL,
+                cwd=_ROOT,  # Python imports from the working directory, which others may be able to write to
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(os.path.isabs, sys.path))},
                 start_new_session=True,  # Ctrl-C in a terminal goes to the owner only, which ends the keeper in order
             )
         self._socket.settimeout(_START_S)

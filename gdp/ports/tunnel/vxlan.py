@@ -18,6 +18,7 @@ from gdp.ports.tunnel.devices import (
     find_device,
     make_up,
     refusal_text,
+    remove_device,
     remove_own_device,
     set_alias,
     set_mtu,
@@ -41,7 +42,7 @@ def make_vxlan(*, ifname: str, vni: int, local: str, remote: str, underlay: str,
         local: inner IPv6 address of this end.
         remote: inner IPv6 address of the other end.
         underlay: device of the tunnel.
-        mtu: bytes after the Ethernet header.
+        mtu: bytes after the Ethernet header; the kernel lowers it to what the tunnel's device carries.
         alias: identifies the devices of this switch.
 
     Raises:
@@ -61,9 +62,13 @@ def make_vxlan(*, ifname: str, vni: int, local: str, remote: str, underlay: str,
         made = find_device(ifname)
         if made is None:
             raise LocalError(f"tunnel {ifname}: another program removed the device")
-        set_alias(made.ifindex, alias)
-        without_addresses(made.ifindex)
-        make_up(made.ifindex)
+        try:
+            set_alias(made.ifindex, alias)
+            without_addresses(made.ifindex)
+            make_up(made.ifindex)
+        except RefusedError:
+            remove_device(made.ifindex)
+            raise
     except RefusedError as error:
         raise LocalError(f"tunnel {ifname}: the VXLAN device cannot be made: {refusal_text(error)}") from error
 

@@ -132,7 +132,13 @@ class WireGuardDevice:
         known = endpoint or (None if before is None else self._endpoint(public_key))
         self._peers[public_key] = _Peer(inner, known, keepalive_s)
         change = PeerChange(public_key=public_key, inner=inner, endpoint=endpoint, keepalive_s=keepalive_s)
-        self._apply(Change(peers=(change,)))
+        try:
+            self._apply(Change(peers=(change,)))
+        except LocalError:
+            del self._peers[public_key]
+            if before is not None:
+                self._peers[public_key] = before
+            raise
         if before is not None and before.inner != inner:
             self._with_device(lambda device: remove_route(device.ifindex, before.inner))
         self._with_device(lambda device: add_route(device.ifindex, inner))
