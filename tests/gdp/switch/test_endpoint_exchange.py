@@ -140,7 +140,7 @@ def test_a_record_is_learnt_and_a_newer_one_replaces_it() -> None:
     assert made.records(at(0.0))[PEER.name].sequence == 3
 
 
-def test_a_record_that_nobody_wants_is_not_kept() -> None:
+def test_a_record_that_is_not_wanted_is_not_kept() -> None:
     made = exchange()
     learn(made, record(PEER).wire)
     assert made.records(at(0.0)) == {}
