@@ -56,7 +56,7 @@ def learn(into: EndpointExchange, *wires: bytes) -> None:
 
 def test_a_record_is_sent_at_once_and_again_until_the_rib_keeps_it() -> None:
     made = exchange()
-    made.publish(record())
+    made.set_own(record())
     times = [now_s for now_s, _ in sent(made, 20.0)]
     assert times[:4] == pytest.approx([0.0, 0.3, 0.9, 2.1])
     made.receive(EndpointResponse(kept_sequence=1), at(20.0))
@@ -65,7 +65,7 @@ def test_a_record_is_sent_at_once_and_again_until_the_rib_keeps_it() -> None:
 
 def test_a_record_that_the_rib_has_lost_is_sent_again_at_once() -> None:
     made = exchange()
-    made.publish(record())
+    made.set_own(record())
     made.statements_to_send(0.0)
     made.receive(EndpointResponse(kept_sequence=1), at(0.1))
     made.receive(EndpointResponse(kept_sequence=0), at(1.0))
@@ -74,7 +74,7 @@ def test_a_record_that_the_rib_has_lost_is_sent_again_at_once() -> None:
 
 def test_another_rib_receives_record_and_query_at_once() -> None:
     made = exchange(PEER)
-    made.publish(record())
+    made.set_own(record())
     made.statements_to_send(0.0)
     made.receive(EndpointResponse(kept_sequence=1), at(0.1))
     made.rib_changed(1.0)
@@ -84,19 +84,19 @@ def test_another_rib_receives_record_and_query_at_once() -> None:
 
 def test_a_refusal_is_kept_for_the_operator_until_the_record_is_accepted() -> None:
     made = exchange()
-    made.publish(record(sequence=3))
+    made.set_own(record(sequence=3))
     made.statements_to_send(0.0)
     made.receive(EndpointResponse(kept_sequence=9, refused=DropReason.STALE), at(0.1))
     assert made.refusal == Refusal(DropReason.STALE, 9)
-    made.publish(record(sequence=10))
+    made.set_own(record(sequence=10))
     assert made.refusal is None
 
 
 def test_a_record_that_is_not_newer_is_not_published() -> None:
     made = exchange()
-    made.publish(record(sequence=3))
+    made.set_own(record(sequence=3))
     with pytest.raises(StatementError):
-        made.publish(record(sequence=3))
+        made.set_own(record(sequence=3))
 
 
 def test_nothing_is_sent_where_nothing_is_published_or_wanted() -> None:
