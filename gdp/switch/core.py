@@ -341,7 +341,7 @@ class SwitchCore:
         Raises:
             StatementError: STALE, its sequence is not higher than that of the one before.
         """
-        self._endpoints.publish(record)
+        self._endpoints.set_own(record)
         self._rest_due_s = None
 
     def set_tunnel_peers(self, names: Collection[Name]) -> None:

@@ -10,9 +10,10 @@ other has its peer configured: a peer stays configured in all pauses, until ``Cl
 
 Types of candidates are tried in this order, of which each end takes the other's::
 
-    host       private IPv4, where both are in one network or behind one NAT
+    host       private IPv4 (RFC 1918, RFC 6598), where both are in one network or behind one NAT
     IPv6       addresses of devices, without a NAT
-    reflexive  as a border sees it; it opens a NAT unless the mapping depends on the destination
+    reflexive  as a border sees it, or a public IPv4 of a device; a NAT is opened unless its mapping depends on the
+               destination
     public     stated by an operator
 """
 
@@ -41,7 +42,7 @@ _JITTER: Final = 0.25  # of a pause, up or down
 _RECOVER_S: Final = 1.0  # a tunnel that was up may recover by itself: WireGuard follows a peer that moves
 _MOVED_S: Final = 5.0  # ... but not if a record has changed so shortly before: an end has moved
 _HOLD_S: Final = 2.5  # after a handshake, for the hello protocol
-_REDUNDANT_S: Final = 30.0  # a tunnel beside a local link is closed after this time
+_REDUNDANT_S: Final = 30.0  # a tunnel next to a local link is closed after this time
 _IPV4_PRIVATE_BITS: Final = 16  # two private addresses with this prefix may be in one network
 
 
@@ -120,7 +121,8 @@ def _pairs(class_: _Class, first: EndpointRecord, second: EndpointRecord) -> lis
     """Return the pairs of one class; where one end has no candidate, each of its uplinks tries those of the other."""
     ends: list[list[_End]] = []
     for record in (first, second):
-        ends.append([(each.uplink, each) for each in record.candidates if _class_of(each) is class_])
+        found = {(each.uplink, each.endpoint): each for each in record.candidates if _class_of(each) is class_}
+        ends.append([(each.uplink, each) for each in found.values()])
     if not ends[0] and not ends[1]:
         return []
     if class_ in (_Class.HOST, _Class.IPV6):
@@ -145,7 +147,8 @@ def _class_of(candidate: Candidate) -> _Class | None:
         return _Class.PUBLIC
     if address.version == 6:
         return _Class.IPV6
-    return _Class.HOST if candidate.type is CandidateType.HOST else _Class.REFLEXIVE
+    is_private = candidate.type is CandidateType.HOST and any(address in each for each in _PRIVATE)
+    return _Class.HOST if is_private else _Class.REFLEXIVE
 
 
 def _is_matched(
@@ -167,6 +170,9 @@ def _is_matched(
 
 
 _UNIQUE_LOCAL: Final = ipaddress.ip_network("fc00::/7")  # RFC 4193
+_PRIVATE: Final = tuple(
+    ipaddress.ip_network(each) for each in ("10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "100.64.0.0/10")
+)
 
 
 @dataclass(slots=True, kw_only=True)

@@ -72,8 +72,8 @@ class EndpointExchange:
         self.own: EndpointRecord | None = None
         self.refusal: Refusal | None = None
 
-    def publish(self, record: EndpointRecord) -> None:
-        """Publish this switch's record, instead of the one before.
+    def set_own(self, record: EndpointRecord) -> None:
+        """Set this switch's record, which is published instead of the one before.
 
         Raises:
             StatementError: STALE, its sequence is not higher.

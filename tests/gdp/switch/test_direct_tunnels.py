@@ -76,6 +76,8 @@ def addresses(own: EndpointRecord, peer: EndpointRecord) -> list[str]:
         ((), ((PUBLIC, "203.0.113.9"),), ["203.0.113.9"]),
         ((), ((TLS, "203.0.113.9"),), []),
         (((HOST, "192.168.1.5"),), ((HOST, "10.0.0.7"),), []),
+        (((HOST, "203.0.113.5"),), ((REFLEXIVE, "198.51.100.1"),), ["198.51.100.1"]),
+        (((REFLEXIVE, "198.51.100.1"),), ((HOST, "203.0.113.5"),), ["203.0.113.5"]),
         (((HOST, "192.168.1.5"),), ((HOST, "192.168.1.6"),), ["192.168.1.6"]),
         (((HOST, "192.168.1.5"),), ((HOST, "192.168.1.5"),), []),
         (((HOST, "fe80::1"),), ((HOST, "fe80::2"),), []),
@@ -208,7 +210,7 @@ def test_a_switch_with_a_link_of_its_own_gets_no_tunnel() -> None:
     assert bed.tunnels.peers([A, B, C], {B}) == [C]
 
 
-def test_a_tunnel_beside_a_lasting_link_is_closed() -> None:
+def test_a_tunnel_next_to_a_lasting_link_is_closed() -> None:
     bed = Bed()
     bed.run(1)
     bed.up.add(B)
