@@ -33,13 +33,12 @@ _PATIENCE_S = 30.0
 class Node:
     """One machine: a folder, a namespace and its processes."""
 
-    def __init__(self, home: Path, label: str, pid: int, peers: list[str]) -> None:
-        self.home, self.label, self._pid = home, label, pid
-        self.enter = ["nsenter", f"--net=/proc/{pid}/ns/net"]
+    def __init__(self, home: Path, label: str, pid: int) -> None:
+        self.home, self.label = home, label
+        self.enter = ["nsenter", f"--net=/proc/{pid}/ns/net", "--"]
         self.running: list[subprocess.Popen[bytes]] = []
         self.identity = home / label
         self.name: Name = load_card(self.identity / "node.card").name
-        del peers
 
     def ip(self, *words: str) -> None:
         """Run ``ip`` here."""
@@ -51,6 +50,30 @@ class Node:
         found: list[dict[str, Any]] = json.loads(done.stdout)
         return found
 
+    def devices(self) -> set[str]:
+        """Return the names of the devices."""
+        return {str(each["ifname"]) for each in self.links()}
+
+    def kill(self, process: subprocess.Popen[bytes]) -> None:
+        """End a process at once, as the kernel does when memory is short."""
+        self.running.remove(process)
+        process.kill()
+        process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
+
+    def run(self, *argv: str) -> subprocess.CompletedProcess[str]:
+        """Run a command here, in the folder of all files; it ends by itself."""
+        return subprocess.run(
+            [*self.enter, *argv],
+            cwd=self.home,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+            capture_output=True,
+            text=True,
+            timeout=_PATIENCE_S,
+            check=False,
+        )
+
     def write(self, file: str, **keys: object) -> Path:
         """Write a configuration of this machine's identity."""
         path = self.home / f"{self.label}-{file}"
@@ -60,13 +83,14 @@ class Node:
 
     def start(self, module: str, config: Path, *words: str) -> subprocess.Popen[bytes]:
         """Start a node, and return when it is ready."""
-        process = subprocess.Popen(
-            [*self.enter, sys.executable, "-m", module, "--config", str(config), "--json", *words],
-            stdout=subprocess.PIPE,
-            stderr=(self.home / f"{self.label}-{module}.log").open("ab"),
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-            bufsize=0,
-        )
+        with (self.home / f"{self.label}-{module}.log").open("ab") as log:
+            process = subprocess.Popen(
+                [*self.enter, sys.executable, "-m", module, "--config", str(config), "--json", *words],
+                stdout=subprocess.PIPE,
+                stderr=log,
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+                bufsize=0,
+            )
         self.running.append(process)
         assert process.stdout is not None
         assert select.select([process.stdout], [], [], _PATIENCE_S)[0], self.log(module)
@@ -101,24 +125,31 @@ class RelayLab:
 
     def __init__(self, home: Path, pids: tuple[int, int]) -> None:
         self.home, self.domain = home, home / "domain"
-        make_domain(self.domain, "lab", unix_s=time.time())
+        make_domain(self.domain, "lab", unix_s=time.time() - 30 * 86_400)
         for label in ("border", "member"):
             make_node(home / label, Role.SWITCH, label, self.domain, days=30, unix_s=time.time())
         self.border, self.member = (
-            Node(home, label, pid, []) for label, pid in zip(("border", "member"), pids, strict=True)
+            Node(home, label, pid) for label, pid in zip(("border", "member"), pids, strict=True)
         )
         self.border_device = tap_name(self.border.name, self.member.name)
         self.member_device = tap_name(self.member.name, self.border.name)
 
-    def relay_config(self, node: Node, **more: object) -> Path:
+    def relay_config(self, node: Node, *, standby: bool = False, **more: object) -> Path:
         """Write ``relay.yaml`` of one machine."""
-        border = {"peer": self.border.name.to_text(), "endpoints": [f"{BORDER_ADDRESS}:{PORT}"]}
+        endpoints = [f"{BORDER_ADDRESS}:{PORT}"]
+        border = {"peer": self.border.name.to_text(), "endpoints": endpoints, "standby": standby}
         part: dict[str, object] = {"server": {"port": PORT}} if node is self.border else {"borders": [border]}
         return node.write("relay.yaml", control_socket=f"{node.label}-relay.sock", **{**part, **more})
 
-    def start_relay(self, node: Node, **more: object) -> subprocess.Popen[bytes]:
+    def start_relay(self, node: Node, *, standby: bool = False, **more: object) -> subprocess.Popen[bytes]:
         """Start the relay of one machine."""
-        return node.start("gdp.cli.relay", self.relay_config(node, **more))
+        return node.start("gdp.cli.relay", self.relay_config(node, standby=standby, **more))
+
+    def start_relays(self) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
+        """Start both relays; return border's and member's when frames may pass."""
+        processes = self.start_relay(self.border), self.start_relay(self.member)
+        wait_for(self.is_up)
+        return processes
 
     def start_switch(self, node: Node, **more: object) -> subprocess.Popen[bytes]:
         """Start the switch of one machine, whose only link is the relay's device."""
@@ -139,6 +170,10 @@ class RelayLab:
     def relay_status(self, node: Node) -> dict[str, Any]:
         """Return the status of the relay of a machine."""
         return node.status(self.home / f"{node.label}-relay.sock")
+
+    def is_up(self) -> bool:
+        """Return whether the member's relay is connected."""
+        return bool(self.relay_status(self.member)["borders"][0]["state"] == "up")
 
     def is_joined(self) -> bool:
         """Return whether both switches see each other."""

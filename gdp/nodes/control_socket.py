@@ -160,7 +160,8 @@ class ControlServer:
     def _handle(self, client: _Client, line: bytes) -> Response:
         try:
             command = decode_request(line)
-            log.info("control command=%s", command.value)
+            level = logging.DEBUG if command is Command.STATUS else logging.INFO  # the relay asks twice a second
+            log.log(level, "control command=%s", command.value)
             if command is Command.RELOAD:
                 self._handlers.reload()
                 return Response({"state": "reloaded"})

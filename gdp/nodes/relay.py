@@ -33,6 +33,7 @@ from gdp.nodes.relay_server import BorderServer, listen_tls
 from gdp.nodes.rights import confine_relay
 from gdp.nodes.runtime import now
 from gdp.nodes.single_instance import run_alone
+from gdp.nodes.switch_watch import SwitchWatch
 from gdp.ports.address_monitor import AddressMonitor
 from gdp.ports.tap import TapDevice, tap_name
 from gdp.relay.connection import ConnectionCounters
@@ -85,6 +86,7 @@ def run_relay(config: RelayConfig, ready: Callable[[Identity, Relay], None]) -> 
         log.info(
             "relay up name=%s role=%s server=%s", identity.name.short, identity.role.value, relay.server is not None
         )
+        relay.start()
         ready(identity, relay)
         loop.run()
 
@@ -106,6 +108,8 @@ class Relay:
         context.tls(is_server=False)
         self.server: BorderServer | None = None
         self.dialers: list[BorderDialer] = []
+        switch = context.config.switch_socket or control_path(context.identity.name)
+        self._watch = SwitchWatch(switch) if any(each.standby for each in context.config.borders) else None
         with contextlib.ExitStack() as opened:
             config = context.config
             self._monitor = opened.enter_context(contextlib.closing(AddressMonitor()))
@@ -122,6 +126,11 @@ class Relay:
         self._loop.register(self._monitor.fileno(), select.EPOLLIN, self._addresses_changed)
         self._loop.add_timed(self)
 
+    def start(self) -> None:
+        """Begin to follow the switch's tunnels, after the confinement of rights."""
+        if self._watch is not None:
+            self._watch.start()
+
     def on_look(self, look: Callable[[], None]) -> None:
         """Call ``look`` from within the loop each ``LOOK_S``, before the members are checked."""
         self._looks.insert(0, look)
@@ -130,6 +139,9 @@ class Relay:
         """Look at files and memberships; return the second of the next call."""
         for look in self._looks:
             look()
+        if self._watch is not None:
+            for dialer in self.dialers:
+                dialer.follow_tunnel(now_s, is_up=dialer.peer.to_text() in self._watch.up)
         return now_s + LOOK_S
 
     def check_members(self) -> None:
@@ -146,6 +158,8 @@ class Relay:
         if self._is_closed:
             return
         self._is_closed = True
+        if self._watch is not None:
+            self._watch.close()
         self._loop.remove_timed(self)
         self._loop.unregister(self._monitor.fileno())
         self._monitor.close()

@@ -47,16 +47,21 @@ class RelayServer(Section):
 
 
 class RelayBorder(Section):
-    """A border that this member dials: the name of its switch, and its endpoints in the order of attempts."""
+    """A border that this member dials: the name of its switch, and its endpoints in the order of attempts.
+
+    With ``standby`` it is dialled only while the switch on this host has no tunnel to it that is up.
+    """
 
     peer: RequiredName
     endpoints: Annotated[tuple[ServerText, ...], Unique] = Field(min_length=1)
+    standby: bool = True
 
 
 class RelayConfig(Section):
     """``relay.yaml``: ``server`` on a border, ``borders`` on a member.
 
-    ``identity`` is that of the switch whose frames are relayed.
+    ``identity`` is that of the switch whose frames are relayed, and ``switch_socket`` its ``control_socket``, where that
+    is configured.
     """
 
     identity: Directory
@@ -70,6 +75,7 @@ class RelayConfig(Section):
     revocations: Directory | None = None
     metrics: Metrics | None = None
     control_socket: NewFile | None = None
+    switch_socket: NewFile | None = None
     sandbox: bool = True
 
     @classmethod

@@ -20,6 +20,7 @@ from typing import Final, NamedTuple
 
 from gdp.crypto.certificates import Membership
 from gdp.errors import LocalError, StatementError
+from gdp.names import Name
 from gdp.nodes.relay_config import RelayBorder, host_and_port
 from gdp.nodes.relay_context import RelayContext
 from gdp.nodes.relay_link import RelayLink, RelayPort, prepare_socket
@@ -28,6 +29,7 @@ from gdp.ports.address_monitor import source_address
 from gdp.ports.tap import TapDevice, tap_name
 from gdp.relay.admission import verified_border
 from gdp.relay.backoff import Backoff
+from gdp.relay.choice import RelayChoice
 from gdp.relay.connection import ConnectionCounters, RelayConnection
 from gdp.sansio import Timestamps
 
@@ -38,6 +40,7 @@ log = logging.getLogger(__name__)
 _CONNECT_S: Final = 2.0  # for one address; then the next one has its turn
 _REFUSED_S: Final = 10.0  # at least, after a refusal
 _CANDIDATES_MAX: Final = 16
+_STANDBY: Final = "on standby: the tunnel over UDP is up, or has a moment to come up"
 
 
 class _Candidate(NamedTuple):
@@ -74,13 +77,20 @@ class BorderDialer:
         self._resolved, self._resolves = socket.socketpair()
         self._is_resolving = False
         self._is_closed = False
+        self._is_wanted = not border.standby
+        self._choice = RelayChoice(begun_s=time.monotonic())
         self._last_refusal = ""
         self.attempts = 0
-        self.reason = "not tried yet"
+        self.reason = _STANDBY if border.standby else "not tried yet"
         self.port = self._new_port()
         self._resolved.setblocking(False)
         self._loop.register(self._resolved.fileno(), select.EPOLLIN, self._take_resolved)
         self._loop.add_timed(self)
+
+    @property
+    def peer(self) -> Name:
+        """Return the name of the border's switch."""
+        return self._border.peer
 
     @property
     def is_up(self) -> bool:
@@ -89,17 +99,36 @@ class BorderDialer:
 
     def handle_timer(self, now_s: float) -> float:
         """Dial, or give up an attempt, when it is due; return the second of the next call."""
-        if self._due_s is not None and now_s >= self._due_s:
+        if self._is_wanted and self._due_s is not None and now_s >= self._due_s:
             self._due_s = None
             if self._connecting is not None:
                 self._failed("no answer from the endpoint")
             elif self._link is None:
                 self._dial()
-        return now_s + 1.0 if self._due_s is None else self._due_s
+        return now_s + 1.0 if self._due_s is None or not self._is_wanted else self._due_s
+
+    def follow_tunnel(self, now_s: float, *, is_up: bool) -> None:
+        """Take in whether the switch's tunnel to this border is up: a border on standby is dialled while it is not."""
+        if not self._border.standby:
+            return
+        is_wanted = self._choice.update(now_s, is_udp_up=is_up)
+        if is_wanted is self._is_wanted:
+            return
+        self._is_wanted = is_wanted
+        log.info("relay %s border=%s", "needed: no tunnel" if is_wanted else "on standby", self._border.peer.short)
+        if is_wanted:
+            self._dial_now()
+            return
+        self._drop_attempt()
+        if self._link is not None:
+            self._link.end(_STANDBY)
+        self.reason = _STANDBY
 
     def network_changed(self) -> None:
         """Connect again at once if the own address towards the border has changed."""
         target, link = self._target, self._link
+        if not self._is_wanted:
+            return
         if target is None:
             if not self._is_resolving:
                 self._dial_now()
@@ -153,7 +182,7 @@ class BorderDialer:
         return {
             "name": self._border.peer.to_text(),
             "endpoints": list(self._border.endpoints),
-            "state": "up" if self.is_up else "connecting",
+            "state": "up" if self.is_up else "connecting" if self._is_wanted else "standby",
             "reason": "" if self.is_up else self.reason,
             "attempts": self.attempts,
             **port_status(self.port, now_s),

@@ -160,7 +160,7 @@ class BorderServer:
     def _accept(self, events: int) -> None:
         del events
         now_s = time.monotonic()
-        if len(self._handshakes) >= _HANDSHAKES_MAX or not self._accepts.spend(now_s):
+        if not self._accepts.spend(now_s):
             self._pause(now_s)
             return
         try:
@@ -172,6 +172,8 @@ class BorderServer:
             log.warning("connection not accepted reason=%s", error.strerror)
             self._pause(now_s)
             return
+        if len(self._handshakes) >= _HANDSHAKES_MAX:  # idle strangers do not keep a member out
+            min(self._handshakes, key=lambda each: each.since_s).end("too many handshakes at once")
         connection = RelayConnection(
             context=self._context.tls(is_server=True),
             is_server=True,

@@ -91,7 +91,7 @@ def confine_relay(config: RelayConfig) -> None:
         Needs(
             capabilities=frozenset({Capability.NET_ADMIN}) | _past_owners(again, kept),
             writes=(*_CHANGED, _DEVICE_SETTINGS, lock_directory(), *kept),
-            reads=(*_code(), _RESOLVER, *again),
+            reads=(*_code(), _RESOLVER, *again, *_folder_of(config.switch_socket)),
             tcp_ports=None if config.borders else ports,
         )
     )
