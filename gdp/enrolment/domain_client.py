@@ -8,7 +8,7 @@ I/O; blocking. ``DomainClient.open(DIR)`` needs only the directory that ``gdp jo
         for mail in domain.receive(since=0):
             ...
 
-Mail that arrives lies in ``DIR/inbox``, one file each, whoever fetched it: the agent or a program like this one. A
+Mail that arrives lies in ``DIR/inbox``, one file each, fetched by the agent or by a program like this one. A
 program remembers the number of the last mail that it has handled, and deletes mail that no other program needs.
 """
 

@@ -4,9 +4,9 @@ Sans-I/O. Each message is 4 bytes of length and one map. The server speaks first
 
     server    greeting  v (1), root (PEM), nonce (32), now (Unix seconds)
     joiner    join      id, nodes: [{request, kem, proof}], mac      -> members, borders, trusts, owner, label
-              install   cards, record                                -> the server knows the machine from now on
     member    member    certificate, signature, instance             -> the connection is the member's from now on
-              poll, renew, install, nodes, send, receive
+              install   cards, record                                -> the border opens its tunnel to the member
+              poll, renew, nodes, send, receive
 
 The joiner verifies the greeting's root by the token's fingerprint, the TLS certificate by the root, and the clocks,
 before it sends anything. A response has ``ok``; a refusal has ``code`` and ``error``, a sentence for people.
