@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
+from gdp.control.endpoint_record import EndpointRecord
 from gdp.control.endpoints import Endpoint
 from gdp.crypto.cbor import encode
 from gdp.crypto.certificates import Membership, Root, Unverified
@@ -24,7 +24,7 @@ from gdp.crypto.kem import KEM_PUBLIC_BYTES, KemPublicKey
 from gdp.crypto.keys import SIGNATURE_BYTES
 from gdp.crypto.x509_profile import SubjectInfo, read_request
 from gdp.enrolment.domain_files import DomainFiles
-from gdp.enrolment.member_setup import make_record, record_file_name
+from gdp.enrolment.member_setup import record_file_name
 from gdp.enrolment.registry import MachineRow, Registry, TokenRow
 from gdp.enrolment.wire import (
     INSTANCE_BYTES,
@@ -37,6 +37,7 @@ from gdp.enrolment.wire import (
 )
 from gdp.errors import LocalError, RemoteError, StatementError
 from gdp.names import Name
+from gdp.nodes.endpoint_files import own_record, public_candidates
 from gdp.stores.audit_log import AuditLog
 from gdp.stores.files import public, read_public, write_all
 from gdp.stores.issue import DAY_S, admit, renew
@@ -144,10 +145,8 @@ class EnrolmentDesk:
         """Return the border's endpoint record, which it signs itself."""
         if self._border is None or unix_s >= self._border_until_s:
             identity = load_identity(self._config.switch, unix_s)
-            candidates = tuple(
-                Candidate(0, CandidateType.PUBLIC, Endpoint.from_text(each)) for each in self._config.public
-            )
-            self._border = make_record(identity, candidates, 1, unix_s)
+            candidates = public_candidates([Endpoint.from_text(each) for each in self._config.public])
+            self._border = own_record(identity, 1, candidates)
             self._border_until_s = min(unix_s + _RECORD_S, float(identity.member.not_after_unix_s))
         return self._border
 
@@ -214,8 +213,9 @@ class EnrolmentDesk:
         self._registry.renewed(new)
         return {"ok": True, "members": wires}
 
-    def nodes(self, fields: Fields, is_online: Callable[[int], bool]) -> dict[str, object]:
+    def nodes(self, session: Session, fields: Fields, is_online: Callable[[int], bool]) -> dict[str, object]:
         """Return one page of the directory of machines."""
+        self._member(session.machine)
         machines = self._registry.machines(after=fields.text("after", 64), limit=PAGE)
         listed = [
             {
@@ -236,14 +236,16 @@ class EnrolmentDesk:
             EnrolmentError: NO_MEMBER or MAILBOX_FULL.
             StatementError: malformed, or not by this member.
         """
+        self._member(session.machine)
         mail = Mail.from_wire(fields.bytes_("mail"))
         if mail.sender.subject.name != session.name:
             raise EnrolmentError(Refusal.WRONG_PROOF, "a mail by another sender")
         self._registry.add_mail(mail.to, session.name, mail.wire)
         return mail.to
 
-    def receive(self, session: Session, fields: Fields) -> dict[str, object]:
+    def mail_page(self, session: Session, fields: Fields) -> dict[str, object]:
         """Return a page of the member's mail; what it fetched before is deleted."""
+        self._member(session.machine)
         since = fields.uint("since", (1 << 63) - 1)
         mail = self._registry.mail_of(session.name, since, PAGE)
         return {"ok": True, "mail": [{"n": each.id, "m": each.wire} for each in mail]}

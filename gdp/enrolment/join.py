@@ -24,9 +24,10 @@ from gdp.crypto.fields import Fields
 from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.keys import PublicKey
 from gdp.enrolment.channel import Channel, connect_any
-from gdp.enrolment.member_setup import MachinePlan, make_record, record_file_name, write_configuration
+from gdp.enrolment.member_setup import MachinePlan, record_file_name, write_configuration
 from gdp.enrolment.wire import INSTANCE_BYTES, EnrolmentError, UnreachableError
 from gdp.errors import LocalError, RemoteError
+from gdp.nodes.endpoint_files import own_record
 from gdp.stores.files import public, read_public, write_all
 from gdp.stores.issue import install_membership, make_node_keys
 from gdp.stores.keyring import CARD, OWNER_PUBLIC
@@ -98,7 +99,7 @@ def join_domain(
         fields, root, server = _ask(request, [keys for _, keys in members], wait)
         (draft / _RESERVE).unlink()
         identities, borders = _install(draft, request, members, fields, root, clock())
-        record = make_record(identities[0], (), len(request.uplinks), clock())
+        record = own_record(identities[0], max(len(request.uplinks), 1), ())
         cards = [read_public(draft / folder / CARD) for folder, _ in members]
         _announce(request.token, identities[-1], {"op": "install", "cards": cards, "record": record.wire}, wait)
         _rename(draft, request.directory)

@@ -12,15 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from gdp.control.endpoint_record import Candidate, EndpointRecord
-from gdp.crypto.identity import Identity
-from gdp.crypto.tunnel_key import TunnelKey
 from gdp.enrolment.member_files import MEMBER_FILE
 from gdp.names import Name
+from gdp.nodes.endpoint_files import RECORD_SUFFIX
 from gdp.stores.files import public, write_all
 from gdp.stores.keyring import DELEGATIONS
 
-__all__ = ["LISTEN_PORT", "MachinePlan", "make_record", "record_file_name", "write_configuration"]
+__all__ = ["LISTEN_PORT", "MachinePlan", "record_file_name", "write_configuration"]
 
 LISTEN_PORT: Final = 51_820  # of WireGuard; of the enrolment server the TCP port of this number
 _FOLDERS: Final = ("peers", "revocations", "inbox", "state/switch", "state/rib", "state/proxy", "proxy.yaml.d")
@@ -68,25 +66,9 @@ def write_configuration(directory: Path, plan: MachinePlan, trusts: Sequence[str
     write_all(directory, {name: public(text.encode()) for name, text in texts.items()})
 
 
-def make_record(identity: Identity, candidates: Sequence[Candidate], uplinks: int, unix_s: float) -> EndpointRecord:
-    """Return a switch's endpoint record, valid as long as its membership.
-
-    Args:
-        uplinks: number of devices that have a tunnel of their own; 0: one tunnel.
-    """
-    keys = tuple(TunnelKey.derive(identity.kem, uplink).public for uplink in range(max(uplinks, 1)))
-    return EndpointRecord.make(
-        identity,
-        keys,
-        tuple(candidates),
-        sequence=int(unix_s * 1000),
-        until_unix_s=identity.member.not_after_unix_s,
-    )
-
-
 def record_file_name(name: Name) -> str:
     """Return the name of a switch's file in a folder of peers."""
-    return f"{name.to_text()}.endpoints"
+    return f"{name.to_text()}{RECORD_SUFFIX}"
 
 
 def _member(plan: MachinePlan, trusts: Sequence[str]) -> str:

@@ -103,7 +103,7 @@ class EnrolmentServer:
         self._news: dict[bytes, set[asyncio.Event]] = defaultdict(set)  # of who polls, by its name
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="enrolment")
 
-    async def serve(self) -> None:
+    async def accept_connections(self) -> None:
         """Serve until cancelled; then every connection and the listening socket are closed."""
         self._listening.setblocking(False)
         upkeep = asyncio.ensure_future(self._keep_up())
@@ -229,14 +229,14 @@ class EnrolmentServer:
             case "renew":
                 return await self._work(desk.renew, session, fields, now)
             case "nodes":
-                return await self._work(desk.nodes, fields, self._is_online)
+                return await self._work(desk.nodes, session, fields, self._is_online)
             case "send":
                 recipient = await self._work(desk.send, session, fields)
                 for event in self._news.get(bytes(recipient), ()):
                     event.set()
                 return {"ok": True}
             case "receive":
-                return await self._work(desk.receive, session, fields)
+                return await self._work(desk.mail_page, session, fields)
         raise StatementError(DropReason.MALFORMED, f"{operation!r} is no request")
 
     def _admit(self, connection: _Connection, session: Session) -> None:
@@ -336,6 +336,6 @@ async def serve_domain(files: DomainFiles, listening: socket.socket) -> None:
         desk = EnrolmentDesk(files, registry)
         server = EnrolmentServer(listening, desk, lambda: make_server_tls(config.domain, config.state, time.time()))
         try:
-            await server.serve()
+            await server.accept_connections()
         finally:
             desk.flush()
