@@ -69,6 +69,11 @@ class Channel:
         """Close the connection; a second call has no effect."""
         self._peer.close()
 
+    def interrupt(self) -> None:
+        """End a request that another thread waits for; it raises ``UnreachableError`` there."""
+        with contextlib.suppress(OSError):  # closed in the meantime
+            socket.socket.shutdown(self._peer, socket.SHUT_RDWR)  # of the plain socket: TLS stays the waiter's
+
     def __enter__(self) -> Channel:
         return self
 

@@ -37,7 +37,7 @@ from gdp.trust.domain import Policy
 from gdp.trust.mail import Mail
 from gdp.trust.node_descriptor import NodeDescriptor
 
-__all__ = ["DomainClient", "Machine", "ReceivedMail", "fetch_mail"]
+__all__ = ["DomainClient", "Machine", "ReceivedMail", "delete_mail", "fetch_mail", "read_inbox"]
 
 MACHINES_PAGE: Final = 64
 MAIL_PAGE: Final = 64
@@ -176,7 +176,7 @@ class DomainClient:
 
     def delete(self, number: int) -> None:
         """Delete a mail of the inbox that was handled; no effect if it is gone."""
-        _mail_path(self._files.inbox, number).unlink(missing_ok=True)
+        delete_mail(self._files.inbox, number)
 
     def _machine(self, fields: Fields) -> Machine:
         cards = [NodeDescriptor.from_wire(each) for each in fields.byte_strings("cards", 4)]
@@ -234,6 +234,11 @@ def read_inbox(inbox: Path, policy: Policy, recipient: Name, since: int) -> Iter
             path.unlink(missing_ok=True)
             continue
         yield ReceivedMail(number=number, sender=sender, kind=mail.kind, body=mail.body, sent_unix_ms=mail.sent_unix_ms)
+
+
+def delete_mail(inbox: Path, number: int) -> None:
+    """Delete a mail that was handled; no effect if it is gone."""
+    _mail_path(inbox, number).unlink(missing_ok=True)
 
 
 def _mail_path(inbox: Path, number: int) -> Path:

@@ -87,6 +87,11 @@ class MemberFiles:
         return self.config.domain
 
     @property
+    def is_border(self) -> bool:
+        """Return whether this is the domain's own machine, whose folder of peers the enrolment server fills."""
+        return (self.directory / "domain.yaml").exists()
+
+    @property
     def mail_identity(self) -> Path:
         """Return the directory of the node that mail is for: the proxy, or the switch where there is no proxy."""
         return self.config.proxy or self.config.switch

@@ -35,6 +35,10 @@ class Lab:
         request = JoinRequest(token=token or self.token(), label=label, directory=self.folder / label)
         return join_domain(request)
 
+    def join_again(self, label: str) -> Joined:
+        """Return a machine that joins under a label into another directory."""
+        return join_domain(JoinRequest(token=self.token(), label=label, directory=self.folder / f"{label}-again"))
+
     def registry(self) -> Registry:
         """Return the registry, to be closed."""
         return Registry(self.files.config.state)
