@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from gdp.cli import options
+from gdp.cli.domain_machine import create, ls, remove, serve, token
 from gdp.cli.key import asked_passphrase, token_key
 from gdp.cli.output import show
 from gdp.cli.rollover import described_root
@@ -19,7 +20,12 @@ from gdp.stores.keyring import ROOT_CERTIFICATE, load_root
 
 __all__ = ["app"]
 
-app = typer.Typer(no_args_is_help=True, help="Found a trust domain, or look at one.")
+app = typer.Typer(no_args_is_help=True, help="Create a trust domain, let machines join it, or look at one.")
+app.command("create", no_args_is_help=True)(create)
+app.command("token", no_args_is_help=True)(token)
+app.command("ls", no_args_is_help=True)(ls)
+app.command("remove", no_args_is_help=True)(remove)
+app.command("serve", no_args_is_help=True)(serve)
 
 RootFile = Annotated[Path, typer.Argument(metavar="FILE", help="a root certificate, PEM or DER")]
 

@@ -12,6 +12,7 @@ import typer
 
 from gdp.cli import audit, cert, control, delegate, domain, key, keygen
 from gdp.cli.endpoints import endpoints
+from gdp.cli.join import agent, join, up
 from gdp.cli.lab import lab
 from gdp.cli.name import name
 from gdp.cli.version import Version
@@ -36,6 +37,8 @@ def _gdp(version: Version = False) -> None:
 app.command("name", no_args_is_help=True)(name)
 app.command("lab", no_args_is_help=True)(lab)
 app.command("endpoints", no_args_is_help=True)(endpoints)
+for member_command in (join, up, agent):
+    app.command(member_command.__name__, no_args_is_help=True)(member_command)
 for command in (control.reload, control.status, control.drain):
     app.command(command.__name__, no_args_is_help=True)(command)
 app.add_typer(keygen.app, name="keygen")

@@ -112,8 +112,16 @@ class CertificateAuthority:
         return self._issue(holder, validity)
 
     def _issue(self, holder: SubjectInfo, validity: Validity) -> Membership:
+        return Membership.from_wire(self.sign(holder, validity), self.root, validity.not_before_unix_s)
+
+    def sign(self, holder: SubjectInfo, validity: Validity) -> bytes:
+        """Return a certificate, DER, that is no authority; the caller has decided about its holder.
+
+        Raises:
+            LocalError: it would outlive the root.
+        """
         if validity.not_after_unix_s > self.root.validity.not_after_unix_s:
-            raise LocalError("a membership cannot outlive the root of its domain")
+            raise LocalError("a certificate cannot outlive the root of its domain")
         issuer = x509.load_der_x509_certificate(self.root.wire).subject
         subject = distinguished_name(holder.unit, holder.label)
         key_id = x509.AuthorityKeyIdentifier(self.root.key_id or None, None, None)
@@ -124,7 +132,7 @@ class CertificateAuthority:
             .add_extension(x509.SubjectKeyIdentifier(holder.subject.name[:_KEY_ID_BYTES]), critical=False)
             .add_extension(key_id, critical=False)
         )
-        return Membership.from_wire(signed_certificate(builder, self.key), self.root, validity.not_before_unix_s)
+        return signed_certificate(builder, self.key)
 
 
 def request_membership(key: SigningKey, role: Role, label: str, digest: bytes) -> bytes:

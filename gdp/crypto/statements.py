@@ -56,6 +56,7 @@ class StatementType(str, Enum):
     ENDPOINTS = "endpoints"  # of a switch: where it can be reached across IP networks
     ENDPOINTS_QUERY = "endpoints-query"  # to a RIB: which endpoint records of these switches are kept?
     ENDPOINTS_ANSWER = "endpoints-answer"
+    MAIL = "mail"  # between members, kept by the enrolment server
 
 
 _TYPES: Final[dict[Value, StatementType]] = {member.value: member for member in StatementType}

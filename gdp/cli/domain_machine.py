@@ -1,0 +1,195 @@
+"""``gdp domain create``, ``token``, ``ls``, ``remove`` and ``serve``: a domain whose machines join with tokens.
+
+I/O.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+import sys
+import time
+from typing import Annotated, Final
+
+import typer
+
+from gdp.cli import options
+from gdp.cli.machine import AtDirectory, NoSystemd, Start, directory_of, say, start_machine
+from gdp.cli.node import set_up_logging
+from gdp.cli.output import moment, show
+from gdp.enrolment.addresses import default_addresses, duration_s, endpoint_of, is_private, server_text
+from gdp.enrolment.create import BORDER, DomainPlan, create_domain, make_token
+from gdp.enrolment.domain_files import DomainFiles
+from gdp.enrolment.member_setup import LISTEN_PORT
+from gdp.enrolment.registry import MachineRow, Registry
+from gdp.enrolment.removal import remove_machine
+from gdp.enrolment.server import bind_server, serve_domain
+from gdp.errors import LocalError
+from gdp.host.interruption import Interrupted, interruptible
+from gdp.trust.join_token import JoinRole
+
+__all__ = ["create", "ls", "remove", "serve", "token"]
+
+_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}", re.ASCII)
+_ONLINE_S: Final = 120.0  # an agent asks at least each minute
+
+Name = Annotated[str, typer.Argument(metavar="NAME", help="of the domain")]
+Public = Annotated[
+    list[str],
+    typer.Option("--public", metavar="HOST[:PORT]", help="where everyone reaches this machine, by UDP and TCP"),
+]
+JoinRoleText = Annotated[str, typer.Option("--role", help="robot, switch or leaf; see the how-to page on joining")]
+Valid = Annotated[str, typer.Option("--valid", metavar="TIME", help="how long the token can be used: 30m, 1h, 7d")]
+Listen = Annotated[int, typer.Option("--listen", min=1, max=65_535, help="UDP port of tunnels, TCP port of enrolment")]
+
+
+def create(
+    name: Name,
+    public: Public = [],  # noqa: B006 (the library copies it)
+    directory: AtDirectory = None,
+    listen: Listen = LISTEN_PORT,
+    label: options.Label = BORDER,
+    no_systemd: NoSystemd = False,
+    start: Start = True,
+) -> None:
+    """Create a trust domain on a reachable machine, start its border, and print the line that joins a first robot.
+
+    \b
+    Examples:
+      gdp domain create lab --public lab.example.org
+      gdp domain create lab --public 203.0.113.7:51820 --no-systemd
+    """
+    if not _NAME.fullmatch(name):
+        raise LocalError(f"domain create: a name has letters, digits, '.', '_' and '-', not {name!r}")
+    servers = [server_text(each, listen) for each in public] or _own_servers(listen)
+    plan = DomainPlan(
+        name=name,
+        directory=directory_of(name, directory),
+        public=[endpoint_of(each) for each in servers],
+        servers=servers,
+        listen=listen,
+        label=label,
+    )
+    files = create_domain(plan)
+    say(f"domain {name} is in {files.directory}; keep a copy of {files.directory / 'domain'} in a safe place")
+    made = make_token(files, JoinRole.ROBOT, valid_s=duration_s("1h"))
+    typer.echo(f"gdp join {made.to_text()}")
+    sys.stdout.flush()
+    if start:
+        start_machine(files.directory, no_systemd=no_systemd)
+
+
+def token(
+    name: Name,
+    role: JoinRoleText = JoinRole.ROBOT.value,
+    valid: Valid = "1h",
+    label: Annotated[str, typer.Option("--label", help="the machine must have this label")] = "",
+    directory: AtDirectory = None,
+    as_json: options.Json = False,
+) -> None:
+    """Make a token: one machine joins with it, once, in one role.
+
+    \b
+    Examples:
+      gdp domain token lab
+      gdp domain token lab --role switch --valid 1d --label gateway
+    """
+    if role not in [each.value for each in JoinRole]:
+        raise LocalError(f"domain token: --role is {', '.join(each.value for each in JoinRole)}, not {role!r}")
+    files = DomainFiles.load(directory_of(name, directory))
+    made = make_token(files, JoinRole(role), valid_s=duration_s(valid), label=label)
+    until = moment(made.expires_unix_s)
+    result = {"token": made.to_text(), "role": role, "label": label or None, "until": until}
+    show(result, as_json=as_json, plain=f"gdp join {made.to_text()}")
+
+
+def ls(
+    name: Name,
+    directory: AtDirectory = None,
+    everything: Annotated[bool, typer.Option("--all", help="removed machines, too")] = False,
+    as_json: options.Json = False,
+) -> None:
+    """List the machines of a domain.
+
+    \b
+    Examples:
+      gdp domain ls lab
+      gdp domain ls lab --all --json
+    """
+    files = DomainFiles.load(directory_of(name, directory))
+    with Registry(files.config.state) as registry:
+        rows = [_row(each) for each in registry.machines(with_removed=everything)]
+    if as_json:
+        typer.echo(json.dumps(rows, ensure_ascii=False))
+        return
+    titles = {"label": "label", "role": "role", "name": "name", "joined": "joined", "seen": "last seen",
+              "expires": "expires", "state": "state"}  # fmt: skip
+    table = [titles, *({key: str(row[key] or "-") for key in titles} for row in rows)]
+    table = [{**each, "name": each["name"][:8]} for each in table]
+    widths = {key: max(len(each[key]) for each in table) for key in titles}
+    for each in table:
+        typer.echo("  ".join(each[key].ljust(widths[key]) for key in titles).rstrip())
+
+
+def remove(
+    name: Name,
+    node: Annotated[str, typer.Argument(metavar="LABEL", help="of the machine")],
+    directory: AtDirectory = None,
+    as_json: options.Json = False,
+) -> None:
+    """Remove a machine from a domain: its memberships are revoked, and its tunnel closes within a second.
+
+    \b
+    Example:
+      gdp domain remove lab robot-7
+    """
+    removed = remove_machine(DomainFiles.load(directory_of(name, directory)), node)
+    show({"removed": removed.machine.label, "revoked": removed.revoked}, as_json=as_json)
+
+
+def serve(directory: options.Directory) -> None:
+    """Run the enrolment server of a domain until Ctrl-C; the units of the border do that.
+
+    \b
+    Example:
+      gdp domain serve /var/lib/gdp/lab
+    """
+    set_up_logging(verbose=False)
+    files = DomainFiles.load(directory)
+    try:
+        asyncio.run(interruptible(serve_domain(files, bind_server(files.config.listen))))
+    except Interrupted:
+        say("the enrolment server has ended")
+
+
+def _own_servers(listen: int) -> list[str]:
+    addresses = default_addresses()
+    if not addresses:
+        raise LocalError("domain create: this machine has no default route: state --public HOST")
+    for each in addresses:
+        if is_private(each):
+            say(f"{each} is a private address: machines elsewhere need a --public HOST that leads here")
+    return [server_text(each, listen) for each in addresses]
+
+
+def _row(machine: MachineRow) -> dict[str, object]:
+    names = {each.role: each.name.to_text() for each in machine.nodes}
+    switch = next((each.name.to_text() for each in machine.nodes if each.role in ("switch", "leaf")), "")
+    is_online = time.time() - machine.seen_unix_s < _ONLINE_S
+    state = "online" if is_online else "offline"
+    if machine.removed_unix_s is not None:
+        state = "revoked"
+    elif machine.has_double:
+        state = "two machines have this identity"
+    return {
+        "label": machine.label,
+        "role": machine.role,
+        "name": switch,
+        "nodes": names,
+        "joined": moment(int(machine.joined_unix_s)),
+        "seen": moment(int(machine.seen_unix_s)) if machine.seen_unix_s else None,
+        "expires": moment(machine.until_unix_s) if machine.nodes else None,
+        "revoked": None if machine.removed_unix_s is None else moment(int(machine.removed_unix_s)),
+        "state": state,
+    }

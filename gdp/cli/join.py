@@ -1,0 +1,123 @@
+"""``gdp join``, ``gdp up`` and ``gdp agent``: a machine that becomes a member with a token, and its programs.
+
+I/O.
+"""
+
+from __future__ import annotations
+
+import re
+import signal
+import socket
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Final, Optional
+
+import typer
+
+from gdp.cli import options
+from gdp.cli.machine import (
+    BORDER_SEEN_S,
+    AtDirectory,
+    NoSystemd,
+    Start,
+    directory_of,
+    say,
+    start_machine,
+    tunnels_up,
+)
+from gdp.cli.node import set_up_logging
+from gdp.enrolment.agent import Agent
+from gdp.enrolment.channel import connect_any
+from gdp.enrolment.join import JoinRequest, join_domain
+from gdp.trust.join_token import JoinToken
+
+__all__ = ["agent", "join", "up"]
+
+_UNSAFE: Final = re.compile(r"[^A-Za-z0-9._-]")
+
+Token = Annotated[str, typer.Argument(metavar="TOKEN", help="as gdp domain create or gdp domain token printed it")]
+LabelText = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option("--label", help="the machine's name for people; by default its host name"),
+]
+Uplinks = Annotated[
+    list[str], typer.Option("--uplink", metavar="IFACE", help="a device with a tunnel of its own; repeatable")
+]
+
+
+def join(
+    token: Token,
+    label: LabelText = None,
+    directory: AtDirectory = None,
+    uplink: Uplinks = [],  # noqa: B006 (the library copies it)
+    no_systemd: NoSystemd = False,
+    start: Start = True,
+) -> None:
+    """Join the domain of a token: make keys, fetch the memberships, and start switch, proxy and agent.
+
+    \b
+    Examples:
+      gdp join gdp1aeag...
+      gdp join gdp1aeag... --label robot-7 --uplink wlan0 --uplink wwan0
+    """
+    read = JoinToken.from_text(token)
+    if directory is None:
+        with connect_any(read.servers, read.root) as channel:
+            directory = directory_of(_UNSAFE.sub("-", channel.root.label), None)
+    request = JoinRequest(token=read, label=label or _host_name(), directory=directory, uplinks=uplink)
+    joined = join_domain(request)
+    say(f"joined the domain {joined.root.label} as {joined.label} ({joined.role}); files are in {directory}")
+    for identity in joined.identities:
+        say(f"  {identity.role.value:<6} {identity.name.to_text()}")
+    if start:
+        start_machine(directory, no_systemd=no_systemd, observed=_say_border)
+
+
+def up(directory: options.Directory, no_systemd: NoSystemd = False) -> None:
+    """Start the programs of a machine that has joined or created a domain.
+
+    \b
+    Example:
+      gdp up /var/lib/gdp/lab --no-systemd
+    """
+    start_machine(directory, no_systemd=no_systemd, observed=_say_border)
+
+
+def agent(directory: options.Directory) -> None:
+    """Run the agent of a machine until Ctrl-C; the units of the machine do that.
+
+    \b
+    Example:
+      gdp agent /var/lib/gdp/lab
+    """
+    set_up_logging(verbose=False)
+    run_agent(Agent(directory))
+
+
+def run_agent(made: Agent) -> None:
+    """Run an agent until SIGINT or SIGTERM."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        """End the agent."""
+        del number, frame
+        made.stop()
+
+    for each in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(each, stop)
+    made.run()
+
+
+def _say_border(directory: Path) -> None:
+    """Say whether the border is a neighbour: it is observed, not assumed."""
+    seen = tunnels_up(directory)
+    if seen:
+        say(f"tunnels are up: {', '.join(seen)}")
+    else:
+        say(
+            f"no tunnel is up after {BORDER_SEEN_S:g} s: the switch keeps trying. Is UDP to the border let through? See"
+            f" gdp status {directory / 'switch'}"
+        )
+
+
+def _host_name() -> str:
+    return socket.gethostname().partition(".")[0] or "robot"

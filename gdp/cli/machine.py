@@ -1,0 +1,103 @@
+"""Start of a machine's programs, for the commands that create or join a domain.
+
+I/O.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Final, Optional
+
+import typer
+
+from gdp.cli.node import set_up_logging
+from gdp.enrolment.addresses import default_directory
+from gdp.enrolment.member_files import MemberFiles
+from gdp.enrolment.programs import missing_ros, programs_of
+from gdp.enrolment.supervisor import supervise
+from gdp.enrolment.units import has_systemd, install_units, unit_texts
+from gdp.errors import GdpError
+from gdp.host.interruption import Interrupted, interruptible
+from gdp.nodes.control_client import ask_node, find_control_socket
+from gdp.nodes.control_protocol import Command
+
+__all__ = ["AtDirectory", "NoSystemd", "Start", "directory_of", "say", "start_machine", "tunnels_up"]
+
+BORDER_SEEN_S: Final = 20.0
+_EACH_S: Final = 0.5
+
+AtDirectory = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option("--directory", metavar="DIR", help="where the files are; /var/lib/gdp/NAME for root"),
+]
+NoSystemd = Annotated[bool, typer.Option("--no-systemd", help="run in the foreground until Ctrl-C, without units")]
+Start = Annotated[bool, typer.Option("--start/--no-start", help="start the programs of this machine")]
+
+
+def directory_of(name: str, stated: Path | None) -> Path:
+    """Return the directory of a domain's files: the stated one, or the default for this user."""
+    state_home = os.environ.get("XDG_STATE_HOME", "")
+    return stated or default_directory(name, is_root=os.geteuid() == 0, state_home=state_home)
+
+
+def say(text: str) -> None:
+    """Write a line for people; results go to standard output, which programs may read."""
+    typer.echo(text, err=True)
+
+
+def start_machine(directory: Path, *, no_systemd: bool, observed: Callable[[Path], None] | None = None) -> None:
+    """Start the programs of a machine: as systemd units, or in the foreground until Ctrl-C.
+
+    Args:
+        observed: called in a thread once they were started, to say what can be seen.
+
+    Raises:
+        LocalError: the directory is no member's, or a program or a unit cannot be started.
+    """
+    programs = programs_of(MemberFiles.load(directory))
+    if reason := missing_ros():
+        say(f"no proxy runs here: {reason}")
+    if has_systemd() and not no_systemd:
+        units = unit_texts(directory, programs)
+        install_units(units)
+        say(f"started, now and at each boot: {' '.join(units)}")
+        if observed is not None:
+            observed(directory)
+        return
+    set_up_logging(verbose=False)
+    say(f"running {', '.join(each.name for each in programs)} in the foreground; Ctrl-C ends them")
+
+    async def started() -> None:
+        """Observe without holding up the supervisor."""
+        if observed is not None:
+            await asyncio.get_running_loop().run_in_executor(None, observed, directory)
+
+    try:
+        asyncio.run(interruptible(supervise(programs, started)))
+    except Interrupted:
+        sys.exit(0)
+
+
+def tunnels_up(directory: Path, deadline_s: float = BORDER_SEEN_S) -> list[str]:
+    """Return the labels of the peers whose tunnels are up, as soon as there is one, or after the deadline."""
+    end_s = time.monotonic() + deadline_s
+    while True:
+        found = _tunnels(directory)
+        if found or time.monotonic() >= end_s:
+            return found
+        time.sleep(_EACH_S)
+
+
+def _tunnels(directory: Path) -> list[str]:
+    with contextlib.suppress(GdpError):  # the switch is still starting
+        status = ask_node(find_control_socket(directory / "switch"), Command.STATUS, 2.0)
+        links = status.result.get("links") if status.is_ok else None
+        if isinstance(links, list):
+            return [str(each.get("label")) for each in links if isinstance(each, dict) and each.get("up") is True]
+    return []

@@ -1,0 +1,57 @@
+"""Certificate of a domain's enrolment server: a leaf that the domain's root issues for TLS.
+
+Sans-I/O. Its unit is ``enrolment``, which is no role of a node: no member's certificate serves in its place. Source:
+RFC 5280; RFC 5929, section 4 (its hash binds what is said to the TLS connection).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Final
+
+from gdp.crypto.ca import CertificateAuthority
+from gdp.crypto.certificates import Root
+from gdp.crypto.keys import PublicKey
+from gdp.crypto.subject import Subject
+from gdp.crypto.validity import Validity
+from gdp.crypto.x509_profile import SubjectInfo, bad, read
+from gdp.errors import DropReason, StatementError
+from gdp.metadata import Metadata
+
+__all__ = ["channel_binding", "issue_server_certificate", "verify_server_certificate"]
+
+_UNIT: Final = "enrolment"
+
+
+def issue_server_certificate(authority: CertificateAuthority, key: PublicKey, validity: Validity) -> bytes:
+    """Return the certificate of a server's key, DER. Raises ``LocalError``: it would outlive the root."""
+    label = authority.root.label
+    subject = Subject.of(Metadata({"kind": _UNIT, "name": label}), key.compressed)
+    return authority.sign(SubjectInfo(subject, _UNIT, label, key), validity)
+
+
+def verify_server_certificate(wire: bytes, root: Root, unix_s: float) -> None:
+    """Return if the domain's root issued this certificate to its enrolment server, and both are valid now.
+
+    Args:
+        wire: DER, as TLS shows it.
+
+    Raises:
+        StatementError: BAD_CERTIFICATE, WRONG_NAME, WRONG_DOMAIN or EXPIRED.
+    """
+    certificate = read(wire)
+    if certificate.holder.unit != _UNIT or certificate.is_authority:
+        raise bad("not the certificate of an enrolment server")
+    if certificate.issuer != root.distinguished_name or certificate.issuer_key_id not in (b"", root.key_id):
+        raise StatementError(DropReason.WRONG_DOMAIN, "not issued by this domain")
+    try:
+        root.key.verify_der(certificate.signature, certificate.signed_bytes)
+    except StatementError as error:
+        raise bad("the signature does not hold") from error
+    root.validity.check(unix_s, "domain root")
+    certificate.validity.check(unix_s, "certificate of the enrolment server")
+
+
+def channel_binding(wire: bytes) -> bytes:
+    """Return tls-server-end-point of a connection, 32 bytes, from the server's certificate, DER."""
+    return hashlib.sha256(wire).digest()

@@ -1,0 +1,357 @@
+"""Desk of a domain: it decides on requests of joiners and members, and writes what follows from them.
+
+I/O: the registry, the domain's keys and ledger, and the border's folder of peers; no socket. Calls may take some
+milliseconds, and tens of them where a disk is synced.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import logging
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from gdp.control.endpoint_record import EndpointRecord
+from gdp.control.endpoints import Endpoint
+from gdp.crypto.cbor import encode
+from gdp.crypto.certificates import Membership, Root, Unverified
+from gdp.crypto.fields import Fields
+from gdp.crypto.identity import node_metadata
+from gdp.crypto.kem import KEM_PUBLIC_BYTES, KemPublicKey
+from gdp.crypto.keys import SIGNATURE_BYTES
+from gdp.crypto.x509_profile import SubjectInfo, read_request
+from gdp.enrolment.domain_files import DomainFiles
+from gdp.enrolment.member_setup import record_file_name
+from gdp.enrolment.registry import MachineRow, Registry, TokenRow
+from gdp.enrolment.wire import (
+    INSTANCE_BYTES,
+    NONCE_BYTES,
+    VERSION,
+    EnrolmentError,
+    Refusal,
+    read_message,
+    verify_member_proof,
+)
+from gdp.errors import LocalError, RemoteError, StatementError
+from gdp.names import Name
+from gdp.nodes.endpoint_files import own_record, public_candidates
+from gdp.stores.audit_log import AuditLog
+from gdp.stores.files import public, read_public, write_all
+from gdp.stores.issue import DAY_S, admit, renew
+from gdp.stores.keyring import OWNER_PUBLIC, ROOT_CERTIFICATE, load_identity, load_root
+from gdp.trust.audit import Action, AuditTrail
+from gdp.trust.domain import Policy
+from gdp.trust.enrolment import MEMBERS_MAX, Application, token_id
+from gdp.trust.join_token import JOIN_ID_BYTES, JoinRole, join_proof
+from gdp.trust.mail import Mail
+from gdp.trust.node_descriptor import NodeDescriptor
+
+__all__ = ["PAGE", "EnrolmentDesk", "Session", "refusal_of"]
+
+log = logging.getLogger(__name__)
+
+PAGE: Final = 64  # machines or mails in one response
+_PROOF_BYTES: Final = 32
+_EARLY_SHARE: Final = 0.1  # a membership with less of its life used is not renewed
+_RECORD_S: Final = DAY_S  # a border's record is made again after this time
+_WHAT: Final = "enrolment"
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """An authenticated connection of a member.
+
+    Args:
+        name: the node that proved its key.
+        instance: random for each start of its program.
+    """
+
+    name: Name
+    machine: int
+    instance: bytes
+
+
+class EnrolmentDesk:
+    """Decisions of one domain, sequential: one thread at a time.
+
+    Raises:
+        LocalError: the domain's keys cannot be read.
+    """
+
+    def __init__(self, files: DomainFiles, registry: Registry) -> None:
+        self._config = files.config
+        self._registry = registry
+        self._trail = AuditTrail()
+        self._trail.begin()
+        self._audit = AuditLog(files.config.domain)
+        self._border: EndpointRecord | None = None
+        self._border_until_s = 0.0
+
+    @property
+    def root(self) -> Root:
+        """Return the domain's root."""
+        return load_root(self._config.domain / ROOT_CERTIFICATE)
+
+    def greeting(self, nonce: bytes, unix_s: float) -> dict[str, object]:
+        """Return the server's first message."""
+        return {"v": VERSION, "root": self.root.to_pem(), "nonce": nonce, "now": int(unix_s)}
+
+    def join(self, fields: Fields, binding: bytes, nonce: bytes, unix_s: float) -> Fields:
+        """Return the response to a request to join.
+
+        Raises:
+            EnrolmentError: refused.
+            StatementError: malformed.
+            StoreError, LocalError: files cannot be written now; the same request may be repeated.
+        """
+        token = self._proven_token(fields, binding, nonce)
+        role = JoinRole(token.role)
+        applications, holders = _applications(fields, role, token.id)
+        label, keys = holders[0].label, _keys_digest(applications, holders)
+        self._check_token(token, keys, label, unix_s)
+        if token.keys is None:
+            for each in holders:
+                if self._registry.machine_of(each.subject.name) is not None:
+                    raise EnrolmentError(
+                        Refusal.IDENTITY_TAKEN,
+                        "a machine with this identity joined before: each machine makes keys of its own",
+                    )
+        machine = self._registry.use_token(token.id, keys, label, unix_s)
+        if token.answer is not None:
+            return read_message(token.answer)
+        members = [
+            admit(self._config.domain, each.request, days=self._config.member_days, unix_s=unix_s)
+            for each in applications
+        ]
+        answer = {"ok": True, "members": [each.wire for each in members], "label": label, **self.news(unix_s)}
+        self._registry.complete_token(token.id, machine, members, encode(answer))
+        self._trail.record(Action.ACCEPTED, _WHAT, who=members[0].name.to_text())
+        log.info("machine enrolled role=%s nodes=%d", role.value, len(members))
+        return read_message(encode(answer))
+
+    def news(self, unix_s: float) -> dict[str, object]:
+        """Return what every member follows: the root, roots of other domains, borders, the owner's key."""
+        return {
+            "root": self.root.to_pem(),
+            "trusts": [read_public(each) for each in self._config.trusts],
+            "borders": [self.border_record(unix_s).wire],
+            "owner": read_public(self._config.owner / OWNER_PUBLIC),
+        }
+
+    def border_record(self, unix_s: float) -> EndpointRecord:
+        """Return the border's endpoint record, which it signs itself."""
+        if self._border is None or unix_s >= self._border_until_s:
+            identity = load_identity(self._config.switch, unix_s)
+            candidates = public_candidates([Endpoint.from_text(each) for each in self._config.public])
+            self._border = own_record(identity, 1, candidates)
+            self._border_until_s = min(unix_s + _RECORD_S, float(identity.member.not_after_unix_s))
+        return self._border
+
+    def identify(self, fields: Fields, binding: bytes, nonce: bytes, unix_s: float) -> Session:
+        """Return the session of a member that proves its key; its membership may have expired, to be renewed.
+
+        Raises:
+            EnrolmentError: NO_MEMBER.
+            StatementError: malformed, or the proof is wrong.
+        """
+        stranger = Unverified.from_wire(fields.bytes_("certificate"))
+        instance = fields.bytes_("instance", INSTANCE_BYTES)
+        machine = self._registry.machine_of(stranger.subject.name)
+        if machine is None or machine.removed_unix_s is not None:
+            self.refused("no member", stranger.subject.name)
+            gone = "was removed from" if machine is not None else "is no member of"
+            raise EnrolmentError(Refusal.NO_MEMBER, f"this machine {gone} the domain; join again with a new token")
+        stranger.verify(self.root, min(unix_s, stranger.validity.not_after_unix_s))
+        verify_member_proof(stranger.key, fields.bytes_("signature", SIGNATURE_BYTES), binding, nonce, instance)
+        return Session(stranger.subject.name, machine.id, instance)
+
+    def install(self, session: Session, fields: Fields, unix_s: float) -> None:
+        """Store a machine's node descriptors, and open the border for its switch.
+
+        Raises:
+            EnrolmentError: WRONG_NODES.
+            StatementError: a descriptor or the endpoint record is not valid.
+        """
+        machine = self._member(session.machine)
+        nodes = {each.name for each in machine.nodes}
+        root = self.root
+        cards = [NodeDescriptor.from_wire(each) for each in fields.byte_strings("cards", MEMBERS_MAX)]
+        for each in cards:
+            each.member_of(root, unix_s)
+        record, _ = EndpointRecord.verified(fields.bytes_("record"), Policy(root, []), unix_s)
+        if not {record.name, *(each.name for each in cards)} <= nodes:
+            raise EnrolmentError(Refusal.WRONG_NODES, "descriptors or an endpoint record of another machine's nodes")
+        for each in cards:
+            self._registry.set_card(each.name, each.wire)
+        if record.name != self.border_record(unix_s).name:
+            write_all(self._config.peers, {record_file_name(record.name): public(record.wire)}, force=True)
+
+    def renew(self, session: Session, fields: Fields, unix_s: float) -> dict[str, object]:
+        """Return new memberships of a machine's nodes; one that has just begun is returned as it is.
+
+        Raises:
+            EnrolmentError: WRONG_NODES or NO_MEMBER.
+            StatementError: malformed, or not issued here.
+        """
+        nodes = {each.name: each for each in self._member(session.machine).nodes}
+        wires, new = list[bytes](), list[Membership]()
+        for wire in fields.byte_strings("certificates", MEMBERS_MAX):
+            stranger = Unverified.from_wire(wire)
+            known = nodes.get(stranger.subject.name)
+            if known is None:
+                raise EnrolmentError(Refusal.WRONG_NODES, "a membership of another machine's node")
+            held = Unverified.from_wire(known.certificate).validity
+            used_s = unix_s - held.not_before_unix_s
+            if used_s < _EARLY_SHARE * (held.not_after_unix_s - held.not_before_unix_s):
+                wires.append(known.certificate)
+                continue
+            new.append(renew(self._config.domain, wire, days=self._config.member_days, unix_s=unix_s))
+            wires.append(new[-1].wire)
+        self._registry.renewed(new)
+        return {"ok": True, "members": wires}
+
+    def nodes(self, session: Session, fields: Fields, is_online: Callable[[int], bool]) -> dict[str, object]:
+        """Return one page of the directory of machines."""
+        self._member(session.machine)
+        machines = self._registry.machines(after=fields.text("after", 64), limit=PAGE)
+        listed = [
+            {
+                "label": each.label,
+                "role": each.role,
+                "cards": [node.card for node in each.nodes if node.card is not None],
+                "online": is_online(each.id),
+                "seen": int(each.seen_unix_s),
+            }
+            for each in machines
+        ]
+        return {"ok": True, "nodes": listed}
+
+    def send(self, session: Session, fields: Fields) -> Name:
+        """Store a mail and return its recipient.
+
+        Raises:
+            EnrolmentError: NO_MEMBER or MAILBOX_FULL.
+            StatementError: malformed, or not by this member.
+        """
+        self._member(session.machine)
+        mail = Mail.from_wire(fields.bytes_("mail"))
+        if mail.sender.subject.name != session.name:
+            raise EnrolmentError(Refusal.WRONG_PROOF, "a mail by another sender")
+        self._registry.add_mail(mail.to, session.name, mail.wire)
+        return mail.to
+
+    def mail_page(self, session: Session, fields: Fields) -> dict[str, object]:
+        """Return a page of the member's mail; what it fetched before is deleted."""
+        self._member(session.machine)
+        since = fields.uint("since", (1 << 63) - 1)
+        mail = self._registry.mail_of(session.name, since, PAGE)
+        return {"ok": True, "mail": [{"n": each.id, "m": each.wire} for each in mail]}
+
+    def status(self, session: Session, unix_s: float) -> tuple[dict[str, object], bytes]:
+        """Return what a poll answers, and a digest by which the member knows it again.
+
+        Raises:
+            EnrolmentError: NO_MEMBER, the machine was removed.
+        """
+        self._member(session.machine)
+        self._registry.saw(session.machine, unix_s)
+        news = self.news(unix_s)
+        digest = hashlib.sha256(encode(news)).digest()
+        return {"ok": True, **news, "digest": digest, "mail": self._registry.has_mail(session.name)}, digest
+
+    def has_double(self, session: Session) -> None:
+        """Note that another machine runs with this member's identity."""
+        self._registry.set_double(session.machine)
+        self.refused("two machines with one identity", session.name)
+
+    def refused(self, reason: str, who: Name | None = None) -> None:
+        """Note a refusal in the audit log."""
+        self._trail.record(Action.REFUSED, _WHAT, who="" if who is None else who.to_text(), reason=reason)
+
+    def flush(self) -> None:
+        """Write the pending lines of the audit log. Raises ``LocalError``: it cannot be written."""
+        self._audit.write(self._trail, time.monotonic(), time.time())
+
+    def _proven_token(self, fields: Fields, binding: bytes, nonce: bytes) -> TokenRow:
+        token = self._registry.find_token(fields.bytes_("id", JOIN_ID_BYTES))
+        if token is None:
+            raise EnrolmentError(Refusal.UNKNOWN_TOKEN, "this domain did not make the token, or it ended long ago")
+        untagged = encode({key: value for key, value in fields.items() if key != "mac"})
+        proof = fields.bytes_("mac", _PROOF_BYTES)
+        if len(nonce) != NONCE_BYTES or not hmac.compare_digest(join_proof(token.mac, binding, nonce, untagged), proof):
+            raise EnrolmentError(Refusal.WRONG_PROOF, "the request is not by the holder of the token")
+        return token
+
+    def _check_token(self, token: TokenRow, keys: bytes, label: str, unix_s: float) -> None:
+        if token.keys is not None and token.keys != keys:
+            machine = "" if token.machine is None else self._label_of(token.machine)
+            when = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(token.used_unix_s or 0))
+            raise EnrolmentError(
+                Refusal.USED,
+                f"this token was used already{machine} at {when}; make another one with gdp domain token. If you did"
+                " not use it, remove that machine",
+            )
+        if token.keys is None and unix_s >= token.expires_unix_s:
+            when = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(token.expires_unix_s))
+            raise EnrolmentError(
+                Refusal.EXPIRED, f"this token expired at {when}; make another one with gdp domain token"
+            )
+        if token.label and token.label != label:
+            raise EnrolmentError(Refusal.WRONG_NODES, f"this token is for the label {token.label!r}, not {label!r}")
+
+    def _label_of(self, machine_id: int) -> str:
+        machine = self._registry.machine(machine_id)
+        return "" if machine is None else f" by {machine.label!r}"
+
+    def _member(self, machine_id: int) -> MachineRow:
+        machine = self._registry.machine(machine_id)
+        if machine is None or machine.removed_unix_s is not None:
+            raise EnrolmentError(Refusal.NO_MEMBER, "this machine was removed from the domain")
+        return machine
+
+
+def _applications(fields: Fields, role: JoinRole, identifier: bytes) -> tuple[list[Application], list[SubjectInfo]]:
+    """Return the applications and their subjects: exactly the nodes of the role, each with a valid key proof."""
+    applications = [
+        Application(
+            each.bytes_("request"),
+            KemPublicKey(each.bytes_("kem", KEM_PUBLIC_BYTES)),
+            each.bytes_("proof", SIGNATURE_BYTES),
+        )
+        for each in fields.maps("nodes", MEMBERS_MAX)
+    ]
+    holders = [read_request(each.request) for each in applications]
+    wanted = [(node_role.value, holders[0].label if holders else "") for _, node_role in role.nodes]
+    if [(each.unit, each.label) for each in holders] != wanted:
+        raise EnrolmentError(Refusal.WRONG_NODES, f"this token allows one machine with the role {role.value}")
+    for application, holder, (_, node_role) in zip(applications, holders, role.nodes, strict=True):
+        if holder.subject.digest != node_metadata(node_role, holder.label).digest():
+            raise EnrolmentError(Refusal.WRONG_NODES, "a node with further metadata")
+        try:
+            application.verify(holder.key, token_id(identifier))
+        except StatementError as error:
+            raise EnrolmentError(Refusal.WRONG_PROOF, "a node's key did not sign the request") from error
+    if len({each.subject.name for each in holders}) != len(holders):
+        raise EnrolmentError(Refusal.WRONG_NODES, "two nodes with one identity")
+    return applications, holders
+
+
+def _keys_digest(applications: Sequence[Application], holders: Sequence[SubjectInfo]) -> bytes:
+    hashed = hashlib.sha256()
+    for application, holder in zip(applications, holders, strict=True):
+        hashed.update(holder.key.compressed + application.kem.wire)
+    return hashed.digest()
+
+
+def refusal_of(error: Exception) -> dict[str, object] | None:
+    """Return the response to a request that raised; None: an error of this program or of its disk."""
+    if isinstance(error, EnrolmentError) and error.code is not None:
+        return {"ok": False, "code": error.code.value, "error": str(error)}
+    if isinstance(error, RemoteError):
+        return {"ok": False, "code": Refusal.MALFORMED.value, "error": f"the request is not valid: {error}"}
+    if isinstance(error, LocalError):
+        return {"ok": False, "code": Refusal.UNAVAILABLE.value, "error": "the server cannot write its files now"}
+    return None

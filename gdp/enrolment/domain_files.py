@@ -1,0 +1,79 @@
+"""Files of a domain's own machine (the border), beyond those of every member (``member_files``).
+
+I/O. In the directory that ``gdp domain create`` makes::
+
+    domain.yaml         what the enrolment server needs
+    domain/  owner/     root key and ledger; key and master secret of the owner of names
+    enrolment/          registry.sqlite3, and the TLS key of the server
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Final
+
+from pydantic import AfterValidator, Field
+
+from gdp.control.endpoints import Endpoint
+from gdp.errors import LocalError
+from gdp.nodes.schema import Directory, ExistingFile, Section, Unique, load
+from gdp.trust.join_token import SERVERS_MAX, split_server
+
+__all__ = ["DOMAIN_FILE", "DomainConfig", "DomainFiles"]
+
+DOMAIN_FILE: Final = "domain.yaml"
+
+
+def _server(text: str) -> str:
+    try:
+        split_server(text)
+    except LocalError as error:
+        raise ValueError(str(error)) from error
+    return text
+
+
+def _endpoint(text: str) -> str:
+    try:
+        Endpoint.from_text(text)
+    except LocalError as error:
+        raise ValueError(str(error)) from error
+    return text
+
+
+class DomainConfig(Section):
+    """``domain.yaml``: keys, folders and addresses of a domain's enrolment server.
+
+    ``listen`` is the TCP port of the server; ``servers`` are the addresses that tokens name; ``public`` are the UDP
+    endpoints of the border's tunnels.
+    """
+
+    domain: Directory
+    owner: Directory
+    switch: Directory
+    state: Directory
+    peers: Directory
+    revocations: Directory
+    listen: int = Field(ge=0, le=65_535)
+    servers: Annotated[tuple[Annotated[str, AfterValidator(_server)], ...], Unique] = Field(
+        min_length=1, max_length=SERVERS_MAX
+    )
+    public: Annotated[tuple[Annotated[str, AfterValidator(_endpoint)], ...], Unique] = ()
+    trusts: Annotated[tuple[ExistingFile, ...], Unique] = ()
+    member_days: float = Field(default=30.0, ge=0.001, le=3_650.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DomainFiles:
+    """The loaded ``domain.yaml`` of a directory."""
+
+    directory: Path
+    config: DomainConfig
+
+    @classmethod
+    def load(cls, directory: Path) -> DomainFiles:
+        """Read the files of a domain. Raises ``LocalError`` or ``ConfigError``: no domain was created there."""
+        path = directory / DOMAIN_FILE
+        if not path.exists():
+            raise LocalError(f"{directory}: no {DOMAIN_FILE} is here; create the domain with gdp domain create")
+        return cls(directory=directory, config=load(DomainConfig, path))

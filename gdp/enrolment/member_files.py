@@ -1,0 +1,112 @@
+"""Files of a member machine: what ``gdp join`` and ``gdp domain create`` write, and who runs from them.
+
+I/O. The directory of one machine::
+
+    member.yaml         who this machine is, and where the enrolment server is
+    switch/  proxy/     keys and memberships of its nodes; a border also has rib/
+    switch.yaml  proxy.yaml  rib.yaml
+    owner.pub           key of the domain's owner of names
+    trusts/*.crt        roots of other domains
+    peers/*.endpoints   endpoint records: the switch opens a tunnel to each
+    revocations/        for the switch
+    inbox/              mail that arrived
+    agent.json          what the agent did last
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Final
+
+from pydantic import AfterValidator, Field
+
+from gdp.enrolment.wire import EnrolmentError
+from gdp.errors import LocalError
+from gdp.nodes.schema import Directory, Domain, Section, Unique, load
+from gdp.stores.keyring import load_root
+from gdp.trust.join_token import SERVERS_MAX, fingerprint_of, split_server
+
+__all__ = ["MEMBER_FILE", "MemberConfig", "MemberFiles"]
+
+MEMBER_FILE: Final = "member.yaml"
+
+
+def _server(text: str) -> str:
+    try:
+        split_server(text)
+    except LocalError as error:
+        raise ValueError(str(error)) from error
+    return text
+
+
+class MemberConfig(Section):
+    """``member.yaml``: identities of one machine, and the enrolment servers of its domain."""
+
+    label: str
+    role: str
+    domain: Domain
+    switch: Directory
+    proxy: Directory | None = None
+    rib: Directory | None = None
+    peers: Directory
+    servers: Annotated[tuple[Annotated[str, AfterValidator(_server)], ...], Unique] = Field(
+        min_length=1, max_length=SERVERS_MAX
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MemberFiles:
+    """The loaded ``member.yaml`` of a directory.
+
+    Args:
+        fingerprint: of the domain's founding root.
+    """
+
+    directory: Path
+    config: MemberConfig
+    fingerprint: bytes
+
+    @classmethod
+    def load(cls, directory: Path) -> MemberFiles:
+        """Read the files of a machine. Raises ``LocalError`` or ``ConfigError``: the directory is no member's."""
+        path = directory / MEMBER_FILE
+        if not path.exists():
+            raise EnrolmentError(None, f"{directory}: no {MEMBER_FILE} is here; run gdp join or gdp domain create")
+        config = load(MemberConfig, path)
+        return cls(directory=directory, config=config, fingerprint=fingerprint_of(load_root(config.domain.root)))
+
+    @property
+    def servers(self) -> tuple[str, ...]:
+        """Return the enrolment servers, ``host:port``."""
+        return self.config.servers
+
+    @property
+    def domain(self) -> Domain:
+        """Return the trust domain, and the others whose members are believed."""
+        return self.config.domain
+
+    @property
+    def is_border(self) -> bool:
+        """Return whether this is the domain's own machine, whose folder of peers the enrolment server fills."""
+        return (self.directory / "domain.yaml").exists()
+
+    @property
+    def mail_identity(self) -> Path:
+        """Return the directory of the node that mail is for: the proxy, or the switch where there is no proxy."""
+        return self.config.proxy or self.config.switch
+
+    @property
+    def nodes(self) -> tuple[Path, ...]:
+        """Return the directories of this machine's nodes, the switch first."""
+        return tuple(each for each in (self.config.switch, self.config.proxy, self.config.rib) if each is not None)
+
+    @property
+    def inbox(self) -> Path:
+        """Return the directory of mail that arrived."""
+        return self.directory / "inbox"
+
+    @property
+    def status_file(self) -> Path:
+        """Return the file in which the agent writes when it last succeeded."""
+        return self.directory / "agent.json"

@@ -1,0 +1,116 @@
+"""Configuration files of a member machine, as ``gdp join`` and ``gdp domain create`` write them.
+
+I/O; writes files. All paths in them are relative, so a directory can be made under another name and renamed.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from gdp.enrolment.member_files import MEMBER_FILE
+from gdp.names import Name
+from gdp.nodes.endpoint_files import RECORD_SUFFIX
+from gdp.stores.files import public, write_all
+from gdp.stores.keyring import DELEGATIONS
+
+__all__ = ["LISTEN_PORT", "MachinePlan", "record_file_name", "write_configuration"]
+
+LISTEN_PORT: Final = 51_820  # of WireGuard; of the enrolment server the TCP port of this number
+_FOLDERS: Final = ("peers", "revocations", "inbox", "state/switch", "state/rib", "state/proxy", "proxy.yaml.d")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MachinePlan:
+    """What the configuration files of a machine say.
+
+    Args:
+        role: ``robot``, ``switch``, ``leaf`` or ``border``.
+        servers: of enrolment, ``host:port``.
+        listen: UDP port of the tunnels; 0: any.
+        public: UDP endpoints at which the tunnels can be reached from everywhere.
+        uplinks: devices that each get a tunnel; none: routing decides.
+    """
+
+    label: str
+    role: str
+    servers: Sequence[str]
+    listen: int
+    public: Sequence[str] = ()
+    uplinks: Sequence[str] = ()
+    has_proxy: bool = True
+    has_rib: bool = False
+
+
+def write_configuration(directory: Path, plan: MachinePlan, trusts: Sequence[str]) -> None:
+    """Write the YAML files and make the folders that they name.
+
+    Args:
+        trusts: file names of other domains' roots, in ``directory``.
+
+    Raises:
+        LocalError: a file exists already, or the system refuses.
+    """
+    for folder in _FOLDERS:
+        write_all(directory / folder, {})
+    write_all(directory / "proxy" / DELEGATIONS if plan.has_proxy else directory / "inbox", {})
+    texts = {MEMBER_FILE: _member(plan, trusts), "switch.yaml": _switch(plan, trusts)}
+    if plan.has_proxy:
+        texts["proxy.yaml"] = _proxy(trusts)
+    if plan.has_rib:
+        texts["rib.yaml"] = _node("rib", trusts) + "iface: rib0\nstate: state/rib\n"
+    write_all(directory, {name: public(text.encode()) for name, text in texts.items()})
+
+
+def record_file_name(name: Name) -> str:
+    """Return the name of a switch's file in a folder of peers."""
+    return f"{name.to_text()}{RECORD_SUFFIX}"
+
+
+def _member(plan: MachinePlan, trusts: Sequence[str]) -> str:
+    lines = [f"label: {json.dumps(plan.label)}", f"role: {plan.role}", _domain("switch", trusts), "switch: switch"]
+    lines += ["proxy: proxy"] if plan.has_proxy else []
+    lines += ["rib: rib"] if plan.has_rib else []
+    return "\n".join([*lines, "peers: peers", f"servers: {json.dumps(list(plan.servers))}", ""])
+
+
+def _switch(plan: MachinePlan, trusts: Sequence[str]) -> str:
+    attach = [*(["rib0"] if plan.has_rib else []), *(["proxy0"] if plan.has_proxy else [])]
+    links = {"listen": plan.listen, "peers": "peers"}
+    public_line = f"  public: {json.dumps(list(plan.public))}\n" if plan.public else ""
+    uplinks_line = f"  uplinks: {json.dumps(list(plan.uplinks))}\n" if plan.uplinks else ""
+    return (
+        _node("switch", trusts)
+        + f"attach: {json.dumps(attach)}\n"
+        + "revocations: revocations\nstate: state/switch\n"
+        + "links:\n"
+        + "".join(f"  {key}: {value}\n" for key, value in links.items())
+        + public_line
+        + uplinks_line
+    )
+
+
+def _proxy(trusts: Sequence[str]) -> str:
+    return (
+        _node("proxy", trusts)
+        + f"delegations: proxy/{DELEGATIONS}\niface: proxy0\nstate: state/proxy\n"
+        + f"ros: {{endpoint: {_ros_endpoint()}}}\n"
+    )
+
+
+def _ros_endpoint() -> str:
+    """Return how the proxy takes part in ROS: through rclpy where it is installed, else through Cyclone DDS."""
+    return "ros2" if importlib.util.find_spec("rclpy") is not None else "dds"
+
+
+def _node(folder: str, trusts: Sequence[str]) -> str:
+    return f"identity: {folder}\n{_domain(folder, trusts)}\n"
+
+
+def _domain(folder: str, trusts: Sequence[str]) -> str:
+    more = f", trusts: {json.dumps(list(trusts))}" if trusts else ""
+    return f"domain: {{root: {folder}/root.crt{more}}}"

@@ -1,0 +1,399 @@
+"""Registry of a domain: its join tokens, its machines and their memberships, and the mail that waits for them.
+
+I/O, one SQLite file, private. The commands ``gdp domain token``, ``ls`` and ``remove`` and the running server use it at
+the same time. A token is marked as used, on disk, before anything is issued for it: a crash at any point never lets a
+second key use it. Of a token the file holds the id and the MAC key, not the secret.
+"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from gdp.crypto.certificates import Membership
+from gdp.enrolment.wire import EnrolmentError, Refusal
+from gdp.errors import LocalError, StoreError
+from gdp.names import Name
+from gdp.stores.files import write_all
+
+__all__ = ["MAILBOX_MAX", "MAILBOX_MAX_BYTES", "MachineRow", "Registry", "StoredMail", "TokenRow"]
+
+MAILBOX_MAX: Final = 1_024  # mails that wait for one node
+MAILBOX_MAX_BYTES: Final = 4 << 20
+_SENDER_MAX: Final = 256  # of them, by one sender
+_FILE: Final = "registry.sqlite3"
+_TIMEOUT_S: Final = 10.0
+_DAY_S: Final = 86_400.0
+_TOKEN_KEPT_S: Final = 30 * _DAY_S  # after its end, so that its refusal can say why
+_TABLES: Final = """
+CREATE TABLE IF NOT EXISTS tokens (
+  id BLOB PRIMARY KEY, mac BLOB NOT NULL, role TEXT NOT NULL, label TEXT NOT NULL,
+  made_unix_s REAL NOT NULL, expires_unix_s REAL NOT NULL,
+  keys BLOB, used_unix_s REAL, machine INTEGER, answer BLOB
+) STRICT;
+CREATE TABLE IF NOT EXISTS machines (
+  id INTEGER PRIMARY KEY AUTOINCREMENT, label TEXT NOT NULL, role TEXT NOT NULL, joined_unix_s REAL NOT NULL,
+  seen_unix_s REAL NOT NULL DEFAULT 0, removed_unix_s REAL, has_double INTEGER NOT NULL DEFAULT 0
+) STRICT;
+CREATE UNIQUE INDEX IF NOT EXISTS labels ON machines (label) WHERE removed_unix_s IS NULL;
+CREATE TABLE IF NOT EXISTS nodes (
+  name BLOB PRIMARY KEY, machine INTEGER NOT NULL, role TEXT NOT NULL, certificate BLOB NOT NULL,
+  until_unix_s INTEGER NOT NULL, card BLOB
+) STRICT;
+CREATE TABLE IF NOT EXISTS certificates (
+  fingerprint BLOB PRIMARY KEY, name BLOB NOT NULL, until_unix_s INTEGER NOT NULL
+) STRICT;
+CREATE TABLE IF NOT EXISTS mail (
+  id INTEGER PRIMARY KEY AUTOINCREMENT, recipient BLOB NOT NULL, sender BLOB NOT NULL, wire BLOB NOT NULL
+) STRICT;
+CREATE INDEX IF NOT EXISTS mailboxes ON mail (recipient, id);
+"""
+_MACHINE: Final = (
+    "SELECT m.id, m.label, m.role, m.joined_unix_s, m.seen_unix_s, m.removed_unix_s, m.has_double FROM machines m"
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TokenRow:
+    """A stored token.
+
+    Args:
+        mac: ``join_key`` of its secret.
+        label: the one that its machine must have; empty: any.
+        keys: SHA-256 of the keys that used it; None: not used.
+        answer: the response to these keys; None: not complete.
+    """
+
+    id: bytes
+    mac: bytes = field(repr=False)
+    role: str
+    label: str
+    expires_unix_s: float
+    keys: bytes | None
+    used_unix_s: float | None
+    machine: int | None
+    answer: bytes | None = field(repr=False)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NodeRow:
+    """A node of a machine; ``card``: its descriptor, or None before it has finished joining."""
+
+    name: Name
+    role: str
+    certificate: bytes = field(repr=False)
+    until_unix_s: int
+    card: bytes | None = field(repr=False)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MachineRow:
+    """A machine of the domain.
+
+    Args:
+        seen_unix_s: when its agent was last connected; 0: never.
+        removed_unix_s: when it was removed; None: it is a member.
+        has_double: two machines were seen with its identity.
+    """
+
+    id: int
+    label: str
+    role: str
+    joined_unix_s: float
+    seen_unix_s: float
+    removed_unix_s: float | None
+    has_double: bool
+    nodes: tuple[NodeRow, ...]
+
+    @property
+    def until_unix_s(self) -> int:
+        """Return when the first of its memberships ends."""
+        return min((each.until_unix_s for each in self.nodes), default=0)
+
+
+@dataclass(frozen=True, slots=True)
+class StoredMail:
+    """A mail that waits."""
+
+    id: int
+    wire: bytes = field(repr=False)
+
+
+class Registry:
+    """The opened registry of a domain; threads may share it.
+
+    Raises:
+        LocalError: other users may write to the folder.
+        StoreError: the file cannot be read or written now; every method may raise this too.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / _FILE
+        write_all(folder, {})
+        self._lock = threading.Lock()
+        with self._translated():
+            os.close(os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
+            self._file = sqlite3.connect(self._path, timeout=_TIMEOUT_S, isolation_level=None, check_same_thread=False)
+            self._file.execute("PRAGMA journal_mode=WAL")
+            self._file.execute("PRAGMA synchronous=FULL")  # a used token stays used after a crash
+            self._file.executescript(_TABLES)
+
+    def close(self) -> None:
+        """Close the file."""
+        with self._lock:
+            self._file.close()
+
+    def __enter__(self) -> Registry:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # tokens
+
+    def add_token(
+        self, identifier: bytes, mac: bytes, *, role: str, label: str, unix_s: float, expires_unix_s: float
+    ) -> None:
+        """Store a token; those that ended long ago are deleted."""
+        with self._writing() as file:
+            file.execute("DELETE FROM tokens WHERE expires_unix_s < ?", (unix_s - _TOKEN_KEPT_S,))
+            file.execute(
+                "INSERT INTO tokens (id, mac, role, label, made_unix_s, expires_unix_s) VALUES (?, ?, ?, ?, ?, ?)",
+                (identifier, mac, role, label, unix_s, expires_unix_s),
+            )
+
+    def find_token(self, identifier: bytes) -> TokenRow | None:
+        """Return the token with this id."""
+        query = (
+            "SELECT id, mac, role, label, expires_unix_s, keys, used_unix_s, machine, answer FROM tokens WHERE id = ?"
+        )
+        with self._translated(), self._lock:
+            row = self._file.execute(query, (identifier,)).fetchone()
+        if row is None:
+            return None
+        id_, mac, role, label, expires_unix_s, keys, used_unix_s, machine, answer = row
+        return TokenRow(
+            id=id_,
+            mac=mac,
+            role=role,
+            label=label,
+            expires_unix_s=expires_unix_s,
+            keys=keys,
+            used_unix_s=used_unix_s,
+            machine=machine,
+            answer=answer,
+        )
+
+    def use_token(self, identifier: bytes, keys: bytes, label: str, unix_s: float) -> int:
+        """Mark a token as used by these keys and reserve the label; return the machine's id.
+
+        Of several requests at once exactly one succeeds; the same keys may repeat it.
+
+        Raises:
+            EnrolmentError: USED by other keys, or LABEL_TAKEN; nothing has changed then.
+        """
+        with self._writing() as file:
+            row = file.execute("SELECT keys, machine, role FROM tokens WHERE id = ?", (identifier,)).fetchone()
+            if row is None or (row[0] is not None and row[0] != keys):
+                raise EnrolmentError(Refusal.USED, "this token was used already")
+            if row[1] is not None:
+                return int(row[1])
+            machine = self._insert_machine(file, label, row[2], unix_s)
+            file.execute(
+                "UPDATE tokens SET keys = ?, used_unix_s = ?, machine = ? WHERE id = ?",
+                (keys, unix_s, machine, identifier),
+            )
+            return machine
+
+    def complete_token(self, identifier: bytes, machine: int, members: Sequence[Membership], answer: bytes) -> None:
+        """Store what was issued for a token, and the response to a repeat of its request."""
+        with self._writing() as file:
+            for each in members:
+                _insert_node(file, machine, each)
+            file.execute("UPDATE tokens SET answer = ? WHERE id = ?", (answer, identifier))
+
+    # machines
+
+    def add_machine(self, label: str, role: str, members: Sequence[Membership], unix_s: float) -> int:
+        """Store a machine that joined without a token; return its id. Raises ``EnrolmentError``: LABEL_TAKEN."""
+        with self._writing() as file:
+            machine = self._insert_machine(file, label, role, unix_s)
+            for each in members:
+                _insert_node(file, machine, each)
+        return machine
+
+    def renewed(self, members: Sequence[Membership]) -> None:
+        """Store renewed memberships of known nodes."""
+        with self._writing() as file:
+            for each in members:
+                file.execute(
+                    "UPDATE nodes SET certificate = ?, until_unix_s = ? WHERE name = ?",
+                    (each.wire, each.not_after_unix_s, each.name),
+                )
+                _insert_certificate(file, each)
+
+    def set_card(self, name: Name, card: bytes) -> None:
+        """Store a node's descriptor."""
+        with self._writing() as file:
+            file.execute("UPDATE nodes SET card = ? WHERE name = ?", (card, name))
+
+    def machine_of(self, name: Name) -> MachineRow | None:
+        """Return the machine of a node, also a removed one."""
+        return self._machine("SELECT machine FROM nodes WHERE name = ?", name)
+
+    def machine(self, machine: int) -> MachineRow | None:
+        """Return the machine with this id, also a removed one."""
+        return self._machine("SELECT id FROM machines WHERE id = ?", machine)
+
+    def machine_with(self, label: str) -> MachineRow | None:
+        """Return the member machine with this label."""
+        return self._machine("SELECT id FROM machines WHERE label = ? AND removed_unix_s IS NULL", label)
+
+    def machines(self, *, after: str = "", limit: int = 1 << 20, with_removed: bool = False) -> list[MachineRow]:
+        """Return machines in the order of their labels, beginning after a label."""
+        condition = "" if with_removed else " AND removed_unix_s IS NULL"
+        query = f"SELECT id FROM machines WHERE label > ?{condition} ORDER BY label, id LIMIT ?"
+        with self._translated(), self._lock:
+            found = [row[0] for row in self._file.execute(query, (after, limit)).fetchall()]
+            return [self._row(each) for each in found]
+
+    def saw(self, machine: int, unix_s: float) -> None:
+        """Note that a machine's agent is connected."""
+        with self._writing() as file:
+            file.execute("UPDATE machines SET seen_unix_s = ? WHERE id = ?", (unix_s, machine))
+
+    def set_double(self, machine: int) -> None:
+        """Note that two machines run with the identity of this one."""
+        with self._writing() as file:
+            file.execute("UPDATE machines SET has_double = 1 WHERE id = ?", (machine,))
+
+    def remove_machine(self, machine: int, unix_s: float) -> list[tuple[bytes, int]]:
+        """Mark a machine as removed; return fingerprint and end of every membership of it that is still valid."""
+        with self._writing() as file:
+            file.execute(
+                "UPDATE machines SET removed_unix_s = ? WHERE id = ? AND removed_unix_s IS NULL", (unix_s, machine)
+            )
+            file.execute("DELETE FROM mail WHERE recipient IN (SELECT name FROM nodes WHERE machine = ?)", (machine,))
+            return [
+                (fingerprint, until)
+                for fingerprint, until in file.execute(
+                    "SELECT fingerprint, until_unix_s FROM certificates WHERE until_unix_s >= ? AND name IN"
+                    " (SELECT name FROM nodes WHERE machine = ?)",
+                    (int(unix_s - _DAY_S), machine),
+                ).fetchall()
+            ]
+
+    # mail
+
+    def add_mail(self, recipient: Name, sender: Name, wire: bytes) -> None:
+        """Store a mail. Raises ``EnrolmentError``: MAILBOX_FULL, or NO_MEMBER: no such recipient."""
+        with self._writing() as file:
+            known = file.execute(
+                "SELECT 1 FROM nodes n JOIN machines m ON m.id = n.machine"
+                " WHERE n.name = ? AND m.removed_unix_s IS NULL",
+                (recipient,),
+            ).fetchone()
+            if known is None:
+                raise EnrolmentError(Refusal.NO_MEMBER, "the recipient is no member of this domain")
+            count, size, own = file.execute(
+                "SELECT count(*), coalesce(sum(length(wire)), 0), coalesce(sum(sender = ?), 0) FROM mail"
+                " WHERE recipient = ?",
+                (sender, recipient),
+            ).fetchone()
+            if count >= MAILBOX_MAX or size + len(wire) > MAILBOX_MAX_BYTES or own >= _SENDER_MAX:
+                raise EnrolmentError(Refusal.MAILBOX_FULL, "the recipient's mailbox is full; its machine may be off")
+            file.execute("INSERT INTO mail (recipient, sender, wire) VALUES (?, ?, ?)", (recipient, sender, wire))
+
+    def mail_of(self, recipient: Name, since: int, limit: int) -> list[StoredMail]:
+        """Return the mail of a node after an id; mail up to that id was fetched and is deleted."""
+        with self._writing() as file:
+            file.execute("DELETE FROM mail WHERE recipient = ? AND id <= ?", (recipient, since))
+            rows = file.execute(
+                "SELECT id, wire FROM mail WHERE recipient = ? ORDER BY id LIMIT ?", (recipient, limit)
+            ).fetchall()
+        return [StoredMail(number, wire) for number, wire in rows]
+
+    def has_mail(self, recipient: Name) -> bool:
+        """Return whether mail waits for a node."""
+        with self._translated(), self._lock:
+            query = "SELECT 1 FROM mail WHERE recipient = ? LIMIT 1"
+            return self._file.execute(query, (recipient,)).fetchone() is not None
+
+    def _insert_machine(self, file: sqlite3.Connection, label: str, role: str, unix_s: float) -> int:
+        query = "SELECT 1 FROM machines WHERE label = ? AND removed_unix_s IS NULL"
+        if file.execute(query, (label,)).fetchone() is not None:
+            raise EnrolmentError(
+                Refusal.LABEL_TAKEN,
+                f"the label {label!r} is taken by another machine of this domain: choose one with --label, or remove"
+                " that machine first",
+            )
+        cursor = file.execute(
+            "INSERT INTO machines (label, role, joined_unix_s) VALUES (?, ?, ?)", (label, role, unix_s)
+        )
+        return int(cursor.lastrowid or 0)
+
+    def _machine(self, query: str, key: object) -> MachineRow | None:
+        with self._translated(), self._lock:
+            row = self._file.execute(query, (key,)).fetchone()
+            return None if row is None else self._row(row[0])
+
+    def _row(self, machine: int) -> MachineRow:
+        found = self._file.execute(f"{_MACHINE} WHERE m.id = ?", (machine,)).fetchone()
+        if found is None:
+            raise StoreError(f"{self._path}: a node of no machine")
+        id_, label, role, joined_unix_s, seen_unix_s, removed_unix_s, has_double = found
+        rows = self._file.execute(
+            "SELECT name, role, certificate, until_unix_s, card FROM nodes WHERE machine = ? ORDER BY rowid", (machine,)
+        ).fetchall()
+        nodes = tuple(
+            NodeRow(name=Name(name), role=each, certificate=certificate, until_unix_s=until, card=card)
+            for name, each, certificate, until, card in rows
+        )
+        return MachineRow(
+            id=id_,
+            label=label,
+            role=role,
+            joined_unix_s=joined_unix_s,
+            seen_unix_s=seen_unix_s,
+            removed_unix_s=removed_unix_s,
+            has_double=bool(has_double),
+            nodes=nodes,
+        )
+
+    @contextmanager
+    def _writing(self) -> Iterator[sqlite3.Connection]:
+        with self._translated(), self._lock:
+            self._file.execute("BEGIN IMMEDIATE")
+            with self._file:  # commits, or rolls back
+                yield self._file
+
+    @contextmanager
+    def _translated(self) -> Iterator[None]:
+        try:
+            yield
+        except (sqlite3.Error, OSError) as error:
+            raise StoreError(f"{self._path}: {error}") from error
+
+
+def _insert_node(file: sqlite3.Connection, machine: int, member: Membership) -> None:
+    known = file.execute("SELECT machine FROM nodes WHERE name = ?", (member.name,)).fetchone()
+    if known is not None and known[0] != machine:
+        raise LocalError("a node of another machine")
+    file.execute(
+        "INSERT OR REPLACE INTO nodes (name, machine, role, certificate, until_unix_s) VALUES (?, ?, ?, ?, ?)",
+        (member.name, machine, member.role.value, member.wire, member.not_after_unix_s),
+    )
+    _insert_certificate(file, member)
+
+
+def _insert_certificate(file: sqlite3.Connection, member: Membership) -> None:
+    file.execute(
+        "INSERT OR REPLACE INTO certificates VALUES (?, ?, ?)",
+        (member.fingerprint, member.name, member.not_after_unix_s),
+    )

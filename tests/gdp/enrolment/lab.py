@@ -1,0 +1,80 @@
+"""A domain with a running enrolment server on loopback, in a thread."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from gdp.control.endpoints import Endpoint
+from gdp.enrolment.create import DomainPlan, create_domain, make_token
+from gdp.enrolment.domain_files import DomainFiles
+from gdp.enrolment.join import Joined, JoinRequest, join_domain
+from gdp.enrolment.registry import Registry
+from gdp.enrolment.server import bind_server, serve_domain
+from gdp.trust.join_token import JoinRole, JoinToken
+
+
+@dataclass(frozen=True)
+class Lab:
+    """A domain and its server."""
+
+    files: DomainFiles
+    folder: Path
+    port: int
+
+    def token(self, role: JoinRole = JoinRole.ROBOT, *, valid_s: float = 3_600.0, label: str = "") -> JoinToken:
+        """Return a new token."""
+        return make_token(self.files, role, valid_s=valid_s, label=label)
+
+    def join(self, label: str, token: JoinToken | None = None) -> Joined:
+        """Return a machine that joined."""
+        request = JoinRequest(token=token or self.token(), label=label, directory=self.folder / label)
+        return join_domain(request)
+
+    def join_again(self, label: str) -> Joined:
+        """Return a machine that joins under a label into another directory."""
+        return join_domain(JoinRequest(token=self.token(), label=label, directory=self.folder / f"{label}-again"))
+
+    def registry(self) -> Registry:
+        """Return the registry, to be closed."""
+        return Registry(self.files.config.state)
+
+
+@contextmanager
+def running_lab(folder: Path, name: str = "lab") -> Iterator[Lab]:
+    """Create a domain and serve it while within."""
+    listening = bind_server(0, "127.0.0.1")
+    port = listening.getsockname()[1]
+    plan = DomainPlan(
+        name=name,
+        directory=folder / name,
+        public=[Endpoint("192.0.2.1", 51_820)],
+        servers=[f"127.0.0.1:{port}"],
+        listen=port,
+    )
+    files = create_domain(plan)
+    loop = asyncio.new_event_loop()
+    task = loop.create_task(serve_domain(files, listening))
+
+    def serve() -> None:
+        asyncio.set_event_loop(loop)
+        try:
+            loop.run_until_complete(task)
+        except asyncio.CancelledError:
+            pass
+        finally:
+            loop.run_until_complete(loop.shutdown_asyncgens())
+            loop.close()
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield Lab(files, folder, port)
+    finally:
+        loop.call_soon_threadsafe(task.cancel)
+        thread.join(10.0)
+        assert not thread.is_alive()
