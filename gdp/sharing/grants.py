@@ -65,18 +65,19 @@ class Grants:
         for store in {each.owner: IssuedStore(each.owner) for each in state.exposed}.values():
             key = load_owner(store.owner).public.compressed
             rules = [each for each in state.exposed if each.owner_key == key.hex()]
-            names = dict[Metadata, None]()
+            names = dict[bytes, Metadata]()
             for each in rules:
                 if each.type_name and "*" not in each.name:
-                    names[described(each.kind, each.name, each.type_name)] = None
+                    metadata = described(each.kind, each.name, each.type_name)
+                    names[metadata.digest()] = metadata
             for lacking in found:
                 metadata = described(lacking.kind, lacking.local, lacking.type_name)
                 if lacking.side == "expose" and metadata.name(key) == lacking.name:
-                    names[metadata] = None
+                    names[metadata.digest()] = metadata
             for issued in store:
                 if issued.is_own and not issued.is_revoked:
-                    names[issued.metadata] = None
-            for metadata in names:
+                    names[issued.metadata.digest()] = issued.metadata
+            for metadata in names.values():
                 covering = [each for each in rules if _covers(each, metadata)]
                 if covering:
                     self._grant(store, metadata, covering, restored)

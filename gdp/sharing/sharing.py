@@ -296,25 +296,23 @@ class Sharing:
 
     def _known(self, at: _Pass, store: IssuedStore, kind: str, name: str, type_name: str) -> list[Metadata]:
         """Return the names of this owner that a name or pattern means. Raises ``LocalError``: none is known."""
-        found = dict[Metadata, None]()
+        found = list[Metadata]()
         if type_name and "*" not in name:
-            found[described(kind, name, type_name)] = None
+            found.append(described(kind, name, type_name))
         else:
             for issued in store:
                 if issued.is_own and issued.metadata["kind"] == kind and fits(name, _ros_name(issued)):
-                    found[issued.metadata] = None
+                    found.append(issued.metadata)
             for rule in at.files.rules:
                 if (rule.side, rule.kind) == ("expose", kind) and rule.type_name and fits(name, rule.name):
                     if rule.is_salted:
-                        raise LocalError(
-                            f"{rule.where}: {rule.name} has a salt; 'gdp delegate name' gives it to a node"
-                        )
+                        raise LocalError(f"{rule.where}: the name has a salt: gdp delegate name gives it to a node")
                     own = {"kind": kind, "name": rule.name, "type": rule.type_name}
-                    found[Metadata({**rule.metadata, **own})] = None
+                    found.append(Metadata({**rule.metadata, **own}))
         if not found:
             hint = "no rule of this machine matches it" if "*" in name else "its type is not known here: state --type"
             raise LocalError(f"{name}: {hint}")
-        return list(found)
+        return found
 
     def _receive(self, at: _Pass) -> None:
         """Take the waiting mails; a mail that is not valid is reported."""
