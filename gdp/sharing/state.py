@@ -74,9 +74,10 @@ class AcceptedName(Section):
 
 
 class OfferSource(Section):
-    """Sender of an offer, and the second at which it came first."""
+    """Sender of an offer, its number in the order of arrival, and the second at which it came first."""
 
     sender: str
+    number: int
     received_unix_s: float
 
 
@@ -165,7 +166,7 @@ class StateFolder:
 
     def offers(self, state: ShareState) -> Iterator[Offer]:
         """Yield the offers, the oldest first. Raises ``LocalError``: a file is invalid."""
-        for name, source in sorted(state.offers.items(), key=lambda item: (item[1].received_unix_s, item[0])):
+        for name, source in sorted(state.offers.items(), key=lambda item: item[1].number):
             file = self.folder / _OFFERS / f"{name}.delegation"
             if file.exists():
                 sender, received_unix_s = source.sender, source.received_unix_s
@@ -182,7 +183,8 @@ class StateFolder:
             raise LocalError(f"{self.folder}: {OFFERS_MAX} offers are stored; no more are taken")
         save_delegation(self.folder / _OFFERS, delegation, force=True)
         before = state.offers.get(name)
-        first = before if before is not None else OfferSource(sender=sender, received_unix_s=unix_s)
+        number = max((each.number for each in state.offers.values()), default=0) + 1
+        first = before or OfferSource(sender=sender, number=number, received_unix_s=unix_s)
         return state.model_copy(update={"offers": {**state.offers, name: first}})
 
     def remove_offer(self, state: ShareState, name: Name) -> ShareState:
