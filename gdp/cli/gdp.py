@@ -13,6 +13,7 @@ import typer
 from gdp.cli import audit, cert, control, delegate, domain, key, keygen
 from gdp.cli.lab import lab
 from gdp.cli.name import name
+from gdp.cli.share import expose, import_names, share
 from gdp.cli.version import Version
 from gdp.errors import GdpError
 
@@ -34,6 +35,9 @@ def _gdp(version: Version = False) -> None:
 
 app.command("name", no_args_is_help=True)(name)
 app.command("lab", no_args_is_help=True)(lab)
+app.command("expose", no_args_is_help=True)(expose)
+app.command("import", no_args_is_help=True)(import_names)
+app.command("share", no_args_is_help=True)(share)
 for command in (control.reload, control.status, control.drain):
     app.command(command.__name__, no_args_is_help=True)(command)
 app.add_typer(keygen.app, name="keygen")

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias
 
 from gdp.crypto.statements import parse
 from gdp.errors import DropReason, GdpError, LocalError, StatementError
@@ -33,7 +33,7 @@ __all__ = ["GROUPS", "RevocationsSink", "Sharing"]
 
 GROUPS: Final = "groups.yaml"
 
-RevocationsSink = Callable[[Sequence[bytes]], None]
+RevocationsSink: TypeAlias = "Callable[[Sequence[bytes]], bool]"
 
 
 @dataclass(slots=True)
@@ -159,7 +159,7 @@ class Sharing:
         """Take back what a node got of a name or a pattern; nothing gives it back by itself.
 
         Args:
-            publish: spreads the statements among the switches.
+            publish: spreads the statements among the switches; returns whether they have them already.
 
         Raises:
             LocalError: nothing of the name was given to the node, or ``publish`` fails: then nothing is recorded.
@@ -174,7 +174,8 @@ class Sharing:
             if not found:
                 raise LocalError(f"{name} is not shared with {label}; 'gdp share --list' shows what is")
             statements = [(each, store.revocations(each, unix_s)) for each in found]
-            publish([wire for _, wires in statements for wire in wires])
+            if not publish([wire for _, wires in statements for wire in wires]):
+                at.report.problems.append("the switch does not run: the revocation spreads when it starts")
             for each, wires in statements:
                 store.save(each.model_copy(update={"is_revoked": True}))
                 for wire in wires:

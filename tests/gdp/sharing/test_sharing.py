@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -40,6 +40,16 @@ def server(site: Site, stack: ExitStack) -> Machine:
     server = site.add("server")
     server.start(stack)
     return server
+
+
+def kept_in(spread: list[bytes]) -> Callable[[Sequence[bytes]], bool]:
+    """Return a switch that takes revocations."""
+
+    def take(statements: Sequence[bytes]) -> bool:
+        spread.extend(statements)
+        return True
+
+    return take
 
 
 def test_a_topic_that_is_exposed_and_imported_has_its_rules_and_rights_on_both_machines(
@@ -172,7 +182,7 @@ def test_what_is_revoked_ends_at_the_node_and_is_not_given_again(site: Site, rob
     server.sharing.accept(importing("/camera/image"), site.now_s)
     (given,) = server.held
     spread: list[bytes] = []
-    robot.sharing.revoke(robot.owner, "/camera/image", "server", spread.extend, site.now_s)
+    robot.sharing.revoke(robot.owner, "/camera/image", "server", kept_in(spread), site.now_s)
     assert [Revocation.from_statement(parse(wire)).fingerprint for wire in spread] == [links_of(given)[0].fingerprint]
     for _ in range(2):
         assert site.upkeep() == []
@@ -185,12 +195,12 @@ def test_a_revocation_covers_the_delegations_before_a_renewal(site: Site, robot:
     site.now_s += 21 * DAY_S
     robot.sharing.renew_delegations(site.now_s)
     spread: list[bytes] = []
-    robot.sharing.revoke(robot.owner, "/goal", "server", spread.extend, site.now_s)
+    robot.sharing.revoke(robot.owner, "/goal", "server", kept_in(spread), site.now_s)
     assert len(spread) == 2
 
 
 def test_a_revocation_that_no_switch_takes_changes_nothing(site: Site, robot: Machine, server: Machine) -> None:
-    def refuse(_: object) -> None:
+    def refuse(_: object) -> bool:
         raise LocalError("switch.yaml: no revocations folder")
 
     robot.sharing.share(robot.owner, "/goal", ["server"], site.now_s, type_name=STRING, days=30)
@@ -204,7 +214,7 @@ def test_a_node_that_is_named_again_gets_a_revoked_name_back(site: Site, robot: 
         robot.sharing.expose(robot.exposing("/camera/image", "server", type_name=IMAGE), site.now_s)
         site.upkeep()
         assert len(server.sharing.offers()) == 1
-        robot.sharing.revoke(robot.owner, "/camera/image", "server", lambda _: None, site.now_s)
+        robot.sharing.revoke(robot.owner, "/camera/image", "server", kept_in([]), site.now_s)
         site.upkeep()
         assert server.sharing.offers() == []
 
@@ -309,7 +319,7 @@ def test_a_name_without_a_known_type_is_not_shared(site: Site, robot: Machine, s
     with pytest.raises(LocalError, match=r"/unknown/\*: no rule of this machine matches it"):
         robot.sharing.share(robot.owner, "/unknown/*", ["server"], site.now_s, days=30)
     with pytest.raises(LocalError, match="/unknown is not shared with server"):
-        robot.sharing.revoke(robot.owner, "/unknown", "server", lambda _: None, site.now_s)
+        robot.sharing.revoke(robot.owner, "/unknown", "server", kept_in([]), site.now_s)
 
 
 def test_mail_that_is_no_delegation_to_this_node_is_reported_and_not_stored(
