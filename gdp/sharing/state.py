@@ -1,6 +1,6 @@
 """State of one node's sharing: what it exposes and to which nodes, what it accepts, and what others offer to it.
 
-I/O. The folder ``shares`` lies in the folder of ``proxy.yaml`` and belongs to the node's user alone::
+I/O. The folder ``proxy.yaml.shares`` lies in the folder of ``proxy.yaml`` and belongs to the node's user alone::
 
     rules.json                      exposed names with their recipients, accepted names, senders of offers
     offers/NAME.delegation          what an owner gave this node, accepted or not
@@ -29,9 +29,9 @@ from gdp.trust.adcert import AdCert
 from gdp.trust.delegation import Delegation
 from gdp.trust.right import Right
 
-__all__ = ["OFFERS_MAX", "SHARES", "AcceptedName", "ExposedName", "Offer", "ShareState", "StateFolder", "links_of"]
+__all__ = ["OFFERS_MAX", "AcceptedName", "ExposedName", "Offer", "ShareState", "StateFolder", "links_of"]
 
-SHARES: Final = "shares"
+_SUFFIX: Final = ".shares"
 OFFERS_MAX: Final = 1_000
 _RULES: Final = "rules.json"
 _OFFERS: Final = "offers"
@@ -139,14 +139,14 @@ class Offer:
 
 
 class StateFolder:
-    """The folder ``shares`` of one proxy.
+    """The folder ``proxy.yaml.shares`` of one proxy.
 
     Args:
         path: of ``proxy.yaml``.
     """
 
     def __init__(self, path: Path) -> None:
-        self.folder = path.parent / SHARES
+        self.folder = path.with_name(path.name + _SUFFIX)
 
     def load(self) -> ShareState:
         """Return the state; an empty one if nothing was shared yet. Raises ``LocalError``: a file is invalid."""
