@@ -8,14 +8,10 @@ file is private (0600) if ``proxy.yaml`` is, or if a rule contains a name's salt
 
 from __future__ import annotations
 
-import fcntl
 import json
 import logging
 import os
-import re
-import stat
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -25,19 +21,16 @@ from fog.enrolment.members import Authority, metadata_of
 from gdp.errors import GdpError, LocalError
 from gdp.nodes.control_client import NotRunningError, ask_node, find_control_socket
 from gdp.nodes.control_protocol import Command
-from gdp.stores.files import private, public, write_all
+from gdp.nodes.drop_in import drop_in_directory, locked, read_drop_in, write_drop_in
 from gdp.stores.keyring import load_public_key
 from proxy.config import matching
 from proxy.config.config import ProxyConfig
-from proxy.config.drop_ins import drop_in_directory
 
 __all__ = ["add_rules", "control_socket_of", "reload", "reload_proxy", "remove_rules"]
 
 log = logging.getLogger(__name__)
 
-_SALT: Final = re.compile(r"""\bsalt["']?[ \t]*:""")  # under `metadata`
 _HEAD: Final = "# Rules of cluster {cluster}; fog writes this file, and removes it with the cluster.\nimport:\n"
-_OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
 _RELOAD_S: Final = 10.0
 
 
@@ -51,7 +44,7 @@ def add_rules(
         LocalError: keys are missing, or the drop-in cannot be written.
     """
     key = load_public_key(authority.owner_key).compressed
-    with _locked(path):
+    with locked(path):
         config = ProxyConfig.load(path)
         lacking = [
             each
@@ -66,7 +59,7 @@ def add_rules(
 def remove_rules(path: Path, cluster: str) -> bool:
     """Remove the drop-in file of a cluster; return whether there was one."""
     file = _drop_in(path, cluster)
-    with _locked(path):
+    with locked(path):
         try:
             file.unlink()
         except FileNotFoundError:
@@ -119,39 +112,12 @@ def _drop_in(path: Path, cluster: str) -> Path:
 def _add_rules(path: Path, authority: Authority, cluster: str, carried: Sequence[ExportedInterface]) -> None:
     """Append rules to the drop-in file of a cluster; restore it if the proxy does not accept the result."""
     file = _drop_in(path, cluster)
-    is_private = not path.stat().st_mode & _OTHERS
-    try:
-        file.parent.mkdir(mode=0o700 if is_private else 0o755, exist_ok=True)
-        before = file.read_text(encoding="utf-8") if file.exists() else None
-    except OSError as error:
-        raise LocalError(f"{file}: {error.strerror}") from error
+    before = read_drop_in(file)
     owner = os.path.relpath(authority.owner_key, file.parent)
     lines = [f"- {json.dumps({**robot_rule(each), 'owner': owner})}\n" for each in carried]
-    _write(file, (before or _HEAD.format(cluster=cluster)) + "".join(lines), is_private=is_private)
+    write_drop_in(path, file.name, (before or _HEAD.format(cluster=cluster)) + "".join(lines))
     try:
         ProxyConfig.load(path)
     except Exception:
-        if before is None:
-            file.unlink()
-        else:
-            _write(file, before, is_private=is_private)
+        write_drop_in(path, file.name, before)
         raise
-
-
-def _write(file: Path, text: str, *, is_private: bool) -> None:
-    new = private if is_private or _SALT.search(text) else public
-    write_all(file.parent, {file.name: new(text.encode())}, force=True)
-
-
-@contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    """Exclude other launches that change this robot's rules, by a lock on the folder of ``proxy.yaml``."""
-    try:
-        folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-    except OSError as error:
-        raise LocalError(f"{path.parent}: {error.strerror}") from error
-    try:
-        fcntl.flock(folder, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(folder)

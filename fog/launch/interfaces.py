@@ -10,9 +10,8 @@ from typing import Final, TypeAlias
 
 from fog.cluster import ExportedInterface
 from gdp.errors import LocalError
+from gdp.ros_names import Kind, fits_kind, is_name
 from gdp.service.replication import Mode, Replication
-from proxy.config.pattern import is_name
-from proxy.config.rule import Kind, fits_kind
 
 __all__ = ["Offered", "SomeReplication", "carried", "replication_rule"]
 

@@ -15,6 +15,7 @@ from gdp.cli.endpoints import endpoints
 from gdp.cli.join import agent, join, up
 from gdp.cli.lab import lab
 from gdp.cli.name import name
+from gdp.cli.share import expose, import_names, share
 from gdp.cli.version import Version
 from gdp.errors import GdpError
 
@@ -39,6 +40,9 @@ app.command("lab", no_args_is_help=True)(lab)
 app.command("endpoints", no_args_is_help=True)(endpoints)
 for member_command in (join, up, agent):
     app.command(member_command.__name__, no_args_is_help=True)(member_command)
+app.command("expose", no_args_is_help=True)(expose)
+app.command("import", no_args_is_help=True)(import_names)
+app.command("share", no_args_is_help=True)(share)
 for command in (control.reload, control.status, control.drain):
     app.command(command.__name__, no_args_is_help=True)(command)
 app.add_typer(keygen.app, name="keygen")

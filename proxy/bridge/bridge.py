@@ -118,6 +118,7 @@ class Bridge:
         self._timed: list[ExposedService | ImportedService] = []
         self._since: dict[_Key, float] = {}  # desired flows that wait for other proxies to begin
         self._failed: dict[_Key, ConfigProblem] = {}  # flows that this graph does not allow at present
+        self._undelegated: dict[_Key, FlowSpec] = {}  # failed flows that wait for a delegation
         self._complaints: set[ConfigProblem] = set()
         self._ended = deque[TopicStats](maxlen=_ENDED_MAX)
         self._is_stale = True
@@ -151,6 +152,11 @@ class Bridge:
         for flow in imported:
             flow.count_losses()
         return [*self._ended, *(flow.stats for flow in imported)]
+
+    @property
+    def undelegated(self) -> list[FlowSpec]:
+        """Return the flows that only lack a delegation."""
+        return [flow_spec for key, flow_spec in self._undelegated.items() if key in self._failed]
 
     @property
     def is_settled(self) -> bool:
@@ -253,6 +259,7 @@ class Bridge:
         for key in [key for key in self._flows if key not in wished]:
             self._end(key)
         self._since = {key: since for key, since in self._since.items() if key in wished}
+        self._undelegated = {key: each for key, each in self._undelegated.items() if key in wished}
         self._tell(complaints)
 
     def _is_our_turn(self, key: _Key, view: _View, now_s: float) -> bool:
@@ -284,8 +291,10 @@ class Bridge:
         """Begin a flow, or record why this graph does not allow it."""
         topic = self._held.find(flow_spec.name, _right(flow_spec))
         if topic is None:
+            self._undelegated[key] = flow_spec
             self._failed[key] = ConfigProblem(flow_spec.local, Fault.NO_DELEGATION, self._how_to_delegate(flow_spec))
             return
+        self._undelegated.pop(key, None)
         try:
             flow = self._make(self._seats[key.seat], flow_spec, topic, view)
         except LocalError as error:

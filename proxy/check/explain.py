@@ -12,10 +12,11 @@ from typing import Final, Protocol
 
 from gdp.metadata import Metadata
 from gdp.names import Name
+from gdp.ros_names import Kind
 from gdp.trust.right import Right
 from proxy.check.finding import Direction, Finding, Match
 from proxy.config.matching import choose, imported
-from proxy.config.rule import SALT, Kind, Rule
+from proxy.config.rule import SALT, Rule
 from proxy.endpoints.endpoint import Graph, GraphEntity, Role
 from proxy.serial.channel import Qos
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 from gdp.names import Name
-from proxy.config.rule import Kind
+from gdp.ros_names import Kind
 
 __all__ = ["Direction", "Finding", "Match"]
 

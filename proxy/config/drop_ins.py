@@ -15,11 +15,12 @@ from typing import Final
 from pydantic import Field, ValidationInfo
 
 from gdp.errors import ConfigError
+from gdp.nodes.drop_in import drop_in_directory
 from gdp.nodes.schema import Section, load
 from gdp.nodes.yaml_source import KeyPath, YamlSource, read_yaml
 from proxy.config.rule import Rule
 
-__all__ = ["DROP_INS", "DropIn", "DropIns", "add_drop_in_rules", "drop_in_directory"]
+__all__ = ["DROP_INS", "DropIn", "DropIns", "add_drop_in_rules"]
 
 DROP_INS: Final = "drop_ins"  # key of the validation context
 _FILES_MAX: Final = 1_000
@@ -34,11 +35,6 @@ class DropIn(Section):
     def rules(self, side: str) -> tuple[Rule, ...]:
         """Return the rules of ``expose`` or ``import``."""
         return self.expose if side == "expose" else self.imports
-
-
-def drop_in_directory(path: Path) -> Path:
-    """Return the drop-in directory of a proxy's configuration, whether it exists or not."""
-    return path.with_name(f"{path.name}.d")
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,8 @@ from typing import TypeAlias
 
 from gdp.metadata import Metadata
 from gdp.names import Name
-from proxy.config.rule import Kind, Rule
+from gdp.ros_names import Kind
+from proxy.config.rule import Rule
 
 __all__ = ["Fault", "choose", "clashes", "imported"]
 

@@ -5,9 +5,8 @@ Section of a configuration file. Validation reads the owner's public key and cha
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
-from typing import Annotated, Final, Literal, TypeAlias
+from typing import Annotated, Final, Literal
 
 from pydantic import (
     AfterValidator,
@@ -26,14 +25,22 @@ from gdp.limits import MESSAGE_MAX_BYTES
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.nodes.schema import Section, relative
+from gdp.ros_names import (
+    NAME_FORM,
+    NAME_MAX_CHARS,
+    PATTERN_FORM,
+    TYPE_FORMS,
+    Kind,
+    fits_kind,
+    is_name,
+    is_pattern,
+    matches,
+)
 from gdp.service.replication import Mode, Replication
 from gdp.stores.files import read_private
-from proxy.config.pattern import NAME_FORM, NAME_MAX_CHARS, PATTERN_FORM, is_name, is_pattern, matches
 from proxy.serial.serializer import Encoding
 
-__all__ = ["DOMAIN_MAX", "SALT", "Kind", "Rule", "fits_kind"]
-
-Kind: TypeAlias = Literal["topic", "service", "action"]
+__all__ = ["DOMAIN_MAX", "SALT", "Rule"]
 
 CALL_S: Final = 5.0
 CALL_MAX_S: Final = 86_400.0
@@ -42,13 +49,6 @@ AT_ONCE_MAX: Final = 65_536
 RATE_MAX_HZ: Final = 1e6
 DOMAIN_MAX: Final = 232  # ports of a higher domain would exceed 65535; DDSI-RTPS 2.5, section 9.6.2
 
-_WORD: Final = "[A-Za-z][A-Za-z0-9_]*"
-_TYPES: Final[dict[Kind, tuple[str, str]]] = {
-    # A service's events and an action's feedback are topics as well.
-    "topic": (f"{_WORD}/(?:msg/{_WORD}|srv/{_WORD}_Event|action/{_WORD}_FeedbackMessage)", "sensor_msgs/msg/Image"),
-    "service": (f"{_WORD}/srv/{_WORD}", "std_srvs/srv/SetBool"),
-    "action": (f"{_WORD}/action/{_WORD}", "test_msgs/action/Fibonacci"),
-}
 SALT: Final = "salt"  # the key of the unguessable part
 _OWN_KEYS: Final = ("kind", "name", "type")
 _OF_TOPICS: Final = ("reliable", "latched", "max_hz")
@@ -108,7 +108,7 @@ CallSeconds = Annotated[float, Field(gt=0, le=CALL_MAX_S)]
 
 def _by_kind(kind: Kind) -> JsonValue:
     """Return the JSON schema of the rules of one kind; a rule without ``kind`` is about a topic."""
-    then: JsonDict = {"type": {"pattern": f"^(?:|{_TYPES[kind][0]})$"}, **dict.fromkeys(_FOREIGN[kind], False)}
+    then: JsonDict = {"type": {"pattern": f"^(?:|{TYPE_FORMS[kind][0]})$"}, **dict.fromkeys(_FOREIGN[kind], False)}
     condition: JsonDict = {"properties": {"kind": {"const": kind}}, "required": [] if kind == "topic" else ["kind"]}
     return {"if": condition, "then": {"properties": then}}
 
@@ -348,7 +348,7 @@ class Rule(Section):
         if text and kind is not None and not fits_kind(text, kind):
             raise ValueError(
                 f"expected the type of {'an' if kind == 'action' else 'a'} {kind} as ROS 2 writes it,"
-                f" such as {_TYPES[kind][1]} (for ROS 1 as well)"
+                f" such as {TYPE_FORMS[kind][1]} (for ROS 1 as well)"
             )
         return text
 
@@ -388,8 +388,3 @@ class Rule(Section):
         if text is not None and not is_name(text):
             raise ValueError("expected a full ROS name, such as /plan/stop")
         return text
-
-
-def fits_kind(type_name: str, kind: Kind) -> bool:
-    """Return whether a type, as ROS 2 writes it, is valid for a topic, a service or an action."""
-    return re.fullmatch(_TYPES[kind][0], type_name) is not None

@@ -18,6 +18,7 @@ from gdp.errors import LocalError
 from gdp.nodes.delegation_store import DelegationStore
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.context import BridgeContext
+from proxy.bridge.desired_flows import FlowSpec
 from proxy.bridge.topic_stats import percentile
 from proxy.config.config import ProxyConfig
 from proxy.endpoints.endpoint import proxy_node_name
@@ -54,6 +55,7 @@ def run(path: Path, settings: ProxyConfig, *, json: bool) -> None:
             )
             node.drains = True
             node.on_reload = lambda: _reload(path, settings, node, bridge)
+            node.undelegated = lambda: [_described(each) for each in bridge.undelegated]
             for endpoint in endpoints:
                 node.runtime.watch(endpoint)
             try:
@@ -135,6 +137,17 @@ def _tell_progress(node: ProxyNode, bridge: Bridge) -> None:
             if each.latencies_ms or each.lost
         ],
     )
+
+
+def _described(flow_spec: FlowSpec) -> dict[str, str]:
+    """Return the fields by which an owner recognizes a flow; metadata are left out, because a salt may be in them."""
+    return {
+        "side": "expose" if flow_spec.is_exposed else "import",
+        "kind": flow_spec.rule.kind,
+        "local": flow_spec.local,
+        "type": flow_spec.type_name,
+        "name": flow_spec.name.to_text(),
+    }
 
 
 def _reload(path: Path, first: ProxyConfig, node: ProxyNode, bridge: Bridge) -> None:

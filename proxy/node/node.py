@@ -9,7 +9,7 @@ import contextlib
 import logging
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import FrameType
 from typing import Final
@@ -44,6 +44,7 @@ __all__ = ["GOODBYE_S", "ProxyNode", "open_topics", "run_node"]
 
 log = logging.getLogger(__name__)
 
+UNDELEGATED_MAX: Final = 100  # flows in one status; each has less than 2 KiB of a response's 256
 GOODBYE_S: Final = 0.2  # time in which a leaving node still sends
 
 
@@ -55,6 +56,7 @@ class ProxyNode:
         on_reload: reads the configuration again; raises ``GdpError`` where the old one stays. None: not supported.
         is_leaving: a SIGUSR1 or a drain arrived: answer what is under way, then end.
         has_drained: all that was under way was answered.
+        undelegated: returns the flows that only lack a delegation, as fields of the status.
         drains: whether the command checks ``is_leaving``; else a SIGUSR1 ends it at once.
     """
 
@@ -65,6 +67,7 @@ class ProxyNode:
     node_log: NodeLog
     credentials: Credentials
     on_reload: Callable[[], None] | None = None
+    undelegated: Callable[[], Sequence[Mapping[str, str]]] = tuple
     is_leaving: bool = False
     drains: bool = False
     has_drained: bool = False
@@ -107,7 +110,9 @@ class ProxyNode:
 
         def status() -> dict[str, object]:
             attached = self.member.attachment.is_attached
-            return node_status(self.identity, sources, uptime_s=time.monotonic() - self.begun_s, attached=attached)
+            missing = list(self.undelegated())[:UNDELEGATED_MAX]
+            uptime_s = time.monotonic() - self.begun_s
+            return node_status(self.identity, sources, uptime_s=uptime_s, attached=attached, undelegated=missing)
 
         return ControlHandlers(reload=self.reload, status=status, drain=self.drain, is_drained=lambda: self.has_drained)
 

@@ -7,13 +7,13 @@ import sys
 
 import pytest
 
-from proxy.config.pattern import is_pattern
+from gdp.ros_names import is_pattern
 
 _CPU_S = 5  # a thousand times the measured time; a pattern that backtracks needs hours
 
 _MATCH = f"""
 import resource, sys
-from proxy.config.pattern import matches
+from gdp.ros_names import matches
 resource.setrlimit(resource.RLIMIT_CPU, ({_CPU_S}, {_CPU_S}))
 print(matches(sys.argv[1], sys.argv[2]))
 """

@@ -14,8 +14,8 @@ from fog.enrolment.robot_config import add_rules, remove_rules
 from fog.site import open_site
 from gdp.errors import ConfigError
 from gdp.metadata import Metadata
+from gdp.nodes.drop_in import drop_in_directory
 from proxy.config.config import ProxyConfig
-from proxy.config.drop_ins import drop_in_directory
 from tests.gdp.cli.test_gdp import Run, gdp, keys
 
 __all__ = ["gdp", "keys"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from proxy.config.pattern import NAME_MAX_CHARS, is_name, is_pattern, matches
+from gdp.ros_names import NAME_MAX_CHARS, is_name, is_pattern, matches
 
 
 @pytest.mark.parametrize("text", ["/a", "/camera/image_raw", "/_hidden", "/fold/_action/status", "/1", "/" + "a" * 511])

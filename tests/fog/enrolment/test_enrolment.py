@@ -23,12 +23,12 @@ from gdp.errors import ConfigError, LocalError
 from gdp.nodes.config import RibConfig, SwitchConfig
 from gdp.nodes.control_socket import ControlHandlers, serve_control_in_thread
 from gdp.nodes.delegation_store import DelegationStore
+from gdp.nodes.drop_in import drop_in_directory
 from gdp.nodes.membership import load_member
 from gdp.stores.keyring import load_identity, load_owner
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
 from proxy.config.config import ProxyConfig
-from proxy.config.drop_ins import drop_in_directory
 from tests.fog.enrolment.desk import CLUSTER, MAP, PLAN, Desk, made_desk
 
 

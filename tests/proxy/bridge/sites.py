@@ -18,6 +18,7 @@ from gdp.crypto.certificates import Role
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
+from gdp.ros_names import Kind
 from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import ring5
 from gdp.trust.owner import Owner
@@ -27,7 +28,6 @@ from proxy.bridge.context import BridgeContext
 from proxy.bridge.counters import Traffic
 from proxy.bridge.faults import Faults
 from proxy.config.config import ProxyConfig, Rule
-from proxy.config.rule import Kind
 from proxy.endpoints.endpoint import proxy_node_name
 from proxy.serial.channel import Qos, RosVersion
 from tests.proxy.bridge import known

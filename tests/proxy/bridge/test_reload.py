@@ -181,3 +181,38 @@ def test_a_client_whose_rule_changes_is_understood_from_then_on(sites: Sites) ->
         sites.run(1)
     assert caller.outcomes == [switched("yes")] * 3
     assert (server.faults, client.faults) == ({}, {})
+
+
+def test_a_pattern_that_is_added_and_removed_costs_the_untouched_topic_nothing(sites: Sites) -> None:
+    robot, server, talker, ear = flowing(sites)
+    image = robot.graph.publish("/camera", "/camera/left/image", STRING)
+    view = Ear(server.graph, "/camera/left/image")
+    sites.every(0.005, 800, lambda number: talker.publish(string(str(number))))
+    sites.run(0.5)
+    sites.reload(robot, expose=["name: /camera/**", CHATTER], holds=[named("/chatter")])
+    assert sites.run(1, lambda: bool(robot.bridge.undelegated))
+    sites.reload(robot, expose=["name: /camera/**", CHATTER], holds=[named("/chatter"), named("/camera/left/image")])
+    sites.reload(server, imports=[f"name: /camera/left/image, type: {STRING}", CHATTER])
+    assert sites.run(2, lambda: robot.is_read() and len(robot.member.publishers()) == 2)
+    image.publish(string("an image"))
+    assert sites.run(1, lambda: view.texts == ["an image"])
+    sites.reload(robot, expose=[CHATTER])
+    sites.run(4)
+    assert robot.carried == {("/chatter", True)}
+    assert ear.texts == [str(number) for number in range(800)]
+
+
+def test_what_a_rule_finds_without_a_delegation_is_listed_until_it_has_one(sites: Sites) -> None:
+    robot = sites.add(ROBOT, expose=["name: /camera/**"], holds=[])
+    camera = robot.graph.publish("/camera", "/camera/image", STRING)
+    robot.graph.publish("/talker", "/chatter", STRING)
+    sites.run(1)
+    (lacking,) = robot.bridge.undelegated
+    assert (lacking.local, lacking.type_name, lacking.is_exposed) == ("/camera/image", STRING, True)
+    sites.reload(robot, expose=["name: /camera/**"], holds=[named("/camera/image")])
+    sites.run(1)
+    assert robot.bridge.undelegated == []
+    camera.close()
+    sites.reload(robot, expose=["name: /camera/**"], holds=[])
+    sites.run(1)
+    assert robot.bridge.undelegated == []

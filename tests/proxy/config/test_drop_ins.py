@@ -8,8 +8,8 @@ import pytest
 
 from fog.site import open_site
 from gdp.errors import ConfigError
+from gdp.nodes.drop_in import drop_in_directory
 from proxy.config.config import ProxyConfig
-from proxy.config.drop_ins import drop_in_directory
 
 RULE = "- {name: %s, type: std_msgs/msg/Empty, owner: %s}\n"
 OWNER = "../owner/owner.pub"

@@ -1,4 +1,4 @@
-"""Patterns of full ROS names.
+"""Full ROS names, patterns of them, and the types of topics, services and actions.
 
 Sans-I/O. In a pattern ``*`` matches any characters of one segment. ``**``, which is a segment of its own, matches one
 or more segments. As in a Unix shell, neither matches the start of a hidden segment (``/fold/_action/status``): a
@@ -11,15 +11,34 @@ from __future__ import annotations
 
 import functools
 import re
-from typing import Final
+from typing import Final, Literal, TypeAlias
 
-__all__ = ["NAME_FORM", "NAME_MAX_CHARS", "PATTERN_FORM", "is_name", "is_pattern", "matches"]
+__all__ = [
+    "NAME_FORM",
+    "NAME_MAX_CHARS",
+    "PATTERN_FORM",
+    "TYPE_FORMS",
+    "Kind",
+    "fits_kind",
+    "is_name",
+    "is_pattern",
+    "matches",
+]
+
+Kind: TypeAlias = Literal["topic", "service", "action"]
 
 NAME_MAX_CHARS: Final = 512
 NAME_FORM: Final = r"(?:/[A-Za-z0-9_]+)+"
 # matches names, too; in ECMAScript's syntax
 PATTERN_FORM: Final = r"(?:/(?:\*\*|\*|\*?[A-Za-z0-9_]+(?:\*[A-Za-z0-9_]+)*\*?))+"
 
+_WORD: Final = "[A-Za-z][A-Za-z0-9_]*"
+TYPE_FORMS: Final[dict[Kind, tuple[str, str]]] = {  # pattern in ECMAScript's syntax, and an example
+    # A service's events and an action's feedback are topics as well.
+    "topic": (f"{_WORD}/(?:msg/{_WORD}|srv/{_WORD}_Event|action/{_WORD}_FeedbackMessage)", "sensor_msgs/msg/Image"),
+    "service": (f"{_WORD}/srv/{_WORD}", "std_srvs/srv/SetBool"),
+    "action": (f"{_WORD}/action/{_WORD}", "test_msgs/action/Fibonacci"),
+}
 _VISIBLE: Final = "(?!_)[A-Za-z0-9_]+"
 
 
@@ -36,6 +55,11 @@ def is_pattern(text: str) -> bool:
 def matches(pattern: str, name: str) -> bool:
     """Return whether a full name matches the pattern."""
     return _compiled(pattern).fullmatch(name) is not None
+
+
+def fits_kind(type_name: str, kind: Kind) -> bool:
+    """Return whether a type, as ROS 2 writes it, is valid for a topic, a service or an action."""
+    return re.fullmatch(TYPE_FORMS[kind][0], type_name) is not None
 
 
 @functools.lru_cache(maxsize=1024)

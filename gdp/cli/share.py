@@ -1,0 +1,322 @@
+"""``gdp expose``, ``gdp import`` and ``gdp share``: names that the nodes of a domain share, on live proxies.
+
+I/O. Exit codes: 0 done, 2 wrong input; then nothing has changed.
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Final, Optional
+
+import typer
+
+from gdp.cli import options
+from gdp.cli.output import moment, show
+from gdp.errors import GdpError, LocalError
+from gdp.sharing.exchange import Exchange
+from gdp.sharing.folder_exchange import FolderExchange
+from gdp.sharing.issued import IssuedDelegation, IssuedStore
+from gdp.sharing.proxy_files import ProxyFiles, fits
+from gdp.sharing.report import ShareReport
+from gdp.sharing.revocations import publish_revocations
+from gdp.sharing.rules import kind_from_text
+from gdp.sharing.sharing import Sharing
+from gdp.sharing.state import AcceptedName, ExposedName, Offer, ShareState
+from gdp.stores.issue import make_owner
+from gdp.stores.keyring import CARD, OWNER_KEY, load_card, load_owner
+
+__all__ = ["expose", "import_names", "share"]
+
+SHARE_DAYS: Final = 30.0
+_PROXY_FILE: Final = "proxy.yaml"
+_SWITCH_FILE: Final = "switch.yaml"
+_OWNER: Final = "owner"
+_POLL_S: Final = 0.1
+
+# typer reads these annotations at run time, on Python 3.10 too: hence Optional.
+AnyName = Annotated[str, typer.Argument(metavar="NAME", help="A ROS name, or a pattern: /camera/* or /camera/**.")]
+OptionalName = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Argument(metavar="NAME", help="A ROS name, or a pattern: /camera/* or /camera/**."),
+]
+Nodes = Annotated[list[str], typer.Option("--to", metavar="NODE", help="A node or a group; may be repeated.")]
+With = Annotated[list[str], typer.Option("--with", metavar="NODE", help="A node or a group; may be repeated.")]
+Source = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option("--from", metavar="NODE", help="Only what this node offers."),
+]
+Kind = Annotated[str, typer.Option("--kind", help="topic, service or action")]
+Type = Annotated[str, typer.Option("--type", help="Its type, such as sensor_msgs/msg/Image; else as it is found.")]
+OwnerDir = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option("--owner", metavar="DIR", help="The owner's directory. Default: owner, in the machine's directory."),
+]
+MachineDir = Annotated[Path, typer.Option("--dir", metavar="DIR", help="The machine's directory, with proxy.yaml.")]
+ExchangeDir = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option(
+        "--exchange", metavar="DIR", help="A folder that the machines share, in place of the domain's server."
+    ),
+]
+Encoding = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option("--encoding", help="json, cbor or cdr: how messages travel."),
+]
+Wait = Annotated[
+    float, typer.Option("--wait", min=0.0, metavar="SECONDS", help="How long to wait for a name without a type.")
+]
+Remove = Annotated[bool, typer.Option("--remove", help="Remove the rule.")]
+List = Annotated[bool, typer.Option("--list", help="Show what there is, and change nothing.")]
+
+
+def expose(
+    name: AnyName,
+    to: Nodes = [],  # noqa: B006 (the library copies it)
+    source: Source = None,
+    kind: Kind = "topic",
+    type_: Type = "",
+    owner: OwnerDir = None,
+    days: options.Days = SHARE_DAYS,
+    encoding: Encoding = None,
+    remove: Remove = False,
+    wait: Wait = 3.0,
+    directory: MachineDir = Path(),
+    exchange: ExchangeDir = None,
+    as_json: options.Json = False,
+) -> None:
+    """Let nodes read a topic, or call a service, of this machine; the running proxy carries it at once.
+
+    A name without --type, and a pattern, take what local nodes publish or serve, now and later. With --from the name
+    is one that NODE lets this machine publish or serve.
+
+    \b
+    Examples:
+      gdp expose '/camera/**' --to server
+      gdp expose /plan --kind service --type nav_msgs/srv/GetPlan --to robot
+      gdp expose /goal --from server
+      gdp expose '/camera/**' --remove
+    """
+    sharing = _sharing(directory, exchange, owner)
+    if remove:
+        _show_change(name, sharing.stop_exposing(kind, name, time.time()), as_json=as_json)
+        return
+    if (source is None) == (not to):
+        raise LocalError("expose: state --to NODE, or --from NODE for a name that NODE lets this machine publish")
+    if source is not None:
+        accepted = AcceptedName(side="expose", name=name, source=source)
+        _show_change(name, sharing.accept(accepted, time.time()), as_json=as_json)
+        return
+    with _owner_of(directory, owner) as folder:
+        wanted = ExposedName(
+            kind=kind_from_text(kind, type_),
+            name=name,
+            type_name=type_,
+            to=tuple(dict.fromkeys(to)),
+            owner=folder,
+            owner_key=load_owner(folder).public.compressed.hex(),
+            days=days,
+            encoding=encoding,
+        )
+        report = sharing.expose(wanted, time.time())
+    until_s = time.monotonic() + wait
+    while not report.granted and report.is_running and time.monotonic() < until_s:
+        time.sleep(_POLL_S)  # the proxy answers at once, and its graph has no event for this process
+        more = sharing.work(time.time())
+        report.granted += more.granted
+        report.problems += [text for text in more.problems if text not in report.problems]
+    _show_change(name, report, as_json=as_json, awaited="as soon as a local node shows it")
+
+
+def import_names(
+    name: OptionalName = None,
+    source: Source = None,
+    show_list: List = False,
+    remove: Remove = False,
+    directory: MachineDir = Path(),
+    exchange: ExchangeDir = None,
+    as_json: options.Json = False,
+) -> None:
+    """Take what other nodes offer to this machine, now and later; the running proxy carries it at once.
+
+    \b
+    Examples:
+      gdp import --list
+      gdp import /camera/image --from robot
+      gdp import '/camera/**' --remove
+    """
+    sharing = _sharing(directory, exchange, None)
+    if show_list:
+        report = sharing.work(time.time())
+        offers = [_offer_fields(offer, is_accepted=is_accepted) for offer, is_accepted in sharing.offers()]
+        accepted = [each.model_dump() for each in sharing.state().accepted]
+        fields = {"offers": offers, "accepted": accepted, "problems": report.problems}
+        show(fields, as_json=as_json, plain=_table(offers, ("name", "type", "from", "rights", "until", "accepted")))
+    elif name is None:
+        raise LocalError("import: state a NAME, or --list")
+    elif remove:
+        _show_change(name, sharing.stop_accepting("import", name, time.time()), as_json=as_json)
+    else:
+        report = sharing.accept(AcceptedName(side="import", name=name, source=source), time.time())
+        found = [each for each, is_accepted in sharing.offers() if is_accepted and fits(name, each.ros_name)]
+        _show_change(name, report, as_json=as_json, offers=found, awaited="as soon as a node offers it")
+
+
+def share(
+    name: OptionalName = None,
+    nodes: With = [],  # noqa: B006 (the library copies it)
+    publish: Annotated[bool, typer.Option("--publish", help="The right to publish a topic, in place of read.")] = False,
+    serve: Annotated[bool, typer.Option("--serve", help="The right to serve, in place of call.")] = False,
+    kind: Kind = "topic",
+    type_: Type = "",
+    owner: OwnerDir = None,
+    days: options.Days = SHARE_DAYS,
+    revoke: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option("--revoke", metavar="NODE", help="Take back what NODE got."),
+    ] = None,
+    renew: Annotated[
+        bool, typer.Option("--renew", help="Renew what is due and take mail, once, where no agent does it.")
+    ] = False,
+    show_list: List = False,
+    directory: MachineDir = Path(),
+    exchange: ExchangeDir = None,
+    as_json: options.Json = False,
+) -> None:
+    """Let nodes act on names of this owner, or take the right back; delegations renew before they expire.
+
+    \b
+    Examples:
+      gdp share /camera/image --with laptop
+      gdp share /goal --type geometry_msgs/msg/PoseStamped --with robot --publish
+      gdp share /camera/image --revoke laptop
+      gdp share --list
+    """
+    folder = owner or directory / _OWNER
+    sharing = _sharing(directory, exchange, owner)
+    if show_list:
+        state = sharing.state()
+        issued = [_issued_fields(each) for each in IssuedStore(folder) if not each.is_own]
+        fields = {"exposed": _exposed_fields(state), "shared": issued}
+        show(fields, as_json=as_json, plain=_table(issued, ("name", "type", "node", "rights", "until", "state")))
+        return
+    if renew:
+        _show_change("all", sharing.work(time.time()), as_json=as_json)
+        return
+    if name is None or (revoke is None) == (not nodes):
+        raise LocalError("share: state a NAME and --with NODE or --revoke NODE; or --list")
+    if revoke is not None:
+        spread = partial(publish_revocations, directory / _SWITCH_FILE)
+        _show_change(name, sharing.revoke(folder, name, revoke, spread, time.time()), as_json=as_json)
+        return
+    known = kind_from_text(kind, type_)
+    if (publish and known != "topic") or (serve and known == "topic"):
+        raise LocalError("share: --publish is for a topic, --serve for --kind service or action")
+    report = sharing.share(
+        folder, name, nodes, time.time(), kind=known, type_name=type_, is_giving=publish or serve, days=days
+    )
+    _show_change(name, report, as_json=as_json)
+
+
+@contextmanager
+def _owner_of(directory: Path, owner: Path | None) -> Iterator[Path]:
+    """Yield an owner's directory; the machine's own owner is made if it is missing, unless the change fails."""
+    folder = owner or directory / _OWNER
+    if owner is not None or (folder / OWNER_KEY).exists():
+        yield folder
+        return
+    make_owner(folder)
+    try:
+        yield folder
+    except GdpError:
+        shutil.rmtree(folder)
+        raise
+
+
+def _sharing(directory: Path, exchange: Path | None, owner: Path | None) -> Sharing:
+    """Return the sharing of the machine in ``directory``."""
+    path = directory / _PROXY_FILE
+    if not path.exists():
+        raise LocalError(f"{directory}: no {_PROXY_FILE} is here; name the machine's directory with --dir")
+    owners = [each for each in (owner or directory / _OWNER,) if (each / OWNER_KEY).exists()]
+    return Sharing(path, _exchange(path, exchange), owners)
+
+
+def _exchange(path: Path, folder: Path | None) -> Exchange:
+    if folder is None:
+        raise LocalError("state --exchange DIR: the folder that the machines share")
+    return FolderExchange(folder, load_card(ProxyFiles.load(path).identity / CARD))
+
+
+def _show_change(
+    name: str, report: ShareReport, *, as_json: bool, offers: Sequence[Offer] | None = None, awaited: str = ""
+) -> None:
+    """Print what a change did; problems go to stderr."""
+    delegated = [_issued_fields(each) for each in report.granted]
+    given = {} if offers is None else {"offers": [_offer_fields(each, is_accepted=True) for each in offers]}
+    applied = {True: "now", False: "at the next start of the proxy", None: "nothing to apply"}[report.is_running]
+    if awaited and not delegated and not offers and report.is_running is not False:
+        applied = awaited
+    fields = {
+        "name": name,
+        "applied": applied,
+        "is_running": report.is_running,
+        **given,
+        "delegated": delegated,
+        "problems": report.problems,
+    }
+    lines = [f"{name}: {applied}"]
+    lines += [f"  {each['name']} [{each['type']}] to {each['node']} until {each['until']}" for each in delegated]
+    lines += [f"  {each.ros_name} [{each.type_name}] from {each.sender}" for each in offers or ()]
+    show(fields, as_json=as_json, plain="\n".join(lines))
+    for text in report.problems:
+        typer.echo(f"gdp: {text}", err=True)
+
+
+def _issued_fields(issued: IssuedDelegation) -> dict[str, object]:
+    meaning = issued.metadata
+    state = "revoked" if issued.is_revoked else "delivered" if issued.is_delivered else "waits for delivery"
+    return {
+        "kind": meaning["kind"],
+        "name": meaning["name"],
+        "type": meaning["type"],
+        "node": issued.label,
+        "rights": sorted(right.value for right in issued.delegation.rights),
+        "until": moment(issued.until_unix_s),
+        "state": state,
+    }
+
+
+def _offer_fields(offer: Offer, *, is_accepted: bool) -> dict[str, object]:
+    return {
+        "kind": offer.kind,
+        "name": offer.ros_name,
+        "type": offer.type_name,
+        "from": offer.sender,
+        "rights": sorted(right.value for right in offer.delegation.rights),
+        "until": moment(offer.until_unix_s),
+        "owner": offer.owner.compressed.hex(),
+        "accepted": is_accepted,
+    }
+
+
+def _exposed_fields(state: ShareState) -> list[dict[str, object]]:
+    return [{"kind": each.kind, "name": each.name, "to": each.to, "days": each.days} for each in state.exposed]
+
+
+def _table(rows: Sequence[Mapping[str, object]], keys: Sequence[str]) -> str:
+    """Return rows as aligned columns under their keys."""
+    cells = [list(keys), *([_cell(row[key]) for key in keys] for row in rows)]
+    widths = [max(len(row[at]) for row in cells) for at in range(len(keys))]
+    lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in cells]
+    return "\n".join(lines)
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)

@@ -1,0 +1,181 @@
+"""Grants: delegations that a node's rules need, issued by the owner keys of this machine, delivered and renewed.
+
+I/O. Own delegations are installed for the proxy of this machine; others go to the mailbox of their node. A delegation
+whose delivery fails is delivered at the next upkeep.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from gdp.errors import GdpError, LocalError
+from gdp.metadata import Metadata
+from gdp.sharing.exchange import Exchange, MailKind, resolve_recipients
+from gdp.sharing.issued import IssuedDelegation, IssuedStore
+from gdp.sharing.proxy_files import ProxyFiles, Undelegated, fits
+from gdp.sharing.report import ShareReport
+from gdp.sharing.state import ExposedName, ShareState
+from gdp.stores.keyring import load_delegation, load_owner, save_delegation
+from gdp.trust.node_descriptor import NodeDescriptor
+from gdp.trust.right import Right
+
+__all__ = ["GIVING", "TAKING", "Grants", "described"]
+
+GIVING: Final = {"topic": Right.PUBLISH, "service": Right.SERVE, "action": Right.SERVE}
+TAKING: Final = {"topic": Right.READ, "service": Right.CALL, "action": Right.CALL}
+
+
+def described(kind: str, name: str, type_name: str) -> Metadata:
+    """Return what the 256-bit name of a shared name digests, besides the owner's key."""
+    return Metadata({"kind": kind, "name": name, "type": type_name})
+
+
+@dataclass(slots=True, kw_only=True)
+class Grants:
+    """The delegations of one upkeep.
+
+    Args:
+        own: descriptor of the proxy of this machine.
+        nodes: proxies of the domain by label; None: the exchange does not answer.
+        report: gets what is issued and what fails.
+        is_changed: whether a delegation of the proxy of this machine was installed, so that it must reload.
+    """
+
+    files: ProxyFiles
+    exchange: Exchange
+    own: NodeDescriptor
+    nodes: Mapping[str, NodeDescriptor] | None
+    groups: Mapping[str, Sequence[str]]
+    unix_s: float
+    report: ShareReport
+    is_changed: bool = False
+
+    def grant_exposed(
+        self, state: ShareState, undelegated: Iterable[Undelegated], restored: Collection[str] = ()
+    ) -> None:
+        """Issue what the exposed names lack: for the proxy itself, and for each recipient.
+
+        Args:
+            undelegated: names that the live proxy has found for the rules.
+            restored: labels of nodes whose revoked delegations are issued again.
+        """
+        found = list(undelegated)
+        for store in {each.owner: IssuedStore(each.owner) for each in state.exposed}.values():
+            key = load_owner(store.owner).public.compressed
+            rules = [each for each in state.exposed if each.owner_key == key.hex()]
+            names = dict[bytes, Metadata]()
+            for each in rules:
+                if each.type_name and "*" not in each.name:
+                    metadata = described(each.kind, each.name, each.type_name)
+                    names[metadata.digest()] = metadata
+            for lacking in found:
+                metadata = described(lacking.kind, lacking.local, lacking.type_name)
+                if lacking.side == "expose" and metadata.name(key) == lacking.name:
+                    names[metadata.digest()] = metadata
+            for issued in store:
+                if issued.is_own and not issued.is_revoked:
+                    names[issued.metadata.digest()] = issued.metadata
+            for metadata in names.values():
+                covering = [each for each in rules if _covers(each, metadata)]
+                if covering:
+                    self._grant(store, metadata, covering, restored)
+
+    def issue(
+        self,
+        store: IssuedStore,
+        label: str,
+        node: NodeDescriptor,
+        metadata: Metadata,
+        rights: Collection[Right],
+        *,
+        days: float,
+    ) -> IssuedDelegation:
+        """Issue and deliver one delegation; its epochs are those of the proxy of this machine.
+
+        Raises:
+            LocalError: the owner's keys are missing, or a record cannot be written.
+        """
+        is_own = node.name == self.own.name
+        name = load_owner(store.owner).subject(metadata).name
+        epochs = {0}
+        file = self.files.delegations / f"{name.to_text()}.delegation"
+        if file.exists():
+            held = load_delegation(file)
+            epochs |= set(held.grants)
+            rights = frozenset(rights) | (held.rights if is_own and held.node == node.name else frozenset())
+        issued = store.issue(node, label, metadata, rights, epochs, days=days, is_own=is_own, unix_s=self.unix_s)
+        return self.deliver(store, issued)
+
+    def deliver(self, store: IssuedStore, issued: IssuedDelegation) -> IssuedDelegation:
+        """Install a delegation here, or send it to its node; what fails is reported.
+
+        Raises:
+            LocalError: the record of the delivery cannot be written.
+        """
+        try:
+            if issued.is_own:
+                save_delegation(self.files.delegations, issued.delegation, force=True)
+                self.is_changed = True
+            else:
+                wire = issued.delegation.to_wire()
+                self.exchange.send(issued.descriptor.name, MailKind.DELEGATION.value, wire)
+            issued = issued.model_copy(update={"is_delivered": True})
+            store.save(issued)
+        except GdpError as error:
+            self.report.problems.append(f"{issued.metadata['name']} is not delivered to {issued.label} yet: {error}")
+        self.report.granted.append(issued)
+        return issued
+
+    def renew(self, owners: Iterable[IssuedStore]) -> None:
+        """Renew the delegations that have used two thirds of their life, and deliver what was not delivered.
+
+        A node that has left the domain gets no renewal.
+        """
+        for store in owners:
+            for issued in store:
+                try:
+                    self._renew(store, issued)
+                except GdpError as error:
+                    self.report.problems.append(
+                        f"the delegation of {issued.metadata['name']} to {issued.label} is not renewed: {error}"
+                    )
+
+    def _renew(self, store: IssuedStore, issued: IssuedDelegation) -> None:
+        if issued.is_revoked:
+            return
+        present = self.own if issued.is_own else None
+        if present is None:
+            present = issued.descriptor if self.nodes is None else self.nodes.get(issued.label)
+        if present is None or present.name != issued.descriptor.name:
+            return  # it has left the domain, or joined again as another node
+        if issued.is_due(self.unix_s):
+            self.deliver(store, store.renew(issued, present, self.unix_s))
+        elif not issued.is_delivered:
+            self.deliver(store, issued)
+
+    def _grant(
+        self, store: IssuedStore, metadata: Metadata, rules: Sequence[ExposedName], restored: Collection[str]
+    ) -> None:
+        kind, days = str(metadata["kind"]), max(each.days for each in rules)
+        wanted = [(self.own.label, self.own, GIVING[kind])]
+        for each in dict.fromkeys(label for rule in rules for label in rule.to):
+            try:
+                nodes = {} if self.nodes is None else resolve_recipients([each], self.nodes, self.groups)
+            except LocalError as error:
+                self.report.problems.append(str(error))
+                continue
+            wanted += [(label, node, TAKING[kind]) for label, node in nodes.items() if node.name != self.own.name]
+        name = load_owner(store.owner).subject(metadata).name
+        for label, node, right in wanted:
+            before = store.find(name, node.name)
+            if before is not None and before.is_revoked and label not in restored:
+                continue
+            if before is None or before.is_revoked or right not in before.delegation.rights:
+                self.issue(store, label, node, metadata, [right], days=days)
+
+
+def _covers(rule: ExposedName, metadata: Metadata) -> bool:
+    kind, name, type_name = (str(metadata[key]) for key in ("kind", "name", "type"))
+    return rule.kind == kind and fits(rule.name, name) and rule.type_name in ("", type_name)

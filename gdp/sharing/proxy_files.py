@@ -1,0 +1,205 @@
+"""Files of a live proxy, as a program that adds rules to it needs them.
+
+I/O. ``proxy.yaml`` is read and never changed; the program's own rules are one drop-in file. The proxy validates all
+rules when it reloads. If it refuses them, the earlier drop-in is restored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal, TypeAlias
+
+from gdp.errors import ConfigError, LocalError
+from gdp.names import Name
+from gdp.nodes.control_client import NotRunningError, ask_node, find_control_socket
+from gdp.nodes.control_protocol import Command
+from gdp.nodes.drop_in import drop_in_directory, read_drop_in, write_drop_in
+from gdp.nodes.yaml_source import Plain, YamlSource, read_yaml
+from gdp.ros_names import is_name, matches
+
+__all__ = ["ProxyFiles", "Side", "StatedRule", "Undelegated", "fits"]
+
+Side: TypeAlias = Literal["expose", "import"]
+
+DROP_IN: Final = "gdp-share.yaml"
+_ANSWER_S: Final = 10.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StatedRule:
+    """A rule that a person or another program wrote.
+
+    Args:
+        name: the name that all sides know, or a pattern of such.
+        type_name: empty if the rule states none.
+        metadata: whatever else the 256-bit name digests.
+        is_salted: whether a file holds an unguessable part of the name.
+        where: ``file:line:column`` of the rule.
+    """
+
+    side: Side
+    kind: str
+    name: str
+    type_name: str
+    metadata: Mapping[str, str | int]
+    is_salted: bool
+    where: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Undelegated:
+    """A local name that a rule of the live proxy means, and for which the proxy holds no delegation.
+
+    Args:
+        local: its name in the graph.
+        name: the 256-bit name that the rule gives to it.
+    """
+
+    side: str
+    kind: str
+    local: str
+    type_name: str
+    name: Name
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProxyFiles:
+    """Paths and rules of one proxy.
+
+    Args:
+        root: root certificate of the proxy's domain.
+        control_socket: None: at the default place.
+        rules: of ``proxy.yaml`` and of the drop-ins of other programs.
+    """
+
+    path: Path
+    identity: Path
+    root: Path
+    delegations: Path
+    control_socket: Path | None
+    rules: Sequence[StatedRule]
+
+    @classmethod
+    def load(cls, path: Path) -> ProxyFiles:
+        """Read the configuration of a proxy.
+
+        Raises:
+            ConfigError: it is missing, is not YAML, or lacks the proxy's identity, domain or delegations.
+        """
+        source = read_yaml(path)
+        data = source.data if isinstance(source.data, dict) else {}
+        domain = data.get("domain")
+        socket = data.get("control_socket")
+        files = [path, *sorted(each for each in drop_in_directory(path).glob("[!.]*.yaml") if each.name != DROP_IN)]
+        return cls(
+            path=path,
+            identity=_path(source, "identity", data.get("identity")),
+            root=_path(source, "domain", domain.get("root") if isinstance(domain, dict) else None),
+            delegations=_path(source, "delegations", data.get("delegations")),
+            control_socket=None if socket is None else _path(source, "control_socket", socket),
+            rules=tuple(rule for file in files for rule in _rules(read_yaml(file))),
+        )
+
+    @property
+    def drop_in(self) -> Path:
+        """Return the file of this program's rules."""
+        return drop_in_directory(self.path) / DROP_IN
+
+    def find(self, side: Side, kind: str, name: str) -> StatedRule | None:
+        """Return the rule that states exactly this name or pattern."""
+        return next((each for each in self.rules if (each.side, each.kind, each.name) == (side, kind, name)), None)
+
+    def replace_rules(self, text: str | None) -> bool:
+        """Write this program's rules and reload the proxy; return whether it runs.
+
+        Args:
+            text: content of the drop-in; None: no rule is left.
+
+        Raises:
+            LocalError: the proxy refuses them, and the earlier rules are restored; or the file cannot be written.
+        """
+        before = read_drop_in(self.drop_in)
+        if text != before:
+            write_drop_in(self.path, DROP_IN, text)
+        try:
+            return self.reload()
+        except LocalError:
+            if text != before:
+                write_drop_in(self.path, DROP_IN, before)
+            raise
+
+    def reload(self) -> bool:
+        """Make the proxy read rules and delegations again; return whether it runs.
+
+        Raises:
+            LocalError: it keeps the old ones; the text gives its reason.
+        """
+        try:
+            answer = ask_node(self._socket(), Command.RELOAD, _ANSWER_S)
+        except NotRunningError:
+            return False
+        if not answer.is_ok:
+            raise LocalError(f"the proxy refused the change: {answer.error}")
+        return True
+
+    def undelegated(self) -> list[Undelegated] | None:
+        """Return what the live proxy lacks a delegation for; None if it does not run.
+
+        Raises:
+            LocalError: it does not answer, or answers in another format.
+        """
+        try:
+            answer = ask_node(self._socket(), Command.STATUS, _ANSWER_S)
+        except NotRunningError:
+            return None
+        listed = answer.result.get("undelegated", [])
+        if not isinstance(listed, list):
+            raise LocalError("the proxy reports its names in another format; restart it with this version")
+        return [_undelegated(each) for each in listed]
+
+    def _socket(self) -> Path:
+        return self.control_socket or find_control_socket(self.identity)
+
+
+def fits(pattern: str, name: str) -> bool:
+    """Return whether a full name, or a pattern of names, is the name or matches the pattern."""
+    return pattern == name or matches(pattern, name)
+
+
+def _undelegated(fields: object) -> Undelegated:
+    match fields:
+        case {"side": str(side), "kind": str(kind), "local": str(local), "type": str(type_name), "name": str(name)}:
+            return Undelegated(side=side, kind=kind, local=local, type_name=type_name, name=Name.from_text(name))
+    raise LocalError("the proxy reports its names in another format; restart it with this version")
+
+
+def _path(source: YamlSource, key: str, value: Plain) -> Path:
+    if not isinstance(value, str):
+        raise source.error((key,), "expected the configuration of a proxy, with identity, domain and delegations")
+    try:
+        return source.path.parent / Path(value).expanduser()
+    except RuntimeError as error:
+        raise ConfigError(str(source.path), key, str(error)) from error
+
+
+def _rules(source: YamlSource) -> Iterator[StatedRule]:
+    """Yield the rules of a file, without validation: the proxy itself validates them."""
+    sides: tuple[Side, Side] = ("expose", "import")
+    for side in sides:
+        listed = source.data.get(side) if isinstance(source.data, dict) else None
+        for index, rule in enumerate(listed if isinstance(listed, list) else []):
+            if isinstance(rule, dict) and isinstance(name := rule.get("name"), str):
+                line, column = source.values[side, index]
+                more = rule.get("metadata")
+                items = more.items() if isinstance(more, dict) else ()
+                yield StatedRule(
+                    side=side,
+                    kind=str(rule.get("kind", "topic")),
+                    name=name,
+                    type_name=str(rule.get("type") or "") if is_name(name) else "",
+                    metadata={key: value for key, value in items if isinstance(value, str | int)},
+                    is_salted=rule.get("salt_file") is not None,
+                    where=f"{source.path}:{line}:{column}",
+                )

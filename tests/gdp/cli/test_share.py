@@ -1,0 +1,169 @@
+"""``gdp expose``, ``gdp import`` and ``gdp share``, as called by a person, through a folder that the machines share."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gdp.cli.gdp import main
+from gdp.sharing.folder_exchange import FolderExchange
+from gdp.stores.keyring import CARD, OWNER_KEY, load_card
+from tests.gdp.sharing.machines import IMAGE, STRING, Machine, Site
+
+Run = Callable[..., "tuple[int, str, str]"]
+
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Site:
+    monkeypatch.chdir(tmp_path)
+    return Site(tmp_path)
+
+
+@pytest.fixture
+def robot(site: Site) -> Machine:
+    return joined(site, "robot")
+
+
+@pytest.fixture
+def server(site: Site) -> Machine:
+    return joined(site, "server")
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    def run(*words: str) -> tuple[int, str, str]:
+        """Return exit code, output and errors of ``gdp COMMAND HOST ...``."""
+        command, host, *rest = words
+        with pytest.raises(SystemExit) as leaving:
+            main([command, *rest, "--dir", host, "--exchange", "common"])
+        shown = capsys.readouterr()
+        return int(leaving.value.code or 0), shown.out, shown.err
+
+    return run
+
+
+def joined(site: Site, label: str) -> Machine:
+    machine = site.add(label)
+    FolderExchange(site.folder / "common", load_card(machine.folder / "proxy" / CARD))
+    return machine
+
+
+def test_two_commands_share_a_topic(robot: Machine, server: Machine, run: Run) -> None:
+    with ExitStack() as stack:
+        robot.start(stack)
+        server.start(stack)
+        code, text, _ = run("expose", "robot", "/camera/image", "--type", IMAGE, "--to", "server")
+        assert (code, text.splitlines()[0]) == (0, "/camera/image: now")
+        assert run("import", "server", "/camera/image", "--from", "robot")[1].splitlines() == [
+            "/camera/image: now",
+            f"  /camera/image [{IMAGE}] from robot",
+        ]
+    assert (robot.rights(), server.rights()) == ({"/camera/image": {"publish"}}, {"/camera/image": {"read"}})
+
+
+def test_a_pattern_waits_for_what_the_graph_shows(robot: Machine, server: Machine, run: Run) -> None:
+    robot.graph.append(("topic", "/camera/image", IMAGE))
+    with ExitStack() as stack:
+        robot.start(stack)
+        code, text, _ = run("expose", "robot", "/camera/**", "--to", "server", "--json")
+    result = json.loads(text)
+    assert (code, result["applied"], result["problems"]) == (0, "now", [])
+    assert [(each["node"], each["rights"]) for each in result["delegated"]] == [
+        ("robot", ["publish"]),
+        ("server", ["read"]),
+    ]
+
+
+def test_a_name_that_no_local_node_shows_is_exposed_later(robot: Machine, server: Machine, run: Run) -> None:
+    with ExitStack() as stack:
+        robot.start(stack)
+        assert run("expose", "robot", "/camera/**", "--to", "server", "--wait", "0")[:2] == (
+            0,
+            "/camera/**: as soon as a local node shows it\n",
+        )
+
+
+def test_without_a_running_proxy_the_text_says_when_a_rule_is_applied(
+    robot: Machine, server: Machine, run: Run
+) -> None:
+    code, text, _ = run("expose", "robot", "/camera/image", "--type", IMAGE, "--to", "server")
+    assert (code, text.splitlines()[0]) == (0, "/camera/image: at the next start of the proxy")
+
+
+def test_lists_show_offers_and_what_is_shared(robot: Machine, server: Machine, run: Run) -> None:
+    run("share", "robot", "/goal", "--type", STRING, "--with", "server", "--publish")
+    offers = listed(run("import", "server", "--list", "--json"))["offers"]
+    assert [(each["name"], each["from"], each["rights"], each["accepted"]) for each in offers] == [
+        ("/goal", "robot", ["publish"], False)
+    ]
+    shared = listed(run("share", "robot", "--list", "--json"))["shared"]
+    assert [(each["name"], each["node"], each["state"]) for each in shared] == [("/goal", "server", "delivered")]
+    assert "/goal  std_msgs/msg/String  server  publish" in run("share", "robot", "--list")[1]
+    assert "/goal  std_msgs/msg/String  robot  publish" in run("import", "server", "--list")[1]
+
+
+def test_a_name_is_taken_back_through_the_switch_of_the_machine(robot: Machine, server: Machine, run: Run) -> None:
+    run("share", "robot", "/goal", "--type", STRING, "--with", "server")
+    (robot.folder / "revoked").mkdir()
+    switch = "identity: proxy\ndomain: {root: proxy/root.crt}\n"
+    (robot.folder / "switch.yaml").write_text(switch)
+    code, _, errors = run("share", "robot", "/goal", "--revoke", "server")
+    assert (code, "a revocation needs a folder; state revocations: DIR" in errors) == (2, True)
+    (robot.folder / "switch.yaml").write_text(f"{switch}revocations: revoked\n")
+    code, _, errors = run("share", "robot", "/goal", "--revoke", "server")
+    assert (code, errors) == (0, "gdp: the switch does not run: the revocation spreads when it starts\n")
+    assert len(list((robot.folder / "revoked").iterdir())) == 1
+    assert listed(run("share", "robot", "--list", "--json"))["shared"][0]["state"] == "revoked"
+    assert listed(run("import", "server", "--list", "--json"))["offers"] == []
+
+
+def test_a_machine_without_an_owner_makes_one_unless_the_command_fails(
+    robot: Machine, server: Machine, run: Run
+) -> None:
+    for file in robot.owner.iterdir():
+        file.unlink()
+    robot.owner.rmdir()
+    assert run("expose", "robot", "/camera/**", "--to", "nowhere")[0] == 2
+    assert not robot.owner.exists()
+    assert run("expose", "robot", "/camera/**", "--to", "server")[0] == 0
+    assert (robot.owner / OWNER_KEY).exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["expose", "robot", "/x"], "gdp: expose: state --to NODE, or --from NODE for a name"),
+        (["expose", "robot", "/x", "--to", "nowhere"], "gdp: 'nowhere': no such node or group in the domain; there"),
+        (["expose", "robot", "/x", "--to", "server", "--kind", "param"], "gdp: 'param': expected topic, service or"),
+        (["expose", "robot", "/x", "--remove"], "gdp: /x is not exposed by 'gdp expose'"),
+        (["expose", "nowhere", "/x", "--to", "server"], "gdp: nowhere: no proxy.yaml is here; name the machine's"),
+        (["import", "robot"], "gdp: import: state a NAME, or --list"),
+        (["import", "robot", "x"], "gdp: 'x': expected a full ROS name, such as /camera/image, or a pattern"),
+        (["import", "robot", "/x", "--remove"], "gdp: /x is not accepted; 'gdp import --list' shows what is"),
+        (["share", "robot", "/x"], "gdp: share: state a NAME and --with NODE or --revoke NODE; or --list"),
+        (["share", "robot", "/x", "--with", "server"], "gdp: /x: its type is not known here: state --type"),
+        (["share", "robot", "/x", "--with", "server", "--serve"], "gdp: share: --publish is for a topic, --serve for"),
+        (["share", "robot", "/x", "--revoke", "server"], "gdp: /x is not shared with server; 'gdp share --list' shows"),
+    ],
+)
+def test_a_wrong_command_is_refused_with_one_sentence(
+    robot: Machine, server: Machine, run: Run, words: list[str], expected: str
+) -> None:
+    before = {path for path in robot.folder.rglob("*") if path.is_file()}
+    code, text, errors = run(*words)
+    assert (code, text, errors.count("\n")) == (2, "", 1)
+    assert errors.startswith(expected)
+    assert {path for path in robot.folder.rglob("*") if path.is_file()} == before
+
+
+def listed(done: tuple[int, str, str]) -> dict[str, Any]:
+    """Return the JSON object of a command that succeeded."""
+    code, text, errors = done
+    assert (code, errors) == (0, "")
+    result: dict[str, Any] = json.loads(text)
+    return result
