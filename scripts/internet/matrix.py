@@ -1,0 +1,126 @@
+"""Matrix of NATs: switches behind each kind of access, which of them reach each other, and which without the border.
+
+I/O. All switches belong to one domain with one border. For each pair, a node at the first switch calls a service at
+the second. The switch's status then says whether a direct tunnel is up.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from itertools import product
+from typing import Final, NamedTuple
+
+import gdp
+from gdp.trust.right import Right
+from internet.access import Access, allows_direct
+from internet.host import Host
+from internet.laboratory import Laboratory
+from internet.overlay import Overlay
+
+__all__ = ["Outcome", "Pair", "measure"]
+
+_LOOK_S: Final = 0.25
+_CALL_S: Final = 5.0
+_SIDES: Final = ("a", "b")
+Pair = tuple[Access, Access]
+
+
+class Outcome(NamedTuple):
+    """What a pair came to.
+
+    Attributes:
+        reached_s: when the first call was answered, in seconds since all switches were up; None: never.
+        direct_s: when the direct tunnel was seen up at the first switch; None: never.
+    """
+
+    reached_s: float | None
+    direct_s: float | None
+
+    def is_as_expected(self, pair: Pair) -> bool:
+        """Return whether the pair is connected, and directly where that is possible and nowhere else."""
+        return self.reached_s is not None and (self.direct_s is not None) is allows_direct(*pair)
+
+
+def measure(laboratory: Laboratory, kinds: Iterable[Access], *, timeout_s: float = 60.0) -> dict[Pair, Outcome]:
+    """Return the outcome of each ordered pair of these kinds.
+
+    Args:
+        timeout_s: longest wait for calls, and for the direct tunnels that are possible.
+
+    Raises:
+        LocalError: a switch does not start, for example because there is no WireGuard.
+    """
+    chosen = list(kinds)
+    pairs = list(product(chosen, chosen))
+    border = laboratory.add_host("border", laboratory.add_site("dc", Access.PUBLIC))
+    hosts = {side: [_add(laboratory, access, side) for access in chosen] for side in _SIDES}
+    everyone = [*hosts["a"], *hosts["b"]]
+    with Overlay(laboratory) as overlay, ExitStack() as stack:
+        overlay.add_switch(border, is_border=True)
+        for host in everyone:
+            overlay.add_switch(host, borders=[border])
+        overlay.start(border)
+        overlay.start_rib(border)
+        overlay.start(*everyone)
+        begun_s = time.monotonic()
+        services = {host.label: f"reach-{host.label}" for host in hosts["b"]}
+        calls = {service: [Right.CALL] for service in services.values()}
+        rights = [*([calls] * len(chosen)), *({name: [Right.SERVE]} for name in services.values())]
+        nodes = [overlay.add_node(host, each) for host, each in zip(everyone, rights, strict=True)]
+        with ThreadPoolExecutor(len(everyone)) as pool:
+            opened = pool.map(overlay.open_session, everyone, nodes)
+            sessions = [stack.enter_context(session) for session in opened]
+            for session, host in zip(sessions[len(chosen) :], hosts["b"], strict=True):
+                session.serve(services[host.label], lambda request: request.payload)
+        reached = _call_all(sessions[: len(chosen)], list(services.values()), begun_s, timeout_s)
+        direct = _wait_for_direct(overlay, hosts, pairs, begun_s, timeout_s)
+    return {pair: Outcome(reached[at], direct.get(at)) for at, pair in enumerate(pairs)}
+
+
+def _add(laboratory: Laboratory, access: Access, side: str) -> Host:
+    label = side + "".join(word[0] for word in access.value.lower().split())
+    return laboratory.add_host(label, laboratory.add_site(f"of-{label}", access))
+
+
+def _call_all(
+    clients: Sequence[gdp.Session], services: Sequence[str], begun_s: float, timeout_s: float
+) -> list[float | None]:
+    """Call each service from each client until it answers, the clients at once; return the times."""
+
+    def call_each(client: gdp.Session) -> list[float | None]:
+        return [_answered_s(client, service, begun_s, timeout_s) for service in services]
+
+    with ThreadPoolExecutor(len(clients)) as pool:
+        return [each for found in pool.map(call_each, clients) for each in found]
+
+
+def _answered_s(client: gdp.Session, service: str, begun_s: float, timeout_s: float) -> float | None:
+    while time.monotonic() < begun_s + timeout_s:
+        try:
+            client.call(service, b"?", timeout_s=_CALL_S)
+        except gdp.SessionError:  # no path to it yet
+            continue
+        return time.monotonic() - begun_s
+    return None
+
+
+def _wait_for_direct(
+    overlay: Overlay, hosts: Mapping[str, Sequence[Host]], pairs: Sequence[Pair], begun_s: float, timeout_s: float
+) -> dict[int, float]:
+    """Return by number of the pair when a direct tunnel was up; wait for those that are possible."""
+    ends = list(product(hosts["a"], hosts["b"]))
+    expected = {at for at, pair in enumerate(pairs) if allows_direct(*pair)}
+    found: dict[int, float] = {}
+    while True:
+        tunnels = {host.label: overlay.tunnels(host) for host in hosts["a"]}
+        now_s = time.monotonic() - begun_s
+        for at, (one, other) in enumerate(ends):
+            row = tunnels[one.label].get(other.label, {})
+            if row.get("direct") and row.get("up"):
+                found.setdefault(at, now_s)
+        if expected <= found.keys() or now_s > timeout_s:
+            return found
+        time.sleep(_LOOK_S)

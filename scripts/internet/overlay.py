@@ -1,0 +1,188 @@
+"""Overlay of a laboratory: a switch on each host, joined by tunnels to borders, and nodes that open sessions there.
+
+I/O. The run's directory holds a folder for each node, with its keys, its configuration and its log. Tunnels need
+``/dev/net/tun`` and wireguard-go, or WireGuard in the kernel.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+import yaml
+
+import gdp
+from gdp.control.endpoints import Endpoint
+from gdp.crypto.certificates import Role
+from gdp.errors import LocalError
+from gdp.host.processes import Process, end_all
+from gdp.metadata import Metadata
+from gdp.nodes.control_client import ask_node, find_control_socket
+from gdp.nodes.control_protocol import Command
+from gdp.nodes.endpoint_files import RECORD_SUFFIX, own_record, public_candidates
+from gdp.stores.files import public, write_all
+from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
+from gdp.stores.keyring import CARD, ROOT_CERTIFICATE
+from gdp.trust.right import Right
+from internet.host import Host
+from internet.laboratory import Laboratory
+
+__all__ = ["LISTEN", "Overlay"]
+
+LISTEN: Final = 51_820
+_PATIENCE_S: Final = 5.0
+_NODE: Final = "node"
+_RIB: Final = "rib"
+_SCRIPTS: Final = Path(__file__).resolve().parent.parent
+Yaml = Mapping[str, object]
+
+
+class Overlay:
+    """Processes of a domain; a context manager that ends them.
+
+    Attributes:
+        folder: of all keys and configuration files.
+    """
+
+    def __init__(self, laboratory: Laboratory) -> None:
+        self.folder = laboratory.run.directory
+        self._laboratory = laboratory
+        self._domain, self._owner = self.folder / "domain", self.folder / "owner"
+        self._processes: dict[str, subprocess.Popen[str]] = {}
+        self._labels: dict[str, str] = {}  # of switches, by name
+        make_domain(self._domain, "field")
+        make_owner(self._owner)
+
+    def __enter__(self) -> Overlay:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end(*self._processes)
+
+    def add_switch(
+        self, host: Host, *, is_border: bool = False, borders: Sequence[Host] = (), links: Yaml | None = None
+    ) -> None:
+        """Make the keys and the configuration of a host's switch, which ``start`` starts.
+
+        Args:
+            is_border: others dial its public addresses.
+            borders: to which it opens a tunnel. Each gets a record of this switch.
+            links: more keys of ``links:``.
+        """
+        label = host.label
+        identity = self.switch_folder(label)
+        made = make_node(identity, Role.SWITCH, label, self._domain)
+        self._labels[made.name.to_text()] = label
+        peers = self.peers_folder(label)
+        peers.mkdir()
+        lease = host.lease(host.devices[0])
+        own = [Endpoint(address.partition("/")[0], LISTEN) for address in (lease.address, lease.address6) if address]
+        endpoints = own if is_border else []
+        record = own_record(made, 1, public_candidates(endpoints))
+        write_all(self.folder / "records", {f"{label}{RECORD_SUFFIX}": public(record.wire)}, force=True)
+        for one, other in ((label, border.label) for border in borders):
+            self._copy_record(one, other)
+            self._copy_record(other, one)
+        content = {
+            "identity": str(identity),
+            "domain": self._root(),
+            "attach": [f"{_NODE}0", *([f"{_RIB}0"] if is_border else [])],
+            "links": {
+                "listen": LISTEN,
+                "public": [each.to_text() for each in endpoints],
+                "peers": str(peers),
+                **(links or {}),
+            },
+        }
+        self.config_file(label).write_text(yaml.safe_dump(content), encoding="utf-8")
+
+    def start(self, *hosts: Host) -> None:
+        """Start the switches of these hosts; return when all are ready. Raises ``LocalError``: one does not start."""
+        self._start({host.label: (host, "gdp.cli.switch", self.config_file(host.label)) for host in hosts})
+
+    def start_rib(self, host: Host) -> None:
+        """Start the domain's RIB on a border; return when it is ready."""
+        identity = self.folder / _RIB
+        make_node(identity, Role.RIB, _RIB, self._domain)
+        path = self.folder / f"{_RIB}.yaml"
+        content = {"identity": str(identity), "domain": self._root(), "iface": f"{_RIB}0"}
+        path.write_text(yaml.safe_dump(content), encoding="utf-8")
+        self._start({_RIB: (host, "gdp.cli.rib", path)})
+
+    def end(self, *labels: str) -> None:
+        """End the switches of these hosts, or the RIB, at once."""
+        ending = [self._processes.pop(label) for label in labels]
+        end_all([Process.from_pid(each.pid) for each in ending if each.poll() is None], _PATIENCE_S)
+        for process in ending:
+            process.communicate()
+
+    def add_node(self, host: Host, rights: Mapping[str, Collection[Right]]) -> Path:
+        """Make the keys of the host's node, with rights on names; return its directory."""
+        node = self.folder / f"{host.label}-{_NODE}"
+        make_node(node, Role.PROXY, node.name, self._domain)
+        for name, given in rights.items():
+            kind = "service" if {Right.SERVE, Right.CALL} & set(given) else "topic"
+            metadata = Metadata({"kind": kind, "name": name})
+            install_delegation(node, delegate(self._owner, node / CARD, metadata, list(given)))
+        return node
+
+    def open_session(self, host: Host, node: Path) -> gdp.Session:
+        """Open a session of this process at the host's switch."""
+        return host.space.inside(lambda: gdp.open(node, iface=f"{_NODE}0", root=self._domain / ROOT_CERTIFICATE))
+
+    def tunnels(self, host: Host) -> dict[str, dict[str, object]]:
+        """Return the status of the tunnels of a host's switch, by the label of the peer's host."""
+        answer = ask_node(find_control_socket(self.switch_folder(host.label)), Command.STATUS, _PATIENCE_S).result
+        rows = answer["links"]
+        assert isinstance(rows, list)
+        return {self._labels[str(row["peer"])]: row for row in rows}
+
+    def switch_folder(self, label: str) -> Path:
+        """Return the directory of a switch's keys."""
+        return self.folder / f"{label}-switch"
+
+    def peers_folder(self, label: str) -> Path:
+        """Return the folder with the endpoint records that a switch reads."""
+        return self.folder / f"{label}-peers"
+
+    def config_file(self, label: str) -> Path:
+        """Return the ``switch.yaml`` of a host."""
+        return self.folder / f"{label}.yaml"
+
+    def log(self, label: str) -> str:
+        """Return what a process has logged."""
+        return (self.folder / f"{label}.log").read_text(encoding="utf-8")
+
+    def _copy_record(self, whose: str, to: str) -> None:
+        name = f"{whose}{RECORD_SUFFIX}"
+        (self.peers_folder(to) / name).write_bytes((self.folder / "records" / name).read_bytes())
+
+    def _root(self) -> Yaml:
+        return {"root": str(self._domain / ROOT_CERTIFICATE)}
+
+    def _start(self, commands: Mapping[str, tuple[Host, str, Path]]) -> None:
+        paths = os.pathsep.join((str(_SCRIPTS.parent), str(_SCRIPTS)))
+        for label, (host, module, config) in commands.items():
+            argv = [sys.executable, "-m", module, "--json", "--config", str(config)]
+            with (self.folder / f"{label}.log").open("ab") as log:
+                process = self._processes[label] = subprocess.Popen(
+                    host.command(argv),
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.PIPE,
+                    stderr=log,
+                    text=True,
+                    env={**os.environ, "PYTHONPATH": paths},
+                    start_new_session=True,
+                )
+            self._laboratory.run.note_process(process.pid)
+        for label in commands:
+            stdout = self._processes[label].stdout
+            assert stdout is not None
+            line = stdout.readline()
+            if not line or json.loads(line).get("event") != "ready":
+                raise LocalError(f"{label} does not start: {line}{self.log(label)[-2_000:]}")
