@@ -156,6 +156,91 @@ def test_two_devices_lead_to_one_peer(sites: tuple[Site, Site]) -> None:
     assert f"{one.ifname}b" in one.ip("-6", "route", "show", two.inner)
 
 
+@pytest.fixture
+def two_uplinks(sites: tuple[Site, Site]) -> tuple[Site, Site]:
+    """Sites with a second cable ``u1``; the first reaches an address of the second over both, and prefers ``u0``."""
+    one, two = sites
+    one.ip("link", "add", "u1", "type", "veth", "peer", "name", "u1", "netns", f"/proc/{os.getpid()}/fd/{two.fd}")
+    for site, address in ((one, "10.7.0.1"), (two, "10.7.0.2")):
+        site.ip("address", "add", f"{address}/24", "dev", "u1")
+        site.ip("link", "set", "u1", "up")
+    two.ip("address", "add", "10.5.0.1/32", "dev", "lo")
+    one.ip("route", "add", "default", "via", "10.9.0.2", "metric", "100")
+    one.ip("route", "add", "default", "via", "10.7.0.2", "metric", "200")
+    two.endpoint = Endpoint("10.5.0.1", PORT)
+    return one, two
+
+
+@pytest.mark.parametrize(("uplink", "source"), [("u0", "10.9.0.1"), ("u1", "10.7.0.1")])
+def test_a_tunnel_over_an_uplink_leaves_by_it(two_uplinks: tuple[Site, Site], uplink: str, source: str) -> None:
+    one, two = two_uplinks
+    first, second = one.open(uplink=uplink), two.open()
+    two.connect(second, one, is_dialling=False)
+    one.connect(first, two, is_dialling=True)
+    sending, receiving = one.frames(), two.frames()
+    until(crosses(sending, receiving), first, second)
+    until(crosses(receiving, sending), first, second)
+    assert second.peers()[one.public_key].endpoint == Endpoint(source, PORT)
+    first.close()
+    assert "fwmark" not in one.ip("rule")
+    assert "table" not in one.ip("route", "show", "table", "all", "type", "unreachable")
+
+
+def test_a_tunnel_over_an_uplink_that_is_down_does_not_use_the_other(two_uplinks: tuple[Site, Site]) -> None:
+    one, two = two_uplinks
+    first = one.open(uplink="u1")
+
+    def is_routed() -> bool:
+        try:
+            return route_mtu(two.endpoint, first.fwmark) > 0
+        except LocalError:
+            return False
+
+    with one.entered():
+        assert is_routed()
+        one.ip("link", "set", "u1", "down")
+        until(lambda: not is_routed())
+        assert route_mtu(two.endpoint) == 1500
+        one.ip("link", "set", "u1", "up")
+        one.ip("route", "add", "default", "via", "10.7.0.2", "metric", "200")
+        until(is_routed)
+
+
+def test_a_killed_owner_leaves_no_rule_of_its_uplink(two_uplinks: tuple[Site, Site]) -> None:
+    one, _ = two_uplinks
+    words = (
+        f"from gdp.ports.tunnel.wireguard import open_wireguard; import time; open_wireguard(ifname={one.ifname!r},"
+        f" private_key=bytes(32), listen_port=0, inner={one.inner!r}, mtu=1440, alias={one.alias!r}, uplink='u1');"
+        " print('open', flush=True); time.sleep(60)"
+    )
+    with one.entered():
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        with subprocess.Popen([sys.executable, "-c", words], stdout=subprocess.PIPE, env=environment) as owner:
+            assert owner.stdout is not None
+            assert owner.stdout.readline() == b"open\n"
+            assert "fwmark" in one.ip("rule")
+            owner.kill()
+    until(lambda: "fwmark" not in one.ip("rule") and not one.has(one.ifname))
+
+
+def test_a_restarted_peer_is_reached_again_at_once(sites: tuple[Site, Site], ends: Ends) -> None:
+    one, two = sites
+    until(crosses(one.frames(), two.frames()), *ends)
+    before = ends[1].peers()[one.public_key].handshake_unix_s
+    with one.entered():
+        ends[0].remove_peer(two.public_key)  # its session and where the peer is are lost
+        ends[0].set_peer(two.public_key, inner=two.inner, endpoint=None, keepalive_s=0)
+    begun_s = time.monotonic()
+
+    def is_new() -> bool:
+        ends[1].retry_handshake(one.public_key)
+        time.sleep(0.5)  # as often as a dialler tries
+        return ends[1].peers()[one.public_key].handshake_unix_s > before
+
+    until(is_new, *ends)
+    assert time.monotonic() - begun_s < 10.0  # WireGuard by itself would wait 15 seconds
+
+
 def test_a_stranger_gets_no_answer(sites: tuple[Site, Site], ends: Ends) -> None:
     one, two = sites
     other = Site(9, one.ifname[1:-1])

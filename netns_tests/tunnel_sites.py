@@ -60,8 +60,8 @@ class Site:
         with self.entered():
             Path("/proc/sys/net", setting).write_text(value)
 
-    def open(self, listen_port: int = PORT, ifname: str = "") -> WireGuardDevice:
-        """Open the WireGuard device."""
+    def open(self, listen_port: int = PORT, ifname: str = "", uplink: str = "") -> WireGuardDevice:
+        """Open a WireGuard device."""
         with self.entered():
             device = open_wireguard(
                 ifname=ifname or self.ifname,
@@ -71,6 +71,7 @@ class Site:
                 mtu=1440,
                 alias=self.alias,
                 backend="wireguard-go",
+                uplink=uplink,
             )
         self._stack.callback(device.close)
         return device

@@ -86,6 +86,7 @@ def open_underlays(config: LinksConfig, identity: Identity) -> Iterator[tuple[Wi
                 mtu=wireguard_mtu,
                 alias=_alias(identity.name),
                 backend=config.backend,
+                uplink=config.uplinks[uplink] if config.uplinks else "",
             )
             stack.callback(device.close)
             devices.append(device)
@@ -153,7 +154,7 @@ class Tunnels:
         underlay = self._underlays[tunnel.uplink]
         ifname, key = tunnel_ifname(self._me, tunnel), record.keys[tunnel.peer_uplink]
         inner = inner_address(tunnel.peer, tunnel.peer_uplink)
-        wireguard_mtu, mtu = _mtus(endpoint)
+        wireguard_mtu, mtu = _mtus(endpoint, underlay.fwmark)
         try:
             underlay.set_peer(key, inner=inner, endpoint=endpoint, keepalive_s=keepalive_s)
             self._widen(tunnel.uplink, wireguard_mtu)
@@ -271,7 +272,7 @@ class Tunnels:
         )
 
     def _follow_mtu(self, tunnel: TunnelId, found: Tunnel) -> None:
-        wireguard_mtu, mtu = _mtus(found.endpoint)
+        wireguard_mtu, mtu = _mtus(found.endpoint, self._underlays[tunnel.uplink].fwmark)
         if (wireguard_mtu, mtu) == (found.wireguard_mtu, found.mtu):
             return
         found.wireguard_mtu, found.mtu = wireguard_mtu, mtu
@@ -289,12 +290,16 @@ class Tunnels:
         self._underlays[uplink].set_mtu(max([wireguard_mtu, *others]))
 
 
-def _mtus(endpoint: Endpoint | None) -> tuple[int, int]:
-    """Return the MTU of WireGuard and of VXLAN towards an endpoint; without a route, those of usual links."""
+def _mtus(endpoint: Endpoint | None, fwmark: int) -> tuple[int, int]:
+    """Return the MTU of WireGuard and of VXLAN towards an endpoint; without a route, those of usual links.
+
+    Args:
+        fwmark: of the packets of the uplink.
+    """
     if endpoint is None:
         return tunnel_mtu(_OUTER_MTU, is_ipv6=True)
     try:
-        outer = route_mtu(endpoint)
+        outer = route_mtu(endpoint, fwmark)
     except LocalError:
         outer = _OUTER_MTU
     return tunnel_mtu(outer, is_ipv6=":" in endpoint.address)

@@ -2,7 +2,7 @@
 
 I/O; a command that ``keeper_process`` starts before the owner confines itself::
 
-    python -m gdp.ports.tunnel.keeper IFNAME ALIAS BACKEND OWNER_PID
+    python -m gdp.ports.tunnel.keeper IFNAME ALIAS BACKEND OWNER_PID [UPLINK]
 
 Standard input is a socket pair to the owner. The keeper writes one JSON object a line (``Report``). It ends when the
 owner's end is closed or the owner dies, and then nothing of the device is left. Without WireGuard in the kernel it
@@ -48,6 +48,7 @@ from gdp.ports.tunnel.devices import (
     without_addresses,
 )
 from gdp.ports.tunnel.uapi import SOCKET_FOLDER, UserspaceControl, socket_path
+from gdp.ports.tunnel.uplink_routes import UplinkRoutes, mark_of
 
 __all__ = ["main"]
 
@@ -124,10 +125,15 @@ class _Owner:
 
     def __init__(self) -> None:
         self._socket = socket.socket(fileno=os.dup(0))
+        self._watched: dict[int, Callable[[], None]] = {}
 
     def fileno(self) -> int:
         """Return its descriptor; it is readable once the owner is gone."""
         return self._socket.fileno()
+
+    def watch(self, fd: int, ready: Callable[[], None]) -> None:
+        """Call ``ready`` from within ``wait`` whenever a descriptor is readable."""
+        self._watched[fd] = ready
 
     def forget(self) -> None:
         """Treat the owner as gone: it died while another process holds its end of the socket pair."""
@@ -141,20 +147,27 @@ class _Owner:
     def wait(self, *others: int, timeout_s: float | None = None) -> bool:
         """Wait for the owner's end or for one of the other descriptors; return whether the owner is still there."""
         poll = select.poll()
-        for fd in (self.fileno(), *others):
+        for fd in (self.fileno(), *others, *self._watched):
             poll.register(fd, select.POLLIN)
-        ready = {fd for fd, _ in poll.poll(None if timeout_s is None else max(timeout_s, 0.0) * 1000)}
-        return self.fileno() not in ready
+        end_s = None if timeout_s is None else time.monotonic() + timeout_s
+        while True:
+            ready = {fd for fd, _ in poll.poll(None if end_s is None else max(end_s - time.monotonic(), 0.0) * 1000)}
+            for fd in ready & self._watched.keys():
+                self._watched[fd]()
+            if self.fileno() in ready:
+                return False
+            if not ready or ready - self._watched.keys():
+                return True
 
 
 def main(words: Sequence[str]) -> None:
     """Make the device and keep it until the owner ends.
 
     Args:
-        words: name of the device, alias of the owner's devices, ``auto``, ``kernel`` or ``wireguard-go``, and the
-            owner's process id.
+        words: name of the device, alias of the owner's devices, ``auto``, ``kernel`` or ``wireguard-go``, the owner's
+            process id, and the device that outer packets leave by, if routing does not decide that.
     """
-    ifname, alias, backend, owner_pid = words[0], words[1], words[2], int(words[3])
+    ifname, alias, backend, owner_pid, uplinks = words[0], words[1], words[2], int(words[3]), words[4:]
     owner = _Owner()
     signal.signal(signal.SIGTERM, lambda *_: owner.forget())
     prctl(_DEATH_SIGNAL, signal.SIGTERM)
@@ -163,6 +176,8 @@ def main(words: Sequence[str]) -> None:
     prctl(_NO_NEW_PRIVS, 1)
     keeper = _Keeper(ifname, alias, owner)
     try:
+        for uplink in uplinks:
+            keeper.follow(uplink)
         keeper.run(backend)
     except RefusedError as error:
         keeper.owner.report(event="failed", text=f"tunnel {ifname}: the device cannot be made: {refusal_text(error)}")
@@ -184,6 +199,23 @@ class _Keeper:
         self._tun_flags = 0
         self._child: _Child | None = None
         self._kernel_ifindex = 0
+        self._routes: UplinkRoutes | None = None
+        self._early: list[str] = []  # warnings before the device was ready
+
+    def follow(self, uplink: str) -> None:
+        """Let the device's packets leave by an uplink, until it is closed."""
+        self._routes = routes = UplinkRoutes(uplink, mark_of(self._ifname))
+        if routes.warning:
+            self._early.append(routes.warning)
+
+        def sync() -> None:
+            """Follow a change of routes."""
+            try:
+                routes.sync()
+            except LocalError as error:
+                self.owner.report(event="warning", text=f"routes of {uplink}: {error}")
+
+        self.owner.watch(routes.fileno(), sync)
 
     def run(self, backend: str) -> None:
         """Make the device, report it, and keep it until the owner ends."""
@@ -191,7 +223,7 @@ class _Keeper:
             _wait_until(lambda: not _is_listening(self._ifname))
         reason = "" if backend == "wireguard-go" else self._make_kernel_device()
         if self._kernel_ifindex:
-            self.owner.report(event="ready", backend="kernel", reason="")
+            self._report_ready("kernel", "")
             self.owner.wait()
             return
         if backend == "kernel":
@@ -200,7 +232,7 @@ class _Keeper:
         self._tun_flags = self._probe(program)
         self._make_tun()
         self._start(program)
-        self.owner.report(event="ready", backend=_PROGRAM, reason=reason or "the configuration states it")
+        self._report_ready(_PROGRAM, reason or "the configuration states it")
         self._supervise(program)
 
     def close(self) -> None:
@@ -213,6 +245,13 @@ class _Keeper:
             os.close(self._tun)
         if self._kernel_ifindex:
             remove_device(self._kernel_ifindex)
+        if self._routes is not None:
+            self._routes.close()
+
+    def _report_ready(self, backend: str, reason: str) -> None:
+        self.owner.report(event="ready", backend=backend, reason=reason)
+        for text in self._early:
+            self.owner.report(event="warning", text=text)
 
     def _make_kernel_device(self) -> str:
         """Make the device in the kernel; return why that is not possible."""

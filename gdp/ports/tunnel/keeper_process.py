@@ -34,7 +34,7 @@ class Report:
     """Report of a keeper.
 
     Args:
-        event: ``ready``, ``failed``, ``died`` or ``restarted``; ``lost`` is the end of the keeper itself.
+        event: ``ready``, ``failed``, ``died``, ``restarted`` or ``warning``; ``lost`` is the end of the keeper itself.
         backend: of ``ready``.
         text: why the device is not the kernel's (``ready``), or what happened.
         is_same: of ``restarted``: the device is still the same, so its addresses and routes stayed.
@@ -53,18 +53,21 @@ class KeeperProcess:
         ifname: name of the device.
         alias: of all devices of this switch.
         backend: ``auto``, ``kernel`` or ``wireguard-go``.
+        uplink: device that outer packets leave by; empty: routing decides.
 
     Raises:
         LocalError: the device cannot be made; the text says why and what to do.
     """
 
-    def __init__(self, ifname: str, alias: str, backend: str) -> None:
+    def __init__(self, ifname: str, alias: str, backend: str, uplink: str = "") -> None:
         self._socket, theirs = socket.socketpair()
         self._buffer = b""
         self._is_lost = False
+        self._waiting: list[Report] = []
+        words = [ifname, alias, backend, str(os.getpid()), *([uplink] if uplink else [])]
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", _MODULE, ifname, alias, backend, str(os.getpid())],
+                [sys.executable, "-m", _MODULE, *words],
                 stdin=theirs.fileno(),
                 stdout=subprocess.DEVNULL,
                 cwd=_ROOT,  # Python imports from the working directory, which others may be able to write to
@@ -77,7 +80,7 @@ class KeeperProcess:
             reports: list[Report] = []
             while not reports:
                 reports = self._received()
-            first = reports[0]
+            first, *self._waiting = reports
         self._socket.setblocking(False)
         if first.event != "ready":
             self.close()
@@ -95,10 +98,11 @@ class KeeperProcess:
 
     def reports(self) -> list[Report]:
         """Return the reports since the last call, without waiting."""
+        waiting, self._waiting = self._waiting, []
         try:
-            return [] if self._is_lost else self._received()
+            return waiting if self._is_lost else waiting + self._received()
         except BlockingIOError:
-            return []
+            return waiting
 
     def close(self) -> None:
         """End the keeper, and return when the device is gone."""

@@ -42,14 +42,14 @@ from gdp.ports.tunnel.keeper_process import KeeperProcess
 from gdp.ports.tunnel.kernel_control import KernelControl
 from gdp.ports.tunnel.path_mtu import RouteMonitor
 from gdp.ports.tunnel.uapi import UserspaceControl
+from gdp.ports.tunnel.uplink_routes import ADDRESS_GROUPS, ROUTE_GROUPS, mark_of
 
 __all__ = ["Backend", "PeerState", "WireGuardDevice", "open_wireguard"]
 
 log = logging.getLogger(__name__)
 
 Backend = Literal["auto", "kernel", "wireguard-go"]
-_ADDRESS_GROUPS: Final = 0x10 | 0x100  # RTMGRP_IPV4_IFADDR, RTMGRP_IPV6_IFADDR
-_ROUTE_GROUPS: Final = 0x40 | 0x400  # RTMGRP_IPV4_ROUTE, RTMGRP_IPV6_ROUTE
+_SILENT_S: Final = 2.0  # a neighbour sends hellos more often than this
 _SESSION_S: Final = 180.0  # REJECT_AFTER_TIME: WireGuard paper, section 6.1
 
 
@@ -69,6 +69,7 @@ class WireGuardDevice:
         ifname: name of the device.
         backend: ``kernel`` or ``wireguard-go``.
         reason: why the device is not the kernel's; empty if it is.
+        fwmark: mark of its outer packets, by which ``route_mtu`` finds their route; 0: none.
     """
 
     def __init__(
@@ -92,13 +93,16 @@ class WireGuardDevice:
         self._mtu = mtu
         self._keeper = keeper
         self._control = control
-        self._fwmark = fwmark
+        self.fwmark = fwmark
         self._peers: dict[bytes, _Peer] = {}
         self._states: dict[bytes, PeerState] = {}
+        self._heard: dict[
+            bytes, tuple[int, float]
+        ] = {}  # bytes received, and the monotonic second of their last change
         with ExitStack() as opened:
             self._routes = RouteMonitor(fwmark)
             opened.callback(self._routes.close)
-            self._news = opened.enter_context(listen(_ADDRESS_GROUPS | _ROUTE_GROUPS))
+            self._news = opened.enter_context(listen(ADDRESS_GROUPS | ROUTE_GROUPS))
             self._epoll = opened.enter_context(select.epoll())
             self._epoll.register(keeper, select.EPOLLIN)
             self._epoll.register(self._news, select.EPOLLIN)
@@ -149,22 +153,24 @@ class WireGuardDevice:
         """Remove a peer with its session and its route; does nothing if there is none."""
         peer = self._peers.pop(public_key, None)
         self._states.pop(public_key, None)
+        self._heard.pop(public_key, None)
         if peer is not None:
             self._apply(Change(peers=(PeerChange(public_key=public_key, is_removed=True),)))
             if all(other.inner != peer.inner for other in self._peers.values()):
                 self._with_device(lambda device: remove_route(device.ifindex, peer.inner))
 
     def retry_handshake(self, public_key: bytes) -> None:
-        """Send to a peer at once: a handshake if it has no session, else a keepalive; does nothing without a peer.
+        """Send to a peer at once: a handshake, or a keepalive if its session works; does nothing without a peer.
 
-        A device limits itself to one handshake in five seconds for each peer. A peer without a session is therefore
-        made again.
+        A device limits itself to one handshake in five seconds for each peer, and believes in a session for 15 seconds
+        after the other end lost it. A peer without a session, or silent for two seconds, is therefore made again.
         """
         peer = self._peers.get(public_key)
         if peer is None:
             return
         state = self.peers()[public_key]
-        if time.time() - state.handshake_unix_s > _SESSION_S:
+        is_silent = time.monotonic() - self._heard[public_key][1] > _SILENT_S
+        if is_silent or time.time() - state.handshake_unix_s > _SESSION_S:
             removed = PeerChange(public_key=public_key, is_removed=True)
             self._apply(Change(peers=(removed, *self._restored(public_key))))
         else:
@@ -177,6 +183,10 @@ class WireGuardDevice:
         except ControlLostError:
             found = {key: state._replace(handshake_unix_s=0.0) for key, state in self._states.items()}
         self._states = {key: found.get(key, PeerState(peer.endpoint, 0.0, 0, 0)) for key, peer in self._peers.items()}
+        now_s = time.monotonic()
+        for key, state in self._states.items():
+            if key not in self._heard or self._heard[key][0] != state.received_bytes:
+                self._heard[key] = state.received_bytes, now_s
         return dict(self._states)
 
     def path_mtu(self, public_key: bytes) -> int | None:
@@ -213,6 +223,8 @@ class WireGuardDevice:
             elif report.event == "lost":
                 self._epoll.unregister(self._keeper)
                 log.error("the keeper of a tunnel device died: start the switch again ifname=%s", self.ifname)
+            elif report.event == "warning":
+                log.warning("tunnel device ifname=%s: %s", self.ifname, report.text)
             else:
                 log.warning("wireguard-go ended ifname=%s reason=%s", self.ifname, report.text)
         if self._has_news():
@@ -243,7 +255,7 @@ class WireGuardDevice:
         peers = tuple(change for key in self._peers for change in self._restored(key))
         self._with_device(self._prepare)
         self._control.apply(
-            Change(private_key=self._private_key, listen_port=self._port, fwmark=self._fwmark, peers=peers)
+            Change(private_key=self._private_key, listen_port=self._port, fwmark=self.fwmark, peers=peers)
         )
 
     def _configure_again(self) -> None:
@@ -323,6 +335,7 @@ def open_wireguard(
     alias: str,
     backend: Backend = "auto",
     fwmark: int = 0,
+    uplink: str = "",
 ) -> WireGuardDevice:
     """Make a WireGuard device and switch it on; one that a dead run of this switch left is replaced.
 
@@ -334,12 +347,13 @@ def open_wireguard(
         mtu: in bytes, at least 1280.
         alias: identifies the devices of this switch.
         fwmark: mark of the outer packets; 0: none.
+        uplink: device that outer packets leave by; they have a mark of their own then. Empty: routing decides.
 
     Raises:
         LocalError: there is no WireGuard of either kind, the port is taken, a foreign device has this name, or this
             user lacks the rights. Nothing is left then.
     """
-    keeper = KeeperProcess(ifname, alias, backend)
+    keeper = KeeperProcess(ifname, alias, backend, uplink)
     try:
         control: WireGuardControl = (
             KernelControl(ifname) if keeper.ready.backend == "kernel" else UserspaceControl(ifname)
@@ -352,7 +366,7 @@ def open_wireguard(
             mtu=mtu,
             keeper=keeper,
             control=control,
-            fwmark=fwmark,
+            fwmark=mark_of(ifname) if uplink else fwmark,
         )
     except BaseException:
         keeper.close()
