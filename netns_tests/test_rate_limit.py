@@ -19,7 +19,7 @@ from netns_tests.spaces import Space
 pytestmark = pytest.mark.netns
 
 MAC, PEER_MAC = bytes([2, 0, 0, 0, 0, 1]), bytes([2, 0, 0, 0, 0, 2])
-RATE = 100_000
+RATE = 20_000
 FRAME = PEER_MAC + MAC + ETHERTYPE.to_bytes(2, "big") + bytes(1_000)
 NUMBER = 200
 INTERACTIVE = 6  # TC_PRIO_INTERACTIVE, of the sockets for control and urgent frames
