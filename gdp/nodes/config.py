@@ -34,6 +34,8 @@ from gdp.limits import (
     KEEPALIVE_MS,
     LEASE_MAX_S,
     LEASE_MIN_S,
+    RELAY_RATE_MAX,
+    RELAY_RATE_MIN,
     RIB_NAMES_PER_SENDER,
     RIB_WATCHES_MAX,
     TABLE_MAX,
@@ -128,7 +130,8 @@ class LinksConfig(Section):
     """Tunnels across IP networks: VXLAN inside WireGuard, one for each peer.
 
     ``peers`` holds an endpoint record for each peer, in files ``*.endpoints``; files may come and go. ``public`` states
-    where this switch can be reached from everywhere: it is a border, and others dial it.
+    where this switch can be reached from everywhere: it is a border, and others dial it. A border limits whom it relays
+    for to the labels and roles of ``relay_for``, and what it sends into each tunnel to ``relay_rate`` bytes per second.
     """
 
     listen: int = Field(default=LISTEN_DEFAULT, ge=0, le=65_535)
@@ -138,6 +141,8 @@ class LinksConfig(Section):
     direct: bool = True
     backend: TunnelBackend = "auto"
     keepalive_s: int = Field(default=25, ge=1, le=65_535)
+    relay_for: Annotated[tuple[str, ...], Unique] = ()
+    relay_rate: int | None = Field(default=None, ge=RELAY_RATE_MIN, le=RELAY_RATE_MAX)
 
     def public_endpoints(self) -> tuple[Endpoint, ...]:
         """Return the stated endpoints."""

@@ -72,7 +72,9 @@ class TunnelLinks:
         self._me = identity.name
         self._policy = policy
         self._switch = switch
-        self._tunnels = Tunnels(identity=identity, switch=switch, runtime=runtime, underlays=underlays)
+        self._tunnels = Tunnels(
+            identity=identity, switch=switch, runtime=runtime, underlays=underlays, relay_rate=config.relay_rate
+        )
         self._own = OwnEndpoints(config=config, identity=identity, switch=switch, tunnels=self._tunnels)
         self._files: dict[Path, tuple[int, int]] = {}  # size and time of what was read
         self._configured: dict[Path, _Peer] = {}
@@ -146,6 +148,7 @@ class TunnelLinks:
             record, member = EndpointRecord.verified(read_public(path), self._policy, now.unix_s)
             if record.name == self._me:
                 raise LocalError("it is this switch's own record")
+            self._check_served(member)
         except (GdpError, OSError) as error:
             log.error("endpoint record not taken file=%s reason=%s", path, error)
             self._configured.pop(path, None)
@@ -156,6 +159,12 @@ class TunnelLinks:
         for tunnel in planned_tunnels(len(self._tunnels.underlays), record):
             self._dialers[tunnel] = Dialer.to(record, tunnel.peer_uplink)
         self._configured[path] = _Peer(record=record, member=member)
+
+    def _check_served(self, member: Membership) -> None:
+        """Return if this switch has tunnels to a member. Raises ``LocalError``: ``relay_for`` leaves it out."""
+        served = self._config.relay_for
+        if served and member.label not in served and member.role.value not in served:
+            raise LocalError(f"neither its label {member.label} nor its role {member.role.value} is in links.relay_for")
 
     def _follow_configured(self, now: Timestamps) -> None:
         """Open and close the tunnels to configured peers, and dial those that do not answer."""
@@ -203,6 +212,8 @@ class TunnelLinks:
     def _act(self, now: Timestamps) -> None:
         """Do what the switch decided about direct tunnels."""
         for action in self._switch.poll_tunnel_actions(now):
+            if not isinstance(action, Close) and not self._is_served(action.record, now):
+                continue
             match action:
                 case Close(peer):
                     self._tunnels.close_peer(peer, now.mono_s)
@@ -220,3 +231,11 @@ class TunnelLinks:
                         is_direct=True,
                     ):
                         self._switch.set_tunnel_port(self._tunnels.all[tunnel].port, record.name)
+
+    def _is_served(self, record: EndpointRecord, now: Timestamps) -> bool:
+        try:
+            self._check_served(self._policy.verify_membership(record.membership, now.unix_s))
+        except GdpError as error:
+            log.debug("no direct tunnel peer=%s reason=%s", record.name.short, error)
+            return False
+        return True

@@ -25,6 +25,7 @@ from gdp.names import Name
 from gdp.nodes.config import LinksConfig
 from gdp.nodes.runtime import Runtime
 from gdp.ports.tunnel.path_mtu import route_mtu, tunnel_mtu
+from gdp.ports.tunnel.rate_limit import limit_rate
 from gdp.ports.tunnel.vxlan import make_vxlan, remove_link, set_link_mtu
 from gdp.ports.tunnel.wireguard import PeerState, WireGuardDevice, open_wireguard
 from gdp.sansio import Timestamps
@@ -105,15 +106,23 @@ class Tunnels:
 
     Args:
         underlays: a WireGuard device for each uplink.
+        relay_rate: bytes per second into each tunnel; None: unlimited.
     """
 
     def __init__(
-        self, *, identity: Identity, switch: SwitchCore, runtime: Runtime, underlays: tuple[WireGuardDevice, ...]
+        self,
+        *,
+        identity: Identity,
+        switch: SwitchCore,
+        runtime: Runtime,
+        underlays: tuple[WireGuardDevice, ...],
+        relay_rate: int | None = None,
     ) -> None:
         self._me = identity.name
         self._switch = switch
         self._runtime = runtime
         self._underlays = underlays
+        self._relay_rate = relay_rate
         self._tunnels: dict[TunnelId, Tunnel] = {}
         self._device_look_s = float("-inf")
         self._closed: deque[tuple[float, int]] = deque()  # ports that the control plane may still name
@@ -270,6 +279,8 @@ class Tunnels:
             mtu=mtu,
             alias=_alias(self._me),
         )
+        if self._relay_rate is not None:
+            limit_rate(ifname, self._relay_rate)
 
     def _follow_mtu(self, tunnel: TunnelId, found: Tunnel) -> None:
         wireguard_mtu, mtu = _mtus(found.endpoint, self._underlays[tunnel.uplink].fwmark)

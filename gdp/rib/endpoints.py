@@ -181,7 +181,7 @@ class RibEndpoints:
         """Respond to a proven switch or RIB with the records that it lacks, and watch them for it.
 
         Raises:
-            StatementError: it may not ask, or asks too often.
+            StatementError: it may not ask, or asks too often; QUOTA after the response, there are too many watches.
         """
         query = EndpointQuery.from_fields(statement.fields)
         is_peer = member.role is Role.RIB and member.domain == self._policy.own
@@ -194,14 +194,20 @@ class RibEndpoints:
             self._send(member.name, [kept.record.wire for kept in wanted if self._is_valid(kept, now)])
             return
         asker = Asker(member.name, member.domain, False)
-        lacked = []
+        lacked: list[bytes] = []
+        refused: StatementError | None = None
         for name, sequence in query.known:
             kept = self._kept.get(name)
-            if query.watch_s > 0:
-                self._watches.add(name, asker, now.mono_s + query.watch_s)
             if kept is not None and kept.record.sequence > sequence and self._may_tell(kept, asker):
                 lacked += [kept.record.wire] if self._is_valid(kept, now) else []
+            try:
+                if query.watch_s > 0:
+                    self._watches.add(name, asker, now.mono_s + query.watch_s)
+            except StatementError as error:
+                refused = error  # without a watch it learns changes by its next query
         self._send(member.name, lacked)
+        if refused is not None:
+            raise refused
 
     def recheck(self, now: Timestamps) -> None:
         """Drop records whose membership is no longer valid: a certificate was revoked."""

@@ -238,3 +238,12 @@ def test_records_from_a_rib_of_another_domain_are_refused() -> None:
     give(core, Relay(record().wire, (), by.membership).to_wire(by.name, by.key), by)
     assert core.endpoints == 0
     assert core.refusals[DropReason.WRONG_DOMAIN] == 2
+
+
+def test_a_query_is_answered_although_there_are_too_many_watches() -> None:
+    core = RibCore(RIB, Policy(SCHOOL.root, [CLOUD.root]), MemoryStore(), RibSettings(watches=1))
+    wire = record().wire
+    give(core, wire)
+    known = tuple((Name(bytes([number]) * 32), 0) for number in range(1, 9))
+    assert records_for(give(core, query(TWO, *known, (ONE.name, 0), watch_s=30.0), TWO), TWO) == [wire]
+    assert core.refusals[DropReason.QUOTA] == 1
