@@ -60,8 +60,8 @@ class RelayBorder(Section):
 class RelayConfig(Section):
     """``relay.yaml``: ``server`` on a border, ``borders`` on a member.
 
-    ``identity`` is that of the switch whose frames are relayed, and ``switch_socket`` its ``control_socket``, where
-    that is configured.
+    ``identity`` is that of the switch whose frames are relayed. ``switch_socket`` is its ``control_socket``, where that
+    is configured.
     """
 
     identity: Directory
