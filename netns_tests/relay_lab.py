@@ -152,15 +152,9 @@ class RelayLab:
         return processes
 
     def start_switch(self, node: Node, **more: object) -> subprocess.Popen[bytes]:
-        """Start the switch of one machine, whose only link is the relay's device."""
-        device = self.border_device if node is self.border else self.member_device
-        config = node.write(
-            "switch.yaml",
-            ports=[{"iface": device, "optional": True, "cost": 100}],
-            control_socket=f"{node.label}-switch.sock",
-            data_plane="raw",
-            **more,
-        )
+        """Start the switch of one machine; its only links are the relay's devices."""
+        socket = f"{node.label}-switch.sock"
+        config = node.write("switch.yaml", relay=True, control_socket=socket, data_plane="raw", **more)
         return node.start("gdp.cli.switch", config)
 
     def neighbours(self, node: Node) -> int:

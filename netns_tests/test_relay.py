@@ -121,6 +121,22 @@ def test_a_change_of_address_is_followed_without_waiting_for_a_timeout(lab: Rela
     assert took_s < HEAL_S
 
 
+def test_a_relay_on_standby_waits_for_a_tunnel_and_then_connects(lab: RelayLab) -> None:
+    lab.start_relay(lab.border)
+    lab.start_relay(lab.member, standby=True)
+    assert lab.relay_status(lab.member)["borders"][0]["state"] == "standby"
+    assert wait_for(lab.is_up) > 1.0, "it gave the tunnel a moment"
+
+
+def test_a_port_that_the_configuration_names_is_not_added_twice(lab: RelayLab) -> None:
+    lab.start_relays()
+    lab.start_switch(lab.border)
+    ports = [{"iface": lab.member_device, "optional": True, "cost": 100}]
+    lab.start_switch(lab.member, ports=ports)
+    wait_for(lab.is_joined)
+    assert lab.member.status(lab.home / "member-switch.sock")["ports"] == 1
+
+
 def test_a_path_that_goes_silent_takes_the_carrier_away(lab: RelayLab) -> None:
     lab.start_relays()
     lab.border.ip("link", "set", "eth0", "down")

@@ -19,10 +19,11 @@ from fog.providers.aws.config import AwsConfig
 from fog.providers.cloud_init import Setup
 from fog.site import SiteConfig
 from fog_demo import cli as demo
-from gdp.cli import gdp, rib, switch
+from gdp.cli import gdp, relay, rib, switch
 from gdp.crypto.keys import SigningKey
 from gdp.errors import ConfigError
 from gdp.nodes.config import RibConfig, SwitchConfig
+from gdp.nodes.relay_config import RelayConfig
 from gdp.nodes.schema import Section
 from proxy.cli import delegate, proxy, replay
 from proxy.config.config import ProxyConfig, Rule
@@ -40,6 +41,7 @@ PROVIDERS = ROOT / "docs/reference/providers.md"
 APPS = {
     "gdp": gdp.app,
     "gdp-switch": switch.app,
+    "gdp-relay": relay.app,
     "gdp-rib": rib.app,
     "gdp-proxy": proxy.app,
     "gdp-delegate": delegate.app,
@@ -49,7 +51,12 @@ APPS = {
     "scripts/fog_demo.sh": demo.app,
 }
 SHELLS = ("bash", "sh")
-MODELS: dict[str, type[Section]] = {"switch.yaml": SwitchConfig, "rib.yaml": RibConfig, "proxy.yaml": ProxyConfig}
+MODELS: dict[str, type[Section]] = {
+    "switch.yaml": SwitchConfig,
+    "relay.yaml": RelayConfig,
+    "rib.yaml": RibConfig,
+    "proxy.yaml": ProxyConfig,
+}
 NODES = ("gdp-switch ", "gdp-rib ", "gdp-proxy ")
 UNITS = {"": 1, "s": 1, "ms": 0.001, "KiB": 1 << 10, "MiB": 1 << 20}
 

@@ -162,6 +162,7 @@ class SwitchConfig(Section):
     ports: tuple[PortConfig, ...] = ()
     attach: Annotated[tuple[AttachName, ...], Unique] = ()
     links: LinksConfig | None = None
+    relay: bool = False
     data_plane: DataPlane = "auto"
     table_max: int = Field(default=ENTRIES_DEFAULT, ge=1, le=TABLE_MAX)
     revocations: Directory | None = None

@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Final
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, IPvAnyAddress, field_validator, model_validator
 
 from gdp.names import Name
 from gdp.nodes.config import ServerText
@@ -29,11 +29,11 @@ class RelayServer(Section):
     """What a border relays, and for whom.
 
     ``allow`` holds labels of members of the own domain, or names of any trusted switch; ``null``: all trusted
-    switches. ``rate`` is in bytes a second for each client and direction.
+    switches. ``address: null`` listens on all of them. ``rate`` is in bytes a second for each client and direction.
     """
 
     port: int = Field(default=RELAY_PORT, ge=1, le=65_535)
-    address: str = "::"
+    address: IPvAnyAddress | None = None
     allow: Annotated[tuple[str, ...], Unique] | None = None
     rate: int | None = Field(default=None, ge=RATE_MIN)
     clients_max: int = Field(default=CLIENTS_MAX, ge=1, le=1_000)
@@ -60,8 +60,8 @@ class RelayBorder(Section):
 class RelayConfig(Section):
     """``relay.yaml``: ``server`` on a border, ``borders`` on a member.
 
-    ``identity`` is that of the switch whose frames are relayed, and ``switch_socket`` its ``control_socket``, where
-    that is configured.
+    ``identity`` is that of the switch whose frames are relayed. ``switch_socket`` is its ``control_socket``, where that
+    is configured.
     """
 
     identity: Directory

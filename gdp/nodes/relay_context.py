@@ -16,6 +16,7 @@ from gdp.errors import RemoteError
 from gdp.nodes.relay_config import RelayConfig
 from gdp.nodes.relay_loop import RelayLoop
 from gdp.nodes.relay_tls import tls_context
+from gdp.ports.tap import relay_alias
 from gdp.relay.connection import ConnectionSettings
 from gdp.sansio import Timestamps
 from gdp.trust.domain import Policy
@@ -44,7 +45,7 @@ class RelayContext:
     @property
     def alias(self) -> str:
         """Return the text that marks devices of this relay."""
-        return f"gdp-relay {self.identity.name.to_text()}"
+        return relay_alias(self.identity.name)
 
     def settings(self, rate: float | None) -> ConnectionSettings:
         """Return the settings of a new connection."""

@@ -272,7 +272,7 @@ class BorderDialer:
 
     def _open(self, link: RelayLink) -> RelayPort | None:
         try:
-            self.port.serve(link)
+            self.port.attach(link)
         except LocalError as error:
             link.end(str(error))
             return None

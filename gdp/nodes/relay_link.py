@@ -59,7 +59,7 @@ class RelayPort:
         self.is_removed = False  # by another program
         loop.register(device.fileno(), _READ, self._handle)
 
-    def serve(self, link: RelayLink) -> None:
+    def attach(self, link: RelayLink) -> None:
         """Pass frames to and from this open connection; the device then has a carrier.
 
         Raises:
@@ -69,7 +69,7 @@ class RelayPort:
         self.link = link
         self.device.set_carrier(on=True)
 
-    def release(self, link: RelayLink) -> None:
+    def detach(self, link: RelayLink) -> None:
         """End the service of this connection; the carrier goes off."""
         if self.link is link:
             self.link = None
@@ -236,7 +236,7 @@ class RelayLink:
         """Report the end; a refused end gets time to read why."""
         self.is_ended = True
         if self.port is not None:
-            self.port.release(self)
+            self.port.detach(self)
         if self.connection.was_refused and not self._pending:
             self._linger_until_s = time.monotonic() + _LINGER_S
             self._wait_for(_READ)

@@ -40,14 +40,13 @@ _ANY: Final = "::"
 
 
 def listen_tls(config: RelayServer) -> socket.socket:
-    """Return the listening socket; it serves IPv4 as well where the address is ``::``.
+    """Return the listening socket; without an address it serves IPv4 and IPv6.
 
     Raises:
         LocalError: the port is in use, needs a right, or the address is not of this host.
     """
-    is_any = config.address == _ANY
-    dual = is_any and socket.has_dualstack_ipv6()
-    host = "" if is_any and not dual else config.address
+    dual = config.address is None and socket.has_dualstack_ipv6()
+    host = (_ANY if dual else "") if config.address is None else str(config.address)
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         listener = socket.create_server((host, config.port), family=family, backlog=_BACKLOG, dualstack_ipv6=dual)
@@ -57,7 +56,7 @@ def listen_tls(config: RelayServer) -> socket.socket:
             raise LocalError(f"{where} is in use by another program; stop it, or give another server.port") from error
         if error.errno in (errno.EACCES, errno.EPERM):
             raise LocalError(f"{where} needs a right of root; {AS_ROOT}") from error
-        raise LocalError(f"{where} at {config.address}: {error.strerror or error}") from error
+        raise LocalError(f"{where} at {host or 'any address'}: {error.strerror or error}") from error
     listener.setblocking(False)
     return listener
 
@@ -208,7 +207,7 @@ class BorderServer:
             client = self._client_of(member)
             if client.port.link is not None:
                 client.port.link.end("replaced by a newer connection of the same client")
-            client.port.serve(link)
+            client.port.attach(link)
         except LocalError as error:
             log.error("client without a device name=%s reason=%s", member.name.short, error)
             link.end(f"the border cannot serve its device: {error}", is_refusal=True)

@@ -25,6 +25,7 @@ from gdp.nodes.link_rows import LinkRows, link_status
 from gdp.nodes.links import LINKS_LOOK_S, TunnelLinks
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
+from gdp.nodes.relay_ports import RELAY_LOOK_S, RelayPorts
 from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.nodes.rights import confine_switch
 from gdp.nodes.runtime import DRAIN_MAX_S, Runtime, now
@@ -61,8 +62,8 @@ def run_switch(
             been touched then.
     """
     identity, policy = load_member(config.identity, config.domain, Role.SWITCH)
-    if not config.ports and not config.attach and config.links is None:
-        raise LocalError("a switch needs at least one port: --iface, or ports or links in the configuration")
+    if not (config.ports or config.attach or config.links is not None or config.relay):
+        raise LocalError("a switch needs at least one port: --iface, or ports, links or relay in the configuration")
     refuse_loopback(ifaces := [port.iface for port in config.ports])
     table = Table()
     settings = NodeSettings(
@@ -92,14 +93,13 @@ def run_switch(
         runtime = Runtime(switch, plane, {port.iface: port.cost for port in config.ports})
         attachments = {port.index for port in plane.ports.values() if port.ifname not in ifaces}
         links = _open_links(config, identity, policy, switch, runtime, underlays)
+        relay = _follow_relay(config, identity, switch, runtime, stack)
         node_log = NodeLog(
             switch.hello_protocol,
             policy,
             plane,
             switch.boundary,
-            lambda now_s: switch.waits(
-                attachments | _absent(plane, optional) | (frozenset() if links is None else links.ports), now_s
-            ),
+            lambda now_s: switch.waits(attachments | _absent(plane, optional) | _dynamic_ports(links, relay), now_s),
             rib=lambda: switch.rib,
             on_wait=on_wait,
         )
@@ -124,12 +124,16 @@ def run_switch(
         _start_links(links, runtime, stack)
         if config.metrics is not None:
             stack.callback(_serve_metrics(sources, config.metrics.port))
-        said = identity.name.short, identity.role.value, chosen.name, len(plane.ports)
-        log.info("switch up name=%s role=%s plane=%s ports=%d", *said)
-        if chosen.reason:
-            log.warning("not the best data plane plane=%s reason=%s", chosen.name, chosen.reason)
+        _log_start(identity, chosen)
         ready(identity, chosen.name, chosen.reason)
         runtime.run()
+
+
+def _log_start(identity: Identity, chosen: Chosen) -> None:
+    said = identity.name.short, identity.role.value, chosen.name, len(chosen.plane.ports)
+    log.info("switch up name=%s role=%s plane=%s ports=%d", *said)
+    if chosen.reason:
+        log.warning("not the best data plane plane=%s reason=%s", chosen.name, chosen.reason)
 
 
 def _add_ports(config: SwitchConfig, plane: Plane, switch: SwitchCore) -> None:
@@ -145,6 +149,24 @@ def _start_links(links: TunnelLinks | None, runtime: Runtime, stack: contextlib.
     if links is not None:
         runtime.every(LINKS_LOOK_S, links.look)
         stack.callback(lambda: links.close(now().mono_s))
+
+
+def _dynamic_ports(links: TunnelLinks | None, relay: RelayPorts | None) -> frozenset[int]:
+    """Return the ports of tunnels and of the relay, for whose neighbours the switch does not wait."""
+    return (frozenset() if links is None else links.ports) | (frozenset() if relay is None else relay.ports)
+
+
+def _follow_relay(
+    config: SwitchConfig, identity: Identity, switch: SwitchCore, runtime: Runtime, stack: contextlib.ExitStack
+) -> RelayPorts | None:
+    """Return the ports on devices of the switch's relay; None: the configuration has no relay."""
+    if not config.relay:
+        return None
+    named = frozenset(port.iface for port in config.ports)
+    relay = RelayPorts(name=identity.name, switch=switch, runtime=runtime, excluded=named)
+    stack.callback(relay.close)
+    runtime.every(RELAY_LOOK_S, relay.look)
+    return relay
 
 
 def _open_links(

@@ -20,7 +20,7 @@ from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.ports.sockets import AS_ROOT
 
-__all__ = ["TapDevice", "tap_name"]
+__all__ = ["TapDevice", "relay_alias", "tap_name"]
 
 _TUN: Final = "/dev/net/tun"
 _TUNSETIFF: Final = 0x400454CA
@@ -38,6 +38,11 @@ _QUEUE_FRAMES: Final = 512  # in the kernel, for a burst; the relay reads it alw
 def tap_name(own: Name, peer: Name) -> str:
     """Return the device of switch ``own`` for its relay connection with ``peer``; unique on a host by its hash."""
     return _PREFIX + hashlib.sha256(b"gdp-relay-tap-1" + own + peer).digest()[:_DIGEST_BYTES].hex()
+
+
+def relay_alias(own: Name) -> str:
+    """Return the alias that marks devices of the relay of switch ``own``."""
+    return f"gdp-relay {own.to_text()}"
 
 
 class TapDevice:
