@@ -6,7 +6,7 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -14,9 +14,20 @@ from gdp.control.endpoint_record import CandidateType, EndpointRecord
 from gdp.control.endpoints import Endpoint
 from gdp.names import Name
 
-__all__ = ["DIAL_S", "Dialer", "TunnelId", "planned_tunnels", "tunnel_ifname", "underlay_ifname"]
+__all__ = [
+    "DIAL_S",
+    "REBIND_S",
+    "Dialer",
+    "RebindSchedule",
+    "TunnelId",
+    "planned_tunnels",
+    "tunnel_ifname",
+    "underlay_ifname",
+]
 
 DIAL_S: Final = 1.0  # one candidate is tried for this time before the next one
+REBIND_S: Final = 1.0
+_REBIND_MAX_S: Final = 30.0
 _DIGITS: Final = 11  # IFNAMSIZ - 1 less the prefix
 
 
@@ -69,12 +80,48 @@ class Dialer:
         public = (each for each in record.candidates if each.type is CandidateType.PUBLIC and each.uplink == uplink)
         return cls(tuple(each.endpoint for each in public))
 
-    def next(self, now_s: float, *, is_up: bool) -> Endpoint | None:
-        """Return the endpoint to dial now; None: go on as before."""
+    def next(
+        self, now_s: float, *, is_up: bool, has_route: Callable[[Endpoint], bool] = lambda _: True
+    ) -> Endpoint | None:
+        """Return the endpoint to dial now; None: go on as before.
+
+        Args:
+            has_route: whether this host can send to an endpoint; others are left out.
+        """
         if is_up:
             self.since_s = now_s
             return None
         if not self.endpoints or now_s < self.since_s + DIAL_S:
             return None
-        self.index, self.since_s = (self.index + 1) % len(self.endpoints), now_s
-        return self.endpoints[self.index]
+        for step in range(1, len(self.endpoints) + 1):
+            index = (self.index + step) % len(self.endpoints)
+            if has_route(self.endpoints[index]):
+                self.index, self.since_s = index, now_s
+                return self.endpoints[index]
+        return None
+
+
+@dataclass(slots=True)
+class RebindSchedule:
+    """When an uplink takes another UDP port, because none of the borders answers any more.
+
+    A NAT may have changed its address and kept its mappings. Keepalives then keep a mapping alive that leads nowhere;
+    only packets from another port get a new one. Source: RFC 4787, section 4.3, on refresh by outbound packets.
+    """
+
+    was_up: bool = False
+    due_s: float = float("inf")
+    pause_s: float = REBIND_S
+
+    def update(self, now_s: float, *, is_up: bool) -> bool:
+        """Take in whether a border answers over the uplink; return whether to take another port now."""
+        if is_up or not self.was_up:
+            self.was_up, self.due_s, self.pause_s = self.was_up or is_up, float("inf"), REBIND_S
+            return False
+        if self.due_s == float("inf"):
+            self.due_s = now_s + self.pause_s
+        if now_s < self.due_s:
+            return False
+        self.pause_s = min(2 * self.pause_s, _REBIND_MAX_S)
+        self.due_s = now_s + self.pause_s
+        return True

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.control.endpoint_record import EndpointRecord
-from gdp.control.tunnel_plan import Dialer, TunnelId, planned_tunnels
+from gdp.control.tunnel_plan import Dialer, RebindSchedule, TunnelId, planned_tunnels
 from gdp.crypto.certificates import Membership
 from gdp.crypto.identity import Identity
 from gdp.errors import GdpError, LocalError
@@ -81,6 +81,7 @@ class TunnelLinks:
         self._dialers: dict[TunnelId, Dialer] = {}
         self._retry_s: dict[TunnelId, float] = {}
         self._reported: set[TunnelId] = set()
+        self._rebinds = [RebindSchedule() for _ in underlays]
         self._records_s = float("-inf")
 
     @property
@@ -183,7 +184,8 @@ class TunnelLinks:
             dialer = self._dialers[tunnel]
             is_up = self._tunnels.is_up(tunnel)
             if tunnel in self._tunnels.all:
-                if (endpoint := dialer.next(now.mono_s, is_up=is_up)) is not None:
+                endpoint = dialer.next(now.mono_s, is_up=is_up, has_route=self._tunnels.has_route(tunnel.uplink))
+                if endpoint is not None:
                     self._tunnels.dial(tunnel, endpoint)
                 self._report_silence(tunnel, peer, now, is_up=is_up)
             elif now.mono_s >= self._retry_s.get(tunnel, 0.0):
@@ -191,9 +193,24 @@ class TunnelLinks:
                 self._tunnels.open(
                     tunnel,
                     peer.record,
-                    dialer.next(now.mono_s, is_up=False),
+                    dialer.next(now.mono_s, is_up=False, has_route=self._tunnels.has_route(tunnel.uplink)),
                     keepalive_s=self._config.keepalive_s if dialer.endpoints else 0,
                     now_s=now.mono_s,
+                )
+
+        if not self._config.public:
+            self._rebind_silent(now.mono_s)
+
+    def _rebind_silent(self, now_s: float) -> None:
+        """Let an uplink over which no border answers any more send from another UDP port."""
+        dialled = [tunnel for tunnel, dialer in self._dialers.items() if dialer.endpoints]
+        for uplink, schedule in enumerate(self._rebinds):
+            is_up = any(self._tunnels.is_up(tunnel) for tunnel in dialled if tunnel.uplink == uplink)
+            if schedule.update(now_s, is_up=is_up):
+                device = self._tunnels.underlays[uplink]
+                device.rebind()
+                log.warning(
+                    "no border answers, sending from another port ifname=%s port=%d", device.ifname, device.listen_port
                 )
 
     def _report_silence(self, tunnel: TunnelId, peer: _Peer, now: Timestamps, *, is_up: bool) -> None:

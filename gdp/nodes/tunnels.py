@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
@@ -144,6 +144,10 @@ class Tunnels:
         found = self._tunnels.get(tunnel)
         return found is not None and self._switch.hello_protocol.neighbour(found.port, tunnel.peer) is not None
 
+    def has_route(self, uplink: int) -> Callable[[Endpoint], bool]:
+        """Return the function that says whether an uplink has a route to an endpoint."""
+        return partial(_has_route, fwmark=self._underlays[uplink].fwmark)
+
     def open(
         self,
         tunnel: TunnelId,
@@ -235,7 +239,7 @@ class Tunnels:
             state = states[tunnel.uplink].get(found.key)
             if state is not None and self._observe(tunnel, found, state):
                 answered.append(tunnel)
-            if now.mono_s >= found.mtu_look_s:
+            if now.mono_s >= found.mtu_look_s and self.is_up(tunnel):
                 found.mtu_look_s = now.mono_s + _MTU_LOOK_S
                 self._follow_mtu(tunnel, found)
         while self._closed and now.mono_s >= self._closed[0][0]:
@@ -299,6 +303,14 @@ class Tunnels:
         """Set the MTU of a WireGuard device to that of its widest tunnel; each VXLAN device has its own."""
         others = (each.wireguard_mtu for tunnel, each in self._tunnels.items() if tunnel.uplink == uplink)
         self._underlays[uplink].set_mtu(max([wireguard_mtu, *others]))
+
+
+def _has_route(endpoint: Endpoint, fwmark: int) -> bool:
+    try:
+        route_mtu(endpoint, fwmark)
+    except LocalError:
+        return False
+    return True
 
 
 def _mtus(endpoint: Endpoint | None, fwmark: int) -> tuple[int, int]:

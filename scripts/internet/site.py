@@ -128,12 +128,10 @@ class Site:
         core, outer = [], []
         if self._has4:
             core.append(f"route del {old} dev {self.uplink}")
-            is_public = self.access is Access.PUBLIC
-            outer.append(
-                f"addr del {old_lan[1]}/{old_lan.prefixlen} dev {LAN}"
-                if is_public
-                else f"addr del {old[1]}/32 dev {WAN}"
-            )
+            if self.access is Access.PUBLIC:
+                outer.append(f"addr del {old_lan[1]}/{old_lan.prefixlen} dev {LAN}")
+            else:  # while the device is down, no packet takes another address, and the NAT forgets its mappings
+                outer += [f"link set {WAN} down", f"addr del {old[1]}/32 dev {WAN}"]
         if self._has6:
             core.append(f"route del {old_prefix} dev {self.uplink}")
             outer.append(f"addr del {old_prefix[1]}/64 dev {LAN}")

@@ -112,7 +112,7 @@ class WireGuardDevice:
 
     @property
     def listen_port(self) -> int:
-        """Return the UDP port; it stays the same while the device is open."""
+        """Return the UDP port; only ``rebind`` changes it."""
         return self._port
 
     @property
@@ -175,6 +175,16 @@ class WireGuardDevice:
             self._apply(Change(peers=(removed, *self._restored(public_key))))
         else:
             self._apply(Change(peers=_kicked(public_key, peer.keepalive_s)))
+
+    def rebind(self) -> None:
+        """Send from another UDP port from now on, so that NATs on the way make new mappings; sessions stay."""
+        self._apply(Change(listen_port=0))
+        try:
+            self._port = self._control.state().listen_port
+        except ControlLostError:
+            self._port = 0  # any: wireguard-go is starting again
+        kicks = [kick for key, peer in self._peers.items() for kick in _kicked(key, peer.keepalive_s)]
+        self._apply(Change(peers=tuple(kicks)))
 
     def peers(self) -> dict[bytes, PeerState]:
         """Return the state of every peer by public key; while the device restarts, without handshakes."""

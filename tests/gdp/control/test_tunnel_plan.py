@@ -6,7 +6,16 @@ import pytest
 
 from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
 from gdp.control.endpoints import Endpoint
-from gdp.control.tunnel_plan import DIAL_S, Dialer, TunnelId, planned_tunnels, tunnel_ifname, underlay_ifname
+from gdp.control.tunnel_plan import (
+    DIAL_S,
+    REBIND_S,
+    Dialer,
+    RebindSchedule,
+    TunnelId,
+    planned_tunnels,
+    tunnel_ifname,
+    underlay_ifname,
+)
 from gdp.crypto.tunnel_key import TunnelKey
 from tests.gdp.control.members import UNIX_S, node
 
@@ -56,3 +65,21 @@ def test_the_endpoints_of_a_border_are_dialled_in_turn_until_it_is_up() -> None:
 
 def test_a_peer_without_public_endpoint_is_not_dialled() -> None:
     assert Dialer.to(record(), 0).next(0.0, is_up=False) is None
+
+
+def test_an_endpoint_without_a_route_is_not_dialled() -> None:
+    dialer = Dialer.to(record(endpoints=(FIRST, SECOND)), 0)
+    for number in range(3):
+        assert dialer.next(number * DIAL_S, is_up=False, has_route=lambda each: each == SECOND) == SECOND
+    assert dialer.next(3 * DIAL_S, is_up=False, has_route=lambda _: False) is None
+    assert dialer.next(3 * DIAL_S, is_up=False) == FIRST
+
+
+def test_an_uplink_takes_another_port_when_every_border_falls_silent() -> None:
+    schedule = RebindSchedule()
+    assert not schedule.update(100.0, is_up=False)  # none has answered yet: the NAT has no stale mapping
+    assert not schedule.update(101.0, is_up=True)
+    found = [at / 10 for at in range(1_020, 1_300) if schedule.update(at / 10, is_up=False)]
+    assert found == pytest.approx([102.0 + REBIND_S, 105.0, 109.0, 117.0], abs=0.11)
+    assert not schedule.update(130.0, is_up=True)
+    assert not schedule.update(130.0 + REBIND_S / 2, is_up=False)
