@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from importlib.util import find_spec
+from shutil import which
 
 import pytest
 
@@ -14,6 +15,7 @@ pytestmark = pytest.mark.netns
 
 _PATIENCE_S = 300.0
 needs_ros2 = pytest.mark.skipif(find_spec("rclpy") is None, reason="rclpy is not installed: scripts/setup.sh --ros2")
+needs_wireguard = pytest.mark.skipif(which("wireguard-go") is None, reason="wireguard-go is not installed")
 
 
 @pytest.mark.parametrize(
@@ -26,6 +28,7 @@ needs_ros2 = pytest.mark.skipif(find_spec("rclpy") is None, reason="rclpy is not
         ["thread_offload.py", "--rounds", "1", "--count", "5"],
         ["priority.py", "--quick", "--no-save"],
         ["bundles.py", "--quick", "--no-save"],
+        pytest.param(["tunnel.py", "--quick", "--no-save", "--only", "kernel"], marks=needs_wireguard),
         pytest.param(["ros.py", "--quick", "--no-save", "--mtu", "9000"], marks=needs_ros2),
         pytest.param(["services.py", "--quick", "--no-save"], marks=needs_ros2),
         pytest.param(["fogros.py", "--quick", "--no-save", "--mtu", "9000"], marks=needs_ros2),

@@ -188,11 +188,17 @@ class MemberRow:
     """Switches and RIB with members that one endpoint module runs; a context manager that ends them."""
 
     def __init__(
-        self, lab: Lab, endpoint: str, topics: Mapping[str, Mapping[Right, Iterable[str]]], *, plane: str
+        self,
+        lab: Lab,
+        endpoint: str,
+        topics: Mapping[str, Mapping[Right, Iterable[str]]],
+        *,
+        plane: str,
+        switches: Sequence[str] = MIDDLE,
     ) -> None:
         self._lab = lab
         self._endpoint = endpoint
-        self._nodes = OverlayNodes(lab, MIDDLE, plane=plane)
+        self._nodes = OverlayNodes(lab, switches, plane=plane)
         self._configs = {node: self._nodes.admit_member(node, own) for node, own in topics.items()}
 
     def __enter__(self) -> MemberRow:

@@ -280,6 +280,8 @@ class _Keeper:
             raise LocalError(f"another {_PROGRAM} serves {socket_path(self._ifname)}; end it first")
         try:
             SOCKET_FOLDER.mkdir(mode=0o755, parents=True, exist_ok=True)
+            if not os.access(SOCKET_FOLDER, os.W_OK | os.X_OK):
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
             socket_path(self._ifname).unlink(missing_ok=True)  # of a killed process
         except OSError as error:
             raise LocalError(f"{_PROGRAM} needs to write to {SOCKET_FOLDER} ({error.strerror}); {AS_ROOT}") from error
