@@ -138,6 +138,8 @@ class Site:
         self._core.ip(core)
         self._outer.ip(outer)
         self._configure()
+        if self._is_nat:
+            self._outer.flush_connections()  # packets that came in between have a mapping to an inner address
         self._laboratory.renew_leases(self)
 
     def cut(self, *, is_silent: bool = True) -> None:
