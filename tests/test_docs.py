@@ -25,6 +25,7 @@ from gdp.errors import ConfigError
 from gdp.nodes.config import RibConfig, SwitchConfig
 from gdp.nodes.relay_config import RelayConfig
 from gdp.nodes.schema import Section
+from internet_demo import cli as internet_demo
 from proxy.cli import delegate, proxy, replay
 from proxy.config.config import ProxyConfig, Rule
 from ring import cli as ring
@@ -49,6 +50,7 @@ APPS = {
     "fog": fog,
     "scripts/ring_topology.sh": ring.app,
     "scripts/fog_demo.sh": demo.app,
+    "scripts/internet_demo.sh": internet_demo.app,
 }
 SHELLS = ("bash", "sh")
 MODELS: dict[str, type[Section]] = {

@@ -1,0 +1,37 @@
+"""Demonstration across an internet: nothing is lost while networks change, and nothing stays behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from gdp.host.run_registry import RunRegistry, outer_uid
+
+pytestmark = [
+    pytest.mark.netns,
+    pytest.mark.skipif(shutil.which("wireguard-go") is None, reason="needs wireguard-go"),
+    pytest.mark.skipif(not os.access("/dev/net/tun", os.R_OK | os.W_OK), reason="needs /dev/net/tun"),
+    pytest.mark.skipif(None in map(shutil.which, ("nft", "conntrack")), reason="needs nft and conntrack"),
+]
+
+_PATIENCE_S = 240.0
+
+
+def test_no_image_and_no_call_is_lost_while_addresses_change_nats_forget_and_an_uplink_is_cut() -> None:
+    argv = [sys.executable, "-m", "internet_demo", "--calm", "1.5", "--delay", "0", "--rate", "10", "--json"]
+    ended = subprocess.run(argv, capture_output=True, text=True, timeout=_PATIENCE_S, check=False)
+    assert ended.stdout, ended.stderr
+    reported = json.loads(ended.stdout)
+    assert (reported["lost"], reported["doubled"], ended.returncode) == (0, 0, 0), reported
+    assert reported["images"] > 50
+    assert len(reported["typed"]) == 6
+    assert len(reported["events"]) == 6
+    registry = RunRegistry(Path(tempfile.gettempdir()) / f"gdp-internet-demo-{outer_uid()}")
+    assert all(each.owner.alive for each in registry.all())

@@ -1,0 +1,122 @@
+"""Command ``python -m internet_demo``, which ``scripts/internet_demo.sh`` runs after its setup.
+
+I/O. Exit status: 0 nothing lost, 1 something lost, 2 wrong input, 130 and 143 for Ctrl-C and SIGTERM.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import sys
+import tempfile
+from dataclasses import asdict
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Final
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from gdp.errors import GdpError, LocalError
+from gdp.host.interruption import let_nothing_interrupt
+from gdp.host.run_registry import RunRegistry, outer_uid
+from internet.laboratory import Laboratory
+from internet.space import TOOLS
+from internet_demo.display import Display
+from internet_demo.scenario import Outcome, Pace, run_scenario
+
+__all__ = ["app", "main"]
+
+_PASSED: Final = 0
+_FAILED: Final = 1
+_WRONG_INPUT: Final = 2
+_PACE: Final = Pace()
+_WIDE: Final = 160  # columns without a terminal
+
+_EXAMPLES: Final = """\b
+Examples:
+  sudo scripts/internet_demo.sh
+  sudo scripts/internet_demo.sh --rate 50 --delay 20
+  sudo scripts/internet_demo.sh --json > outcome.json
+"""
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+
+class _Ended(Exception):  # noqa: N818  (not an error)
+    """A signal ends the demonstration; ``args[0]`` is its number."""
+
+
+@app.command(epilog=_EXAMPLES)
+def demo(
+    rate: Annotated[float, typer.Option(min=1, max=200, help="Images, and calls, a second.")] = _PACE.rate_hz,
+    size: Annotated[int, typer.Option(min=100, max=1_000_000, help="Bytes of an image.")] = _PACE.image_bytes,
+    calm: Annotated[float, typer.Option(min=0.5, help="Seconds after each event.")] = _PACE.calm_s,
+    delay: Annotated[float, typer.Option(min=0, max=500, help="Delay of each uplink, in ms.")] = _PACE.delay_ms,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the outcome as JSON; all else on stderr.")] = False,
+) -> None:
+    """A robot behind NATs, two clouds and an edge box on IPv6 form a domain by tokens, and their networks change.
+
+    The robot's address changes twice, NATs forget their mappings, and one of the robot's two uplinks is cut, while
+    images and calls cross. It takes about a minute; the last line says how many of them were lost. Everything is gone
+    afterwards, also after Ctrl-C; what a killed demonstration left, the next one removes.
+    """
+    console = Console(stderr=as_json)
+    if not console.is_terminal:
+        console = Console(stderr=as_json, width=_WIDE)
+    errors = Console(stderr=True, highlight=False, soft_wrap=True)
+    try:
+        code = _run(Pace(rate, size, calm, delay), console, as_json=as_json)
+    except _Ended as ended:
+        console.print("interrupted")
+        code = 128 + int(ended.args[0])
+    except GdpError as error:
+        errors.print(escape(str(error)))
+        code = _WRONG_INPUT
+    raise typer.Exit(code)
+
+
+def main() -> None:
+    """Run the command; never returns."""
+    app(prog_name="internet_demo.sh")
+
+
+def _run(pace: Pace, console: Console, *, as_json: bool) -> int:
+    if missing := [tool for tool in TOOLS if shutil.which(tool) is None]:
+        raise LocalError(f"not installed: {', '.join(missing)} (packages iproute2, nftables, conntrack)")
+    runs = RunRegistry(Path(tempfile.gettempdir()) / f"gdp-internet-demo-{outer_uid()}")
+    for swept in runs.sweep():
+        console.print(f"removed what run {swept} had left behind")
+    for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(each, _end)
+    run = runs.start()
+    try:
+        with Laboratory(run) as laboratory, Display(console) as display:
+            outcome = run_scenario(laboratory, pace, display)
+    finally:
+        let_nothing_interrupt()
+        run.end()
+    _tell(outcome, console, as_json=as_json)
+    return _FAILED if outcome.lost or outcome.doubled or not outcome.images else _PASSED
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    del frame
+    raise _Ended(number)
+
+
+def _tell(outcome: Outcome, console: Console, *, as_json: bool) -> None:
+    for reason in outcome.reasons:
+        console.print(escape(reason), highlight=False, soft_wrap=True)
+    for event in outcome.events:
+        console.print(f"longest pause {event.pause_s * 1e3:5.0f} ms: {event.text}", highlight=False)
+    if as_json:
+        json.dump(asdict(outcome), sys.stdout, indent=1)
+        sys.stdout.write("\n")
+        return
+    summary = (
+        f"{outcome.images} images to two readers, {outcome.calls} calls, {outcome.doubled} doubled, {outcome.lost} lost"
+    )
+    console.print(summary, style="bold red" if outcome.lost else "bold green", highlight=False)

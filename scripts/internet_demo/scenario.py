@@ -1,0 +1,140 @@
+"""Scenario of the demonstration: machines join, traffic flows, and networks change under it.
+
+I/O. Each step may be shown by a ``Display``.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from typing import Final
+
+from gdp.trust.right import Right
+from internet.access import Access
+from internet.laboratory import Laboratory
+from internet_demo.display import Display
+from internet_demo.stage import WIFI, WWAN, Stage
+from internet_demo.traffic import CAMERA, PLAN, Traffic
+
+__all__ = ["Event", "Outcome", "Pace", "run_scenario"]
+
+_LOOK_S: Final = 0.25
+_READERS: Final = ("cloud-a", "edge")
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """Pace of the demonstration.
+
+    Args:
+        calm_s: after each event.
+        delay_ms: of each uplink, in each direction.
+    """
+
+    rate_hz: float = 20.0
+    image_bytes: int = 20_000
+    calm_s: float = 5.0
+    delay_ms: float = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """An event, and the longest pause between two images at any reader from then until the next one."""
+
+    text: str
+    pause_s: float
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What the demonstration came to."""
+
+    images: int = 0
+    calls: int = 0
+    lost: int = 0
+    doubled: int = 0
+    joined_s: float = 0.0
+    typed: list[str] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
+    reasons: list[str] = field(default_factory=list)
+
+
+def run_scenario(laboratory: Laboratory, pace: Pace, display: Display) -> Outcome:
+    """Play the demonstration.
+
+    Raises:
+        LocalError: a machine does not join, or a program does not start.
+    """
+    outcome = Outcome()
+    display.step("networks: home and 5G for the robot, a provider's NAT, a public cloud, an office on IPv6 only")
+    with Stage(laboratory, pace.delay_ms) as stage, ExitStack() as stack:
+        begun_s = time.monotonic()
+        _join_all(stage)
+        outcome.typed = stage.typed
+        for command in stage.typed:
+            display.step(f"typed at {command}")
+        stage.wait_until_joined()
+        outcome.joined_s = time.monotonic() - begun_s
+        display.step(f"all machines have joined after {outcome.joined_s:.1f} s")
+        stage.grant(
+            {
+                "robot": {CAMERA: [Right.PUBLISH], PLAN: [Right.CALL]},
+                "cloud-a": {CAMERA: [Right.READ], PLAN: [Right.SERVE]},
+                "edge": {CAMERA: [Right.READ]},
+            }
+        )
+        sessions = {
+            label: stack.enter_context(stage.open_session(stage.machines[label])) for label in ("robot", *_READERS)
+        }
+        readers = {label: sessions[label] for label in _READERS}
+        traffic = Traffic(sessions["robot"], sessions["cloud-a"], readers, pace.rate_hz, pace.image_bytes)
+        try:
+            for text, act in _events(stage):
+                traffic.reset_pauses()
+                display.step(text)
+                act()
+                _watch(stage, traffic, display, pace.calm_s)
+                outcome.events.append(Event(text, max(each.longest_s for each in traffic.readers.values())))
+        finally:
+            traffic.end()
+        outcome.images, outcome.calls, outcome.lost = traffic.camera.sent, traffic.calls.begun, traffic.lost
+        outcome.doubled = sum(each.doubled for each in traffic.readers.values())
+        outcome.reasons = list(traffic.calls.reasons)
+    return outcome
+
+
+def _join_all(stage: Stage) -> None:
+    """Create the domain; let the other machines join at once."""
+    first = stage.create_domain()
+    stage.start(stage.cloud_b)
+    tokens = [first, stage.make_token(), stage.make_token()]
+    hosts = (stage.robot, stage.cloud_a, stage.edge)
+    options = ((f"--uplink={WIFI}", f"--uplink={WWAN}"), (), ())
+    with ThreadPoolExecutor(len(hosts)) as pool:
+        joining = [pool.submit(stage.join, *each[:2], *each[2]) for each in zip(hosts, tokens, options, strict=True)]
+        for each in joining:
+            each.result()
+    stage.start(*hosts)
+
+
+def _events(stage: Stage) -> list[tuple[str, Callable[[], None]]]:
+    cafe = stage.add_site("cafe", Access.FULL_CONE)
+    return [
+        ("images and calls cross", lambda: None),
+        ("the provider gives the robot's home another address", stage.home.renumber),
+        ("the robot's Wi-Fi moves to another network", lambda: stage.robot.attach(cafe, WIFI)),
+        ("the NAT of the 5G network forgets its mappings", stage.mobile.flush_mappings),
+        ("the NAT of cloud A forgets its mappings", stage.cloud_a.site().flush_mappings),
+        ("the robot's Wi-Fi uplink is cut: packets vanish", cafe.cut),
+    ]
+
+
+def _watch(stage: Stage, traffic: Traffic, display: Display, seconds: float) -> None:
+    deadline_s = time.monotonic() + seconds
+    while time.monotonic() < deadline_s:
+        links = {label: stage.links(machine) for label, machine in stage.machines.items()}
+        display.show(stage.machines.values(), links, traffic)
+        time.sleep(_LOOK_S)

@@ -1,0 +1,226 @@
+"""Stage of the demonstration: an internet with four machines, of which three join the domain of the fourth by tokens.
+
+I/O; creates namespaces, keys, files and processes of one run.
+::
+
+    robot   wlan0 -- home, port-restricted NAT ----+
+            wwan0 -- 5G, symmetric NAT ------------+-- internet -- cloud-b, public: border, RIB, enrolment
+    cloud-a ------- provider, port-restricted NAT -+
+    edge    ------- office, IPv6 only -------------+
+
+Commands and programs are those that a person or systemd starts on real machines. The ROS proxy of a machine is left
+out: sessions of this process take its place, with its keys.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import gdp
+from gdp.control.endpoints import Endpoint
+from gdp.enrolment.member_files import MemberFiles
+from gdp.enrolment.member_setup import LISTEN_PORT
+from gdp.enrolment.programs import programs_of
+from gdp.errors import GdpError, LocalError
+from gdp.host.processes import Process, end_all
+from gdp.metadata import Metadata
+from gdp.nodes.control_client import ask_node, find_control_socket
+from gdp.nodes.control_protocol import Command
+from gdp.stores.issue import delegate, install_delegation, make_owner
+from gdp.stores.keyring import CARD, load_card
+from gdp.trust.right import Right
+from internet.access import Access
+from internet.host import Host
+from internet.laboratory import Laboratory
+from internet.site import Site
+
+__all__ = ["WIFI", "WWAN", "Link", "Machine", "Stage"]
+
+WIFI: Final = "wlan0"
+WWAN: Final = "wwan0"
+_DOMAIN: Final = "lab"
+_PATIENCE_S: Final = 60.0
+_LOOK_S: Final = 0.2
+_STATUS_S: Final = 2.0
+_SHOWN: Final = 40  # characters of a word
+_SCRIPTS: Final = Path(__file__).resolve().parent.parent
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """A machine of the domain.
+
+    Args:
+        directory: of its keys and configuration.
+    """
+
+    label: str
+    host: Host
+    directory: Path
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """A tunnel that is up: the machine at its far end, its device, whether it is direct, and where the peer is."""
+
+    peer: str
+    device: str
+    is_direct: bool
+    endpoint: str
+
+
+class Stage:
+    """Networks, machines and their programs; a context manager that ends the programs.
+
+    Args:
+        delay_ms: of each uplink, in each direction; 0: none, and no process for it.
+
+    Attributes:
+        typed: the commands that a person types, each after its machine.
+    """
+
+    def __init__(self, laboratory: Laboratory, delay_ms: float) -> None:
+        self._laboratory = laboratory
+        self._folder = laboratory.run.directory
+        self._delay_ms = delay_ms
+        self._processes: list[subprocess.Popen[bytes]] = []
+        self.machines: dict[str, Machine] = {}
+        self.typed: list[str] = []
+        self.cloud_b = self._add_host("cloud-b", self.add_site("dc", Access.PUBLIC))
+        self.home, self.mobile = self.add_site("home", Access.PORT_RESTRICTED), self.add_site("5g", Access.SYMMETRIC)
+        self.robot = laboratory.add_host("robot", self.home, WIFI)
+        self.robot.attach(self.mobile, WWAN)
+        self.cloud_a = self._add_host("cloud-a", self.add_site("provider", Access.PORT_RESTRICTED))
+        self.edge = self._add_host("edge", self.add_site("office", Access.IPV6_ONLY))
+
+    def __enter__(self) -> Stage:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        end_all([Process.from_pid(each.pid) for each in self._processes if each.poll() is None], _PATIENCE_S / 6)
+        for process in self._processes:
+            process.wait()
+
+    def add_site(self, label: str, access: Access) -> Site:
+        """Attach one more network."""
+        site = self._laboratory.add_site(label, access, has_line=bool(self._delay_ms))
+        if self._delay_ms:
+            site.set_delay(self._delay_ms, self._delay_ms / 10)
+        return site
+
+    def create_domain(self) -> str:
+        """Create the domain on the public machine; return the token for the first machine."""
+        lease = self.cloud_b.lease()
+        addresses = [each.partition("/")[0] for each in (lease.address, lease.address6)]
+        public = [f"--public={Endpoint(each, LISTEN_PORT).to_text()}" for each in addresses]
+        return self._command(self.cloud_b, "domain", "create", _DOMAIN, *public).split()[-1]
+
+    def make_token(self) -> str:
+        """Return a token for one more machine."""
+        words = ("domain", "token", _DOMAIN)
+        self._typed(self.cloud_b, words)
+        return self._run(self.cloud_b, *words, f"--directory={self._directory(self.cloud_b)}").split()[-1]
+
+    def join(self, host: Host, token: str, *options: str) -> None:
+        """Let a machine join by a token."""
+        self._command(host, "join", token, f"--label={host.label}", *options)
+
+    def start(self, *hosts: Host) -> None:
+        """Start the programs of machines, as the last step of their commands does; the kernel ends them with us."""
+        for host in hosts:
+            for program in programs_of(MemberFiles.load(self._directory(host))):
+                if program.name != "proxy":
+                    self._start(host, program.argv)
+
+    def wait_until_joined(self) -> None:
+        """Return when each machine has a tunnel to the border. Raises ``LocalError``: one has none in time."""
+        deadline_s = time.monotonic() + _PATIENCE_S
+        while waiting := [label for label, each in self.machines.items() if not self.links(each)]:
+            if time.monotonic() > deadline_s:
+                raise LocalError(f"no tunnel at {', '.join(waiting)}: {self.log(waiting[0])[-2_000:]}")
+            time.sleep(_LOOK_S)
+
+    def links(self, machine: Machine) -> list[Link]:
+        """Return the tunnels of a machine that are up; none while its switch starts."""
+        try:
+            answer = ask_node(find_control_socket(machine.directory / "switch"), Command.STATUS, _STATUS_S)
+        except GdpError:
+            return []
+        rows = answer.result.get("links", [])
+        assert isinstance(rows, list)
+        labels = {
+            load_card(each.directory / "switch" / CARD).name.to_text(): each.label for each in self.machines.values()
+        }
+        return [
+            Link(labels[row["peer"]], str(row["device"]), bool(row.get("direct")), str(row["endpoint"]))
+            for row in rows
+            if row["up"] and row["peer"] in labels
+        ]
+
+    def grant(self, rights: Mapping[str, Mapping[str, Collection[Right]]]) -> None:
+        """Let nodes of machines act on names: by label of the machine, then by name."""
+        owner = self._folder / "owner"
+        make_owner(owner)
+        for label, names in rights.items():
+            node = self.machines[label].directory / "proxy"
+            for name, given in names.items():
+                kind = "service" if {Right.SERVE, Right.CALL} & set(given) else "topic"
+                metadata = Metadata({"kind": kind, "name": name})
+                install_delegation(node, delegate(owner, node / CARD, metadata, list(given)))
+
+    def open_session(self, machine: Machine) -> gdp.Session:
+        """Open a session of this process on a machine."""
+        return machine.host.space.inside(lambda: gdp.open(machine.directory / "proxy"))
+
+    def log(self, label: str) -> str:
+        """Return what the programs of a machine have logged."""
+        return (self._folder / f"{label}.log").read_text(encoding="utf-8", errors="replace")
+
+    def _add_host(self, label: str, site: Site) -> Host:
+        return self._laboratory.add_host(label, site)
+
+    def _directory(self, host: Host) -> Path:
+        return self._folder / host.label
+
+    def _command(self, host: Host, *words: str) -> str:
+        """Execute a command that makes a machine, without its last step; return its output."""
+        self._typed(host, words)
+        directory = self._directory(host)
+        said = self._run(host, *words, f"--directory={directory}", "--no-start")
+        self.machines[host.label] = Machine(host.label, host, directory)
+        return said
+
+    def _typed(self, host: Host, words: Sequence[str]) -> None:
+        shown = " ".join(word if len(word) < _SHOWN else f"{word[: _SHOWN - 3]}..." for word in words)
+        self.typed.append(f"{host.label}: gdp {shown}")
+
+    def _run(self, host: Host, *words: str) -> str:
+        argv = host.command([sys.executable, "-m", "gdp.cli.gdp", *words])
+        done = subprocess.run(argv, capture_output=True, check=False, text=True, env=_environment())
+        if done.returncode:
+            raise LocalError(f"{host.label}: gdp {words[0]}: {done.stderr.strip()}")
+        return done.stdout
+
+    def _start(self, host: Host, argv: Sequence[str]) -> None:
+        with (self._folder / f"{host.label}.log").open("ab") as log:
+            process = subprocess.Popen(
+                host.command(argv),
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                env=_environment(),
+                start_new_session=True,
+            )
+        self._processes.append(process)
+        self._laboratory.run.note_process(process.pid)
+
+
+def _environment() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": os.pathsep.join((str(_SCRIPTS.parent), str(_SCRIPTS)))}
