@@ -52,6 +52,7 @@ def create(
     label: options.Label = BORDER,
     no_systemd: NoSystemd = False,
     start: Start = True,
+    as_json: options.Json = False,
 ) -> None:
     """Create a trust domain on a reachable machine, start its border, and print the line that joins a first robot.
 
@@ -74,7 +75,8 @@ def create(
     files = create_domain(plan)
     say(f"domain {name} is in {files.directory}; keep a copy of {files.directory / 'domain'} in a safe place")
     made = make_token(files, JoinRole.ROBOT, valid_s=duration_s("1h"))
-    typer.echo(f"gdp join {made.to_text()}")
+    result = {"domain": name, "directory": str(files.directory), "servers": servers, "token": made.to_text()}
+    show(result, as_json=as_json, plain=f"gdp join {made.to_text()}")
     sys.stdout.flush()
     if start:
         start_machine(files.directory, no_systemd=no_systemd)
@@ -148,7 +150,7 @@ def remove(
     show({"removed": removed.machine.label, "revoked": removed.revoked}, as_json=as_json)
 
 
-def serve(directory: options.Directory) -> None:
+def serve(directory: options.Directory, as_json: options.Json = False) -> None:
     """Run the enrolment server of a domain until Ctrl-C; the units of the border do that.
 
     \b
@@ -157,8 +159,10 @@ def serve(directory: options.Directory) -> None:
     """
     set_up_logging(verbose=False)
     files = DomainFiles.load(directory)
+    listening = bind_server(files.config.listen)
+    show({"listening": files.config.listen}, as_json=as_json, plain=f"listening on TCP port {files.config.listen}")
     try:
-        asyncio.run(interruptible(serve_domain(files, bind_server(files.config.listen))))
+        asyncio.run(interruptible(serve_domain(files, listening)))
     except Interrupted:
         say("the enrolment server has ended")
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 import signal
 import socket
+import sys
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Final, Optional
@@ -26,12 +27,15 @@ from gdp.cli.machine import (
     tunnels_up,
 )
 from gdp.cli.node import set_up_logging
+from gdp.cli.output import show
 from gdp.enrolment.agent import Agent
 from gdp.enrolment.channel import connect_any
 from gdp.enrolment.join import JoinRequest, join_domain
+from gdp.enrolment.member_files import MemberFiles
+from gdp.enrolment.programs import programs_of
 from gdp.trust.join_token import JoinToken
 
-__all__ = ["agent", "join", "up"]
+__all__ = ["agent", "join", "run_agent", "up"]
 
 _UNSAFE: Final = re.compile(r"[^A-Za-z0-9._-]")
 
@@ -52,6 +56,7 @@ def join(
     uplink: Uplinks = [],  # noqa: B006 (the library copies it)
     no_systemd: NoSystemd = False,
     start: Start = True,
+    as_json: options.Json = False,
 ) -> None:
     """Join the domain of a token: make keys, fetch the memberships, and start switch, proxy and agent.
 
@@ -69,21 +74,30 @@ def join(
     say(f"joined the domain {joined.root.label} as {joined.label} ({joined.role}); files are in {directory}")
     for identity in joined.identities:
         say(f"  {identity.role.value:<6} {identity.name.to_text()}")
+    if as_json:
+        names = {each.role.value: each.name.to_text() for each in joined.identities}
+        result = {"domain": joined.root.label, "label": joined.label, "role": joined.role, "directory": str(directory)}
+        show({**result, "nodes": names}, as_json=True)
+        sys.stdout.flush()
     if start:
         start_machine(directory, no_systemd=no_systemd, observed=_say_border)
 
 
-def up(directory: options.Directory, no_systemd: NoSystemd = False) -> None:
+def up(directory: options.Directory, no_systemd: NoSystemd = False, as_json: options.Json = False) -> None:
     """Start the programs of a machine that has joined or created a domain.
 
     \b
     Example:
       gdp up /var/lib/gdp/lab --no-systemd
     """
+    if as_json:
+        programs = [each.name for each in programs_of(MemberFiles.load(directory))]
+        show({"directory": str(directory), "programs": programs}, as_json=True)
+        sys.stdout.flush()
     start_machine(directory, no_systemd=no_systemd, observed=_say_border)
 
 
-def agent(directory: options.Directory) -> None:
+def agent(directory: options.Directory, as_json: options.Json = False) -> None:
     """Run the agent of a machine until Ctrl-C; the units of the machine do that.
 
     \b
@@ -91,7 +105,9 @@ def agent(directory: options.Directory) -> None:
       gdp agent /var/lib/gdp/lab
     """
     set_up_logging(verbose=False)
-    run_agent(Agent(directory))
+    made = Agent(directory)
+    show({"directory": str(directory)}, as_json=as_json, plain=f"agent of {directory}; Ctrl-C ends it")
+    run_agent(made)
 
 
 def run_agent(made: Agent) -> None:
