@@ -161,6 +161,7 @@ def serve(directory: options.Directory, as_json: options.Json = False) -> None:
     files = DomainFiles.load(directory)
     listening = bind_server(files.config.listen)
     show({"listening": files.config.listen}, as_json=as_json, plain=f"listening on TCP port {files.config.listen}")
+    sys.stdout.flush()
     try:
         asyncio.run(interruptible(serve_domain(files, listening)))
     except Interrupted:

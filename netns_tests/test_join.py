@@ -1,0 +1,96 @@
+"""A domain is created on a public machine; machines behind NATs join with tokens, and one is removed."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from gdp.errors import GdpError
+from gdp.nodes.control_client import ask_node, find_control_socket
+from gdp.nodes.control_protocol import Command
+from internet.access import Access
+from internet.host import Host
+from internet.laboratory import Laboratory
+
+pytestmark = pytest.mark.netns
+
+PATIENCE_S = 90.0
+GDP = (sys.executable, "-m", "gdp.cli.gdp")
+
+
+@contextlib.contextmanager
+def running(host: Host, folder: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
+    """Run ``gdp`` on a host while within; end it as Ctrl-C does."""
+    with (folder / f"{host.label}.log").open("w") as log:
+        process = subprocess.Popen(
+            host.command([*GDP, *words]), stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True
+        )
+        try:
+            yield process
+        finally:
+            process.send_signal(signal.SIGINT)
+            process.communicate(timeout=PATIENCE_S)
+
+
+def run(*words: str) -> str:
+    """Run a command of the border's operator, and return what it prints."""
+    return subprocess.run([*GDP, *words], check=True, capture_output=True, text=True, timeout=PATIENCE_S).stdout
+
+
+def links(directory: Path) -> list[dict[str, object]]:
+    """Return the tunnels of a machine's switch; empty: the switch is not up yet."""
+    with contextlib.suppress(GdpError):
+        found = ask_node(find_control_socket(directory / "switch"), Command.STATUS, 5.0).result.get("links")
+        return found if isinstance(found, list) else []
+    return []
+
+
+def up(directory: Path) -> set[object]:
+    """Return the labels of the peers whose tunnels are up."""
+    return {each["label"] for each in links(directory) if each["up"] is True}
+
+
+def eventually(found: Callable[[], bool], logs: Path) -> None:
+    """Wait until something holds."""
+    end_s = time.monotonic() + PATIENCE_S
+    while not found():
+        assert time.monotonic() < end_s, "".join(each.read_text() for each in logs.glob("*.log"))[-4_000:]
+        time.sleep(0.1)
+
+
+def test_machines_behind_nats_join_with_tokens_and_a_removed_one_has_no_tunnel(
+    laboratory: Laboratory, tmp_path: Path
+) -> None:
+    border = laboratory.add_host("border", laboratory.add_site("dc", Access.PUBLIC))
+    robot = laboratory.add_host("robot", laboratory.add_site("home", Access.SYMMETRIC))
+    arm = laboratory.add_host("arm", laboratory.add_site("hall", Access.PORT_RESTRICTED))
+    address, lab = border.lease().address.partition("/")[0], tmp_path / "lab"
+    with contextlib.ExitStack() as stack:
+        words = ("domain", "create", "lab", "--public", address, "--directory", str(lab), "--no-systemd")
+        created = stack.enter_context(running(border, tmp_path, *words))
+        assert created.stdout is not None
+        assert select.select([created.stdout], [], [], PATIENCE_S)[0]
+        tokens = [created.stdout.readline(), run("domain", "token", "lab", "--directory", str(lab), "--role", "leaf")]
+        eventually(lambda: "listening on TCP port" in (tmp_path / "border.log").read_text(), tmp_path)
+        for host, line in zip((robot, arm), tokens, strict=True):
+            home = str(tmp_path / host.label)
+            line_words = (*line.split()[1:], "--label", host.label, "--directory", home, "--no-systemd")
+            stack.enter_context(running(host, tmp_path, *line_words))
+        eventually(lambda: up(lab) == {"robot", "arm"}, tmp_path)
+        eventually(lambda: "border" in up(tmp_path / "robot"), tmp_path)
+        eventually(lambda: "tunnels are up: border" in (tmp_path / "robot.log").read_text(), tmp_path)
+        rows = {
+            each["label"]: each for each in json.loads(run("domain", "ls", "lab", "--directory", str(lab), "--json"))
+        }
+        assert rows.keys() == {"border", "robot", "arm"}
+        run("domain", "remove", "lab", "robot", "--directory", str(lab))
+        eventually(lambda: {each["label"] for each in links(lab)} == {"arm"}, tmp_path)
