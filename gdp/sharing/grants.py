@@ -28,7 +28,7 @@ TAKING: Final = {"topic": Right.READ, "service": Right.CALL, "action": Right.CAL
 
 
 def described(kind: str, name: str, type_name: str) -> Metadata:
-    """Return what the 256-bit name of a shared name digests, besides the owner's key."""
+    """Return what the 256-bit name of a shared name digests, in addition to the owner's key."""
     return Metadata({"kind": kind, "name": name, "type": type_name})
 
 

@@ -53,7 +53,7 @@ class Sharing:
     Args:
         path: of ``proxy.yaml``. ``groups.yaml`` may lie in the same folder.
         exchange: directory and mailboxes of the domain.
-        owners: directories of owners whose delegations are renewed, besides those of exposed names.
+        owners: directories of owners whose delegations are renewed, in addition to those of exposed names.
     """
 
     def __init__(self, path: Path, exchange: Exchange, owners: Sequence[Path] = ()) -> None:
@@ -317,7 +317,7 @@ class Sharing:
 
     def _receive(self, at: _Pass) -> None:
         """Take the waiting mails; a mail that is not valid is reported."""
-        for mail in self._exchange.receive():
+        for mail in self._exchange.receive_mail():
             try:
                 if mail.kind == MailKind.DELEGATION.value:
                     self._take_delegation(at, mail)
