@@ -274,7 +274,7 @@ def _sharing(directory: Path, folder: Path | None, owner: Path | None) -> Iterat
     path = directory / _PROXY_FILE
     owners = [each for each in (owner or directory / _OWNER,) if (each / OWNER_KEY).exists()]
     if folder is not None:
-        yield Sharing(path, FolderExchange(folder, load_card(ProxyFiles.load(path).identity / CARD)), owners)
+        yield Sharing(path, FolderExchange(folder, load_card(ProxyFiles.read(path).identity / CARD)), owners)
     elif (directory / MEMBER_FILE).exists():
         with contextlib.closing(MemberExchange(directory, fetches=True)) as exchange:
             yield Sharing(path, exchange, owners)

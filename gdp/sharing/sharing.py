@@ -192,12 +192,12 @@ class Sharing:
 
     def offers(self) -> list[tuple[Offer, bool]]:
         """Return the offers, each with whether it is accepted. Raises ``LocalError``: a file is invalid."""
-        state = self._folder.load()
+        state = self._folder.read_state()
         return [(each, any(each.fits(name) for name in state.accepted)) for each in self._folder.offers(state)]
 
     def state(self) -> ShareState:
         """Return what is exposed and accepted. Raises ``LocalError``: the file is invalid."""
-        return self._folder.load()
+        return self._folder.read_state()
 
     def renew_delegations(self, unix_s: float) -> ShareReport:
         """Renew and redeliver the delegations of which two thirds are over; an agent calls this periodically.
@@ -224,7 +224,7 @@ class Sharing:
     def _change(self, unix_s: float) -> Iterator[_Pass]:
         """Load what a change needs, and save the state unless it fails."""
         with locked(self._path):
-            files, report = ProxyFiles.load(self._path), ShareReport()
+            files, report = ProxyFiles.read(self._path), ShareReport()
             grants = Grants(
                 files=files,
                 exchange=self._exchange,
@@ -234,7 +234,7 @@ class Sharing:
                 unix_s=unix_s,
                 report=report,
             )
-            state = self._folder.load()
+            state = self._folder.read_state()
             at = _Pass(files, state, list(self._folder.offers(state)), grants, report)
             yield at
             if at.state != state:
