@@ -85,7 +85,18 @@ class Site:
 
     def gdp(self, command: str, host: str, *words: str) -> dict[str, Any]:
         """Run a command of ``gdp`` on one machine; return its JSON output."""
-        argv = [sys.executable, "-m", "gdp.cli.gdp", command, *words, "--dir", host, "--exchange", "common", "--json"]
+        argv = [
+            sys.executable,
+            "-m",
+            "gdp.cli.gdp",
+            command,
+            *words,
+            "--directory",
+            host,
+            "--exchange",
+            "common",
+            "--json",
+        ]
         done = subprocess.run(
             argv,
             cwd=self.home,

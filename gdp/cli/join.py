@@ -33,6 +33,8 @@ from gdp.enrolment.channel import connect_any
 from gdp.enrolment.join import JoinRequest, join_domain
 from gdp.enrolment.member_files import MemberFiles
 from gdp.enrolment.programs import programs_of
+from gdp.sharing.member_exchange import MemberExchange
+from gdp.sharing.upkeep import ShareUpkeep
 from gdp.trust.join_token import JoinToken
 
 __all__ = ["agent", "join", "run_agent", "up"]
@@ -100,6 +102,8 @@ def up(directory: options.Directory, no_systemd: NoSystemd = False, as_json: opt
 def agent(directory: options.Directory, as_json: options.Json = False) -> None:
     """Run the agent of a machine until Ctrl-C; the units of the machine do that.
 
+    It renews memberships and delegations, fetches mail, and delegates shared names that appear.
+
     \b
     Example:
       gdp agent /var/lib/gdp/lab
@@ -107,7 +111,15 @@ def agent(directory: options.Directory, as_json: options.Json = False) -> None:
     set_up_logging(verbose=False)
     made = Agent(directory)
     show({"directory": str(directory)}, as_json=as_json, plain=f"agent of {directory}; Ctrl-C ends it")
-    run_agent(made)
+    upkeep = ShareUpkeep(directory, MemberExchange(directory, fetches=False))
+    has_proxy = (directory / "proxy.yaml").exists()
+    if has_proxy:
+        upkeep.start()
+    try:
+        run_agent(made)
+    finally:
+        if has_proxy:
+            upkeep.stop()
 
 
 def run_agent(made: Agent) -> None:

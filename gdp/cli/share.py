@@ -5,10 +5,10 @@ I/O. Exit codes: 0 done, 2 wrong input; then nothing has changed.
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Final, Optional
@@ -16,11 +16,13 @@ from typing import Annotated, Final, Optional
 import typer
 
 from gdp.cli import options
+from gdp.cli.machine import directory_of
 from gdp.cli.output import moment, show
+from gdp.enrolment.member_files import MEMBER_FILE
 from gdp.errors import GdpError, LocalError
-from gdp.sharing.exchange import Exchange
 from gdp.sharing.folder_exchange import FolderExchange
 from gdp.sharing.issued import IssuedDelegation, IssuedStore
+from gdp.sharing.member_exchange import MemberExchange
 from gdp.sharing.proxy_files import ProxyFiles, fits
 from gdp.sharing.report import ShareReport
 from gdp.sharing.revocations import publish_revocations
@@ -56,7 +58,10 @@ OwnerDir = Annotated[
     Optional[Path],  # noqa: UP045
     typer.Option("--owner", metavar="DIR", help="The owner's directory. Default: owner, in the machine's directory."),
 ]
-MachineDir = Annotated[Path, typer.Option("--dir", metavar="DIR", help="The machine's directory, with proxy.yaml.")]
+MachineDir = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option("--directory", metavar="DIR", help="The machine's files. Default: this folder, or where it joined."),
+]
 ExchangeDir = Annotated[
     Optional[Path],  # noqa: UP045
     typer.Option(
@@ -85,7 +90,7 @@ def expose(
     encoding: Encoding = None,
     remove: Remove = False,
     wait: Wait = 3.0,
-    directory: MachineDir = Path(),
+    directory: MachineDir = None,
     exchange: ExchangeDir = None,
     as_json: options.Json = False,
 ) -> None:
@@ -101,35 +106,35 @@ def expose(
       gdp expose /goal --from server
       gdp expose '/camera/**' --remove
     """
-    sharing = _sharing(directory, exchange, owner)
-    if remove:
-        _show_change(name, sharing.stop_exposing(kind, name, time.time()), as_json=as_json)
-        return
-    if (source is None) == (not to):
-        raise LocalError("expose: state --to NODE, or --from NODE for a name that NODE lets this machine publish")
-    if source is not None:
-        accepted = AcceptedName(side="expose", name=name, source=source)
-        _show_change(name, sharing.accept(accepted, time.time()), as_json=as_json)
-        return
-    with _owner_of(directory, owner) as folder:
-        wanted = ExposedName(
-            kind=kind_from_text(kind, type_),
-            name=name,
-            type_name=type_,
-            to=tuple(dict.fromkeys(to)),
-            owner=folder,
-            owner_key=load_owner(folder).public.compressed.hex(),
-            days=days,
-            encoding=encoding,
-        )
-        report = sharing.expose(wanted, time.time())
-    until_s = time.monotonic() + wait
-    while not report.granted and report.is_running and time.monotonic() < until_s:
-        time.sleep(_POLL_S)  # the proxy answers at once, and its graph has no event for this process
-        more = sharing.work(time.time())
-        report.granted += more.granted
-        report.problems += [text for text in more.problems if text not in report.problems]
-    _show_change(name, report, as_json=as_json, awaited="as soon as a local node shows it")
+    directory = _machine_directory(directory)
+    with _sharing(directory, exchange, owner) as sharing:
+        if remove:
+            _show_change(name, sharing.stop_exposing(kind, name, time.time()), as_json=as_json)
+            return
+        if (source is None) == (not to):
+            raise LocalError("expose: state --to NODE, or --from NODE for a name that NODE lets this machine publish")
+        if source is not None:
+            accepted = AcceptedName(side="expose", name=name, source=source)
+            _show_change(name, sharing.accept(accepted, time.time()), as_json=as_json)
+            return
+        with _owner_of(directory, owner) as folder:
+            wanted = ExposedName(
+                kind=kind_from_text(kind, type_),
+                name=name,
+                type_name=type_,
+                to=tuple(dict.fromkeys(to)),
+                owner=folder,
+                owner_key=load_owner(folder).public.compressed.hex(),
+                days=days,
+                encoding=encoding,
+            )
+            report = sharing.expose(wanted, time.time())
+        until_s = time.monotonic() + wait
+        while not (given := _given(folder, kind, name)) and report.is_running and time.monotonic() < until_s:
+            time.sleep(_POLL_S)  # the graph of the proxy has no event for this process
+            report.problems = sharing.work(time.time()).problems
+        report.granted = given
+        _show_change(name, report, as_json=as_json, awaited="as soon as a local node shows it")
 
 
 def import_names(
@@ -137,7 +142,7 @@ def import_names(
     source: Source = None,
     show_list: List = False,
     remove: Remove = False,
-    directory: MachineDir = Path(),
+    directory: MachineDir = None,
     exchange: ExchangeDir = None,
     as_json: options.Json = False,
 ) -> None:
@@ -149,21 +154,22 @@ def import_names(
       gdp import /camera/image --from robot
       gdp import '/camera/**' --remove
     """
-    sharing = _sharing(directory, exchange, None)
-    if show_list:
-        report = sharing.work(time.time())
-        offers = [_offer_fields(offer, is_accepted=is_accepted) for offer, is_accepted in sharing.offers()]
-        accepted = [each.model_dump() for each in sharing.state().accepted]
-        fields = {"offers": offers, "accepted": accepted, "problems": report.problems}
-        show(fields, as_json=as_json, plain=_table(offers, ("name", "type", "from", "rights", "until", "accepted")))
-    elif name is None:
-        raise LocalError("import: state a NAME, or --list")
-    elif remove:
-        _show_change(name, sharing.stop_accepting("import", name, time.time()), as_json=as_json)
-    else:
-        report = sharing.accept(AcceptedName(side="import", name=name, source=source), time.time())
-        found = [each for each, is_accepted in sharing.offers() if is_accepted and fits(name, each.ros_name)]
-        _show_change(name, report, as_json=as_json, offers=found, awaited="as soon as a node offers it")
+    directory = _machine_directory(directory)
+    with _sharing(directory, exchange, None) as sharing:
+        if show_list:
+            report = sharing.work(time.time())
+            offers = [_offer_fields(offer, is_accepted=is_accepted) for offer, is_accepted in sharing.offers()]
+            accepted = [each.model_dump() for each in sharing.state().accepted]
+            fields = {"offers": offers, "accepted": accepted, "problems": report.problems}
+            show(fields, as_json=as_json, plain=_table(offers, ("name", "type", "from", "rights", "until", "accepted")))
+        elif name is None:
+            raise LocalError("import: state a NAME, or --list")
+        elif remove:
+            _show_change(name, sharing.stop_accepting("import", name, time.time()), as_json=as_json)
+        else:
+            report = sharing.accept(AcceptedName(side="import", name=name, source=source), time.time())
+            found = [each for each, is_accepted in sharing.offers() if is_accepted and fits(name, each.ros_name)]
+            _show_change(name, report, as_json=as_json, offers=found, awaited="as soon as a node offers it")
 
 
 def share(
@@ -183,7 +189,7 @@ def share(
         bool, typer.Option("--renew", help="Renew what is due and take mail, once, where no agent does it.")
     ] = False,
     show_list: List = False,
-    directory: MachineDir = Path(),
+    directory: MachineDir = None,
     exchange: ExchangeDir = None,
     as_json: options.Json = False,
 ) -> None:
@@ -196,33 +202,43 @@ def share(
       gdp share /camera/image --revoke laptop
       gdp share --list
     """
+    directory = _machine_directory(directory)
     folder = owner or directory / _OWNER
-    sharing = _sharing(directory, exchange, owner)
-    if show_list:
-        state = sharing.state()
-        issued = [_issued_fields(each) for each in IssuedStore(folder) if not each.is_own]
-        fields = {"exposed": _exposed_fields(state), "shared": issued}
-        show(fields, as_json=as_json, plain=_table(issued, ("name", "type", "node", "rights", "until", "state")))
-        return
-    if renew:
-        _show_change("all", sharing.work(time.time()), as_json=as_json)
-        return
-    if name is None or (revoke is None) == (not nodes):
-        raise LocalError("share: state a NAME and --with NODE or --revoke NODE; or --list")
-    if revoke is not None:
-        spread = partial(publish_revocations, directory / _SWITCH_FILE)
-        _show_change(name, sharing.revoke(folder, name, revoke, spread, time.time()), as_json=as_json)
-        return
-    known = kind_from_text(kind, type_)
-    if (publish and known != "topic") or (serve and known == "topic"):
-        raise LocalError("share: --publish is for a topic, --serve for --kind service or action")
-    report = sharing.share(
-        folder, name, nodes, time.time(), kind=known, type_name=type_, is_giving=publish or serve, days=days
-    )
-    _show_change(name, report, as_json=as_json)
+    with _sharing(directory, exchange, owner) as sharing:
+        if show_list:
+            state = sharing.state()
+            issued = [_issued_fields(each) for each in IssuedStore(folder) if not each.is_own]
+            fields = {"exposed": _exposed_fields(state), "shared": issued}
+            show(fields, as_json=as_json, plain=_table(issued, ("name", "type", "node", "rights", "until", "state")))
+            return
+        if renew:
+            _show_change("all", sharing.work(time.time()), as_json=as_json)
+            return
+        if name is None or (revoke is None) == (not nodes):
+            raise LocalError("share: state a NAME and --with NODE or --revoke NODE; or --list")
+        if revoke is not None:
+            spread = partial(publish_revocations, directory / _SWITCH_FILE)
+            _show_change(name, sharing.revoke(folder, name, revoke, spread, time.time()), as_json=as_json)
+            return
+        known = kind_from_text(kind, type_)
+        if (publish and known != "topic") or (serve and known == "topic"):
+            raise LocalError("share: --publish is for a topic, --serve for --kind service or action")
+        report = sharing.share(
+            folder, name, nodes, time.time(), kind=known, type_name=type_, is_giving=publish or serve, days=days
+        )
+        _show_change(name, report, as_json=as_json)
 
 
-@contextmanager
+def _given(owner: Path, kind: str, name: str) -> list[IssuedDelegation]:
+    """Return what was delegated of a name or a pattern, by this command or by the agent."""
+    return [
+        each
+        for each in IssuedStore(owner)
+        if not each.is_revoked and each.metadata["kind"] == kind and fits(name, str(each.metadata["name"]))
+    ]
+
+
+@contextlib.contextmanager
 def _owner_of(directory: Path, owner: Path | None) -> Iterator[Path]:
     """Yield an owner's directory; the machine's own owner is made if it is missing, unless the change fails."""
     folder = owner or directory / _OWNER
@@ -237,19 +253,33 @@ def _owner_of(directory: Path, owner: Path | None) -> Iterator[Path]:
         raise
 
 
-def _sharing(directory: Path, exchange: Path | None, owner: Path | None) -> Sharing:
-    """Return the sharing of the machine in ``directory``."""
+def _machine_directory(stated: Path | None) -> Path:
+    """Return the directory of this machine's files: the stated one, this folder, or the only domain that it joined."""
+    if stated is None and not Path(_PROXY_FILE).exists():
+        domains = directory_of("any", None).parent
+        joined = sorted(each.parent for each in domains.glob(f"*/{MEMBER_FILE}"))
+        if len(joined) != 1:
+            what = f"several domains are in {domains}" if joined else f"no {_PROXY_FILE} is here, nor in {domains}"
+            raise LocalError(f"{what}; name the machine's files with --directory")
+        return joined[0]
+    directory = stated or Path()
+    if not (directory / _PROXY_FILE).exists():
+        raise LocalError(f"{directory}: no {_PROXY_FILE} is here; name the machine's files with --directory")
+    return directory
+
+
+@contextlib.contextmanager
+def _sharing(directory: Path, folder: Path | None, owner: Path | None) -> Iterator[Sharing]:
+    """Yield the sharing of the machine in ``directory``, through a folder or the domain's server."""
     path = directory / _PROXY_FILE
-    if not path.exists():
-        raise LocalError(f"{directory}: no {_PROXY_FILE} is here; name the machine's directory with --dir")
     owners = [each for each in (owner or directory / _OWNER,) if (each / OWNER_KEY).exists()]
-    return Sharing(path, _exchange(path, exchange), owners)
-
-
-def _exchange(path: Path, folder: Path | None) -> Exchange:
-    if folder is None:
-        raise LocalError("state --exchange DIR: the folder that the machines share")
-    return FolderExchange(folder, load_card(ProxyFiles.load(path).identity / CARD))
+    if folder is not None:
+        yield Sharing(path, FolderExchange(folder, load_card(ProxyFiles.read(path).identity / CARD)), owners)
+    elif (directory / MEMBER_FILE).exists():
+        with contextlib.closing(MemberExchange(directory, fetches=True)) as exchange:
+            yield Sharing(path, exchange, owners)
+    else:
+        raise LocalError(f"{directory}: this machine has not joined a domain; state --exchange DIR, a shared folder")
 
 
 def _show_change(

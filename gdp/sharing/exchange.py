@@ -51,7 +51,7 @@ class Exchange(Protocol):
     def send(self, to: Name, kind: str, data: bytes) -> None:
         """Leave a mail for a member; it is kept until the member receives it."""
 
-    def receive(self) -> Iterator[Mail]:
+    def receive_mail(self) -> Iterator[Mail]:
         """Yield the waiting mails of a ``MailKind``; each is removed when the next one is asked for."""
 
 

@@ -60,7 +60,7 @@ class FolderExchange:
         wire = encode({"from": self._own.label, "kind": kind, "data": data})
         write_all(self._folder / _MAIL / to.to_text(), {name: private(wire)})
 
-    def receive(self) -> Iterator[Mail]:
+    def receive_mail(self) -> Iterator[Mail]:
         """Yield the waiting mails; each is removed when the next one is asked for, a malformed one at once."""
         for path in sorted((self._folder / _MAIL / self._own.name.to_text()).glob("*.mail")):
             try:

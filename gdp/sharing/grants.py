@@ -10,9 +10,10 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from gdp.errors import GdpError, LocalError
+from gdp.crypto.certificates import Root
+from gdp.errors import GdpError
 from gdp.metadata import Metadata
-from gdp.sharing.exchange import Exchange, MailKind, resolve_recipients
+from gdp.sharing.exchange import Exchange, MailKind, proxies_of, resolve_recipients
 from gdp.sharing.issued import IssuedDelegation, IssuedStore
 from gdp.sharing.proxy_files import ProxyFiles, Undelegated, fits
 from gdp.sharing.report import ShareReport
@@ -28,7 +29,7 @@ TAKING: Final = {"topic": Right.READ, "service": Right.CALL, "action": Right.CAL
 
 
 def described(kind: str, name: str, type_name: str) -> Metadata:
-    """Return what the 256-bit name of a shared name digests, besides the owner's key."""
+    """Return what the 256-bit name of a shared name digests, in addition to the owner's key."""
     return Metadata({"kind": kind, "name": name, "type": type_name})
 
 
@@ -38,7 +39,7 @@ class Grants:
 
     Args:
         own: descriptor of the proxy of this machine.
-        nodes: proxies of the domain by label; None: the exchange does not answer.
+        root: of the domain, which confirms the descriptors of its nodes.
         report: gets what is issued and what fails.
         is_changed: whether a delegation of the proxy of this machine was installed, so that it must reload.
     """
@@ -46,11 +47,29 @@ class Grants:
     files: ProxyFiles
     exchange: Exchange
     own: NodeDescriptor
-    nodes: Mapping[str, NodeDescriptor] | None
+    root: Root
     groups: Mapping[str, Sequence[str]]
     unix_s: float
     report: ShareReport
     is_changed: bool = False
+    _nodes: Mapping[str, NodeDescriptor] | None = None
+    _failure: GdpError | None = None
+
+    def nodes(self) -> Mapping[str, NodeDescriptor]:
+        """Return the proxies of the domain by label; the exchange is asked once.
+
+        Raises:
+            GdpError: the exchange does not answer.
+        """
+        if self._failure is not None:
+            raise self._failure
+        if self._nodes is None:
+            try:
+                self._nodes = proxies_of(self.exchange, self.root, self.unix_s)
+            except GdpError as error:
+                self._failure = error
+                raise
+        return self._nodes
 
     def grant_exposed(
         self, state: ShareState, undelegated: Iterable[Undelegated], restored: Collection[str] = ()
@@ -145,15 +164,23 @@ class Grants:
     def _renew(self, store: IssuedStore, issued: IssuedDelegation) -> None:
         if issued.is_revoked:
             return
-        present = self.own if issued.is_own else None
-        if present is None:
-            present = issued.descriptor if self.nodes is None else self.nodes.get(issued.label)
+        if issued.is_delivered and not issued.is_due(self.unix_s):
+            return
+        present = self.own if issued.is_own else self._present(issued)
         if present is None or present.name != issued.descriptor.name:
             return  # it has left the domain, or joined again as another node
         if issued.is_due(self.unix_s):
             self.deliver(store, store.renew(issued, present, self.unix_s))
         elif not issued.is_delivered:
             self.deliver(store, issued)
+
+    def _present(self, issued: IssuedDelegation) -> NodeDescriptor | None:
+        """Return the descriptor of a node, None if it has left; without an answer the one at the time of issue."""
+        try:
+            return self.nodes().get(issued.label)
+        except GdpError as error:
+            self.report.add_problem(error)
+            return issued.descriptor
 
     def _grant(
         self, store: IssuedStore, metadata: Metadata, rules: Sequence[ExposedName], restored: Collection[str]
@@ -162,9 +189,9 @@ class Grants:
         wanted = [(self.own.label, self.own, GIVING[kind])]
         for each in dict.fromkeys(label for rule in rules for label in rule.to):
             try:
-                nodes = {} if self.nodes is None else resolve_recipients([each], self.nodes, self.groups)
-            except LocalError as error:
-                self.report.problems.append(str(error))
+                nodes = resolve_recipients([each], self.nodes(), self.groups)
+            except GdpError as error:
+                self.report.add_problem(error)
                 continue
             wanted += [(label, node, TAKING[kind]) for label, node in nodes.items() if node.name != self.own.name]
         name = load_owner(store.owner).subject(metadata).name

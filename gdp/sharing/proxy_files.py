@@ -82,7 +82,7 @@ class ProxyFiles:
     rules: Sequence[StatedRule]
 
     @classmethod
-    def load(cls, path: Path) -> ProxyFiles:
+    def read(cls, path: Path) -> ProxyFiles:
         """Read the configuration of a proxy.
 
         Raises:

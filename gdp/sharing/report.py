@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from gdp.errors import GdpError
 from gdp.sharing.issued import IssuedDelegation
 from gdp.sharing.state import Offer
 
@@ -25,3 +26,8 @@ class ShareReport:
     granted: list[IssuedDelegation] = field(default_factory=list)
     received: list[Offer] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
+
+    def add_problem(self, error: GdpError) -> None:
+        """Add the text of an error, unless it is there already."""
+        if str(error) not in self.problems:
+            self.problems.append(str(error))

@@ -16,7 +16,7 @@ from gdp.crypto.statements import parse
 from gdp.errors import DropReason, GdpError, LocalError, StatementError
 from gdp.metadata import Metadata
 from gdp.nodes.drop_in import locked, read_drop_in
-from gdp.sharing.exchange import Exchange, Mail, MailKind, load_groups, proxies_of, resolve_recipients
+from gdp.sharing.exchange import Exchange, Mail, MailKind, load_groups, resolve_recipients
 from gdp.sharing.grants import GIVING, TAKING, Grants, described
 from gdp.sharing.issued import IssuedDelegation, IssuedStore
 from gdp.sharing.proxy_files import ProxyFiles, Side, fits
@@ -53,7 +53,7 @@ class Sharing:
     Args:
         path: of ``proxy.yaml``. ``groups.yaml`` may lie in the same folder.
         exchange: directory and mailboxes of the domain.
-        owners: directories of owners whose delegations are renewed, besides those of exposed names.
+        owners: directories of owners whose delegations are renewed, in addition to those of exposed names.
     """
 
     def __init__(self, path: Path, exchange: Exchange, owners: Sequence[Path] = ()) -> None:
@@ -75,7 +75,7 @@ class Sharing:
         with self._change(unix_s) as at:
             check_exposed(at.files, at.state, at.offers, wanted)
             grants = at.grants
-            added = resolve_recipients(wanted.to, self._reachable(at), grants.groups)
+            added = resolve_recipients(wanted.to, at.grants.nodes(), grants.groups)
             kept = [each for each in at.state.exposed if (each.kind, each.name) != (wanted.kind, wanted.name)]
             for each in at.state.exposed:
                 if each not in kept:
@@ -146,7 +146,7 @@ class Sharing:
         check_name(name)
         kind_from_text(kind, type_name)
         with self._change(unix_s) as at:
-            nodes = resolve_recipients(recipients, self._reachable(at), at.grants.groups)
+            nodes = resolve_recipients(recipients, at.grants.nodes(), at.grants.groups)
             store = IssuedStore(owner.absolute())
             right = (GIVING if is_giving else TAKING)[kind]
             for metadata in self._known(at, store, kind, name, type_name):
@@ -192,12 +192,12 @@ class Sharing:
 
     def offers(self) -> list[tuple[Offer, bool]]:
         """Return the offers, each with whether it is accepted. Raises ``LocalError``: a file is invalid."""
-        state = self._folder.load()
+        state = self._folder.read_state()
         return [(each, any(each.fits(name) for name in state.accepted)) for each in self._folder.offers(state)]
 
     def state(self) -> ShareState:
         """Return what is exposed and accepted. Raises ``LocalError``: the file is invalid."""
-        return self._folder.load()
+        return self._folder.read_state()
 
     def renew_delegations(self, unix_s: float) -> ShareReport:
         """Renew and redeliver the delegations of which two thirds are over; an agent calls this periodically.
@@ -224,22 +224,17 @@ class Sharing:
     def _change(self, unix_s: float) -> Iterator[_Pass]:
         """Load what a change needs, and save the state unless it fails."""
         with locked(self._path):
-            files, report = ProxyFiles.load(self._path), ShareReport()
-            try:
-                nodes = proxies_of(self._exchange, load_root(files.root), unix_s)
-            except GdpError as error:
-                nodes = None
-                report.problems.append(str(error))
+            files, report = ProxyFiles.read(self._path), ShareReport()
             grants = Grants(
                 files=files,
                 exchange=self._exchange,
                 own=load_card(files.identity / CARD),
-                nodes=nodes,
+                root=load_root(files.root),
                 groups=load_groups(self._path.with_name(GROUPS)),
                 unix_s=unix_s,
                 report=report,
             )
-            state = self._folder.load()
+            state = self._folder.read_state()
             at = _Pass(files, state, list(self._folder.offers(state)), grants, report)
             yield at
             if at.state != state:
@@ -250,14 +245,7 @@ class Sharing:
         try:
             step(at)
         except GdpError as error:
-            if str(error) not in at.report.problems:
-                at.report.problems.append(str(error))
-
-    def _reachable(self, at: _Pass) -> dict[str, NodeDescriptor]:
-        """Return the proxies of the domain. Raises ``LocalError``: the exchange does not answer."""
-        if at.grants.nodes is None:
-            raise LocalError(at.report.problems[0])
-        return dict(at.grants.nodes)
+            at.report.add_problem(error)
 
     def _apply(self, at: _Pass, *, is_required: bool = False) -> None:
         """Install and remove delegations of offers, and write the rules.
@@ -282,7 +270,8 @@ class Sharing:
             at.report.is_running = at.files.replace_rules(text)
 
     def _grant(self, at: _Pass, restored: Sequence[str] | dict[str, NodeDescriptor] = ()) -> None:
-        at.grants.grant_exposed(at.state, at.files.undelegated() or (), restored)
+        if at.state.exposed:
+            at.grants.grant_exposed(at.state, at.files.undelegated() or (), restored)
         self._reload_changed(at)
 
     def _renew(self, at: _Pass) -> None:
@@ -317,7 +306,7 @@ class Sharing:
 
     def _receive(self, at: _Pass) -> None:
         """Take the waiting mails; a mail that is not valid is reported."""
-        for mail in self._exchange.receive():
+        for mail in self._exchange.receive_mail():
             try:
                 if mail.kind == MailKind.DELEGATION.value:
                     self._take_delegation(at, mail)

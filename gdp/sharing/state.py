@@ -148,7 +148,7 @@ class StateFolder:
     def __init__(self, path: Path) -> None:
         self.folder = path.with_name(path.name + _SUFFIX)
 
-    def load(self) -> ShareState:
+    def read_state(self) -> ShareState:
         """Return the state; an empty one if nothing was shared yet. Raises ``LocalError``: a file is invalid."""
         file = self.folder / _RULES
         if not file.exists():

@@ -40,7 +40,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
         """Return exit code, output and errors of ``gdp COMMAND HOST ...``."""
         command, host, *rest = words
         with pytest.raises(SystemExit) as leaving:
-            main([command, *rest, "--dir", host, "--exchange", "common"])
+            main([command, *rest, "--directory", host, "--exchange", "common"])
         shown = capsys.readouterr()
         return int(leaving.value.code or 0), shown.out, shown.err
 

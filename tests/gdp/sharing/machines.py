@@ -64,7 +64,7 @@ class _Member:
         self._check()
         self.directory.mail[to].append(Mail(sender=self.label, kind=kind, data=data))
 
-    def receive(self) -> Iterator[Mail]:
+    def receive_mail(self) -> Iterator[Mail]:
         self._check()
         waiting = self.directory.mail[self.directory.cards[self.label].name]
         while waiting:
