@@ -27,7 +27,7 @@ from netns_tests.spaces import Space
 
 PORT = 443
 BORDER_ADDRESS, MEMBER_ADDRESS, LATER_ADDRESS = "192.0.2.1", "192.0.2.2", "192.0.2.3"
-_PATIENCE_S = 30.0
+_PATIENCE_S = 60.0
 
 
 class Node:
