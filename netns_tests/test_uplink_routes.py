@@ -143,7 +143,7 @@ def follow(routes: UplinkRoutes, until: Callable[[], bool]) -> None:
 
 
 def left() -> list[str]:
-    """Return the rules and routes that are ours, whoever made them."""
+    """Return the rules and routes with our protocol number."""
     words = "proto", str(PROTOCOL)
     found = []
     for family in ("-4", "-6"):
