@@ -39,9 +39,8 @@ ADDRESS_GROUPS: Final = 0x10 | 0x100  # RTMGRP_IPV4_IFADDR, RTMGRP_IPV6_IFADDR
 ROUTE_GROUPS: Final = 0x40 | 0x400  # RTMGRP_IPV4_ROUTE, RTMGRP_IPV6_ROUTE
 _RULE_GROUPS: Final = 0x80 | 1 << 18  # RTMGRP_IPV4_RULE; RTNLGRP_IPV6_RULE is 19
 _PRIORITY: Final = 5_000
-_MARK: Final = (
-    0x40010000  # no table of the system; not a mark of Tailscale, which compares 0xff0000 with 0x40000, 0x80000
-)
+# above the tables of the system; with bit 0x10000 it is no mark of Tailscale, 0x40000 or 0x80000 of 0xff0000
+_MARK: Final = 0x40010000
 _MARK_BITS: Final = 0x3FFE1FFF  # follow from the name; the bits of Kubernetes (0xc000) and CNI (0x2000) stay 0
 
 _RTM_NEWROUTE, _RTM_DELROUTE, _RTM_GETROUTE = 24, 25, 26
