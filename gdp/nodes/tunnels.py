@@ -14,7 +14,7 @@ from functools import partial
 from types import MappingProxyType
 from typing import Final
 
-from gdp.control.endpoint_record import EndpointRecord
+from gdp.control.endpoint_record import UPLINKS_MAX, EndpointRecord
 from gdp.control.endpoints import Endpoint, inner_address, tunnel_vni
 from gdp.control.tunnel_plan import TunnelId, tunnel_ifname, underlay_ifname
 from gdp.crypto.identity import Identity
@@ -26,6 +26,7 @@ from gdp.nodes.config import LinksConfig
 from gdp.nodes.runtime import Runtime
 from gdp.ports.tunnel.path_mtu import route_mtu, tunnel_mtu
 from gdp.ports.tunnel.rate_limit import limit_rate
+from gdp.ports.tunnel.uplink_routes import mark_of, remove_leftovers
 from gdp.ports.tunnel.vxlan import make_vxlan, remove_link, set_link_mtu
 from gdp.ports.tunnel.wireguard import PeerState, WireGuardDevice, open_wireguard
 from gdp.sansio import Timestamps
@@ -76,11 +77,13 @@ def open_underlays(config: LinksConfig, identity: Identity) -> Iterator[tuple[Wi
         LocalError: there is no WireGuard here, the port is taken, or the process may not make devices.
     """
     wireguard_mtu, _ = tunnel_mtu(_OUTER_MTU, is_ipv6=True)
+    ifnames = [underlay_ifname(identity.name, uplink) for uplink in range(UPLINKS_MAX)]
+    remove_leftovers(map(mark_of, ifnames))  # of a dead run, perhaps with more uplinks
     with contextlib.ExitStack() as stack:
         devices = []
         for uplink in range(max(len(config.uplinks), 1)):
             device = open_wireguard(
-                ifname=underlay_ifname(identity.name, uplink),
+                ifname=ifnames[uplink],
                 private_key=TunnelKey.derive(identity.kem, uplink).private,
                 listen_port=config.listen + uplink if config.listen else 0,
                 inner=inner_address(identity.name, uplink),
