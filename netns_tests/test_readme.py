@@ -1,4 +1,4 @@
-"""Two machines set up by the commands of the README, or of the tutorial, in two namespaces that a cable joins."""
+"""Two machines set up by the commands of a how-to page, or of the tutorial, in two namespaces that a cable joins."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from netns_tests.cable import Terminals, sim_link
 from netns_tests.spaces import Space
 from proxy.recordings.compare import compare
 from tests.machines import Machines
-from tests.pages import ROOT, Block, blocks, blocks_between
+from tests.pages import ROOT, Block, blocks
 
 pytestmark = pytest.mark.netns
 
-README = blocks_between(ROOT / "README.md", "Two machines of your own")
+CABLE = blocks(ROOT / "docs/how-to/one-cable.md")
 TUTORIAL = blocks(ROOT / "docs/tutorials/two-machines.md")
 _TOPIC = "/camera/image"
 
 
-@pytest.mark.parametrize("page", [README, TUTORIAL], ids=["readme", "tutorial"])
+@pytest.mark.parametrize("page", [CABLE, TUTORIAL], ids=["cable", "tutorial"])
 def test_a_recording_goes_from_one_machine_to_the_other_by_the_commands_of_a_page(
     page: list[Block], space: Space, tmp_path: Path
 ) -> None:
