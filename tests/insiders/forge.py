@@ -523,6 +523,12 @@ class Forge:
             "c": identity.membership,
         }  # fmt: skip
 
+    def _mail(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        return {
+            "to": rng.choice(self._nodes), "k": rng.choice(("delegation", "a-b", "")), "s": self._number(rng),
+            "b": rng.randbytes(rng.choice((0, 1, 2_000))), "c": identity.membership,
+        }  # fmt: skip
+
     def _digest(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
         return {
             "p": rng.choice((b"", b"\x00", bytes(2))), "h": rng.choice((rng.randbytes(8), rng.randbytes(2_048))),
@@ -778,7 +784,7 @@ _BODIES: Final[dict[StatementType, _Make]] = {
     _T.OPEN: Forge._open, _T.ACCEPT: Forge._accept, _T.REVOKED: Forge._revoked, _T.LACKING: Forge._lacking,
     _T.ADCERT: Forge._adcert, _T.RTCERT: Forge._rtcert, _T.CARD: Forge._card, _T.GRANT: Forge._grant,
     _T.ENDPOINTS: Forge._endpoints, _T.ENDPOINTS_QUERY: Forge._endpoints_query,
-    _T.ENDPOINTS_ANSWER: Forge._endpoints_answer,
+    _T.ENDPOINTS_ANSWER: Forge._endpoints_answer, _T.MAIL: Forge._mail,
 }  # fmt: skip
 _K = Kind
 _KINDS: Final[dict[StatementType, tuple[Kind, ...]]] = {
@@ -793,6 +799,7 @@ _KINDS: Final[dict[StatementType, tuple[Kind, ...]]] = {
     _T.GRANT: (_K.ADVERTISE_ACK,), _T.OPEN: (_K.RIB_REQUEST,), _T.ACCEPT: (_K.RIB_ANSWER,),
     _T.REVOKED: (_K.REVOKED,), _T.LACKING: (_K.REVOKED,), _T.ENDPOINTS: (_K.RIB_REQUEST,),
     _T.ENDPOINTS_QUERY: (_K.RIB_REQUEST,), _T.ENDPOINTS_ANSWER: (_K.RIB_ANSWER, _K.RIB_REQUEST),
+    _T.MAIL: (_K.RIB_REQUEST, _K.RIB_ANSWER),
 }  # fmt: skip
 _RARE: Final = {_T.ADCERT, _T.RTCERT, _T.CARD, _T.GRANT}
 _SPOKEN: Final = tuple(each for each in _BODIES for _ in range(1 if each in _RARE else 6))
