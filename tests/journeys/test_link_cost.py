@@ -6,13 +6,18 @@ from itertools import pairwise
 
 import pytest
 
+from gdp.frame.codec import ETHER_BYTES, decode
+from gdp.frame.kinds import Kind
 from gdp.limits import COST_AUTO
+from gdp.simulation.network import SimLink
 from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from tests.journeys.flows import SERVER, flowing
 
 CABLES = ("s1", "left"), ("left", "s4"), ("s1", "right"), ("right", "s4")
 JITTER_S = 0.01
 WINS_S = 15.0
+FASTER_S = 25.0
 SETTLED_S = 30.0
 STEP_S = 0.5
 
@@ -96,3 +101,40 @@ def test_a_fixed_cost_is_used_whatever_the_delay() -> None:
     for a, b in CABLES:
         world.network.set_cost(world.cables[frozenset((a, b))], 10 if "left" in (a, b) else 20)
     assert set(next_hops(world, 75.0)[2:]) == {"left"}
+
+
+def test_of_two_uplinks_to_one_switch_the_faster_carries_a_topic_and_a_change_loses_nothing() -> None:
+    world = Simulation(
+        topology=Topology(
+            (Link("nuc1", "nuc5"),),
+            (DomainPlan("lab", ("nuc1", "nuc5")),),
+            (
+                Attachment("nuc5", "rib", "rib"),
+                Attachment("nuc1", "proxy", "robot"),
+                Attachment("nuc5", "proxy", "server"),
+            ),
+        )
+    )
+    first = world.cables[frozenset(("nuc1", "nuc5"))]
+    second = world.network.connect("nuc1", "nuc5", SimLink(0.03, JITTER_S), COST_AUTO)
+    first.delay_s, first.jitter_s = 0.01, JITTER_S
+    world.network.set_cost(first, COST_AUTO)
+    ports = {port.mac: port.index for port in world.switches["nuc5"].hello_protocol.ports.values()}
+    used: list[tuple[float, int]] = []
+
+    def tap(at_s: float, a: str, b: str, frame: bytes) -> None:
+        if (a, b) == ("nuc1", "nuc5") and decode(frame, ETHER_BYTES).kind == Kind.DATA:
+            used.append((at_s, ports[frame[:6]]))
+
+    assert world.run_until_attached()
+    world.network.taps.append(tap)
+    flow = flowing(world)
+    begun_s, count = world.network.now.mono_s, 800
+    flow.stream(count, 0.1, size=100)
+    world.network.run(SETTLED_S)
+    first.delay_s, second.delay_s = second.delay_s, first.delay_s
+    world.network.run(60.0)
+    assert flow.numbers(SERVER) == list(range(count))
+    before = {port for at_s, port in used if begun_s + 5.0 < at_s < begun_s + SETTLED_S}
+    after = {port for at_s, port in used if at_s > begun_s + SETTLED_S + FASTER_S}
+    assert (before, after) == ({min(ports.values())}, {max(ports.values())})
