@@ -231,11 +231,12 @@ def share(
 
 def _given(owner: Path, kind: str, name: str) -> list[IssuedDelegation]:
     """Return what was delegated of a name or a pattern, by this command or by the agent."""
-    return [
+    found = [
         each
         for each in IssuedStore(owner)
         if not each.is_revoked and each.metadata["kind"] == kind and fits(name, str(each.metadata["name"]))
     ]
+    return sorted(found, key=lambda each: (str(each.metadata["name"]), not each.is_own, each.label))
 
 
 @contextlib.contextmanager
