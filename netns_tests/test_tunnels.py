@@ -206,6 +206,19 @@ def test_a_tunnel_over_an_uplink_that_is_down_does_not_use_the_other(two_uplinks
         until(is_routed)
 
 
+def test_a_session_moves_to_the_other_uplink_when_one_goes_down(two_uplinks: tuple[Site, Site]) -> None:
+    one, two = two_uplinks
+    first, second = one.open(), two.open()
+    two.connect(second, one, is_dialling=False)
+    one.connect(first, two, is_dialling=True)
+    sending, receiving = one.frames(), two.frames()
+    until(crosses(sending, receiving), first, second)
+    one.ip("link", "set", "u0", "down")
+    until(crosses(sending, receiving), first, second)
+    until(crosses(receiving, sending), first, second)
+    assert second.peers()[one.public_key].endpoint == Endpoint("10.7.0.1", PORT)
+
+
 def test_a_killed_owner_leaves_no_rule_of_its_uplink(two_uplinks: tuple[Site, Site]) -> None:
     one, _ = two_uplinks
     words = (

@@ -20,7 +20,7 @@ from typing import Final, Literal
 
 from gdp.control.endpoints import Endpoint
 from gdp.errors import LocalError
-from gdp.ports.netlink import READ_BYTES, RefusedError, listen
+from gdp.ports.netlink import LINK_GROUP, READ_BYTES, RefusedError, listen
 from gdp.ports.tunnel.control import (
     Change,
     ControlLostError,
@@ -102,7 +102,7 @@ class WireGuardDevice:
         with ExitStack() as opened:
             self._routes = RouteMonitor(fwmark)
             opened.callback(self._routes.close)
-            self._news = opened.enter_context(listen(ADDRESS_GROUPS | ROUTE_GROUPS))
+            self._news = opened.enter_context(listen(LINK_GROUP | ADDRESS_GROUPS | ROUTE_GROUPS))
             self._epoll = opened.enter_context(select.epoll())
             self._epoll.register(keeper, select.EPOLLIN)
             self._epoll.register(self._news, select.EPOLLIN)
