@@ -19,9 +19,10 @@ import pytest
 from gdp.control.endpoints import Endpoint
 from gdp.crypto.certificates import Role
 from gdp.errors import LocalError
+from gdp.ports.tunnel import uapi
 from gdp.ports.tunnel.devices import find_device
 from gdp.ports.tunnel.path_mtu import RouteMonitor, route_mtu
-from gdp.ports.tunnel.uapi import socket_path
+from gdp.ports.tunnel.uapi import UserspaceControl, socket_path
 from gdp.ports.tunnel.vxlan import make_vxlan, remove_link, set_link_mtu
 from gdp.ports.tunnel.wireguard import WireGuardDevice, open_wireguard
 from gdp.stores.issue import make_domain, make_node
@@ -128,6 +129,29 @@ def test_changes_during_a_restart_are_applied_after_it(sites: tuple[Site, Site],
         ends[1].remove_peer(one.public_key)
         ends[1].set_peer(one.public_key, inner=one.inner, endpoint=one.endpoint, keepalive_s=25)
     until(crosses(one.frames(), two.frames()), *ends)
+
+
+def test_changes_while_wireguard_go_hangs_are_applied_when_it_goes_on(
+    sites: tuple[Site, Site], ends: Ends, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, two = sites
+    until(crosses(one.frames(), two.frames()), *ends)
+    monkeypatch.setattr(uapi, "_PAUSE_S", 0.5)
+    pid = process_of(two.ifname)
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        with two.entered():
+            ends[1].remove_peer(one.public_key)
+            ends[1].set_peer(bytes(32), inner="fd00::77", endpoint=None, keepalive_s=0)
+    finally:
+        os.kill(pid, signal.SIGCONT)
+
+    def has_changed() -> bool:
+        with two.entered():
+            ends[1].poll()
+        return set(UserspaceControl(two.ifname).state().peers) == {bytes(32)}
+
+    until(has_changed, *ends)
 
 
 def test_a_device_that_another_program_removed_is_made_again(sites: tuple[Site, Site], ends: Ends) -> None:
