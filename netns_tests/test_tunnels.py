@@ -19,9 +19,10 @@ import pytest
 from gdp.control.endpoints import Endpoint
 from gdp.crypto.certificates import Role
 from gdp.errors import LocalError
+from gdp.ports.tunnel import uapi
 from gdp.ports.tunnel.devices import find_device
 from gdp.ports.tunnel.path_mtu import RouteMonitor, route_mtu
-from gdp.ports.tunnel.uapi import socket_path
+from gdp.ports.tunnel.uapi import UserspaceControl, socket_path
 from gdp.ports.tunnel.vxlan import make_vxlan, remove_link, set_link_mtu
 from gdp.ports.tunnel.wireguard import WireGuardDevice, open_wireguard
 from gdp.stores.issue import make_domain, make_node
@@ -130,6 +131,29 @@ def test_changes_during_a_restart_are_applied_after_it(sites: tuple[Site, Site],
     until(crosses(one.frames(), two.frames()), *ends)
 
 
+def test_changes_while_wireguard_go_hangs_are_applied_when_it_goes_on(
+    sites: tuple[Site, Site], ends: Ends, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, two = sites
+    until(crosses(one.frames(), two.frames()), *ends)
+    monkeypatch.setattr(uapi, "_PAUSE_S", 0.5)
+    pid = process_of(two.ifname)
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        with two.entered():
+            ends[1].remove_peer(one.public_key)
+            ends[1].set_peer(bytes(32), inner="fd00::77", endpoint=None, keepalive_s=0)
+    finally:
+        os.kill(pid, signal.SIGCONT)
+
+    def has_changed() -> bool:
+        with two.entered():
+            ends[1].poll()
+        return set(UserspaceControl(two.ifname).state().peers) == {bytes(32)}
+
+    until(has_changed, *ends)
+
+
 def test_a_device_that_another_program_removed_is_made_again(sites: tuple[Site, Site], ends: Ends) -> None:
     one, two = sites
     until(crosses(one.frames(), two.frames()), *ends)
@@ -204,6 +228,19 @@ def test_a_tunnel_over_an_uplink_that_is_down_does_not_use_the_other(two_uplinks
         one.ip("link", "set", "u1", "up")
         one.ip("route", "add", "default", "via", "10.7.0.2", "metric", "200")
         until(is_routed)
+
+
+def test_a_session_moves_to_the_other_uplink_when_one_goes_down(two_uplinks: tuple[Site, Site]) -> None:
+    one, two = two_uplinks
+    first, second = one.open(), two.open()
+    two.connect(second, one, is_dialling=False)
+    one.connect(first, two, is_dialling=True)
+    sending, receiving = one.frames(), two.frames()
+    until(crosses(sending, receiving), first, second)
+    one.ip("link", "set", "u0", "down")
+    until(crosses(sending, receiving), first, second)
+    until(crosses(receiving, sending), first, second)
+    assert second.peers()[one.public_key].endpoint == Endpoint("10.7.0.1", PORT)
 
 
 def test_a_killed_owner_leaves_no_rule_of_its_uplink(two_uplinks: tuple[Site, Site]) -> None:

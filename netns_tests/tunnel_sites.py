@@ -19,7 +19,8 @@ from gdp.ports.tunnel.vxlan import make_vxlan
 from gdp.ports.tunnel.wireguard import WireGuardDevice, open_wireguard
 from netns_tests.spaces import Space, enter_namespace
 
-PATIENCE_S = 20.0
+PATIENCE_S = 30.0
+POLL_S = 1.0
 PORT = 51820
 VNI = 77
 ETHERTYPE = 0x88B5
@@ -135,10 +136,15 @@ def two_sites() -> Iterator[tuple[Site, Site]]:
 
 
 def until(is_true: Callable[[], bool], *devices: WireGuardDevice, what: str = "") -> None:
-    """Serve the events of these devices until this is true."""
+    """Serve these devices, as a switch does, until this is true."""
     end_s = time.monotonic() + PATIENCE_S
+    poll_s = time.monotonic() + POLL_S
     while not is_true():
         assert time.monotonic() < end_s, what or "not in time"
+        if time.monotonic() > poll_s:
+            poll_s += POLL_S
+            for device in devices:
+                device.poll()
         ready, _, _ = select.select(devices, [], [], 0.01)
         for device in ready:
             device.handle_events()

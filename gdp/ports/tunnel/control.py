@@ -90,3 +90,6 @@ class WireGuardControl(Protocol):
 
     def state(self) -> DeviceState:
         """Return the device's state."""
+
+    def resume(self) -> None:
+        """Ask a process again that did not respond: it was restarted."""

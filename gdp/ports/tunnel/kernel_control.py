@@ -60,6 +60,9 @@ class KernelControl:
         except self._refusal as error:
             raise LocalError(f"tunnel {self._ifname}: {self._text(error.code)}") from error
 
+    def resume(self) -> None:
+        """Do nothing: the kernel always responds."""
+
     def _set(self, settings: dict[str, object], change: Change) -> None:
         try:
             self._wireguard.set(self._ifname, **settings)

@@ -14,6 +14,7 @@ from __future__ import annotations
 import errno
 import os
 import socket
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
@@ -26,6 +27,7 @@ __all__ = ["SOCKET_FOLDER", "UserspaceControl", "parse_state", "request_text", "
 
 SOCKET_FOLDER: Final = Path("/var/run/wireguard")  # wireguard-go allows no other
 _TIMEOUT_S: Final = 1.0  # it replies within milliseconds; the limit keeps a stopped process from blocking a node
+_PAUSE_S: Final = 5.0
 _REPLY_MAX_BYTES: Final = 4 << 20
 _NANO: Final = 1e-9
 
@@ -36,10 +38,14 @@ def socket_path(ifname: str) -> Path:
 
 
 class UserspaceControl:
-    """Control of the device of a ``wireguard-go`` process, as ``WireGuardControl``."""
+    """Control of the device of a ``wireguard-go`` process, as ``WireGuardControl``.
+
+    After a request without a reply, further ones fail at once for a while: a process that hangs must not slow a node.
+    """
 
     def __init__(self, ifname: str) -> None:
         self._ifname = ifname
+        self._silent_until_s = 0.0
 
     def apply(self, change: Change) -> None:
         """Change the device."""
@@ -49,8 +55,14 @@ class UserspaceControl:
         """Return the device's state."""
         return parse_state(self._ask("get=1\n\n"))
 
+    def resume(self) -> None:
+        """Ask a process again that did not respond: it was restarted."""
+        self._silent_until_s = 0.0
+
     def _ask(self, request: str) -> list[tuple[str, str]]:
         """Return the lines of a reply without its last."""
+        if time.monotonic() < self._silent_until_s:
+            raise ControlLostError(f"tunnel {self._ifname}: wireguard-go did not respond")
         try:
             with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
                 connection.settimeout(_TIMEOUT_S)
@@ -58,6 +70,8 @@ class UserspaceControl:
                 connection.sendall(request.encode())
                 reply = _read(connection)
         except OSError as error:
+            if isinstance(error, TimeoutError):
+                self._silent_until_s = time.monotonic() + _PAUSE_S
             raise ControlLostError(f"tunnel {self._ifname}: wireguard-go does not respond: {error}") from error
         lines = [(key, value) for key, _, value in (line.partition("=") for line in reply.splitlines()) if key]
         if not lines or lines[-1][0] != "errno":

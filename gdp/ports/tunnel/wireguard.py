@@ -20,7 +20,7 @@ from typing import Final, Literal
 
 from gdp.control.endpoints import Endpoint
 from gdp.errors import LocalError
-from gdp.ports.netlink import READ_BYTES, RefusedError, listen
+from gdp.ports.netlink import LINK_GROUP, READ_BYTES, RefusedError, listen
 from gdp.ports.tunnel.control import (
     Change,
     ControlLostError,
@@ -96,13 +96,14 @@ class WireGuardDevice:
         self.fwmark = fwmark
         self._peers: dict[bytes, _Peer] = {}
         self._states: dict[bytes, PeerState] = {}
+        self._has_waiting = False  # changes that wireguard-go did not get
         self._heard: dict[
             bytes, tuple[int, float]
         ] = {}  # bytes received, and the monotonic second of their last change
         with ExitStack() as opened:
             self._routes = RouteMonitor(fwmark)
             opened.callback(self._routes.close)
-            self._news = opened.enter_context(listen(ADDRESS_GROUPS | ROUTE_GROUPS))
+            self._news = opened.enter_context(listen(LINK_GROUP | ADDRESS_GROUPS | ROUTE_GROUPS))
             self._epoll = opened.enter_context(select.epoll())
             self._epoll.register(keeper, select.EPOLLIN)
             self._epoll.register(self._news, select.EPOLLIN)
@@ -192,7 +193,12 @@ class WireGuardDevice:
             found = self._control.state().peers
         except ControlLostError:
             found = {key: state._replace(handshake_unix_s=0.0) for key, state in self._states.items()}
-        self._states = {key: found.get(key, PeerState(peer.endpoint, 0.0, 0, 0)) for key, peer in self._peers.items()}
+        unknown = PeerState(None, 0.0, 0, 0)  # of a process that was restarted and has no peers yet
+        states = {key: found.get(key, unknown) for key in self._peers}
+        self._states = {
+            key: state if state.endpoint is not None else state._replace(endpoint=self._endpoint(key))
+            for key, state in states.items()
+        }
         now_s = time.monotonic()
         for key, state in self._states.items():
             if key not in self._heard or self._heard[key][0] != state.received_bytes:
@@ -229,6 +235,7 @@ class WireGuardDevice:
             if report.event == "restarted":
                 log.warning("wireguard-go was restarted ifname=%s", self.ifname)
                 is_new = is_new or not report.is_same
+                self._control.resume()
                 self._configure_again()
             elif report.event == "lost":
                 self._epoll.unregister(self._keeper)
@@ -247,6 +254,8 @@ class WireGuardDevice:
 
         Call it each second. Returns as ``handle_events``.
         """
+        if self._has_waiting:
+            self._configure_again()
         self.peers()
         self._follow_routes()
         return self.handle_events()
@@ -262,8 +271,10 @@ class WireGuardDevice:
 
     def _configure(self) -> None:
         """Apply everything that was given. Raises ``LocalError``: the device refuses."""
-        peers = tuple(change for key in self._peers for change in self._restored(key))
         self._with_device(self._prepare)
+        gone = self._control.state().peers.keys() - self._peers.keys()
+        removed = [PeerChange(public_key=key, is_removed=True) for key in gone]
+        peers = (*removed, *(change for key in self._peers for change in self._restored(key)))
         self._control.apply(
             Change(private_key=self._private_key, listen_port=self._port, fwmark=self.fwmark, peers=peers)
         )
@@ -271,7 +282,10 @@ class WireGuardDevice:
     def _configure_again(self) -> None:
         try:
             self._configure()
-        except LocalError as error:  # it died again, or its port was taken meanwhile
+            self._has_waiting = False
+        except ControlLostError:
+            self._has_waiting = True
+        except LocalError as error:  # its port was taken meanwhile
             log.error("tunnel device not configured ifname=%s reason=%s", self.ifname, error)
 
     def _prepare(self, device: Device) -> None:
@@ -299,6 +313,7 @@ class WireGuardDevice:
         try:
             self._control.apply(change)
         except ControlLostError:  # applied with everything else once wireguard-go is back
+            self._has_waiting = True
             log.info("change waits for wireguard-go ifname=%s", self.ifname)
 
     def _with_device(self, act: Callable[[Device], None]) -> None:

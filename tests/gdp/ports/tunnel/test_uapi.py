@@ -123,6 +123,14 @@ def test_a_process_that_does_not_reply_is_lost(
         UserspaceControl("wg").state()
 
 
+def test_a_process_that_hangs_is_not_asked_again_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    control = UserspaceControl("wg")
+    with replying(tmp_path, monkeypatch, None), pytest.raises(ControlLostError):
+        control.state()
+    with pytest.raises(ControlLostError, match="did not respond"):
+        control.state()
+
+
 def test_a_missing_process_is_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(uapi, "SOCKET_FOLDER", tmp_path)
     with pytest.raises(ControlLostError, match="does not respond"):
