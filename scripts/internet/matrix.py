@@ -59,9 +59,10 @@ def measure(laboratory: Laboratory, kinds: Iterable[Access], *, timeout_s: float
     hosts = {side: [_add(laboratory, access, side) for access in chosen] for side in _SIDES}
     everyone = [*hosts["a"], *hosts["b"]]
     with Overlay(laboratory) as overlay, ExitStack() as stack:
-        overlay.add_switch(border, is_border=True)
+        overlay.add_switch(border, is_border=True, has_relay=Access.UDP_BLOCKED in chosen)
         for host in everyone:
-            overlay.add_switch(host, borders=[border])
+            is_blocked = host.site(host.devices[0]).access is Access.UDP_BLOCKED
+            overlay.add_switch(host, borders=[border], has_relay=is_blocked)
         overlay.start(border)
         overlay.start_rib(border)
         overlay.start(*everyone)
