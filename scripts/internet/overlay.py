@@ -36,6 +36,7 @@ __all__ = ["LISTEN", "Overlay"]
 
 LISTEN: Final = 51_820
 _PATIENCE_S: Final = 5.0
+_ATTACH_S: Final = 60.0
 _RELAY: Final = "relay"
 _TLS_PORT: Final = 443
 _NODE: Final = "node"
@@ -151,8 +152,9 @@ class Overlay:
         return node
 
     def open_session(self, host: Host, node: Path) -> gdp.Session:
-        """Open a session of this process at the host's switch."""
-        return host.space.inside(lambda: gdp.open(node, iface=f"{_NODE}0", root=self._domain / ROOT_CERTIFICATE))
+        """Open a session of this process at the host's switch, which may still have to find a way to the RIB."""
+        root, iface = self._domain / ROOT_CERTIFICATE, f"{_NODE}0"
+        return host.space.inside(lambda: gdp.open(node, iface=iface, root=root, timeout_s=_ATTACH_S))
 
     def tunnels(self, host: Host) -> dict[str, dict[str, object]]:
         """Return the status of the tunnels of a host's switch, by the label of the peer's host."""
