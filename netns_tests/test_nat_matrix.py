@@ -16,7 +16,7 @@ from internet.matrix import measure
 
 pytestmark = pytest.mark.netns
 
-KINDS = (Access.PORT_RESTRICTED, Access.SYMMETRIC, Access.IPV6_ONLY)
+KINDS = (Access.PORT_RESTRICTED, Access.SYMMETRIC, Access.UDP_BLOCKED)
 
 
 def test_switches_behind_nats_reach_each_other_and_directly_where_that_is_possible(laboratory: Laboratory) -> None:

@@ -4,7 +4,7 @@
 #
 #   sudo scripts/internet_demo.sh                       about a minute
 #   sudo scripts/internet_demo.sh --json > out.json     the outcome for programs; progress goes to standard error
-#   scripts/internet_demo.sh --help                     all options; works without sudo where user namespaces are allowed
+#   scripts/internet_demo.sh --help                     all options
 set -euo pipefail
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)

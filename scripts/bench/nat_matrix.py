@@ -23,7 +23,7 @@ from rich.table import Table
 from gdp.host.run_registry import RunRegistry
 from internet.access import Access
 from internet.laboratory import Laboratory
-from internet.matrix import Outcome, Pair, measure
+from internet.matrix import Outcome, Pair, batches, measure
 
 KINDS = [each.value for each in Access]
 
@@ -36,19 +36,25 @@ def main() -> int:
     )
     parser.add_argument("--json", action="store_true", help="print the outcome as JSON")
     options = parser.parse_args()
-    runs = RunRegistry()
-    run = runs.start()
-    try:
-        with Laboratory(run) as laboratory:
-            found = measure(laboratory, [Access(each) for each in options.kinds])
-    finally:
-        run.end()
+    kinds = [Access(each) for each in options.kinds]
+    found: dict[Pair, Outcome] = {}
+    for batch in batches(kinds):
+        found = {**_measured(batch), **found}
     if options.json:
         rows = [{"pair": [a.value, b.value], **outcome._asdict()} for (a, b), outcome in found.items()]
         print(json.dumps(rows, indent=1))
     else:
-        _show(found, [Access(each) for each in options.kinds])
+        _show(found, kinds)
     return 0 if all(outcome.is_as_expected(pair) for pair, outcome in found.items()) else 1
+
+
+def _measured(kinds: Sequence[Access]) -> dict[Pair, Outcome]:
+    run = RunRegistry().start()
+    try:
+        with Laboratory(run) as laboratory:
+            return measure(laboratory, kinds)
+    finally:
+        run.end()
 
 
 def _show(found: Mapping[Pair, Outcome], kinds: Sequence[Access]) -> None:

@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from itertools import product
+from itertools import combinations, product
 from typing import Final, NamedTuple
 
 import gdp
@@ -20,9 +20,10 @@ from internet.host import Host
 from internet.laboratory import Laboratory
 from internet.overlay import Overlay
 
-__all__ = ["Outcome", "Pair", "measure"]
+__all__ = ["Outcome", "Pair", "batches", "measure"]
 
 _LOOK_S: Final = 0.25
+_GROUP: Final = 3
 _CALL_S: Final = 5.0
 _SIDES: Final = ("a", "b")
 Pair = tuple[Access, Access]
@@ -48,7 +49,7 @@ def measure(laboratory: Laboratory, kinds: Iterable[Access], *, timeout_s: float
     """Return the outcome of each ordered pair of these kinds.
 
     Args:
-        timeout_s: longest wait for calls, and for the direct tunnels that are possible.
+        timeout_s: longest wait for calls and for the direct tunnels that are possible, once every node is attached.
 
     Raises:
         LocalError: a switch does not start, for example because there is no WireGuard.
@@ -59,9 +60,10 @@ def measure(laboratory: Laboratory, kinds: Iterable[Access], *, timeout_s: float
     hosts = {side: [_add(laboratory, access, side) for access in chosen] for side in _SIDES}
     everyone = [*hosts["a"], *hosts["b"]]
     with Overlay(laboratory) as overlay, ExitStack() as stack:
-        overlay.add_switch(border, is_border=True)
+        overlay.add_switch(border, is_border=True, has_relay=Access.UDP_BLOCKED in chosen)
         for host in everyone:
-            overlay.add_switch(host, borders=[border])
+            is_blocked = host.site(host.devices[0]).access is Access.UDP_BLOCKED
+            overlay.add_switch(host, borders=[border], has_relay=is_blocked)
         overlay.start(border)
         overlay.start_rib(border)
         overlay.start(*everyone)
@@ -75,9 +77,24 @@ def measure(laboratory: Laboratory, kinds: Iterable[Access], *, timeout_s: float
             sessions = [stack.enter_context(session) for session in opened]
             for session, host in zip(sessions[len(chosen) :], hosts["b"], strict=True):
                 session.serve(services[host.label], lambda request: request.payload)
-        reached = _call_all(sessions[: len(chosen)], list(services.values()), begun_s, timeout_s)
-        direct = _wait_for_direct(overlay, hosts, pairs, begun_s, timeout_s)
+        deadline_s = time.monotonic() + timeout_s
+        reached = _call_all(sessions[: len(chosen)], list(services.values()), begun_s, deadline_s)
+        direct = _wait_for_direct(overlay, hosts, pairs, begun_s, deadline_s)
     return {pair: Outcome(reached[at], direct.get(at)) for at, pair in enumerate(pairs)}
+
+
+def batches(kinds: Iterable[Access]) -> list[tuple[Access, ...]]:
+    """Return groups of at most three kinds, such that each pair of kinds is in one: seven groups for seven kinds.
+
+    Two small laboratories cost a machine less than one of twice the size, where each switch has a tunnel to each other.
+    """
+    groups: list[tuple[Access, ...]] = [*combinations(kinds, _GROUP)] or [tuple(kinds)]
+    left = {pair for group in groups for pair in combinations(group, 2)}
+    chosen: list[tuple[Access, ...]] = []
+    while left or not chosen:
+        chosen.append(max(groups, key=lambda group: len(left & set(combinations(group, 2)))))
+        left -= set(combinations(chosen[-1], 2))
+    return chosen
 
 
 def _add(laboratory: Laboratory, access: Access, side: str) -> Host:
@@ -86,19 +103,19 @@ def _add(laboratory: Laboratory, access: Access, side: str) -> Host:
 
 
 def _call_all(
-    clients: Sequence[gdp.Session], services: Sequence[str], begun_s: float, timeout_s: float
+    clients: Sequence[gdp.Session], services: Sequence[str], begun_s: float, deadline_s: float
 ) -> list[float | None]:
     """Call each service from each client until it answers, the clients at once; return the times."""
 
     def call_each(client: gdp.Session) -> list[float | None]:
-        return [_answered_s(client, service, begun_s, timeout_s) for service in services]
+        return [_answered_s(client, service, begun_s, deadline_s) for service in services]
 
     with ThreadPoolExecutor(len(clients)) as pool:
         return [each for found in pool.map(call_each, clients) for each in found]
 
 
-def _answered_s(client: gdp.Session, service: str, begun_s: float, timeout_s: float) -> float | None:
-    while time.monotonic() < begun_s + timeout_s:
+def _answered_s(client: gdp.Session, service: str, begun_s: float, deadline_s: float) -> float | None:
+    while time.monotonic() < deadline_s:
         try:
             client.call(service, b"?", timeout_s=_CALL_S)
         except gdp.SessionError:  # no path to it yet
@@ -108,7 +125,7 @@ def _answered_s(client: gdp.Session, service: str, begun_s: float, timeout_s: fl
 
 
 def _wait_for_direct(
-    overlay: Overlay, hosts: Mapping[str, Sequence[Host]], pairs: Sequence[Pair], begun_s: float, timeout_s: float
+    overlay: Overlay, hosts: Mapping[str, Sequence[Host]], pairs: Sequence[Pair], begun_s: float, deadline_s: float
 ) -> dict[int, float]:
     """Return by number of the pair when a direct tunnel was up; wait for those that are possible."""
     ends = list(product(hosts["a"], hosts["b"]))
@@ -121,6 +138,6 @@ def _wait_for_direct(
             row = tunnels[one.label].get(other.label, {})
             if row.get("direct") and row.get("up"):
                 found.setdefault(at, now_s)
-        if expected <= found.keys() or now_s > timeout_s:
+        if expected <= found.keys() or time.monotonic() > deadline_s:
             return found
         time.sleep(_LOOK_S)

@@ -36,6 +36,9 @@ __all__ = ["LISTEN", "Overlay"]
 
 LISTEN: Final = 51_820
 _PATIENCE_S: Final = 5.0
+_ATTACH_S: Final = 60.0
+_RELAY: Final = "relay"
+_TLS_PORT: Final = 443
 _NODE: Final = "node"
 _RIB: Final = "rib"
 _SCRIPTS: Final = Path(__file__).resolve().parent.parent
@@ -65,13 +68,20 @@ class Overlay:
         self.end(*self._processes)
 
     def add_switch(
-        self, host: Host, *, is_border: bool = False, borders: Sequence[Host] = (), links: Yaml | None = None
+        self,
+        host: Host,
+        *,
+        is_border: bool = False,
+        borders: Sequence[Host] = (),
+        has_relay: bool = False,
+        links: Yaml | None = None,
     ) -> None:
         """Make the keys and the configuration of a host's switch, which ``start`` starts.
 
         Args:
             is_border: others dial its public addresses.
             borders: to which it opens a tunnel. Each gets a record of this switch.
+            has_relay: whether a relay runs next to it: the server of a border, or on standby towards the borders.
             links: more keys of ``links:``.
         """
         label = host.label
@@ -98,12 +108,22 @@ class Overlay:
                 "peers": str(peers),
                 **(links or {}),
             },
+            "relay": has_relay,
         }
         self.config_file(label).write_text(yaml.safe_dump(content), encoding="utf-8")
+        if has_relay:
+            self._write_relay(label, is_border=is_border, borders=borders)
 
     def start(self, *hosts: Host) -> None:
-        """Start the switches of these hosts; return when all are ready. Raises ``LocalError``: one does not start."""
+        """Start the switches and relays of these hosts; return when all are ready.
+
+        Raises:
+            LocalError: one does not start.
+        """
         self._start({host.label: (host, "gdp.cli.switch", self.config_file(host.label)) for host in hosts})
+        relays = {f"{host.label}-{_RELAY}": host for host in hosts}
+        found = {label: (host, "gdp.cli.relay", self.config_file(label)) for label, host in relays.items()}
+        self._start({label: each for label, each in found.items() if each[2].exists()})
 
     def start_rib(self, host: Host) -> None:
         """Start the domain's RIB on a border; return when it is ready."""
@@ -132,8 +152,9 @@ class Overlay:
         return node
 
     def open_session(self, host: Host, node: Path) -> gdp.Session:
-        """Open a session of this process at the host's switch."""
-        return host.space.inside(lambda: gdp.open(node, iface=f"{_NODE}0", root=self._domain / ROOT_CERTIFICATE))
+        """Open a session of this process at the host's switch, which may still have to find a way to the RIB."""
+        root, iface = self._domain / ROOT_CERTIFICATE, f"{_NODE}0"
+        return host.space.inside(lambda: gdp.open(node, iface=iface, root=root, timeout_s=_ATTACH_S))
 
     def tunnels(self, host: Host) -> dict[str, dict[str, object]]:
         """Return the status of the tunnels of a host's switch, by the label of the peer's host."""
@@ -151,12 +172,26 @@ class Overlay:
         return self.folder / f"{label}-peers"
 
     def config_file(self, label: str) -> Path:
-        """Return the ``switch.yaml`` of a host."""
+        """Return the configuration file of a host's switch, or of another program by its label."""
         return self.folder / f"{label}.yaml"
 
     def log(self, label: str) -> str:
         """Return what a process has logged."""
         return (self.folder / f"{label}.log").read_text(encoding="utf-8")
+
+    def _write_relay(self, label: str, *, is_border: bool, borders: Sequence[Host]) -> None:
+        ends: Yaml = {"server": {"port": _TLS_PORT}}
+        if not is_border:
+            names = {peer: name for name, peer in self._labels.items()}
+            dialled = [(names[each.label], each.lease(each.devices[0])) for each in borders]
+            ends = {
+                "borders": [
+                    {"peer": name, "endpoints": [Endpoint(lease.address.partition("/")[0], _TLS_PORT).to_text()]}
+                    for name, lease in dialled
+                ]
+            }
+        content = {"identity": str(self.switch_folder(label)), "domain": self._root(), **ends}
+        self.config_file(f"{label}-{_RELAY}").write_text(yaml.safe_dump(content), encoding="utf-8")
 
     def _copy_record(self, whose: str, to: str) -> None:
         name = f"{whose}{RECORD_SUFFIX}"

@@ -7,6 +7,7 @@ from itertools import product
 import pytest
 
 from internet.access import TRAITS, Access, allows_direct
+from internet.matrix import batches
 from internet.rules import Fault, core_rules, router_rules
 from tests.pages import ROOT
 
@@ -61,3 +62,14 @@ def test_the_core_drops_in_both_directions_only_where_a_fault_is_set(share: floa
     text = core_rules({"port0": Fault(loss=share), "port1": Fault()})
     assert text.count(" drop\n") == expected
     assert "port1" not in text
+
+
+def test_seven_batches_of_three_kinds_hold_each_pair() -> None:
+    found = batches(Access)
+    assert {pair for batch in found for pair in product(batch, batch)} == set(product(KINDS, KINDS))
+    assert [len(batch) for batch in found] == [3] * 7
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_up_to_three_kinds_are_one_batch(count: int) -> None:
+    assert batches(KINDS[:count]) == [tuple(KINDS[:count])]
