@@ -21,7 +21,7 @@ from gdp.cli.output import moment, show
 from gdp.enrolment.addresses import default_addresses, duration_s, endpoint_of, is_private, server_text
 from gdp.enrolment.create import BORDER, DomainPlan, create_domain, make_token
 from gdp.enrolment.domain_files import DomainFiles
-from gdp.enrolment.member_setup import LISTEN_PORT
+from gdp.enrolment.member_setup import LISTEN_PORT, RELAY_PORT
 from gdp.enrolment.registry import MachineRow, Registry
 from gdp.enrolment.removal import remove_machine
 from gdp.enrolment.server import bind_server, serve_domain
@@ -41,6 +41,7 @@ Public = Annotated[
 ]
 JoinRoleText = Annotated[str, typer.Option("--role", help="robot, switch or leaf; see the how-to page on joining")]
 Valid = Annotated[str, typer.Option("--valid", metavar="TIME", help="how long the token can be used: 30m, 1h, 7d")]
+RelayPort = Annotated[int, typer.Option("--relay-port", min=0, max=65_535, help="TCP port of the relay; 0: none")]
 Listen = Annotated[int, typer.Option("--listen", min=1, max=65_535, help="UDP port of tunnels, TCP port of enrolment")]
 
 
@@ -49,6 +50,7 @@ def create(
     public: Public = [],  # noqa: B006 (the library copies it)
     directory: AtDirectory = None,
     listen: Listen = LISTEN_PORT,
+    relay_port: RelayPort = RELAY_PORT,
     label: options.Label = BORDER,
     no_systemd: NoSystemd = False,
     start: Start = True,
@@ -70,6 +72,7 @@ def create(
         public=[endpoint_of(each) for each in servers],
         servers=servers,
         listen=listen,
+        relay_port=relay_port,
         label=label,
     )
     files = create_domain(plan)

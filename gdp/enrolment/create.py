@@ -42,6 +42,7 @@ class DomainPlan:
         public: UDP endpoints at which the border's tunnels can be reached from everywhere.
         servers: TCP addresses of the enrolment server, ``host:port``, that tokens name.
         listen: port of the tunnels (UDP) and of the enrolment server (TCP).
+        relay_port: TCP port of the border's relay; 0: none.
     """
 
     name: str
@@ -50,6 +51,7 @@ class DomainPlan:
     servers: Sequence[str]
     listen: int
     label: str = BORDER
+    relay_port: int = 0
 
 
 def create_domain(plan: DomainPlan, *, unix_s: float | None = None) -> DomainFiles:
@@ -114,6 +116,7 @@ def _fill(draft: Path, plan: DomainPlan, unix_s: float) -> None:
         servers=[loopback],
         listen=plan.listen,
         public=public_texts,
+        relay_port=plan.relay_port,
         has_rib=True,
     )
     write_configuration(draft, machine, ())
@@ -127,6 +130,7 @@ def _fill(draft: Path, plan: DomainPlan, unix_s: float) -> None:
         f"listen: {plan.listen}",
         f"servers: {json.dumps(list(plan.servers))}",
         f"public: {json.dumps(public_texts)}",
+        f"relays: {json.dumps(_relays(plan))}",
     ]
     owner = read_public(draft / "owner" / OWNER_PUBLIC)
     write_all(draft, {DOMAIN_FILE: public("\n".join([*lines, ""]).encode()), OWNER_PUBLIC: public(owner)})
@@ -134,3 +138,10 @@ def _fill(draft: Path, plan: DomainPlan, unix_s: float) -> None:
         registry.add_machine(plan.label, BORDER, [each.member for each in identities], unix_s)
         for folder, identity in zip((folder for folder, _ in _NODES), identities, strict=True):
             registry.set_card(identity.name, read_public(draft / folder / CARD))
+
+
+def _relays(plan: DomainPlan) -> list[str]:
+    """Return ``host:port`` of the relay, at the hosts of the enrolment server."""
+    if not plan.relay_port:
+        return []
+    return list(dict.fromkeys(f"{each.rpartition(':')[0]}:{plan.relay_port}" for each in plan.servers))

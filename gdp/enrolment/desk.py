@@ -138,6 +138,7 @@ class EnrolmentDesk:
             "root": self.root.to_pem(),
             "trusts": [read_public(each) for each in self._config.trusts],
             "borders": [self.border_record(unix_s).wire],
+            "relays": list(self._config.relays),
             "owner": read_public(self._config.owner / OWNER_PUBLIC),
         }
 

@@ -45,7 +45,7 @@ class DomainConfig(Section):
     """``domain.yaml``: keys, folders and addresses of a domain's enrolment server.
 
     ``listen`` is the TCP port of the server; ``servers`` are the addresses that tokens name; ``public`` are the UDP
-    endpoints of the border's tunnels.
+    endpoints of the border's tunnels, and ``relays`` the TCP addresses of its relay, ``host:port``.
     """
 
     domain: Directory
@@ -59,6 +59,7 @@ class DomainConfig(Section):
         min_length=1, max_length=SERVERS_MAX
     )
     public: Annotated[tuple[Annotated[str, AfterValidator(_endpoint)], ...], Unique] = ()
+    relays: Annotated[tuple[Annotated[str, AfterValidator(_server)], ...], Unique] = ()
     trusts: Annotated[tuple[ExistingFile, ...], Unique] = ()
     member_days: float = Field(default=30.0, ge=0.001, le=3_650.0)
 

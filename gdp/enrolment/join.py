@@ -33,7 +33,7 @@ from gdp.stores.issue import install_membership, make_node_keys
 from gdp.stores.keyring import CARD, OWNER_PUBLIC
 from gdp.trust.domain import Policy
 from gdp.trust.enrolment import MEMBERS_MAX, apply
-from gdp.trust.join_token import JoinToken, join_id, join_key, join_proof
+from gdp.trust.join_token import SERVERS_MAX, JoinToken, join_id, join_key, join_proof, split_server
 
 __all__ = ["JoinRequest", "Joined", "join_domain"]
 
@@ -175,6 +175,9 @@ def _install(
         trusts = [Root.from_wire(each) for each in fields.byte_strings("trusts", _TRUSTS_MAX)]
         policy = Policy(root, [])
         wires = fields.byte_strings("borders", _BORDERS_MAX)
+        relays = fields.texts("relays", SERVERS_MAX)
+        for each in relays:
+            split_server(each)
         borders = tuple(EndpointRecord.verified(each, policy, unix_s)[0] for each in wires)
         if len(certificates) != len(nodes):
             raise LocalError("another number of memberships")
@@ -192,6 +195,7 @@ def _install(
         servers=request.token.servers,
         listen=request.listen,
         uplinks=request.uplinks,
+        relays={each.name: relays for each in borders},
         has_proxy=any(role is Role.PROXY for _, role in request.token.role.nodes),
     )
     write_configuration(draft, plan, sorted(files))

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import importlib.util
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
@@ -18,9 +18,11 @@ from gdp.nodes.endpoint_files import RECORD_SUFFIX
 from gdp.stores.files import public, write_all
 from gdp.stores.keyring import DELEGATIONS
 
-__all__ = ["LISTEN_PORT", "MachinePlan", "record_file_name", "write_configuration"]
+__all__ = ["LISTEN_PORT", "RELAY_FILE", "RELAY_PORT", "MachinePlan", "record_file_name", "write_configuration"]
 
 LISTEN_PORT: Final = 51_820  # of WireGuard; of the enrolment server the TCP port of this number
+RELAY_PORT: Final = 443
+RELAY_FILE: Final = "relay.yaml"
 _FOLDERS: Final = ("peers", "revocations", "inbox", "state/switch", "state/rib", "state/proxy", "proxy.yaml.d")
 
 
@@ -34,6 +36,8 @@ class MachinePlan:
         listen: UDP port of the tunnels; 0: any.
         public: UDP endpoints at which the tunnels can be reached from everywhere.
         uplinks: devices that each get a tunnel; none: routing decides.
+        relay_port: TCP port at which a border relays; 0: it does not.
+        relays: of each border, ``host:port`` of its relay, for networks that block UDP.
     """
 
     label: str
@@ -42,8 +46,15 @@ class MachinePlan:
     listen: int
     public: Sequence[str] = ()
     uplinks: Sequence[str] = ()
+    relay_port: int = 0
+    relays: Mapping[Name, Sequence[str]] = field(default_factory=dict)
     has_proxy: bool = True
     has_rib: bool = False
+
+    @property
+    def has_relay(self) -> bool:
+        """Return whether a relay runs next to the switch."""
+        return bool(self.relay_port or any(self.relays.values()))
 
 
 def write_configuration(directory: Path, plan: MachinePlan, trusts: Sequence[str]) -> None:
@@ -61,6 +72,8 @@ def write_configuration(directory: Path, plan: MachinePlan, trusts: Sequence[str
     texts = {MEMBER_FILE: _member(plan, trusts), "switch.yaml": _switch(plan, trusts)}
     if plan.has_proxy:
         texts["proxy.yaml"] = _proxy(trusts)
+    if plan.has_relay:
+        texts[RELAY_FILE] = _relay(plan, trusts)
     if plan.has_rib:
         texts["rib.yaml"] = _node("rib", trusts) + "iface: rib0\nstate: state/rib\n"
     write_all(directory, {name: public(text.encode()) for name, text in texts.items()})
@@ -87,11 +100,21 @@ def _switch(plan: MachinePlan, trusts: Sequence[str]) -> str:
         _node("switch", trusts)
         + f"attach: {json.dumps(attach)}\n"
         + "revocations: revocations\nstate: state/switch\n"
+        + ("relay: true\n" if plan.has_relay else "")
         + "links:\n"
         + "".join(f"  {key}: {value}\n" for key, value in links.items())
         + public_line
         + uplinks_line
     )
+
+
+def _relay(plan: MachinePlan, trusts: Sequence[str]) -> str:
+    lines = [f"server: {{port: {plan.relay_port}}}"] if plan.relay_port else []
+    if relays := {name: list(each) for name, each in plan.relays.items() if each}:
+        lines.append("borders:")
+        for name, endpoints in relays.items():
+            lines += [f'  - peer: "{name.to_text()}"', f"    endpoints: {json.dumps(endpoints)}"]
+    return _node("switch", trusts) + "revocations: revocations\n" + "\n".join([*lines, ""])
 
 
 def _proxy(trusts: Sequence[str]) -> str:

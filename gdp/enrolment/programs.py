@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.enrolment.member_files import MemberFiles
+from gdp.enrolment.member_setup import RELAY_FILE
 
 __all__ = ["MachineProgram", "missing_ros", "programs_of"]
 
@@ -54,12 +55,18 @@ def programs_of(files: MemberFiles) -> list[MachineProgram]:
             capabilities=(*_NET, "CAP_BPF", "CAP_PERFMON"),
         )
     ]
+    if (directory / RELAY_FILE).exists():
+        argv = _module("gdp.cli.relay", "--config", directory / RELAY_FILE)
+        needed = ("CAP_NET_ADMIN", "CAP_NET_RAW", "CAP_NET_BIND_SERVICE")
+        title = "GDP relay: carries frames through TLS where UDP is blocked"
+        found.append(MachineProgram(name="relay", title=title, argv=argv, capabilities=needed))
     if files.config.rib is not None:
         argv = _module("gdp.cli.rib", "--config", directory / "rib.yaml", "--await-iface", _AWAIT_S)
         found.append(MachineProgram(name="rib", title="GDP RIB: stores where names are", argv=argv, capabilities=_NET))
     if files.is_border:
         argv = _module("gdp.cli.gdp", "domain", "serve", directory)
-        found.append(MachineProgram(name="enrolment", title="GDP enrolment server of a domain", argv=argv))
+        title, bind = "GDP enrolment server of a domain", ("CAP_NET_BIND_SERVICE",)
+        found.append(MachineProgram(name="enrolment", title=title, argv=argv, capabilities=bind))
     if files.config.proxy is not None and not missing_ros():
         argv = _module("proxy.cli.proxy", "--config", directory / "proxy.yaml", "--await-iface", _AWAIT_S)
         ros = tuple((key, os.environ[key]) for key in _ROS_VARIABLES if os.environ.get(key))

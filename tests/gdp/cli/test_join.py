@@ -16,6 +16,7 @@ from gdp.enrolment.programs import MachineProgram, programs_of
 from gdp.enrolment.units import install_units, remove_units, unit_texts
 from gdp.errors import LocalError
 from gdp.nodes.config import RibConfig, SwitchConfig
+from gdp.nodes.relay_config import RelayConfig
 from gdp.trust.join_token import JoinToken
 from proxy.config.config import ProxyConfig
 from tests.gdp.enrolment.lab import Lab, running_lab
@@ -58,7 +59,10 @@ def test_what_create_writes_is_a_good_configuration_of_each_node(tmp_path: Path)
     assert RibConfig.load(tmp_path / "lab/rib.yaml").iface == "rib0"
     assert ProxyConfig.load(tmp_path / "lab/proxy.yaml").iface == "proxy0"
     programs = [each.name for each in programs_of(MemberFiles.load(tmp_path / "lab"))]
-    assert programs[:3] == ["switch", "rib", "enrolment"]
+    assert programs[:4] == ["switch", "relay", "rib", "enrolment"]
+    relay = RelayConfig.load(tmp_path / "lab/relay.yaml")
+    assert relay.server is not None
+    assert relay.server.port == 443
     assert programs[-1] == "agent"
 
 
@@ -99,6 +103,7 @@ def test_join_writes_a_good_configuration_of_each_node(lab: Lab, capsys: pytest.
     assert _run(*words, "--uplink", "wlan0", "--uplink", "wwan0") == 0
     result = json.loads(capsys.readouterr().out)
     assert (result["domain"], result["label"], result["role"]) == ("lab", "robot-1", "robot")
+    assert not (home / "relay.yaml").exists()  # this domain's border has no relay
     switch = SwitchConfig.load(home / "switch.yaml")
     assert switch.links is not None
     assert switch.links.uplinks == ("wlan0", "wwan0")

@@ -45,7 +45,7 @@ class Lab:
 
 
 @contextmanager
-def running_lab(folder: Path, name: str = "lab") -> Iterator[Lab]:
+def running_lab(folder: Path, name: str = "lab", *, relay_port: int = 0) -> Iterator[Lab]:
     """Create a domain and serve it while within."""
     listening = bind_server(0, "127.0.0.1")
     port = listening.getsockname()[1]
@@ -55,6 +55,7 @@ def running_lab(folder: Path, name: str = "lab") -> Iterator[Lab]:
         public=[Endpoint("192.0.2.1", 51_820)],
         servers=[f"127.0.0.1:{port}"],
         listen=port,
+        relay_port=relay_port,
     )
     files = create_domain(plan)
     loop = asyncio.new_event_loop()
