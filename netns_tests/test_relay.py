@@ -142,7 +142,8 @@ def test_where_udp_becomes_blocked_frames_go_through_tls(lab: RelayLab) -> None:
     assert done.returncode == 0, done.stderr
     took_s = wait_for(lambda: not lab.tunnel_is_up() and lab.is_joined())
     print(f"UDP blocked: joined through TLS after {took_s:.1f} s")
-    assert lab.relay_status(lab.member)["borders"][0]["state"] == "up"
+    (row,) = lab.member.status(lab.home / "member-switch.sock")["relay"]
+    assert (row["peer"], row["via"], row["up"]) == (lab.border.name.to_text(), "tls (slower)", True)
     lab.member.run("nft", "delete", "table", "inet", "blocked")
     wait_for(lab.tunnel_is_up)
     assert lab.is_up(), "the relay stays until the tunnel has been stable"
