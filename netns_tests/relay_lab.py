@@ -34,7 +34,7 @@ class Node:
     """One machine: a folder, a namespace and its processes."""
 
     def __init__(self, home: Path, label: str, pid: int) -> None:
-        self.home, self.label = home, label
+        self.home, self.label, self.pid = home, label, pid
         self.enter = ["nsenter", f"--net=/proc/{pid}/ns/net", "--"]
         self.running: list[subprocess.Popen[bytes]] = []
         self.identity = home / label

@@ -20,7 +20,16 @@ from gdp.stores.issue import delegate, install_delegation, make_domain, make_nod
 from gdp.stores.keyring import CARD, load_domain, load_identity
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
-from netns_tests.relay_lab import BORDER_ADDRESS, LATER_ADDRESS, MEMBER_ADDRESS, PORT, RelayLab, relay_lab, wait_for
+from netns_tests.relay_lab import (
+    BORDER_ADDRESS,
+    LATER_ADDRESS,
+    MEMBER_ADDRESS,
+    PORT,
+    Node,
+    RelayLab,
+    relay_lab,
+    wait_for,
+)
 from netns_tests.spaces import Space
 
 pytestmark = [
@@ -147,6 +156,17 @@ def test_where_udp_becomes_blocked_frames_go_through_tls(lab: RelayLab) -> None:
     lab.member.run("nft", "delete", "table", "inet", "blocked")
     wait_for(lab.tunnel_is_up)
     assert lab.is_up(), "the relay stays until the tunnel has been stable"
+
+
+def test_an_endpoint_may_be_a_host_name(lab: RelayLab) -> None:
+    lab.start_relay(lab.border)
+    border = {"peer": lab.border.name.to_text(), "endpoints": [f"localhost:{PORT}"], "standby": False}
+    guest = Node(lab.home, "member", lab.border.pid)  # in the namespace of the border, where this name leads to it
+    try:
+        guest.start("gdp.cli.relay", lab.relay_config(lab.member, borders=[border]))
+        wait_for(lab.is_up)
+    finally:
+        guest.end()
 
 
 def test_a_port_that_the_configuration_names_is_not_added_twice(lab: RelayLab) -> None:
