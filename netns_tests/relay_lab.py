@@ -34,7 +34,7 @@ class Node:
     """One machine: a folder, a namespace and its processes."""
 
     def __init__(self, home: Path, label: str, pid: int) -> None:
-        self.home, self.label = home, label
+        self.home, self.label, self.pid = home, label, pid
         self.enter = ["nsenter", f"--net=/proc/{pid}/ns/net", "--"]
         self.running: list[subprocess.Popen[bytes]] = []
         self.identity = home / label
@@ -156,6 +156,20 @@ class RelayLab:
         socket = f"{node.label}-switch.sock"
         config = node.write("switch.yaml", relay=True, control_socket=socket, data_plane="raw", **more)
         return node.start("gdp.cli.switch", config)
+
+    def link_peers(self) -> None:
+        """Write the endpoint record of each machine for the other, so that a tunnel over UDP can join them."""
+        for node, other in ((self.border, self.member), (self.member, self.border)):
+            (self.home / f"{node.label}-peers").mkdir()
+            record = self.home / f"{node.label}-peers/{other.label}.endpoints"
+            where = ["--public", f"{BORDER_ADDRESS}:51820"] if other is self.border else []
+            done = node.run(sys.executable, "-m", "gdp.cli.gdp", "endpoints", other.label, *where, "-o", str(record))
+            assert done.returncode == 0, done.stderr
+
+    def tunnel_is_up(self) -> bool:
+        """Return whether the member's switch has its border as a neighbour over UDP."""
+        links = self.member.status(self.home / "member-switch.sock")["links"]
+        return bool(links and links[0]["up"])
 
     def neighbours(self, node: Node) -> int:
         """Return how many neighbours the switch of a machine has."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -19,7 +20,16 @@ from gdp.stores.issue import delegate, install_delegation, make_domain, make_nod
 from gdp.stores.keyring import CARD, load_domain, load_identity
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
-from netns_tests.relay_lab import BORDER_ADDRESS, LATER_ADDRESS, MEMBER_ADDRESS, PORT, RelayLab, relay_lab, wait_for
+from netns_tests.relay_lab import (
+    BORDER_ADDRESS,
+    LATER_ADDRESS,
+    MEMBER_ADDRESS,
+    PORT,
+    Node,
+    RelayLab,
+    relay_lab,
+    wait_for,
+)
 from netns_tests.spaces import Space
 
 pytestmark = [
@@ -125,6 +135,38 @@ def test_a_relay_on_standby_waits_for_a_tunnel_and_then_connects(lab: RelayLab) 
     lab.start_relay(lab.member, standby=True)
     assert lab.relay_status(lab.member)["borders"][0]["state"] == "standby"
     assert wait_for(lab.is_up) > 1.0, "it gave the tunnel a moment"
+
+
+@pytest.mark.skipif(shutil.which("wireguard-go") is None, reason="wireguard-go is not installed")
+@pytest.mark.skipif(shutil.which("nft") is None, reason="nft is not installed")
+def test_where_udp_becomes_blocked_frames_go_through_tls(lab: RelayLab) -> None:
+    lab.link_peers()
+    lab.start_relay(lab.border)
+    lab.start_relay(lab.member, standby=True, switch_socket="member-switch.sock")
+    for node, listen in ((lab.border, 51_820), (lab.member, 0)):
+        lab.start_switch(node, links={"listen": listen, "peers": f"{node.label}-peers", "backend": "wireguard-go"})
+    wait_for(lab.tunnel_is_up)
+    rules = "table inet blocked { chain out { type filter hook output priority 0; meta l4proto udp drop; }; }"
+    done = lab.member.run("nft", rules)
+    assert done.returncode == 0, done.stderr
+    took_s = wait_for(lambda: not lab.tunnel_is_up() and lab.is_joined())
+    print(f"UDP blocked: joined through TLS after {took_s:.1f} s")
+    (row,) = lab.member.status(lab.home / "member-switch.sock")["relay"]
+    assert (row["peer"], row["via"], row["up"]) == (lab.border.name.to_text(), "tls (slower)", True)
+    lab.member.run("nft", "delete", "table", "inet", "blocked")
+    wait_for(lab.tunnel_is_up)
+    assert lab.is_up(), "the relay stays until the tunnel has been stable"
+
+
+def test_an_endpoint_may_be_a_host_name(lab: RelayLab) -> None:
+    lab.start_relay(lab.border)
+    border = {"peer": lab.border.name.to_text(), "endpoints": [f"localhost:{PORT}"], "standby": False}
+    guest = Node(lab.home, "member", lab.border.pid)  # in the namespace of the border, where this name leads to it
+    try:
+        guest.start("gdp.cli.relay", lab.relay_config(lab.member, borders=[border]))
+        wait_for(lab.is_up)
+    finally:
+        guest.end()
 
 
 def test_a_port_that_the_configuration_names_is_not_added_twice(lab: RelayLab) -> None:

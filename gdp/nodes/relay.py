@@ -13,7 +13,6 @@ import select
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Final
 
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
@@ -29,6 +28,7 @@ from gdp.nodes.relay_config import RelayConfig
 from gdp.nodes.relay_context import RelayContext
 from gdp.nodes.relay_dialer import BorderDialer
 from gdp.nodes.relay_loop import RelayLoop
+from gdp.nodes.relay_ports import VIA
 from gdp.nodes.relay_server import BorderServer, listen_tls
 from gdp.nodes.rights import confine_relay
 from gdp.nodes.runtime import now
@@ -39,11 +39,9 @@ from gdp.ports.tap import TapDevice, tap_name
 from gdp.relay.connection import ConnectionCounters
 from gdp.telemetry.sources import Sources
 
-__all__ = ["VIA", "Relay", "relay_control_path", "run_relay"]
+__all__ = ["Relay", "relay_control_path", "run_relay"]
 
 log = logging.getLogger(__name__)
-
-VIA: Final = "tls (slower)"
 
 
 def relay_control_path(config: RelayConfig, switch: Name) -> Path:

@@ -19,11 +19,12 @@ from gdp.ports.tap import relay_alias
 from gdp.sansio import Timestamps
 from gdp.switch.core import SwitchCore
 
-__all__ = ["RELAY_COST", "RELAY_LOOK_S", "RelayPorts"]
+__all__ = ["RELAY_COST", "RELAY_LOOK_S", "VIA", "RelayPorts"]
 
 log = logging.getLogger(__name__)
 
 RELAY_COST: Final = 1_000
+VIA: Final = "tls (slower)"
 RELAY_LOOK_S: Final = 0.1
 _FORGET_S: Final = 60.0  # after this time no tree and no table entry names a removed port
 
@@ -58,6 +59,16 @@ class RelayPorts:
     def ports(self) -> frozenset[int]:
         """Return the port indices of the relay's devices."""
         return frozenset(self._ports.values())
+
+    def status(self) -> list[dict[str, object]]:
+        """Return the JSON fields of each port, with the neighbour that is up there."""
+        neighbours = {each.port: each for each in self._switch.hello_protocol.all_up()}
+        rows: list[dict[str, object]] = []
+        for ifname, port in self._ports.items():
+            found = neighbours.get(port)
+            peer = None if found is None else found.name.to_text()
+            rows.append({"peer": peer, "device": ifname, "via": VIA, "cost": self._cost, "up": found is not None})
+        return rows
 
     def look(self, now: Timestamps) -> None:
         """Add ports for new devices of the relay, and remove those whose device is gone."""

@@ -114,7 +114,7 @@ def run_switch(
 
         stack.enter_context(runtime.signals(reload))
         sources = _sources(switch, chosen, node_log, runtime)
-        handlers = _control_handlers(identity, switch, chosen, runtime, reload, sources, links)
+        handlers = _control_handlers(identity, switch, chosen, runtime, reload, sources, links, relay)
         stack.enter_context(runtime.control(config.control_socket or control_path(identity.name), handlers))
         _revoke(switch, config.revocations)
         keep_audit(config.audit, policy.audit, switch.drops, runtime, stack)
@@ -202,6 +202,7 @@ def _control_handlers(
     reload: Callable[[], None],
     sources: Sources,
     links: TunnelLinks | None,
+    relay: RelayPorts | None,
 ) -> ControlHandlers:
     begun_s = now().mono_s
 
@@ -216,6 +217,8 @@ def _control_handlers(
         }
         if links is not None:
             more["links"] = links.status(now())
+        if relay is not None:
+            more["relay"] = relay.status()
         return node_status(identity, sources, uptime_s=now().mono_s - begun_s, **more)
 
     return ControlHandlers(

@@ -29,7 +29,13 @@ from tests.fog.enrolment.desk import made_desk
 from tests.pages import ROOT
 
 UNITS = sorted((ROOT / "scripts" / "systemd").glob("*.service"))
-EXPOSURE_MAX = {"gdp-switch": 27, "gdp-rib": 27, "gdp-proxy": 32, "fog-machine": 50}  # tenths; 96 without fences
+EXPOSURE_MAX = {  # tenths; 96 without fences
+    "gdp-switch": 27,
+    "gdp-relay": 27,
+    "gdp-rib": 27,
+    "gdp-proxy": 32,
+    "fog-machine": 50,
+}
 FENCES = (
     *("NoNewPrivileges=yes", "ProtectSystem=strict", "ProtectHome=yes", "PrivateTmp=yes", "CapabilityBoundingSet="),
     *("RestrictAddressFamilies=", "SystemCallFilter=", "MemoryMax=", "LimitNOFILE="),

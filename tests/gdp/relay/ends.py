@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ssl
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -26,8 +27,8 @@ def at(mono_s: float) -> Timestamps:
     return Timestamps(mono_s, NOW)
 
 
-def domain(label: str) -> CertificateAuthority:
-    return CertificateAuthority.create(label, SigningKey.generate(), Validity.lasting(NOW - 99 * DAY_S, 400 * DAY_S))
+def domain(label: str, unix_s: float = NOW) -> CertificateAuthority:
+    return CertificateAuthority.create(label, SigningKey.generate(), Validity.lasting(unix_s - 99 * DAY_S, 400 * DAY_S))
 
 
 def member(
@@ -51,6 +52,7 @@ class Ends:
     member_policy: Policy
     allow: frozenset[str] | None = None
     clients_max: int = 64
+    begun_s: float = 0.0  # of the connections
 
     def admit(self, certificate: bytes, moment: Timestamps) -> Membership:
         found = verified_switch(certificate, self.border_policy.verify_membership, moment.unix_s)
@@ -60,7 +62,9 @@ class Ends:
 
     def server(self, settings: ConnectionSettings = SETTINGS) -> RelayConnection:
         context = tls_context(self.border, self.border_policy, is_server=True)
-        return RelayConnection(context=context, is_server=True, settings=settings, authenticate=self.admit, now_s=0.0)
+        return RelayConnection(
+            context=context, is_server=True, settings=settings, authenticate=self.admit, now_s=self.begun_s
+        )
 
     def client(
         self,
@@ -76,7 +80,7 @@ class Ends:
             is_server=False,
             settings=settings,
             authenticate=authenticate or dialled,
-            now_s=0.0,
+            now_s=self.begun_s,
         )
 
 
@@ -96,6 +100,14 @@ def ends(
         allow=allow,
         clients_max=clients_max,
     )
+
+
+def ends_now() -> Ends:
+    """Return a border and a member whose certificates and clocks are those of this machine."""
+    unix_s = time.time()
+    lab = domain("lab", unix_s)
+    one, other = (member(lab, label, begins_s=unix_s - 60) for label in ("border", "member"))
+    return Ends(one, other, Policy(lab.root), Policy(lab.root), begun_s=time.monotonic())
 
 
 def exchange(one: RelayConnection, other: RelayConnection, mono_s: float = 0.0) -> tuple[list[bytes], list[bytes]]:

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 
+from gdp.crypto.identity import Identity
+from gdp.crypto.keys import PublicKey, SigningKey
+from gdp.crypto.validity import Validity
+from gdp.errors import LocalError
 from gdp.frame.kinds import Flag
+from gdp.nodes.relay_tls import tls_context
 from gdp.relay.connection import HANDSHAKE_S, ConnectionState, RelayConnection
 from gdp.relay.framing import PREFIX, ControlMessage, ControlType
-from tests.gdp.relay.ends import SETTINGS, at, ends, exchange
+from gdp.trust.domain import Policy
+from tests.gdp.relay.ends import DAY_S, NOW, SETTINGS, Ends, at, domain, ends, exchange, member
 from tests.gdp.relay.test_frame_queue import frame, numbers
 
 OPEN, CLOSED = ConnectionState.OPEN, ConnectionState.CLOSED
@@ -184,3 +191,40 @@ def test_bytes_after_the_end_have_no_effect(pair: tuple[RelayConnection, RelayCo
     server.close("done")
     assert server.receive_bytes(data, at(0.0)) == []
     assert server.reason == "done"
+
+
+def test_a_member_of_the_former_root_and_one_of_its_successor_connect() -> None:
+    former = domain("lab")
+    old = member(former, "old")
+    successor = former.succeed(SigningKey.generate(), Validity.lasting(NOW, 400 * DAY_S), int(NOW + 30 * DAY_S))
+    new = member(successor, "new", begins_s=NOW)
+    renewed = Policy(successor.root)
+    for border, joining in ((old, new), (new, old)):
+        both = Ends(border=border, member=joining, border_policy=renewed, member_policy=renewed)
+        client, server = both.client(), both.server()
+        exchange(client, server)
+        assert (client.state, server.state) == (OPEN, OPEN)
+
+
+def test_a_key_in_a_token_is_refused_with_a_reason() -> None:
+    both = ends()
+
+    class TokenKey(SigningKey):
+        """Key that never leaves its token."""
+
+        def __init__(self, public: PublicKey) -> None:
+            self.public = public
+
+        def sign(self, data: bytes) -> bytes:
+            raise NotImplementedError
+
+        def sign_digest(self, digest: bytes) -> bytes:
+            raise NotImplementedError
+
+        def to_file(self, protect: Callable[[bytes], bytes] | None = None) -> bytes:
+            raise NotImplementedError
+
+    found = both.member
+    guarded = Identity(found.member, found.root, TokenKey(found.key.public), found.kem)
+    with pytest.raises(LocalError, match="TLS cannot use the key in a token"):
+        tls_context(guarded, both.member_policy, is_server=False)
