@@ -5,7 +5,7 @@ I/O; blocking. ``DomainClient.open(DIR)`` needs only the directory that ``gdp jo
     with DomainClient.open(Path("/var/lib/gdp/lab")) as domain:
         server = domain.find("server")
         domain.send(server.name, "delegation-request", body)
-        for mail in domain.receive(since=0):
+        for mail in domain.read_mails(since=0):
             ...
 
 Mail that arrives lies in ``DIR/inbox``, one file each, fetched by the agent or by a program like this one. A
@@ -164,7 +164,7 @@ class DomainClient:
         """
         self._channel.request({"op": "send", "mail": Mail.make(self.identity, to, kind, body, time.time())})
 
-    def receive(self, since: int = 0) -> list[ReceivedMail]:
+    def read_mails(self, since: int = 0) -> list[ReceivedMail]:
         """Fetch new mail into the inbox, and return what is there after number ``since``, the oldest first.
 
         Raises:

@@ -86,7 +86,7 @@ class MemberExchange:
         failure = None
         if self._fetches:
             try:
-                self._request(lambda client: client.receive(self._seen))
+                self._request(lambda client: client.read_mails(self._seen))
             except GdpError as error:
                 failure = error
         recipient = load_card(self._files.mail_identity / CARD).name

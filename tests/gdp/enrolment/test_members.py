@@ -81,13 +81,13 @@ def test_mail_waits_for_its_recipient_and_is_delivered_in_order(lab: Lab) -> Non
     with DomainClient.open(lab.folder / "ada") as ada, DomainClient.open(lab.folder / "bob") as bob:
         for number in range(3):
             ada.send(ada.find("bob").name, "test-order", bytes([number]))
-        mails = [each for each in bob.receive() if each.kind == "test-order"]
+        mails = [each for each in bob.read_mails() if each.kind == "test-order"]
         assert [each.body for each in mails] == [b"\0", b"\1", b"\2"]
         assert {each.sender.label for each in mails} == {"ada"}
-        assert [each.body for each in bob.receive(mails[1].number)] == [b"\2"]
+        assert [each.body for each in bob.read_mails(mails[1].number)] == [b"\2"]
         for each in mails:
             bob.delete(each.number)
-        assert not [each for each in bob.receive() if each.kind == "test-order"]
+        assert not [each for each in bob.read_mails() if each.kind == "test-order"]
 
 
 def test_mail_to_a_stranger_is_refused(lab: Lab) -> None:
@@ -113,7 +113,7 @@ def test_a_full_mailbox_refuses_more(lab: Lab, monkeypatch: pytest.MonkeyPatch) 
         with pytest.raises(EnrolmentError, match="mailbox is full"):
             bob.send(to, "test", b"")
     with DomainClient.open(lab.folder / "ada") as ada:
-        for each in ada.receive():
+        for each in ada.read_mails():
             ada.delete(each.number)
 
 

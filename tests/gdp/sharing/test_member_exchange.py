@@ -66,10 +66,10 @@ def test_the_upkeep_of_an_agent_takes_the_mail_that_the_agent_fetched(lab: Lab) 
     upkeep.work()
     assert rights(server) == []
     with DomainClient.open(server) as client:
-        assert [mail.kind for mail in client.receive()] == ["note", "share"]
+        assert [mail.kind for mail in client.read_mails()] == ["note", "share"]
         upkeep.work()
         assert rights(server) == [frozenset({Right.READ})]
-        assert [mail.kind for mail in client.receive()] == ["note"]
+        assert [mail.kind for mail in client.read_mails()] == ["note"]
     exchange.close()
 
 
