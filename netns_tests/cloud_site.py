@@ -39,7 +39,7 @@ __all__ = ["TUNNEL_ID", "CloudSite", "wheelhouse"]
 
 TUNNEL_ID: Final = 42
 _TUNNEL: Final = "fog0"
-_COMMAND_S: Final = 120.0
+_COMMAND_S: Final = 400.0  # fog launch waits for a machine that boots
 _DEVICES: Final = RobotDevices(uplink=_TUNNEL, proxy="robot0", rib="rib0", watch="watch0")
 _ROS: Final = ("ros-jazzy-rmw-fastrtps-cpp", "ros-jazzy-std-msgs")
 
