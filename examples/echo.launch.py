@@ -3,8 +3,8 @@
 ``fog launch examples/echo.launch.py rate:=50``
 
 Machines of the provider ``local`` have the robot's packages. A rented machine needs wheels of the nodes, of this
-package and of ROS: ``fog wheels dist scripts/fog_demo ros-jazzy-rmw-fastrtps-cpp ros-jazzy-std-msgs --build empy``. Name the
-folder in ``software.wheels`` of ``fog.yaml`` (docs/reference/providers.md).
+package and of ROS: ``fog wheels dist scripts/fog_demo ros-jazzy-rmw-fastrtps-cpp ros-jazzy-std-msgs --build empy``.
+Name the folder in ``software.wheels`` of ``fog.yaml`` (docs/reference/providers.md).
 """
 
 from fog import DeclareLaunchArgument, FogCluster, LaunchConfiguration, LaunchDescription, Node, SpotMachine
