@@ -2,9 +2,9 @@
 
 ``fog launch examples/echo.launch.py rate:=50``
 
-Machines of the provider ``local`` have the robot's packages. A rented machine needs the wheel of the nodes:
-``.venv/bin/pip wheel --no-deps --wheel-dir dist scripts/fog_demo``. Serve it, and pin it in ``setup.requirements``
-next to the wheels of gdp-ros, rclpy and std_srvs (docs/reference/providers.md).
+Machines of the provider ``local`` have the robot's packages. A rented machine needs wheels of the nodes, of this
+package and of ROS: ``fog wheels dist scripts/fog_demo ros-jazzy-rmw-fastrtps-cpp ros-jazzy-std-msgs --build empy``.
+Name the folder in ``software.wheels`` of ``fog.yaml`` (docs/reference/providers.md).
 """
 
 from fog import DeclareLaunchArgument, FogCluster, LaunchConfiguration, LaunchDescription, Node, SpotMachine

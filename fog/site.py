@@ -34,6 +34,7 @@ from fog.latency.known import Latencies
 from fog.providers.aws.config import AwsConfig
 from fog.providers.cloud_init import Vxlan
 from fog.providers.skypilot.config import SkyPilotConfig
+from fog.software.config import SOFTWARE_PORT, SoftwareConfig
 from fog.topology import AUTOMATIC, AUTOMATIC_REPLICA, Gateway, Topology
 from gdp.crypto.certificates import Role
 from gdp.errors import LocalError
@@ -101,6 +102,9 @@ class SiteConfig(Section):
     enrolment: EnrolmentConfig = Field(
         default=EnrolmentConfig(), description="Where rented machines, with keys of their own, ask for memberships."
     )
+    software: SoftwareConfig = Field(
+        default=SoftwareConfig(), description="What rented machines fetch from the supervisor: wheels, a workspace."
+    )
     idle_s: float | None = Field(default=None, gt=0, description="Default of a cluster's idle limit, in seconds.")
     budget_usd: float | None = Field(default=None, gt=0, description="Default of a cluster's budget.")
     latency_ms: Mapping[str, Annotated[float, Field(ge=0)]] = Field(
@@ -125,6 +129,13 @@ class SiteConfig(Section):
             return self.enrolment.address or ""
         remote = self._vxlan.remote
         return f"[{remote}]:{ENROLMENT_PORT}" if remote.version == 6 else f"{remote}:{ENROLMENT_PORT}"
+
+    @property
+    def software_address(self) -> str:
+        """Return where a rented machine fetches its software, ``HOST:PORT``; empty: machines run on this host."""
+        if self.software.address is not None or not self.enrolment_address:
+            return self.software.address or ""
+        return f"{self.enrolment_address.rpartition(':')[0]}:{SOFTWARE_PORT}"
 
     @property
     def _tunnel(self) -> str:
@@ -165,10 +176,12 @@ class SiteConfig(Section):
         """Reject a machine that installs nothing: it would cost money and never serve."""
         setups = {"aws": self.aws.setup, "skypilot": self.skypilot.setup}
         has_image = bool(self.aws.images) if self.provider == "aws" else False
-        if self.provider in setups and not setups[self.provider].has_requirements and not has_image:
+        installs = self.software.wheels is not None or has_image
+        if self.provider in setups and not setups[self.provider].has_requirements and not installs:
             raise ValueError(
-                f"machines of {self.provider} have nothing to install: name the wheels of this package and of the"
-                f" nodes, each with its hash, in {self.provider}.setup.requirements or requirements_file"
+                f"machines of {self.provider} have nothing to install: fill a folder with `fog wheels` and name it in"
+                " software.wheels, or name the wheels of this package and of the nodes, each with its hash, in"
+                f" {self.provider}.setup.requirements or requirements_file"
             )
         return self
 
@@ -205,6 +218,8 @@ class _Settings(TypedDict):
     latency: LatencyConfig
     enrolment: EnrolmentConfig
     enrolment_address: str
+    software: SoftwareConfig
+    software_address: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -240,6 +255,20 @@ class Site:
     latency: LatencyConfig = field(default_factory=LatencyConfig)
     enrolment: EnrolmentConfig = field(default_factory=EnrolmentConfig)
     enrolment_address: str = ""
+    software: SoftwareConfig = field(default_factory=SoftwareConfig)
+    software_address: str = ""
+
+    @property
+    def software_folder(self) -> Path:
+        """Return the folder of the software server's keys, and of the packed workspace."""
+        return self.state / "software"
+
+    @property
+    def software_listens(self) -> tuple[str, int]:
+        """Return host and port on which the supervisor serves software; an empty host: every address."""
+        if self.software.listen is not None:
+            return host_and_port(self.software.listen)
+        return "", host_and_port(self.software_address)[1]
 
     @property
     def enrolment_folder(self) -> Path:
@@ -266,7 +295,8 @@ class Site:
     @property
     def latencies(self) -> Latencies:
         """Return the known latencies of regions."""
-        return Latencies(self.state, self.latency, self.latency_ms)
+        config = self.latency.for_aws() if self.provider == "aws" else self.latency
+        return Latencies(self.state, config, self.latency_ms)
 
     @property
     def robot(self) -> Path | None:
@@ -464,4 +494,6 @@ def _settings(config: SiteConfig) -> _Settings:
         "latency": config.latency,
         "enrolment": config.enrolment,
         "enrolment_address": config.enrolment_address,
+        "software": config.software,
+        "software_address": config.software_address,
     }

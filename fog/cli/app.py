@@ -15,6 +15,7 @@ from fog.cli import scale, status
 from fog.cli.down import down
 from fog.cli.launch import launch
 from fog.cli.plan import cost_table, plan
+from fog.cli.wheels import wheels_command
 from fog.providers.local.cli import local_app
 from fog.site import open_site
 
@@ -45,6 +46,7 @@ app.command("cost")(status.cost)
 app.command("plan")(plan)
 app.command("prices")(cost_table)
 app.command("down")(down)
+app.command("wheels")(wheels_command)
 app.command("supervise")(scale.supervise)
 app.add_typer(local_app(lambda: open_site(None).state / "local"), name="local")
 

@@ -18,7 +18,7 @@ import typer
 from rich.console import Console
 
 from fog.cli.down import clear, end_cluster
-from fog.cli.market import choices, market, reached, refusal
+from fog.cli.market import choices, in_regions, market, reached, refusal
 from fog.cli.options import AsJson, SiteFile, State, opened, peeked
 from fog.cli.robot_nodes import INTERRUPTED, resolved, run
 from fog.cli.views import a_console, event_line, print_json
@@ -53,6 +53,10 @@ Gateway = Annotated[
     Optional[GatewayKind],  # noqa: UP045
     typer.Option("--gateway", help="without fog.yaml: a switch of its own, or one of the machines"),
 ]
+Regions = Annotated[
+    Optional[list[str]],  # noqa: UP045
+    typer.Option("--region", metavar="REGION", help="where machines are made, in order; repeatable"),
+]
 # what else ends the cluster, such as another launch
 EndsWith = Annotated[str, typer.Option("--ends-with", hidden=True)]
 Wait = Annotated[float, typer.Option("--wait", metavar="S", min=0.0, help="how long the replicas may take")]
@@ -68,12 +72,14 @@ def launch(
     keep: Keep = False,
     wait: Wait = _WAIT_S,
     gateway: Gateway = None,
+    region: Regions = None,
     ends_with: EndsWith = "",
     as_json: AsJson = False,
 ) -> None:
     """Start a launch file's cluster; when its replicas serve, run the robot's nodes until they end or Ctrl-C.
 
     With the robot's nodes the cluster ends, unless it is kept. A cluster of that name that is up takes the new plan.
+    Machines are made in the regions of --region, in turn; without it where latency and price are best.
     What robot's nodes with output="log" print goes to a file in the state folder, which is printed.
 
     \b
@@ -91,6 +97,7 @@ def launch(
             said,
             idle_s=here.idle_s if said.idle_s is None else said.idle_s,
             budget_usd=here.budget_usd if said.budget_usd is None else said.budget_usd,
+            machines=in_regions(said.machines, region or []),
         )
         with closing(open_provider(here, [each.region for each in plan.machines if each.region])) as provider:
             found = market(provider, plan.machines, here.latencies)

@@ -19,7 +19,7 @@ from fog.plan.target import Target, machines_for
 from fog.providers.provider import Provider
 from gdp.errors import GdpError, LocalError
 
-__all__ = ["Market", "choices", "market", "reached", "refusal"]
+__all__ = ["Market", "choices", "in_regions", "market", "reached", "refusal"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +43,13 @@ def market(provider: Provider, machines: Sequence[MachineRequest], latencies: La
     regions = list(dict.fromkeys(offer.region for offer in offers))
     latencies.refresh(regions, time.time())
     return Market(tuple(offers), latencies.lookup(regions, time.time()))
+
+
+def in_regions(machines: Sequence[MachineRequest], regions: Sequence[str]) -> tuple[MachineRequest, ...]:
+    """Return the machines in these regions, in turn, whatever the launch file says; unchanged if there are none."""
+    if not regions:
+        return tuple(machines)
+    return tuple(replace(each, region=regions[at % len(regions)]) for at, each in enumerate(machines))
 
 
 def reached(plan: ClusterPlan, found: Market) -> tuple[ClusterPlan, Target | None]:

@@ -87,11 +87,13 @@ def machine_boot(
     shares_host: bool,
     lease_s: float = ADVERTISEMENT_LEASE_S,
     uplink: str = "",
+    software: Mapping[str, bytes] | None = None,
 ) -> MachineBundle:
     """Return the bootstrap bundle of a machine; its only secret is the token.
 
     Args:
         uplink: device that the machine has while it is the gateway of its group; empty: it never is the gateway.
+        software: further files, by which the machine fetches its software.
     """
     domain = 1 + int(name[1:]) % _DOMAINS
     ports = [{"iface": iface}, *([{"iface": uplink, "optional": True}] if uplink else [])]
@@ -100,6 +102,7 @@ def machine_boot(
         TICKET_FILE: ticket.to_json(),
         _OWNER: authority.owner_key.read_bytes(),
         _PROFILE: _OFTEN,
+        **(software or {}),
         "switch.yaml": _yaml({**_who("switch"), "ports": ports, "attach": ["proxy0"], "table_max": _TABLE_MAX}),
         "proxy.yaml": _yaml(
             {

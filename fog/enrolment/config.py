@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field
 
 from gdp.nodes.schema import Section
 
-__all__ = ["ENROLMENT_PORT", "EnrolmentConfig", "host_and_port"]
+__all__ = ["ENROLMENT_PORT", "EnrolmentConfig", "host_and_port", "listening_place", "reachable_place"]
 
 ENROLMENT_PORT: Final = 4780
 
@@ -30,12 +30,22 @@ def host_and_port(text: str) -> tuple[str, int]:
     return ("" if host == "*" else host.strip("[]")), int(port)
 
 
-def _place(text: str) -> str:
+def listening_place(text: str) -> str:
+    """Return ``HOST:PORT`` unchanged.
+
+    Raises:
+        ValueError: the text has another form.
+    """
     host_and_port(text)
     return text
 
 
-def _reachable(text: str) -> str:
+def reachable_place(text: str) -> str:
+    """Return ``HOST:PORT`` unchanged.
+
+    Raises:
+        ValueError: the text has another form, or no host.
+    """
     if not host_and_port(text)[0]:
         raise ValueError(f"{text!r}: machines need an address to reach: expected HOST:PORT")
     return text
@@ -44,12 +54,12 @@ def _reachable(text: str) -> str:
 class EnrolmentConfig(Section):
     """Section ``enrolment:`` of ``fog.yaml``."""
 
-    address: Annotated[str, AfterValidator(_reachable)] | None = Field(
+    address: Annotated[str, AfterValidator(reachable_place)] | None = Field(
         default=None,
         description="`HOST:PORT` at which a rented machine reaches the supervisor, by TCP. Default: the tunnel's"
         f" `remote`, port {ENROLMENT_PORT}. Machines of `local` use a Unix socket.",
     )
-    listen: Annotated[str, AfterValidator(_place)] | None = Field(
+    listen: Annotated[str, AfterValidator(listening_place)] | None = Field(
         default=None,
         description="`HOST:PORT` on which the supervisor listens. Default: every address, with the port of `address`.",
     )

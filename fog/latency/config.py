@@ -27,6 +27,7 @@ __all__ = ["Endpoint", "LatencyConfig"]
 
 _FORM: Final = re.compile(r"(?:(tcp|udp)://)?(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._{}-]+):(\d{1,5})")
 _EVERY: Final = "*"
+_AWS: Final = {_EVERY: "ec2.{region}.amazonaws.com:443"}  # every region's public endpoint
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +75,10 @@ class LatencyConfig(Section):
     )
     lifetime_s: float = Field(default=3_600.0, gt=0, le=86_400, description="For how long a measurement holds.")
     timeout_s: float = Field(default=1.0, gt=0, le=30, description="How long one try may take.")
+
+    def for_aws(self) -> LatencyConfig:
+        """Return the section with EC2's public endpoint of each region, unless endpoints are stated."""
+        return self if self.endpoints else self.model_copy(update={"endpoints": _AWS})
 
     def endpoint(self, region: str) -> Endpoint | None:
         """Return the endpoint of a region; None: there is none."""

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import base64
 import gzip
+import inspect
 import io
 import shlex
 import tarfile
@@ -21,6 +22,7 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv6Address
+from pathlib import Path
 from typing import Annotated, Final
 
 import yaml
@@ -29,10 +31,24 @@ from pydantic import AfterValidator, Field
 from fog.host.bundle import BOOT_FILE, read_programs
 from fog.host.managed_process import NODE_USER
 from fog.providers.requirements import pinned, read_requirements
+from fog.software import fetch
+from fog.software.offer import WORKSPACE
+from fog.software.server import SOFTWARE_FILE
 from gdp.errors import LocalError
 from gdp.nodes.schema import ExistingFile, Section
+from gdp.stores.files import read_at_most
 
-__all__ = ["HOME", "USER_DATA_MAX_BYTES", "VXLAN_PORT", "Placed", "Setup", "Vxlan", "cloud_config", "placed"]
+__all__ = [
+    "HOME",
+    "USER_DATA_MAX_BYTES",
+    "VXLAN_PORT",
+    "AptSource",
+    "Placed",
+    "Setup",
+    "Vxlan",
+    "cloud_config",
+    "placed",
+]
 __all__ += ["lines_of", "shell_script", "user_data"]
 
 HOME: Final = "/var/lib/fog"
@@ -41,6 +57,12 @@ VXLAN_PORT: Final = 4789  # RFC 7348
 _INSTALLED: Final = "/opt/fog"
 _REQUIREMENTS: Final = "/etc/fog-requirements.txt"
 _INSTALL: Final = "/usr/local/sbin/fog-install"
+_FETCH: Final = "/usr/local/sbin/fog-fetch"
+_SOFTWARE: Final = "/opt/fog-software"
+_WORKSPACE: Final = "/opt/fog-workspace"
+_APT: Final = "/etc/apt/sources.list.d/fog-{}.sources"
+_APT_KEY: Final = "/etc/apt/keyrings/fog-{}.asc"
+_KEY_MAX_BYTES: Final = 64 << 10
 _PACKAGES: Final = ("python3-venv", "iproute2", "util-linux")
 _PRIVATE: Final = 0o600
 _NODE_USER: Final = "fog-node"  # user account of the users' nodes, which cannot read the machine's keys
@@ -117,18 +139,30 @@ class Vxlan(Section):
     device: str = Field(default="fog0", pattern=r"^[a-z][a-z0-9]{0,14}$")
 
 
+class AptSource(Section):
+    """Repository of packages, such as that of ROS; ``key_file``: its signing key, in ASCII armour."""
+
+    uri: str = Field(pattern=r"^https?://[!-~]+$")
+    suite: str = Field(pattern=r"^[A-Za-z0-9._/-]+$")
+    components: tuple[Annotated[str, Field(pattern=r"^[A-Za-z0-9._/-]+$")], ...] = ("main",)
+    key_file: ExistingFile
+
+
 class Setup(Section):
-    """Software that a machine installs in addition to its bundle.
+    """Software that a machine installs in addition to its bundle and to the site's ``software``.
 
     For pip, each with its hash: ``requirements`` (the wheel of this package, wheels with the nodes, and all
     dependencies) and the file ``requirements_file``. ``packages`` are packages of the distribution in addition to the
-    required ones. Without ``vxlan``, the devices of the bundle's switch must exist. There is no default for pip,
-    because anyone could register an unused name on an index.
+    required ones, and ``apt_sources`` are further repositories of such. ``source`` are shell scripts that the machine
+    sources before its programs start. Without ``vxlan``, the devices of the bundle's switch must exist. There is no
+    default for pip, because anyone could register an unused name on an index.
     """
 
     requirements: tuple[Annotated[str, AfterValidator(pinned)], ...] = ()
     requirements_file: ExistingFile | None = None
+    apt_sources: tuple[AptSource, ...] = ()
     packages: tuple[str, ...] = ()
+    source: tuple[Annotated[str, Field(pattern=r"^/[A-Za-z0-9._/+-]+$")], ...] = ()
     vxlan: Vxlan | None = None
 
     @property
@@ -160,7 +194,12 @@ def placed(files: Mapping[str, bytes], setup: Setup) -> list[Placed]:
             raise LocalError(f"a boot's file {path!r} lies outside the machine's folder")
     own = [Placed(f"{HOME}/{path}", content) for path, content in sorted(files.items())]
     own.append(Placed(_REQUIREMENTS, _requirements(setup), 0o644))
-    own.append(Placed(_INSTALL, _install(setup).encode(), 0o755))
+    own.append(Placed(_INSTALL, _install(setup, fetches=SOFTWARE_FILE in files).encode(), 0o755))
+    if SOFTWARE_FILE in files:
+        own.append(Placed(_FETCH, inspect.getsource(fetch).encode(), 0o755))
+    for index, each in enumerate(setup.apt_sources):
+        own.append(Placed(_APT_KEY.format(index), _key(each.key_file), 0o644))
+        own.append(Placed(_APT.format(index), _apt(each, _APT_KEY.format(index)), 0o644))
     own.append(Placed("/etc/systemd/system/fog-machine.service", _service(setup).encode(), 0o644))
     own.append(Placed("/etc/systemd/system/fog-log@.service", _LOG.encode(), 0o644))
     if setup.vxlan:
@@ -210,6 +249,7 @@ def shell_script(files: Mapping[str, bytes], setup: Setup) -> str:
         "base64 -d <<'EOF' | sudo tar --extract --gzip --no-same-owner --directory / --file -",
         f"{_tar(files, setup)}EOF",
         *(f"sudo {shlex.join(line)}" for line in _CLOSE),
+        "sudo apt-get update -qq",
         f"sudo env DEBIAN_FRONTEND=noninteractive apt-get install -qq {shlex.join([*_PACKAGES, *setup.packages])}",
         *(f"sudo {line}" for line in _start(files, setup)),
     ]
@@ -238,24 +278,46 @@ def _start(files: Mapping[str, bytes], setup: Setup) -> list[str]:
     return ["systemctl daemon-reload", f"systemctl enable --now --no-block {' '.join(units)}"]
 
 
-def _install(setup: Setup) -> str:
+def _install(setup: Setup, *, fetches: bool) -> str:
     # the service runs it before each start, so an unreachable index is tried again
-    if not setup.has_requirements:
-        return f"""#!/bin/sh
-set -eu
-{_MAKE_USER}
-{_METADATA}[ -x {_INSTALLED}/bin/fog-machine ] && exit 0
-echo 'nothing is installed: name it, pinned by hash, in requirements or requirements_file of setup' >&2
+    head = f"#!/bin/sh\nset -eu\n{_MAKE_USER}\n{_METADATA}"
+    if not setup.has_requirements and not fetches:
+        return f"""{head}[ -x {_INSTALLED}/bin/fog-machine ] && exit 0
+echo 'nothing is installed: name it in software.wheels, or pinned by hash in requirements of setup' >&2
 exit 1
 """
-    return f"""#!/bin/sh
-set -eu
-{_MAKE_USER}
-{_METADATA}[ -e {_INSTALLED}/complete ] && exit 0
-python3 -m venv {_INSTALLED}
-{_INSTALLED}/bin/pip install --no-input --quiet --require-hashes --requirement {_REQUIREMENTS}
-touch {_INSTALLED}/complete
-"""
+    steps = []
+    if fetches:
+        steps.append(f"python3 {_FETCH} {HOME}/{SOFTWARE_FILE} {_SOFTWARE}")
+    steps.append(f"python3 -m venv {_INSTALLED}")
+    pip = f"{_INSTALLED}/bin/pip install --no-input --quiet --require-hashes"
+    if fetches:
+        offline = "--no-index --no-deps --no-compile --no-cache-dir"
+        steps.append(f"{pip} {offline} --requirement {_SOFTWARE}/requirements.txt")
+        steps.append(f"mkdir -p {_WORKSPACE}")
+        unpack = f"tar --extract --gzip --no-same-owner --file {_SOFTWARE}/{WORKSPACE} --directory {_WORKSPACE}"
+        steps.append(f"[ ! -e {_SOFTWARE}/{WORKSPACE} ] || {unpack}")
+    if setup.has_requirements:
+        steps.append(f"{pip} --requirement {_REQUIREMENTS}")
+    return (
+        f"{head}[ -e {_INSTALLED}/complete ] && exit 0\n" + "\n".join([*steps, f"touch {_INSTALLED}/complete"]) + "\n"
+    )
+
+
+def _apt(source: AptSource, key: str) -> bytes:
+    parts = " ".join(source.components)
+    return f"Types: deb\nURIs: {source.uri}\nSuites: {source.suite}\nComponents: {parts}\nSigned-By: {key}\n".encode()
+
+
+def _key(path: Path) -> bytes:
+    try:
+        with path.open("rb") as file:
+            key = read_at_most(file, _KEY_MAX_BYTES)
+    except OSError as error:
+        raise LocalError(f"{path}: {error.strerror}") from error
+    if not key.startswith(b"-----BEGIN PGP PUBLIC KEY BLOCK-----"):
+        raise LocalError(f"{path}: an OpenPGP public key in ASCII armour is expected")
+    return key
 
 
 def _requirements(setup: Setup) -> bytes:
@@ -274,7 +336,7 @@ SuccessAction=poweroff
 
 [Service]
 ExecStartPre=+{_INSTALL}
-ExecStart={_INSTALLED}/bin/fog-machine --home {HOME}
+ExecStart={_start_line(setup)}
 Environment={NODE_USER}={_NODE_USER} FASTDDS_BUILTIN_TRANSPORTS=UDPv4
 Environment=XDG_RUNTIME_DIR=%t/fog HOME={HOME} ROS_HOME={HOME}/ros
 TimeoutStartSec=20min
@@ -288,6 +350,12 @@ StandardError=journal+console
 [Install]
 WantedBy=multi-user.target
 """
+
+
+def _start_line(setup: Setup) -> str:
+    scripts = [*setup.source, f"{_WORKSPACE}/local_setup.bash"]
+    source = "for each; do if [ -e $$each ]; then . $$each; fi; done"
+    return f"/bin/bash -c '{source}; exec {_INSTALLED}/bin/fog-machine --home {HOME}' fog-machine {' '.join(scripts)}"
 
 
 def _tunnel(vxlan: Vxlan) -> str:

@@ -12,7 +12,7 @@ from fog.hardware import Hardware
 from fog.machine import Machine, MachineBundle, MachineSpec
 from fog.offer import Offer
 
-__all__ = ["GatewayProvider", "Provider"]
+__all__ = ["AccountProvider", "GatewayProvider", "Provider"]
 
 
 class Provider(Protocol):
@@ -66,6 +66,19 @@ class Provider(Protocol):
 
     def close(self) -> None:
         """Release the adapter's resources; machines continue."""
+        ...
+
+
+@runtime_checkable
+class AccountProvider(Protocol):
+    """Provider whose machines need something that outlives them in the user's account, such as a firewall's rules."""
+
+    def clear_account(self) -> None:
+        """Remove what this provider made in the account, unless machines of another site use it.
+
+        Raises:
+            StoreError: the account cannot be reached now, or something is in use by machines that end; try again.
+        """
         ...
 
 

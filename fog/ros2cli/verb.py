@@ -24,6 +24,7 @@ __all__ = [
     "StatusVerb",
     "SuperviseVerb",
     "VerbExtension",
+    "WheelsVerb",
 ]
 
 
@@ -87,6 +88,10 @@ class PricesVerb(VerbExtension):
 
 class SuperviseVerb(VerbExtension):
     """Keep clusters as they are wanted."""
+
+
+class WheelsVerb(VerbExtension):
+    """Build the wheels that rented machines install."""
 
 
 class LocalVerb(VerbExtension):

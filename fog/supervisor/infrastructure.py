@@ -10,6 +10,7 @@ import os
 import shutil
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -21,7 +22,7 @@ from fog.launch.resolve import command_line, deferred
 from fog.machine import MachineState
 from fog.providers.local.netlinks import delete
 from fog.providers.local.spawn import spawn_detached
-from fog.providers.provider import Provider
+from fog.providers.provider import AccountProvider, Provider
 from fog.site import SCRATCH, Site
 from gdp.errors import LocalError
 from gdp.host.run_registry import RunRegistry
@@ -112,6 +113,10 @@ def tear_down(site: Site) -> None:
             provider = local_provider(site)
             provider.close_network()
             provider.sweep()
+        else:
+            with closing(open_provider(site)) as elsewhere:
+                if isinstance(elsewhere, AccountProvider):
+                    elsewhere.clear_account()
         for left in (site.state / SCRATCH).iterdir():  # keys of a machine whose creation was interrupted
             shutil.rmtree(left, ignore_errors=True)
 

@@ -61,6 +61,7 @@ class MachineActions:
 
     Args:
         wake: called when an action has ended, from its thread.
+        software: returns the files by which a new machine fetches its software.
     """
 
     def __init__(
@@ -73,6 +74,7 @@ class MachineActions:
         provider: Provider,
         command: Callable[[CloudNode], Sequence[str]],
         wake: Callable[[], None],
+        software: Callable[[], Mapping[str, bytes]] = dict,
     ) -> None:
         self.provider = provider
         self._site = site
@@ -80,6 +82,7 @@ class MachineActions:
         self._events = events
         self._credentials = credentials
         self._command = command
+        self._software = software
         self.runner = ActionRunner(wake)
         self._offers = OfferCache(site.latencies)
         self._swept: set[str] = set()  # machines without leftovers at the provider
@@ -184,6 +187,7 @@ class MachineActions:
             lease_s=self._site.lease_s,
             shares_host=self.provider.name == "local",
             uplink=uplink,
+            software=self._software(),
         )
         record = Record(spec, wanted, IssuedCredentials("", until_unix_s), now_s)
         records.append(record)

@@ -11,8 +11,8 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Callable
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from functools import partial
 from types import FrameType
@@ -22,6 +22,7 @@ from fog.enrolment.listener import Listener, bind_tcp, bind_unix
 from fog.enrolment.responder import Responder
 from fog.enrolment.tickets import Tickets
 from fog.site import Site, topology_now
+from fog.software.server import SoftwareServer
 from fog.supervisor.background import held
 from fog.supervisor.infrastructure import command_of, open_provider, set_up
 from fog.supervisor.journal import Journal
@@ -48,15 +49,17 @@ def supervise(site: Site, *, stays: bool = False, lock: int | None = None) -> No
         lock: descriptor of the lock, if it is already held.
 
     Raises:
-        LocalError: another supervisor runs, the provider is not available, or the enrolment port is taken.
+        LocalError: another supervisor runs, the provider is not available, or a port for machines is taken.
     """
+    timeouts = Timeouts() if site.provider == "local" else Timeouts(boot_s=_ELSEWHERE_S)
     with (
         held(site, lock),
         closing(Journal(site.journal)) as journal,
         closing(Tickets(site.enrolment_folder)) as tickets,
         closing(Listener(_bound(site), Responder(tickets, site.authority))),
+        _software(site, timeouts.boot_s) as software,
     ):
-        _run(site, journal, tickets, stays=stays)
+        _run(site, journal, tickets, timeouts, software, stays=stays)
 
 
 def _bound(site: Site) -> socket.socket:
@@ -66,7 +69,30 @@ def _bound(site: Site) -> socket.socket:
     return bind_unix(site.enrolment_socket)
 
 
-def _run(site: Site, journal: Journal, tickets: Tickets, *, stays: bool) -> None:
+@contextmanager
+def _software(site: Site, lifetime_s: float) -> Iterator[Callable[[], Mapping[str, bytes]]]:
+    """Serve the software of rented machines; yield what returns the files by which a new machine fetches it."""
+    if site.provider == "local" or site.software.is_empty:
+        yield dict
+        return
+    listening = bind_tcp(*site.software_listens)
+    with ExitStack() as stack:
+        stack.callback(listening.close)
+        url = f"https://{site.software_address}"
+        server = SoftwareServer(listening, site.software_folder, site.software, url, time.time)
+        stack.callback(server.close)
+        yield partial(server.bundle_file, lifetime_s)
+
+
+def _run(
+    site: Site,
+    journal: Journal,
+    tickets: Tickets,
+    timeouts: Timeouts,
+    software: Callable[[], Mapping[str, bytes]],
+    *,
+    stays: bool,
+) -> None:
     ended, drained = threading.Event(), threading.Event()
     watch = Watch(*site.watch) if site.watch is not None else None
     offered = _offered(site, journal)
@@ -79,7 +105,8 @@ def _run(site: Site, journal: Journal, tickets: Tickets, *, stays: bool) -> None
         command=partial(command_of, site),
         heard=watch.serving_proxies if watch is not None else lambda: None,
         on_names=watch.reload if watch is not None else lambda: None,
-        patience=Timeouts() if provider.name == "local" else Timeouts(boot_s=_ELSEWHERE_S),
+        patience=timeouts,
+        software=software,
     )
 
     def drain() -> None:

@@ -45,6 +45,7 @@ class Supervisor:
 
     Args:
         heard: servers that the overlay reports; None: the overlay cannot be queried.
+        software: returns the files by which a new machine fetches its software.
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class Supervisor:
         heard: Callable[[], Heard | None],
         on_names: Callable[[], None] = lambda: None,
         patience: Timeouts = PATIENCE,
+        software: Callable[[], Mapping[str, bytes]] = dict,
     ) -> None:
         self._site = site
         self._journal = journal
@@ -75,6 +77,7 @@ class Supervisor:
             provider=provider,
             command=command,
             wake=self._woken.set,
+            software=software,
         )
         self._gateways = GatewayUplinks(journal, self._events, self._actions, patience)
         self._limits = UsageLimits(site, journal)

@@ -111,16 +111,20 @@ class Cgroup:
                     os.kill(pid, signal.SIGKILL)
 
     def remove(self) -> None:
-        """Kill the remaining processes of the group, and remove it; no error if it is gone."""
+        """Kill the remaining processes of the group, and remove it with the groups in it; no error if it is gone."""
         end_s = time.monotonic() + _PATIENCE_S
         for folder in self._standing():
             while True:
                 self.kill()  # in the loop: without cgroup.kill, a process may have started another
                 try:
+                    for nested in sorted(folder.rglob("*/"), reverse=True):  # made by its processes, as by systemd
+                        if nested.is_dir():  # Python before 3.11 returns files, too
+                            nested.rmdir()
                     folder.rmdir()
                     break
                 except FileNotFoundError:
-                    break
+                    if not folder.exists():
+                        break
                 except OSError as error:  # busy until the last process ends, which version 1 does not report
                     if time.monotonic() > end_s:
                         raise LocalError(f"{folder} cannot be removed: {error.strerror}") from error

@@ -20,6 +20,7 @@ _TRY_AGAIN: Final = {
     "InsufficientAddressCapacity": "there is no public address to be had there now",
     "InsufficientFreeAddressesInSubnet": "the subnet has no free address",
     "SpotMaxPriceTooLow": "the spot price is above the limit now",
+    "InvalidGroup.NotFound": "the security group was removed a moment ago",
     "IdempotentParameterMismatch": "the machine was asked for a moment ago, and is not listed yet",
     "RequestLimitExceeded": "too many requests",
     "ResourceCountExceeded": "too many requests",

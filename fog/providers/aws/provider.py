@@ -25,7 +25,7 @@ from fog.providers.aws.clients import Clients, filters
 from fog.providers.aws.config import AwsConfig
 from fog.providers.aws.errors import asking, is_code
 from fog.providers.aws.instances import CLUSTER, DRAIN, MACHINE, machine_of
-from fog.providers.aws.region import ground_of
+from fog.providers.aws.region import ground_of, remove_groups
 from fog.providers.aws.run_request import order
 from fog.providers.cloud_init import lines_of, user_data
 from gdp.errors import LocalError
@@ -41,6 +41,7 @@ log = logging.getLogger(__name__)
 
 WATCHER: Final = Program("notice", ("{python}", "-m", "fog.providers.aws.notice", "--home", "{home}"))
 _AT_ONCE: Final = 8
+_END_S: Final = 180.0  # a machine that is terminated takes about a minute to end
 _LIVING: Final = ("pending", "running", "stopping", "stopped")
 _LINUX: Final = ("Linux/UNIX", "Linux/UNIX (Amazon VPC)")
 
@@ -119,6 +120,17 @@ class AwsProvider:
                 known = [each["InstanceId"] for each in found]
                 if known:
                     client.terminate_instances(InstanceIds=known)
+
+    def clear_account(self) -> None:
+        """Delete the security groups that this provider made; disks and spot requests end with their machines.
+
+        Raises:
+            StoreError: EC2 cannot be reached now, or machines take longer than usual to end.
+            LocalError: EC2 refuses the credentials.
+        """
+        for region in self._clients.regions():
+            with asking(f"{region}: delete security groups"):
+                remove_groups(self._clients[region], region, _END_S)
 
     def drain(self, machine: str) -> None:
         """Tag the instance; its watcher reads the tag in the metadata within seconds and drains."""

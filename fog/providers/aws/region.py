@@ -1,26 +1,36 @@
 """Prerequisites of a region for machines: an image, a subnet and a security group.
 
 I/O; queries EC2, and creates a security group if none fits.
-The group's name encodes what it admits, so a group for other settings is never widened. The group belongs to no run and
-is not removed: it is free of charge, and the next cluster uses it.
+The group's name encodes what it admits, so a group for other settings is never widened. Clusters with the same settings
+share it. It is removed when the last cluster of a site is down, unless machines of another site use it.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import logging
+import time
+from typing import TYPE_CHECKING, Final
 
 from fog.providers.aws.clients import filters
 from fog.providers.aws.config import AwsConfig
 from fog.providers.aws.errors import is_code
 from fog.providers.aws.run_request import Ground
 from fog.providers.cloud_init import VXLAN_PORT
-from gdp.errors import LocalError
+from gdp.errors import LocalError, StoreError
 
 if TYPE_CHECKING:
     from types_boto3_ec2 import EC2Client
     from types_boto3_ec2.type_defs import ImageTypeDef, IpPermissionTypeDef
 
-__all__ = ["ground_of"]
+__all__ = ["ground_of", "remove_groups"]
+
+
+log = logging.getLogger(__name__)
+
+_DESCRIPTION: Final = "machines of fog clusters"
+_ENDED: Final = ("terminated",)
+_ENDING: Final = ("shutting-down", "terminated")
+_STEP_S: Final = 2.0
 
 
 def ground_of(client: EC2Client, region: str, config: AwsConfig) -> Ground:
@@ -66,14 +76,55 @@ def _security_group(client: EC2Client, region: str, config: AwsConfig) -> str:
 
 
 def _create(client: EC2Client, name: str, vpc: str) -> str:
-    what = "machines of fog clusters"
     try:
-        return client.create_security_group(GroupName=name, Description=what, VpcId=vpc)["GroupId"]
+        return client.create_security_group(GroupName=name, Description=_DESCRIPTION, VpcId=vpc)["GroupId"]
     except client.exceptions.ClientError as error:
         if not is_code(error, "InvalidGroup.Duplicate"):  # else another launcher created it at the same time
             raise
     place = filters({"group-name": name, "vpc-id": vpc})
     return client.describe_security_groups(Filters=place)["SecurityGroups"][0]["GroupId"]
+
+
+def remove_groups(client: EC2Client, region: str, patience_s: float) -> None:
+    """Remove the groups that ``ground_of`` made in a region; a group of machines that do not end stays.
+
+    Args:
+        patience_s: how long to wait for machines that are shutting down; EC2 keeps their groups until then.
+
+    Raises:
+        StoreError: such machines have not ended in that time.
+    """
+    end_s = time.monotonic() + patience_s
+    found = client.describe_security_groups(Filters=filters({"description": _DESCRIPTION}))["SecurityGroups"]
+    for group in (each["GroupId"] for each in found):
+        while True:
+            states = _states_of_users(client, group)
+            if any(each not in _ENDING for each in states):
+                log.info("security group kept region=%s group=%s: machines use it", region, group)
+                break
+            if not states and _is_deleted(client, group):
+                break
+            if time.monotonic() >= end_s:
+                raise StoreError(f"{region}: security group {group} is in use by machines that end: try again")
+            time.sleep(_STEP_S)  # EC2 reports no event when a machine has ended
+
+
+def _states_of_users(client: EC2Client, group: str) -> list[str]:
+    """Return the states of the instances with a security group, without those that have ended."""
+    pages = client.get_paginator("describe_instances").paginate(Filters=filters({"instance.group-id": group}))
+    each = (one["State"]["Name"] for page in pages for some in page["Reservations"] for one in some["Instances"])
+    return [state for state in each if state not in _ENDED]
+
+
+def _is_deleted(client: EC2Client, group: str) -> bool:
+    try:
+        client.delete_security_group(GroupId=group)
+    except client.exceptions.ClientError as error:
+        if is_code(error, "DependencyViolation"):  # a network interface is not yet released
+            return False
+        if not is_code(error, "InvalidGroup.NotFound"):  # else another site removed it at the same time
+            raise
+    return True
 
 
 def _permissions(config: AwsConfig) -> list[IpPermissionTypeDef]:

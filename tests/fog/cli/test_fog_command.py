@@ -23,7 +23,8 @@ from tests.fog.supervisor.machines import record, serving
 from tests.fog.supervisor.test_journal import PLAN
 from tests.pages import ROOT
 
-VERBS = ["launch", "ls", "status", "scale up", "scale down", "logs", "ssh", "cost", "plan", "down", "supervise"]
+VERBS = ["launch", "ls", "status", "scale up", "scale down", "logs", "ssh", "cost", "plan", "down"]
+VERBS += ["supervise", "wheels"]
 Run = Callable[..., Result]
 
 

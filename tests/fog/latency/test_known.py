@@ -76,3 +76,9 @@ def test_another_endpoint_for_a_region_is_another_measurement(tmp_path: Path, pr
 def test_a_cache_that_cannot_be_read_is_an_empty_one(tmp_path: Path, probes: Probes) -> None:
     (tmp_path / "latency.json").write_text('{"near": {"ms": 3}}', encoding="utf-8")
     assert Latencies(tmp_path, CONFIG, {}, probes).ms(["near"], 1_000.0) == {}
+
+
+def test_every_region_of_aws_has_an_endpoint_unless_others_are_stated() -> None:
+    found = LatencyConfig().for_aws().endpoint("eu-west-1")
+    assert found == Endpoint("tcp", "ec2.eu-west-1.amazonaws.com", 443)
+    assert CONFIG.for_aws() == CONFIG

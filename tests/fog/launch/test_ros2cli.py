@@ -15,6 +15,7 @@ from tests.pages import ROOT
 VERBS = (
     *("cost", "down", "launch", "local", "logs", "ls", "plan", "prices", "scale", "ssh", "status"),
     "supervise",
+    "wheels",
 )
 
 

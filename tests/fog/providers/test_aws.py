@@ -305,3 +305,42 @@ def test_a_programs_lines_are_found_in_the_console(
     assert aws.log(made, "", 5) == "[1.3] fog-machine[5]: ends"
     with pytest.raises(LocalError, match="no machine of EC2"):
         aws.log("elsewhere", "", 1)
+
+
+def groups(cloud: Cloud) -> set[str]:
+    """Return the security groups of both regions."""
+    return {
+        each["GroupId"]
+        for region in (EAST, WEST)
+        for each in cloud.client(region).describe_security_groups()["SecurityGroups"]
+    }
+
+
+def test_a_cleared_account_has_no_security_group_of_ours(cloud: Cloud) -> None:
+    own = provider(setup=Setup(vxlan=Vxlan.model_validate({"remote": "203.0.113.9"})))
+    own.clear_account()  # those of the other tests
+    before = groups(cloud)
+    made = [own.create(spec("cleared", "m1"), BOOT), own.create(spec("cleared", "m2", WEST), BOOT)]
+    assert len(groups(cloud)) == len(before) + 2
+    own.terminate(made)
+    own.clear_account()
+    assert groups(cloud) == before
+    own.close()
+
+
+def test_a_group_of_machines_that_run_stays(cloud: Cloud, aws: AwsProvider) -> None:
+    made = aws.create(spec("stays"), BOOT)
+    (group,) = cloud.instance(made)["SecurityGroups"]
+    aws.clear_account()
+    assert group["GroupId"] in groups(cloud)
+    aws.terminate([made])
+
+
+def test_a_group_is_kept_until_its_machines_have_ended(cloud: Cloud, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = provider(setup=Setup(vxlan=Vxlan.model_validate({"remote": "203.0.113.10"})))
+    own.terminate([own.create(spec("ending"), BOOT)])
+    cloud.refuse(monkeypatch, "DependencyViolation", "delete_security_group")
+    monkeypatch.setattr("fog.providers.aws.provider._END_S", 0.0)
+    with pytest.raises(StoreError, match="try again"):
+        own.clear_account()
+    own.close()

@@ -139,3 +139,22 @@ def test_the_installation_is_done_once_and_again_after_a_failure(tmp_path: Path)
     installs = next(file for file in placed(FILES, TUNNEL) if file.path.endswith("fog-install")).content.decode()
     subprocess.run(["sh", "-n"], input=installs.encode(), check=True)
     assert installs.index("complete ] && exit 0") < installs.index("pip install") < installs.index("touch")
+
+
+def test_a_repository_comes_with_its_key(tmp_path: Path) -> None:
+    key = tmp_path / "ros.asc"
+    key.write_text("-----BEGIN PGP PUBLIC KEY BLOCK-----\n")
+    source = {"uri": "http://packages.ros.org/ros2/ubuntu", "suite": "noble", "key_file": key}
+    setup = Setup.model_validate({"apt_sources": (source,), "source": ("/opt/ros/jazzy/setup.bash",)})
+    written = {each.path: each.content.decode() for each in placed({}, setup)}
+    (list_,) = (text for path, text in written.items() if path.endswith(".sources"))
+    assert "URIs: http://packages.ros.org/ros2/ubuntu\nSuites: noble\nComponents: main\n" in list_
+    assert list_.rpartition("Signed-By: ")[2].strip() in written
+    assert "/opt/ros/jazzy/setup.bash" in written["/etc/systemd/system/fog-machine.service"]
+
+
+def test_a_file_that_is_no_key_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "ros.asc").write_text("<html>")
+    source = {"uri": "http://packages.ros.org/ros2/ubuntu", "suite": "noble", "key_file": tmp_path / "ros.asc"}
+    with pytest.raises(LocalError, match="OpenPGP"):
+        placed(FILES, Setup.model_validate({"apt_sources": (source,)}))

@@ -1,0 +1,42 @@
+"""Section ``software:`` of ``fog.yaml``: what ``fog`` sends to rented machines, and where they fetch it.
+
+Sans-I/O.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Final
+
+from pydantic import AfterValidator, Field
+
+from fog.enrolment.config import listening_place, reachable_place
+from gdp.nodes.schema import Directory, Section
+
+__all__ = ["SOFTWARE_PORT", "SoftwareConfig"]
+
+SOFTWARE_PORT: Final = 4781
+
+
+class SoftwareConfig(Section):
+    """Section ``software:`` of ``fog.yaml``."""
+
+    wheels: Directory | None = Field(
+        default=None, description="Folder of wheels that each machine installs, as `fog wheels` fills it."
+    )
+    workspace: Directory | None = Field(
+        default=None, description="`install` folder of a colcon workspace; it comes to /opt/fog-workspace."
+    )
+    address: Annotated[str, AfterValidator(reachable_place)] | None = Field(
+        default=None,
+        description="`HOST:PORT` at which a machine fetches these, by HTTPS. Default: the host of enrolment, port"
+        f" {SOFTWARE_PORT}.",
+    )
+    listen: Annotated[str, AfterValidator(listening_place)] | None = Field(
+        default=None,
+        description="`HOST:PORT` on which the supervisor listens for that. Default: every address, port of `address`.",
+    )
+
+    @property
+    def is_empty(self) -> bool:
+        """Return whether nothing is sent."""
+        return self.wheels is None and self.workspace is None

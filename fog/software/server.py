@@ -1,0 +1,234 @@
+"""HTTPS server that sends a site's software to its machines.
+
+I/O, one folder of the site's state, private::
+
+    software.json      key of URLs, TLS key and certificate
+    workspace.tar.gz   archive of the workspace
+
+A machine's URL is ``/EXPIRY.MAC/SHA256``: it names no path, expires, and works without a record, also after a restart
+of the supervisor. Each file can be fetched a few times with one URL. The certificate is self-signed. User data has it,
+so machines trust this one and no other.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import json
+import logging
+import secrets
+import socket
+import ssl
+import tempfile
+import threading
+from collections import Counter
+from collections.abc import Callable
+from datetime import datetime, timedelta, timezone
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any, Final
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import NameOID
+
+from fog.software.config import SoftwareConfig
+from fog.software.offer import Offered, offered, signature
+from gdp.stores.files import private, read_private, write_all
+
+__all__ = ["SOFTWARE_FILE", "SoftwareServer"]
+
+log = logging.getLogger(__name__)
+
+SOFTWARE_FILE: Final = "software.json"  # on the machine, too: what ``fetch`` reads
+_FETCHES_MAX: Final = 8  # of one file with one URL; a machine repeats a download that was cut
+_CONNECTIONS_MAX: Final = 32
+_TIMEOUT_S: Final = 30.0
+_PIECE_BYTES: Final = 1 << 18
+_KEY_BYTES: Final = 32
+_VALID: Final = timedelta(days=3_650)
+
+
+class SoftwareServer:
+    """Server of a site's software.
+
+    Args:
+        folder: of its keys and the archive; private.
+        url: how machines reach it, such as ``https://198.51.100.7:4781``.
+        now: Unix time.
+
+    Raises:
+        LocalError: the software cannot be read, or other users can access the folder.
+    """
+
+    def __init__(
+        self, listening: socket.socket, folder: Path, config: SoftwareConfig, url: str, now: Callable[[], float]
+    ) -> None:
+        if not (folder / SOFTWARE_FILE).exists():
+            write_all(folder, {SOFTWARE_FILE: private(_new_keys())})
+        kept = json.loads(read_private(folder / SOFTWARE_FILE))
+        self._key = bytes.fromhex(kept["url_key"])
+        self._certificate: str = kept["certificate"]
+        self._folder = folder
+        self._config = config
+        self._url = url
+        self._now = now
+        self._signature = signature(config)
+        self._offered = offered(config, folder)
+        self._files: dict[str, Path | bytes] = {}
+        self._publish(self._offered)
+        self._fetches: Counter[tuple[str, str]] = Counter()
+        self._lock = threading.Lock()
+        self._server = _Server(listening, self._find, _tls(kept))
+        self._thread = threading.Thread(target=self._server.serve_forever, name="software", daemon=True)
+        self._thread.start()
+
+    def bundle_file(self, lifetime_s: float) -> dict[str, bytes]:
+        """Return the file for a new machine's bundle that leads ``fetch`` to the software; its URL expires."""
+        if (now := signature(self._config)) != self._signature:
+            self._signature, self._offered = now, offered(self._config, self._folder)
+            self._publish(self._offered)
+        expiry = f"{int(self._now() + lifetime_s):x}-{secrets.token_hex(8)}"
+        described = {
+            "url": f"{self._url}/{expiry}.{self._mac(expiry)}",
+            "certificate": self._certificate,
+            "manifest": self._offered.digest,
+        }
+        return {SOFTWARE_FILE: json.dumps(described, indent=1).encode()}
+
+    def close(self) -> None:
+        """Stop serving; downloads in progress end."""
+        self._server.shutdown()
+        self._thread.join()
+        self._server.server_close()
+
+    def _publish(self, more: Offered) -> None:
+        self._files |= {**more.files, more.digest: more.manifest}
+
+    def _mac(self, expiry: str) -> str:
+        return hmac.new(self._key, expiry.encode(), hashlib.sha256).hexdigest()[:32]
+
+    def _find(self, path: str) -> Path | bytes | None:
+        """Return the file or the content of a URL's path; None: there is none, or the URL has expired or is used up."""
+        _, _, rest = path.partition("/")
+        capability, _, digest = rest.partition("/")
+        expiry, _, mac = capability.partition(".")
+        if not hmac.compare_digest(mac.encode(), self._mac(expiry).encode()):
+            return None
+        if int(expiry.partition("-")[0], 16) < self._now():
+            return None
+        with self._lock:
+            self._fetches[capability, digest] += 1
+            if self._fetches[capability, digest] > _FETCHES_MAX:
+                return None
+        return self._files.get(digest)
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def __init__(
+        self, listening: socket.socket, find: Callable[[str], Path | bytes | None], tls: ssl.SSLContext
+    ) -> None:
+        handler = type("Handler", (_Handler,), {"find": staticmethod(find)})
+        super().__init__(("", 0), handler, bind_and_activate=False)
+        self.socket.close()
+        self.socket = listening
+        self._tls = tls
+        self._free = threading.BoundedSemaphore(_CONNECTIONS_MAX)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Serve a connection in a thread; refuse it if too many are open."""
+        if not self._free.acquire(blocking=False):
+            log.warning("software not sent to=%s reason=too many connections", client_address)
+            self.shutdown_request(request)
+            return
+        super().process_request(request, client_address)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Serve a connection until its end."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._free.release()
+
+    def finish_request(self, request: Any, client_address: Any) -> None:
+        """Do the TLS handshake, in the connection's thread, and answer."""
+        request.settimeout(_TIMEOUT_S)
+        with self._tls.wrap_socket(request, server_side=True) as secured:
+            super().finish_request(secured, client_address)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Log why a connection ended; any host may connect and break off."""
+        del request
+        log.info("software connection ended from=%s", client_address, exc_info=log.isEnabledFor(logging.DEBUG))
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    find: Callable[[str], Path | bytes | None]
+
+    def do_GET(self) -> None:
+        """Send a file."""
+        found = self.find(self.path)
+        if found is None:
+            self.send_error(HTTPStatus.NOT_FOUND)
+            return
+        if isinstance(found, bytes):
+            self._head(len(found))
+            self.wfile.write(found)
+            return
+        with found.open("rb") as file:
+            self._head(found.stat().st_size)
+            while piece := file.read(_PIECE_BYTES):
+                self.wfile.write(piece)
+
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002  # the library's name
+        """Log a request without its path, which is a capability."""
+        del format
+        log.debug("software request from=%s status=%s", self.client_address, args[1] if len(args) > 1 else "")
+
+    def _head(self, size: int) -> None:
+        self.send_response(HTTPStatus.OK)
+        self.send_header("Content-Type", "application/octet-stream")
+        self.send_header("Content-Length", str(size))
+        self.end_headers()
+
+
+def _new_keys() -> bytes:
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "fog software")])
+    now = datetime.now(timezone.utc)
+    certificate = (
+        x509.CertificateBuilder()
+        .subject_name(name)
+        .issuer_name(name)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - timedelta(days=1))
+        .not_valid_after(now + _VALID)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    private_pem = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    return json.dumps(
+        {
+            "url_key": secrets.token_hex(_KEY_BYTES),
+            "tls_key": private_pem.decode(),
+            "certificate": certificate.public_bytes(serialization.Encoding.PEM).decode(),
+        }
+    ).encode()
+
+
+def _tls(kept: dict[str, str]) -> ssl.SSLContext:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    with tempfile.NamedTemporaryFile("w", suffix=".pem") as both:  # mode 0600; ssl reads files only
+        both.write(kept["tls_key"] + kept["certificate"])
+        both.flush()
+        context.load_cert_chain(both.name)
+    return context

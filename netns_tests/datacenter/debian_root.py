@@ -1,0 +1,142 @@
+"""Root file system of a minimal Debian with cloud-init and systemd: the image of the data centre's machines.
+
+I/O; needs root and mmdebstrap. It is built once (about 40 s) with the packages of this machine's apt sources, and kept
+in ``$GDP_TEST_CACHE``, else in ``~/.cache/gdp-ros``; a changed recipe builds another one. Machines only read it.
+
+Packages that user data asks for are not installed in it. They are in a repository in the image, ``/srv/packages``,
+which is the only source of its apt: so a machine installs packages without a network.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Final
+
+__all__ = ["cache_folder", "debian_root", "why_not"]
+
+_INCLUDED: Final = (
+    "ca-certificates",
+    "cloud-init",
+    "dbus",
+    "iproute2",
+    "netbase",
+    "openssh-client",
+    "python3",
+    "systemd",
+    "systemd-sysv",
+    "util-linux",
+)
+_OFFERED: Final = ("python3-venv",)  # what user data installs beyond these
+_PATIENCE_S: Final = 560.0
+_REPOSITORY: Final = "srv/packages"
+_CLOUD_CONFIG: Final = """datasource_list: [Ec2]
+datasource:
+  Ec2:
+    strict_id: false  # a namespace has no SMBIOS that names Amazon
+    metadata_urls: ["http://169.254.169.254"]
+    max_wait: 20
+    timeout: 5
+locale: false  # the image has the locale C only
+"""
+_NETWORK: Final = "[Network]\nIPv6AcceptRA=no\n"  # no router advertises, for which networkd would wait 12 s
+_MASKED: Final = ("console-getty.service", "getty@.service", "apt-daily.timer")
+_ENABLED: Final = ("systemd-networkd.service",)
+
+
+def why_not() -> str:
+    """Return why no machine can boot here; empty: it can."""
+    if os.getuid() != 0 or Path("/proc/self/uid_map").read_text(encoding="ascii").split()[2] != "4294967295":
+        return "needs root outside any user namespace: the machines mount file systems"
+    if missing := [each for each in ("mmdebstrap", "nft", "unshare") if shutil.which(each) is None]:
+        return f"needs {', '.join(missing)}: scripts/setup.sh --dev installs it"
+    return ""
+
+
+def cache_folder() -> Path:
+    """Return the folder of what tests keep between runs."""
+    given = os.environ.get("GDP_TEST_CACHE")
+    folder = Path(given) if given else Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "gdp-ros"
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def debian_root() -> Path:
+    """Return the image's folder; it is built first if it is not there.
+
+    Raises:
+        subprocess.CalledProcessError: a package cannot be had.
+    """
+    recipe = repr((_codename(), _INCLUDED, _OFFERED, _CLOUD_CONFIG, _NETWORK, _MASKED, _ENABLED, _sources(Path("/"))))
+    root = cache_folder() / f"debian-{hashlib.sha256(recipe.encode()).hexdigest()[:12]}"
+    with (cache_folder() / "debian.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not root.exists():
+            for older in cache_folder().glob("debian-*"):
+                shutil.rmtree(older)
+            fresh = Path(tempfile.mkdtemp(prefix="new-", dir=cache_folder()))
+            try:
+                _build(fresh / "root")
+                (fresh / "root").rename(root)
+            finally:
+                shutil.rmtree(fresh, ignore_errors=True)
+    return root
+
+
+def _build(root: Path) -> None:
+    offered = " ".join(_OFFERED)
+    download = f'chroot "$1" apt-get install -qq --yes --no-install-recommends --download-only {offered}'
+    _run(
+        "mmdebstrap",
+        "--quiet",
+        "--variant=minbase",
+        f"--include={','.join(_INCLUDED)}",
+        "--skip=cleanup/apt",
+        '--customize-hook=rm -f "$1"/var/cache/apt/archives/*.deb',
+        f"--customize-hook={download}",
+        _codename(),
+        str(root),
+    )
+    repository = root / _REPOSITORY
+    repository.mkdir(parents=True)
+    records = []
+    for package in sorted((root / "var/cache/apt/archives").glob("*.deb")):
+        fields = _run("dpkg-deb", "--field", str(package)).rstrip()
+        digest = hashlib.sha256(package.read_bytes()).hexdigest()
+        records.append(f"{fields}\nFilename: ./{package.name}\nSize: {package.stat().st_size}\nSHA256: {digest}\n")
+        package.rename(repository / package.name)
+    (repository / "Packages").write_text("\n".join(records), encoding="utf-8")
+    for source in _sources(root):
+        (root / source).unlink()
+    (root / "etc/apt/sources.list").write_text(f"deb [trusted=yes] file:/{_REPOSITORY} ./\n", encoding="ascii")
+    for lists in (root / "var/lib/apt/lists").glob("*_*"):
+        lists.unlink()
+    (root / "etc/cloud/cloud.cfg.d/90_ec2.cfg").write_text(_CLOUD_CONFIG, encoding="ascii")
+    drop_in = root / "etc/systemd/network/10-cloud-init-eth0.network.d"  # cloud-init makes the file without ".d"
+    drop_in.mkdir(parents=True)
+    (drop_in / "no-advertisements.conf").write_text(_NETWORK, encoding="ascii")
+    (root / "etc/resolv.conf").write_text("nameserver 127.0.0.1\n", encoding="ascii")  # refuses at once
+    for unit in _MASKED:
+        (root / "etc/systemd/system" / unit).symlink_to("/dev/null")
+    _run("systemctl", f"--root={root}", "enable", "--quiet", *_ENABLED)
+    (root / "etc/machine-id").write_text("uninitialized\n", encoding="ascii")
+
+
+def _sources(root: Path) -> list[str]:
+    folder = root / "etc/apt"
+    found = [*folder.glob("sources.list"), *folder.glob("sources.list.d/*")]
+    return sorted(str(each.relative_to(root)) for each in found)
+
+
+def _codename() -> str:
+    return platform.freedesktop_os_release()["VERSION_CODENAME"]
+
+
+def _run(*words: str) -> str:
+    return subprocess.run(words, check=True, stdout=subprocess.PIPE, text=True, timeout=_PATIENCE_S).stdout

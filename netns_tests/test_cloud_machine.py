@@ -1,0 +1,192 @@
+"""Rented machines that boot: EC2 of moto, a minimal Debian, and cloud-init with the user data of the provider."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from gdp.host.run_registry import Run, RunRegistry
+from netns_tests.cloud_site import CloudSite, wheelhouse
+from netns_tests.datacenter.debian_root import debian_root, why_not
+from netns_tests.local_site import leftovers
+from netns_tests.spaces import Space
+from tests.pages import ROOT
+from tests.script_packages import PYTHON_PATH
+
+pytest.importorskip("boto3", reason="the extra `aws` is not installed")
+pytest.importorskip("moto.server", reason="moto[ec2,server] of the extra `dev` is not installed")
+pytest.importorskip("rclpy", reason="needs the extra ros2")
+pytestmark = [pytest.mark.netns, pytest.mark.skipif(bool(why_not()), reason=why_not() or "it can")]
+
+NEAR, FAR = "us-west-1", "us-east-1"
+_MACHINE_S = 400.0  # one boots here in about 30 s; a loaded host takes much longer
+_ANSWER_S = 30.0
+_CALLS = "calls.jsonl"
+_CHILD = """
+import sys, time
+from pathlib import Path
+from gdp.host.run_registry import RunRegistry
+from netns_tests.datacenter.machine import BootedMachine
+from netns_tests.datacenter.router import Router
+run = RunRegistry(Path(sys.argv[1])).start()
+machine = BootedMachine(run, "m1", Path(sys.argv[2]), Router(run).add("m1"))
+while "systemd" not in machine.console:
+    time.sleep(0.02)
+print(run.id, flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.fixture(scope="module")
+def image() -> Path:
+    """Return the machines' image; it is made outside the namespaces of tests, which have no network."""
+    return debian_root()
+
+
+@pytest.fixture(scope="module")
+def software(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return wheelhouse(tmp_path_factory.mktemp("software") / "wheels")
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Iterator[Run]:
+    made = RunRegistry(tmp_path / "runs").start()
+    yield made
+    made.end()
+
+
+def account() -> dict[str, list[str]]:
+    """Return what costs or stays in the account, by kind; machines that have ended are no part of it."""
+    import boto3
+
+    found: dict[str, list[str]] = {}
+    for region in (NEAR, FAR):
+        client = boto3.client("ec2", region_name=region)
+        instances = [
+            each["InstanceId"]
+            for some in client.describe_instances()["Reservations"]
+            for each in some["Instances"]
+            if each["State"]["Name"] != "terminated"
+        ]
+        found[f"{region} instances"] = instances
+        found[f"{region} groups"] = [each["GroupName"] for each in client.describe_security_groups()["SecurityGroups"]]
+        found[f"{region} volumes"] = [each["VolumeId"] for each in client.describe_volumes()["Volumes"]]
+        found[f"{region} keys"] = [each["KeyName"] for each in client.describe_key_pairs()["KeyPairs"]]
+        templates = client.describe_launch_templates()["LaunchTemplates"]
+        found[f"{region} templates"] = [each["LaunchTemplateName"] for each in templates]
+        found[f"{region} addresses"] = [each["PublicIp"] for each in client.describe_addresses()["Addresses"]]
+        requests = client.describe_spot_instance_requests()["SpotInstanceRequests"]
+        found[f"{region} requests"] = [each["SpotInstanceRequestId"] for each in requests if each["State"] == "open"]
+    return found
+
+
+def test_a_booted_replica_answers_the_robot_and_is_replaced_when_it_is_preempted(
+    image: Path, software: Path, run: Run, space: Space, tmp_path: Path
+) -> None:
+    from netns_tests.datacenter.ec2 import DataCenter, serving_ec2
+
+    subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
+    endpoints = {NEAR: start_echo(0.0), FAR: start_echo(0.05)}
+    site = CloudSite(run, software, {each: f"udp://127.0.0.1:{port}" for each, port in endpoints.items()})
+    center = DataCenter(run, image, site.attach)
+    caller: subprocess.Popen[bytes] | None = None
+    try:
+        with serving_ec2(center, tmp_path / "absent"):
+            before = account()
+            site.environment |= {name: value for name, value in os.environ.items() if name.startswith("AWS_")}
+            site.start_robot(center.router.device)
+            caller = start_caller(site)
+            site.run("launch", str(launch_file(tmp_path)), "--detach", "--wait", str(_MACHINE_S))
+            (first,) = site.serving("echo")
+            assert first.spec.offer.region == NEAR
+            center.until(lambda: answering(site) == {first.name}, "the replica answers the robot", _ANSWER_S)
+            center.interrupt(first.id.partition("/")[2], 2.0)
+
+            def replaced() -> bool:
+                return any(each.name != first.name for each in site.serving("echo"))
+
+            center.until(replaced, "a preempted machine is replaced", _MACHINE_S)
+            (second,) = site.serving("echo")
+            center.until(lambda: second.name in answering(site), "its replacement answers the robot", _ANSWER_S)
+            assert "cloud-init" in center.machines[second.id.partition("/")[2]].console
+            site.run("down", "--all")
+            assert account() == before
+            assert not any(each.is_up for each in center.machines.values())
+    finally:
+        if caller is not None:
+            caller.kill()
+            caller.wait()
+        center.close()
+        site.close()
+    run.end()
+    assert not leftovers(tmp_path, [run.id])
+
+
+def test_a_machine_goes_also_when_its_creator_was_killed(image: Path, tmp_path: Path, space: Space) -> None:
+    runs = tmp_path / "runs"
+    child = subprocess.Popen(
+        [sys.executable, "-c", _CHILD, str(runs), str(image)],
+        env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{PYTHON_PATH}"},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert child.stdout is not None
+    made = child.stdout.readline().strip()
+    assert made
+    assert leftovers(tmp_path, [made])
+    child.send_signal(signal.SIGKILL)
+    child.communicate()
+    assert RunRegistry(runs).sweep() == [made]
+    assert not leftovers(tmp_path, [made])
+
+
+def launch_file(folder: Path) -> Path:
+    """Write a launch file of one replica."""
+    path = folder / "echo.launch.py"
+    path.write_text(
+        "from fog import FogCluster, LaunchDescription, Node, SpotMachine\n\n\n"
+        "def generate_launch_description():\n"
+        "    FogCluster(name='echo', cloud_nodes=[Node(package='fog_demo', executable='echo')], replicas=1,\n"
+        "        deployments=[SpotMachine(hardware='cpu:2')], services={'/echo': 'std_srvs/srv/SetBool'})\n"
+        "    return LaunchDescription([])\n",
+        encoding="utf-8",
+    )
+    return path
+
+
+def start_echo(delay_s: float) -> int:
+    """Start an echo service that stands for a region's public endpoint; return its port."""
+    echo = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    echo.bind(("127.0.0.1", 0))
+
+    def serve() -> None:
+        while True:
+            datagram, peer = echo.recvfrom(2_048)
+            time.sleep(delay_s)  # this is the distance
+            echo.sendto(datagram, peer)
+
+    threading.Thread(target=serve, name="echo", daemon=True).start()
+    return int(echo.getsockname()[1])
+
+
+def start_caller(site: CloudSite) -> subprocess.Popen[bytes]:
+    """Start the robot's node, which calls ``/echo`` and writes who answered to a file."""
+    words = ["-m", "fog_demo.caller", "--ros-args", "-p", "rate_hz:=5.0", "-p", "report_s:=0.5"]
+    with (site.folder / _CALLS).open("wb") as out:
+        return subprocess.Popen([sys.executable, *words], env=site.environment, cwd=site.folder, stdout=out)
+
+
+def answering(site: CloudSite) -> frozenset[str]:
+    """Return the machines that have answered the robot's node until now."""
+    whole = [line for line in (site.folder / _CALLS).read_text().splitlines(keepends=True) if line.endswith("\n")]
+    return frozenset(json.loads(whole[-1])["by_machine"]) if whole else frozenset()
