@@ -47,8 +47,9 @@ def server_text(text: str, port: int) -> str:
     Raises:
         LocalError: it is neither.
     """
+    is_bracketed = text.startswith("[") and text.endswith("]")
     with contextlib.suppress(ValueError):
-        return Endpoint(str(ipaddress.ip_address(text)), port).to_text()
+        return Endpoint(str(ipaddress.ip_address(text[1:-1] if is_bracketed else text)), port).to_text()
     if ":" not in text:
         text = f"{text}:{port}"
     host, _ = split_server(text)

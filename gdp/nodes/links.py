@@ -112,16 +112,18 @@ class TunnelLinks:
 
     def _row(self, tunnel: TunnelId, found: Tunnel, labels: Mapping[Name, str], now: Timestamps) -> dict[str, object]:
         age_s = round(now.unix_s - found.handshake_unix_s, 1) if found.handshake_unix_s else None
+        neighbour = self._switch.hello_protocol.neighbour(found.port, tunnel.peer)
+        member = None if neighbour is None else neighbour.member
         return {
             "peer": tunnel.peer.to_text(),
-            "label": labels.get(tunnel.peer),
+            "label": labels.get(tunnel.peer) if member is None else member.label,
             "device": found.ifname,
             "via": self._tunnels.underlays[tunnel.uplink].backend,
             "direct": found.is_direct,
             "endpoint": None if found.endpoint is None else found.endpoint.to_text(),
             "handshake_age_s": age_s,
             "mtu": found.mtu,
-            "up": self._tunnels.is_up(tunnel),
+            "up": neighbour is not None,
         }
 
     # configured peers
