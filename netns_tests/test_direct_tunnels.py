@@ -32,7 +32,7 @@ pytestmark = [
     pytest.mark.skipif(os.geteuid() != 0, reason="wireguard-go needs root for its control socket"),
 ]
 
-PATIENCE_S = 40.0
+PATIENCE_S = 150.0
 PORT = 51_820
 BORDER, ONE, OTHER = "border", "one", "other"
 

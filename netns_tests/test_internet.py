@@ -19,7 +19,7 @@ from gdp.host.run_registry import RunRegistry
 from internet.access import TRAITS, Access, allows_direct
 from internet.host import ETHERNET, Host
 from internet.laboratory import Laboratory
-from internet.probe import UdpProbe, observe, open_paths
+from internet.probe import SILENCE_S, UdpProbe, observe, open_paths
 
 pytestmark = pytest.mark.netns
 
@@ -64,7 +64,7 @@ def test_a_nat_lets_in_whom_the_socket_wrote_to_and_a_full_cone_lets_in_all(
     ):
         public = observe(probe, known)
         assert public is not None
-        arrived = [observe(each, probe, public) is not None for each in (stranger, port, known)]
+        arrived = [observe(each, probe, public, timeout_s=1.0) is not None for each in (stranger, port, known)]
     assert arrived == [not TRAITS[access].is_filtering, not TRAITS[access].is_filtering, True]
 
 
@@ -86,7 +86,7 @@ def test_hosts_of_a_site_reach_each_other_by_public_endpoints_if_the_nat_hairpin
     with UdpProbe(one) as a, UdpProbe(other) as b, UdpProbe(borders[0]) as border:
         seen_a, seen_b = observe(a, border), observe(b, border)
         assert seen_b is not None
-        source = observe(a, b, seen_b)
+        source = observe(a, b, seen_b, timeout_s=1.0)
         assert observe(a, b) is not None  # by its own address it always does
     assert source == (seen_a if hairpin else None)
 
@@ -94,17 +94,17 @@ def test_hosts_of_a_site_reach_each_other_by_public_endpoints_if_the_nat_hairpin
 def test_where_udp_is_blocked_only_tcp_to_port_443_passes(laboratory: Laboratory, borders: tuple[Host, Host]) -> None:
     robot = attach(laboratory, Access.UDP_BLOCKED)
     with UdpProbe(robot) as probe, UdpProbe(borders[0], port=443) as border:
-        assert observe(probe, border) is None
+        assert observe(probe, border, timeout_s=SILENCE_S) is None
     assert connects(robot, borders[0], 443)
-    assert not connects(robot, borders[0], 80)
+    assert not connects(robot, borders[0], 80, 0.5)
 
 
-def connects(client: Host, server: Host, port: int) -> bool:
+def connects(client: Host, server: Host, port: int, timeout_s: float = 5.0) -> bool:
     """Return whether a TCP connection is made."""
     with server.space.inside(socket.socket) as listener, client.space.inside(socket.socket) as caller:
         listener.bind(("", port))
         listener.listen()
-        caller.settimeout(0.5)
+        caller.settimeout(timeout_s)
         try:
             caller.connect((server.lease().address.partition("/")[0], port))
         except TimeoutError:
@@ -118,7 +118,7 @@ def test_an_ipv6_only_host_shows_its_own_address_and_lets_no_stranger_in(
     robot = attach(laboratory, Access.IPV6_ONLY)
     assert not robot.lease().has(4)
     with UdpProbe(robot, 6) as probe, UdpProbe(borders[0], 6) as border, UdpProbe(borders[1], 6) as stranger:
-        assert observe(stranger, probe) is None
+        assert observe(stranger, probe, timeout_s=SILENCE_S) is None
         assert observe(probe, border) == probe.local
         assert observe(border, probe) == border.local
 
@@ -138,7 +138,7 @@ def test_a_nat_that_forgets_its_mappings_lets_its_peer_in_after_the_next_datagra
     with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
         before = observe(probe, border)
         robot.site().flush_mappings()
-        assert observe(border, probe, before) is None
+        assert observe(border, probe, before, timeout_s=SILENCE_S) is None
         after = observe(probe, border)
         assert observe(border, probe, after) is not None
 
@@ -160,7 +160,7 @@ def test_mappings_end_after_the_timeout_of_the_site(laboratory: Laboratory, bord
     with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
         public = observe(probe, border)
         time.sleep(1.5)
-        assert observe(border, probe, public) is None
+        assert observe(border, probe, public, timeout_s=SILENCE_S) is None
 
 
 @pytest.mark.parametrize("access", [*NATS, Access.PUBLIC], ids=lambda each: each.value)
@@ -176,7 +176,7 @@ def test_a_renumbered_site_shows_a_new_address_to_the_same_socket(
         assert after is not None
         assert before.address != after.address
         assert observe(border, probe, after) is not None
-        assert observe(border, probe, before) is None
+        assert observe(border, probe, before, timeout_s=SILENCE_S) is None
 
 
 def test_a_renumbered_ipv6_site_gives_its_hosts_another_prefix(
@@ -239,8 +239,8 @@ def test_a_silent_cut_loses_datagrams_without_an_error_until_it_ends(
     with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
         public = observe(probe, border)
         robot.site().cut()
-        assert observe(probe, border) is None
-        assert observe(border, probe, public) is None
+        assert observe(probe, border, timeout_s=SILENCE_S) is None
+        assert observe(border, probe, public, timeout_s=SILENCE_S) is None
         assert all(probe.send(border.local, b"no error") for _ in range(3))
         robot.site().restore()
         assert observe(probe, border) == public
@@ -282,9 +282,9 @@ def test_a_router_that_restarts_forgets_its_mappings_and_serves_again(
     with UdpProbe(robot, version) as probe, UdpProbe(borders[0], version) as border:
         public = observe(probe, border)
         robot.site().power_off()
-        assert observe(probe, border) is None
+        assert observe(probe, border, timeout_s=SILENCE_S) is None
         robot.site().power_on()
-        assert observe(border, probe, public) is None
+        assert observe(border, probe, public, timeout_s=SILENCE_S) is None
         assert observe(probe, border) is not None
 
 
@@ -339,7 +339,7 @@ def test_a_limited_uplink_drops_what_exceeds_its_queue(laboratory: Laboratory, b
             border.sources.clear()
             for number in range(90):
                 probe.send(border.local, b"%2d" % number + bytes(1_200))
-            border.wait(b"never sent")
+            border.wait(b"%2d" % 89 + bytes(1_200) if is_whole else b"never sent", 5.0 if is_whole else SILENCE_S)
             assert (len(border.sources) == 90) is is_whole
 
 

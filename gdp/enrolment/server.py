@@ -241,11 +241,12 @@ class EnrolmentServer:
 
     def _admit(self, connection: _Connection, session: Session) -> None:
         """Count a connection as a member's, no longer as a stranger's."""
+        is_new = session.machine not in self._members
+        if is_new and len(self._members) >= _MEMBERS_MAX:
+            raise EnrolmentError(Refusal.UNAVAILABLE, "too many members are connected")
         connections = self._members[session.machine]
         if len(connections) >= _EACH_MEMBER_MAX:
             next(iter(connections)).task.cancel()
-        elif session.machine not in self._members and len(self._members) >= _MEMBERS_MAX:
-            raise EnrolmentError(Refusal.UNAVAILABLE, "too many members are connected")
         self._strangers.pop(connection, None)
         connections[connection] = None
         connection.session = session

@@ -209,11 +209,7 @@ class TunnelLinks:
         for uplink, schedule in enumerate(self._rebinds):
             is_up = any(self._tunnels.is_up(tunnel) for tunnel in dialled if tunnel.uplink == uplink)
             if schedule.update(now_s, is_up=is_up):
-                device = self._tunnels.underlays[uplink]
-                device.rebind()
-                log.warning(
-                    "no border answers, sending from another port ifname=%s port=%d", device.ifname, device.listen_port
-                )
+                self._tunnels.rebind(uplink)
 
     def _report_silence(self, tunnel: TunnelId, peer: _Peer, now: Timestamps, *, is_up: bool) -> None:
         """Report a border that does not answer, once until it does."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -178,7 +179,7 @@ class Tunnels:
             port = self._runtime.add_port(ifname, COST_AUTO)
         except LocalError as error:
             log.error("tunnel not made peer=%s reason=%s; it is tried again", tunnel.peer.short, error)
-            remove_link(ifname, _alias(self._me))
+            self._remove(tunnel.uplink, ifname, key)
             return False
         self._tunnels[tunnel] = Tunnel(
             ifname=ifname,
@@ -212,10 +213,27 @@ class Tunnels:
         self._runtime.remove_port(found.port)
         self._switch.set_tunnel_port(found.port, None)
         self._closed.append((now_s + _FORGET_S, found.port))
-        remove_link(found.ifname, _alias(self._me))
-        if not any(each.key == found.key for each in self._tunnels.values()):
-            self._underlays[tunnel.uplink].remove_peer(found.key)
+        self._remove(tunnel.uplink, found.ifname, found.key)
         log.info("tunnel removed peer=%s ifname=%s", tunnel.peer.short, found.ifname)
+
+    def _remove(self, uplink: int, ifname: str, key: bytes) -> None:
+        """Remove the device of a tunnel, and its WireGuard peer unless another tunnel has it; a refusal is logged."""
+        try:
+            remove_link(ifname, _alias(self._me))
+            if not any(tunnel.uplink == uplink and each.key == key for tunnel, each in self._tunnels.items()):
+                self._underlays[uplink].remove_peer(key)
+        except LocalError as error:
+            log.error("tunnel not removed ifname=%s reason=%s", ifname, error)
+
+    def rebind(self, uplink: int) -> None:
+        """Let an uplink send from another UDP port."""
+        device = self._underlays[uplink]
+        try:
+            device.rebind()
+        except LocalError as error:
+            log.error("not sending from another port ifname=%s reason=%s", device.ifname, error)
+            return
+        log.warning("no border answers, sending from another port ifname=%s port=%d", device.ifname, device.listen_port)
 
     def close_peer(self, peer: Name, now_s: float) -> None:
         """Remove all tunnels to a peer."""
@@ -236,7 +254,7 @@ class Tunnels:
             for device in self._underlays:
                 if device.poll():
                     self._remake(device)
-        states = [device.peers() for device in self._underlays]
+        states = [_states_of(device) for device in self._underlays]
         answered = []
         for tunnel, found in self._tunnels.items():
             state = states[tunnel.uplink].get(found.key)
@@ -268,12 +286,13 @@ class Tunnels:
 
     def _remake(self, device: WireGuardDevice) -> None:
         """Make the VXLAN devices on a device that was made again; their ports open when they appear."""
-        for tunnel, found in self._tunnels.items():
+        for tunnel, found in list(self._tunnels.items()):
             if self._underlays[tunnel.uplink] is device:
                 try:
                     self._make_vxlan(tunnel, found.ifname, found.mtu)
                 except LocalError as error:
                     log.error("tunnel not made again peer=%s reason=%s", tunnel.peer.short, error)
+                    self.close(tunnel, time.monotonic())  # it is opened again later
 
     def _make_vxlan(self, tunnel: TunnelId, ifname: str, mtu: int) -> None:
         local, remote = inner_address(self._me, tunnel.uplink), inner_address(tunnel.peer, tunnel.peer_uplink)
@@ -306,6 +325,15 @@ class Tunnels:
         """Set the MTU of a WireGuard device to that of its widest tunnel; each VXLAN device has its own."""
         others = (each.wireguard_mtu for tunnel, each in self._tunnels.items() if tunnel.uplink == uplink)
         self._underlays[uplink].set_mtu(max([wireguard_mtu, *others]))
+
+
+def _states_of(device: WireGuardDevice) -> dict[bytes, PeerState]:
+    """Return the peers of a device; none if it is gone, which is reported when it comes back."""
+    try:
+        return device.peers()
+    except LocalError as error:
+        log.warning("peers not read ifname=%s reason=%s", device.ifname, error)
+        return {}
 
 
 def _has_route(endpoint: Endpoint, fwmark: int) -> bool:

@@ -18,10 +18,11 @@ from gdp.control.endpoints import Endpoint
 from gdp.ports.sockets import large_buffers
 from internet.host import Host
 
-__all__ = ["UdpProbe", "observe", "open_paths"]
+__all__ = ["SILENCE_S", "UdpProbe", "observe", "open_paths"]
 
 _PATIENCE_S: Final = 5.0
-_SILENCE_S: Final = 0.3  # after which an answer counts as lost; nothing delays a datagram here
+SILENCE_S: Final = 0.3  # after which a datagram that is expected to be lost counts as lost
+_QUIET_S: Final = 1.0  # ... and one that may come or not
 _ROUNDS: Final = 3
 _TOKEN_BYTES: Final = 8
 _DATAGRAM_BYTES: Final = 2_048
@@ -82,7 +83,7 @@ class UdpProbe:
                 continue
             self.sources[content] = Endpoint(source[0], source[1])
 
-    def wait(self, content: bytes, timeout_s: float = _SILENCE_S) -> Endpoint | None:
+    def wait(self, content: bytes, timeout_s: float = SILENCE_S) -> Endpoint | None:
         """Return the source of a datagram with this content; None: none comes in time."""
         deadline_s = time.monotonic() + timeout_s
         while content not in self.sources:
@@ -92,15 +93,17 @@ class UdpProbe:
         return self.sources[content]
 
 
-def observe(sender: UdpProbe, receiver: UdpProbe, to: Endpoint | None = None) -> Endpoint | None:
-    """Send a datagram and return the source that the receiver sees; None: it does not arrive.
+def observe(
+    sender: UdpProbe, receiver: UdpProbe, to: Endpoint | None = None, *, timeout_s: float = _PATIENCE_S
+) -> Endpoint | None:
+    """Send a datagram and return the source that the receiver sees; None: it does not arrive in time.
 
     Args:
         to: destination; by default the receiver's own address.
     """
     token = secrets.token_bytes(_TOKEN_BYTES)
     sender.send(to or receiver.local, token)
-    return receiver.wait(token)
+    return receiver.wait(token, timeout_s)
 
 
 class _Attempt:
@@ -160,7 +163,7 @@ def _observe_all(attempts: Sequence[_Attempt], reflectors: dict[int, UdpProbe]) 
     for attempt in attempts:
         for probe, token in zip(attempt.probes, attempt.tokens, strict=True):
             probe.send(reflectors[attempt.version].local, token)
-    while ready := select.select(list(reflectors.values()), (), (), _SILENCE_S)[0]:
+    while ready := select.select(list(reflectors.values()), (), (), _QUIET_S)[0]:
         for reflector in ready:
             reflector.receive()
     for attempt in attempts:
