@@ -104,6 +104,7 @@ class TunnelLinks:
     def close(self, now_s: float) -> None:
         """Remove the ports and devices of all tunnels."""
         self._tunnels.close_all(now_s)
+        self._own.close()
 
     def status(self, now: Timestamps) -> list[dict[str, object]]:
         """Return the JSON fields of each tunnel."""

@@ -9,13 +9,14 @@ import logging
 import time
 from typing import Final
 
-from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
+from gdp.control.endpoint_record import CANDIDATES_MAX, Candidate, CandidateType, EndpointRecord
 from gdp.control.endpoints import Endpoint
 from gdp.crypto.identity import Identity
 from gdp.errors import DropReason, StatementError
 from gdp.nodes.config import LinksConfig
 from gdp.nodes.endpoint_files import own_record, public_candidates
 from gdp.nodes.tunnels import Tunnels
+from gdp.ports.address_monitor import AddressMonitor
 from gdp.ports.host_addresses import host_addresses
 from gdp.sansio import Timestamps
 from gdp.switch.core import SwitchCore
@@ -24,7 +25,7 @@ __all__ = ["OwnEndpoints"]
 
 log = logging.getLogger(__name__)
 
-_ADDRESSES_LOOK_S: Final = 1.0
+_ADDRESSES_LOOK_S: Final = 10.0  # where no notification comes, such as for a device that moves between namespaces
 
 
 class OwnEndpoints:
@@ -37,24 +38,26 @@ class OwnEndpoints:
         self._tunnels = tunnels
         self._hosts: tuple[Candidate, ...] = ()
         self._hosts_s = float("-inf")
+        self._monitor = AddressMonitor()
         self._published: EndpointRecord | None = None
 
     def publish_changes(self, now: Timestamps) -> None:
         """Publish a record if the candidates differ from the published ones, or the RIB keeps a later record."""
-        if now.mono_s >= self._hosts_s:
+        if self._monitor.poll() or now.mono_s >= self._hosts_s:
             self._hosts_s = now.mono_s + _ADDRESSES_LOOK_S
             self._hosts = self._host_candidates()
-        known = self._published
+        known, candidates = self._published, self._candidates()[:CANDIDATES_MAX]
         refusal = self._switch.endpoint_refusal
         sequence = time.time_ns() // 1_000_000
         is_stale = refusal is not None and refusal.reason is DropReason.STALE
         kept_sequence = refusal.kept_sequence if refusal is not None and is_stale else 0
         if known is not None:
-            if known.candidates == self._candidates() and known.sequence > kept_sequence:
+            is_same = (known.candidates, known.membership) == (candidates, self._identity.membership)
+            if is_same and known.sequence > kept_sequence:
                 return
             sequence = max(sequence, known.sequence + 1)
         sequence = max(sequence, kept_sequence + 1)
-        record = own_record(self._identity, len(self._tunnels.underlays), self._candidates(), sequence=sequence)
+        record = own_record(self._identity, len(self._tunnels.underlays), candidates, sequence=sequence)
         try:
             self._switch.publish_endpoints(record)
         except StatementError as error:
@@ -63,6 +66,10 @@ class OwnEndpoints:
         self._published = record
         shown = ", ".join(f"{each.type.value} {each.endpoint.to_text()}" for each in record.candidates)
         log.info("endpoints published candidates=%s", shown or "none")
+
+    def close(self) -> None:
+        """Stop following the addresses of this host."""
+        self._monitor.close()
 
     def _candidates(self) -> tuple[Candidate, ...]:
         public = public_candidates(self._config.public_endpoints(), len(self._tunnels.underlays))
