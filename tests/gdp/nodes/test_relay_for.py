@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import cast
 
@@ -22,8 +24,9 @@ from tests.gdp.control.members import POLICY, UNIX_S, Nonces, at, node
 BORDER, HOME, LEAF = node("border"), node("home"), node("robot", Role.LEAF)
 
 
-def links(folder: Path, *relay_for: str) -> tuple[TunnelLinks, SwitchCore]:
-    """Return the tunnels of a border with a file for each member, and its switch."""
+@contextmanager
+def links(folder: Path, *relay_for: str) -> Iterator[tuple[TunnelLinks, SwitchCore]]:
+    """Yield the tunnels of a border with a file for each member, and its switch."""
     for identity in (HOME, LEAF):
         candidates = (Candidate(0, CandidateType.REFLEXIVE, Endpoint("192.0.2.1", 51_820)),)
         keys = (TunnelKey.derive(identity.kem).public,)
@@ -40,7 +43,10 @@ def links(folder: Path, *relay_for: str) -> tuple[TunnelLinks, SwitchCore]:
         underlays=(),
     )
     made._read_records(at(0.0))
-    return made, switch
+    try:
+        yield made, switch
+    finally:
+        made.close(0.0)
 
 
 @pytest.mark.parametrize(
@@ -50,14 +56,14 @@ def links(folder: Path, *relay_for: str) -> tuple[TunnelLinks, SwitchCore]:
 def test_a_border_takes_the_records_of_the_members_that_it_serves(
     tmp_path: Path, relay_for: tuple[str, ...], served: set[str]
 ) -> None:
-    _, switch = links(tmp_path, *relay_for)
     labels = {each.name: each.member.label for each in (HOME, LEAF)}
-    assert {labels[name] for name in switch._tunnel_peers} == served
+    with links(tmp_path, *relay_for) as (_, switch):
+        assert {labels[name] for name in switch._tunnel_peers} == served
 
 
 def test_a_member_that_is_not_served_gets_no_direct_tunnel_either(tmp_path: Path) -> None:
-    made, _ = links(tmp_path, "home")
     keys = (TunnelKey.derive(LEAF.kem).public,)
-    for identity, is_served in ((HOME, True), (LEAF, False)):
-        record = EndpointRecord.make(identity, keys, (), sequence=2, until_unix_s=UNIX_S + 600)
-        assert made._is_served(record, at(0.0)) is is_served
+    with links(tmp_path, "home") as (made, _):
+        for identity, is_served in ((HOME, True), (LEAF, False)):
+            record = EndpointRecord.make(identity, keys, (), sequence=2, until_unix_s=UNIX_S + 600)
+            assert made._is_served(record, at(0.0)) is is_served
