@@ -31,7 +31,8 @@ from gdp.enrolment.wire import (
     read_message,
 )
 from gdp.errors import StatementError
-from gdp.trust.join_token import fingerprint_of, split_server
+from gdp.host_port import split_host_port
+from gdp.trust.join_token import fingerprint_of
 
 __all__ = ["CONNECT_S", "Channel", "client_context", "connect", "connect_any"]
 
@@ -143,7 +144,7 @@ def connect(
     end_s = time.monotonic() + timeout_s
     with contextlib.ExitStack() as stack:
         try:
-            plain = stack.enter_context(socket.create_connection(split_server(server), timeout=timeout_s))
+            plain = stack.enter_context(socket.create_connection(split_host_port(server), timeout=timeout_s))
             plain.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             peer = stack.enter_context(client_context().wrap_socket(plain))
             greeting = _receive(peer, end_s, _GREETING_MAX_BYTES)

@@ -27,13 +27,14 @@ from gdp.enrolment.channel import Channel, connect_any
 from gdp.enrolment.member_setup import MachinePlan, record_file_name, write_configuration
 from gdp.enrolment.wire import INSTANCE_BYTES, EnrolmentError, UnreachableError
 from gdp.errors import LocalError, RemoteError
+from gdp.host_port import split_host_port
 from gdp.nodes.endpoint_files import own_record
 from gdp.stores.files import public, read_public, write_all
 from gdp.stores.issue import install_membership, make_node_keys
 from gdp.stores.keyring import CARD, OWNER_PUBLIC
 from gdp.trust.domain import Policy
 from gdp.trust.enrolment import MEMBERS_MAX, apply
-from gdp.trust.join_token import SERVERS_MAX, JoinToken, join_id, join_key, join_proof, split_server
+from gdp.trust.join_token import SERVERS_MAX, JoinToken, join_id, join_key, join_proof
 
 __all__ = ["JoinRequest", "Joined", "join_domain"]
 
@@ -177,7 +178,7 @@ def _install(
         wires = fields.byte_strings("borders", _BORDERS_MAX)
         relays = fields.texts("relays", SERVERS_MAX)
         for each in relays:
-            split_server(each)
+            split_host_port(each)
         borders = tuple(EndpointRecord.verified(each, policy, unix_s)[0] for each in wires)
         if len(certificates) != len(nodes):
             raise LocalError("another number of memberships")

@@ -36,6 +36,7 @@ from gdp.enrolment.wire import (
     read_message,
 )
 from gdp.errors import DropReason, GdpError, LocalError, StatementError
+from gdp.ports.listening import listen_tcp
 from gdp.token_bucket import TokenBucket
 
 __all__ = ["STRANGER_S", "EnrolmentServer", "bind_server", "serve_domain"]
@@ -53,7 +54,6 @@ _REQUEST_S: Final = 10.0  # for the bytes of one request, after its first
 _IDLE_S: Final = 2 * POLL_MAX_S
 _FLUSH_S: Final = 10.0
 _TLS_S: Final = 86_400.0
-_BACKLOG: Final = 128
 _INSTANCES_MAX: Final = 16  # remembered starts of one machine's agent
 
 _T = TypeVar("_T")
@@ -62,10 +62,7 @@ _T = TypeVar("_T")
 def bind_server(port: int, host: str = "") -> socket.socket:
     """Return a listening socket; an empty host: all addresses. Raises ``LocalError``: the port is taken."""
     try:
-        if not host and socket.has_dualstack_ipv6():
-            return socket.create_server(("", port), family=socket.AF_INET6, backlog=_BACKLOG, dualstack_ipv6=True)
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        return socket.create_server((host, port), family=family, backlog=_BACKLOG)
+        return listen_tcp(host, port)
     except OSError as error:
         raise LocalError(
             f"enrolment server: TCP port {port} cannot be listened on: {error.strerror or error}; choose another one"

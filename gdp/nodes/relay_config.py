@@ -15,7 +15,7 @@ from gdp.nodes.config import ServerText
 from gdp.nodes.schema import Directory, Domain, Metrics, NewFile, RequiredName, Section, Unique, load
 from gdp.relay.framing import MTU_MAX, MTU_MIN
 
-__all__ = ["RelayBorder", "RelayConfig", "RelayServer", "host_and_port"]
+__all__ = ["RelayBorder", "RelayConfig", "RelayServer"]
 
 RELAY_PORT: Final = 443
 CLIENTS_MAX: Final = 64
@@ -100,9 +100,3 @@ class RelayConfig(Section):
         if self.dead_ms < 2 * self.keepalive_ms:
             raise ValueError(f"dead_ms: at least twice keepalive_ms ({self.keepalive_ms})")
         return self
-
-
-def host_and_port(endpoint: str) -> tuple[str, int]:
-    """Return the parts of ``host:port``, without the brackets of an IPv6 address."""
-    host, _, port = endpoint.rpartition(":")
-    return host.removeprefix("[").removesuffix("]"), int(port)

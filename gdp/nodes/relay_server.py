@@ -21,6 +21,7 @@ from gdp.nodes.relay_config import RelayConfig, RelayServer
 from gdp.nodes.relay_context import RelayContext
 from gdp.nodes.relay_link import RelayLink, RelayPort, prepare_socket
 from gdp.nodes.relay_loop import RelayLoop
+from gdp.ports.listening import listen_tcp
 from gdp.ports.sockets import AS_ROOT
 from gdp.ports.tap import TapDevice, tap_name
 from gdp.relay.admission import ClientAdmission, verified_switch
@@ -32,11 +33,9 @@ __all__ = ["BorderServer", "listen_tls", "port_status"]
 
 log = logging.getLogger(__name__)
 
-_BACKLOG: Final = 128
 _HANDSHAKES_MAX: Final = 32  # unauthenticated connections at once
 _ACCEPTS_PER_S: Final = 50.0  # a handshake costs about a millisecond
 _ACCEPT_PAUSE_S: Final = 0.1
-_ANY: Final = "::"
 
 
 def listen_tls(config: RelayServer) -> socket.socket:
@@ -45,11 +44,9 @@ def listen_tls(config: RelayServer) -> socket.socket:
     Raises:
         LocalError: the port is in use, needs a right, or the address is not of this host.
     """
-    dual = config.address is None and socket.has_dualstack_ipv6()
-    host = (_ANY if dual else "") if config.address is None else str(config.address)
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    host = "" if config.address is None else str(config.address)
     try:
-        listener = socket.create_server((host, config.port), family=family, backlog=_BACKLOG, dualstack_ipv6=dual)
+        listener = listen_tcp(host, config.port)
     except OSError as error:
         where = f"relay server: port {config.port}"
         if error.errno == errno.EADDRINUSE:

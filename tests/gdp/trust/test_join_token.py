@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gdp.errors import LocalError
-from gdp.trust.join_token import JoinRole, JoinToken, join_id, join_key, join_proof, split_server
+from gdp.trust.join_token import JoinRole, JoinToken, join_id, join_key, join_proof
 
 TOKEN = JoinToken(
     root=bytes(range(32)),
@@ -78,9 +78,3 @@ def test_a_proof_holds_for_one_connection_only() -> None:
         for request in (b"e", b"f")
     }
     assert len(proofs) == 8
-
-
-@pytest.mark.parametrize("text", ["", "host", ":1", "host:", "host:0", "host:65536", "höst:1", "a" * 200 + ":1"])
-def test_what_is_no_host_and_port_is_refused(text: str) -> None:
-    with pytest.raises(LocalError, match="host:port"):
-        split_server(text)
