@@ -14,13 +14,14 @@ from typing import Final
 
 from gdp.enrolment.member_files import MEMBER_FILE
 from gdp.names import Name
+from gdp.nodes.config import LISTEN_DEFAULT
 from gdp.nodes.endpoint_files import RECORD_SUFFIX
 from gdp.stores.files import public, write_all
 from gdp.stores.keyring import DELEGATIONS
 
 __all__ = ["LISTEN_PORT", "RELAY_FILE", "RELAY_PORT", "MachinePlan", "record_file_name", "write_configuration"]
 
-LISTEN_PORT: Final = 51_820  # of WireGuard; of the enrolment server the TCP port of this number
+LISTEN_PORT: Final = LISTEN_DEFAULT  # of WireGuard; of the enrolment server the TCP port of this number
 RELAY_PORT: Final = 443
 RELAY_FILE: Final = "relay.yaml"
 _FOLDERS: Final = ("peers", "revocations", "inbox", "state/switch", "state/rib", "state/proxy", "proxy.yaml.d")

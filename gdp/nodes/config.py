@@ -57,7 +57,16 @@ from gdp.ports.kernel.abi import ENTRIES_DEFAULT
 from gdp.stores.cluster_address import ClusterAddress
 from gdp.stores.files import read_private
 
-__all__ = ["DataPlane", "LeaseSeconds", "LinksConfig", "PortConfig", "Quotas", "RibConfig", "SwitchConfig"]
+__all__ = [
+    "LISTEN_DEFAULT",
+    "DataPlane",
+    "LeaseSeconds",
+    "LinksConfig",
+    "PortConfig",
+    "Quotas",
+    "RibConfig",
+    "SwitchConfig",
+]
 
 
 def _endpoint(text: str) -> str:
