@@ -32,6 +32,7 @@ from gdp.control.neighbour import Neighbour
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import DropReason, StatementError
+from gdp.frame.codec import second_path_key
 from gdp.frame.kinds import Kind
 from gdp.limits import JOIN_LEASE_S, JOIN_REFRESH_S, READERS_MAX, TREES_MAX
 from gdp.message.shares import Shares
@@ -95,6 +96,7 @@ class MulticastTrees:
         self._reader_shares = Shares(READERS_MAX)
         self._readers_end_s = float("inf")  # no reader's lease ends before
         self._branch_shares = Shares(TREES_MAX)
+        self._second: dict[Name, dict[Name, Tree]] = {}  # trees of second copies, by publisher and topic
         self.trees = Trees()
         self.drops: Counter[DropReason] = Counter()
 
@@ -252,6 +254,24 @@ class MulticastTrees:
             else:
                 self._restate(tree)
         return is_behind and tree.switch != join.switch
+
+    def path_counts(self) -> dict[str, int]:
+        """Return how many flows to readers here want two paths, by what they have.
+
+        ``disjoint``: two paths without a shared link; ``shared``: both use a link that every path needs; ``single``:
+        there is one path at most.
+        """
+        counts = dict.fromkeys(("disjoint", "shared", "single"), 0)
+        topics = [
+            topic
+            for topic, readers in self._readers.items()
+            if any(reader.advertisement.paths == 2 for reader in readers.values())
+        ]
+        for tree in (tree for topic in topics for tree in self.trees.of_topic(topic)):
+            if tree.path == 1 and any(branch.wants_pair for branch in tree.branches.values()):
+                pair = self._pairs.present(tree.switch, tree.domain)
+                counts["single" if pair is None else "shared" if pair.is_shared else "disjoint"] += 1
+        return counts
 
     def neighbour_up(self, at: Downstream, now_s: float) -> None:
         """Repeat to a neighbour the joins that it received before its present session, whose state it has lost."""
@@ -415,6 +435,36 @@ class MulticastTrees:
         tree.protection = self._backups.protection(tree)
         if not self._table.install(tree.key, tree.hops(self._outbox.mac_of()), tree.expires_s(), tree.sides):
             self.drops[DropReason.QUOTA] += 1
+        if tree.path == 2:
+            self._second.setdefault(tree.publisher, {})[tree.topic] = tree
+            self._install_to_publisher(tree.publisher)
+
+    def _uninstall(self, tree: Tree) -> None:
+        self._table.remove(tree.key)
+        trees = self._second.get(tree.publisher, {})
+        if tree.path == 2 and trees.pop(tree.topic, None) is not None:
+            self._install_to_publisher(tree.publisher)
+        if not trees:
+            self._second.pop(tree.publisher, None)
+
+    def _install_to_publisher(self, publisher: Name) -> None:
+        """Lead second copies to a publisher itself, such as AckNacks and answers, up one of its second trees.
+
+        Of several trees it is the one with the shortest route, so that these paths form no loop either.
+        """
+        macs, key = self._outbox.mac_of(), second_path_key(publisher)
+        best: tuple[int, Name] | None = None
+        for topic, tree in self._second.get(publisher, {}).items():
+            if tree.upstream is not None and tree.upstream[0] in macs and tree.branches:
+                found = len(tree.guide.route) if tree.guide is not None else 0, topic
+                best = found if best is None else min(best, found)
+        if best is None:
+            self._table.remove(key)
+            return
+        tree = self._second[publisher][best[1]]
+        port, mac = tree.upstream or (0, b"")
+        if not self._table.install(key, ((port, mac + macs[port]),), tree.expires_s()):
+            self.drops[DropReason.QUOTA] += 1
 
     def _put_branch(self, tree: Tree, at: Downstream, branch: Branch) -> bool:
         """Add or replace a branch; return False, and remove a bare tree, where its neighbour has too many."""
@@ -435,7 +485,7 @@ class MulticastTrees:
             self._install(tree)
             self._restate(tree)
             return
-        self._table.remove(tree.key)
+        self._uninstall(tree)
         self._leave_former(tree)
         self._leave_backup(tree)
         self._leave(tree)

@@ -72,6 +72,11 @@ class PathPairs:
             self._renew(held, self._paths.disjoint(switch, domain), now_s)
         return held.pair
 
+    def present(self, switch: Name, domain: Name) -> PathPair | None:
+        """Return the pair that ``to`` last returned for a target, or None."""
+        held = self._held.get((switch, domain))
+        return None if held is None else held.pair
+
     def handle_timer(self, now_s: float) -> None:
         """Follow the better pairs that are due."""
         for (switch, domain), held in list(self._held.items()):
