@@ -29,7 +29,7 @@ from gdp.client.key_epochs import Secrets
 from gdp.client.reordering import ReorderingBuffer
 from gdp.crypto.envelope import Opener
 from gdp.errors import DropReason, EnvelopeError, RemoteError
-from gdp.frame.codec import Header
+from gdp.frame.codec import Header, second_path_copy
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import NACKS_PER_REPORT, NUMBER_MAX, REPLAY_WINDOW_MESSAGES, REPORT_IDLE_S, SEQUENCE_BYTES
 from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
@@ -38,6 +38,7 @@ from gdp.message.loss import Losses, LossReason
 from gdp.message.reassembly import ReassembledMessage, Reassembler, VerifiesDigest
 from gdp.message.reassembly_quota import ReassemblyQuota
 from gdp.message.renumbering import Renumbering
+from gdp.message.second_copies import DeferredRequests, SecondCopies
 from gdp.names import Name
 from gdp.sansio import ReceivedFrame
 from gdp.trust.advertisement import Advertisement
@@ -141,6 +142,8 @@ class WriterProxy:
         self._schedule = AckNackSchedule(self._data, now_s)
         self._order = ReorderingBuffer(publisher, budget)
         self._delivery = DeliveryQueue(publisher, incarnation, self._data.drops)
+        self._copies: SecondCopies | None = None
+        self._deferred = DeferredRequests()
         self._is_reliable: bool | None = None
         self._sent = (0, 0)  # the publisher has sent everything before this (number, fragment)
         self.state = WriterProxyState.NEW
@@ -159,6 +162,18 @@ class WriterProxy:
     def idle_s(self, idle_s: float) -> None:
         """Set the longest time between two reports."""
         self._schedule.idle_s = idle_s
+
+    @property
+    def paths(self) -> int:
+        """Return over how many paths frames of this publisher come, and reports to it go."""
+        return 1 if self._copies is None else 2
+
+    @paths.setter
+    def paths(self, paths: int) -> None:
+        """Set over how many paths frames come and reports go."""
+        if paths != self.paths:
+            self._copies = SecondCopies() if paths > 1 else None
+            self._data.copies, self._status.copies = self._copies, None if self._copies is None else SecondCopies()
 
     @property
     def drops(self) -> Counter[DropReason]:
@@ -213,7 +228,7 @@ class WriterProxy:
         if header.incarnation != self.incarnation:
             self._data.drops[DropReason.WRONG_INCARNATION] += 1
         elif header.kind == Kind.HEARTBEAT and header.number <= self._before.status:
-            self._status.drops[DropReason.REPLAYED] += 1
+            self._status.drop_copy(header, DropReason.REPLAYED, now_s)
         elif header.kind == Kind.HEARTBEAT:
             joined = self._status.add(header, frame, now_s)
             if joined is not None:
@@ -250,32 +265,39 @@ class WriterProxy:
         if self.state is WriterProxyState.NEW:
             schedule.due_s = now_s + ANNOUNCE_S
             number, sequence = (self._before.number, self._before.sequence) if self._before.resumes else (0, 0)
-            return self._sealer.seal_first(AckNack(AckNackFlag.NEW, number, 0, (), sequence))
+            return self._over_paths(self._sealer.seal_first(AckNack(AckNackFlag.NEW, number, 0, (), sequence)))
         missing = self._missing() if self._is_reliable else ()
+        if self._copies is not None:
+            missing = self._deferred.poll_due(missing, self._copies.lag_s(now_s), now_s)
         schedule.handle_reported(now_s, is_missing=bool(missing))
+        schedule.due_s = min(schedule.due_s, self._deferred.due_s)
         expected = self._order.expected
         part, sequence = self._data.progress(expected), self._delivery.sequence
-        return self._sealer.seal_all(AckNack(AckNackFlag.NONE, expected, part, missing, sequence, self.lost), now_s)
+        report = AckNack(AckNackFlag.NONE, expected, part, missing, sequence, self.lost)
+        return self._over_paths(self._sealer.seal_all(report, now_s))
 
     def poll_delivered(self) -> list[Delivered]:
         """Remove and return the messages that are ready, in order."""
         return self._delivery.poll()
 
-    def close(self) -> bytes:
-        """Release all memory; return the frame of the goodbye."""
+    def close(self) -> list[bytes]:
+        """Release all memory; return the frames of the goodbye."""
         self._data.close()
         self._status.close()
         self._order.poll_all()
         self._schedule.due_s = float("inf")
-        return self._sealer.seal(
-            AckNack(AckNackFlag.BYE, self._order.expected, 0, (), self._delivery.sequence, self.lost)
-        )
+        report = AckNack(AckNackFlag.BYE, self._order.expected, 0, (), self._delivery.sequence, self.lost)
+        return self._over_paths([self._sealer.seal(report)])
 
     def renew(self, secrets: Secrets) -> None:
         """Replace the topic's secrets; an epoch that is still among them opens as before."""
         self._secrets = secrets
         self._openers.clear()
         self._sealer.renew(secrets)
+
+    def _over_paths(self, notes: list[bytes]) -> list[bytes]:
+        """Return notes, and their second copies if there are two paths."""
+        return notes if self._copies is None else [*notes, *map(second_path_copy, notes)]
 
     def _opener(self, kind: Kind, epoch: int) -> Opener:
         opener = self._openers.get((kind, epoch))
@@ -293,7 +315,10 @@ class WriterProxy:
             reassembler.drops[DropReason.MALFORMED] += 1
             return
         if self.state is WriterProxyState.LIVE and not 0 <= header.number - expected < REPLAY_WINDOW_MESSAGES:
-            reassembler.drops[DropReason.LATE if header.number < expected else DropReason.MEMORY_FULL] += 1
+            if header.number < expected:
+                reassembler.drop_copy(header, DropReason.LATE, now_s)
+            else:
+                reassembler.drops[DropReason.MEMORY_FULL] += 1
             return
         seen, highest, refused = reassembler.new_parts, reassembler.highest, reassembler.drops[DropReason.MEMORY_FULL]
         joined = reassembler.add(header, frame, now_s)

@@ -252,6 +252,8 @@ def _sources(switch: SwitchCore, chosen: Chosen, node_log: NodeLog, runtime: Run
     plane = chosen.plane
     links = LinkRows(switch.hello_protocol, plane.ports)
     runtime.every(LOOK_S, links.refresh)
+    two_paths = switch.multicast.path_counts()
+    runtime.every(LOOK_S, lambda _now: two_paths.update(switch.multicast.path_counts()))
 
     def frames() -> dict[str, int]:
         """Return the frame counts by direction."""
@@ -266,5 +268,6 @@ def _sources(switch: SwitchCore, chosen: Chosen, node_log: NodeLog, runtime: Run
         pending_frames=lambda: switch.resolver.pending_frames,
         waiting=node_log.metrics,
         links=lambda: links.rows,
+        two_paths=lambda: two_paths,
         clashes=lambda: switch.hello_protocol.clashes,
     )
