@@ -105,8 +105,9 @@ def ping(end: End, settings: Settings) -> None:
         publisher.publish(os.urandom(_PING_BYTES))
         end.member.flush(time.monotonic())
         end.runtime.send()
-        while not list(end.member.poll_messages()):
-            end.runtime.step(time.monotonic() + PATIENCE_S)
+        deadline_s = time.monotonic() + PATIENCE_S
+        if not end.runtime.run(lambda: bool(list(end.member.poll_messages())), deadline_s):
+            raise TimeoutError("a ping was not answered")
 
     say(times_s=_timed(once, float(settings["seconds"])))
     end.leave()
@@ -124,6 +125,8 @@ def read(end: End, _: Settings) -> None:
             end.runtime.step(time.monotonic() + PATIENCE_S)
             for each in end.member.poll_messages():
                 if each.topic == asked:
+                    if not back.readers:  # the first ping may come before its sender is known as a reader of answers
+                        end.wait_for_readers([back])
                     back.publish(each.delivered.message)
                     end.member.flush(time.monotonic())
                     end.runtime.send()
