@@ -22,6 +22,7 @@ from gdp.enrolment.addresses import default_addresses, duration_s, endpoint_of, 
 from gdp.enrolment.create import BORDER, DomainPlan, create_domain, make_token
 from gdp.enrolment.domain_files import DomainFiles
 from gdp.enrolment.member_setup import LISTEN_PORT, RELAY_PORT
+from gdp.enrolment.preflight import check_ports, check_tunnels
 from gdp.enrolment.registry import MachineRow, Registry
 from gdp.enrolment.removal import remove_machine
 from gdp.enrolment.server import bind_server, serve_domain
@@ -77,6 +78,10 @@ def create(
         relay_port=relay_port,
         label=label,
     )
+    if start:
+        check_tunnels()
+        relay = {relay_port: "--relay-port"} if relay_port else {}
+        check_ports({listen: "--listen"}, {listen: "--listen", **relay})
     files = create_domain(plan)
     say(f"domain {name} is in {files.directory}; keep a copy of {files.directory / 'domain'} in a safe place")
     made = [make_token(files, JoinRole.ROBOT, valid_s=duration_s("1h")).to_text() for _ in range(tokens)]

@@ -70,13 +70,16 @@ class Shell:
         """Return what it has printed."""
         return self._log.read_text(encoding="utf-8", errors="replace")
 
-    def wait(self, timeout_s: float) -> None:
-        """Return when the command has ended well. Raises ``LocalError``: it failed, or goes on."""
+    def exit_code(self, timeout_s: float) -> int:
+        """Return the exit code of the command. Raises ``LocalError``: it goes on after this time."""
         try:
-            code = self._process.wait(timeout_s)
+            return self._process.wait(timeout_s)
         except subprocess.TimeoutExpired as error:
             raise LocalError(f"goes on after {timeout_s:g} s: {self.text[-_SHOWN:]}") from error
-        if code:
+
+    def wait(self, timeout_s: float) -> None:
+        """Return when the command has ended well. Raises ``LocalError``: it failed, or goes on."""
+        if code := self.exit_code(timeout_s):
             raise LocalError(f"exit code {code}: {self.text[-_SHOWN:]}")
 
     def wait_for(self, words: str, timeout_s: float) -> None:
