@@ -32,6 +32,7 @@ from gdp.enrolment.agent import Agent
 from gdp.enrolment.channel import connect_any
 from gdp.enrolment.join import JoinRequest, join_domain
 from gdp.enrolment.member_files import MemberFiles
+from gdp.enrolment.preflight import check_tunnels
 from gdp.enrolment.programs import programs_of
 from gdp.sharing.member_exchange import MemberExchange
 from gdp.sharing.upkeep import ShareUpkeep
@@ -68,6 +69,8 @@ def join(
       gdp join gdp1aeag... --label robot-7 --uplink wlan0 --uplink wwan0
     """
     read = JoinToken.from_text(token)
+    if start:
+        check_tunnels()
     if directory is None:
         with connect_any(read.servers, read.root) as channel:
             directory = directory_of(_UNSAFE.sub("-", channel.root.label), None)
@@ -92,6 +95,7 @@ def up(directory: options.Directory, no_systemd: NoSystemd = False, as_json: opt
     Example:
       gdp up /var/lib/gdp/lab --no-systemd
     """
+    check_tunnels()
     if as_json:
         programs = [each.name for each in programs_of(MemberFiles.load(directory))]
         show({"directory": str(directory), "programs": programs}, as_json=True)

@@ -129,7 +129,10 @@ def connect_any(servers: Sequence[str], fingerprint: bytes, *, timeout_s: float 
             return connect(each, fingerprint, timeout_s=timeout_s)
         except UnreachableError as error:
             reasons.append(str(error))
-    raise UnreachableError("; ".join(reasons))
+    raise UnreachableError(
+        f"the enrolment server is not reachable: {'; '.join(reasons)}; check the network, and that TCP to it is let"
+        " through"
+    )
 
 
 def connect(

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import secrets
-import shutil
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from gdp.control.endpoints import Endpoint
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.enrolment.domain_files import DOMAIN_FILE, DomainFiles
+from gdp.enrolment.draft import draft_of, publish_draft, reserve_space
 from gdp.enrolment.member_setup import MachinePlan, write_configuration
 from gdp.enrolment.registry import Registry
 from gdp.errors import LocalError
@@ -63,16 +63,10 @@ def create_domain(plan: DomainPlan, *, unix_s: float | None = None) -> DomainFil
     directory, now = plan.directory, time.time() if unix_s is None else unix_s
     if directory.exists():
         raise LocalError(f"{directory}: is there already; gdp domain token makes a token of an existing domain")
-    draft = directory.parent / f".{directory.name}.{secrets.token_hex(8)}"
-    try:
-        directory.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
-        draft.mkdir(mode=0o700)
+    with draft_of(directory) as draft:
+        reserve_space(draft, "no domain was created").unlink()
         _fill(draft, plan, now)
-        draft.rename(directory)
-    except OSError as error:
-        raise LocalError(f"{directory}: {error.strerror}; name another --directory") from error
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
+        publish_draft(draft, directory)
     return DomainFiles.load(directory)
 
 

@@ -6,13 +6,10 @@ nothing behind. Private keys never leave this machine.
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import os
 import secrets
-import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -24,6 +21,7 @@ from gdp.crypto.fields import Fields
 from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.keys import PublicKey
 from gdp.enrolment.channel import Channel, connect_any
+from gdp.enrolment.draft import draft_of, publish_draft, reserve_space
 from gdp.enrolment.member_setup import MachinePlan, record_file_name, write_configuration
 from gdp.enrolment.wire import INSTANCE_BYTES, EnrolmentError, UnreachableError
 from gdp.errors import LocalError, RemoteError
@@ -40,8 +38,7 @@ __all__ = ["JoinRequest", "Joined", "join_domain"]
 
 log = logging.getLogger(__name__)
 
-_RESERVED_BYTES: Final = 512 << 10  # held while the request is under way: what comes back then fits the disk
-_RESERVE: Final = "reserved"
+_UNUSED: Final = "the token was not used"
 _TRUSTS_MAX: Final = 64
 _BORDERS_MAX: Final = 16
 _RETRY_S: Final = 30.0
@@ -92,18 +89,19 @@ def join_domain(
         raise LocalError(
             f"{request.directory}: is there already: this machine has joined; name another --directory, or remove it"
         )
-    with _draft_of(request.directory) as draft:
+    with draft_of(request.directory) as draft:
+        reserve_space(draft, _UNUSED).unlink()
         members = [
             (folder, make_node_keys(draft / folder, role, request.label)) for folder, role in request.token.role.nodes
         ]
-        _reserve(draft)
+        reserved = reserve_space(draft, _UNUSED)  # while the request is under way: what comes back then fits the disk
         fields, root, server = _ask(request, [keys for _, keys in members], wait)
-        (draft / _RESERVE).unlink()
+        reserved.unlink()
         identities, borders = _install(draft, request, members, fields, root, clock())
         record = own_record(identities[0], max(len(request.uplinks), 1), ())
         cards = [read_public(draft / folder / CARD) for folder, _ in members]
         _announce(request.token, identities[-1], {"op": "install", "cards": cards, "record": record.wire}, wait)
-        _rename(draft, request.directory)
+        publish_draft(draft, request.directory)
     return Joined(
         root=root,
         label=request.label,
@@ -154,9 +152,7 @@ def _repeated(
                 return send(channel), channel.root, channel.server
         except UnreachableError as error:
             if not has_connected or time.monotonic() >= end_s:
-                raise UnreachableError(
-                    f"the enrolment server is not reachable: {error}; check the network and that TCP is let through"
-                ) from error
+                raise
             log.info("enrolment repeated reason=%s", error)
             wait(_RETRY_EACH_S)
 
@@ -202,44 +198,3 @@ def _install(
     write_configuration(draft, plan, sorted(files))
     write_all(draft / "peers", {record_file_name(each.name): public(each.wire) for each in borders})
     return identities, borders
-
-
-@contextlib.contextmanager
-def _draft_of(directory: Path) -> Iterator[Path]:
-    """Yield a new private folder next to a directory; it is removed at the end if it was not renamed."""
-    draft = directory.parent / f".{directory.name}.{secrets.token_hex(8)}"
-    try:
-        directory.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
-        draft.mkdir(mode=0o700)
-    except OSError as error:
-        raise LocalError(f"{directory.parent}: {error.strerror}; name another --directory") from error
-    try:
-        yield draft
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
-
-
-def _reserve(draft: Path) -> None:
-    """Occupy the space of what comes back: a full disk is found before the token is used up."""
-    try:
-        handle = os.open(draft / _RESERVE, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-        with os.fdopen(handle, "wb") as file:
-            os.posix_fallocate(file.fileno(), 0, _RESERVED_BYTES)
-            os.fsync(file.fileno())
-    except OSError as error:
-        raise LocalError(
-            f"{draft.parent}: {error.strerror}: joining needs {_RESERVED_BYTES >> 10} KiB; free some space, then run"
-            " the command again: the token was not used"
-        ) from error
-
-
-def _rename(draft: Path, directory: Path) -> None:
-    try:
-        draft.rename(directory)
-        folder = os.open(directory.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
-    except OSError as error:
-        raise LocalError(f"{directory}: {error.strerror}") from error

@@ -140,9 +140,13 @@ class Registry:
         with self._translated():
             os.close(os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
             self._file = sqlite3.connect(self._path, timeout=_TIMEOUT_S, isolation_level=None, check_same_thread=False)
-            self._file.execute("PRAGMA journal_mode=WAL")
-            self._file.execute("PRAGMA synchronous=FULL")  # a used token stays used after a crash
-            self._file.executescript(_TABLES)
+            try:
+                self._file.execute("PRAGMA journal_mode=WAL")
+                self._file.execute("PRAGMA synchronous=FULL")  # a used token stays used after a crash
+                self._file.executescript(_TABLES)
+            except sqlite3.Error:
+                self._file.close()
+                raise
 
     def close(self) -> None:
         """Close the file."""

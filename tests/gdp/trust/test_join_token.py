@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import string
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -38,14 +40,12 @@ def test_a_token_does_not_show_its_secret_in_a_log() -> None:
     assert repr(TOKEN.secret) not in repr(TOKEN)
 
 
-@given(at=st.integers(4, len(TOKEN.to_text()) - 1), letter=st.sampled_from("abcdefghijklmnopqrstuvwxyz234567"))
-def test_one_wrong_character_is_recognised(at: int, letter: str) -> None:
+def test_every_single_wrong_character_is_recognised() -> None:
     text = TOKEN.to_text()
-    wrong = text[:at] + letter + text[at + 1 :]
-    assert _read(wrong) in (
-        TOKEN if wrong == text or at == len(text) - 1 else None,
-        None,
-    )  # its last bits carry nothing
+    for at in range(len(text)):
+        for letter in set(string.ascii_lowercase + string.digits) - {text[at]}:
+            read = _read(text[:at] + letter + text[at + 1 :])
+            assert read is None or (read == TOKEN and at == len(text) - 1)  # its last bits carry nothing
 
 
 @given(st.text(max_size=200))
