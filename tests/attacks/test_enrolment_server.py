@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import socket
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +18,7 @@ from gdp.crypto.fields import Fields
 from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.statements import parse
 from gdp.enrolment import desk as desk_module
+from gdp.enrolment import server as server_module
 from gdp.enrolment.create import DomainPlan, create_domain, make_token
 from gdp.enrolment.desk import EnrolmentDesk, Session
 from gdp.enrolment.domain_files import DomainFiles
@@ -30,6 +33,7 @@ from gdp.trust.enrolment import apply
 from gdp.trust.join_token import JoinRole, JoinToken, join_id, join_key, join_proof
 from gdp.trust.mail import Mail
 from gdp.trust.revocation import Revocation
+from tests.gdp.enrolment.lab import running_lab
 
 NOW = 1_800_000_000.0
 DAY_S = 86_400.0
@@ -215,6 +219,22 @@ def test_a79_a_membership_that_followed_a_revoked_one_is_not_renewed(server: Ser
     write_all(server.files.config.revocations, {"by-hand.revoke": public(wire)})
     with pytest.raises(EnrolmentError, match="was revoked"):
         server.desk.renew(session, machine.renewal(), NOW + 28 * DAY_S)
+
+
+# strangers
+
+
+def test_a83_the_connections_of_one_address_leave_handshakes_for_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server_module, "_ACCEPTS_PER_S", 2.0)
+    monkeypatch.setattr(server_module, "_EACH_PER_S", 1.0, raising=False)
+    monkeypatch.setattr(server_module, "_EACH_BURST", 4.0, raising=False)
+    with running_lab(tmp_path) as lab, contextlib.ExitStack() as strangers:
+        for _ in range(100):
+            made = socket.create_connection(("127.0.0.1", lab.port), source_address=("127.0.0.2", 0))
+            strangers.enter_context(made)
+        lab.join("patient")
 
 
 # members
