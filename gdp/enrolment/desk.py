@@ -12,6 +12,7 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 from gdp.control.endpoint_record import EndpointRecord
@@ -22,6 +23,7 @@ from gdp.crypto.fields import Fields
 from gdp.crypto.identity import node_metadata
 from gdp.crypto.kem import KEM_PUBLIC_BYTES, KemPublicKey
 from gdp.crypto.keys import SIGNATURE_BYTES
+from gdp.crypto.statements import parse
 from gdp.crypto.x509_profile import SubjectInfo, read_request
 from gdp.enrolment.domain_files import DomainFiles
 from gdp.enrolment.member_setup import record_file_name
@@ -35,7 +37,7 @@ from gdp.enrolment.wire import (
     read_message,
     verify_member_proof,
 )
-from gdp.errors import LocalError, RemoteError, StatementError
+from gdp.errors import LocalError, RemoteError, StatementError, StoreError
 from gdp.names import Name
 from gdp.nodes.endpoint_files import own_record, public_candidates
 from gdp.stores.audit_log import AuditLog
@@ -48,6 +50,7 @@ from gdp.trust.enrolment import MEMBERS_MAX, Application, token_id
 from gdp.trust.join_token import JOIN_ID_BYTES, JoinRole, join_proof
 from gdp.trust.mail import Mail
 from gdp.trust.node_descriptor import NodeDescriptor
+from gdp.trust.revocation import Revocation
 
 __all__ = ["PAGE", "EnrolmentDesk", "Session", "refusal_of"]
 
@@ -87,6 +90,7 @@ class EnrolmentDesk:
         self._trail = AuditTrail()
         self._trail.begin()
         self._audit = AuditLog(files.config.domain)
+        self._revocations: dict[Path, tuple[int, bytes]] = {}  # time of change, fingerprint of the certificate
         self._border: EndpointRecord | None = None
         self._border_until_s = 0.0
 
@@ -185,18 +189,29 @@ class EnrolmentDesk:
         record, _ = EndpointRecord.verified(fields.bytes_("record"), Policy(root, []), unix_s)
         if not {record.name, *(each.name for each in cards)} <= nodes:
             raise EnrolmentError(Refusal.WRONG_NODES, "descriptors or an endpoint record of another machine's nodes")
+        if record.candidates:  # else a member could aim the border's packets at any address
+            raise EnrolmentError(
+                Refusal.WRONG_NODES, "a machine that joins states no endpoints here: it dials the border"
+            )
         for each in cards:
             self._registry.set_card(each.name, each.wire)
         if record.name != self.border_record(unix_s).name:
-            write_all(self._config.peers, {record_file_name(record.name): public(record.wire)}, force=True)
+            file = record_file_name(record.name)
+            write_all(self._config.peers, {file: public(record.wire)}, force=True)
+            try:
+                self._member(session.machine)
+            except EnrolmentError:  # removed in the meantime, perhaps before the file was there to be deleted
+                (self._config.peers / file).unlink(missing_ok=True)
+                raise
 
     def renew(self, session: Session, fields: Fields, unix_s: float) -> dict[str, object]:
         """Return new memberships of a machine's nodes; one that has just begun is returned as it is.
 
         Raises:
-            EnrolmentError: WRONG_NODES or NO_MEMBER.
+            EnrolmentError: WRONG_NODES, or NO_MEMBER: it was removed, or the root revoked a membership of it.
             StatementError: malformed, or not issued here.
         """
+        self._refuse_revoked(session.machine)
         nodes = {each.name: each for each in self._member(session.machine).nodes}
         wires, new = list[bytes](), list[Membership]()
         for wire in fields.byte_strings("certificates", MEMBERS_MAX):
@@ -302,6 +317,29 @@ class EnrolmentDesk:
             )
         if token.label and token.label != label:
             raise EnrolmentError(Refusal.WRONG_NODES, f"this token is for the label {token.label!r}, not {label!r}")
+
+    def _refuse_revoked(self, machine: int) -> None:
+        """Refuse a machine of which any membership was revoked, for example with ``gdp cert revoke``."""
+        known, folder = self._revocations, self._config.revocations
+        try:
+            present = {path: path.stat().st_mtime_ns for path in folder.iterdir()} if folder.exists() else {}
+        except OSError as error:
+            raise StoreError(f"{folder}: {error.strerror}") from error
+        for path, changed_ns in present.items():
+            if path not in known or known[path][0] != changed_ns:
+                try:
+                    known[path] = changed_ns, Revocation.read(parse(read_public(path))).fingerprint
+                except StatementError as error:
+                    known[path] = changed_ns, b""
+                    log.error("revocation not taken file=%s reason=%s", path, error)
+        for path in known.keys() - present.keys():
+            del known[path]
+        if self._registry.fingerprints(machine) & {fingerprint for _, fingerprint in known.values()}:
+            raise EnrolmentError(
+                Refusal.NO_MEMBER,
+                "a membership of this machine was revoked: remove the machine with gdp domain remove, then join again"
+                " with a new token",
+            )
 
     def _label_of(self, machine_id: int) -> str:
         machine = self._registry.machine(machine_id)

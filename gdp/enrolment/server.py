@@ -36,8 +36,9 @@ from gdp.enrolment.wire import (
     read_message,
 )
 from gdp.errors import DropReason, GdpError, LocalError, StatementError
+from gdp.ports.client_network import client_network
 from gdp.ports.listening import listen_tcp
-from gdp.token_bucket import TokenBucket
+from gdp.token_bucket import TokenBucket, TokenBuckets
 
 __all__ = ["STRANGER_S", "EnrolmentServer", "bind_server", "serve_domain"]
 
@@ -50,6 +51,9 @@ _EACH_MAX: Final = 16  # strangers from one address
 _MEMBERS_MAX: Final = 4_096
 _EACH_MEMBER_MAX: Final = 8  # connections of one machine
 _ACCEPTS_PER_S: Final = 50.0  # a handshake costs about 1 ms
+_EACH_PER_S: Final = 25.0  # of them, of one address
+_EACH_BURST: Final = 100.0  # a site behind one NAT whose machines start together
+_LOOK_S: Final = 0.0005  # between connections above the share of their address, which cost no handshake
 _REQUEST_S: Final = 10.0  # for the bytes of one request, after its first
 _IDLE_S: Final = 2 * POLL_MAX_S
 _FLUSH_S: Final = 10.0
@@ -75,7 +79,7 @@ class _Connection:
 
     task: asyncio.Task[None] = field(init=False)
     peer: socket.socket
-    host: str
+    host: bytes  # as of ``client_network``
     session: Session | None = None
     is_attended: bool = False
     nonce: bytes = field(default_factory=lambda: os.urandom(NONCE_BYTES))
@@ -94,6 +98,7 @@ class EnrolmentServer:
         self._make_tls = make_tls
         self._tls = make_tls()
         self._rate = TokenBucket(_ACCEPTS_PER_S, _ACCEPTS_PER_S)
+        self._each = TokenBuckets(_EACH_PER_S, _EACH_BURST)
         self._strangers: OrderedDict[_Connection, None] = OrderedDict()
         self._members: dict[int, OrderedDict[_Connection, None]] = defaultdict(OrderedDict)
         self._polling: dict[int, OrderedDict[bytes, None]] = defaultdict(OrderedDict)  # instances, the newest last
@@ -122,7 +127,6 @@ class EnrolmentServer:
         wait_s = (1.0 - self._rate.left(time.monotonic())) / _ACCEPTS_PER_S
         if wait_s > 0:
             await asyncio.sleep(wait_s)  # further connections wait in the kernel's queue
-        self._rate.charge(time.monotonic(), 1.0)
         try:
             peer, address = await asyncio.get_running_loop().sock_accept(self._listening)
         except ConnectionAbortedError:
@@ -131,7 +135,13 @@ class EnrolmentServer:
             log.warning("enrolment connection not accepted reason=%s", error.strerror)
             await asyncio.sleep(1.0)
             return
-        connection = _Connection(peer=peer, host=str(address[0]))
+        host = client_network(str(address[0]))
+        if not self._each.spend(host, time.monotonic()):
+            peer.close()
+            await asyncio.sleep(_LOOK_S)
+            return
+        self._rate.charge(time.monotonic(), 1.0)
+        connection = _Connection(peer=peer, host=host)
         same = [each for each in self._strangers if each.host == connection.host]
         if len(same) >= _EACH_MAX:
             same[0].task.cancel()

@@ -21,13 +21,14 @@ from gdp.nodes.relay_config import RelayConfig, RelayServer
 from gdp.nodes.relay_context import RelayContext
 from gdp.nodes.relay_link import RelayLink, RelayPort, prepare_socket
 from gdp.nodes.relay_loop import RelayLoop
+from gdp.ports.client_network import client_network
 from gdp.ports.listening import listen_tcp
 from gdp.ports.sockets import AS_ROOT
 from gdp.ports.tap import TapDevice, tap_name
 from gdp.relay.admission import ClientAdmission, verified_switch
-from gdp.relay.connection import ConnectionCounters, RelayConnection
+from gdp.relay.connection import ConnectionCounters, Limits, RelayConnection
 from gdp.sansio import Timestamps
-from gdp.token_bucket import TokenBucket
+from gdp.token_bucket import TokenBucket, TokenBuckets
 
 __all__ = ["BorderServer", "listen_tls", "port_status"]
 
@@ -35,6 +36,9 @@ log = logging.getLogger(__name__)
 
 _HANDSHAKES_MAX: Final = 32  # unauthenticated connections at once
 _ACCEPTS_PER_S: Final = 50.0  # a handshake costs about a millisecond
+_EACH_PER_S: Final = 25.0  # of them, of one address
+_EACH_BURST: Final = 100.0  # a site behind one NAT whose machines start together
+_LOOKS_PER_S: Final = 2_000.0  # connections whose address is looked at: an address above its share costs no handshake
 _ACCEPT_PAUSE_S: Final = 0.1
 
 
@@ -60,11 +64,12 @@ def listen_tls(config: RelayServer) -> socket.socket:
 
 @dataclass(slots=True)
 class _Client:
-    """A client that is or was connected; the device stays for its next connection."""
+    """A client that is or was connected; the device and the limits stay for its next connection."""
 
     member: Membership
     port: RelayPort
     last_s: float
+    limits: Limits | None
 
 
 class BorderServer:
@@ -86,6 +91,9 @@ class BorderServer:
         self._clients: dict[Name, _Client] = {}
         self._handshakes: set[RelayLink] = set()
         self._accepts = TokenBucket(_ACCEPTS_PER_S, _ACCEPTS_PER_S)
+        self._each = TokenBuckets(_EACH_PER_S, _EACH_BURST)
+        self._looks = TokenBucket(_LOOKS_PER_S, _LOOKS_PER_S)
+        self._turned_away = 0
         self._resume_s: float | None = None
         self._ended = ConnectionCounters()
         self.refusals = 0
@@ -140,6 +148,7 @@ class BorderServer:
             "port": self._server.port,
             "clients": [self._client_status(client, now_s) for client in self._clients.values()],
             "refused": self.refusals,
+            "turned_away": self._turned_away,
             "last_refusal": self._last_refusal,
         }
 
@@ -156,11 +165,16 @@ class BorderServer:
     def _accept(self, events: int) -> None:
         del events
         now_s = time.monotonic()
-        if not self._accepts.spend(now_s):
+        if self._accepts.left(now_s) < 1.0 or not self._looks.spend(now_s):
             self._pause(now_s)
             return
         try:
-            peer, _ = self._listener.accept()
+            peer, address = self._listener.accept()
+            if not self._each.spend(client_network(str(address[0])), now_s):
+                self._turned_away += 1
+                peer.close()
+                return
+            self._accepts.charge(now_s, 1.0)
             prepare_socket(peer, self._config.dead_ms)
         except (BlockingIOError, ConnectionAbortedError):
             return
@@ -191,7 +205,8 @@ class BorderServer:
 
     def _authenticate(self, certificate: bytes, at: Timestamps) -> Membership:
         member = verified_switch(certificate, self._context.policy.verify_membership, at.unix_s)
-        self._admission.check(member, [name for name, each in self._clients.items() if each.port.link is not None])
+        connected = {name: each.member.domain for name, each in self._clients.items() if each.port.link is not None}
+        self._admission.check(member, connected)
         return member
 
     def _open(self, link: RelayLink) -> RelayPort | None:
@@ -201,7 +216,8 @@ class BorderServer:
         if member is None:
             raise LocalError("a connection is open without an authenticated client")
         try:
-            client = self._client_of(member)
+            client = self._client_of(member, link.connection.limits)
+            link.connection.limits = client.limits
             if client.port.link is not None:
                 client.port.link.end("replaced by a newer connection of the same client")
             client.port.attach(link)
@@ -213,8 +229,12 @@ class BorderServer:
         log.info("client up label=%s name=%s address=%s", member.label, member.name.short, link.remote)
         return client.port
 
-    def _client_of(self, member: Membership) -> _Client:
-        """Return the entry of a client, with a device; the longest disconnected one gives way to a new one."""
+    def _client_of(self, member: Membership, limits: Limits | None) -> _Client:
+        """Return the entry of a client, with a device; the longest disconnected one gives way to a new one.
+
+        Args:
+            limits: of a client that is new here.
+        """
         known = self._clients.get(member.name)
         if known is not None and not known.port.is_removed:
             return known
@@ -227,7 +247,7 @@ class BorderServer:
             self._forget(min(idle, key=lambda each: each.last_s))
         own = self._context.identity.name
         device = TapDevice(tap_name(own, member.name), self._context.alias, self._config.mtu)
-        client = _Client(member, RelayPort(self._loop, device), time.monotonic())
+        client = _Client(member, RelayPort(self._loop, device), time.monotonic(), limits)
         self._clients[member.name] = client
         return client
 
