@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Final, TypeAlias
 
 from fog.cluster import CloudNode, ClusterPlan
+from fog.enrolment.domain_members import DomainMembers
 from fog.enrolment.members import metadata_of
 from fog.enrolment.tickets import Tickets
 from fog.machine import Machine, MachineState
@@ -21,9 +22,10 @@ from fog.site import Site
 from fog.supervisor.event_log import EventLog
 from fog.supervisor.events import changes
 from fog.supervisor.gateway_uplinks import GatewayUplinks
+from fog.supervisor.join_credentials import JoinCredentials
 from fog.supervisor.journal import Cluster, Journal
 from fog.supervisor.machine_actions import MachineActions
-from fog.supervisor.machine_credentials import MachineCredentials
+from fog.supervisor.machine_credentials import CredentialIssuer, MachineCredentials
 from fog.supervisor.reconcile import Timeouts, decide
 from fog.supervisor.record import Record, update_record
 from fog.supervisor.robot_access import RobotAccess
@@ -37,6 +39,7 @@ Heard: TypeAlias = "Mapping[str, frozenset[str]]"  # service -> proxies that ser
 
 _GRACE_POLLS: Final = 5  # polls in which a new machine may be missing
 _GRACE_MIN_S: Final = 2.0
+_JOINED_S: Final = 0.25  # another process writes which machines have joined, and notifies no other
 PATIENCE: Final = Timeouts()
 
 
@@ -44,6 +47,7 @@ class Supervisor:
     """Supervisor that keeps the clusters of a site in their desired state; ``StoreError``: the journal is unusable.
 
     Args:
+        enrolment: tickets for machines of this host, or the border's domain, which rented machines join.
         heard: servers that the overlay reports; None: the overlay cannot be queried.
         software: returns the files by which a new machine fetches its software.
     """
@@ -53,7 +57,7 @@ class Supervisor:
         *,
         site: Site,
         journal: Journal,
-        tickets: Tickets,
+        enrolment: Tickets | DomainMembers,
         provider: Provider,
         command: Callable[[CloudNode], Sequence[str]],
         heard: Callable[[], Heard | None],
@@ -68,7 +72,11 @@ class Supervisor:
         self._grace_s = max(_GRACE_POLLS * provider.poll_s, _GRACE_MIN_S)
         self._woken = threading.Event()
         self._events = EventLog(journal)
-        self._credentials = MachineCredentials(site, journal, self._events, tickets, boot_s=patience.boot_s)
+        self._credentials: CredentialIssuer
+        if isinstance(enrolment, Tickets):
+            self._credentials = MachineCredentials(site, journal, self._events, enrolment, boot_s=patience.boot_s)
+        else:
+            self._credentials = JoinCredentials(site, journal, self._events, enrolment, boot_s=patience.boot_s)
         self._actions = MachineActions(
             site=site,
             journal=journal,
@@ -104,8 +112,10 @@ class Supervisor:
         self._woken.set()
 
     def wait(self) -> None:
-        """Wait until the next reconciliation is due."""
-        self._woken.wait(self._actions.provider.poll_s)
+        """Wait until the next reconciliation is due, or a machine has joined."""
+        left_s = self._actions.provider.poll_s
+        while left_s > 0 and not self._woken.wait(min(left_s, _JOINED_S)) and not self._credentials.has_reports():
+            left_s -= _JOINED_S
         self._woken.clear()
 
     def close(self) -> None:

@@ -19,11 +19,20 @@ from gdp.nodes.endpoint_files import RECORD_SUFFIX
 from gdp.stores.files import public, write_all
 from gdp.stores.keyring import DELEGATIONS
 
-__all__ = ["LISTEN_PORT", "RELAY_FILE", "RELAY_PORT", "MachinePlan", "record_file_name", "write_configuration"]
+__all__ = [
+    "LISTEN_PORT",
+    "RELAY_FILE",
+    "RELAY_PORT",
+    "WATCH_IFACE",
+    "MachinePlan",
+    "record_file_name",
+    "write_configuration",
+]
 
 LISTEN_PORT: Final = LISTEN_DEFAULT  # of WireGuard; of the enrolment server the TCP port of this number
 RELAY_PORT: Final = 443
 RELAY_FILE: Final = "relay.yaml"
+WATCH_IFACE: Final = "watch0"  # of a border: from there a launcher sees which replicas serve
 _FOLDERS: Final = ("peers", "revocations", "inbox", "state/switch", "state/rib", "state/proxy", "proxy.yaml.d")
 
 
@@ -93,7 +102,9 @@ def _member(plan: MachinePlan, trusts: Sequence[str]) -> str:
 
 
 def _switch(plan: MachinePlan, trusts: Sequence[str]) -> str:
-    attach = [*(["rib0"] if plan.has_rib else []), *(["proxy0"] if plan.has_proxy else [])]
+    attach = ["rib0"] if plan.has_rib else []
+    attach += ["proxy0"] if plan.has_proxy else []
+    attach += [WATCH_IFACE] if plan.has_rib else []
     links = {"listen": plan.listen, "peers": "peers"}
     public_line = f"  public: {json.dumps(list(plan.public))}\n" if plan.public else ""
     uplinks_line = f"  uplinks: {json.dumps(list(plan.uplinks))}\n" if plan.uplinks else ""

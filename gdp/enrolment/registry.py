@@ -220,6 +220,11 @@ class Registry:
             )
             return machine
 
+    def withdraw_tokens(self, label: str) -> None:
+        """Delete the unused tokens for machines with this label."""
+        with self._writing() as file:
+            file.execute("DELETE FROM tokens WHERE label = ? AND keys IS NULL", (label,))
+
     def complete_token(self, identifier: bytes, machine: int, members: Sequence[Membership], answer: bytes) -> None:
         """Store what was issued for a token, and the response to a repeat of its request.
 

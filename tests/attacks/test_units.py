@@ -105,7 +105,7 @@ def test_a53_the_unit_has_every_fence(unit: Path) -> None:
 
 def test_a53_nodes_of_a_machine_are_the_users_code(tmp_path: Path) -> None:
     with made_desk(tmp_path) as desk:
-        boot = desk.boot("m1", shares_host=False)
+        boot = desk.boot("m1")
     programs = read_programs(pack(boot)["boot.json"])
     assert {each.name: each.is_users for each in programs if each.name in ("switch", "proxy")} == {
         "switch": False,

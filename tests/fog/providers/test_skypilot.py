@@ -294,6 +294,10 @@ def test_the_real_package_takes_our_tasks_in_a_dry_run(home: Path) -> None:
     assert reported["no such region"].startswith("LocalError")
     assert "nowhere" in reported["no such region"]
     assert (reported["machines"], reported["terminate"]) == ("[]", "None")
+    task = reported["task"]
+    assert task["written again"]
+    assert "systemctl enable --now --no-block fog-machine" in task["setup"]
+    assert task["run"].startswith("sudo journalctl --follow --unit fog-machine")
 
 
 def test_names_too_long_for_a_label_are_refused() -> None:
