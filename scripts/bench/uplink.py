@@ -116,6 +116,7 @@ def exchange(
         if with_tcp:
             stack.enter_context(start_role(lab, CLOUD, "tcp-read", {"address": ADDRESSES[CLOUD]})).read(READY_S)
             stack.enter_context(start_role(lab, ROBOT, "tcp-send", {"address": ADDRESSES[CLOUD]})).read(READY_S)
+        line.rewind()
         start_ns = time.monotonic_ns() + 50_000_000
         begin_ns = start_ns + round(WARM_UP_S * 1e9)
         end_ns = begin_ns + round(options.seconds * 1e9)

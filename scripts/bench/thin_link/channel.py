@@ -33,7 +33,10 @@ class Rate(Protocol):
         """Return when the last bit of a frame leaves; calls come in the order of the frames."""
 
     def capacity_bytes(self, begin_ns: int, end_ns: int) -> float:
-        """Return how many bytes could leave between two moments."""
+        """Return how many bytes could leave between two moments, both after the last ``rewind``."""
+
+    def rewind(self, now_ns: int) -> None:
+        """Begin a recording again."""
 
 
 class ConstantRate:
@@ -51,6 +54,9 @@ class ConstantRate:
     def capacity_bytes(self, begin_ns: int, end_ns: int) -> float:
         """Return the bytes of a span, as ``Rate``."""
         return (end_ns - begin_ns) / self._byte_ns
+
+    def rewind(self, now_ns: int) -> None:
+        """Do nothing: this server has no recording."""
 
 
 class TraceRate:
@@ -74,6 +80,7 @@ class TraceRate:
         self._period_ms = self._moments[-1]
         self._next = 0  # index, over all repetitions, of the opportunity in use
         self._left = OPPORTUNITY_BYTES
+        self._begun_ns = 0
 
     def depart_ns(self, ready_ns: int, size: int) -> int:
         """Return when the last byte leaves, as ``Rate``."""
@@ -89,12 +96,17 @@ class TraceRate:
         """Return the bytes of a span, as ``Rate``."""
         return float(OPPORTUNITY_BYTES * (self._index_from(end_ns) - self._index_from(begin_ns)))
 
+    def rewind(self, now_ns: int) -> None:
+        """Begin the recording again, as ``Rate``."""
+        self._next, self._left, self._begun_ns = 0, OPPORTUNITY_BYTES, now_ns
+
     def _moment_ns(self, index: int) -> int:
         cycle, at = divmod(index, len(self._moments))
-        return (cycle * self._period_ms + self._moments[at]) * _MS_NS
+        return self._begun_ns + (cycle * self._period_ms + self._moments[at]) * _MS_NS
 
     def _index_from(self, moment_ns: int) -> int:
         """Return the first opportunity that is not before a moment."""
+        moment_ns -= self._begun_ns
         if moment_ns <= 0:
             return 0
         cycle, rest_ns = divmod(moment_ns - 1, self._period_ms * _MS_NS)  # the end of a repetition belongs to it
@@ -118,6 +130,7 @@ class Loss:
     def __init__(self, share: float, burst: float, seed: int) -> None:
         if not 0 <= share < 1 or burst < 1:
             raise ValueError(f"a loss has a share of 0 to 1 and a burst of at least 1, not {share} and {burst}")
+        self._seed = seed
         self._random = Random(seed)  # the n-th frame has the same fate in every run with this seed
         self._is_independent = burst == 1
         self._to_good = 1 / burst
@@ -131,6 +144,11 @@ class Loss:
             return drawn < self._to_bad
         self._is_bad = drawn >= self._to_good if self._is_bad else drawn < self._to_bad
         return self._is_bad
+
+    def rewind(self) -> None:
+        """Begin the sequence of fates again."""
+        self._random.seed(self._seed)
+        self._is_bad = False
 
 
 @dataclass(slots=True)
@@ -198,6 +216,11 @@ class Channel:
             if is_marked:
                 counters.marked_bytes += size
         return self._backlog
+
+    def rewind(self, now_ns: int) -> None:
+        """Begin recording and losses again, so that what follows meets the same link whenever it starts."""
+        self.rate.rewind(now_ns)
+        self._loss.rewind()
 
     def take_depths(self) -> list[int]:
         """Return the depths since the last call."""

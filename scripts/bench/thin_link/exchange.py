@@ -84,8 +84,8 @@ class Exchange:
         for each in self._mix:
             if each.direction != self._direction:
                 continue
-            work = self._publish if each.period_s else self._answer
-            threading.Thread(target=work, args=(each, self._senders[each.name], window), daemon=True).start()
+            work, sender = self._publish if each.period_s else self._answer, self._senders[each.name]
+            threading.Thread(target=work, args=(each, sender, window), name=f"publish {each.name}", daemon=True).start()
 
     def take(self, stream: Stream, message: bytes, now_ns: int) -> None:
         """Take a message that arrived."""

@@ -67,6 +67,10 @@ class Line:
         self._process = process
         self._before: Mapping[str, Any] = self._ask()
 
+    def rewind(self) -> None:
+        """Begin recording and losses again: every system meets the same link from here on."""
+        self._ask(rewind=True)
+
     def begin(self) -> None:
         """Begin a span."""
         self._before = self._ask()
@@ -86,9 +90,9 @@ class Line:
         up, down = (_flow(before[side], after[side]) for side in ("up", "down"))
         return Used(up, down, after["late_us"] / 1e3, cpu_share)
 
-    def _ask(self) -> dict[str, Any]:
+    def _ask(self, **order: bool) -> dict[str, Any]:
         try:
-            return self._process.ask(report=True)
+            return self._process.ask(report=True, **order)
         except BrokenPipeError:
             return self._process.read(0.0)  # raises FailedError with the reason
 

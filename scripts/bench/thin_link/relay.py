@@ -2,7 +2,8 @@
 
 I/O; two AF_PACKET sockets, whole batches a system call. Run as ``python -m thin_link.relay FILE``; the file holds JSON
 with ``devices`` (from the robot, to the cloud), ``up`` and ``down`` (``Direction``) and ``seed``.
-Each line on its standard input is answered by one line of JSON with all counters; it ends with its input.
+Each line on its standard input is answered by one line of JSON with all counters; one with the word ``rewind`` begins
+recordings and losses again. It ends with its input.
 
 It runs under SCHED_FIFO where that is allowed, so the processes that it connects do not delay it. Its devices must have
 no offloads: a channel counts frames, not segments of TCP.
@@ -88,8 +89,11 @@ class _Relay:
             for way in self._ways:
                 self._send_due(way)
             if control in ready:
-                if not os.read(control, 1 << 10):
+                order = os.read(control, 1 << 10)
+                if not order:
                     return
+                if b"rewind" in order:
+                    self._rewind()
                 self._report()
 
     def _pause_s(self) -> float | None:
@@ -133,6 +137,11 @@ class _Relay:
                 late[min(max(now_ns - due_ns, 0) // _BUCKET_NS, _BUCKETS)] += 1
                 frames.append(frame)
             self._batch.send(way.sink, frames, head, self._drops)
+
+    def _rewind(self) -> None:
+        now_ns = time.monotonic_ns() - self._start_ns
+        for way in self._ways:
+            way.channel.rewind(now_ns)
 
     def _report(self) -> None:
         now_ns = time.monotonic_ns() - self._start_ns
