@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from pyroute2 import IPRoute
 
-__all__ = ["add_address", "add_bridge", "hand_over", "mac_addresses", "received", "set_mtu", "set_up"]
+__all__ = ["add_address", "add_bridge", "add_neighbour", "hand_over", "mac_addresses", "received", "set_mtu", "set_up"]
 
 
 def add_address(device: str, address: str, *, prefix_bits: int = 24) -> None:
@@ -27,6 +27,13 @@ def add_bridge(name: str, devices: Sequence[str] = ()) -> None:
         for device in devices:
             here.link("set", index=here.link_lookup(ifname=device)[0], master=bridge)
         here.link("set", index=bridge, state="up")
+
+
+def add_neighbour(device: str, address: str, mac: bytes) -> None:
+    """Name the MAC address of an IPv4 neighbour for good, so that nothing asks for it."""
+    with IPRoute() as here:
+        (index,) = here.link_lookup(ifname=device)
+        here.neigh("add", dst=address, lladdr=mac.hex(":"), ifindex=index, state="permanent")
 
 
 def set_up(device: str) -> None:

@@ -1,0 +1,68 @@
+"""Relay of a thin link between namespaces: which frames cross it; its times are measured by the bench ``uplink``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "scripts" / "bench"))
+
+from testbed import Lab
+from thin_link.conditions import Conditions, Direction
+from thin_link.line import ADDRESSES, CLOUD, ROBOT, Used, open_line, thin_link_lab
+from thin_link.systems import start_role
+
+from gdp.host.run_registry import RunRegistry
+
+pytestmark = pytest.mark.netns
+
+_FRAME = 1_500
+_READY_S = 20.0
+
+
+@pytest.fixture
+def lab() -> Iterator[Lab]:
+    run = RunRegistry().start()
+    try:
+        yield thin_link_lab(run)
+    finally:
+        run.end()
+
+
+def link(*, bits_s: float, fifo_frames: int, loss: float, seed: int) -> Conditions:
+    """Return a link of 5 ms each way."""
+    both = Direction(bits_s, 5.0, fifo_frames * _FRAME, loss, 1.0)
+    return Conditions("test", both, both, seed)
+
+
+def crossed(lab: Lab, conditions: Conditions, count: int) -> tuple[list[int], Used]:
+    """Send so many full datagrams at once; return the numbers of those that crossed, and the use of the link."""
+    with ExitStack() as stack:
+        line = stack.enter_context(open_line(lab, conditions))
+        line.begin()
+        settings = {"address": ADDRESSES[CLOUD], "silence_s": 1.5}
+        reader = stack.enter_context(start_role(lab, CLOUD, "probe-read", settings))
+        reader.read(_READY_S)
+        sender = start_role(lab, ROBOT, "probe-send", {"address": ADDRESSES[CLOUD], "count": count, "every_ns": 0})
+        stack.enter_context(sender).read(_READY_S)
+        arrived = reader.read(_READY_S)["arrived"]
+        assert isinstance(arrived, list)
+        return [int(number) for number, _, _ in arrived], line.end()
+
+
+def test_a_burst_that_exceeds_the_fifo_loses_exactly_what_does_not_fit(lab: Lab) -> None:
+    numbers, used = crossed(lab, link(bits_s=24_000, fifo_frames=3, loss=0.0, seed=1), 40)
+    assert numbers == [0, 1, 2]  # a frame takes half a second, the burst far less
+    assert used.up.queue_drop_share == pytest.approx(37 / 40)
+
+
+def test_frames_cross_in_order_and_one_seed_loses_the_same_ones(lab: Lab) -> None:
+    conditions = link(bits_s=50e6, fifo_frames=500, loss=0.1, seed=5)
+    (once, used), (again, _) = crossed(lab, conditions, 300), crossed(lab, conditions, 300)
+    assert once == again == sorted(once)
+    assert len(once) < 300
+    assert used.up.loss_share == pytest.approx((300 - len(once)) / 300)

@@ -1,0 +1,145 @@
+"""Thin link between two namespaces, as the bench owns it: devices without offloads, a relay, and its reports.
+
+I/O. Starts a process in the namespace between robot and cloud.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final
+
+from devices import add_address, add_neighbour, mac_addresses
+from machine import set_offloads
+from peers.process import FailedError, Started
+from testbed import Lab
+from topologies import flat_topology
+
+from gdp.host.run_registry import Run
+from thin_link.conditions import FRAME_BYTES, Conditions
+
+__all__ = ["ADDRESSES", "CLOUD", "LINE", "ROBOT", "Flow", "Line", "Used", "open_line", "thin_link_lab"]
+
+ROBOT: Final = "s1"
+CLOUD: Final = "s2"
+LINE: Final = "line"
+ADDRESSES: Final = {ROBOT: "10.99.0.1", CLOUD: "10.99.0.2"}
+_INSIDE: Final = (("a", ROBOT), (ROBOT, LINE), (LINE, CLOUD), (CLOUD, "b"))
+_READY_S: Final = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Flow:
+    """One direction of a link over a span.
+
+    Attributes:
+        share: bytes that were delivered, of those that the link could carry.
+        marked_share: the same, of the TCP flow alone.
+        queue_drop_share, loss_share: of the frames offered to the link.
+        depths_bytes: highest queue in each tenth of a second.
+    """
+
+    share: float
+    marked_share: float
+    queue_drop_share: float
+    loss_share: float
+    capacity_bytes: float
+    depths_bytes: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Used:
+    """Use of a link over a span, and how exact its relay was: lateness of frames, p99 in ms."""
+
+    up: Flow
+    down: Flow
+    late_ms: float
+    cpu_share: float
+
+
+class Line:
+    """Running relay."""
+
+    def __init__(self, process: Started) -> None:
+        self._process = process
+        self._before: Mapping[str, Any] = self._ask()
+
+    def rewind(self) -> None:
+        """Begin recording and losses again: every system meets the same link from here on."""
+        self._ask(rewind=True)
+
+    def begin(self) -> None:
+        """Begin a span."""
+        self._before = self._ask()
+
+    def end(self) -> Used:
+        """Return the use of the link since ``begin``.
+
+        Raises:
+            FailedError: the relay lost a frame itself, so that the figures would mean nothing.
+        """
+        before, after = self._before, self._ask()
+        for what in ("oversized", "refused", "kernel_drops"):
+            if count := after[what] - (0 if what == "kernel_drops" else before[what]):
+                raise FailedError(f"the relay of the link had {count} frames {what}")
+        span_s = (after["now_ns"] - before["now_ns"]) / 1e9
+        cpu_share = (after["cpu_s"] - before["cpu_s"]) / span_s
+        up, down = (_flow(before[side], after[side]) for side in ("up", "down"))
+        return Used(up, down, after["late_us"] / 1e3, cpu_share)
+
+    def _ask(self, **order: bool) -> dict[str, Any]:
+        try:
+            return self._process.ask(report=True, **order)
+        except BrokenPipeError:
+            return self._process.read(0.0)  # raises FailedError with the reason
+
+
+def _flow(before: Mapping[str, Any], after: Mapping[str, Any]) -> Flow:
+    def grown(key: str) -> float:
+        """Return by how much a counter has grown."""
+        return float(after[key] - before[key])
+
+    offered, capacity = max(grown("offered"), 1.0), max(grown("capacity_bytes"), 1.0)
+    return Flow(
+        share=grown("delivered_bytes") / capacity,
+        marked_share=grown("marked_bytes") / capacity,
+        queue_drop_share=grown("queue_drops") / offered,
+        loss_share=grown("losses") / offered,
+        capacity_bytes=capacity,
+        depths_bytes=tuple(after["depth_bytes"]),
+    )
+
+
+def thin_link_lab(run: Run) -> Lab:
+    """Make the machines ``a - s1 - line - s2 - b``: programs and switch of the robot, the link, those of the cloud."""
+    topology = flat_topology(
+        _INSIDE, mtu=FRAME_BYTES, rib=CLOUD, members=("a", "b"), switches=("a", ROBOT, LINE, CLOUD, "b")
+    )
+    lab = Lab(run, topology)
+    for node, address in ADDRESSES.items():
+        lab.inside(node, partial(add_address, LINE, address))
+        lab.inside(node, partial(set_offloads, LINE, on=False))
+        lab.inside(LINE, partial(set_offloads, node, on=False))
+    macs = {node: lab.inside(node, partial(mac_addresses, [LINE]))[LINE] for node in ADDRESSES}
+    for node, other in ((ROBOT, CLOUD), (CLOUD, ROBOT)):
+        lab.inside(node, partial(add_neighbour, LINE, ADDRESSES[other], macs[other]))  # no ARP crosses the link
+    return lab
+
+
+@contextmanager
+def open_line(lab: Lab, conditions: Conditions) -> Iterator[Line]:
+    """Run the relay of a link until the context ends."""
+    path = lab.directory / "line.json"
+    settings = {
+        "devices": (ROBOT, CLOUD),
+        "up": conditions.up.to_fields(),
+        "down": conditions.down.to_fields(),
+        "seed": conditions.seed,
+    }
+    path.write_text(json.dumps(settings), encoding="ascii")
+    with lab.start(LINE, "relay", ["-m", "thin_link.relay", str(path)], has_orders=True) as process:
+        process.read(_READY_S)
+        yield Line(process)

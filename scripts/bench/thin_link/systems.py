@@ -1,0 +1,175 @@
+"""Systems of the uplink bench: the processes of each on the machines of robot and cloud, ready for the traffic.
+
+I/O. Starts processes; a context manager ends them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from typing import Any, Final, Protocol
+
+from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
+from peers.certificates import make_certificates
+from peers.process import FailedError, Started
+from testbed import Lab, OverlayNodes
+
+from gdp.trust.right import Right
+from thin_link.line import ADDRESSES, CLOUD, ROBOT
+from thin_link.traffic import streams
+
+__all__ = ["SYSTEMS", "System", "start_role"]
+
+_READY_S: Final = 45.0
+_MODULE: Final = "uplink_endpoint"
+_PORT: Final = 7_447
+_WIREGUARD_MTU: Final = 1_420
+_INNER: Final = {ROBOT: "fd00::1", CLOUD: "fd00::2"}
+
+Ends = tuple[Started, Started]
+
+
+class System(Protocol):
+    """One way to carry the traffic. ``name`` is its row, and its word in ``--only``."""
+
+    @property
+    def name(self) -> str:
+        """The row that it fills."""
+
+    def run(self, lab: Lab, camera: str) -> Any:
+        """Return a context with both ends, robot first, matched and waiting for a window.
+
+        Raises:
+            FailedError: it is not installed, or did not come up.
+        """
+
+
+def start_role(lab: Lab, node: str, role: str, settings: Mapping[str, Any], *, has_orders: bool = False) -> Started:
+    """Start a role of the endpoint process."""
+    return lab.start(node, role, ["-m", _MODULE, role, json.dumps(settings)], has_orders=has_orders)
+
+
+@contextmanager
+def _both(lab: Lab, system: str, camera: str, places: tuple[str, str], own: tuple[Any, Any]) -> Iterator[Ends]:
+    """Start cloud and robot at their places, and wait until they are matched."""
+    with ExitStack() as stack:
+        made = []
+        for role, node, mine in zip(("cloud", "robot"), places[::-1], own[::-1], strict=True):
+            settings = {"system": system, "camera": camera, "own": mine}
+            made.append(stack.enter_context(start_role(lab, node, role, settings, has_orders=True)))
+        for end in made:
+            end.read(_READY_S)
+        yield made[1], made[0]
+
+
+class Gdp:
+    """Switches at robot and cloud, the RIB at the cloud, and a session of the library at either."""
+
+    name = "gdp"
+
+    def __init__(self, plane: str = "raw") -> None:
+        self._plane = plane
+
+    @contextmanager
+    def run(self, lab: Lab, camera: str) -> Iterator[Ends]:
+        """Run both ends, as ``System``."""
+        mix = streams(camera)
+        up = [each.name for each in mix if each.direction == "up"]
+        down = [each.name for each in mix if each.direction == "down"]
+        with ExitStack() as stack:
+            nodes = OverlayNodes(lab, (ROBOT, CLOUD), plane=self._plane)
+            stack.callback(nodes.close)
+            robot = nodes.admit_member("a", {Right.PUBLISH: up, Right.READ: down})
+            cloud = nodes.admit_member("b", {Right.PUBLISH: down, Right.READ: up})
+            own = ({"config": str(robot)}, {"config": str(cloud)})
+            yield stack.enter_context(_both(lab, "gdp", camera, ("a", "b"), own))
+
+
+class Zenoh:
+    """Two peers over one link with mutual TLS, of TCP or of QUIC."""
+
+    def __init__(self, scheme: str, congestion: str) -> None:
+        self.name = f"zenoh-{scheme}-{congestion}"
+        self._scheme = scheme
+        self._congestion = congestion
+
+    @contextmanager
+    def run(self, lab: Lab, camera: str) -> Iterator[Ends]:
+        """Run both ends, as ``System``."""
+        directory = lab.directory / "tls"
+        if not directory.exists():
+            make_certificates(directory, {node: [address] for node, address in ADDRESSES.items()})
+        at = f"{self._scheme}/{ADDRESSES[CLOUD]}:{_PORT}"
+        own = [
+            {
+                "certificates": str(directory),
+                "host": node,
+                "congestion": self._congestion,
+                "listen": [at] if node == CLOUD else [],
+                "connect": [at] if node == ROBOT else [],
+            }
+            for node in (ROBOT, CLOUD)
+        ]
+        with _both(lab, "zenoh", camera, (ROBOT, CLOUD), (own[0], own[1])) as ends:
+            yield ends
+
+
+class Cyclone:
+    """Two participants of Cyclone DDS in one WireGuard tunnel."""
+
+    name = "cyclone-wireguard"
+
+    @contextmanager
+    def run(self, lab: Lab, camera: str) -> Iterator[Ends]:
+        """Run both ends, as ``System``."""
+        with _tunnel(lab):
+            own = ({"xml": _cyclone_xml(ROBOT, CLOUD)}, {"xml": _cyclone_xml(CLOUD, ROBOT)})
+            with _both(lab, "cyclone", camera, (ROBOT, CLOUD), own) as ends:
+                yield ends
+
+
+@contextmanager
+def _tunnel(lab: Lab) -> Iterator[None]:
+    """Make a WireGuard tunnel between robot and cloud; names of devices are unique on the host."""
+    keys, tag = {node: X25519PrivateKey.generate() for node in ADDRESSES}, os.urandom(3).hex()
+    with ExitStack() as stack:
+        for node, other in ((ROBOT, CLOUD), (CLOUD, ROBOT)):
+            settings = {
+                "ifname": f"u{tag}{node}",
+                "key": keys[node].private_bytes_raw().hex(),
+                "peer_key": keys[other].public_key().public_bytes_raw().hex(),
+                "peer_address": ADDRESSES[other],
+                "inner": _INNER[node],
+                "peer_inner": _INNER[other],
+                "mtu": _WIREGUARD_MTU,
+            }
+            device = stack.enter_context(start_role(lab, node, "wireguard", settings, has_orders=True))
+            if "backend" not in device.read(_READY_S):
+                raise FailedError("the WireGuard device did not say that it is ready")
+        yield
+
+
+def _cyclone_xml(own: str, other: str) -> str:
+    """Return the configuration of an end whose only peer is in the tunnel; else the defaults of Cyclone."""
+    return (
+        '<CycloneDDS><Domain id="any"><General><Transport>udp6</Transport>'
+        f'<Interfaces><NetworkInterface address="{_INNER[own]}"/></Interfaces>'
+        "<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
+        f'<MaxAutoParticipantIndex>1</MaxAutoParticipantIndex><Peers><Peer address="{_INNER[other]}"/></Peers>'
+        "</Discovery></Domain></CycloneDDS>"
+    )
+
+
+SYSTEMS: Final[Mapping[str, System]] = {
+    each.name: each
+    for each in (
+        Gdp(),
+        Zenoh("tls", "drop"),
+        Zenoh("tls", "block"),
+        Zenoh("quic", "drop"),
+        Zenoh("quic", "block"),
+        Cyclone(),
+    )
+}

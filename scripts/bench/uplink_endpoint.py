@@ -1,0 +1,191 @@
+"""Endpoint processes of the uplink bench: traffic of robot and cloud over one system, TCP, WireGuard, and probes.
+
+Processes of their own, started by ``uplink.py``::
+
+    robot, cloud             the traffic over ``system``: gdp, zenoh or cyclone
+    tcp-send, tcp-read       one TCP flow (CUBIC) from the robot to the cloud
+    wireguard                a WireGuard device at either, until standard input ends
+    probe-send, probe-read   datagrams at a stated rate, and the moments at which the kernel received them
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import selectors
+import socket
+import struct
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+from peers.jsonl import read_order, say
+from thin_link.carrier import Arrival, Carrier
+from thin_link.exchange import Exchange, Window
+from thin_link.relay import MARKED_PORT
+from thin_link.traffic import Direction, streams
+
+from gdp.control.endpoints import Endpoint
+from gdp.ports.tunnel.wireguard import open_wireguard
+
+__all__ = ["PROBE_BYTES", "PROBE_PORT"]
+
+PROBE_PORT: Final = 7_001
+PROBE_BYTES: Final = 1_472  # of a datagram that fills 1,500 bytes
+_PATIENCE_S: Final = 30.0
+_POLL_S: Final = 0.02
+_CHUNK: Final = 1 << 16
+_RECEIVE_BUFFER_FORCE, _TIMESTAMP_NS = 33, 35
+_BUFFER_BYTES: Final = 16 << 20
+_PROBE: Final = struct.Struct("!IQ")
+_STAMP: Final = struct.Struct("=qq")
+_WIREGUARD_PORT: Final = 51_820
+_ALIAS: Final = "gdp-bench uplink"
+
+Settings = Mapping[str, Any]
+
+
+def _carrier(settings: Settings, arrived: Arrival) -> Carrier:
+    """Return the end of the system; its library is loaded by none other."""
+    own = dict(settings["own"])
+    if settings["system"] == "gdp":
+        from thin_link.gdp_carrier import GdpCarrier
+
+        return GdpCarrier(own, arrived)
+    if settings["system"] == "zenoh":
+        from thin_link.zenoh_carrier import ZenohCarrier
+
+        return ZenohCarrier(own, arrived)
+    from thin_link.cyclone_carrier import CycloneCarrier
+
+    return CycloneCarrier(own, arrived)
+
+
+def traffic(settings: Settings, direction: Direction) -> None:
+    """Exchange the traffic once for each command with a window; report every stream after it."""
+    exchange = Exchange(streams(settings["camera"]), direction)
+    carrier = _carrier(settings, exchange.take)
+    exchange.join(carrier)
+    deadline_s = time.monotonic() + _PATIENCE_S
+    while not carrier.is_matched():
+        if time.monotonic() > deadline_s:
+            raise TimeoutError("no reader: the other end did not appear")
+        time.sleep(_POLL_S)
+    say(event="ready")
+    order = read_order()
+    window = Window(order["start_ns"], order["begin_ns"], order["end_ns"])
+    exchange.start(window)
+    time.sleep(max(order["drained_ns"] - time.monotonic_ns(), 0) / 1e9)
+    tallies = {
+        name: {
+            "due": tally.due,
+            "sent": tally.sent,
+            "ages_s": list(tally.ages_s.values()),
+            "broken": tally.broken,
+            "doubled": tally.doubled,
+        }
+        for name, tally in exchange.tallies.items()
+    }
+    say(streams=tallies, refusals=dict(Counter(exchange.refusals)))
+    sys.stdout.flush()
+    os._exit(0)  # a publisher may still wait; nothing of it is to be kept
+
+
+def tcp_send(settings: Settings) -> None:
+    """Send as fast as TCP allows, until ended."""
+    with socket.socket() as connection:
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, b"cubic")
+        connection.settimeout(_PATIENCE_S)
+        connection.connect((settings["address"], MARKED_PORT))
+        chunk = os.urandom(_CHUNK)
+        say(event="ready")
+        while True:
+            connection.sendall(chunk)
+
+
+def tcp_read(settings: Settings) -> None:
+    """Read one connection until it ends."""
+    with socket.create_server((settings["address"], MARKED_PORT)) as listener:
+        say(event="ready")
+        connection, _ = listener.accept()
+        buffer = bytearray(_CHUNK)
+        with connection:
+            while connection.recv_into(buffer):
+                pass
+
+
+def wireguard(settings: Settings) -> None:
+    """Make a WireGuard device to the other end, until standard input ends."""
+    peer = Endpoint(settings["peer_address"], _WIREGUARD_PORT)
+    device = open_wireguard(
+        ifname=settings["ifname"],
+        private_key=bytes.fromhex(settings["key"]),
+        listen_port=_WIREGUARD_PORT,
+        inner=settings["inner"],
+        mtu=settings["mtu"],
+        alias=_ALIAS,
+    )
+    device.set_peer(bytes.fromhex(settings["peer_key"]), inner=settings["peer_inner"], endpoint=peer, keepalive_s=25)
+    say(event="ready", backend=device.backend)
+    with selectors.DefaultSelector() as selector:
+        for source in (sys.stdin, device):
+            selector.register(source, selectors.EVENT_READ)
+        while not any(key.fileobj is sys.stdin for key, _ in selector.select()):
+            device.handle_events()
+    device.close()
+
+
+def probe_send(settings: Settings) -> None:
+    """Send ``count`` full datagrams ``every_ns`` apart, or at once where that is 0; report the moments."""
+    count, every_ns, sent_ns = int(settings["count"]), int(settings["every_ns"]), list[int]()
+    padding = bytes(PROBE_BYTES - _PROBE.size)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, 32, _BUFFER_BYTES)  # SO_SNDBUFFORCE
+        probe.connect((settings["address"], PROBE_PORT))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+        start_ns = time.monotonic_ns()
+        for number in range(count):
+            if (pause_ns := start_ns + number * every_ns - time.monotonic_ns()) > 0:
+                time.sleep(pause_ns / 1e9)
+            now_ns = time.time_ns()
+            probe.send(_PROBE.pack(number, now_ns) + padding)
+            sent_ns.append(now_ns)
+    say(sent_ns=sent_ns)
+
+
+def probe_read(settings: Settings) -> None:
+    """Read datagrams until none came for ``silence_s``; report number and age of each, and when it arrived."""
+    found: list[tuple[int, int, int]] = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, _RECEIVE_BUFFER_FORCE, _BUFFER_BYTES)
+        probe.setsockopt(socket.SOL_SOCKET, _TIMESTAMP_NS, 1)
+        probe.bind((settings["address"], PROBE_PORT))
+        say(event="ready")
+        probe.settimeout(_PATIENCE_S)
+        while True:
+            try:
+                datagram, stamps, _, _ = probe.recvmsg(2_048, 64)
+            except TimeoutError:
+                break
+            probe.settimeout(float(settings["silence_s"]))
+            seconds, nanoseconds = _STAMP.unpack_from(stamps[0][2])
+            number, sent_ns = _PROBE.unpack_from(datagram)
+            arrived_ns = seconds * 1_000_000_000 + nanoseconds
+            found.append((number, arrived_ns - sent_ns, arrived_ns))
+    say(arrived=found)
+
+
+_ROLES: Final[Mapping[str, Callable[[Settings], None]]] = {
+    "robot": lambda settings: traffic(settings, "up"),
+    "cloud": lambda settings: traffic(settings, "down"),
+    "tcp-send": tcp_send,
+    "tcp-read": tcp_read,
+    "wireguard": wireguard,
+    "probe-send": probe_send,
+    "probe-read": probe_read,
+}
+
+if __name__ == "__main__":
+    _ROLES[sys.argv[1]](json.loads(sys.argv[2]))
