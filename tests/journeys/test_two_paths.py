@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
+from typing import cast
 
 import networkx as nx
 import pytest
@@ -190,7 +191,8 @@ def drawn(seed: int) -> list[tuple[str, str, int]]:
 
 
 def _has_bridge(graph: nx.MultiGraph[int]) -> bool:
-    return any(graph.number_of_edges(a, b) == 1 for a, b in nx.bridges(nx.Graph(graph)))
+    bridges = cast("list[tuple[int, int]]", list(nx.bridges(nx.Graph(graph))))
+    return any(graph.number_of_edges(a, b) == 1 for a, b in bridges)
 
 
 @pytest.mark.parametrize("seed", range(1, 9))

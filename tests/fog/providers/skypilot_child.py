@@ -76,7 +76,7 @@ def main() -> None:
     def dry_run(offer: Offer) -> str:
         return outcome(lambda: provider.dry_run(replace(spec, offer=offer), boot))
 
-    reported = {
+    reported: dict[str, object] = {
         "enabled": list(enabled.values()),
         "offers": [asdict(each) for each in offers],
         "gpu": [each.type_name for each in provider.offers(Hardware.from_text("T4"), spot=False)],
