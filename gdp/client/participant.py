@@ -308,6 +308,9 @@ class Participant:
         for writer_proxy in self._writer_proxies_due.poll_due(now.mono_s):
             writer_proxy.handle_timer(now.mono_s)
             self._reporting[writer_proxy] = None
+            subscription = self._subscriptions.get(writer_proxy.topic)
+            if subscription is not None:  # it may have gone on without what is lost
+                self._messages += subscription.poll_messages(writer_proxy.publisher)
         self.flush(now.mono_s)
 
     def flush(self, now_s: float) -> None:

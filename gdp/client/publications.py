@@ -173,6 +173,8 @@ class Publications:
     def receive_join(self, join: Join, now_s: float) -> None:
         """Note that a tree is installed, and its MTU."""
         publisher = self._publishers.get(join.topic)
+        if publisher is not None and join.publisher == self._source.name and join.path > 1:
+            publisher.second_path_until_s = now_s + join.lease_s
         if publisher is not None and join.publisher == self._source.name and join.lease_s > 0:
             path = self._paths.setdefault(join.topic, PathMtu())
             mtu, is_split = path.receive_mtu(join.mtu, now_s), False

@@ -49,9 +49,10 @@ class Publisher:
         past: last numbers of an earlier publisher of the same topic, in this incarnation.
         patience: timeouts of its readers.
         address: destination of the frames; None: the topic.
-        paths: 2: a second copy of each frame is sent, marked for the second path.
+        paths: 2: a second copy of each frame is sent, marked for the second path, while there is one.
 
     Attributes:
+        second_path_until_s: monotonic second until which there is a second path, as far as known here.
         published: called when frames are ready to be polled, and when the publisher closes.
         has_more: the last ``poll_frames`` reached its limit.
 
@@ -76,6 +77,7 @@ class Publisher:
     ) -> None:
         self.topic = topic
         self.paths = paths
+        self.second_path_until_s = float("-inf")
         self._is_reliable = reliable
         self.is_urgent = urgent
         self.has_more = False
@@ -309,13 +311,14 @@ class Publisher:
         if mtu is None or not self._readers:
             return []
         self._queue.seal_deferred()
-        limit = max(limit_bytes // (mtu * self.paths), 1)
+        copies = 2 if self.paths > 1 and now_s < self.second_path_until_s else 1
+        limit = max(limit_bytes // (mtu * copies), 1)
         frames = self._seal_status(now_s, mtu) if self._heartbeats.is_due(now_s) else []
         frames += self._queue.frames_to_send(now_s, limit - len(frames))
         self.has_more = len(frames) >= limit
         if frames:
             self._acknowledgements.last_sent_s = now_s
-        return frames if self.paths == 1 else [*frames, *map(second_path_copy, frames)]
+        return frames if copies == 1 else [*frames, *map(second_path_copy, frames)]
 
     def _set_flags(self) -> None:
         queue = self._queue

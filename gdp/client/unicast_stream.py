@@ -105,6 +105,7 @@ class UnicastStream(Publisher):
             address=self.reader.name,
             paths=paths,
         )
+        self.second_path_until_s = float("inf")  # no join tells of it; without one the first switch drops the copies
         self.tree_stands(MTU_MIN_BYTES if mtu is None else mtu)
 
     def mark_in_use(self, now_s: float) -> None:

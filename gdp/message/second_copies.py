@@ -15,7 +15,8 @@ from gdp.message.acknack import MissingRange
 __all__ = ["DeferredRequests", "SecondCopies"]
 
 _KEPT: Final = 256  # messages whose first fragment is remembered until its copy comes
-_FORGET_S: Final = 1.0  # without a copy for this time, one path is taken for broken, and nothing is awaited from it
+_FORGET_S: Final = 1.0  # fragments without a copy for this time: one path is broken, and nothing is awaited from it
+_IDLE_S: Final = 0.25  # a pause of the writer, which says nothing of its paths
 _LAG_MAX_S: Final = 0.5  # a path that is further behind is not awaited
 _SPREAD: Final = 1.25  # of the lag that was measured: the next one may be longer
 _DECAY: Final = 0.9  # of the estimate with each copy that came sooner
@@ -24,15 +25,18 @@ _DECAY: Final = 0.9  # of the estimate with each copy that came sooner
 class SecondCopies:
     """Delay of the later copies of one writer's fragments."""
 
-    __slots__ = ("_came", "_copied_s", "_lag_s")
+    __slots__ = ("_came", "_first_s", "_lag_s", "_since_s")
 
     def __init__(self) -> None:
         self._came: OrderedDict[int, tuple[int, float]] = OrderedDict()  # by message: a fragment, and when it came
-        self._copied_s = float("-inf")
+        self._first_s = self._since_s = float("-inf")  # the last first fragment; since when no copy has come
         self._lag_s = 0.0
 
     def handle_first(self, number: int, part: int, now_s: float) -> None:
         """Note the first fragment that came of a message; later ones of it are ignored."""
+        if now_s - self._first_s > _IDLE_S:
+            self._since_s = now_s
+        self._first_s = now_s
         if number not in self._came:
             self._came[number] = part, now_s
             if len(self._came) > _KEPT:
@@ -40,15 +44,15 @@ class SecondCopies:
 
     def handle_copy(self, number: int, part: int, now_s: float) -> None:
         """Note the copy of a fragment that had come before."""
-        self._copied_s = now_s
+        self._since_s = now_s
         first, came_s = self._came.get(number, (-1, now_s))
         if first == part:
             del self._came[number]
             self._lag_s = max(min(now_s - came_s, _LAG_MAX_S), self._lag_s * _DECAY)
 
-    def lag_s(self, now_s: float) -> float:
+    def lag_s(self) -> float:
         """Return how long to wait for the slower path; 0 while one path brings nothing."""
-        return _SPREAD * self._lag_s if now_s - self._copied_s < _FORGET_S else 0.0
+        return _SPREAD * self._lag_s if self._first_s - self._since_s < _FORGET_S else 0.0
 
 
 class DeferredRequests:

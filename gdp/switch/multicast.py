@@ -401,9 +401,12 @@ class MulticastTrees:
             branch.route = () if pair is None else pair.first
         second = self.trees.get(first.topic, first.publisher, 2)
         if second is not None:
-            kept = wanting if pair is not None else {}
-            for at in [at for at, branch in second.branches.items() if branch.wants_pair and at not in kept]:
+            for at in [at for at, branch in second.branches.items() if branch.wants_pair and at not in wanting]:
                 self._cut(second, at)
+            if pair is None:  # copies are still under way on the path that remains, which the first tree takes over
+                for branch in second.branches.values():
+                    if branch.wants_pair:
+                        branch.expires_s = min(branch.expires_s, now_s + _OVERLAP_S)
         if pair is None:
             return
         second = self._tree(first.topic, first.publisher, first.allowed, 2)
