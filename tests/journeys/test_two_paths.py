@@ -145,7 +145,7 @@ def test_two_links_between_the_same_switches_carry_one_copy_each() -> None:
     at.copies.clear()
     flow.stream(1, PERIOD_S, size=100)
     at.world.network.run(1.0)
-    assert sum(count for (a, b, _, _), count in at.copies.items() if (a, b) == ("s0", "s1")) == 2
+    assert sum(count for key, count in at.copies.items() if key[:2] == ("s0", "s1")) == 2
     trees = [at.trees(flow.topic.name, path)["s1"] for path in (1, 2)]
     assert trees[0].upstream != trees[1].upstream
     assert flow.numbers("s2/rs2") == [0]
