@@ -12,10 +12,13 @@ from itertools import pairwise
 import networkx as nx
 import pytest
 
+from gdp.control.join import Join, RouteLink
+from gdp.crypto.statements import parse
+from gdp.errors import StatementError
 from gdp.frame.codec import ETHER_BYTES, SECOND_PATH, decode, second_path_key
 from gdp.frame.kinds import Kind
 from gdp.limits import JOIN_LEASE_S
-from gdp.names import Name
+from gdp.names import ZERO, Name
 from gdp.simulation.network import SimLink
 from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
@@ -238,3 +241,92 @@ def test_over_one_path_alone_each_message_travels_once() -> None:
     flow.stream(10, PERIOD_S, size=100)
     at.world.network.run(2.0)
     assert flow.numbers("s2/rs2") == list(range(10))
+
+
+def test_every_reader_of_a_topic_gets_all_of_it_through_cuts_of_any_link() -> None:
+    links = [("s0", "s1", 10), ("s0", "s2", 10), ("s1", "s3", 10), ("s2", "s3", 10), ("s3", "s4", 10), ("s2", "s4", 10)]
+    at = site(links, ("s3", "s4"))
+    cut_each(at, flow_of(at, ("s3", "s4")), [at.cables[0], at.cables[3], at.cables[5]])
+
+
+def test_a_path_of_each_tree_crosses_to_another_domain_at_its_own_border() -> None:
+    links = [("s0", "s1", 10), ("s0", "s2", 10), ("s1", "s3", 10), ("s2", "s4", 10), ("s3", "s5", 10), ("s4", "s5", 10)]
+    topology = Topology(
+        tuple(Link(*link) for link in links),
+        (DomainPlan("cloud", ("s0", "s1", "s2")), DomainPlan("home", ("s3", "s4", "s5"), upper="cloud")),
+        (
+            Attachment("s0", "rib", "rib"), Attachment("s5", "rib", "rib"),
+            Attachment("s0", "proxy", "robot"), Attachment("s5", "proxy", "rs5"),
+        ),
+    )  # fmt: skip
+    world = Simulation(topology=topology)
+    at = Site(world, [(a, b, world.cables[frozenset((a, b))]) for a, b, _ in links])
+    world.network.taps.append(at.tap)
+    assert world.run_until_attached(20.0)
+    flow = flow_of(at, ("s5",))
+    assert {path: at.trees(flow.topic.name, path).keys() & {"s3", "s4"} for path in (1, 2)} in (
+        {1: {"s3"}, 2: {"s4"}},
+        {1: {"s4"}, 2: {"s3"}},
+    )
+    cut_each(at, flow, [at.cables[2], at.cables[4]])
+
+
+@pytest.mark.parametrize("wrong", ["a route that returns", "a route through the sender", "a backup", "one path asked"])
+def test_a_join_with_a_wrong_route_makes_no_tree(wrong: str) -> None:
+    at = site(TWO_UPLINKS, ("s2",))
+    flow = flow_of(at, ("s2",), asked=1 if wrong == "one path asked" else 2)
+    middle = at.world.switches["s1"]
+    sender, robot = (at.world.switches[label].name for label in ("s2", "s0"))
+    seen = at.trees(flow.topic.name, 1)["s2"]
+    neighbour = next(each for each in middle.hello_protocol.all_up() if each.name == sender)
+    route = {"a route that returns": middle.name, "a route through the sender": sender}.get(wrong, robot)
+    join = Join(
+        topic=flow.topic.name,
+        publisher=flow.member.name,
+        switch=robot,
+        domain=neighbour.domain,
+        allowed=frozenset({neighbour.domain}),
+        mtu=1_500,
+        lease_s=5.0,
+        evidence=seen.evidence,
+        session=bytes(16),
+        sequence=1 << 62,
+        version=seen.version,
+        proof=seen.proof,
+        path=2,
+        route=(RouteLink(route, 1), RouteLink(robot, 2)) if route != robot else (RouteLink(robot, 1),),
+        backup_for=sender if wrong == "a backup" else ZERO,
+    )
+    now = at.world.network.now
+    check = partial(middle.multicast.join, join, neighbour, now.mono_s)
+    if wrong == "one path asked":
+        check = partial(middle._evidence.of_join, join, now)
+    with pytest.raises(StatementError):
+        check()
+
+
+def test_a_statement_with_a_switch_twice_in_its_route_is_malformed() -> None:
+    at = site(TWO_UPLINKS, ("s2",))
+    flow = flow_of(at, ("s2",))
+    tree = at.trees(flow.topic.name, 2)["s2"]
+    link = RouteLink(Name(b"a" * 32), 1)
+    for route in ((link, link), (link,) * 40, (RouteLink(ZERO, 1),), (RouteLink(link.name, 1 << 32),)):
+        join = Join(
+            topic=tree.topic, publisher=tree.publisher, switch=tree.switch, domain=tree.domain, allowed=tree.allowed,
+            mtu=1_500, lease_s=5.0, evidence=b"", session=bytes(16), sequence=1, path=2, route=route,
+        )  # fmt: skip
+        identity = at.world.identities["s2"]
+        statement = parse(join.to_wire(identity.name, identity.key))
+        with pytest.raises(StatementError, match=r"route|list"):
+            Join.from_fields(statement.fields)
+
+
+def test_status_counts_what_the_flows_have() -> None:
+    at = site(TWO_UPLINKS, ("s2",))
+    flow_of(at, ("s2",))
+    counts = at.world.switches["s2"].multicast.path_counts
+    assert counts() == {"disjoint": 0, "shared": 1, "single": 0}
+    at.world.network.set_link(at.cables[1][2], up=False)
+    at.world.network.run(1.0)
+    assert counts() == {"disjoint": 0, "shared": 0, "single": 1}
+    assert sum(at.world.switches["s1"].multicast.path_counts().values()) == 0
