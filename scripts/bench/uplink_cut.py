@@ -18,6 +18,7 @@ from __future__ import annotations
 import struct
 import threading
 import time
+from collections.abc import Mapping
 from contextlib import ExitStack
 from itertools import pairwise
 from typing import Final
@@ -188,7 +189,7 @@ def start(laboratory: Laboratory, stack: ExitStack) -> dict[int, Flow]:
     return flows
 
 
-def _has_pair(status: dict[str, object]) -> bool:
+def _has_pair(status: Mapping[str, object]) -> bool:
     """Return whether the reader's switch has two paths for the flow; both use its own uplink."""
     counters = status["counters"]
     assert isinstance(counters, dict)

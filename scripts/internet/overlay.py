@@ -165,7 +165,7 @@ class Overlay:
         assert isinstance(rows, list)
         return {self._labels[str(row["peer"])]: row for row in rows}
 
-    def status(self, host: Host) -> dict[str, object]:
+    def status(self, host: Host) -> Mapping[str, object]:
         """Return the status of a host's switch."""
         return ask_node(find_control_socket(self.switch_folder(host.label)), Command.STATUS, _PATIENCE_S).result
 
