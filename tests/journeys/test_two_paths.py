@@ -162,11 +162,16 @@ def test_reports_to_the_publisher_take_both_paths() -> None:
     at.world.network.run(3.0)
     assert at.reports["s1", "s0", 0] > 0
     assert at.reports["s1", "s0", SECOND_PATH] == at.reports["s1", "s0", 0]
-    ports = {
-        at.world.switches["s1"].table.entries[key][0][0]
-        for key in (bytes(flow.member.name), second_path_key(flow.member.name))
-    }
-    assert len(ports) == 2
+    assert len(ports_to(at, flow, "s1")) == 2
+    at.world.network.set_cost(at.cables[1][2], 9)  # now the first copies take the link of the second tree
+    at.world.network.run(3.0)
+    assert len(ports_to(at, flow, "s1")) == 2
+
+
+def ports_to(at: Site, flow: Flow, label: str) -> set[int]:
+    """Return the ports by which both copies of a frame to the publisher leave a switch."""
+    entries = at.world.switches[label].table.entries
+    return {entries[key][0][0] for key in (bytes(flow.member.name), second_path_key(flow.member.name))}
 
 
 def test_a_cut_of_either_uplink_delays_no_message() -> None:
