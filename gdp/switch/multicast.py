@@ -96,6 +96,7 @@ class MulticastTrees:
         self._reader_shares = Shares(READERS_MAX)
         self._readers_end_s = float("inf")  # no reader's lease ends before
         self._branch_shares = Shares(TREES_MAX)
+        self._paired: set[tuple[Name, Name]] = set()  # topics and publishers that readers here want over two paths
         self._second: dict[Name, dict[Name, Tree]] = {}  # trees of second copies, by publisher and topic
         self.trees = Trees()
         self.drops: Counter[DropReason] = Counter()
@@ -262,13 +263,8 @@ class MulticastTrees:
         there is one path at most.
         """
         counts = dict.fromkeys(("disjoint", "shared", "single"), 0)
-        topics = [
-            topic
-            for topic, readers in self._readers.items()
-            if any(reader.advertisement.paths == 2 for reader in readers.values())
-        ]
-        for tree in (tree for topic in topics for tree in self.trees.of_topic(topic)):
-            if tree.path == 1 and any(branch.wants_pair for branch in tree.branches.values()):
+        for tree in (self.trees.get(*each) for each in self._paired):
+            if tree is not None and any(branch.wants_pair for branch in tree.branches.values()):
                 pair = self._pairs.present(tree.switch, tree.domain)
                 counts["single" if pair is None else "shared" if pair.is_shared else "disjoint"] += 1
         return counts
@@ -320,8 +316,12 @@ class MulticastTrees:
 
     def reroute(self, now_s: float) -> None:
         """Join again where the path to a publisher has changed."""
-        for tree in self.trees.all():
-            self._route_pair(tree, now_s)
+        for topic, publisher in list(self._paired):
+            tree = self.trees.get(topic, publisher)
+            if tree is None:
+                self._paired.discard((topic, publisher))
+            else:
+                self._route_pair(tree, now_s)
         for tree in self.trees.all():
             if self._follow(tree, now_s):
                 continue
@@ -329,6 +329,8 @@ class MulticastTrees:
                 self._install(tree)
             if tree.path == 2 or tree.asked_route or tree.guide is not None:
                 self._restate(tree)
+        for publisher in list(self._second):
+            self._install_to_publisher(publisher)
 
     def handle_timer(self, now_s: float) -> list[Name]:
         """Prune and renew trees; return the topics that lost their last reader here."""
@@ -396,6 +398,10 @@ class MulticastTrees:
         wanting = {at: branch for at, branch in first.branches.items() if branch.wants_pair}
         if first.path != 1 or not (wanting or self.trees.get(first.topic, first.publisher, 2)):
             return
+        if wanting:
+            self._paired.add((first.topic, first.publisher))
+        else:
+            self._paired.discard((first.topic, first.publisher))
         pair = self._pairs.to(first.switch, first.domain, now_s) if wanting else None
         for branch in wanting.values():
             branch.route = () if pair is None else pair.first
@@ -465,9 +471,21 @@ class MulticastTrees:
             self._table.remove(key)
             return
         tree = self._second[publisher][best[1]]
-        port, mac = tree.upstream or (0, b"")
+        port, mac = self._apart_from_ordinary(tree) or (0, b"")
         if not self._table.install(key, ((port, mac + macs[port]),), tree.expires_s()):
             self.drops[DropReason.QUOTA] += 1
+
+    def _apart_from_ordinary(self, second: Tree) -> Downstream | None:
+        """Return where second copies to the publisher of a second tree go: not over the link that first copies take.
+
+        Of parallel links to one neighbour the first copies take the cheapest, which may be that of the second tree.
+        """
+        first = self.trees.get(second.topic, second.publisher)
+        if first is None or first.upstream is None or first.upstream_name != second.upstream_name:
+            return second.upstream
+        ordinary = self._outbox.neighbour(first.upstream_name) if first.upstream_name is not None else None
+        is_taken = ordinary is not None and (ordinary.port, ordinary.mac) == second.upstream
+        return first.upstream if is_taken else second.upstream
 
     def _put_branch(self, tree: Tree, at: Downstream, branch: Branch) -> bool:
         """Add or replace a branch; return False, and remove a bare tree, where its neighbour has too many."""

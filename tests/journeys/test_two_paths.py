@@ -8,15 +8,17 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
-from typing import cast
 
 import networkx as nx
 import pytest
 
+from gdp.control.join import Join, RouteLink
+from gdp.crypto.statements import parse
+from gdp.errors import StatementError
 from gdp.frame.codec import ETHER_BYTES, SECOND_PATH, decode, second_path_key
 from gdp.frame.kinds import Kind
 from gdp.limits import JOIN_LEASE_S
-from gdp.names import Name
+from gdp.names import ZERO, Name
 from gdp.simulation.network import SimLink
 from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
@@ -146,7 +148,7 @@ def test_two_links_between_the_same_switches_carry_one_copy_each() -> None:
     at.copies.clear()
     flow.stream(1, PERIOD_S, size=100)
     at.world.network.run(1.0)
-    assert sum(count for (a, b, _, _), count in at.copies.items() if (a, b) == ("s0", "s1")) == 2
+    assert sum(count for key, count in at.copies.items() if key[:2] == ("s0", "s1")) == 2
     trees = [at.trees(flow.topic.name, path)["s1"] for path in (1, 2)]
     assert trees[0].upstream != trees[1].upstream
     assert flow.numbers("s2/rs2") == [0]
@@ -160,11 +162,16 @@ def test_reports_to_the_publisher_take_both_paths() -> None:
     at.world.network.run(3.0)
     assert at.reports["s1", "s0", 0] > 0
     assert at.reports["s1", "s0", SECOND_PATH] == at.reports["s1", "s0", 0]
-    ports = {
-        at.world.switches["s1"].table.entries[key][0][0]
-        for key in (bytes(flow.member.name), second_path_key(flow.member.name))
-    }
-    assert len(ports) == 2
+    assert len(ports_to(at, flow, "s1")) == 2
+    at.world.network.set_cost(at.cables[1][2], 9)  # now the first copies take the link of the second tree
+    at.world.network.run(3.0)
+    assert len(ports_to(at, flow, "s1")) == 2
+
+
+def ports_to(at: Site, flow: Flow, label: str) -> set[int]:
+    """Return the ports by which both copies of a frame to the publisher leave a switch."""
+    entries = at.world.switches[label].table.entries
+    return {entries[key][0][0] for key in (bytes(flow.member.name), second_path_key(flow.member.name))}
 
 
 def test_a_cut_of_either_uplink_delays_no_message() -> None:
@@ -186,13 +193,8 @@ def drawn(seed: int) -> list[tuple[str, str, int]]:
         graph: nx.MultiGraph[int] = nx.MultiGraph(nx.gnm_random_graph(size, rng.randint(size - 1, 2 * size), seed=rng))
         for _ in range(rng.randint(0, 3)):
             graph.add_edge(*rng.choice([*pairwise(range(size))]))
-        if nx.is_connected(graph) and nx.edge_connectivity(nx.Graph(graph)) >= 1 and not _has_bridge(graph):
+        if nx.is_connected(graph) and not nx.has_bridges(graph):
             return [(f"s{a}", f"s{b}", rng.randint(5, 20)) for a, b in sorted(graph.edges())]
-
-
-def _has_bridge(graph: nx.MultiGraph[int]) -> bool:
-    bridges = cast("list[tuple[int, int]]", list(nx.bridges(nx.Graph(graph))))
-    return any(graph.number_of_edges(a, b) == 1 for a, b in bridges)
 
 
 @pytest.mark.parametrize("seed", range(1, 9))
@@ -240,3 +242,92 @@ def test_over_one_path_alone_each_message_travels_once() -> None:
     flow.stream(10, PERIOD_S, size=100)
     at.world.network.run(2.0)
     assert flow.numbers("s2/rs2") == list(range(10))
+
+
+def test_every_reader_of_a_topic_gets_all_of_it_through_cuts_of_any_link() -> None:
+    links = [("s0", "s1", 10), ("s0", "s2", 10), ("s1", "s3", 10), ("s2", "s3", 10), ("s3", "s4", 10), ("s2", "s4", 10)]
+    at = site(links, ("s3", "s4"))
+    cut_each(at, flow_of(at, ("s3", "s4")), [at.cables[0], at.cables[3], at.cables[5]])
+
+
+def test_a_path_of_each_tree_crosses_to_another_domain_at_its_own_border() -> None:
+    links = [("s0", "s1", 10), ("s0", "s2", 10), ("s1", "s3", 10), ("s2", "s4", 10), ("s3", "s5", 10), ("s4", "s5", 10)]
+    topology = Topology(
+        tuple(Link(*link) for link in links),
+        (DomainPlan("cloud", ("s0", "s1", "s2")), DomainPlan("home", ("s3", "s4", "s5"), upper="cloud")),
+        (
+            Attachment("s0", "rib", "rib"), Attachment("s5", "rib", "rib"),
+            Attachment("s0", "proxy", "robot"), Attachment("s5", "proxy", "rs5"),
+        ),
+    )  # fmt: skip
+    world = Simulation(topology=topology)
+    at = Site(world, [(a, b, world.cables[frozenset((a, b))]) for a, b, _ in links])
+    world.network.taps.append(at.tap)
+    assert world.run_until_attached(20.0)
+    flow = flow_of(at, ("s5",))
+    assert {path: at.trees(flow.topic.name, path).keys() & {"s3", "s4"} for path in (1, 2)} in (
+        {1: {"s3"}, 2: {"s4"}},
+        {1: {"s4"}, 2: {"s3"}},
+    )
+    cut_each(at, flow, [at.cables[2], at.cables[4]])
+
+
+@pytest.mark.parametrize("wrong", ["a route that returns", "a route through the sender", "a backup", "one path asked"])
+def test_a_join_with_a_wrong_route_makes_no_tree(wrong: str) -> None:
+    at = site(TWO_UPLINKS, ("s2",))
+    flow = flow_of(at, ("s2",), asked=1 if wrong == "one path asked" else 2)
+    middle = at.world.switches["s1"]
+    sender, robot = (at.world.switches[label].name for label in ("s2", "s0"))
+    seen = at.trees(flow.topic.name, 1)["s2"]
+    neighbour = next(each for each in middle.hello_protocol.all_up() if each.name == sender)
+    route = {"a route that returns": middle.name, "a route through the sender": sender}.get(wrong, robot)
+    join = Join(
+        topic=flow.topic.name,
+        publisher=flow.member.name,
+        switch=robot,
+        domain=neighbour.domain,
+        allowed=frozenset({neighbour.domain}),
+        mtu=1_500,
+        lease_s=5.0,
+        evidence=seen.evidence,
+        session=bytes(16),
+        sequence=1 << 62,
+        version=seen.version,
+        proof=seen.proof,
+        path=2,
+        route=(RouteLink(route, 1), RouteLink(robot, 2)) if route != robot else (RouteLink(robot, 1),),
+        backup_for=sender if wrong == "a backup" else ZERO,
+    )
+    now = at.world.network.now
+    check: Callable[[], object] = partial(middle.multicast.join, join, neighbour, now.mono_s)
+    if wrong == "one path asked":
+        check = partial(middle._evidence.of_join, join, now)
+    with pytest.raises(StatementError):
+        check()
+
+
+def test_a_statement_with_a_switch_twice_in_its_route_is_malformed() -> None:
+    at = site(TWO_UPLINKS, ("s2",))
+    flow = flow_of(at, ("s2",))
+    tree = at.trees(flow.topic.name, 2)["s2"]
+    link = RouteLink(Name(b"a" * 32), 1)
+    for route in ((link, link), (link,) * 40, (RouteLink(ZERO, 1),), (RouteLink(link.name, 1 << 32),)):
+        join = Join(
+            topic=tree.topic, publisher=tree.publisher, switch=tree.switch, domain=tree.domain, allowed=tree.allowed,
+            mtu=1_500, lease_s=5.0, evidence=b"", session=bytes(16), sequence=1, path=2, route=route,
+        )  # fmt: skip
+        identity = at.world.identities["s2"]
+        statement = parse(join.to_wire(identity.name, identity.key))
+        with pytest.raises(StatementError, match=r"route|list"):
+            Join.from_fields(statement.fields)
+
+
+def test_status_counts_what_the_flows_have() -> None:
+    at = site(TWO_UPLINKS, ("s2",))
+    flow_of(at, ("s2",))
+    counts = at.world.switches["s2"].multicast.path_counts
+    assert counts() == {"disjoint": 0, "shared": 1, "single": 0}
+    at.world.network.set_link(at.cables[1][2], up=False)
+    at.world.network.run(1.0)
+    assert counts() == {"disjoint": 0, "shared": 0, "single": 1}
+    assert sum(at.world.switches["s1"].multicast.path_counts().values()) == 0
