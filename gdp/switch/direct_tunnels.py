@@ -147,8 +147,8 @@ def _class_of(candidate: Candidate) -> _Class | None:
         return _Class.PUBLIC
     if address.version == 6:
         return _Class.IPV6
-    is_private = candidate.type is CandidateType.HOST and any(address in each for each in _PRIVATE)
-    return _Class.HOST if is_private else _Class.REFLEXIVE
+    is_host = candidate.type is CandidateType.HOST and candidate.endpoint.is_private
+    return _Class.HOST if is_host else _Class.REFLEXIVE
 
 
 def _is_matched(
@@ -170,9 +170,6 @@ def _is_matched(
 
 
 _UNIQUE_LOCAL: Final = ipaddress.ip_network("fc00::/7")  # RFC 4193
-_PRIVATE: Final = tuple(
-    ipaddress.ip_network(each) for each in ("10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "100.64.0.0/10")
-)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -203,6 +200,7 @@ class DirectTunnels:
         self._maximum = maximum
         self._attempts: dict[Name, _Attempt] = {}
         self._own: EndpointRecord | None = None
+        self._ranks: dict[Name, bytes] = {}  # of the members at the last call of ``peers``
 
     def peers(self, members: Iterable[Name], linked: Collection[Name]) -> list[Name]:
         """Return the switches whose records are of use, the most preferred first.
@@ -211,7 +209,8 @@ class DirectTunnels:
         compute, so that with more than ``maximum`` members both ends tend to choose each other.
         """
         others = {each for each in members if each != self._me and each not in linked} - self._attempts.keys()
-        return [*self._attempts, *sorted(others, key=self._rank)]
+        self._ranks = {name: self._rank(name) for name in others}
+        return [*self._attempts, *sorted(others, key=self._ranks.__getitem__)]
 
     def poll_actions(
         self,
@@ -334,7 +333,7 @@ class DirectTunnels:
         return pause_s * (1 - _JITTER + 2 * _JITTER * draw)
 
     def _rank(self, peer: Name) -> bytes:
-        return self._hash(peer, b"rank")
+        return self._ranks.get(peer) or self._hash(peer, b"rank")
 
     def _hash(self, peer: Name, about: bytes) -> bytes:
         return hashlib.sha256(b"gdp direct tunnel\0" + min(self._me, peer) + max(self._me, peer) + about).digest()
