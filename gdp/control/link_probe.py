@@ -5,7 +5,8 @@ when it is silent, or when this node's address on an uplink has changed. It is p
 another link answers polls meanwhile::
 
     reason of the probe   link that must answer                     what follows
-    silence               to the same neighbour                     its node is alive, so this link has failed
+    silence               to the same neighbour                     its node is alive, so this link has failed, and
+                                                                    silent ones over the same uplink have, too
     changed address       to the same neighbour, or of this uplink  the uplink works, but not towards this neighbour
 
 So a node that is slow, and an uplink that is not usable yet, have the whole detection time. A link has answered if a

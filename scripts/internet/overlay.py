@@ -93,7 +93,9 @@ class Overlay:
         lease = host.lease(host.devices[0])
         own = [Endpoint(address.partition("/")[0], LISTEN) for address in (lease.address, lease.address6) if address]
         endpoints = own if is_border else []
-        record = own_record(made, 1, public_candidates(endpoints))
+        uplinks = (links or {}).get("uplinks", ())
+        assert isinstance(uplinks, Sequence)
+        record = own_record(made, max(len(uplinks), 1), public_candidates(endpoints))
         write_all(self.folder / "records", {f"{label}{RECORD_SUFFIX}": public(record.wire)}, force=True)
         for one, other in ((label, border.label) for border in borders):
             self._copy_record(one, other)

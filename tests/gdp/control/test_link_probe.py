@@ -21,7 +21,7 @@ from gdp.frame.kinds import Kind
 from gdp.sansio import BROADCAST, ReceivedFrame
 from tests.gdp.control.members import POLICY, UNIX_S, Nonces, at, node, statement_of
 
-ROBOT, BORDER, SERVER = node("robot"), node("border"), node("server")
+ROBOT, BORDER, SERVER, OTHER = (node(label) for label in ("robot", "border", "server", "other"))
 STEP_S = 0.005
 DELAY_S = 0.005
 EARLY_S = 0.1
@@ -182,6 +182,29 @@ def test_an_address_that_a_border_sees_changed_has_the_other_tunnels_probed(one_
     one_uplink.run(0.5)
     assert robot.observed_addresses()[0, BORDER.name].address == "192.0.2.9"
     assert one_uplink.gone["robot", 1] - begun_s < 2 * EARLY_S
+
+
+def test_with_an_uplink_all_its_silent_tunnels_fail_and_those_that_answer_stay() -> None:
+    mesh = Mesh(
+        {"robot": ROBOT, "border": BORDER, "server": SERVER, "other": OTHER},
+        [
+            (("robot", 0), ("border", 0)),
+            (("robot", 1), ("border", 1)),
+            (("robot", 2), ("server", 0)),
+            (("robot", 3), ("other", 0)),
+        ],
+    )
+    for port, uplink in ((0, 0), (1, 1), (2, 0), (3, 0)):
+        mesh.nodes["robot"].set_uplink(port, uplink)
+    mesh.run(3.0)
+    mesh.fail(("robot", 0))
+    mesh.fail(("robot", 2))
+    begun_s = mesh.now_s
+    mesh.run(0.5)
+    assert {end: gone_s - begun_s < 0.25 for end, gone_s in mesh.gone.items() if end[0] == "robot"} == {
+        ("robot", 0): True,
+        ("robot", 2): True,
+    }
 
 
 def test_a_neighbour_that_polls_is_reported_once(one_uplink: Mesh) -> None:
