@@ -731,12 +731,14 @@ class HelloProtocol:
         probe = session.probe
         if probe is None:
             return float("inf")
-        others = self._others(neighbour, of_uplink=probe.is_moved)
-        has_answer = any(each.quality.confirmed_s >= probe.since_s for each in others)
-        if not probe.is_moved and neighbour.port in self._uplinks:
-            failed_s = self._failed_s.get(self._uplinks[neighbour.port], float("-inf"))
-            has_answer = has_answer or failed_s >= probe.since_s - _UPLINK_FAILS_S
-        return probe.fails_at_s(session.quality.rtt) if has_answer else float("inf")
+        for other in self._others(neighbour, of_uplink=probe.is_moved):
+            probe.note_other(other.quality.confirmed_s)
+        uplink = self._uplinks.get(neighbour.port)
+        if not probe.is_moved and uplink is not None:
+            failed_s = self._failed_s.get(uplink, float("-inf"))
+            if failed_s >= probe.since_s - _UPLINK_FAILS_S:
+                probe.note_other(probe.since_s)
+        return probe.fails_at_s(session.quality.rtt)
 
     def _alive(self, neighbour: Neighbour, heard_s: float) -> None:
         neighbour.heard_s, neighbour.lateness_s, neighbour.let_go_s = heard_s, self._lateness_s, None

@@ -133,7 +133,7 @@ def test_a_far_end_that_pauses_on_all_links_is_given_its_whole_time(two_links: M
 
 def test_a_few_lost_keepalives_end_no_link(two_links: Mesh) -> None:
     two_links.fail(("robot", 0))
-    two_links.run(0.1)
+    two_links.run(0.04)
     two_links.cut.clear()
     two_links.run(1.0)
     assert two_links.gone == {}
@@ -227,5 +227,14 @@ def test_a_slow_link_has_more_time_to_answer() -> None:
 
 
 def test_one_poll_alone_ends_nothing() -> None:
-    probe = LinkProbe(since_s=0.0, polls=1)
+    probe = LinkProbe(since_s=0.0, polls=1, worked_s=0.0)
     assert probe.fails_at_s(RttEstimator()) == float("inf")
+
+
+def test_patience_begins_when_another_link_works() -> None:
+    probe = LinkProbe(since_s=1.0, polls=9)
+    probe.note_other(0.9)  # before the probe: it shows nothing
+    assert probe.fails_at_s(RttEstimator()) == float("inf")
+    probe.note_other(3.0)
+    probe.note_other(4.0)
+    assert probe.fails_at_s(RttEstimator()) == 3.0 + patience_s(RttEstimator())
