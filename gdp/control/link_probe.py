@@ -5,7 +5,8 @@ when it is silent, or when this node's address on an uplink has changed. It is p
 another link answers polls meanwhile::
 
     reason of the probe   link that must answer                     what follows
-    silence               to the same neighbour                     its node is alive, so this link has failed
+    silence               to the same neighbour                     its node is alive, so this link has failed, and
+                                                                    silent ones over the same uplink have, too
     changed address       to the same neighbour, or of this uplink  the uplink works, but not towards this neighbour
 
 So a node that is slow, and an uplink that is not usable yet, have the whole detection time. A link has answered if a
@@ -36,11 +37,13 @@ class LinkProbe:
         since_s: when it began.
         is_moved: this node's address has changed; otherwise the neighbour is silent.
         polls: number of polls that were sent.
+        worked_s: since when it is known that other links answer; None: it is not known.
     """
 
     since_s: float
     is_moved: bool = False
     polls: int = 0
+    worked_s: float | None = None
 
     def is_answered(self, confirmed_s: float) -> bool:
         """Return whether a keepalive of the probed neighbour ends the probe.
@@ -49,11 +52,22 @@ class LinkProbe:
             confirmed_s: when the last of our keepalives that the neighbour has echoed was sent. After a change of the
                 address, keepalives to the former one may still arrive, and show nothing.
         """
-        return not self.is_moved or confirmed_s >= self.since_s
+        return not self.is_moved or self._covers(confirmed_s)
+
+    def note_other(self, confirmed_s: float) -> None:
+        """Note that another link has answered a keepalive that was sent then; the first one after the begin counts."""
+        if self.worked_s is None and self._covers(confirmed_s):
+            self.worked_s = confirmed_s
+
+    def _covers(self, sent_s: float) -> bool:
+        """Return whether a keepalive of ours was sent in this probe, of a moved node not from its former address."""
+        return sent_s > self.since_s or (sent_s == self.since_s and not self.is_moved)
 
     def fails_at_s(self, rtt: RttEstimator) -> float:
-        """Return when the neighbour is lost if another link has answered; never before ``POLLS_MIN`` polls."""
-        return self.since_s + patience_s(rtt) if self.polls >= POLLS_MIN else float("inf")
+        """Return when the neighbour is lost; never unless another link works, and not before ``POLLS_MIN`` polls."""
+        if self.worked_s is None or self.polls < POLLS_MIN:
+            return float("inf")
+        return self.worked_s + patience_s(rtt)
 
 
 def patience_s(rtt: RttEstimator) -> float:

@@ -77,6 +77,7 @@ _LATE_S: Final = 0.02  # later than this, the node itself was not scheduled in t
 _CLASH_S: Final = 3.0  # another node must have our identity for this time
 _CLASH_PAUSE_S: Final = 10.0  # above the time between two idle hellos
 _OTHERS_MAX: Final = 4  # links that are polled because a neighbour is silent
+_UPLINK_FAILS_S: Final = 0.2  # the links over an uplink that fails become silent within this time
 _TOGETHER: Final = 0.125  # of an interval: keepalives due within it leave at once
 
 # A neighbour after the change, and its state before; the same state if only the link to it changed, MTU or cost.
@@ -117,6 +118,7 @@ class HelloProtocol:
         self._timing = settings.timing  # where ``set_timing`` sets no other for a port
         self._timings: dict[int, Timing] = {}
         self._uplinks: dict[int, int] = {}  # of ports whose links share one
+        self._failed_s: dict[int, float] = {}  # by uplink: when a link over it failed alone
         self._is_probing = False  # some neighbour is
         self._polled: set[int] = set()  # ports at which a neighbour has polled us
         self._incarnation = settings.incarnation
@@ -618,6 +620,7 @@ class HelloProtocol:
         for port in self.ports.values():
             silent = [n for n in port.neighbours.values() if now_s >= self._gone_at_s(n)]
             if silent:
+                self._note_failed(port, silent, now_s)
                 if any(each.is_proven for each in silent):
                     port.hurry(now_s)  # a neighbour that still receives us learns at once that we do not receive it
                 changes += self._lose(port, silent, NeighbourEvent.SILENCE)
@@ -713,14 +716,29 @@ class HelloProtocol:
         hellos_end_s = max(neighbour.greeted_s, flooded_until_s) + _HELLOS_MISSED * HELLO_IDLE * self._hello_s
         return min(neighbour.heard_s + session.detect_s, hellos_end_s, self._failed_at_s(neighbour, session)) + late_s
 
+    def _note_failed(self, port: HelloPort, lost: list[Neighbour], now_s: float) -> None:
+        """Note that an uplink has failed, if it no longer reaches a node that another link reaches."""
+        for neighbour in lost:
+            session = neighbour.keepalives
+            if session is None or session.probe is None or session.probe.is_moved or port.index not in self._uplinks:
+                continue
+            if now_s >= self._failed_at_s(neighbour, session):
+                self._failed_s[self._uplinks[port.index]] = now_s
+                self._next_s = None
+
     def _failed_at_s(self, neighbour: Neighbour, session: KeepaliveSession) -> float:
         """Return when a probe ends the neighbour: never unless another link has answered since it began."""
         probe = session.probe
         if probe is None:
             return float("inf")
-        others = self._others(neighbour, of_uplink=probe.is_moved)
-        has_answer = any(each.quality.confirmed_s >= probe.since_s for each in others)
-        return probe.fails_at_s(session.quality.rtt) if has_answer else float("inf")
+        for other in self._others(neighbour, of_uplink=probe.is_moved):
+            probe.note_other(other.quality.confirmed_s)
+        uplink = self._uplinks.get(neighbour.port)
+        if not probe.is_moved and uplink is not None:
+            failed_s = self._failed_s.get(uplink, float("-inf"))
+            if failed_s >= probe.since_s - _UPLINK_FAILS_S:
+                probe.note_other(probe.since_s)
+        return probe.fails_at_s(session.quality.rtt)
 
     def _alive(self, neighbour: Neighbour, heard_s: float) -> None:
         neighbour.heard_s, neighbour.lateness_s, neighbour.let_go_s = heard_s, self._lateness_s, None

@@ -21,7 +21,7 @@ from gdp.frame.kinds import Kind
 from gdp.sansio import BROADCAST, ReceivedFrame
 from tests.gdp.control.members import POLICY, UNIX_S, Nonces, at, node, statement_of
 
-ROBOT, BORDER, SERVER = node("robot"), node("border"), node("server")
+ROBOT, BORDER, SERVER, OTHER = (node(label) for label in ("robot", "border", "server", "other"))
 STEP_S = 0.005
 DELAY_S = 0.005
 EARLY_S = 0.1
@@ -133,7 +133,7 @@ def test_a_far_end_that_pauses_on_all_links_is_given_its_whole_time(two_links: M
 
 def test_a_few_lost_keepalives_end_no_link(two_links: Mesh) -> None:
     two_links.fail(("robot", 0))
-    two_links.run(0.1)
+    two_links.run(0.04)
     two_links.cut.clear()
     two_links.run(1.0)
     assert two_links.gone == {}
@@ -184,6 +184,29 @@ def test_an_address_that_a_border_sees_changed_has_the_other_tunnels_probed(one_
     assert one_uplink.gone["robot", 1] - begun_s < 2 * EARLY_S
 
 
+def test_with_an_uplink_all_its_silent_tunnels_fail_and_those_that_answer_stay() -> None:
+    mesh = Mesh(
+        {"robot": ROBOT, "border": BORDER, "server": SERVER, "other": OTHER},
+        [
+            (("robot", 0), ("border", 0)),
+            (("robot", 1), ("border", 1)),
+            (("robot", 2), ("server", 0)),
+            (("robot", 3), ("other", 0)),
+        ],
+    )
+    for port, uplink in ((0, 0), (1, 1), (2, 0), (3, 0)):
+        mesh.nodes["robot"].set_uplink(port, uplink)
+    mesh.run(3.0)
+    mesh.fail(("robot", 0))
+    mesh.fail(("robot", 2))
+    begun_s = mesh.now_s
+    mesh.run(0.5)
+    assert {end: gone_s - begun_s < 0.25 for end, gone_s in mesh.gone.items() if end[0] == "robot"} == {
+        ("robot", 0): True,
+        ("robot", 2): True,
+    }
+
+
 def test_a_neighbour_that_polls_is_reported_once(one_uplink: Mesh) -> None:
     border = one_uplink.nodes["border"]
     border.poll_polled()
@@ -204,5 +227,14 @@ def test_a_slow_link_has_more_time_to_answer() -> None:
 
 
 def test_one_poll_alone_ends_nothing() -> None:
-    probe = LinkProbe(since_s=0.0, polls=1)
+    probe = LinkProbe(since_s=0.0, polls=1, worked_s=0.0)
     assert probe.fails_at_s(RttEstimator()) == float("inf")
+
+
+def test_patience_begins_when_another_link_works() -> None:
+    probe = LinkProbe(since_s=1.0, polls=9)
+    probe.note_other(0.9)  # before the probe: it shows nothing
+    assert probe.fails_at_s(RttEstimator()) == float("inf")
+    probe.note_other(3.0)
+    probe.note_other(4.0)
+    assert probe.fails_at_s(RttEstimator()) == 3.0 + patience_s(RttEstimator())
