@@ -15,7 +15,9 @@ pytestmark = pytest.mark.netns
 
 _PATIENCE_S = 300.0
 needs_ros2 = pytest.mark.skipif(find_spec("rclpy") is None, reason="rclpy is not installed: scripts/setup.sh --ros2")
-needs_wireguard = pytest.mark.skipif(which("wireguard-go") is None, reason="wireguard-go is not installed")
+needs_wireguard = pytest.mark.skipif(
+    which("wireguard-go") is None or which("wg") is None, reason="wireguard-go or wireguard-tools is not installed"
+)
 
 
 @pytest.mark.parametrize(
