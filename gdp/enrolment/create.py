@@ -16,7 +16,7 @@ from typing import Final
 from gdp.control.endpoints import Endpoint
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
-from gdp.enrolment.domain_files import DOMAIN_FILE, DomainFiles
+from gdp.enrolment.domain_files import DOMAIN_FILE, MEMBER_DAYS, DomainFiles
 from gdp.enrolment.draft import draft_of, publish_draft, reserve_space
 from gdp.enrolment.member_setup import MachinePlan, write_configuration
 from gdp.enrolment.registry import Registry
@@ -101,7 +101,9 @@ def _fill(draft: Path, plan: DomainPlan, unix_s: float) -> None:
     make_owner(draft / "owner")
     identities = list[Identity]()
     for folder, role in _NODES:
-        identities.append(make_node(draft / folder, role, plan.label, draft / "domain", unix_s=unix_s))
+        identities.append(
+            make_node(draft / folder, role, plan.label, draft / "domain", days=MEMBER_DAYS, unix_s=unix_s)
+        )
     public_texts = [each.to_text() for each in plan.public]
     loopback = f"127.0.0.1:{plan.listen}"
     machine = MachinePlan(

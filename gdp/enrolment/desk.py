@@ -42,8 +42,8 @@ from gdp.names import Name
 from gdp.nodes.endpoint_files import own_record, public_candidates
 from gdp.stores.audit_log import AuditLog
 from gdp.stores.files import public, read_public, write_all
-from gdp.stores.issue import DAY_S, admit, renew
-from gdp.stores.keyring import OWNER_PUBLIC, ROOT_CERTIFICATE, load_identity, load_root
+from gdp.stores.issue import admit, renew
+from gdp.stores.keyring import NODE_CERTIFICATE, OWNER_PUBLIC, ROOT_CERTIFICATE, load_identity, load_root
 from gdp.trust.audit import Action, AuditTrail
 from gdp.trust.domain import Policy
 from gdp.trust.enrolment import MEMBERS_MAX, Application, token_id
@@ -59,7 +59,6 @@ log = logging.getLogger(__name__)
 PAGE: Final = 64  # machines or mails in one response
 _PROOF_BYTES: Final = 32
 _EARLY_SHARE: Final = 0.1  # a membership with less of its life used is not renewed
-_RECORD_S: Final = DAY_S  # a border's record is made again after this time
 _WHAT: Final = "enrolment"
 
 
@@ -92,7 +91,7 @@ class EnrolmentDesk:
         self._audit = AuditLog(files.config.domain)
         self._revocations: dict[Path, tuple[int, bytes]] = {}  # time of change, fingerprint of the certificate
         self._border: EndpointRecord | None = None
-        self._border_until_s = 0.0
+        self._border_certificate = b""
 
     @property
     def root(self) -> Root:
@@ -148,11 +147,11 @@ class EnrolmentDesk:
 
     def border_record(self, unix_s: float) -> EndpointRecord:
         """Return the border's endpoint record, which it signs itself."""
-        if self._border is None or unix_s >= self._border_until_s:
+        certificate = read_public(self._config.switch / NODE_CERTIFICATE)
+        if self._border is None or certificate != self._border_certificate:
             identity = load_identity(self._config.switch, unix_s)
             candidates = public_candidates([Endpoint.from_text(each) for each in self._config.public])
-            self._border = own_record(identity, 1, candidates)
-            self._border_until_s = min(unix_s + _RECORD_S, float(identity.member.not_after_unix_s))
+            self._border, self._border_certificate = own_record(identity, 1, candidates), certificate
         return self._border
 
     def identify(self, fields: Fields, binding: bytes, nonce: bytes, unix_s: float) -> Session:
@@ -245,17 +244,18 @@ class EnrolmentDesk:
         ]
         return {"ok": True, "nodes": listed}
 
-    def send(self, session: Session, fields: Fields) -> Name:
+    def send(self, session: Session, fields: Fields, unix_s: float) -> Name:
         """Store a mail and return its recipient.
 
         Raises:
             EnrolmentError: NO_MEMBER or MAILBOX_FULL.
-            StatementError: malformed, or not by this member.
+            StatementError: malformed, not by this member, or EXPIRED: under a membership that its recipient refuses.
         """
         self._member(session.machine)
         mail = Mail.from_wire(fields.bytes_("mail"))
         if mail.sender.subject.name != session.name:
             raise EnrolmentError(Refusal.WRONG_PROOF, "a mail by another sender")
+        mail.sender.validity.check(unix_s, "the membership in a mail")
         self._registry.add_mail(mail.to, session.name, mail.wire)
         return mail.to
 

@@ -14,6 +14,7 @@ program remembers the number of the last mail that it has handled, and deletes m
 
 from __future__ import annotations
 
+import logging
 import re
 import secrets
 import time
@@ -38,6 +39,8 @@ from gdp.trust.mail import Mail
 from gdp.trust.node_descriptor import NodeDescriptor
 
 __all__ = ["DomainClient", "Machine", "ReceivedMail", "delete_mail", "fetch_mail", "read_inbox"]
+
+log = logging.getLogger(__name__)
 
 MACHINES_PAGE: Final = 64
 MAIL_PAGE: Final = 64
@@ -159,9 +162,10 @@ class DomainClient:
             body: at most ``MAIL_BODY_MAX_BYTES``.
 
         Raises:
-            LocalError: kind or body are out of bounds.
+            LocalError: kind or body are out of bounds, or the membership has ended.
             EnrolmentError: no such node, its mailbox is full, or as ``Channel.request``.
         """
+        self.identity = load_identity(self._files.mail_identity, time.time())  # it may have been renewed
         self._channel.request({"op": "send", "mail": Mail.make(self.identity, to, kind, body, time.time())})
 
     def read_mails(self, since: int = 0) -> list[ReceivedMail]:
@@ -227,7 +231,8 @@ def read_inbox(inbox: Path, policy: Policy, recipient: Name, since: int) -> Iter
         try:
             mail = Mail.from_wire(read_private(path))
             sender = policy.verify_membership(mail.sender.wire, time.time())
-        except StatementError:
+        except StatementError as error:
+            log.warning("mail deleted file=%s reason=%s", path.name, error)
             path.unlink(missing_ok=True)
             continue
         if mail.to != recipient:

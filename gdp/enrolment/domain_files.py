@@ -21,9 +21,10 @@ from gdp.host_port import checked_host_port
 from gdp.nodes.schema import Directory, ExistingFile, Section, Unique, load
 from gdp.trust.join_token import SERVERS_MAX
 
-__all__ = ["DOMAIN_FILE", "DomainConfig", "DomainFiles"]
+__all__ = ["DOMAIN_FILE", "MEMBER_DAYS", "DomainConfig", "DomainFiles"]
 
 DOMAIN_FILE: Final = "domain.yaml"
+MEMBER_DAYS: Final = 30.0  # also of the border's first memberships
 
 
 def _endpoint(text: str) -> str:
@@ -54,7 +55,7 @@ class DomainConfig(Section):
     public: Annotated[tuple[Annotated[str, AfterValidator(_endpoint)], ...], Unique] = ()
     relays: Annotated[tuple[Annotated[str, AfterValidator(checked_host_port)], ...], Unique] = ()
     trusts: Annotated[tuple[ExistingFile, ...], Unique] = ()
-    member_days: float = Field(default=30.0, ge=0.001, le=3_650.0)
+    member_days: float = Field(default=MEMBER_DAYS, ge=0.001, le=3_650.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +17,7 @@ from gdp.enrolment.member_files import MEMBER_FILE
 from gdp.names import Name
 from gdp.nodes.config import LISTEN_DEFAULT
 from gdp.nodes.endpoint_files import RECORD_SUFFIX
-from gdp.stores.files import public, write_all
+from gdp.stores.files import public, read_public, write_all
 from gdp.stores.keyring import DELEGATIONS
 
 __all__ = [
@@ -26,6 +27,7 @@ __all__ = [
     "WATCH_IFACE",
     "MachinePlan",
     "record_file_name",
+    "update_relays",
     "write_configuration",
 ]
 
@@ -33,6 +35,7 @@ LISTEN_PORT: Final = LISTEN_DEFAULT  # of WireGuard; of the enrolment server the
 RELAY_PORT: Final = 443
 RELAY_FILE: Final = "relay.yaml"
 WATCH_IFACE: Final = "watch0"  # of a border: from there a launcher sees which replicas serve
+_BORDERS: Final = re.compile(r"^borders:\n(?:[ \t].*\n)*", re.MULTILINE)
 _FOLDERS: Final = ("peers", "revocations", "inbox", "state/switch", "state/rib", "state/proxy", "proxy.yaml.d")
 
 
@@ -89,6 +92,26 @@ def write_configuration(directory: Path, plan: MachinePlan, trusts: Sequence[str
     write_all(directory, {name: public(text.encode()) for name, text in texts.items()})
 
 
+def update_relays(directory: Path, relays: Mapping[Name, Sequence[str]]) -> bool:
+    """Write where the relays of borders are now into ``relay.yaml``; return whether that changed something.
+
+    Only the key ``borders`` is replaced. A machine without the file runs no relay, and a change to no relay at all
+    leaves what there is.
+
+    Raises:
+        LocalError: the file cannot be written.
+    """
+    path = directory / RELAY_FILE
+    if not path.exists() or not any(relays.values()):
+        return False
+    before = read_public(path).decode()
+    after, count = _BORDERS.subn(_borders({name: each for name, each in relays.items() if each}), before)
+    if not count or after == before:
+        return False
+    write_all(directory, {RELAY_FILE: public(after.encode())}, force=True)
+    return True
+
+
 def record_file_name(name: Name) -> str:
     """Return the name of a switch's file in a folder of peers."""
     return f"{name.to_text()}{RECORD_SUFFIX}"
@@ -122,11 +145,15 @@ def _switch(plan: MachinePlan, trusts: Sequence[str]) -> str:
 
 def _relay(plan: MachinePlan, trusts: Sequence[str]) -> str:
     lines = [f"server: {{port: {plan.relay_port}}}"] if plan.relay_port else []
-    if relays := {name: list(each) for name, each in plan.relays.items() if each}:
-        lines.append("borders:")
-        for name, endpoints in relays.items():
-            lines += [f'  - peer: "{name.to_text()}"', f"    endpoints: {json.dumps(endpoints)}"]
-    return _node("switch", trusts) + "revocations: revocations\n" + "\n".join([*lines, ""])
+    text = _node("switch", trusts) + "revocations: revocations\n" + "\n".join([*lines, ""])
+    return text + _borders({name: each for name, each in plan.relays.items() if each})
+
+
+def _borders(relays: Mapping[Name, Sequence[str]]) -> str:
+    lines = ["borders:"] if relays else []
+    for name, endpoints in relays.items():
+        lines += [f'  - peer: "{name.to_text()}"', f"    endpoints: {json.dumps(list(endpoints))}"]
+    return "\n".join([*lines, ""])
 
 
 def _proxy(trusts: Sequence[str]) -> str:

@@ -238,7 +238,7 @@ class EnrolmentServer:
             case "nodes":
                 return await self._work(desk.nodes, session, fields, self._is_online)
             case "send":
-                recipient = await self._work(desk.send, session, fields)
+                recipient = await self._work(desk.send, session, fields, now)
                 for event in self._news.get(bytes(recipient), ()):
                     event.set()
                 return {"ok": True}
