@@ -17,7 +17,7 @@ from typing import Final
 
 from gdp.control.endpoint_record import UPLINKS_MAX, EndpointRecord
 from gdp.control.endpoints import Endpoint, inner_address, tunnel_vni
-from gdp.control.tunnel_plan import TunnelId, tunnel_ifname, underlay_ifname
+from gdp.control.tunnel_plan import UNDERLAY_PREFIXES, TunnelId, tunnel_ifname, underlay_ifname
 from gdp.crypto.identity import Identity
 from gdp.crypto.tunnel_key import TunnelKey
 from gdp.errors import LocalError
@@ -25,10 +25,11 @@ from gdp.limits import COST_AUTO
 from gdp.names import Name
 from gdp.nodes.config import LinksConfig
 from gdp.nodes.runtime import Runtime
+from gdp.ports.tunnel.outside_filter import OutsideFilter
 from gdp.ports.tunnel.path_mtu import route_mtu, tunnel_mtu
 from gdp.ports.tunnel.rate_limit import limit_rate
 from gdp.ports.tunnel.uplink_routes import mark_of, remove_leftovers
-from gdp.ports.tunnel.vxlan import make_vxlan, remove_link, set_link_mtu
+from gdp.ports.tunnel.vxlan import VXLAN_PORT, make_vxlan, remove_link, set_link_mtu
 from gdp.ports.tunnel.wireguard import PeerState, WireGuardDevice, open_wireguard
 from gdp.sansio import Timestamps
 from gdp.switch.core import SwitchCore
@@ -83,6 +84,10 @@ def open_underlays(config: LinksConfig, identity: Identity) -> Iterator[tuple[Wi
     ifnames = [underlay_ifname(identity.name, uplink) for uplink in range(UPLINKS_MAX)]
     remove_leftovers(map(mark_of, ifnames))  # of a dead run, perhaps with more uplinks
     with contextlib.ExitStack() as stack:
+        try:
+            stack.callback(OutsideFilter(f"gdp-{ifnames[0]}", VXLAN_PORT, UNDERLAY_PREFIXES).close)
+        except LocalError as error:
+            log.warning("hosts that reach this one by IPv6 can send frames into its tunnels reason=%s", error)
         devices = []
         for uplink in range(max(len(config.uplinks), 1)):
             device = open_wireguard(
