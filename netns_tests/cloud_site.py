@@ -10,8 +10,11 @@ import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Mapping
 from contextlib import closing, suppress
 from hashlib import sha256
@@ -32,7 +35,7 @@ from netns_tests.local_site import until
 from tests.pages import ROOT
 from tests.script_packages import PYTHON_PATH
 
-__all__ = ["CloudSite", "wheelhouse"]
+__all__ = ["CloudSite", "launch_file", "start_echo", "wheelhouse"]
 
 _COMMAND_S: Final = 400.0  # fog launch waits for a machine that boots
 _STATUS_S: Final = 5.0
@@ -160,3 +163,32 @@ class CloudSite:
                 ask_node(each, Command.STATUS, _STATUS_S).is_ok for each in nodes
             )
         return False
+
+
+def launch_file(folder: Path) -> Path:
+    """Write a launch file of one replica."""
+    path = folder / "echo.launch.py"
+    path.write_text(
+        "from fog import FogCluster, LaunchDescription, Node, SpotMachine\n\n\n"
+        "def generate_launch_description():\n"
+        "    FogCluster(name='echo', cloud_nodes=[Node(package='fog_demo', executable='echo')], replicas=1,\n"
+        "        deployments=[SpotMachine(hardware='cpu:2')], services={'/echo': 'std_srvs/srv/SetBool'})\n"
+        "    return LaunchDescription([])\n",
+        encoding="utf-8",
+    )
+    return path
+
+
+def start_echo(delay_s: float) -> int:
+    """Start an echo service that stands for a region's public endpoint; return its port."""
+    echo = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    echo.bind(("127.0.0.1", 0))
+
+    def serve() -> None:
+        while True:
+            datagram, peer = echo.recvfrom(2_048)
+            time.sleep(delay_s)  # this is the distance
+            echo.sendto(datagram, peer)
+
+    threading.Thread(target=serve, name="echo", daemon=True).start()
+    return int(echo.getsockname()[1])

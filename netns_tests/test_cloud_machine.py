@@ -7,11 +7,8 @@ import json
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,7 +17,7 @@ import pytest
 
 from fog.supervisor.record import Record
 from gdp.host.run_registry import Run, RunRegistry
-from netns_tests.cloud_site import CloudSite, wheelhouse
+from netns_tests.cloud_site import CloudSite, launch_file, start_echo, wheelhouse
 from netns_tests.datacenter.debian_root import debian_root, why_not
 from netns_tests.local_site import leftovers
 from netns_tests.spaces import Space
@@ -186,35 +183,6 @@ def copies_of_the_token(center: DataCenter, machine: Record) -> str:
     folders = ["/etc", "/opt/fog-software", "/root", "/run", "/tmp", "/var/lib/cloud", "/var/lib/fog", "/var/log"]
     search = f"grep -rlsF {token} {' '.join(folders)} || true"
     return center.machines[identifier].run("sh", "-c", search)
-
-
-def launch_file(folder: Path) -> Path:
-    """Write a launch file of one replica."""
-    path = folder / "echo.launch.py"
-    path.write_text(
-        "from fog import FogCluster, LaunchDescription, Node, SpotMachine\n\n\n"
-        "def generate_launch_description():\n"
-        "    FogCluster(name='echo', cloud_nodes=[Node(package='fog_demo', executable='echo')], replicas=1,\n"
-        "        deployments=[SpotMachine(hardware='cpu:2')], services={'/echo': 'std_srvs/srv/SetBool'})\n"
-        "    return LaunchDescription([])\n",
-        encoding="utf-8",
-    )
-    return path
-
-
-def start_echo(delay_s: float) -> int:
-    """Start an echo service that stands for a region's public endpoint; return its port."""
-    echo = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    echo.bind(("127.0.0.1", 0))
-
-    def serve() -> None:
-        while True:
-            datagram, peer = echo.recvfrom(2_048)
-            time.sleep(delay_s)  # this is the distance
-            echo.sendto(datagram, peer)
-
-    threading.Thread(target=serve, name="echo", daemon=True).start()
-    return int(echo.getsockname()[1])
 
 
 def start_caller(site: CloudSite) -> subprocess.Popen[bytes]:

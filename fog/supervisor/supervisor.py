@@ -39,7 +39,7 @@ Heard: TypeAlias = "Mapping[str, frozenset[str]]"  # service -> proxies that ser
 
 _GRACE_POLLS: Final = 5  # polls in which a new machine may be missing
 _GRACE_MIN_S: Final = 2.0
-_JOINED_S: Final = 0.25  # another process writes which machines have joined, and notifies no other
+_NEWS_S: Final = 0.25  # another process writes which machines have joined, and notifies no other
 PATIENCE: Final = Timeouts()
 
 
@@ -90,6 +90,7 @@ class Supervisor:
         self._gateways = GatewayUplinks(journal, self._events, self._actions, patience)
         self._limits = UsageLimits(site, journal)
         self._robots = RobotAccess(site, on_names)
+        self._known: Heard | None = None  # what the overlay reported at the last reconciliation
         self._settled: set[str] = set()  # clusters that are down without leftovers
         self._owner_key = load_public_key(site.authority.owner_key).compressed
 
@@ -112,11 +113,14 @@ class Supervisor:
         self._woken.set()
 
     def wait(self) -> None:
-        """Wait until the next reconciliation is due, or a machine has joined."""
+        """Wait until the next reconciliation is due, a machine has joined, or other replicas serve than before."""
         left_s = self._actions.provider.poll_s
-        while left_s > 0 and not self._woken.wait(min(left_s, _JOINED_S)) and not self._credentials.has_reports():
-            left_s -= _JOINED_S
+        while left_s > 0 and not self._woken.wait(min(left_s, _NEWS_S)) and not self._has_news():
+            left_s -= _NEWS_S
         self._woken.clear()
+
+    def _has_news(self) -> bool:
+        return self._credentials.has_reports() or self._heard() != self._known
 
     def close(self) -> None:
         """Wait for running actions and write their results; machines continue."""
@@ -125,6 +129,7 @@ class Supervisor:
 
     def reconcile(self) -> None:
         """Reconcile every cluster once."""
+        self._known = self._heard()
         self._actions.collect_results(time.time())
         self._credentials.handle_reports(self._release_misused, time.time())
         for cluster in self._journal.clusters():

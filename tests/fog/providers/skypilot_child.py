@@ -88,11 +88,8 @@ def main() -> None:
         "terminate": outcome(lambda: provider.terminate(["fog-a-demo-m1"])),
     }
     read = sky.Task.from_yaml_config(unserved.tasks[0])  # SkyPilot's own parser, with its schema
-    reported["task"] = {
-        "setup": read.setup,
-        "run": read.run,
-        "written again": read.to_yaml_config() == unserved.tasks[0],
-    }
+    types = [each.instance_type for each in read.resources]
+    reported["task"] = {"setup": read.setup, "run": read.run, "types": types}
     sys.__stdout__.write(f"\n{json.dumps(reported)}\n")  # type: ignore[union-attr]
 
 
