@@ -258,7 +258,7 @@ def test_a81_one_members_mail_leaves_space_in_a_mailbox_for_others(server: Serve
         wire = Mail.make(machine.identities[node], to, "delegation", bytes(12 << 10), NOW)
         session = machine.session(server.desk, node=node)
         for _ in range(count):
-            server.desk.send(session, Fields({"mail": wire}))
+            server.desk.send(session, Fields({"mail": wire}), NOW)
 
     for node in (0, 1):  # as its switch, and as its proxy
         with pytest.raises(EnrolmentError) as refusal:
