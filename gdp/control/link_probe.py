@@ -18,15 +18,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from gdp.control.link_quality import RttEstimator
+from gdp.control.link_quality import LinkQuality
 
 __all__ = ["LinkProbe", "patience_s"]
 
-POLLS_MIN: Final = 2  # one may be lost
+POLLS_MIN: Final = 3  # two may be lost
 _LEAST_S: Final = 0.05
 _MARGIN_S: Final = 0.02  # for the work of the far end
 _UNMEASURED_S: Final = 0.2
 _VARIATIONS: Final = 4  # RFC 6298, section 2
+_PER_LOSS: Final = 20.0  # twice the time where a twentieth of the frames is lost
 
 
 @dataclass(slots=True, kw_only=True)
@@ -63,15 +64,17 @@ class LinkProbe:
         """Return whether a keepalive of ours was sent in this probe, of a moved node not from its former address."""
         return sent_s > self.since_s or (sent_s == self.since_s and not self.is_moved)
 
-    def fails_at_s(self, rtt: RttEstimator) -> float:
+    def fails_at_s(self, quality: LinkQuality) -> float:
         """Return when the neighbour is lost; never unless another link works, and not before ``POLLS_MIN`` polls."""
         if self.worked_s is None or self.polls < POLLS_MIN:
             return float("inf")
-        return self.worked_s + patience_s(rtt)
+        return self.worked_s + patience_s(quality)
 
 
-def patience_s(rtt: RttEstimator) -> float:
-    """Return how long an answer to polls may take, in seconds."""
+def patience_s(quality: LinkQuality) -> float:
+    """Return how long an answer to polls may take over a link, in seconds; more polls fit in where frames are lost."""
+    rtt = quality.rtt
     if rtt.srtt_s is None:
         return _UNMEASURED_S
-    return max(_LEAST_S, rtt.srtt_s + _VARIATIONS * rtt.rttvar_s + _MARGIN_S)
+    answer_s = max(_LEAST_S, rtt.srtt_s + _VARIATIONS * rtt.rttvar_s + _MARGIN_S)
+    return answer_s * (1 + _PER_LOSS * max(quality.loss_in, quality.loss_out))

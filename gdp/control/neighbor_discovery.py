@@ -738,7 +738,7 @@ class HelloProtocol:
             failed_s = self._failed_s.get(uplink, float("-inf"))
             if failed_s >= probe.since_s - _UPLINK_FAILS_S:
                 probe.note_other(probe.since_s)
-        return probe.fails_at_s(session.quality.rtt)
+        return probe.fails_at_s(session.quality)
 
     def _alive(self, neighbour: Neighbour, heard_s: float) -> None:
         neighbour.heard_s, neighbour.lateness_s, neighbour.let_go_s = heard_s, self._lateness_s, None

@@ -13,7 +13,7 @@ from typing import Final
 from gdp.control.endpoint_record import CANDIDATES_MAX, Candidate, CandidateType, EndpointRecord
 from gdp.control.endpoints import Endpoint
 from gdp.crypto.identity import Identity
-from gdp.errors import DropReason, StatementError
+from gdp.errors import DropReason, LocalError, StatementError
 from gdp.nodes.config import LinksConfig
 from gdp.nodes.endpoint_files import own_record, public_candidates
 from gdp.nodes.tunnels import Tunnels
@@ -63,7 +63,10 @@ class OwnEndpoints:
         """Publish a record if the candidates differ from the published ones, or the RIB keeps a later record."""
         if self._monitor.poll() or now.mono_s >= self._hosts_s:
             self._hosts_s = now.mono_s + _ADDRESSES_LOOK_S
-            self._hosts = self._host_candidates()
+            try:
+                self._hosts = self._host_candidates()
+            except LocalError as error:
+                log.warning("own addresses not read, the former ones count on reason=%s", error)
         known, candidates = self._published, self._candidates()[:CANDIDATES_MAX]
         refusal = self._switch.endpoint_refusal
         sequence = time.time_ns() // 1_000_000

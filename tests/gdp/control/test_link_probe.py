@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable
 
 import pytest
@@ -10,7 +11,7 @@ from gdp.control.endpoints import Endpoint
 from gdp.control.fragments import ControlFragmenter
 from gdp.control.hello import Timing
 from gdp.control.link_probe import LinkProbe, patience_s
-from gdp.control.link_quality import RttEstimator
+from gdp.control.link_quality import LinkQuality
 from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.settings import NodeSettings
 from gdp.crypto.identity import Identity
@@ -39,6 +40,8 @@ class Mesh:
         self.far: dict[End, End] = {}
         self.cut: set[End] = set()  # whose frames do not leave
         self.frozen: set[str] = set()
+        self.loss = 0.0
+        self._chance = random.Random(1)
         self.gone: dict[tuple[str, int], float] = {}
         self._under_way: list[tuple[float, End, bytes, bytes]] = []
         for salt, (name, identity) in enumerate(identities.items(), 1):
@@ -70,7 +73,9 @@ class Mesh:
                     source = name, sent.port
                     if source not in self.cut and sent.mac in (BROADCAST, self.mac(self.far[source])):
                         self._under_way += [
-                            (self.now_s + DELAY_S, self.far[source], self.mac(source), frame) for frame in sent.frames
+                            (self.now_s + DELAY_S, self.far[source], self.mac(source), frame)
+                            for frame in sent.frames
+                            if self._chance.random() >= self.loss
                         ]
         return self.now_s - begun_s
 
@@ -217,24 +222,32 @@ def test_a_neighbour_that_polls_is_reported_once(one_uplink: Mesh) -> None:
 
 
 def test_a_slow_link_has_more_time_to_answer() -> None:
-    quick, slow = RttEstimator(), RttEstimator()
+    quick, slow = LinkQuality(), LinkQuality()
     for number in range(100):
-        quick.add(0.002, number * 0.1)
-        slow.add(0.3, number * 0.1)
+        quick.rtt.add(0.002, number * 0.1)
+        slow.rtt.add(0.3, number * 0.1)
     assert patience_s(quick) == 0.05
     assert patience_s(slow) > 0.3
-    assert patience_s(RttEstimator()) > patience_s(quick)
+    assert patience_s(LinkQuality()) > patience_s(quick)
+    quick.loss_out = 0.05
+    assert patience_s(quick) == 0.1
+
+
+def test_where_a_twentieth_of_the_frames_is_lost_no_link_fails(two_links: Mesh) -> None:
+    two_links.loss = 0.05
+    two_links.run(60.0)
+    assert two_links.gone == {}
 
 
 def test_one_poll_alone_ends_nothing() -> None:
     probe = LinkProbe(since_s=0.0, polls=1, worked_s=0.0)
-    assert probe.fails_at_s(RttEstimator()) == float("inf")
+    assert probe.fails_at_s(LinkQuality()) == float("inf")
 
 
 def test_patience_begins_when_another_link_works() -> None:
     probe = LinkProbe(since_s=1.0, polls=9)
     probe.note_other(0.9)  # before the probe: it shows nothing
-    assert probe.fails_at_s(RttEstimator()) == float("inf")
+    assert probe.fails_at_s(LinkQuality()) == float("inf")
     probe.note_other(3.0)
     probe.note_other(4.0)
-    assert probe.fails_at_s(RttEstimator()) == 3.0 + patience_s(RttEstimator())
+    assert probe.fails_at_s(LinkQuality()) == 3.0 + patience_s(LinkQuality())
