@@ -39,6 +39,7 @@ class Field:
     border: FreshMachine
     robot: FreshMachine
     second: FreshMachine
+    blocked: FreshMachine
     tokens: list[str] = field(default_factory=list)
 
     def refusal(self, machine: FreshMachine, command: str, around: str = "{}") -> str:
@@ -74,7 +75,8 @@ def site() -> Iterator[Field]:
                 return stack.enter_context(FreshMachine(host, run.directory))
 
             border, second = add("border", Access.PUBLIC), add("second", Access.PUBLIC)
-            made = Field(border, add("robot", Access.PORT_RESTRICTED), second)
+            robot, blocked = add("robot", Access.PORT_RESTRICTED), add("blocked", Access.UDP_BLOCKED)
+            made = Field(border, robot, second, blocked)
             address = border.host.lease().address.partition("/")[0]
             created = border.type(f"gdp domain create lab --public {address} --tokens 2")
             created.wait_for("listening on TCP port", PATIENCE_S)
@@ -142,6 +144,12 @@ def test_a_border_whose_port_is_taken_creates_no_domain(site: Field, bound: str,
     user.end()
     assert text in said
     assert "end that one, or state another port with --" in said
+
+
+def test_a_machine_whose_network_lets_only_tcp_443_through_joins(site: Field) -> None:
+    joined = site.blocked.type(f"gdp join {site.tokens[0]} --label blocked")
+    joined.wait_for("joined the domain lab as blocked", PATIENCE_S)
+    joined.wait_for("frames pass through TLS at the border", PATIENCE_S)
 
 
 def test_after_all_refusals_the_same_token_is_good(site: Field) -> None:

@@ -16,7 +16,7 @@ from typing import Final
 from gdp.control.endpoints import Endpoint
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
-from gdp.enrolment.domain_files import DOMAIN_FILE, MEMBER_DAYS, DomainFiles
+from gdp.enrolment.domain_files import DOMAIN_FILE, HANDOVER_SOCKET, MEMBER_DAYS, DomainFiles
 from gdp.enrolment.draft import draft_of, publish_draft, reserve_space
 from gdp.enrolment.member_setup import MachinePlan, write_configuration
 from gdp.enrolment.registry import Registry
@@ -24,11 +24,12 @@ from gdp.errors import LocalError
 from gdp.stores.files import public, read_public, write_all
 from gdp.stores.issue import make_domain, make_node, make_owner
 from gdp.stores.keyring import CARD, OWNER_PUBLIC, ROOT_CERTIFICATE, load_root
-from gdp.trust.join_token import JOIN_SECRET_BYTES, JoinRole, JoinToken, fingerprint_of, join_id, join_key
+from gdp.trust.join_token import JOIN_SECRET_BYTES, SERVERS_MAX, JoinRole, JoinToken, fingerprint_of, join_id, join_key
 
 __all__ = ["BORDER", "DomainPlan", "create_domain", "make_token"]
 
 BORDER: Final = "border"  # role and default label of the domain's own machine
+_STATE: Final = "enrolment"
 _NODES: Final = (("switch", Role.SWITCH), ("rib", Role.RIB), ("proxy", Role.PROXY))
 
 
@@ -113,6 +114,7 @@ def _fill(draft: Path, plan: DomainPlan, unix_s: float) -> None:
         listen=plan.listen,
         public=public_texts,
         relay_port=plan.relay_port,
+        handover=f"{_STATE}/{HANDOVER_SOCKET}",
         has_rib=True,
     )
     write_configuration(draft, machine, ())
@@ -120,17 +122,17 @@ def _fill(draft: Path, plan: DomainPlan, unix_s: float) -> None:
         "domain: domain",
         "owner: owner",
         "switch: switch",
-        "state: enrolment",
+        f"state: {_STATE}",
         "peers: peers",
         "revocations: revocations",
         f"listen: {plan.listen}",
-        f"servers: {json.dumps(list(plan.servers))}",
+        f"servers: {json.dumps(list(dict.fromkeys([*plan.servers, *_relays(plan)]))[:SERVERS_MAX])}",
         f"public: {json.dumps(public_texts)}",
         f"relays: {json.dumps(_relays(plan))}",
     ]
     owner = read_public(draft / "owner" / OWNER_PUBLIC)
     write_all(draft, {DOMAIN_FILE: public("\n".join([*lines, ""]).encode()), OWNER_PUBLIC: public(owner)})
-    with Registry(draft / "enrolment") as registry:
+    with Registry(draft / _STATE) as registry:
         registry.add_machine(plan.label, BORDER, [each.member for each in identities], unix_s)
         for folder, identity in zip((folder for folder, _ in _NODES), identities, strict=True):
             registry.set_card(identity.name, read_public(draft / folder / CARD))

@@ -10,7 +10,7 @@ import logging
 import secrets
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -34,7 +34,7 @@ from gdp.trust.domain import Policy
 from gdp.trust.enrolment import MEMBERS_MAX, apply
 from gdp.trust.join_token import SERVERS_MAX, JoinToken, join_id, join_key, join_proof
 
-__all__ = ["JoinRequest", "Joined", "join_domain"]
+__all__ = ["JoinRequest", "Joined", "join_domain", "prefer_server"]
 
 log = logging.getLogger(__name__)
 
@@ -75,6 +75,11 @@ class Joined:
     server: str
 
 
+def prefer_server(token: JoinToken, server: str) -> JoinToken:
+    """Return a token that names a server first which answered: a firewall may block the others."""
+    return replace(token, servers=(server, *(each for each in token.servers if each != server)))
+
+
 def join_domain(
     request: JoinRequest, *, clock: Callable[[], float] = time.time, wait: Callable[[float], None] = time.sleep
 ) -> Joined:
@@ -97,6 +102,7 @@ def join_domain(
         reserved = reserve_space(draft, _UNUSED)  # while the request is under way: what comes back then fits the disk
         fields, root, server = _ask(request, [keys for _, keys in members], wait)
         reserved.unlink()
+        request = replace(request, token=prefer_server(request.token, server))
         identities, borders = _install(draft, request, members, fields, root, clock())
         record = own_record(identities[0], max(len(request.uplinks), 1), ())
         cards = [read_public(draft / folder / CARD) for folder, _ in members]

@@ -50,6 +50,7 @@ class MachinePlan:
         public: UDP endpoints at which the tunnels can be reached from everywhere.
         uplinks: devices that each get a tunnel; none: routing decides.
         relay_port: TCP port at which a border relays; 0: it does not.
+        handover: socket of the enrolment server that takes connections of the relay's port; empty: none.
         relays: of each border, ``host:port`` of its relay, for networks that block UDP.
     """
 
@@ -60,6 +61,7 @@ class MachinePlan:
     public: Sequence[str] = ()
     uplinks: Sequence[str] = ()
     relay_port: int = 0
+    handover: str = ""
     relays: Mapping[Name, Sequence[str]] = field(default_factory=dict)
     has_proxy: bool = True
     has_rib: bool = False
@@ -144,7 +146,8 @@ def _switch(plan: MachinePlan, trusts: Sequence[str]) -> str:
 
 
 def _relay(plan: MachinePlan, trusts: Sequence[str]) -> str:
-    lines = [f"server: {{port: {plan.relay_port}}}"] if plan.relay_port else []
+    enrolment = f", enrolment: {plan.handover}" if plan.handover else ""
+    lines = [f"server: {{port: {plan.relay_port}{enrolment}}}"] if plan.relay_port else []
     text = _node("switch", trusts) + "revocations: revocations\n" + "\n".join([*lines, ""])
     return text + _borders({name: each for name, each in plan.relays.items() if each})
 

@@ -17,11 +17,12 @@ from collections import OrderedDict, defaultdict
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final, TypeVar
 
 from gdp.crypto.fields import Fields
 from gdp.enrolment.desk import EnrolmentDesk, Session, refusal_of
-from gdp.enrolment.domain_files import DomainFiles
+from gdp.enrolment.domain_files import HANDOVER_SOCKET, DomainFiles
 from gdp.enrolment.registry import Registry
 from gdp.enrolment.server_tls import ServerTls, make_server_tls
 from gdp.enrolment.wire import (
@@ -40,7 +41,7 @@ from gdp.ports.client_network import client_network
 from gdp.ports.listening import listen_tcp
 from gdp.token_bucket import TokenBucket, TokenBuckets
 
-__all__ = ["STRANGER_S", "EnrolmentServer", "bind_server", "serve_domain"]
+__all__ = ["STRANGER_S", "EnrolmentServer", "bind_handover", "bind_server", "serve_domain"]
 
 log = logging.getLogger(__name__)
 
@@ -73,6 +74,19 @@ def bind_server(port: int, host: str = "") -> socket.socket:
         ) from error
 
 
+def bind_handover(path: Path) -> socket.socket:
+    """Return the socket at which a relay hands over connections. Raises ``LocalError``: it cannot be made."""
+    receiver = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+    try:
+        path.unlink(missing_ok=True)
+        receiver.bind(str(path))
+        path.chmod(0o600)
+    except OSError as error:
+        receiver.close()
+        raise LocalError(f"enrolment server: {path}: {error.strerror or error}") from error
+    return receiver
+
+
 @dataclass(slots=True, eq=False)
 class _Connection:
     """One connection; ``session`` is set once its client has proved to be a member."""
@@ -90,10 +104,18 @@ class EnrolmentServer:
 
     Args:
         make_tls: returns a fresh context; called at the start, and each day.
+        handover: of ``bind_handover``; None: no relay hands connections over.
     """
 
-    def __init__(self, listening: socket.socket, desk: EnrolmentDesk, make_tls: Callable[[], ServerTls]) -> None:
+    def __init__(
+        self,
+        listening: socket.socket,
+        desk: EnrolmentDesk,
+        make_tls: Callable[[], ServerTls],
+        handover: socket.socket | None = None,
+    ) -> None:
         self._listening = listening
+        self._handover = handover
         self._desk = desk
         self._make_tls = make_tls
         self._tls = make_tls()
@@ -108,12 +130,17 @@ class EnrolmentServer:
     async def accept_connections(self) -> None:
         """Serve until cancelled; then every connection and the listening socket are closed."""
         self._listening.setblocking(False)
-        upkeep = asyncio.ensure_future(self._keep_up())
+        upkeep, loop = asyncio.ensure_future(self._keep_up()), asyncio.get_running_loop()
+        if self._handover is not None:
+            loop.add_reader(self._handover, self._take_handed, self._handover)
         try:
             while True:
                 await self._accept()
         finally:
             self._listening.close()
+            if self._handover is not None:
+                loop.remove_reader(self._handover)
+                self._handover.close()
             tasks = [upkeep, *(each.task for each in self._connections())]
             for task in tasks:
                 task.cancel()
@@ -141,6 +168,25 @@ class EnrolmentServer:
             await asyncio.sleep(_LOOK_S)
             return
         self._rate.charge(time.monotonic(), 1.0)
+        self._begin(peer, host)
+
+    def _take_handed(self, handover: socket.socket) -> None:
+        """Serve a connection that the relay accepted, whose rate it limits."""
+        try:
+            _, descriptors, _, _ = socket.recv_fds(handover, 1, 1)
+        except BlockingIOError:
+            return
+        for descriptor in descriptors:
+            peer = socket.socket(fileno=descriptor)
+            try:
+                peer.setblocking(False)
+                host = client_network(str(peer.getpeername()[0]))
+            except OSError:  # it is gone
+                peer.close()
+                continue
+            self._begin(peer, host)
+
+    def _begin(self, peer: socket.socket, host: str) -> None:
         connection = _Connection(peer=peer, host=host)
         same = [each for each in self._strangers if each.host == connection.host]
         if len(same) >= _EACH_MAX:
@@ -339,10 +385,16 @@ async def serve_domain(files: DomainFiles, listening: socket.socket) -> None:
         LocalError: the domain's keys cannot be read, or its folders cannot be written.
         StoreError: the registry cannot be opened.
     """
-    config = files.config
+    config, handover = files.config, None
     with contextlib.closing(listening), Registry(config.state) as registry:
         desk = EnrolmentDesk(files, registry)
-        server = EnrolmentServer(listening, desk, lambda: make_server_tls(config.domain, config.state, time.time()))
+        try:
+            handover = bind_handover(config.state / HANDOVER_SOCKET)
+        except LocalError as error:
+            log.warning("the relay's port does not enrol machines reason=%s", error)
+        server = EnrolmentServer(
+            listening, desk, lambda: make_server_tls(config.domain, config.state, time.time()), handover
+        )
         try:
             await server.accept_connections()
         finally:

@@ -30,6 +30,7 @@ class RelayServer(Section):
 
     ``allow`` holds labels of members of the own domain, or names of any trusted switch; ``null``: all trusted
     switches. ``address: null`` listens on all of them. ``rate`` is in bytes a second for each client and direction.
+    ``enrolment`` is the socket at which the enrolment server of this host takes connections that come to this port.
     """
 
     port: int = Field(default=RELAY_PORT, ge=1, le=65_535)
@@ -37,6 +38,7 @@ class RelayServer(Section):
     allow: Annotated[tuple[str, ...], Unique] | None = None
     rate: int | None = Field(default=None, ge=RATE_MIN)
     clients_max: int = Field(default=CLIENTS_MAX, ge=1, le=1_000)
+    enrolment: NewFile | None = None
 
     @field_validator("allow")
     @classmethod

@@ -19,6 +19,7 @@ from gdp.errors import LocalError, StatementError
 from gdp.names import Name
 from gdp.nodes.relay_config import RelayConfig, RelayServer
 from gdp.nodes.relay_context import RelayContext
+from gdp.nodes.relay_hello import HELLO_S, HelloWait, hand_over
 from gdp.nodes.relay_link import RelayLink, RelayPort, prepare_socket
 from gdp.nodes.relay_loop import RelayLoop
 from gdp.ports.client_network import client_network
@@ -90,6 +91,7 @@ class BorderServer:
         self._loop: RelayLoop = context.loop
         self._clients: dict[Name, _Client] = {}
         self._handshakes: set[RelayLink] = set()
+        self._hellos: set[HelloWait] = set()
         self._accepts = TokenBucket(_ACCEPTS_PER_S, _ACCEPTS_PER_S)
         self._each = TokenBuckets(_EACH_PER_S, _EACH_BURST)
         self._looks = TokenBucket(_LOOKS_PER_S, _LOOKS_PER_S)
@@ -110,7 +112,9 @@ class BorderServer:
         return self._server.port
 
     def handle_timer(self, now_s: float) -> float:
-        """Accept connections again after a pause; return the second of the next call."""
+        """Accept connections again after a pause, and end late hellos; return the second of the next call."""
+        for hello in [each for each in self._hellos if now_s >= each.since_s + HELLO_S]:
+            self._end_stranger(hello, "no hello in time")
         if self._resume_s is not None and now_s >= self._resume_s:
             self._resume_s = None
             self._loop.register(self._listener.fileno(), select.EPOLLIN, self._accept)
@@ -127,8 +131,8 @@ class BorderServer:
         if self._resume_s is None:
             self._loop.unregister(self._listener.fileno())
         self._listener.close()
-        for link in list(self._handshakes):
-            link.end("the border ends")
+        for stranger in self._strangers():
+            self._end_stranger(stranger, "the border ends")
         for client in list(self._clients.values()):
             if client.port.link is not None:
                 client.port.link.end("the border ends")
@@ -175,27 +179,58 @@ class BorderServer:
                 peer.close()
                 return
             self._accepts.charge(now_s, 1.0)
-            prepare_socket(peer, self._config.dead_ms)
         except (BlockingIOError, ConnectionAbortedError):
             return
         except OSError as error:  # no descriptors left, which this process cannot repair
             log.warning("connection not accepted reason=%s", error.strerror)
             self._pause(now_s)
             return
-        if len(self._handshakes) >= _HANDSHAKES_MAX:  # idle strangers do not keep a member out
-            min(self._handshakes, key=lambda each: each.since_s).end("too many handshakes at once")
+        peer.setblocking(False)
+        strangers = self._strangers()
+        if len(strangers) >= _HANDSHAKES_MAX:  # idle strangers do not keep a member out
+            self._end_stranger(min(strangers, key=lambda each: each.since_s), "too many handshakes at once")
+        if self._server.enrolment is None:
+            self._serve(peer)
+        else:
+            self._hellos.add(HelloWait(loop=self._loop, accepted=peer, chosen=self._choose))
+
+    def _choose(self, hello: HelloWait, peer: socket.socket, is_enrolment: bool) -> None:
+        self._hellos.discard(hello)
+        if not is_enrolment or self._server.enrolment is None:
+            self._serve(peer)
+            return
+        try:
+            hand_over(peer, self._server.enrolment)
+        except OSError as error:
+            log.info("connection not handed to the enrolment server reason=%s", error.strerror or error)
+
+    def _serve(self, peer: socket.socket) -> None:
+        """Begin the handshake of a relay connection."""
         connection = RelayConnection(
             context=self._context.tls(is_server=True),
             is_server=True,
             settings=self._context.settings(self._server.rate),
             authenticate=self._authenticate,
-            now_s=now_s,
+            now_s=time.monotonic(),
         )
-        self._handshakes.add(
-            RelayLink(
+        try:
+            prepare_socket(peer, self._config.dead_ms)
+            link = RelayLink(
                 loop=self._loop, connected=peer, connection=connection, opened=self._open, closed=self._ended_link
             )
-        )
+        except OSError as error:  # the peer is gone
+            log.info("connection gone before its handshake reason=%s", error.strerror)
+            peer.close()
+            return
+        self._handshakes.add(link)
+
+    def _strangers(self) -> list[RelayLink | HelloWait]:
+        return [*self._handshakes, *self._hellos]
+
+    def _end_stranger(self, stranger: RelayLink | HelloWait, reason: str) -> None:
+        if isinstance(stranger, HelloWait):
+            self._hellos.discard(stranger)
+        stranger.end(reason)
 
     def _pause(self, now_s: float) -> None:
         """Leave further connections in the kernel's queue for a moment."""
