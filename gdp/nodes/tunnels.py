@@ -182,6 +182,8 @@ class Tunnels:
         """
         underlay = self._underlays[tunnel.uplink]
         ifname, key = tunnel_ifname(self._me, tunnel), record.keys[tunnel.peer_uplink]
+        if not self._make_way(tunnel, key, now_s):
+            return False
         inner = inner_address(tunnel.peer, tunnel.peer_uplink)
         wireguard_mtu, mtu = _mtus(endpoint, underlay.fwmark)
         try:
@@ -209,6 +211,19 @@ class Tunnels:
         )
         at = "where it dials from" if endpoint is None else endpoint.to_text()
         log.info("tunnel made peer=%s ifname=%s endpoint=%s", tunnel.peer.short, ifname, at)
+        return True
+
+    def _make_way(self, tunnel: TunnelId, key: bytes, now_s: float) -> bool:
+        """Return whether a tunnel may use a key: another peer's with the same key stays if it is up, else it is closed.
+
+        A record does not prove its key. Only who has the key can come up, and a device has one peer for each key.
+        """
+        for other, found in list(self._tunnels.items()):
+            if other.uplink == tunnel.uplink and other.peer != tunnel.peer and found.key == key:
+                if self.is_up(other):
+                    log.warning("tunnel not made peer=%s reason=%s has its key", tunnel.peer.short, other.peer.short)
+                    return False
+                self.close(other, now_s)
         return True
 
     def dial(self, tunnel: TunnelId, endpoint: Endpoint | None) -> None:

@@ -33,6 +33,7 @@ __all__ = ["HANDSHAKE_S", "ConnectionCounters", "ConnectionSettings", "Connectio
 
 HANDSHAKE_S: Final = 5.0  # from the first byte to OPEN
 _BATCH_RECORDS: Final = 4  # of one call of ``data_to_send``
+_WAITING_MAX_BYTES: Final = 2 * _BATCH_RECORDS * RECORD_BYTES  # frames leave in batches of half of it
 _BURST_S: Final = 0.25
 _BURST_MIN_BYTES: Final = 2 * RECORD_BYTES
 
@@ -171,6 +172,8 @@ class RelayConnection:
             self.refuse(str(refusal))
         except (TlsError, FrameError) as error:
             self._close(str(error))
+        if self._tls.waiting_bytes > _WAITING_MAX_BYTES:  # each request for new keys is answered (RFC 8446, 4.6.3)
+            self._close("the other end requests more than it reads")
         size = sum(map(len, frames))
         self._counters.frames_in += len(frames)
         self._counters.bytes_in += size
@@ -222,7 +225,7 @@ class RelayConnection:
                 self._close(f"no sign of life for {self._settings.dead_s:g} s")
             elif now_s >= self._sent_s + self._settings.keepalive_s:
                 self._sent_s = now_s
-                if not self._tls.has_data_to_send:  # else these bytes are a sign of life, too
+                if not self._tls.waiting_bytes:  # else these bytes are a sign of life, too
                     self._tls.write(KEEPALIVE)
 
     def refuse(self, sentence: str) -> None:

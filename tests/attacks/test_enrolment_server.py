@@ -221,6 +221,36 @@ def test_a79_a_membership_that_followed_a_revoked_one_is_not_renewed(server: Ser
         server.desk.renew(session, machine.renewal(), NOW + 28 * DAY_S)
 
 
+# crashes
+
+
+def test_a_server_that_died_while_a_machine_joined_completes_the_repeated_request(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine = Machine.with_token(server.token(), "robot")
+
+    def die(*args: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Registry, "complete_token", die)
+        with pytest.raises(KeyboardInterrupt):
+            machine.ask(server.desk)
+    with Registry(server.files.config.state) as registry:
+        machine.take(machine.ask(EnrolmentDesk(server.files, registry)), server.files)
+        with pytest.raises(EnrolmentError, match="used already by 'robot'"):
+            Machine.with_token(machine.token, "thief").ask(EnrolmentDesk(server.files, registry))
+
+
+def test_a_machine_that_died_while_it_joined_is_removed_and_joins_again(server: Server) -> None:
+    lost = Machine.with_token(server.token(), "robot")
+    lost.ask(server.desk)
+    with pytest.raises(EnrolmentError, match="remove that machine first"):
+        server.joined("robot")
+    server.remove("robot")
+    server.joined("robot")
+
+
 # strangers
 
 
