@@ -70,9 +70,9 @@ class RobotDevices:
     watch: str
 
 
-def machine_label(plan: ClusterPlan, name: str) -> str:
+def machine_label(cluster: str, name: str) -> str:
     """Return the label of a machine's nodes in the domain."""
-    return f"{plan.name}-{name}"
+    return f"{cluster}-{name}"
 
 
 def machine_seats(plan: ClusterPlan, name: str, *, is_gateway: bool = False) -> tuple[PlannedSeat, PlannedSeat]:
@@ -82,7 +82,7 @@ def machine_seats(plan: ClusterPlan, name: str, *, is_gateway: bool = False) -> 
         is_gateway: it may become the gateway of its group. Its switch is then not a leaf, because it carries transit
             traffic.
     """
-    title = machine_label(plan, name)
+    title = machine_label(plan.name, name)
     switch = Seat(SWITCH, Role.SWITCH if is_gateway else Role.LEAF, title)
     return PlannedSeat(switch), PlannedSeat(Seat(PROXY, Role.PROXY, title), plan.carried)
 
@@ -142,7 +142,7 @@ def joining_boot(
         "delegations": f"{identity}/{DELEGATIONS}",
     }
     files = {
-        JOIN_FILE: join_file(token, machine_label(plan, name)),
+        JOIN_FILE: join_file(token, machine_label(plan.name, name)),
         _PROFILE: _OFTEN,
         **(software or {}),
         "proxy.yaml": _yaml(_serving_proxy(proxy, plan, name, f"{MEMBER_FOLDER}/{_OWNER}", lease_s)),

@@ -58,7 +58,7 @@ class JoinCredentials:
         """
         del uplink  # these machines are no gateways
         until_s = end_of_credentials(self._site, now_s)
-        token = self._members.issue_token(machine_label(plan, name), valid_s=self._boot_s, unix_s=now_s)
+        token = self._members.issue_token(machine_label(plan.name, name), valid_s=self._boot_s, unix_s=now_s)
         boot = joining_boot(
             plan,
             name,
@@ -123,4 +123,4 @@ class JoinCredentials:
 
 
 def _label(record: Record) -> str:
-    return f"{record.spec.cluster}-{record.name}"
+    return machine_label(record.spec.cluster, record.name)

@@ -16,6 +16,7 @@ import logging
 import os
 import subprocess
 import tempfile
+import time
 from collections.abc import Mapping
 from contextlib import ExitStack
 from itertools import pairwise
@@ -44,6 +45,7 @@ WAIT_S: Final = 400.0
 BASELINE: Final = "tokens and tunnels"
 COLUMN: Final = "s"
 WHOLE: Final = "whole: token to serving replica"
+DOWN: Final = "fog down, until nothing is left"
 STAGES: Final = (
     "request, systemd, until cloud-init begins",
     "cloud-init until software is fetched: network, apt, files",
@@ -85,7 +87,9 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
                 over.add(BASELINE, stage, COLUMN, took_s)
             over.add(BASELINE, WHOLE, COLUMN, sum(stages.values()))
             progress(f"round {number}/{options.rounds}: {sum(stages.values()):.1f} s, {stages}")
+            begun_s = time.monotonic()
             site.run("down", CLUSTER)
+            over.add(BASELINE, DOWN, COLUMN, time.monotonic() - begun_s)
         targets = [over.target("token to serving replica, s", BASELINE, WHOLE, COLUMN, TARGET_S, at_most=True)]
     settings = {"rounds": options.rounds, "commands on the robot's side": 0}
     return Outcome("cloud_boot", "From a token to a serving replica", over, targets, settings)
