@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any, Final
 
 from devices import add_address, add_neighbour, mac_addresses
@@ -28,6 +29,7 @@ CLOUD: Final = "s2"
 LINE: Final = "line"
 ADDRESSES: Final = {ROBOT: "10.99.0.1", CLOUD: "10.99.0.2"}
 _INSIDE: Final = (("a", ROBOT), (ROBOT, LINE), (LINE, CLOUD), (CLOUD, "b"))
+_TCP_CONTROL: Final = Path("/proc/sys/net/ipv4/tcp_congestion_control")
 _READY_S: Final = 10.0
 
 
@@ -113,13 +115,22 @@ def _flow(before: Mapping[str, Any], after: Mapping[str, Any]) -> Flow:
     )
 
 
-def thin_link_lab(run: Run) -> Lab:
-    """Make the machines ``a - s1 - line - s2 - b``: programs and switch of the robot, the link, those of the cloud."""
+def thin_link_lab(run: Run, *, tcp_control: str = "cubic") -> Lab:
+    """Make the machines ``a - s1 - line - s2 - b``: programs and switch of the robot, the link, those of the cloud.
+
+    Args:
+        tcp_control: congestion control of TCP at robot and cloud; a machine's own default may differ from Linux's.
+
+    Raises:
+        LocalError: the kernel refuses.
+        FailedError: it has no such congestion control.
+    """
     topology = flat_topology(
         _INSIDE, mtu=FRAME_BYTES, rib=CLOUD, members=("a", "b"), switches=("a", ROBOT, LINE, CLOUD, "b")
     )
     lab = Lab(run, topology)
     for node, address in ADDRESSES.items():
+        lab.inside(node, partial(_set_tcp_control, tcp_control))
         lab.inside(node, partial(add_address, LINE, address))
         lab.inside(node, partial(set_offloads, LINE, on=False))
         lab.inside(LINE, partial(set_offloads, node, on=False))
@@ -127,6 +138,13 @@ def thin_link_lab(run: Run) -> Lab:
     for node, other in ((ROBOT, CLOUD), (CLOUD, ROBOT)):
         lab.inside(node, partial(add_neighbour, LINE, ADDRESSES[other], macs[other]))  # no ARP crosses the link
     return lab
+
+
+def _set_tcp_control(name: str) -> None:
+    try:
+        _TCP_CONTROL.write_text(name, encoding="ascii")
+    except OSError as error:
+        raise FailedError(f"no TCP congestion control {name}: {error.strerror}") from error
 
 
 @contextmanager
