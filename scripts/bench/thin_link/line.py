@@ -6,11 +6,11 @@ I/O. Starts a process in the namespace between robot and cloud.
 from __future__ import annotations
 
 import json
+import subprocess
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any, Final
 
 from devices import add_address, add_neighbour, mac_addresses
@@ -29,7 +29,6 @@ CLOUD: Final = "s2"
 LINE: Final = "line"
 ADDRESSES: Final = {ROBOT: "10.99.0.1", CLOUD: "10.99.0.2"}
 _INSIDE: Final = (("a", ROBOT), (ROBOT, LINE), (LINE, CLOUD), (CLOUD, "b"))
-_TCP_CONTROL: Final = Path("/proc/sys/net/ipv4/tcp_congestion_control")
 _READY_S: Final = 10.0
 
 
@@ -130,8 +129,8 @@ def thin_link_lab(run: Run, *, tcp_control: str = "cubic") -> Lab:
     )
     lab = Lab(run, topology)
     for node, address in ADDRESSES.items():
-        lab.inside(node, partial(_set_tcp_control, tcp_control))
         lab.inside(node, partial(add_address, LINE, address))
+        _set_tcp_control(lab, node, tcp_control)
         lab.inside(node, partial(set_offloads, LINE, on=False))
         lab.inside(LINE, partial(set_offloads, node, on=False))
     macs = {node: lab.inside(node, partial(mac_addresses, [LINE]))[LINE] for node in ADDRESSES}
@@ -140,11 +139,17 @@ def thin_link_lab(run: Run, *, tcp_control: str = "cubic") -> Lab:
     return lab
 
 
-def _set_tcp_control(name: str) -> None:
-    try:
-        _TCP_CONTROL.write_text(name, encoding="ascii")
-    except OSError as error:
-        raise FailedError(f"no TCP congestion control {name}: {error.strerror}") from error
+def _set_tcp_control(lab: Lab, node: str, name: str) -> None:
+    """Set the congestion control on the route: only a route may name one that the first namespace does not offer all.
+
+    Source: Linux, net/ipv4/tcp_cong.c, ``tcp_set_default_congestion_control``.
+    """
+    route = f"10.99.0.0/24 dev {LINE} proto kernel scope link src {ADDRESSES[node]} congctl {name}"
+    ran = subprocess.run(
+        lab.command(node, ["ip", "route", "replace", *route.split()]), capture_output=True, text=True, check=False
+    )
+    if ran.returncode:
+        raise FailedError(f"no TCP congestion control {name}: {ran.stderr.strip()}")
 
 
 @contextmanager
