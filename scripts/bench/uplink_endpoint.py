@@ -145,6 +145,7 @@ def probe_send(settings: Settings) -> None:
         probe.setsockopt(socket.SOL_SOCKET, 32, _BUFFER_BYTES)  # SO_SNDBUFFORCE
         probe.connect((settings["address"], PROBE_PORT))
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # the relay of the link has the last core
         start_ns = time.monotonic_ns()
         for number in range(count):
             if (pause_ns := start_ns + number * every_ns - time.monotonic_ns()) > 0:

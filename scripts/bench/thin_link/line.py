@@ -6,6 +6,7 @@ I/O. Starts a process in the namespace between robot and cloud.
 from __future__ import annotations
 
 import json
+import subprocess
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -113,20 +114,42 @@ def _flow(before: Mapping[str, Any], after: Mapping[str, Any]) -> Flow:
     )
 
 
-def thin_link_lab(run: Run) -> Lab:
-    """Make the machines ``a - s1 - line - s2 - b``: programs and switch of the robot, the link, those of the cloud."""
+def thin_link_lab(run: Run, *, tcp_control: str = "cubic") -> Lab:
+    """Make the machines ``a - s1 - line - s2 - b``: programs and switch of the robot, the link, those of the cloud.
+
+    Args:
+        tcp_control: congestion control of TCP at robot and cloud; a machine's own default may differ from Linux's.
+
+    Raises:
+        LocalError: the kernel refuses.
+        FailedError: it has no such congestion control.
+    """
     topology = flat_topology(
         _INSIDE, mtu=FRAME_BYTES, rib=CLOUD, members=("a", "b"), switches=("a", ROBOT, LINE, CLOUD, "b")
     )
     lab = Lab(run, topology)
     for node, address in ADDRESSES.items():
         lab.inside(node, partial(add_address, LINE, address))
+        _set_tcp_control(lab, node, tcp_control)
         lab.inside(node, partial(set_offloads, LINE, on=False))
         lab.inside(LINE, partial(set_offloads, node, on=False))
     macs = {node: lab.inside(node, partial(mac_addresses, [LINE]))[LINE] for node in ADDRESSES}
     for node, other in ((ROBOT, CLOUD), (CLOUD, ROBOT)):
         lab.inside(node, partial(add_neighbour, LINE, ADDRESSES[other], macs[other]))  # no ARP crosses the link
     return lab
+
+
+def _set_tcp_control(lab: Lab, node: str, name: str) -> None:
+    """Set the congestion control on the route: only a route may name one that the first namespace does not offer all.
+
+    Source: Linux, net/ipv4/tcp_cong.c, ``tcp_set_default_congestion_control``.
+    """
+    route = f"10.99.0.0/24 dev {LINE} proto kernel scope link src {ADDRESSES[node]} congctl {name}"
+    ran = subprocess.run(
+        lab.command(node, ["ip", "route", "replace", *route.split()]), capture_output=True, text=True, check=False
+    )
+    if ran.returncode:
+        raise FailedError(f"no TCP congestion control {name}: {ran.stderr.strip()}")
 
 
 @contextmanager

@@ -199,6 +199,7 @@ def _open(device: str) -> socket.socket:
 def _be_first() -> None:
     """Take precedence over ordinary processes, and keep pauses exact."""
     ctypes.CDLL(None).prctl(_TIMER_SLACK, 1, 0, 0, 0)  # the default adds 50 us to each pause
+    os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})  # others learn to use another core
     gc.disable()  # a frame makes no cycle; a collection would delay the next ones
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
