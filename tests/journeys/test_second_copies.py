@@ -11,11 +11,13 @@ import pytest
 
 from gdp.client.participant import Participant
 from gdp.errors import DropReason
-from gdp.frame.codec import ETHER_BYTES, HOPS_AT, SECOND_PATH, decode
+from gdp.frame.codec import ETHER_BYTES, HOPS_AT, SECOND_PATH, Header, decode, encode
 from gdp.frame.kinds import Kind
+from gdp.sansio import ReceivedFrame
 from gdp.simulation.network import SimLink
 from gdp.trust.right import Right
 from tests.journeys.flows import Flow
+from tests.journeys.services import Party, meet, work
 from tests.journeys.test_two_paths import Site, site
 
 pytestmark = pytest.mark.momentary("a cut, and the seconds before and after it, are what these tests are about")
@@ -161,6 +163,46 @@ def test_a_second_copy_is_the_first_but_for_one_bit() -> None:
     second = [frame for frame in frames if frame[HOPS_AT] & SECOND_PATH]
     without = [frame[:HOPS_AT] + bytes([frame[HOPS_AT] & ~SECOND_PATH]) + frame[HOPS_AT + 1 :] for frame in second]
     assert without == first
+
+
+@pytest.mark.parametrize("which", [0, 1], ids=["faster", "slower"])
+def test_a_call_over_two_paths_is_answered_in_time_while_one_of_them_fails(which: int) -> None:
+    at = site([("s0", "s1", 10), ("s0", "s1", 12)], ("s1",))
+    at.cables[1][2].delay_s = SLOW_S
+    network = at.world.network
+    server = Party(at.world, "s0/robot", Right.SERVE, paths=2)
+    client = Party(at.world, READER, Right.CALL, paths=2)
+    assert meet(at.world, server, client)
+    work(at.world, server, client, until_s=4.0)
+    late: list[int] = []
+
+    def check(number: int) -> None:
+        if b"%d by s0/robot" % number not in client.bodies():
+            late.append(number)
+
+    for number in range(100):
+        network.call(number * 0.05, partial(client.publish, b"%d" % number))
+        network.call(number * 0.05 + 2 * LATE_S, partial(check, number))
+    work(at.world, server, client, until_s=1.0)
+    at.cables[which][2].loss = 1.0
+    work(at.world, server, client, until_s=2.5)
+    at.cables[which][2].loss = 0.0
+    work(at.world, server, client, until_s=4.0)
+    assert late == []
+    assert client.bodies() == [b"%d by s0/robot" % number for number in range(100)]
+
+
+def test_a_second_copy_to_an_unknown_name_is_dropped_and_no_rib_is_asked() -> None:
+    made = pair()
+    world, robot = made.at.world, made.flow.member
+    switch = world.switches["s0"]
+    (link,) = [each for each in switch.hello_protocol.all_up() if each.name == robot.name]
+    header = Header(Kind.DATA, 0, SECOND_PATH | 64, 0, 0, 1, 0, 1, 1, b"\x55" * 32, robot.name)
+    switch.frames_to_send()
+    before = Counter(switch.drops())
+    switch.receive([ReceivedFrame(link.port, link.mac, encode(header))], world.network.now)
+    assert Counter(switch.drops()) - before == {DropReason.NO_SECOND_PATH: 1}
+    assert switch.frames_to_send() == []
 
 
 def _frames(made: Pair, count: int) -> list[tuple[int, bytes]]:
