@@ -446,7 +446,11 @@ class Participant:
         return (
             None
             if writer_proxy is None
-            else Party(PeerIncarnation(writer_proxy.publisher, writer_proxy.incarnation), writer_proxy.exchange)
+            else Party(
+                PeerIncarnation(writer_proxy.publisher, writer_proxy.incarnation),
+                writer_proxy.exchange,
+                writer_proxy.second_path_s,
+            )
         )
 
     def _revoke(self, statement: Statement, now: Timestamps) -> None:

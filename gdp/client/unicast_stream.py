@@ -39,6 +39,8 @@ __all__ = [
 ]
 
 IDLE_S: Final = 60.0  # without a reader and a message, after which a stream is forgotten
+# A second path by which frames of the reader came is taken to lead back to it for this time. It may be silent for long.
+_SECOND_PATH_S: Final = 60.0
 
 
 class PeerIncarnation(NamedTuple):
@@ -49,10 +51,14 @@ class PeerIncarnation(NamedTuple):
 
 
 class Party(NamedTuple):
-    """Incarnation of a connected node, and the X25519 key that its advertisement names."""
+    """Incarnation of a connected node, and the X25519 key that its advertisement names.
+
+    ``second_path_s``: when a frame of it last came by a second path.
+    """
 
     incarnation_id: PeerIncarnation
     exchange: bytes
+    second_path_s: float = float("-inf")
 
 
 def private_name(service: Name, writer: PeerIncarnation, reader: PeerIncarnation) -> Name:
@@ -105,8 +111,12 @@ class UnicastStream(Publisher):
             address=self.reader.name,
             paths=paths,
         )
-        self.second_path_until_s = float("inf")  # no join tells of it; without one the first switch drops the copies
+        self.note_second_path(party.second_path_s)
         self.tree_stands(MTU_MIN_BYTES if mtu is None else mtu)
+
+    def note_second_path(self, came_s: float) -> None:
+        """Note when a frame of the reader last came by a second path: copies to it go up the same tree."""
+        self.second_path_until_s = came_s + _SECOND_PATH_S
 
     def mark_in_use(self, now_s: float) -> None:
         """Note that the stream is in use; a silent reader becomes active."""

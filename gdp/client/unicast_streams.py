@@ -109,6 +109,7 @@ class UnicastStreams:
                 now_s=now_s,
             )
             stream.published = self._published
+        stream.note_second_path(party.second_path_s)
         stream.mark_in_use(now_s)
         return stream
 

@@ -29,7 +29,7 @@ from gdp.client.key_epochs import Secrets
 from gdp.client.reordering import ReorderingBuffer
 from gdp.crypto.envelope import Opener
 from gdp.errors import DropReason, EnvelopeError, RemoteError
-from gdp.frame.codec import Header, second_path_copy
+from gdp.frame.codec import SECOND_PATH, Header, second_path_copy
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import NACKS_PER_REPORT, NUMBER_MAX, REPLAY_WINDOW_MESSAGES, REPORT_IDLE_S, SEQUENCE_BYTES
 from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
@@ -94,6 +94,7 @@ class WriterProxy:
     Attributes:
         advertisement: newest advertisement of the publisher.
         description: the publisher's description of its messages.
+        second_path_s: when a frame of the publisher last came by a second path.
 
     Raises:
         StatementError: MALFORMED, ``exchange`` is no key.
@@ -153,6 +154,7 @@ class WriterProxy:
         self.description = b""
         self.advertisement: Advertisement | None = None
         self.advertisement_sequence = 0
+        self.second_path_s = float("-inf")
         if not introduces:
             self._begin_at(max(ended.number, 1), max(ended.sequence, 1), now_s)
 
@@ -230,7 +232,10 @@ class WriterProxy:
         """Process one DATA or HEARTBEAT frame of this publisher."""
         if header.incarnation != self.incarnation:
             self._data.drops[DropReason.WRONG_INCARNATION] += 1
-        elif header.kind == Kind.HEARTBEAT and header.number <= self._before.status:
+            return
+        if header.hops_left & SECOND_PATH:
+            self.second_path_s = now_s
+        if header.kind == Kind.HEARTBEAT and header.number <= self._before.status:
             self._status.drop_copy(header, DropReason.REPLAYED, now_s)
         elif header.kind == Kind.HEARTBEAT:
             joined = self._status.add(header, frame, now_s)

@@ -192,6 +192,24 @@ def test_a_call_over_two_paths_is_answered_in_time_while_one_of_them_fails(which
     assert client.bodies() == [b"%d by s0/robot" % number for number in range(100)]
 
 
+def test_answers_are_sent_once_where_no_second_path_leads_to_the_client() -> None:
+    at = site([("s0", "s1", 10)], ("s1",))
+    seen: list[int] = []
+
+    def tap(_at_s: float, a: str, _b: str, frame: bytes) -> None:
+        header = decode(frame, ETHER_BYTES)
+        if a == "s0/robot" and header.kind == Kind.DATA:
+            seen.append(header.hops_left & SECOND_PATH)
+
+    at.world.network.taps.append(tap)
+    server = Party(at.world, "s0/robot", Right.SERVE, paths=2)
+    client = Party(at.world, READER, Right.CALL, paths=2)
+    assert meet(at.world, server, client)
+    client.publish(b"1")
+    assert work(at.world, server, client, until_s=5.0, have=1)
+    assert seen == [0]
+
+
 def test_a_second_copy_to_an_unknown_name_is_dropped_and_no_rib_is_asked() -> None:
     made = pair()
     world, robot = made.at.world, made.flow.member
