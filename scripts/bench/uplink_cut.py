@@ -6,8 +6,8 @@ reads both. A cut lets all packets of one uplink vanish, so that only missing ke
 turns.
 
 The delay of a message is the time from its publication to its arrival. A message is late if its delay is above the
-limit: twice the longest delay of the quiet seconds before the cuts, and at least ``LIMIT_MIN_MS``, which is far below
-the time until a switch detects the cut. The silence of a cut is the longest time between two messages.
+limit: twice the longest delay of the quiet seconds before the cuts, and at least ``--limit-ms``. That is far below the
+210 ms until a switch detects the cut. The silence of a cut is the longest time between two messages.
 
     sudo .venv/bin/python scripts/bench/uplink_cut.py                  # writes docs/benchmarks/uplink_cut.json
     sudo .venv/bin/python scripts/bench/uplink_cut.py --rounds 2 --no-save
@@ -109,7 +109,7 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
         quiet_s = time.monotonic()
         time.sleep(options.quiet_s)
         limits = {
-            paths: max(2 * max(flow.delays_ms(quiet_s, time.monotonic() - 0.5)), LIMIT_MIN_MS)
+            paths: max(2 * max(flow.delays_ms(quiet_s, time.monotonic() - 0.5)), options.limit_ms)
             for paths, flow in flows.items()
         }
         silences: dict[int, list[float]] = {paths: [] for paths in flows}
@@ -200,6 +200,9 @@ if __name__ == "__main__":
     parser = command_line(__doc__, rounds=30, quick={"rounds": 2}, has_record=True)
     parser.add_argument(
         "--quiet-s", type=float, default=10.0, help="without a cut, for the limit (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--limit-ms", type=float, default=LIMIT_MIN_MS, help="least delay of a late message (default: %(default)s)"
     )
     parser.add_argument("--settle-s", type=float, default=SETTLE_S, help="between two cuts (default: %(default)s)")
     run_bench(parser, measure)
