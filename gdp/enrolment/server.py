@@ -186,7 +186,7 @@ class EnrolmentServer:
                 continue
             self._begin(peer, host)
 
-    def _begin(self, peer: socket.socket, host: str) -> None:
+    def _begin(self, peer: socket.socket, host: bytes) -> None:
         connection = _Connection(peer=peer, host=host)
         same = [each for each in self._strangers if each.host == connection.host]
         if len(same) >= _EACH_MAX:
