@@ -26,17 +26,19 @@ from typing import Annotated, ClassVar, Final, Literal, TypedDict
 from pydantic import AfterValidator, Field, model_validator
 
 from fog.enrolment.bootstrap import RobotDevices, robot_boot
-from fog.enrolment.config import ENROLMENT_PORT, EnrolmentConfig, host_and_port
+from fog.enrolment.config import EnrolmentConfig, host_and_port
 from fog.enrolment.members import Authority
 from fog.host.bundle import install
 from fog.latency.config import LatencyConfig
 from fog.latency.known import Latencies
 from fog.providers.aws.config import AwsConfig
-from fog.providers.cloud_init import Vxlan
+from fog.providers.cloud_init import Setup
 from fog.providers.skypilot.config import SkyPilotConfig
 from fog.software.config import SOFTWARE_PORT, SoftwareConfig
 from fog.topology import AUTOMATIC, AUTOMATIC_REPLICA, Gateway, Topology
 from gdp.crypto.certificates import Role
+from gdp.enrolment.domain_files import DomainFiles
+from gdp.enrolment.member_setup import WATCH_IFACE
 from gdp.errors import LocalError
 from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.nodes.config import LeaseSeconds, SwitchConfig
@@ -62,8 +64,17 @@ class SiteConfig(Section):
 
     renamed: ClassVar[Mapping[str, str]] = {"papers_days": "credential_days"}
 
-    domain: Directory = Field(description="Directory of the trust domain, with its root key: admits machines.")
-    owner: Directory = Field(description="Directory of the owner of the names that clusters serve.")
+    border: Directory | None = Field(
+        default=None,
+        description="What `gdp domain create` made on this host. Its domain is the site's, rented machines join it, and"
+        " domain, owner, robots, switch and watch are those of the border.",
+    )
+    domain: Directory | None = Field(
+        default=None, description="Directory of the trust domain, with its root key: admits machines."
+    )
+    owner: Directory | None = Field(
+        default=None, description="Directory of the owner of the names that clusters serve."
+    )
     robots: Annotated[tuple[ExistingFile, ...], Unique] = Field(
         default=(), description="`proxy.yaml` of each robot that is to use clusters; they are given rules."
     )
@@ -79,7 +90,7 @@ class SiteConfig(Section):
         default=SkyPilotConfig(), description="Of provider `skypilot`; see docs/reference/providers.md."
     )
     machine_iface: Ifname | None = Field(
-        default=None, description="A machine's device towards the overlay. Default: of `local` eth0, else the tunnel's."
+        default=None, description="`local`: a machine's device towards the overlay. Default: eth0."
     )
     uplink: Ifname | None = Field(
         default=None, description="`local`: the port of the robot's switch that leads to the machines; it is made."
@@ -100,7 +111,7 @@ class SiteConfig(Section):
         description="Lease of the machines' advertisements, in seconds: `lease_s` of their proxy.yaml.",
     )
     enrolment: EnrolmentConfig = Field(
-        default=EnrolmentConfig(), description="Where rented machines, with keys of their own, ask for memberships."
+        default=EnrolmentConfig(), description="`local`: how machines, with keys of their own, get memberships."
     )
     software: SoftwareConfig = Field(
         default=SoftwareConfig(), description="What rented machines fetch from the supervisor: wheels, a workspace."
@@ -117,67 +128,53 @@ class SiteConfig(Section):
 
     @property
     def device(self) -> str:
-        """Return a machine's device towards the overlay; empty: not configured."""
-        return self.machine_iface or ("eth0" if self.provider == "local" else self._tunnel)
-
-    @property
-    def enrolment_address(self) -> str:
-        """Return where a rented machine reaches the supervisor, ``HOST:PORT``; empty: machines run on this host."""
-        if self.provider == "local":
-            return ""
-        if self.enrolment.address is not None or self._vxlan is None:
-            return self.enrolment.address or ""
-        remote = self._vxlan.remote
-        return f"[{remote}]:{ENROLMENT_PORT}" if remote.version == 6 else f"{remote}:{ENROLMENT_PORT}"
+        """Return a machine's device towards the overlay."""
+        return self.machine_iface or "eth0"
 
     @property
     def software_address(self) -> str:
-        """Return where a rented machine fetches its software, ``HOST:PORT``; empty: machines run on this host."""
-        if self.software.address is not None or not self.enrolment_address:
+        """Return where a rented machine fetches its software, ``HOST:PORT``; empty: machines run on this host.
+
+        Raises:
+            ConfigError: ``domain.yaml`` of the border is not valid.
+        """
+        if self.software.address is not None or self.provider == "local" or self.border is None:
             return self.software.address or ""
-        return f"{self.enrolment_address.rpartition(':')[0]}:{SOFTWARE_PORT}"
+        server = DomainFiles.load(self.border).config.servers[0]
+        return f"{server.rpartition(':')[0]}:{SOFTWARE_PORT}"
 
     @property
-    def _tunnel(self) -> str:
-        return "" if self._vxlan is None else self._vxlan.device
-
-    @property
-    def _vxlan(self) -> Vxlan | None:
-        setups = {"aws": self.aws.setup, "skypilot": self.skypilot.setup}
-        return setups[self.provider].vxlan if self.provider in setups else None
+    def _setup(self) -> Setup | None:
+        return {"aws": self.aws.setup, "skypilot": self.skypilot.setup}.get(self.provider)
 
     @model_validator(mode="after")
-    def _meets_the_overlay(self) -> SiteConfig:
-        """Reject a machine without a device to the robot: it would cost money and never serve."""
-        if not self.device:
-            raise ValueError(
-                f"machines of {self.provider} have no way to the robot: set {self.provider}.setup.vxlan, or name in"
-                " machine_iface the device of a tunnel that you install"
-            )
-        if self._tunnel not in ("", self.device):
-            raise ValueError(
-                f"machine_iface is {self.device}, but the tunnel of {self.provider}.setup.vxlan is {self._tunnel}:"
-                " leave machine_iface out, or let both say the same"
-            )
+    def _is_one_domain(self) -> SiteConfig:
+        """Reject a site without a domain, or with two."""
+        stated = [key for key in ("domain", "owner", "switch", "watch") if getattr(self, key) is not None]
+        if self.border is not None and stated:
+            raise ValueError(f"{', '.join(stated)}: those of the border are used: remove them, or remove border")
+        if self.border is None and (self.domain is None or self.owner is None):
+            raise ValueError("name domain and owner, or border: the directory that gdp domain create made on this host")
         return self
 
     @model_validator(mode="after")
-    def _can_enrol(self) -> SiteConfig:
-        """Reject a machine that cannot reach a responder: it would cost money and never serve."""
-        if self.provider != "local" and not self.enrolment_address:
+    def _can_join(self) -> SiteConfig:
+        """Reject a machine that cannot reach the robot: it would cost money and never serve."""
+        if self.provider == "local" and self.border is not None:
+            raise ValueError("machines of local enrol on this host: name domain and owner instead of border")
+        if self.provider != "local" and self.border is None:
             raise ValueError(
-                f"machines of {self.provider} do not know where to enrol: set enrolment.address to HOST:PORT at which"
-                " they reach this supervisor"
+                f"machines of {self.provider} have no way to the robot: run gdp domain create on this host, and name in"
+                " border the directory that it makes"
             )
         return self
 
     @model_validator(mode="after")
     def _has_something_to_install(self) -> SiteConfig:
         """Reject a machine that installs nothing: it would cost money and never serve."""
-        setups = {"aws": self.aws.setup, "skypilot": self.skypilot.setup}
         has_image = bool(self.aws.images) if self.provider == "aws" else False
         installs = self.software.wheels is not None or has_image
-        if self.provider in setups and not setups[self.provider].has_requirements and not installs:
+        if self._setup is not None and not self._setup.has_requirements and not installs:
             raise ValueError(
                 f"machines of {self.provider} have nothing to install: fill a folder with `fog wheels` and name it in"
                 " software.wheels, or name the wheels of this package and of the nodes, each with its hash, in"
@@ -217,7 +214,6 @@ class _Settings(TypedDict):
     latency_ms: Mapping[str, float]
     latency: LatencyConfig
     enrolment: EnrolmentConfig
-    enrolment_address: str
     software: SoftwareConfig
     software_address: str
 
@@ -231,6 +227,7 @@ class Site:
         file: its ``fog.yaml``; None: self-contained.
         revocations: folder, and the switch's file that names it; None: revocations are not published.
         watch: directory of keys, and device; None: only the provider reports on machines.
+        border: what ``gdp domain create`` made, whose domain rented machines join; None: machines run on this host.
     """
 
     id: str
@@ -254,9 +251,9 @@ class Site:
     latency_ms: Mapping[str, float] = field(default_factory=dict)
     latency: LatencyConfig = field(default_factory=LatencyConfig)
     enrolment: EnrolmentConfig = field(default_factory=EnrolmentConfig)
-    enrolment_address: str = ""
     software: SoftwareConfig = field(default_factory=SoftwareConfig)
     software_address: str = ""
+    border: Path | None = None
 
     @property
     def software_folder(self) -> Path:
@@ -278,19 +275,12 @@ class Site:
     @property
     def enrolment_url(self) -> str:
         """Return the address of enrolment that tickets contain."""
-        return f"tcp://{self.enrolment_address}" if self.enrolment_address else f"unix:{self.enrolment_socket}"
+        return f"unix:{self.enrolment_socket}"
 
     @property
     def enrolment_socket(self) -> Path:
         """Return the socket for machines of this host."""
         return self.enrolment_folder / "socket"
-
-    @property
-    def enrolment_listens(self) -> tuple[str, int]:
-        """Return host and port on which the supervisor listens for rented machines; an empty host: every address."""
-        if self.enrolment.listen is not None:
-            return host_and_port(self.enrolment.listen)
-        return "", host_and_port(self.enrolment_address)[1]
 
     @property
     def latencies(self) -> Latencies:
@@ -453,28 +443,64 @@ def _install_again(robot: Path, authority: Authority, devices: RobotDevices) -> 
 
 
 def _stated(config: SiteConfig, file: Path, folder: Path, identifier: str) -> Site:
-    authority = Authority(config.domain.absolute(), config.owner.absolute(), folder / SCRATCH)
+    places = _places(config)
+    authority = Authority(places.domain.absolute(), places.owner.absolute(), folder / SCRATCH)
     revocations = None
-    if config.switch is not None:
-        directory = SwitchConfig.load(config.switch).revocations
-        revocations = None if directory is None else (directory.absolute(), config.switch.absolute())
+    if places.switch is not None:
+        directory = SwitchConfig.load(places.switch).revocations
+        revocations = None if directory is None else (directory.absolute(), places.switch.absolute())
     watch = None
-    if config.watch is not None:
+    if places.watch is not None:
         keys = folder / "watch"
         if not (keys / "node.card").exists():
             make_node(keys, Role.PROXY, "supervisor", authority.domain, force=True)
         (keys / "delegations").mkdir(mode=0o700, exist_ok=True)
-        watch = (keys, config.watch)
+        watch = (keys, places.watch)
     return Site(
         id=identifier,
         state=folder,
         file=file,
         authority=authority,
-        robots=tuple(path.absolute() for path in config.robots),
+        robots=tuple(path.absolute() for path in places.robots),
         revocations=revocations,
         watch=watch,
         uplink=config.uplink or f"fog{identifier}-up",
+        border=None if config.border is None else config.border.absolute(),
         **_settings(config),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Places:
+    """Files of a site's domain and robots."""
+
+    domain: Path
+    owner: Path
+    robots: tuple[Path, ...]
+    switch: Path | None
+    watch: str | None
+
+
+def _places(config: SiteConfig) -> _Places:
+    """Return the places that the file names, or those of its border; its proxy is the robot, unless robots are named.
+
+    Raises:
+        ConfigError: a file of the border is not valid.
+    """
+    if config.domain is not None and config.owner is not None:
+        return _Places(
+            domain=config.domain, owner=config.owner, robots=config.robots, switch=config.switch, watch=config.watch
+        )
+    if config.border is None:
+        raise LocalError("the site has no domain")
+    files, switch = DomainFiles.load(config.border).config, config.border / "switch.yaml"
+    proxy = config.border / "proxy.yaml"
+    return _Places(
+        domain=files.domain,
+        owner=files.owner,
+        robots=config.robots or ((proxy,) if proxy.exists() else ()),
+        switch=switch,
+        watch=WATCH_IFACE if WATCH_IFACE in SwitchConfig.load(switch).attach else None,
     )
 
 
@@ -493,7 +519,6 @@ def _settings(config: SiteConfig) -> _Settings:
         "latency_ms": config.latency_ms,
         "latency": config.latency,
         "enrolment": config.enrolment,
-        "enrolment_address": config.enrolment_address,
         "software": config.software,
         "software_address": config.software_address,
     }

@@ -81,6 +81,8 @@ class DropReason(IntEnum):
     COOKIE_REQUIRED = 43  # a stranger's hello under load, without proof that it receives at its address
     UNCONCERNED = 44  # a revocation by an issuer of whose certificates none is held here
     THROUGH_LEAF = 45  # the path leads through a leaf, or a leaf sends for more than the nodes attached to it
+    NO_SECOND_PATH = 46  # the second copy of a frame at a switch that has no second path for it
+    SECOND_COPY = 47  # the other path of a flow with two had brought it before
 
     @property
     def label(self) -> str:

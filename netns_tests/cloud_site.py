@@ -1,7 +1,7 @@
-"""Site of ``fog`` whose machines boot in a data centre: a robot, its switch's end of the tunnels, and ``fog.yaml``.
+"""Site of ``fog`` whose machines boot in a data centre: a border, whose proxy is the robot's, and ``fog.yaml``.
 
-I/O; everything belongs to one run. The robot's side (switch, RIB, proxy) runs in the namespace of the caller. The
-data centre's machines reach it through NAT, and their tunnels end in one VXLAN device here, as an operator makes it.
+I/O; everything belongs to one run. The border runs in the namespace of the caller: ``gdp domain create`` makes it, and
+the data centre's machines join it by their tokens, from behind NAT.
 """
 
 from __future__ import annotations
@@ -10,37 +10,35 @@ import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Mapping
-from contextlib import closing
+from contextlib import closing, suppress
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final
 
-from fog.enrolment.bootstrap import RobotDevices, robot_boot
-from fog.enrolment.members import Authority
-from fog.host.bundle import install
-from fog.host.status import Status
-from fog.machine import MachineState
 from fog.software.wheels import build_wheel, wheels
 from fog.supervisor.journal import Journal
 from fog.supervisor.record import Record
+from gdp.errors import GdpError
 from gdp.host.run_registry import Run
-from gdp.stores.issue import make_domain, make_owner
+from gdp.nodes.control_client import ask_node, find_control_socket
+from gdp.nodes.control_protocol import Command
 from netns_tests.datacenter.debian_root import cache_folder
 from netns_tests.datacenter.ec2 import UBUNTU
-from netns_tests.datacenter.router import CALLER, Lease
+from netns_tests.datacenter.router import CALLER
 from netns_tests.local_site import until
 from tests.pages import ROOT
 from tests.script_packages import PYTHON_PATH
 
-__all__ = ["TUNNEL_ID", "CloudSite", "wheelhouse"]
+__all__ = ["CloudSite", "launch_file", "start_echo", "wheelhouse"]
 
-TUNNEL_ID: Final = 42
-_TUNNEL: Final = "fog0"
 _COMMAND_S: Final = 400.0  # fog launch waits for a machine that boots
-_DEVICES: Final = RobotDevices(uplink=_TUNNEL, proxy="robot0", rib="rib0", watch="watch0")
+_STATUS_S: Final = 5.0
 _ROS: Final = ("ros-jazzy-rmw-fastrtps-cpp", "ros-jazzy-std-msgs")
 
 
@@ -68,33 +66,15 @@ class CloudSite:
 
     def __init__(self, run: Run, wheel_folder: Path, latency: Mapping[str, str]) -> None:
         self.folder = run.directory
+        self.border = self.folder / "border"
         self.state = self.folder / "state"
         self._run = run
-        self._robot: subprocess.Popen[bytes] | None = None
-        make_domain(self.folder / "domain", "cloud")
-        make_owner(self.folder / "owner")
-        scratch = self.folder / "scratch"
-        scratch.mkdir(mode=0o700)
-        self._home = self.folder / "robot"
-        install(
-            self._home, robot_boot(Authority(self.folder / "domain", self.folder / "owner", scratch), _DEVICES, days=1)
-        )
-        for each in ("proxy/delegations", "revocations"):
-            (self._home / each).mkdir(mode=0o700)
+        self._border: subprocess.Popen[bytes] | None = None
         content = {
-            "domain": "domain",
-            "owner": "owner",
-            "robots": ["robot/proxy.yaml"],
-            "switch": "robot/switch.yaml",
-            "watch": _DEVICES.watch,
+            "border": "border",
             "state": "state",
             "provider": "aws",
-            "aws": {
-                "regions": list(latency),
-                "image_owner": UBUNTU,
-                "image_name": "ubuntu/images/*",
-                "setup": {"vxlan": {"remote": str(CALLER), "id": TUNNEL_ID, "device": _TUNNEL}},
-            },
+            "aws": {"regions": list(latency), "image_owner": UBUNTU, "image_name": "ubuntu/images/*"},
             "software": {"wheels": str(wheel_folder)},
             "latency": {"endpoints": dict(latency)},
         }
@@ -107,21 +87,33 @@ class CloudSite:
             "PYTHONPATH": PYTHON_PATH,
         }
 
-    def start_robot(self, device: str) -> None:
-        """Make the robot's end of the tunnels on the device to the data centre, and start switch, RIB and proxy."""
-        link = f"link add {_TUNNEL} type vxlan id {TUNNEL_ID} local {CALLER} dstport 4789 dev {device}"
-        for words in (link, f"link set {_TUNNEL} up"):
-            subprocess.run(["ip", *words.split()], check=True)
-        argv = [sys.executable, "-m", "fog.host.cli", "--home", str(self._home)]
-        with (self.folder / "robot.log").open("wb") as log:
-            self._robot = subprocess.Popen(argv, env=self.environment, stdout=log, stderr=log, start_new_session=True)
-        self._run.note_process(self._robot.pid)
-        until(self._is_robot_up, "the robot's side is up")
+    def start_border(self) -> None:
+        """Create the domain on this host, and start its border, whose proxy is the robot's."""
+        argv = [sys.executable, "-m", "gdp.cli.gdp", "domain", "create", "cloud", "--public", str(CALLER)]
+        argv += ["--directory", str(self.border), "--no-systemd"]
+        with (self.folder / "border.log").open("wb") as log:
+            self._border = subprocess.Popen(argv, env=self.environment, stdout=log, stderr=log, start_new_session=True)
+        self._run.note_process(self._border.pid)
+        until(self._is_border_up, "the border is up")
 
-    def attach(self, lease: Lease) -> None:
-        """Make the robot's end of the tunnel reach a new machine."""
-        entry = f"fdb append 00:00:00:00:00:00 dev {_TUNNEL} dst {lease.public}"
-        subprocess.run(["bridge", *entry.split()], check=True)
+    def members(self) -> dict[str, str]:
+        """Return label -> state of the domain's machines, as ``gdp domain ls`` shows them, removed ones included."""
+        argv = ["domain", "ls", "cloud", "--directory", str(self.border), "--all", "--json"]
+        done = subprocess.run(
+            [sys.executable, "-m", "gdp.cli.gdp", *argv],
+            env=self.environment,
+            capture_output=True,
+            text=True,
+            timeout=_COMMAND_S,
+            check=True,
+        )
+        return {each["label"]: each["state"] for each in json.loads(done.stdout)}
+
+    def tunnels(self) -> list[str]:
+        """Return the labels of the peers of the border's switch."""
+        status = ask_node(find_control_socket(self.border / "switch"), Command.STATUS, _STATUS_S)
+        links = status.result.get("links")
+        return [str(each["label"]) for each in links] if isinstance(links, list) else []
 
     def run(self, *words: str) -> str:
         """Run ``fog`` for this site and return its output."""
@@ -156,13 +148,47 @@ class CloudSite:
         return [json.loads(line) for line in lines]
 
     def close(self) -> None:
-        """End the robot's side."""
-        if self._robot is not None:
-            self._robot.send_signal(signal.SIGTERM)
-            self._robot.wait(timeout=_COMMAND_S)
+        """End the border."""
+        if self._border is not None:
+            self._border.send_signal(signal.SIGINT)
+            self._border.wait(timeout=_COMMAND_S)
 
-    def _is_robot_up(self) -> bool:
-        assert self._robot is not None
-        assert self._robot.poll() is None, (self.folder / "robot.log").read_text()
-        status = Status.read(self._home)
-        return status is not None and status.state is MachineState.RUNNING
+    def _is_border_up(self) -> bool:
+        assert self._border is not None
+        log = (self.folder / "border.log").read_text()
+        assert self._border.poll() is None, log
+        with suppress(GdpError):
+            nodes = (find_control_socket(self.border / each) for each in ("switch", "rib", "proxy"))
+            return "listening on TCP port" in log and all(
+                ask_node(each, Command.STATUS, _STATUS_S).is_ok for each in nodes
+            )
+        return False
+
+
+def launch_file(folder: Path) -> Path:
+    """Write a launch file of one replica."""
+    path = folder / "echo.launch.py"
+    path.write_text(
+        "from fog import FogCluster, LaunchDescription, Node, SpotMachine\n\n\n"
+        "def generate_launch_description():\n"
+        "    FogCluster(name='echo', cloud_nodes=[Node(package='fog_demo', executable='echo')], replicas=1,\n"
+        "        deployments=[SpotMachine(hardware='cpu:2')], services={'/echo': 'std_srvs/srv/SetBool'})\n"
+        "    return LaunchDescription([])\n",
+        encoding="utf-8",
+    )
+    return path
+
+
+def start_echo(delay_s: float) -> int:
+    """Start an echo service that stands for a region's public endpoint; return its port."""
+    echo = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    echo.bind(("127.0.0.1", 0))
+
+    def serve() -> None:
+        while True:
+            datagram, peer = echo.recvfrom(2_048)
+            time.sleep(delay_s)  # this is the distance
+            echo.sendto(datagram, peer)
+
+    threading.Thread(target=serve, name="echo", daemon=True).start()
+    return int(echo.getsockname()[1])

@@ -15,7 +15,9 @@ pytestmark = pytest.mark.netns
 
 _PATIENCE_S = 300.0
 needs_ros2 = pytest.mark.skipif(find_spec("rclpy") is None, reason="rclpy is not installed: scripts/setup.sh --ros2")
-needs_wireguard = pytest.mark.skipif(which("wireguard-go") is None, reason="wireguard-go is not installed")
+needs_wireguard = pytest.mark.skipif(
+    which("wireguard-go") is None or which("wg") is None, reason="wireguard-go or wireguard-tools is not installed"
+)
 
 
 @pytest.mark.parametrize(
@@ -29,6 +31,7 @@ needs_wireguard = pytest.mark.skipif(which("wireguard-go") is None, reason="wire
         ["priority.py", "--quick", "--no-save"],
         ["bundles.py", "--quick", "--no-save"],
         pytest.param(["tunnel.py", "--quick", "--no-save", "--only", "kernel"], marks=needs_wireguard),
+        pytest.param(["first_topic.py", "--rounds", "1", "--no-save"], marks=[needs_ros2, needs_wireguard]),
         ["uplink.py", "--quick", "--no-save", "--no-tcp", "--fifo", "bdp", "--only", "line", "gdp"],
         pytest.param(["ros.py", "--quick", "--no-save", "--mtu", "9000"], marks=needs_ros2),
         pytest.param(["services.py", "--quick", "--no-save"], marks=needs_ros2),

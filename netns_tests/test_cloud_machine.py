@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import os
+import re
 import signal
-import socket
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
+from fog.supervisor.record import Record
 from gdp.host.run_registry import Run, RunRegistry
-from netns_tests.cloud_site import CloudSite, wheelhouse
+from netns_tests.cloud_site import CloudSite, launch_file, start_echo, wheelhouse
 from netns_tests.datacenter.debian_root import debian_root, why_not
 from netns_tests.local_site import leftovers
 from netns_tests.spaces import Space
 from tests.pages import ROOT
 from tests.script_packages import PYTHON_PATH
+
+if TYPE_CHECKING:
+    from netns_tests.datacenter.ec2 import DataCenter
 
 pytest.importorskip("boto3", reason="the extra `aws` is not installed")
 pytest.importorskip("moto.server", reason="moto[ec2,server] of the extra `dev` is not installed")
@@ -98,18 +102,21 @@ def test_a_booted_replica_answers_the_robot_and_is_replaced_when_it_is_preempted
     subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
     endpoints = {NEAR: start_echo(0.0), FAR: start_echo(0.05)}
     site = CloudSite(run, software, {each: f"udp://127.0.0.1:{port}" for each, port in endpoints.items()})
-    center = DataCenter(run, image, site.attach)
+    center = DataCenter(run, image)
     caller: subprocess.Popen[bytes] | None = None
     try:
         with serving_ec2(center, tmp_path / "absent"):
             before = account()
             site.environment |= {name: value for name, value in os.environ.items() if name.startswith("AWS_")}
-            site.start_robot(center.router.device)
+            site.start_border()
             caller = start_caller(site)
             site.run("launch", str(launch_file(tmp_path)), "--detach", "--wait", str(_MACHINE_S))
             (first,) = site.serving("echo")
             assert first.spec.offer.region == NEAR
             center.until(lambda: answering(site) == {first.name}, "the replica answers the robot", _ANSWER_S)
+            assert inbound_rules() == []
+            assert copies_of_the_token(center, first) == ""
+            assert f"echo-{first.name}" in site.tunnels()
             center.interrupt(first.id.partition("/")[2], 2.0)
 
             def replaced() -> bool:
@@ -118,9 +125,13 @@ def test_a_booted_replica_answers_the_robot_and_is_replaced_when_it_is_preempted
             center.until(replaced, "a preempted machine is replaced", _MACHINE_S)
             (second,) = site.serving("echo")
             center.until(lambda: second.name in answering(site), "its replacement answers the robot", _ANSWER_S)
+            assert site.members()[f"echo-{first.name}"] == "revoked"
+            assert f"echo-{first.name}" not in site.tunnels()
             assert "cloud-init" in center.machines[second.id.partition("/")[2]].console
             site.run("down", "--all")
             assert account() == before
+            assert {label for label, state in site.members().items() if state != "revoked"} == {"border"}
+            assert site.tunnels() == []
             assert not any(each.is_up for each in center.machines.values())
     finally:
         if caller is not None:
@@ -150,33 +161,28 @@ def test_a_machine_goes_also_when_its_creator_was_killed(image: Path, tmp_path: 
     assert not leftovers(tmp_path, [made])
 
 
-def launch_file(folder: Path) -> Path:
-    """Write a launch file of one replica."""
-    path = folder / "echo.launch.py"
-    path.write_text(
-        "from fog import FogCluster, LaunchDescription, Node, SpotMachine\n\n\n"
-        "def generate_launch_description():\n"
-        "    FogCluster(name='echo', cloud_nodes=[Node(package='fog_demo', executable='echo')], replicas=1,\n"
-        "        deployments=[SpotMachine(hardware='cpu:2')], services={'/echo': 'std_srvs/srv/SetBool'})\n"
-        "    return LaunchDescription([])\n",
-        encoding="utf-8",
-    )
-    return path
+def inbound_rules() -> list[str]:
+    """Return what security groups of the account let in, but those that each region has from the start."""
+    import boto3
+
+    groups = [
+        each
+        for region in (NEAR, FAR)
+        for each in boto3.client("ec2", region_name=region).describe_security_groups()["SecurityGroups"]
+        if each["GroupName"] != "default"
+    ]
+    assert groups
+    return [str(rule) for each in groups for rule in each["IpPermissions"]]
 
 
-def start_echo(delay_s: float) -> int:
-    """Start an echo service that stands for a region's public endpoint; return its port."""
-    echo = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    echo.bind(("127.0.0.1", 0))
-
-    def serve() -> None:
-        while True:
-            datagram, peer = echo.recvfrom(2_048)
-            time.sleep(delay_s)  # this is the distance
-            echo.sendto(datagram, peer)
-
-    threading.Thread(target=serve, name="echo", daemon=True).start()
-    return int(echo.getsockname()[1])
+def copies_of_the_token(center: DataCenter, machine: Record) -> str:
+    """Return the files of a machine, one a line, that hold the token with which it has joined."""
+    identifier = machine.id.partition("/")[2]
+    data = gzip.decompress(center.document(identifier).user_data).decode()
+    (token,) = set(re.findall(r"gdp1[a-z2-7]+", data))
+    folders = ["/etc", "/opt/fog-software", "/root", "/run", "/tmp", "/var/lib/cloud", "/var/lib/fog", "/var/log"]
+    search = f"grep -rlsF {token} {' '.join(folders)} || true"
+    return center.machines[identifier].run("sh", "-c", search)
 
 
 def start_caller(site: CloudSite) -> subprocess.Popen[bytes]:

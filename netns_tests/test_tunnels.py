@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import select
 import shutil
 import signal
@@ -119,6 +120,18 @@ def test_a_killed_wireguard_go_heals_and_the_link_stays(sites: tuple[Site, Site]
         until(lambda pid=pid: not is_alive(pid))  # type: ignore[misc]
         until(crosses(one, two), *ends)  # the same packet sockets: the devices are the same
         until(crosses(two, one), *ends)
+
+
+def test_wireguard_go_gets_large_receive_buffers_also_after_a_rebind(sites: tuple[Site, Site], ends: Ends) -> None:
+    def has_large_buffers() -> bool:
+        with sites[0].entered():
+            listed = subprocess.run(["ss", "-OHlnum"], check=True, capture_output=True, text=True).stdout
+        own = [line for line in listed.splitlines() if f":{ends[0].listen_port} " in line]
+        return bool(own) and all(int(re.findall(r",rb(\d+)", line)[0]) > (7 << 20) for line in own)
+
+    until(has_large_buffers, *ends)
+    ends[0].rebind()
+    until(has_large_buffers, *ends)
 
 
 def test_changes_during_a_restart_are_applied_after_it(sites: tuple[Site, Site], ends: Ends) -> None:

@@ -22,11 +22,23 @@ SOURCE, OTHER_SOURCE = bytes([0x50]) * 32, bytes([0x51]) * 32
 ONE, BOTH, SPLIT, GONE, HALF, UNKNOWN, DEAD, ANYBODY = (bytes([0xD0 + n]) * 32 for n in range(8))
 RESCUED, READY, CUT_OFF, TREE = (bytes([0xE0 + n]) * 32 for n in range(4))
 NO_SOURCE = bytes(32)
+SECOND = 0x80
+NO_SECOND = (DropReason.NO_SECOND_PATH,)
 
 TO_WIDE = (WIDE, PEER_MACS[WIDE] + WIDE_MAC)
 TO_NARROW = (NARROW, PEER_MACS[NARROW] + NARROW_MAC)
 TO_ABSENT = (ABSENT, bytes(12))
+
+
+def _second(name: bytes) -> bytes:
+    return name[:31] + bytes([name[31] ^ 1])
+
+
 ENTRIES: dict[bytes, Hops] = {
+    _second(ONE) + SOURCE: (TO_NARROW,),
+    _second(BOTH) + SOURCE: (TO_WIDE, TO_NARROW),
+    _second(SPLIT): (TO_WIDE,),
+    _second(GONE) + SOURCE: NOWHERE,
     ONE: (TO_WIDE,),
     BOTH: (TO_WIDE, TO_NARROW),
     SPLIT: (TO_WIDE,),
@@ -93,7 +105,19 @@ CASES = [
     _forwarded("padding is kept", frame(ONE, b"x", padding=b"padding"), WIDE),
     _forwarded("unknown flags and kinds pass", frame(ONE, kind=0x7F, flags=0xFF), WIDE),
     _forwarded("two hops left become one", frame(ONE, hops_left=2), WIDE),
-    _forwarded("255 hops left become 254", frame(ONE, hops_left=255), WIDE),
+    _forwarded("127 hops left become 126", frame(ONE, hops_left=127), WIDE),
+    _forwarded("a second copy takes the second path", frame(ONE, hops_left=SECOND | 64), NARROW),
+    _forwarded("a second copy keeps its bit at the last hop", frame(ONE, hops_left=SECOND | 2), NARROW),
+    _forwarded("a second copy with the most hops", frame(ONE, hops_left=SECOND | 127), NARROW),
+    _forwarded("copies of a second copy", frame(BOTH, hops_left=SECOND | 64), NARROW, WIDE),
+    _forwarded("a second copy of any source", frame(SPLIT, source=OTHER_SOURCE, hops_left=SECOND | 64), WIDE),
+    Case("a second copy of another source", frame(ONE, source=OTHER_SOURCE, hops_left=SECOND | 64), drops=NO_SECOND),
+    Case("a second copy without a second path", frame(HALF, hops_left=SECOND | 64), drops=NO_SECOND),
+    Case("a second copy to an unknown name", frame(UNKNOWN, hops_left=SECOND | 64), drops=NO_SECOND),
+    Case("a second copy with one hop left", frame(ONE, hops_left=SECOND | 1), drops=(DropReason.HOPS_EXPIRED,)),
+    Case("a second copy with no hops left", frame(ONE, hops_left=SECOND), drops=(DropReason.HOPS_EXPIRED,)),
+    Case("a negative entry of the second path", frame(GONE, hops_left=SECOND | 64), drops=(DropReason.NO_ROUTE,)),
+    Case("a neighbour's word with the bit", frame(ONE, kind=Kind.HELLO, hops_left=SECOND | 1), punted=True),
     _forwarded("the widest frame", frame(ONE, bytes(1500 - 96)), WIDE),
     _forwarded("copies", frame(BOTH), WIDE, NARROW),
     _forwarded("the widest frame for both", frame(BOTH, bytes(700 - 96)), WIDE, NARROW),

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+from collections.abc import Sequence
 from contextlib import closing, suppress
 from typing import Annotated, Final
 
@@ -92,7 +93,9 @@ def end_cluster(site: Site, journal: Journal, name: str, why: str, *, as_json: b
             time.sleep(_STEP_S)
         rest = _release(site, name)
         now_s = time.time()
-        for record in journal.machines(name, gone=False):
+        left = journal.machines(name, gone=False)
+        _remove_members(site, name, [each.name for each in left], now_s)
+        for record in left:
             from fog.supervisor.record import Outcome
 
             journal.put(record.ended(record.ending or Outcome.RELEASED, why, now_s), now_s, "released", why)
@@ -100,6 +103,18 @@ def end_cluster(site: Site, journal: Journal, name: str, why: str, *, as_json: b
         if not as_json:
             console.print(event_line(entry))
     return max(count, rest)
+
+
+def _remove_members(site: Site, cluster: str, machines: Sequence[str], now_s: float) -> None:
+    """Remove machines from the border's domain that no supervisor has removed."""
+    if site.border is None or not machines:
+        return
+    from fog.enrolment.bootstrap import machine_label
+    from fog.enrolment.domain_members import DomainMembers
+
+    with closing(DomainMembers(site.border)) as members:
+        for each in machines:
+            members.remove(machine_label(cluster, each), unix_s=now_s)
 
 
 def _release(site: Site, name: str) -> int:

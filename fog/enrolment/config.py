@@ -1,19 +1,15 @@
-"""Section ``enrolment:`` of ``fog.yaml``: the address at which rented machines reach the launcher.
+"""Section ``enrolment:`` of ``fog.yaml``, and the form of addresses in that file.
 
 Sans-I/O.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Final
-
-from pydantic import AfterValidator, Field
+from pydantic import Field
 
 from gdp.nodes.schema import Section
 
-__all__ = ["ENROLMENT_PORT", "EnrolmentConfig", "host_and_port", "listening_place", "reachable_place"]
-
-ENROLMENT_PORT: Final = 4780
+__all__ = ["EnrolmentConfig", "host_and_port", "listening_place", "reachable_place"]
 
 
 def host_and_port(text: str) -> tuple[str, int]:
@@ -54,16 +50,7 @@ def reachable_place(text: str) -> str:
 class EnrolmentConfig(Section):
     """Section ``enrolment:`` of ``fog.yaml``."""
 
-    address: Annotated[str, AfterValidator(reachable_place)] | None = Field(
-        default=None,
-        description="`HOST:PORT` at which a rented machine reaches the supervisor, by TCP. Default: the tunnel's"
-        f" `remote`, port {ENROLMENT_PORT}. Machines of `local` use a Unix socket.",
-    )
-    listen: Annotated[str, AfterValidator(listening_place)] | None = Field(
-        default=None,
-        description="`HOST:PORT` on which the supervisor listens. Default: every address, with the port of `address`.",
-    )
     revoke_misused: bool = Field(
         default=True,
-        description="Whether a machine whose token was used again, with another key, is revoked and replaced.",
+        description="`local`: whether a machine whose ticket was used again, with another key, is replaced.",
     )

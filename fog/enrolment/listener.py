@@ -22,6 +22,7 @@ from typing import Final
 
 from fog.enrolment.responder import Responder
 from gdp.errors import GdpError, LocalError, StatementError
+from gdp.ports.listening import listen_tcp
 from gdp.trust.enrolment import REQUEST_MAX_BYTES, request_head
 
 __all__ = ["ACCEPTS_PER_S", "CONNECTIONS_MAX", "CONNECTION_S", "Listener", "bind_tcp", "bind_unix"]
@@ -54,10 +55,7 @@ def bind_tcp(host: str, port: int) -> socket.socket:
         LocalError: the port is taken, or the address is not this host's.
     """
     try:
-        if not host and socket.has_dualstack_ipv6():
-            return socket.create_server(("", port), family=socket.AF_INET6, backlog=_BACKLOG, dualstack_ipv6=True)
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        return socket.create_server((host, port), family=family, backlog=_BACKLOG)
+        return listen_tcp(host, port)
     except OSError as error:
         raise LocalError(f"enrolment: listen on {host or '*'}:{port}: {error.strerror or error}") from error
 

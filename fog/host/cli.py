@@ -15,7 +15,7 @@ from typing import Annotated
 import typer
 
 from fog.host.agent import MachineAgent
-from fog.host.bundle import TICKET_FILE
+from fog.host.bundle import JOIN_FILE, TICKET_FILE
 from gdp.cli.node import Verbose, emit, failing_clearly, set_up_logging
 from gdp.cli.version import Version
 
@@ -40,8 +40,8 @@ def machine(
     await_go: AwaitGo = False,
     version: Version = False,
 ) -> None:
-    """Be a machine of a cluster: enrol if there is a ticket, run the programs of boot.json until SIGTERM.
-    SIGUSR1 drains it first.
+    """Be a machine of a cluster: enrol if there is a ticket, join if there is a token, run the programs of boot.json
+    until SIGTERM. SIGUSR1 drains it first.
 
     Its folder's status.json tells how they are, logs/ what they say.
     """
@@ -52,16 +52,38 @@ def machine(
         if await_go and not sys.stdin.readline():
             log.warning("no start command came, so no record of this machine exists")
             raise typer.Exit(1)
-        if (home / TICKET_FILE).exists():
-            from fog.host.enrolment import enrol  # later starts do not need these imports
-
+        reason = ""
+        if (home / TICKET_FILE).exists() or (home / JOIN_FILE).exists():
             signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR1, signal.SIGUSR2})  # until the agent handles them
-            enrol(home.resolve())
-        reason = asyncio.run(host.run())
+            reason = _become_member(home.resolve())
+        reason = reason or asyncio.run(host.run())
         if json:
             emit("done", reason=reason)
         else:
             typer.echo(f"machine ends: {reason}")
+
+
+def _become_member(home: Path) -> str:
+    """Enrol with the ticket, or join with the token; return why the machine never can; empty: it has.
+
+    A machine whose token is used, unknown or expired ends, so that another one replaces it. Later starts do not need
+    these imports.
+    """
+    if (home / TICKET_FILE).exists():
+        from fog.host.enrolment import enrol
+
+        enrol(home)
+    if (home / JOIN_FILE).exists():
+        from fog.host.joining import join
+        from gdp.enrolment.wire import EnrolmentError, Refusal
+
+        try:
+            join(home)
+        except EnrolmentError as error:
+            if error.code not in (Refusal.USED, Refusal.UNKNOWN_TOKEN, Refusal.EXPIRED):
+                raise
+            return f"the domain refuses it: {error}"
+    return ""
 
 
 def main() -> None:

@@ -21,7 +21,6 @@ import tarfile
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from ipaddress import IPv4Address, IPv6Address
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -41,11 +40,9 @@ from gdp.stores.files import read_at_most
 __all__ = [
     "HOME",
     "USER_DATA_MAX_BYTES",
-    "VXLAN_PORT",
     "AptSource",
     "Placed",
     "Setup",
-    "Vxlan",
     "cloud_config",
     "placed",
 ]
@@ -53,7 +50,6 @@ __all__ += ["lines_of", "shell_script", "user_data"]
 
 HOME: Final = "/var/lib/fog"
 USER_DATA_MAX_BYTES: Final = 16 * 1024
-VXLAN_PORT: Final = 4789  # RFC 7348
 _INSTALLED: Final = "/opt/fog"
 _REQUIREMENTS: Final = "/etc/fog-requirements.txt"
 _INSTALL: Final = "/usr/local/sbin/fog-install"
@@ -63,13 +59,20 @@ _WORKSPACE: Final = "/opt/fog-workspace"
 _APT: Final = "/etc/apt/sources.list.d/fog-{}.sources"
 _APT_KEY: Final = "/etc/apt/keyrings/fog-{}.asc"
 _KEY_MAX_BYTES: Final = 64 << 10
-_PACKAGES: Final = ("python3-venv", "iproute2", "util-linux")
+_PACKAGES: Final = ("python3-venv", "iproute2", "util-linux", "wireguard-go")  # the last where the kernel has none
+_APT_CONFIG: Final = 'APT::Install-Recommends "false";\n'
 _PRIVATE: Final = 0o600
 _NODE_USER: Final = "fog-node"  # user account of the users' nodes, which cannot read the machine's keys
 _NODE_HOME: Final = "/var/lib/fog-node"
 _MAKE_USER: Final = (
     f"id -u {_NODE_USER} >/dev/null 2>&1 || useradd --system --user-group --shell /usr/sbin/nologin"
     f" --home-dir {_NODE_HOME} --create-home {_NODE_USER}"
+)
+# cloud-init keeps copies of the user data, with the machine's token; they have been used when this runs.
+_SCRUB: Final = (
+    "for each in /var/lib/cloud/instances/*; do\n"
+    'rm -f "$each"/user-data.txt* "$each"/cloud-config.txt "$each"/obj.pkl\n'
+    "done"
 )
 # The metadata service exposes user data with the machine's secrets, so only programs of root may reach it. Routing
 # rules
@@ -103,7 +106,7 @@ SystemCallFilter=@system-service bpf capset seccomp landlock_create_ruleset land
 SystemCallErrorNumber=EPERM
 MemoryMax=90%
 LimitNOFILE=65536
-RuntimeDirectory=fog
+RuntimeDirectory=fog wireguard
 RuntimeDirectoryMode=0700
 """
 _CLOSE: Final = (
@@ -126,19 +129,6 @@ WantedBy=multi-user.target
 """
 
 
-class Vxlan(Section):
-    """Layer-2 device through a tunnel to the operator's side.
-
-    The tunnel is neither encrypted nor authenticated: frames in it are sealed, but a firewall or a VPN below must
-    prevent injected frames. ``remote`` is the address of the other end as the machine reaches it. ``device`` is the
-    name of the tunnel on the machine: the switch's port.
-    """
-
-    remote: IPv4Address | IPv6Address
-    id: int = Field(default=1, ge=1, lt=1 << 24)
-    device: str = Field(default="fog0", pattern=r"^[a-z][a-z0-9]{0,14}$")
-
-
 class AptSource(Section):
     """Repository of packages, such as that of ROS; ``key_file``: its signing key, in ASCII armour."""
 
@@ -154,8 +144,8 @@ class Setup(Section):
     For pip, each with its hash: ``requirements`` (the wheel of this package, wheels with the nodes, and all
     dependencies) and the file ``requirements_file``. ``packages`` are packages of the distribution in addition to the
     required ones, and ``apt_sources`` are further repositories of such. ``source`` are shell scripts that the machine
-    sources before its programs start. Without ``vxlan``, the devices of the bundle's switch must exist. There is no
-    default for pip, because anyone could register an unused name on an index.
+    sources before its programs start. There is no default for pip, because anyone could register an unused name on an
+    index.
     """
 
     requirements: tuple[Annotated[str, AfterValidator(pinned)], ...] = ()
@@ -163,7 +153,6 @@ class Setup(Section):
     apt_sources: tuple[AptSource, ...] = ()
     packages: tuple[str, ...] = ()
     source: tuple[Annotated[str, Field(pattern=r"^/[A-Za-z0-9._/+-]+$")], ...] = ()
-    vxlan: Vxlan | None = None
 
     @property
     def has_requirements(self) -> bool:
@@ -202,8 +191,6 @@ def placed(files: Mapping[str, bytes], setup: Setup) -> list[Placed]:
         own.append(Placed(_APT.format(index), _apt(each, _APT_KEY.format(index)), 0o644))
     own.append(Placed("/etc/systemd/system/fog-machine.service", _service(setup).encode(), 0o644))
     own.append(Placed("/etc/systemd/system/fog-log@.service", _LOG.encode(), 0o644))
-    if setup.vxlan:
-        own.append(Placed("/etc/systemd/system/fog-tunnel.service", _tunnel(setup.vxlan).encode(), 0o644))
     return own
 
 
@@ -218,10 +205,11 @@ def cloud_config(files: Mapping[str, bytes], setup: Setup) -> str:
             packed = base64.b64encode(file.content).decode()
             written.append({**entry, "encoding": "b64", "content": packed})
     config = {
+        "apt": {"preserve_sources_list": True, "conf": _APT_CONFIG},
         "package_update": True,
         "packages": [*_PACKAGES, *setup.packages],
         "write_files": written,
-        "runcmd": [*_CLOSE, *(shlex.split(line) for line in _start(files, setup))],
+        "runcmd": [*_CLOSE, *(shlex.split(line) for line in _start(files))],
     }
     return "#cloud-config\n" + yaml.safe_dump(config, sort_keys=False, width=4096)
 
@@ -244,14 +232,15 @@ def user_data(files: Mapping[str, bytes], setup: Setup) -> bytes:
 
 def shell_script(files: Mapping[str, bytes], setup: Setup) -> str:
     """Return a bash script with the effect of ``cloud_config``, for root or a user with ``sudo``."""
+    packages = shlex.join([*_PACKAGES, *setup.packages])
     lines = [
         "set -euo pipefail",
         "base64 -d <<'EOF' | sudo tar --extract --gzip --no-same-owner --directory / --file -",
         f"{_tar(files, setup)}EOF",
         *(f"sudo {shlex.join(line)}" for line in _CLOSE),
         "sudo apt-get update -qq",
-        f"sudo env DEBIAN_FRONTEND=noninteractive apt-get install -qq {shlex.join([*_PACKAGES, *setup.packages])}",
-        *(f"sudo {line}" for line in _start(files, setup)),
+        f"sudo env DEBIAN_FRONTEND=noninteractive apt-get install -qq --no-install-recommends {packages}",
+        *(f"sudo {line}" for line in _start(files)),
     ]
     return "\n".join(lines) + "\n"
 
@@ -272,15 +261,15 @@ def _tar(files: Mapping[str, bytes], setup: Setup) -> str:
     return base64.encodebytes(packed.getvalue()).decode()
 
 
-def _start(files: Mapping[str, bytes], setup: Setup) -> list[str]:
+def _start(files: Mapping[str, bytes]) -> list[str]:
     programs = read_programs(files[BOOT_FILE]) if BOOT_FILE in files else ()
-    units = ["fog-tunnel"] * bool(setup.vxlan) + ["fog-machine"] + [f"fog-log@{each.name}" for each in programs]
+    units = ["fog-machine"] + [f"fog-log@{each.name}" for each in programs]
     return ["systemctl daemon-reload", f"systemctl enable --now --no-block {' '.join(units)}"]
 
 
 def _install(setup: Setup, *, fetches: bool) -> str:
     # the service runs it before each start, so an unreachable index is tried again
-    head = f"#!/bin/sh\nset -eu\n{_MAKE_USER}\n{_METADATA}"
+    head = f"#!/bin/sh\nset -eu\n{_SCRUB}\n{_MAKE_USER}\n{_METADATA}"
     if not setup.has_requirements and not fetches:
         return f"""{head}[ -x {_INSTALLED}/bin/fog-machine ] && exit 0
 echo 'nothing is installed: name it in software.wheels, or pinned by hash in requirements of setup' >&2
@@ -326,11 +315,10 @@ def _requirements(setup: Setup) -> bytes:
 
 
 def _service(setup: Setup) -> str:
-    after = " fog-tunnel.service" if setup.vxlan else ""
     return f"""[Unit]
 Description=The programs of a machine of a fog cluster
-After=network-online.target{after}
-Wants=network-online.target{after}
+After=network-online.target
+Wants=network-online.target
 StartLimitIntervalSec=0
 SuccessAction=poweroff
 
@@ -356,22 +344,3 @@ def _start_line(setup: Setup) -> str:
     scripts = [*setup.source, f"{_WORKSPACE}/local_setup.bash"]
     source = "for each; do if [ -e $$each ]; then . $$each; fi; done"
     return f"/bin/bash -c '{source}; exec {_INSTALLED}/bin/fog-machine --home {HOME}' fog-machine {' '.join(scripts)}"
-
-
-def _tunnel(vxlan: Vxlan) -> str:
-    link = f"{vxlan.device} type vxlan id {vxlan.id} remote {vxlan.remote} dstport {VXLAN_PORT}"
-    return f"""[Unit]
-Description=The layer-2 tunnel of a fog cluster
-After=network-online.target
-Wants=network-online.target
-
-[Service]
-Type=oneshot
-RemainAfterExit=yes
-ExecStart=/bin/sh -c 'ip link show {vxlan.device} || ip link add {link}'
-ExecStart=/bin/sh -c 'ip link set {vxlan.device} up'
-ExecStop=/bin/sh -c 'ip link delete {vxlan.device}'
-
-[Install]
-WantedBy=multi-user.target
-"""

@@ -28,7 +28,7 @@ class SoftwareConfig(Section):
     )
     address: Annotated[str, AfterValidator(reachable_place)] | None = Field(
         default=None,
-        description="`HOST:PORT` at which a machine fetches these, by HTTPS. Default: the host of enrolment, port"
+        description="`HOST:PORT` at which a machine fetches these, by HTTPS. Default: the border's host, port"
         f" {SOFTWARE_PORT}.",
     )
     listen: Annotated[str, AfterValidator(listening_place)] | None = Field(

@@ -12,6 +12,7 @@ so machines trust this one and no other.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import hmac
 import json
@@ -21,7 +22,7 @@ import socket
 import ssl
 import tempfile
 import threading
-from collections import Counter
+from collections import Counter, OrderedDict
 from collections.abc import Callable
 from datetime import datetime, timedelta, timezone
 from http import HTTPStatus
@@ -46,6 +47,7 @@ SOFTWARE_FILE: Final = "software.json"  # on the machine, too: what ``fetch`` re
 _FETCHES_MAX: Final = 8  # of one file with one URL; a machine repeats a download that was cut
 _CONNECTIONS_MAX: Final = 32
 _TIMEOUT_S: Final = 30.0
+_YIELD_S: Final = 1.0  # for the end of a connection that gives way
 _PIECE_BYTES: Final = 1 << 18
 _KEY_BYTES: Final = 32
 _VALID: Final = timedelta(days=3_650)
@@ -119,11 +121,12 @@ class SoftwareServer:
             return None
         if int(expiry.partition("-")[0], 16) < self._now():
             return None
+        found = self._files.get(digest)
+        if found is None:
+            return None
         with self._lock:
             self._fetches[capability, digest] += 1
-            if self._fetches[capability, digest] > _FETCHES_MAX:
-                return None
-        return self._files.get(digest)
+            return None if self._fetches[capability, digest] > _FETCHES_MAX else found
 
 
 class _Server(ThreadingHTTPServer):
@@ -132,33 +135,55 @@ class _Server(ThreadingHTTPServer):
     def __init__(
         self, listening: socket.socket, find: Callable[[str], Path | bytes | None], tls: ssl.SSLContext
     ) -> None:
-        handler = type("Handler", (_Handler,), {"find": staticmethod(find)})
+        handler = type("Handler", (_Handler,), {"find": staticmethod(find), "set_idle": staticmethod(self.set_idle)})
         super().__init__(("", 0), handler, bind_and_activate=False)
         self.socket.close()
         self.socket = listening
         self._tls = tls
         self._free = threading.BoundedSemaphore(_CONNECTIONS_MAX)
+        self._idle: OrderedDict[socket.socket, None] = OrderedDict()  # without a valid URL yet, the oldest first
+        self._lock = threading.Lock()
+
+    def get_request(self) -> tuple[socket.socket, Any]:
+        """Accept a connection; its handshake follows in its thread."""
+        request, client_address = super().get_request()
+        request.settimeout(_TIMEOUT_S)
+        return self._tls.wrap_socket(request, server_side=True, do_handshake_on_connect=False), client_address
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Serve a connection in a thread; refuse it if too many are open."""
+        """Serve a connection in a thread; if too many are open, the oldest one without a valid URL gives way."""
         if not self._free.acquire(blocking=False):
-            log.warning("software not sent to=%s reason=too many connections", client_address)
-            self.shutdown_request(request)
-            return
+            with self._lock:
+                oldest = next(iter(self._idle), None)
+                if oldest is not None:
+                    del self._idle[oldest]
+                    _interrupt(oldest)
+            if oldest is None or not self._free.acquire(timeout=_YIELD_S):
+                log.warning("software not sent to=%s reason=too many connections", client_address)
+                self.shutdown_request(request)
+                return
+        self.set_idle(request, is_idle=True)
         super().process_request(request, client_address)
+
+    def set_idle(self, connection: socket.socket, *, is_idle: bool) -> None:
+        """Note whether a connection is one of a machine that fetches now; others give way to new ones."""
+        with self._lock:
+            self._idle.pop(connection, None)
+            if is_idle:
+                self._idle[connection] = None
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         """Serve a connection until its end."""
         try:
             super().process_request_thread(request, client_address)
         finally:
+            self.set_idle(request, is_idle=False)
             self._free.release()
 
     def finish_request(self, request: Any, client_address: Any) -> None:
         """Do the TLS handshake, in the connection's thread, and answer."""
-        request.settimeout(_TIMEOUT_S)
-        with self._tls.wrap_socket(request, server_side=True) as secured:
-            super().finish_request(secured, client_address)
+        request.do_handshake()
+        super().finish_request(request, client_address)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Log why a connection ended; any host may connect and break off."""
@@ -169,6 +194,7 @@ class _Server(ThreadingHTTPServer):
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     find: Callable[[str], Path | bytes | None]
+    set_idle: Callable[..., None]
 
     def do_GET(self) -> None:
         """Send a file."""
@@ -176,6 +202,13 @@ class _Handler(BaseHTTPRequestHandler):
         if found is None:
             self.send_error(HTTPStatus.NOT_FOUND)
             return
+        self.set_idle(self.connection, is_idle=False)
+        try:
+            self._send(found)
+        finally:
+            self.set_idle(self.connection, is_idle=True)
+
+    def _send(self, found: Path | bytes) -> None:
         if isinstance(found, bytes):
             self._head(len(found))
             self.wfile.write(found)
@@ -195,6 +228,12 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Type", "application/octet-stream")
         self.send_header("Content-Length", str(size))
         self.end_headers()
+
+
+def _interrupt(connection: socket.socket) -> None:
+    """End what another thread does with a connection."""
+    with contextlib.suppress(OSError):  # it has ended in the meantime
+        socket.socket.shutdown(connection, socket.SHUT_RDWR)  # of the plain socket: TLS stays its thread's
 
 
 def _new_keys() -> bytes:

@@ -11,7 +11,7 @@ from functools import partial
 from typing import Final
 
 from fog.cluster import CloudNode, ClusterPlan, MachineRequest
-from fog.enrolment.bootstrap import machine_boot, node_names
+from fog.enrolment.bootstrap import node_names
 from fog.enrolment.credentials import IssuedCredentials
 from fog.latency.known import Latencies
 from fog.machine import Machine, MachineSpec, MachineState
@@ -22,7 +22,7 @@ from fog.supervisor.actions import ActionRunner
 from fog.supervisor.event_log import EventLog
 from fog.supervisor.final_logs import decode_logs, encode_logs
 from fog.supervisor.journal import FINAL_LOGS, Journal
-from fog.supervisor.machine_credentials import MachineCredentials
+from fog.supervisor.machine_credentials import CredentialIssuer
 from fog.supervisor.placement import place
 from fog.supervisor.reconcile import Action, Drain, Launch
 from fog.supervisor.record import Outcome, Record
@@ -70,7 +70,7 @@ class MachineActions:
         site: Site,
         journal: Journal,
         events: EventLog,
-        credentials: MachineCredentials,
+        credentials: CredentialIssuer,
         provider: Provider,
         command: Callable[[CloudNode], Sequence[str]],
         wake: Callable[[], None],
@@ -176,18 +176,13 @@ class MachineActions:
         offer = choice.offer
         spec = MachineSpec(plan.name, self._journal.next_machine(plan.name), offer)
         uplink = self._uplink_iface(offer.region)
-        ticket, until_unix_s = self._credentials.issue_ticket(plan, spec.name, now_s, is_gateway=bool(uplink))
-        boot = machine_boot(
-            self._site.authority,
+        boot, until_unix_s = self._credentials.make_bundle(
             plan,
             spec.name,
             self._command,
-            ticket,
-            iface=self._site.machine_iface,
-            lease_s=self._site.lease_s,
-            shares_host=self.provider.name == "local",
+            self._software(),
+            now_s,
             uplink=uplink,
-            software=self._software(),
         )
         record = Record(spec, wanted, IssuedCredentials("", until_unix_s), now_s)
         records.append(record)

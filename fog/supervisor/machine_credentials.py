@@ -1,4 +1,4 @@
-"""Credentials of machines: enrolment tickets, issued credentials and revocation.
+"""Credentials of machines of this host: enrolment tickets, issued credentials and revocation.
 
 I/O; writes tickets, the journal and revocations.
 """
@@ -7,15 +7,16 @@ from __future__ import annotations
 
 import logging
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TypeAlias
+from typing import Protocol, TypeAlias
 
-from fog.cluster import ClusterPlan
-from fog.enrolment.bootstrap import machine_seats
+from fog.cluster import CloudNode, ClusterPlan
+from fog.enrolment.bootstrap import machine_boot, machine_seats
 from fog.enrolment.members import revoke_credentials
 from fog.enrolment.robot_config import reload
 from fog.enrolment.tickets import News, Report, Tickets
+from fog.machine import MachineBundle
 from fog.site import Site
 from fog.supervisor.event_log import EventLog
 from fog.supervisor.journal import Journal
@@ -26,12 +27,50 @@ from gdp.stores.issue import DAY_S
 from gdp.stores.keyring import load_domain
 from gdp.trust.enrolment import TOKEN_BYTES, Ticket
 
-__all__ = ["MachineCredentials", "Release"]
+__all__ = ["CredentialIssuer", "MachineCredentials", "Release", "end_of_credentials"]
 
 log = logging.getLogger(__name__)
 
 # arguments: plan, name of the machine, the provider's id
 Release: TypeAlias = "Callable[[ClusterPlan, str, str], None]"
+
+
+class CredentialIssuer(Protocol):
+    """Issuer of the credentials of a site's machines, which also revokes them."""
+
+    def make_bundle(
+        self,
+        plan: ClusterPlan,
+        name: str,
+        command: Callable[[CloudNode], Sequence[str]],
+        software: Mapping[str, bytes],
+        now_s: float,
+        *,
+        uplink: str,
+    ) -> tuple[MachineBundle, float]:
+        """Return a new machine's bundle, and the end of validity of its credentials (Unix time)."""
+
+    def has_reports(self) -> bool:
+        """Return whether ``handle_reports`` has something to do at once."""
+
+    def handle_reports(self, release: Release, now_s: float) -> None:
+        """Record the machines that became members, and release those whose token was misused."""
+
+    def revoke(self, record: Record, now_s: float) -> None:
+        """Revoke the memberships of a machine, and make its token useless."""
+
+
+def end_of_credentials(site: Site, now_s: float) -> float:
+    """Return the end of validity of a new machine's credentials (Unix time).
+
+    Raises:
+        LocalError: the domain is missing, or its root certificate has expired.
+    """
+    root = load_domain(site.authority.domain).root
+    until_s = min(now_s + site.credential_days * DAY_S, float(root.validity.not_after_unix_s))
+    if until_s <= now_s:
+        raise LocalError("the root of the domain has run out")
+    return until_s
 
 
 class MachineCredentials:
@@ -44,16 +83,41 @@ class MachineCredentials:
         self._tickets = tickets
         self._boot_s = boot_s
 
-    def issue_ticket(self, plan: ClusterPlan, name: str, now_s: float, *, is_gateway: bool) -> tuple[Ticket, float]:
-        """Return a new machine's ticket, and the end of validity of its credentials (Unix time).
+    def make_bundle(
+        self,
+        plan: ClusterPlan,
+        name: str,
+        command: Callable[[CloudNode], Sequence[str]],
+        software: Mapping[str, bytes],
+        now_s: float,
+        *,
+        uplink: str,
+    ) -> tuple[MachineBundle, float]:
+        """Return a new machine's bundle with a ticket, and the end of validity of its credentials (Unix time).
 
         Raises:
             LocalError: the domain is missing, or its root certificate has expired.
         """
-        root = load_domain(self._site.authority.domain).root
-        until_s = min(now_s + self._site.credential_days * DAY_S, float(root.validity.not_after_unix_s))
-        if until_s <= now_s:
-            raise LocalError("the root of the domain has run out")
+        ticket, until_s = self._issue_ticket(plan, name, now_s, is_gateway=bool(uplink))
+        boot = machine_boot(
+            self._site.authority,
+            plan,
+            name,
+            command,
+            ticket,
+            iface=self._site.machine_iface,
+            lease_s=self._site.lease_s,
+            uplink=uplink,
+            software=software,
+        )
+        return boot, until_s
+
+    def has_reports(self) -> bool:
+        """Return False: the supervisor polls machines of this host often enough."""
+        return False
+
+    def _issue_ticket(self, plan: ClusterPlan, name: str, now_s: float, *, is_gateway: bool) -> tuple[Ticket, float]:
+        until_s = end_of_credentials(self._site, now_s)
         ticket = self._tickets.issue(
             plan.name,
             name,

@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 import os
 import signal
-import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -18,6 +17,7 @@ from functools import partial
 from types import FrameType
 from typing import Final
 
+from fog.enrolment.domain_members import DomainMembers
 from fog.enrolment.listener import Listener, bind_tcp, bind_unix
 from fog.enrolment.responder import Responder
 from fog.enrolment.tickets import Tickets
@@ -55,18 +55,24 @@ def supervise(site: Site, *, stays: bool = False, lock: int | None = None) -> No
     with (
         held(site, lock),
         closing(Journal(site.journal)) as journal,
-        closing(Tickets(site.enrolment_folder)) as tickets,
-        closing(Listener(_bound(site), Responder(tickets, site.authority))),
+        _enrolment(site) as enrolment,
         _software(site, timeouts.boot_s) as software,
     ):
-        _run(site, journal, tickets, timeouts, software, stays=stays)
+        _run(site, journal, enrolment, timeouts, software, stays=stays)
 
 
-def _bound(site: Site) -> socket.socket:
-    """Return the listening socket for enrolment of the site's machines."""
-    if site.enrolment_address:
-        return bind_tcp(*site.enrolment_listens)
-    return bind_unix(site.enrolment_socket)
+@contextmanager
+def _enrolment(site: Site) -> Iterator[Tickets | DomainMembers]:
+    """Yield how machines become members: by tickets on this host, served while within, or by joining the domain."""
+    if site.border is not None:
+        with closing(DomainMembers(site.border)) as members:
+            yield members
+        return
+    with (
+        closing(Tickets(site.enrolment_folder)) as tickets,
+        closing(Listener(bind_unix(site.enrolment_socket), Responder(tickets, site.authority))),
+    ):
+        yield tickets
 
 
 @contextmanager
@@ -87,7 +93,7 @@ def _software(site: Site, lifetime_s: float) -> Iterator[Callable[[], Mapping[st
 def _run(
     site: Site,
     journal: Journal,
-    tickets: Tickets,
+    enrolment: Tickets | DomainMembers,
     timeouts: Timeouts,
     software: Callable[[], Mapping[str, bytes]],
     *,
@@ -100,7 +106,7 @@ def _run(
     supervisor = Supervisor(
         site=site,
         journal=journal,
-        tickets=tickets,
+        enrolment=enrolment,
         provider=provider,
         command=partial(command_of, site),
         heard=watch.serving_proxies if watch is not None else lambda: None,

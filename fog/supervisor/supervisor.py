@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Final, TypeAlias
 
 from fog.cluster import CloudNode, ClusterPlan
+from fog.enrolment.domain_members import DomainMembers
 from fog.enrolment.members import metadata_of
 from fog.enrolment.tickets import Tickets
 from fog.machine import Machine, MachineState
@@ -21,9 +22,10 @@ from fog.site import Site
 from fog.supervisor.event_log import EventLog
 from fog.supervisor.events import changes
 from fog.supervisor.gateway_uplinks import GatewayUplinks
+from fog.supervisor.join_credentials import JoinCredentials
 from fog.supervisor.journal import Cluster, Journal
 from fog.supervisor.machine_actions import MachineActions
-from fog.supervisor.machine_credentials import MachineCredentials
+from fog.supervisor.machine_credentials import CredentialIssuer, MachineCredentials
 from fog.supervisor.reconcile import Timeouts, decide
 from fog.supervisor.record import Record, update_record
 from fog.supervisor.robot_access import RobotAccess
@@ -37,6 +39,7 @@ Heard: TypeAlias = "Mapping[str, frozenset[str]]"  # service -> proxies that ser
 
 _GRACE_POLLS: Final = 5  # polls in which a new machine may be missing
 _GRACE_MIN_S: Final = 2.0
+_NEWS_S: Final = 0.25  # another process writes which machines have joined, and notifies no other
 PATIENCE: Final = Timeouts()
 
 
@@ -44,6 +47,7 @@ class Supervisor:
     """Supervisor that keeps the clusters of a site in their desired state; ``StoreError``: the journal is unusable.
 
     Args:
+        enrolment: tickets for machines of this host, or the border's domain, which rented machines join.
         heard: servers that the overlay reports; None: the overlay cannot be queried.
         software: returns the files by which a new machine fetches its software.
     """
@@ -53,7 +57,7 @@ class Supervisor:
         *,
         site: Site,
         journal: Journal,
-        tickets: Tickets,
+        enrolment: Tickets | DomainMembers,
         provider: Provider,
         command: Callable[[CloudNode], Sequence[str]],
         heard: Callable[[], Heard | None],
@@ -68,7 +72,11 @@ class Supervisor:
         self._grace_s = max(_GRACE_POLLS * provider.poll_s, _GRACE_MIN_S)
         self._woken = threading.Event()
         self._events = EventLog(journal)
-        self._credentials = MachineCredentials(site, journal, self._events, tickets, boot_s=patience.boot_s)
+        self._credentials: CredentialIssuer
+        if isinstance(enrolment, Tickets):
+            self._credentials = MachineCredentials(site, journal, self._events, enrolment, boot_s=patience.boot_s)
+        else:
+            self._credentials = JoinCredentials(site, journal, self._events, enrolment, boot_s=patience.boot_s)
         self._actions = MachineActions(
             site=site,
             journal=journal,
@@ -82,6 +90,7 @@ class Supervisor:
         self._gateways = GatewayUplinks(journal, self._events, self._actions, patience)
         self._limits = UsageLimits(site, journal)
         self._robots = RobotAccess(site, on_names)
+        self._known: Heard | None = None  # what the overlay reported at the last reconciliation
         self._settled: set[str] = set()  # clusters that are down without leftovers
         self._owner_key = load_public_key(site.authority.owner_key).compressed
 
@@ -104,9 +113,14 @@ class Supervisor:
         self._woken.set()
 
     def wait(self) -> None:
-        """Wait until the next reconciliation is due."""
-        self._woken.wait(self._actions.provider.poll_s)
+        """Wait until the next reconciliation is due, a machine has joined, or other replicas serve than before."""
+        left_s = self._actions.provider.poll_s
+        while left_s > 0 and not self._woken.wait(min(left_s, _NEWS_S)) and not self._has_news():
+            left_s -= _NEWS_S
         self._woken.clear()
+
+    def _has_news(self) -> bool:
+        return self._credentials.has_reports() or self._heard() != self._known
 
     def close(self) -> None:
         """Wait for running actions and write their results; machines continue."""
@@ -115,6 +129,7 @@ class Supervisor:
 
     def reconcile(self) -> None:
         """Reconcile every cluster once."""
+        self._known = self._heard()
         self._actions.collect_results(time.time())
         self._credentials.handle_reports(self._release_misused, time.time())
         for cluster in self._journal.clusters():

@@ -22,6 +22,7 @@ from gdp.enrolment.addresses import default_addresses, duration_s, endpoint_of, 
 from gdp.enrolment.create import BORDER, DomainPlan, create_domain, make_token
 from gdp.enrolment.domain_files import DomainFiles
 from gdp.enrolment.member_setup import LISTEN_PORT, RELAY_PORT
+from gdp.enrolment.preflight import check_ports, check_tunnels
 from gdp.enrolment.registry import MachineRow, Registry
 from gdp.enrolment.removal import remove_machine
 from gdp.enrolment.server import bind_server, serve_domain
@@ -42,6 +43,7 @@ Public = Annotated[
 JoinRoleText = Annotated[str, typer.Option("--role", help="robot, switch or leaf; see the how-to page on joining")]
 Valid = Annotated[str, typer.Option("--valid", metavar="TIME", help="how long the token can be used: 30m, 1h, 7d")]
 RelayPort = Annotated[int, typer.Option("--relay-port", min=0, max=65_535, help="TCP port of the relay; 0: none")]
+Tokens = Annotated[int, typer.Option("--tokens", min=1, max=100, help="how many lines to print: one joins one machine")]
 Listen = Annotated[int, typer.Option("--listen", min=1, max=65_535, help="UDP port of tunnels, TCP port of enrolment")]
 
 
@@ -52,15 +54,16 @@ def create(
     listen: Listen = LISTEN_PORT,
     relay_port: RelayPort = RELAY_PORT,
     label: options.Label = BORDER,
+    tokens: Tokens = 1,
     no_systemd: NoSystemd = False,
     start: Start = True,
     as_json: options.Json = False,
 ) -> None:
-    """Create a trust domain on a reachable machine, start its border, and print the line that joins a first robot.
+    """Create a trust domain on a reachable machine, start its border, and print a line for each machine to join.
 
     \b
     Examples:
-      gdp domain create lab --public lab.example.org
+      gdp domain create lab --public lab.example.org --tokens 2
       gdp domain create lab --public 203.0.113.7:51820 --no-systemd
     """
     if not _NAME.fullmatch(name):
@@ -75,11 +78,15 @@ def create(
         relay_port=relay_port,
         label=label,
     )
+    if start:
+        check_tunnels()
+        relay = {relay_port: "--relay-port"} if relay_port else {}
+        check_ports({listen: "--listen"}, {listen: "--listen", **relay})
     files = create_domain(plan)
     say(f"domain {name} is in {files.directory}; keep a copy of {files.directory / 'domain'} in a safe place")
-    made = make_token(files, JoinRole.ROBOT, valid_s=duration_s("1h"))
-    result = {"domain": name, "directory": str(files.directory), "servers": servers, "token": made.to_text()}
-    show(result, as_json=as_json, plain=f"gdp join {made.to_text()}")
+    made = [make_token(files, JoinRole.ROBOT, valid_s=duration_s("1h")).to_text() for _ in range(tokens)]
+    result = {"domain": name, "directory": str(files.directory), "servers": servers, "tokens": made}
+    show(result, as_json=as_json, plain="\n".join(f"gdp join {each}" for each in made))
     sys.stdout.flush()
     if start:
         start_machine(files.directory, no_systemd=no_systemd)

@@ -22,16 +22,17 @@ from gdp.cli.machine import (
     NoSystemd,
     Start,
     directory_of,
+    paths_up,
     say,
     start_machine,
-    tunnels_up,
 )
 from gdp.cli.node import set_up_logging
 from gdp.cli.output import show
 from gdp.enrolment.agent import Agent
 from gdp.enrolment.channel import connect_any
-from gdp.enrolment.join import JoinRequest, join_domain
+from gdp.enrolment.join import JoinRequest, join_domain, prefer_server
 from gdp.enrolment.member_files import MemberFiles
+from gdp.enrolment.preflight import check_tunnels
 from gdp.enrolment.programs import programs_of
 from gdp.sharing.member_exchange import MemberExchange
 from gdp.sharing.upkeep import ShareUpkeep
@@ -68,9 +69,12 @@ def join(
       gdp join gdp1aeag... --label robot-7 --uplink wlan0 --uplink wwan0
     """
     read = JoinToken.from_text(token)
+    if start:
+        check_tunnels()
     if directory is None:
         with connect_any(read.servers, read.root) as channel:
             directory = directory_of(_UNSAFE.sub("-", channel.root.label), None)
+            read = prefer_server(read, channel.server)
     request = JoinRequest(token=read, label=label or _host_name(), directory=directory, uplinks=uplink)
     joined = join_domain(request)
     say(f"joined the domain {joined.root.label} as {joined.label} ({joined.role}); files are in {directory}")
@@ -92,6 +96,7 @@ def up(directory: options.Directory, no_systemd: NoSystemd = False, as_json: opt
     Example:
       gdp up /var/lib/gdp/lab --no-systemd
     """
+    check_tunnels()
     if as_json:
         programs = [each.name for each in programs_of(MemberFiles.load(directory))]
         show({"directory": str(directory), "programs": programs}, as_json=True)
@@ -137,9 +142,11 @@ def run_agent(made: Agent) -> None:
 
 def _say_border(directory: Path) -> None:
     """Say whether the border is a neighbour: it is observed, not assumed."""
-    seen = tunnels_up(directory)
+    seen, has_relay = paths_up(directory)
     if seen:
         say(f"tunnels are up: {', '.join(seen)}")
+    elif has_relay:
+        say("no tunnel is up, UDP seems to be blocked: frames pass through TLS at the border, which is slower")
     else:
         say(
             f"no tunnel is up after {BORDER_SEEN_S:g} s: the switch keeps trying. Is UDP to the border let through? See"

@@ -27,7 +27,7 @@ from gdp.host.interruption import Interrupted, interruptible
 from gdp.nodes.control_client import ask_node, find_control_socket
 from gdp.nodes.control_protocol import Command
 
-__all__ = ["AtDirectory", "NoSystemd", "Start", "directory_of", "say", "start_machine", "tunnels_up"]
+__all__ = ["AtDirectory", "NoSystemd", "Start", "directory_of", "paths_up", "say", "start_machine"]
 
 BORDER_SEEN_S: Final = 20.0
 _EACH_S: Final = 0.5
@@ -84,20 +84,20 @@ def start_machine(directory: Path, *, no_systemd: bool, observed: Callable[[Path
         sys.exit(0)
 
 
-def tunnels_up(directory: Path, deadline_s: float = BORDER_SEEN_S) -> list[str]:
-    """Return the labels of the peers whose tunnels are up, as soon as there is one, or after the deadline."""
+def paths_up(directory: Path, deadline_s: float = BORDER_SEEN_S) -> tuple[list[str], bool]:
+    """Return the labels of the peers whose tunnels are up, and whether a relay is; once there is one, or in the end."""
     end_s = time.monotonic() + deadline_s
     while True:
-        found = _tunnels(directory)
-        if found or time.monotonic() >= end_s:
+        found = _labels_up(directory, "links"), bool(_labels_up(directory, "relay"))
+        if any(found) or time.monotonic() >= end_s:
             return found
         time.sleep(_EACH_S)
 
 
-def _tunnels(directory: Path) -> list[str]:
+def _labels_up(directory: Path, key: str) -> list[str]:
     with contextlib.suppress(GdpError):  # the switch is still starting
         status = ask_node(find_control_socket(directory / "switch"), Command.STATUS, 2.0)
-        links = status.result.get("links") if status.is_ok else None
+        links = status.result.get(key) if status.is_ok else None
         if isinstance(links, list):
             return [str(each.get("label")) for each in links if isinstance(each, dict) and each.get("up") is True]
     return []

@@ -66,6 +66,7 @@ class PendingAdvertisement:
     right: Right
     chain: tuple[bytes, ...]
     is_global: bool
+    paths: int = 1
     advertisement_at_s: float = 0.0
     is_taken: bool = False
     refused: DropReason | None = None
@@ -153,10 +154,12 @@ class Attachment:
         assert self._switch is not None
         return self.hello_protocol.ports[self._switch.port].mtu
 
-    def advertisement(self, subject: Subject, right: Right, chain: tuple[bytes, ...], *, is_global: bool) -> None:
-        """Advertise a name from now on."""
+    def advertisement(
+        self, subject: Subject, right: Right, chain: tuple[bytes, ...], *, is_global: bool, paths: int = 1
+    ) -> None:
+        """Advertise a name from now on; ``paths``: over how many disjoint paths its frames are to travel."""
         self._advertisements[subject.name, right] = PendingAdvertisement(
-            subject=subject, right=right, chain=chain, is_global=is_global
+            subject=subject, right=right, chain=chain, is_global=is_global, paths=paths
         )
 
     def renew(self, name: Name, chain: tuple[bytes, ...]) -> None:
@@ -329,6 +332,7 @@ class Attachment:
             chain=each.chain,
             previous=self._former if now.mono_s - self._moved_s < _MOVED_S else ZERO,
             exchange=self._exchange if each.right in HEARS.values() else b"",
+            paths=each.paths,
         )
 
     def _rtcert_for(self, switch: Name) -> bytes:

@@ -114,25 +114,30 @@ class Participant:
         depth: int = 0,
         is_global: bool = True,
         urgent: bool = False,
+        paths: int = 1,
     ) -> Publisher:
-        """Publish a topic from now on."""
+        """Publish a topic from now on; ``paths`` 2: each frame twice, over two disjoint paths where they exist."""
         self._check(topic, Right.PUBLISH, is_free=topic.name not in self._publications)
         publisher = self._publications.add(
-            topic.name, topic.secrets, description, reliable=reliable, depth=depth, urgent=urgent
+            topic.name, topic.secrets, description, reliable=reliable, depth=depth, urgent=urgent, paths=paths
         )
-        self._advertisement(topic, Right.PUBLISH, is_global=is_global)
+        self._advertisement(topic, Right.PUBLISH, is_global=is_global, paths=paths)
         return publisher
 
-    def serve(self, topic: Topic, description: bytes, *, is_global: bool = True, urgent: bool = False) -> Publisher:
+    def serve(
+        self, topic: Topic, description: bytes, *, is_global: bool = True, urgent: bool = False, paths: int = 1
+    ) -> Publisher:
         """Serve a name; return the stream that all its clients receive. ``respond`` sends to one of them."""
-        return self._join_service(topic, Right.SERVE, description, is_global=is_global, urgent=urgent)
+        return self._join_service(topic, Right.SERVE, description, is_global=is_global, urgent=urgent, paths=paths)
 
-    def call(self, topic: Topic, description: bytes, *, is_global: bool = True, urgent: bool = False) -> Publisher:
+    def call(
+        self, topic: Topic, description: bytes, *, is_global: bool = True, urgent: bool = False, paths: int = 1
+    ) -> Publisher:
         """Call a name from now on; return the stream of requests to all its servers. ``send_request`` sends to one.
 
         A request that is published while ``peers`` is empty reaches no server.
         """
-        return self._join_service(topic, Right.CALL, description, is_global=is_global, urgent=urgent)
+        return self._join_service(topic, Right.CALL, description, is_global=is_global, urgent=urgent, paths=paths)
 
     def respond(self, service: Name, client: Name, message: bytes) -> None:
         """Send a message to one client of a name that is served here.
@@ -194,11 +199,11 @@ class Participant:
             self._close(self._subscriptions.remove(name))
         self.attachment.withdraw(name, right)
 
-    def subscribe(self, topic: Topic) -> None:
-        """Read a topic from now on, from every publisher of it."""
+    def subscribe(self, topic: Topic, *, paths: int = 1) -> None:
+        """Read a topic from now on, from every publisher of it; ``paths`` 2: by two paths from those that want two."""
         self._check(topic, Right.READ, is_free=self._subscriptions.get(topic.name) is None)
-        self._subscriptions.add(topic, Right.READ)
-        self._advertisement(topic, Right.READ, is_global=False)
+        self._subscriptions.add(topic, Right.READ, paths)
+        self._advertisement(topic, Right.READ, is_global=False, paths=paths)
 
     def unsubscribe(self, name: Name) -> None:
         """Stop reading a topic; one that is not read is ignored. A later ``subscribe`` begins with new messages."""
@@ -303,6 +308,9 @@ class Participant:
         for writer_proxy in self._writer_proxies_due.poll_due(now.mono_s):
             writer_proxy.handle_timer(now.mono_s)
             self._reporting[writer_proxy] = None
+            subscription = self._subscriptions.get(writer_proxy.topic)
+            if subscription is not None:  # it may have gone on without what is lost
+                self._messages += subscription.poll_messages(writer_proxy.publisher)
         self.flush(now.mono_s)
 
     def flush(self, now_s: float) -> None:
@@ -361,22 +369,22 @@ class Participant:
         if not is_free:
             raise LocalError(f"{topic.name.short} is in use already: {right.value} is refused for it")
 
-    def _advertisement(self, topic: Topic, right: Right, *, is_global: bool) -> None:
+    def _advertisement(self, topic: Topic, right: Right, *, is_global: bool, paths: int) -> None:
         delegation = topic.delegation
-        self.attachment.advertisement(delegation.subject, right, delegation.chain, is_global=is_global)
+        self.attachment.advertisement(delegation.subject, right, delegation.chain, is_global=is_global, paths=paths)
 
     def _join_service(
-        self, topic: Topic, right: Right, description: bytes, *, is_global: bool, urgent: bool
+        self, topic: Topic, right: Right, description: bytes, *, is_global: bool, urgent: bool, paths: int
     ) -> Publisher:
         is_free = topic.name not in self._publications and self._subscriptions.get(topic.name) is None
         self._check(topic, right, is_free=is_free)
         publisher = self._publications.add(
             topic.name, topic.secrets, description,
-            reliable=True, urgent=urgent, patience=CALLS if right is Right.CALL else TOPICS,
+            reliable=True, urgent=urgent, patience=CALLS if right is Right.CALL else TOPICS, paths=paths,
         )  # fmt: skip
-        self._publications.enable_unicast(topic.name, topic.secrets, urgent=urgent)
-        self._subscriptions.add(topic, right)
-        self._advertisement(topic, right, is_global=is_global)
+        self._publications.enable_unicast(topic.name, topic.secrets, urgent=urgent, paths=paths)
+        self._subscriptions.add(topic, right, paths)
+        self._advertisement(topic, right, is_global=is_global, paths=paths)
         return publisher
 
     def _look_at_clock(self, now_s: float) -> None:
@@ -459,9 +467,9 @@ class Participant:
         """Close writer proxies and the streams to ended peers; ``goodbye``: also send each publisher a goodbye."""
         self._under_way = None
         for writer_proxy in writer_proxies:
-            note = writer_proxy.close()
+            notes = writer_proxy.close()
             if goodbye:
-                self.attachment.send([note])
+                self.attachment.send(notes)
             self._reporting.pop(writer_proxy, None)
             self._writer_proxies_due.reschedule(writer_proxy)
             self._publications.forget(

@@ -78,6 +78,7 @@ class Publications:
         depth: int = 0,
         urgent: bool,
         patience: ReaderTimeouts = TOPICS,
+        paths: int = 1,
     ) -> Publisher:
         """Publish a name from now on, above all numbers that were used for it before."""
         publisher = Publisher(
@@ -90,12 +91,13 @@ class Publications:
             urgent=urgent,
             past=self._sequence_registry.of(name),
             patience=patience,
+            paths=paths,
         )
         publisher.published = self.turns.add
         self._publishers[name] = publisher
         return publisher
 
-    def enable_unicast(self, name: Name, secrets: Secrets, *, urgent: bool) -> None:
+    def enable_unicast(self, name: Name, secrets: Secrets, *, urgent: bool, paths: int = 1) -> None:
         """Enable unicast streams on a published name from now on."""
         self._private[name] = UnicastStreams(
             service=name,
@@ -104,6 +106,7 @@ class Publications:
             sequence_registry=self._sequence_registry,
             published=self.turns.add,
             urgent=urgent,
+            paths=paths,
         )
 
     def remove(self, name: Name) -> bool:
@@ -170,6 +173,8 @@ class Publications:
     def receive_join(self, join: Join, now_s: float) -> None:
         """Note that a tree is installed, and its MTU."""
         publisher = self._publishers.get(join.topic)
+        if publisher is not None and join.publisher == self._source.name and join.path > 1:
+            publisher.second_path_until_s = now_s + join.lease_s
         if publisher is not None and join.publisher == self._source.name and join.lease_s > 0:
             path = self._paths.setdefault(join.topic, PathMtu())
             mtu, is_split = path.receive_mtu(join.mtu, now_s), False

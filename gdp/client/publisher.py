@@ -24,7 +24,7 @@ from gdp.client.reader_proxies import TOPICS, ReaderProxies, ReaderTimeouts
 from gdp.client.send_queue import SendQueue
 from gdp.client.sequence_numbers import FIRST, SequenceState
 from gdp.errors import DropReason, EnvelopeError, RemoteError
-from gdp.frame.codec import Header
+from gdp.frame.codec import Header, second_path_copy
 from gdp.frame.kinds import Flag
 from gdp.limits import MTU_MIN_BYTES, WINDOW_BYTES
 from gdp.message.bundle import BUNDLE_BYTES
@@ -49,8 +49,10 @@ class Publisher:
         past: last numbers of an earlier publisher of the same topic, in this incarnation.
         patience: timeouts of its readers.
         address: destination of the frames; None: the topic.
+        paths: 2: a second copy of each frame is sent, marked for the second path, while there is one.
 
     Attributes:
+        second_path_until_s: monotonic second until which there is a second path, as far as known here.
         published: called when frames are ready to be polled, and when the publisher closes.
         has_more: the last ``poll_frames`` reached its limit.
 
@@ -71,8 +73,11 @@ class Publisher:
         past: SequenceState = FIRST,
         patience: ReaderTimeouts = TOPICS,
         address: Name | None = None,
+        paths: int = 1,
     ) -> None:
         self.topic = topic
+        self.paths = paths
+        self.second_path_until_s = float("-inf")
         self._is_reliable = reliable
         self.is_urgent = urgent
         self.has_more = False
@@ -268,7 +273,8 @@ class Publisher:
             secret = self._keys.secret_of(header.epoch, now_s)
             report, is_new = self._readers.open(header, frame, secret, now_s, may_begin=not is_old)
         except RemoteError as error:
-            self.drops[error.reason] += 1
+            is_copy = self.paths > 1 and error.reason is DropReason.REPLAYED
+            self.drops[DropReason.SECOND_COPY if is_copy else error.reason] += 1
             return False
         self._acknowledgements.handle_acknack(header.source, report, is_new=is_new, now_s=now_s)
         self._heartbeats.wanted |= is_old  # it has not received the new epoch yet
@@ -305,13 +311,14 @@ class Publisher:
         if mtu is None or not self._readers:
             return []
         self._queue.seal_deferred()
-        limit = max(limit_bytes // mtu, 1)
+        copies = 2 if self.paths > 1 and now_s < self.second_path_until_s else 1
+        limit = max(limit_bytes // (mtu * copies), 1)
         frames = self._seal_status(now_s, mtu) if self._heartbeats.is_due(now_s) else []
         frames += self._queue.frames_to_send(now_s, limit - len(frames))
         self.has_more = len(frames) >= limit
         if frames:
             self._acknowledgements.last_sent_s = now_s
-        return frames
+        return frames if copies == 1 else [*frames, *map(second_path_copy, frames)]
 
     def _set_flags(self) -> None:
         queue = self._queue

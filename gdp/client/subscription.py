@@ -72,6 +72,7 @@ class Subscription:
     """One name that is read, the right of its peers, and its writer proxies.
 
     Attributes:
+        paths: over how many paths frames come, and reports go, where the peer wants the same.
         private: by writer.
         absent: publishers whose route has ended, with their incarnation, and where their writer proxies ended.
         past_losses: of closed writer proxies.
@@ -79,6 +80,7 @@ class Subscription:
 
     topic: Topic
     right: Right
+    paths: int = 1
     writer_proxies: dict[Name, WriterProxy] = field(default_factory=dict)
     private: dict[Name, UnicastReceiver] = field(default_factory=dict)
     absent: dict[Name, tuple[int, Ended]] = field(default_factory=dict)
@@ -101,6 +103,14 @@ class Subscription:
     def all(self) -> list[WriterProxy]:
         """Return every writer proxy."""
         return [*self.writer_proxies.values(), *self.private.values()]
+
+    def set_advertisement(self, writer_proxy: WriterProxy, advertisement: Advertisement) -> None:
+        """Set the newest advertisement of a publisher: it may want two paths, or no longer."""
+        writer_proxy.advertisement_sequence, writer_proxy.advertisement = advertisement.sequence, advertisement
+        writer_proxy.paths = min(self.paths, advertisement.paths)
+        private = self.private.get(writer_proxy.publisher)
+        if private is not None:
+            private.paths = writer_proxy.paths
 
     def poll_messages(self, source: Name) -> list[Message]:
         """Return, once, the messages of one source; unicast ones only once the source has sent their description."""
@@ -159,9 +169,9 @@ class Subscriptions:
         """Return the subscription of a name, or None."""
         return self._by_name.get(name)
 
-    def add(self, topic: Topic, right: Right) -> None:
-        """Read a name from now on."""
-        self._by_name[topic.name] = Subscription(topic=topic, right=right)
+    def add(self, topic: Topic, right: Right, paths: int = 1) -> None:
+        """Read a name from now on; ``paths``: over how many paths its frames are to come."""
+        self._by_name[topic.name] = Subscription(topic=topic, right=right, paths=paths)
 
     def remove(self, name: Name) -> list[WriterProxy]:
         """Stop reading a name; return the writer proxies to close."""
@@ -208,7 +218,7 @@ class Subscriptions:
             if advertisement.sequence <= writer_proxy.advertisement_sequence:
                 return change
             if writer_proxy.incarnation == advertisement.incarnation:
-                writer_proxy.advertisement_sequence, writer_proxy.advertisement = advertisement.sequence, advertisement
+                subscription.set_advertisement(writer_proxy, advertisement)
                 return change
             writer_proxy.finish()
             rest = [Message(answer.name, each, writer_proxy.description) for each in writer_proxy.poll_delivered()]
@@ -267,8 +277,8 @@ class Subscriptions:
             ended=ended,
             restarted=incarnation_id != advertisement.incarnation,
         )
-        writer_proxy.advertisement_sequence, writer_proxy.advertisement = advertisement.sequence, advertisement
         subscription.writer_proxies[party] = writer_proxy
+        subscription.set_advertisement(writer_proxy, advertisement)
         if subscription.right is Right.SERVE:
             writer_proxy.idle_s = CALL_IDLE_S
         if subscription.right is not Right.READ:
@@ -294,6 +304,7 @@ class Subscriptions:
                 now_s=now_s,
                 ended=ended,
             )
+            writer_proxy.paths = public.paths
         return writer_proxy
 
     def _stream_from(self, topic: Name, writer_proxy: WriterProxy) -> Name:

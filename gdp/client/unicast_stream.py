@@ -73,6 +73,7 @@ class UnicastStream(Publisher):
         writer: its source for all readers.
         mtu: smallest on the path; None if not known yet.
         past: of the same stream, if it was forgotten.
+        paths: over how many paths each frame is sent.
     """
 
     def __init__(
@@ -86,6 +87,7 @@ class UnicastStream(Publisher):
         urgent: bool,
         past: SequenceState,
         now_s: float,
+        paths: int = 1,
     ) -> None:
         self.reader = party.incarnation_id
         self._exchange = party.exchange
@@ -101,7 +103,9 @@ class UnicastStream(Publisher):
             urgent=urgent,
             past=past,
             address=self.reader.name,
+            paths=paths,
         )
+        self.second_path_until_s = float("inf")  # no join tells of it; without one the first switch drops the copies
         self.tree_stands(MTU_MIN_BYTES if mtu is None else mtu)
 
     def mark_in_use(self, now_s: float) -> None:

@@ -30,6 +30,7 @@ class UnicastStreams:
         urgent: whether their frames go before those that are not urgent.
         pasts: last numbers of forgotten streams; shared by all publishers of this incarnation.
         published: called with each stream that has frames to send.
+        paths: over how many paths each frame is sent.
     """
 
     def __init__(
@@ -41,6 +42,7 @@ class UnicastStreams:
         sequence_registry: SequenceRegistry,
         published: Callable[[Publisher], None],
         urgent: bool,
+        paths: int = 1,
     ) -> None:
         self._service = service
         self._writer = writer
@@ -48,6 +50,7 @@ class UnicastStreams:
         self._sequence_registry = sequence_registry
         self._published = published
         self._urgent = urgent
+        self._paths = paths
         self._streams: dict[Name, UnicastStream] = {}  # by reader
         self._look_at_s = 0.0  # no stream is idle for long enough before
         self._drops: Counter[DropReason] = Counter()  # of closed streams
@@ -101,6 +104,7 @@ class UnicastStreams:
                 secrets=self._secrets,
                 mtu=mtu,
                 urgent=self._urgent,
+                paths=self._paths,
                 past=past,
                 now_s=now_s,
             )

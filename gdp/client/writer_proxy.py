@@ -16,7 +16,7 @@ It joins five parts:
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Sequence
 from enum import Enum
 from typing import Final, NamedTuple
@@ -29,7 +29,7 @@ from gdp.client.key_epochs import Secrets
 from gdp.client.reordering import ReorderingBuffer
 from gdp.crypto.envelope import Opener
 from gdp.errors import DropReason, EnvelopeError, RemoteError
-from gdp.frame.codec import Header
+from gdp.frame.codec import Header, second_path_copy
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import NACKS_PER_REPORT, NUMBER_MAX, REPLAY_WINDOW_MESSAGES, REPORT_IDLE_S, SEQUENCE_BYTES
 from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
@@ -38,6 +38,7 @@ from gdp.message.loss import Losses, LossReason
 from gdp.message.reassembly import ReassembledMessage, Reassembler, VerifiesDigest
 from gdp.message.reassembly_quota import ReassemblyQuota
 from gdp.message.renumbering import Renumbering
+from gdp.message.second_copies import DeferredRequests, SecondCopies
 from gdp.names import Name
 from gdp.sansio import ReceivedFrame
 from gdp.trust.advertisement import Advertisement
@@ -141,6 +142,11 @@ class WriterProxy:
         self._schedule = AckNackSchedule(self._data, now_s)
         self._order = ReorderingBuffer(publisher, budget)
         self._delivery = DeliveryQueue(publisher, incarnation, self._data.drops)
+        self._copies: SecondCopies | None = None
+        self._gap_until_s = float("inf")  # best effort, two paths: until then the slower one may bring what is missing
+        self._gap_at = 0  # ... and the number that is missing
+        self._held: deque[tuple[float, Heartbeat]] = deque()  # ... and what a Heartbeat says of it counts
+        self._deferred = DeferredRequests()
         self._is_reliable: bool | None = None
         self._sent = (0, 0)  # the publisher has sent everything before this (number, fragment)
         self.state = WriterProxyState.NEW
@@ -159,6 +165,18 @@ class WriterProxy:
     def idle_s(self, idle_s: float) -> None:
         """Set the longest time between two reports."""
         self._schedule.idle_s = idle_s
+
+    @property
+    def paths(self) -> int:
+        """Return over how many paths frames of this publisher come, and reports to it go."""
+        return 1 if self._copies is None else 2
+
+    @paths.setter
+    def paths(self, paths: int) -> None:
+        """Set over how many paths frames come and reports go."""
+        if paths != self.paths:
+            self._copies = SecondCopies() if paths > 1 else None
+            self._data.copies, self._status.copies = self._copies, None if self._copies is None else SecondCopies()
 
     @property
     def drops(self) -> Counter[DropReason]:
@@ -213,7 +231,7 @@ class WriterProxy:
         if header.incarnation != self.incarnation:
             self._data.drops[DropReason.WRONG_INCARNATION] += 1
         elif header.kind == Kind.HEARTBEAT and header.number <= self._before.status:
-            self._status.drops[DropReason.REPLAYED] += 1
+            self._status.drop_copy(header, DropReason.REPLAYED, now_s)
         elif header.kind == Kind.HEARTBEAT:
             joined = self._status.add(header, frame, now_s)
             if joined is not None:
@@ -231,15 +249,23 @@ class WriterProxy:
         return taken
 
     def handle_timer(self, now_s: float) -> None:
-        """Drop what waited too long for its fragments (best effort)."""
+        """Drop what waited too long for its fragments, and go on without what neither path brought (best effort)."""
         is_final = self.state is WriterProxyState.LIVE and not self._is_reliable
+        while self._held and self._held[0][0] <= now_s:
+            self._apply_progress(self._held.popleft()[1], now_s)
+        if self._gap_until_s <= now_s:
+            if self._order:
+                self._skip_to(self._order.numbers[0])
+            self._deliver(now_s)
         self._data.drop_expired(now_s, for_good=is_final)
         self._status.drop_expired(now_s, for_good=False)
 
     def get_timer(self) -> float:
         """Return the monotonic second of the next timer."""
         expiries = [self._status.next_expiry(), self._data.next_expiry()]
-        return min([self._schedule.due_s, *(expiry for expiry in expiries if expiry is not None)])
+        held_s = self._held[0][0] if self._held else float("inf")
+        due_s = min(self._schedule.due_s, self._gap_until_s, held_s)
+        return min([due_s, *(expiry for expiry in expiries if expiry is not None)])
 
     def control_to_send(self, now_s: float) -> list[bytes]:
         """Return the frames of the report that is due, if one is, and of an introduction if it is wanted."""
@@ -250,32 +276,40 @@ class WriterProxy:
         if self.state is WriterProxyState.NEW:
             schedule.due_s = now_s + ANNOUNCE_S
             number, sequence = (self._before.number, self._before.sequence) if self._before.resumes else (0, 0)
-            return self._sealer.seal_first(AckNack(AckNackFlag.NEW, number, 0, (), sequence))
+            return self._over_paths(self._sealer.seal_first(AckNack(AckNackFlag.NEW, number, 0, (), sequence)))
         missing = self._missing() if self._is_reliable else ()
+        if self._copies is not None:
+            missing = self._deferred.poll_due(missing, self._lag_s(), now_s)
         schedule.handle_reported(now_s, is_missing=bool(missing))
+        schedule.due_s = min(schedule.due_s, self._deferred.due_s)
         expected = self._order.expected
         part, sequence = self._data.progress(expected), self._delivery.sequence
-        return self._sealer.seal_all(AckNack(AckNackFlag.NONE, expected, part, missing, sequence, self.lost), now_s)
+        report = AckNack(AckNackFlag.NONE, expected, part, missing, sequence, self.lost)
+        return self._over_paths(self._sealer.seal_all(report, now_s))
 
     def poll_delivered(self) -> list[Delivered]:
         """Remove and return the messages that are ready, in order."""
         return self._delivery.poll()
 
-    def close(self) -> bytes:
-        """Release all memory; return the frame of the goodbye."""
+    def close(self) -> list[bytes]:
+        """Release all memory; return the frames of the goodbye."""
         self._data.close()
         self._status.close()
         self._order.poll_all()
-        self._schedule.due_s = float("inf")
-        return self._sealer.seal(
-            AckNack(AckNackFlag.BYE, self._order.expected, 0, (), self._delivery.sequence, self.lost)
-        )
+        self._schedule.due_s = self._gap_until_s = float("inf")
+        self._held.clear()
+        report = AckNack(AckNackFlag.BYE, self._order.expected, 0, (), self._delivery.sequence, self.lost)
+        return self._over_paths([self._sealer.seal(report)])
 
     def renew(self, secrets: Secrets) -> None:
         """Replace the topic's secrets; an epoch that is still among them opens as before."""
         self._secrets = secrets
         self._openers.clear()
         self._sealer.renew(secrets)
+
+    def _over_paths(self, notes: list[bytes]) -> list[bytes]:
+        """Return notes, and their second copies if there are two paths."""
+        return notes if self._copies is None else [*notes, *map(second_path_copy, notes)]
 
     def _opener(self, kind: Kind, epoch: int) -> Opener:
         opener = self._openers.get((kind, epoch))
@@ -293,7 +327,10 @@ class WriterProxy:
             reassembler.drops[DropReason.MALFORMED] += 1
             return
         if self.state is WriterProxyState.LIVE and not 0 <= header.number - expected < REPLAY_WINDOW_MESSAGES:
-            reassembler.drops[DropReason.LATE if header.number < expected else DropReason.MEMORY_FULL] += 1
+            if header.number < expected:
+                reassembler.drop_copy(header, DropReason.LATE, now_s)
+            else:
+                reassembler.drops[DropReason.MEMORY_FULL] += 1
             return
         seen, highest, refused = reassembler.new_parts, reassembler.highest, reassembler.drops[DropReason.MEMORY_FULL]
         joined = reassembler.add(header, frame, now_s)
@@ -305,26 +342,29 @@ class WriterProxy:
                 self._schedule.handle_part(header, highest, expected, now_s)
         if joined is not None:
             self._sealer.handle_message(joined.number, header.epoch, now_s)
-            self._arrange(joined)
+            self._arrange(joined, now_s)
         elif (
             reassembler.drops[DropReason.MEMORY_FULL] > refused and self.state is WriterProxyState.LIVE and self._order
         ):
             self._delivery.skipped = LossReason.READER_MEMORY
             # the memory behind the gap is exhausted: go on without the missing messages
             self._skip_to(self._order.numbers[0])
-            self._deliver()
+            self._deliver(now_s)
 
-    def _arrange(self, joined: ReassembledMessage) -> None:
+    def _arrange(self, joined: ReassembledMessage, now_s: float) -> None:
         """Order a complete message, and deliver the consecutive ones."""
         order, delivery = self._order, self._delivery
-        if self.state is WriterProxyState.LIVE and (not self._is_reliable or joined.number == order.expected):
+        skips = not self._is_reliable and self._lag_s() <= 0
+        if self.state is WriterProxyState.LIVE and (skips or joined.number == order.expected):
             if joined.number > order.expected:
                 self._skip_to(joined.number)
             delivery.deliver(joined)
             order.expected = joined.number + 1
-            self._deliver()
+            self._deliver(now_s)
         elif order.put(joined):
             delivery.record_published(min(int.from_bytes(joined.head, "big"), NUMBER_MAX) + 1)
+            if not self._is_reliable:
+                self._deliver(now_s)
         elif self.state is WriterProxyState.NEW:
             self._data.drops[DropReason.MEMORY_FULL] += 1
         else:
@@ -332,7 +372,7 @@ class WriterProxy:
             self._skip_to(joined.number)
             delivery.deliver(joined)
             order.expected += 1
-            self._deliver()
+            self._deliver(now_s)
 
     def _missing(self) -> tuple[MissingRange, ...]:
         """Return what is known to be missing: gaps below the newest fragment, and all that a Heartbeat announced."""
@@ -372,15 +412,24 @@ class WriterProxy:
         for move in status.moves:
             if move.is_before(order.expected):
                 self._renumber(move)
+        lag_s = self._lag_s()
+        if self._is_reliable or lag_s <= 0:
+            self._apply_progress(status, now_s)
+        else:
+            self._held.append((now_s + lag_s, status))
+        self._schedule.due_s = now_s
+
+    def _apply_progress(self, status: Heartbeat, now_s: float) -> None:
+        """Go on where a Heartbeat says that nothing before will come, and count that as lost."""
+        order, delivery = self._order, self._delivery
         otherwise = delivery.gap_reason
         if status.oldest > order.expected:
             self._skip_to(status.oldest)
             delivery.lose_until(status.oldest_sequence, otherwise)
-        self._deliver()
+        self._deliver(now_s)
         if order.expected == status.sent_number:
             delivery.lose_until(status.sent_sequence, otherwise)
         delivery.record_published(status.sent_sequence)
-        self._schedule.due_s = now_s
 
     def _begin(self, status: Heartbeat, start: StreamStart, *, is_latched: bool) -> None:
         """Begin at the publisher's start, and count what came between that and the last message read before."""
@@ -429,14 +478,25 @@ class WriterProxy:
             self._delivery.deliver(joined)
         self._data.forget(number)
 
-    def _deliver(self) -> None:
+    def _deliver(self, now_s: float) -> None:
         order = self._order
+        gap_until_s, self._gap_until_s = self._gap_until_s, float("inf")
         if self.state is WriterProxyState.NEW or not order:
             return
         for joined in order.consecutive():
             self._delivery.deliver(joined)
-        if order and not self._is_reliable:
+        if not order or self._is_reliable:
+            return
+        lag_s = self._lag_s()
+        if lag_s > 0:
+            is_same = self._gap_at == order.expected and now_s < gap_until_s < float("inf")
+            self._gap_at, self._gap_until_s = order.expected, gap_until_s if is_same else now_s + lag_s
+        else:
             self._skip_to(order.numbers[-1] + 1)
+
+    def _lag_s(self) -> float:
+        """Return how long the slower path may take to bring what the faster one has lost; 0 with one path."""
+        return 0.0 if self._copies is None else self._copies.lag_s()
 
 
 def _below(ranges: list[tuple[int, int]], end: int) -> list[tuple[int, int]]:

@@ -65,11 +65,6 @@ class EndpointRecord:
     membership: bytes = field(repr=False)
     wire: bytes = field(default=b"", repr=False)
 
-    @property
-    def is_reachable(self) -> bool:
-        """Return whether the operator states an address that is reachable from everywhere: a border."""
-        return any(each.type is CandidateType.PUBLIC for each in self.candidates)
-
     @classmethod
     def make(
         cls,

@@ -20,6 +20,9 @@ _ULA: Final = b"\xfd"  # RFC 4193, section 3.1, locally assigned
 _ADDRESS_BYTES: Final = 16
 _PORT_BYTES: Final = 2
 _VNI_BYTES: Final = 3
+_PRIVATE: Final = tuple(  # RFC 1918, RFC 6598
+    ipaddress.ip_network(each) for each in ("10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "100.64.0.0/10")
+)
 
 
 class Endpoint(NamedTuple):
@@ -59,6 +62,12 @@ class Endpoint(NamedTuple):
         if not port:
             raise ValueError("port 0")
         return cls(str(address), port)
+
+    @property
+    def is_private(self) -> bool:
+        """Whether the address is of private IPv4 networks, so that it has a meaning in its own network only."""
+        address = ipaddress.ip_address(self.address)
+        return any(address in each for each in _PRIVATE)
 
     def to_wire(self) -> bytes:
         """Return the bytes that ``from_wire`` reads."""

@@ -13,6 +13,7 @@ from gdp.control.endpoints import Endpoint
 from gdp.control.hello import echo_of
 from gdp.control.join import Join
 from gdp.control.link_quality import LinkQuality
+from gdp.control.link_state import link_key
 from gdp.control.neighbour import Neighbour, NeighbourState
 from gdp.control.strangers import Strangers
 from gdp.crypto.exchange import ExchangeKey
@@ -74,6 +75,10 @@ class HelloPort:
         """Return what our end and those of all neighbours that are up accept, in bytes after the Ethernet header."""
         up = [n.mtu for n in self.neighbours.values() if n.state is NeighbourState.UP]
         return min([self.own_mtu, *up])
+
+    def link_key(self, neighbour: Neighbour) -> int:
+        """Return the key of the link to a neighbour on this port."""
+        return link_key(self.mac, neighbour.mac)
 
     @property
     def hello_mtu(self) -> int:

@@ -7,16 +7,31 @@ ends and counts up within them. So a restarted sender is accepted at once, indep
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final, NamedTuple
 
 from gdp.control.hello import ECHO_BYTES, NONCE_BYTES
+from gdp.control.link_state import LINK_KEY_MAX
 from gdp.control.query import TRANSIT_MAX
 from gdp.crypto.fields import Fields
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.statements import StatementType, sign
-from gdp.limits import FRAME_MAX_BYTES, LEASE_MAX_S
-from gdp.names import ZERO, Name
+from gdp.errors import DropReason, StatementError
+from gdp.limits import FRAME_MAX_BYTES, LEASE_MAX_S, PATHS_MAX
+from gdp.names import NAME_BYTES, ZERO, Name
 
-__all__ = ["Join"]
+__all__ = ["ROUTE_MAX", "Join", "Route", "RouteLink"]
+
+ROUTE_MAX: Final = 32  # links of one path
+
+
+class RouteLink(NamedTuple):
+    """One link of a route: the switch that it leads to, and the key of the link (``link_key``)."""
+
+    name: Name
+    key: int
+
+
+Route = tuple[RouteLink, ...]  # from a switch towards the publisher's, in order
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,6 +52,8 @@ class Join:
             ``ZERO`` in an ordinary join. Source: the secondary join of RFC 7431.
         sender_session: nonce of the sender's port.
         proof: the signed advertisement of the publisher, which states that it is at ``switch``; empty in a leave.
+        path: 1, or 2 for the tree of second copies. Source: ``docs/explanation/two-paths.md``.
+        route: what remains of the path that the reader's switch chose; empty: the receiver follows its own.
     """
 
     topic: Name
@@ -53,6 +70,8 @@ class Join:
     backup_for: Name = ZERO
     sender_session: bytes = bytes(NONCE_BYTES)
     proof: bytes = b""
+    path: int = 1
+    route: Route = ()
 
     def to_wire(self, signer: Name, key: SigningKey) -> bytes:
         """Return the signed statement."""
@@ -71,6 +90,8 @@ class Join:
             "b": self.backup_for,
             "o": self.sender_session,
             "c": self.proof,
+            "a": self.path,
+            "r": [list(each) for each in self.route],
         }
         return sign(StatementType.JOIN, body, signer, key)
 
@@ -92,4 +113,27 @@ class Join:
             backup_for=fields.optional_name("b"),
             sender_session=fields.bytes_("o", NONCE_BYTES),
             proof=fields.bytes_("c"),
+            path=_path(fields),
+            route=_route(fields),
         )
+
+
+def _path(fields: Fields) -> int:
+    path = fields.uint("a", PATHS_MAX)
+    if not path:
+        raise StatementError(DropReason.MALFORMED, "a path of number 0")
+    return path
+
+
+def _route(fields: Fields) -> Route:
+    """Return the route. Raises ``StatementError``: MALFORMED, a switch stands twice."""
+    found = []
+    for each in fields.list_("r", ROUTE_MAX):
+        match each:
+            case [bytes(name), int(key)] if len(name) == NAME_BYTES and name != ZERO and 0 <= key <= LINK_KEY_MAX:
+                found.append(RouteLink(Name(name), key))
+            case _:
+                raise StatementError(DropReason.MALFORMED, "a link of a route")
+    if len({link.name for link in found}) < len(found):
+        raise StatementError(DropReason.MALFORMED, "a route with a loop")
+    return tuple(found)

@@ -24,6 +24,7 @@ from enum import IntFlag
 from typing import Final
 
 from gdp.control.hello import DIGEST_BYTES, MULTIPLIER_MAX, Timing
+from gdp.control.link_probe import LinkProbe
 from gdp.control.link_quality import LinkQuality, LinkReport
 from gdp.crypto.exchange import ExchangeKey
 from gdp.errors import DropReason, FrameError
@@ -124,6 +125,8 @@ class KeepaliveSession:
         received: highest sequence number that came.
         is_alive: one has come.
         hears_us: the neighbour reports that it receives ours.
+        is_poll_due: an answer is wanted although the neighbour is not silent.
+        probe: of the link, while the neighbour does not answer.
         quality: measurements of the link.
         has_new_cost: the keepalive opened last changed the cost that follows from them.
     """
@@ -139,6 +142,8 @@ class KeepaliveSession:
     is_final_due: bool = False
     is_alive: bool = False
     hears_us: bool = False
+    is_poll_due: bool = False
+    probe: LinkProbe | None = None
     quality: LinkQuality = field(default_factory=LinkQuality)
     has_new_cost: bool = False
 
@@ -198,7 +203,7 @@ class KeepaliveSession:
             source: our name and incarnation.
         """
         flags = _POLL * poll | _FINAL * self.is_final_due | _HEARD * self.is_alive
-        self.is_final_due = False
+        self.is_final_due = self.is_poll_due = False
         name, incarnation = source
         header = Header(Kind.KEEPALIVE, Flag.LAST, HOPS_MAX, 0, PAYLOAD_BYTES, sequence, 0, 1, incarnation, ZERO, name)
         frame = seal_keepalive(self.out_key, header, flags, multiplier, digest, self.quality.report_to_send(now_s))
@@ -222,12 +227,32 @@ class KeepaliveSession:
         self.detect_s = self.in_interval_s * max(multiplier, 1)
         self.received, self.is_alive = header.number, True
         self.hears_us = bool(flags & _HEARD)
+        if self.probe is not None and self.probe.is_answered(self.quality.confirmed_s):
+            self.probe = None
         if flags & _POLL:
             self.is_final_due, self.send_at_s = True, now_s
         return digest
+
+    def begin_probe(self, now_s: float, *, is_restarted: bool) -> None:
+        """Probe the link, because this node's address has changed.
+
+        Args:
+            is_restarted: polls that were sent before do not count.
+        """
+        if self.probe is None or is_restarted:
+            self.probe = LinkProbe(since_s=now_s)
+        self.probe.is_moved, self.poll_at_s = True, now_s
+
+    def note_poll(self, now_s: float) -> None:
+        """Note that a silent neighbour, or one that is probed, is polled now."""
+        if self.probe is None:
+            self.probe = LinkProbe(since_s=now_s)
+        self.probe.polls += 1
 
     def suspect_at_s(self, heard_s: float) -> float:
         """Return when a neighbour last heard at ``heard_s`` is polled next; never before its first keepalive."""
         if not self.is_alive:
             return float("inf")
+        if self.probe is not None:
+            return self.poll_at_s
         return max(heard_s + _SUSPECT_AFTER * self.in_interval_s, self.poll_at_s)

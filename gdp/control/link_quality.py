@@ -110,14 +110,16 @@ class LinkQuality:
         rtt: round-trip time.
         loss_out: share of our keepalives that the neighbour reports as lost, 0 to 1.
         cost: cost of the link that follows from both, damped.
+        confirmed_s: when the last of our keepalives that the neighbour has echoed was sent.
     """
 
-    __slots__ = ("_count", "_heard_s", "_in", "_received", "_sent_s", "cost", "loss_out", "rtt")
+    __slots__ = ("_count", "_heard_s", "_in", "_received", "_sent_s", "confirmed_s", "cost", "loss_out", "rtt")
 
     def __init__(self) -> None:
         self.rtt = RttEstimator()
         self.loss_out = 0.0
         self.cost = DampedCost()
+        self.confirmed_s = float("-inf")
         self._in = LossWindow()
         self._count = 0
         self._sent_s: deque[float] = deque(maxlen=_SENT_MAX)  # the last one is of ``_count``
@@ -156,7 +158,8 @@ class LinkQuality:
         age = self._count - report.echo
         if not report.echo or not 0 <= age < len(self._sent_s):
             return False
-        rtt_s = heard_s - self._sent_s[-1 - age] - report.held_us / 1e6
+        self.confirmed_s = self._sent_s[-1 - age]
+        rtt_s = heard_s - self.confirmed_s - report.held_us / 1e6
         if rtt_s < 0 or not self.rtt.add(rtt_s, heard_s):
             return False
         return self.cost.update(link_cost(self.rtt.srtt_s or 0.0, self.loss_in, self.loss_out), heard_s)

@@ -8,6 +8,7 @@ that are reachable behind it. When a failure partitions a domain, each part is r
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Final, NamedTuple, TypeVar
@@ -20,14 +21,15 @@ from gdp.errors import DropReason, StatementError
 from gdp.limits import CONTROL_MAX_BYTES, FRAME_MAX_BYTES
 from gdp.names import ZERO, Name
 
-__all__ = ["Adjacency", "AttachedRib", "LinkState", "Scope"]
+__all__ = ["LINK_KEY_MAX", "Adjacency", "AttachedRib", "LinkState", "Scope", "link_key"]
 
 LINKS_MAX: Final = 128
 RIBS_MAX: Final = 16
 MEMBERS_MAX: Final = 128  # 4.4 kB; of a larger domain the rest is reached through the nearest border
 COST_MAX: Final = 1 << 24
+LINK_KEY_MAX: Final = (1 << 32) - 1
 _HEAD_BYTES: Final = 330  # COSE, keys, heads, sequence number, incarnation, time and signature
-_LINK_BYTES: Final = 80
+_LINK_BYTES: Final = 85
 _NAME_BYTES: Final = 34
 _RIB_BYTES: Final = 110  # in addition to its two certificates
 
@@ -42,12 +44,25 @@ class Scope(Enum):
 
 
 class Adjacency(NamedTuple):
-    """A link to a neighbour, or, in ``inside``, the path to another border of the same domain."""
+    """A link to a neighbour, or, in ``inside``, the path to another border of the same domain.
+
+    Args:
+        key: distinguishes the links between the same two switches (``link_key``); 0 in ``inside``.
+    """
 
     name: Name
     domain: Name
     cost: int
     mtu: int
+    key: int = 0
+
+
+def link_key(mac: bytes, other_mac: bytes) -> int:
+    """Return the key of a link, which both ends compute alike from their two addresses; it has 32 bits.
+
+    It does not depend on other links between the same switches, so that it stays when one of them comes or goes.
+    """
+    return int.from_bytes(hashlib.sha256(min(mac, other_mac) + max(mac, other_mac)).digest()[:4], "big")
 
 
 class AttachedRib(NamedTuple):
@@ -193,13 +208,14 @@ def _adjacencies(fields: Fields, key: str) -> tuple[Adjacency, ...]:
     found = []
     for each in fields.list_(key, LINKS_MAX):
         match each:
-            case [bytes(name), bytes(domain), int(cost), int(mtu)] if (
+            case [bytes(name), bytes(domain), int(cost), int(mtu), int(key_)] if (
                 len(name) == len(domain) == 32
                 and ZERO not in (name, domain)
                 and 0 < cost <= COST_MAX
                 and 0 < mtu <= FRAME_MAX_BYTES
+                and 0 <= key_ <= LINK_KEY_MAX
             ):
-                found.append(Adjacency(Name(name), Name(domain), cost, mtu))
+                found.append(Adjacency(Name(name), Name(domain), cost, mtu, key_))
             case _:
                 raise StatementError(DropReason.MALFORMED, "adjacency")
     return tuple(found)

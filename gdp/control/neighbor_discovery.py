@@ -14,13 +14,15 @@ candidate is evicted. Candidates are answered with no more bytes than they have 
 Hellos also state the MTU of each end: a link is as wide as its narrowest end. When an end changes, both know at once.
 
 Between neighbours that are up, keepalives (``keepalive.py``) replace most hellos: a silent cut is detected after the
-negotiated detection time. Time in which this node itself was not scheduled does not count as a neighbour's silence.
+negotiated detection time, or earlier if another link shows that only this one fails (``link_probe.py``). Time in which
+this node itself was not scheduled does not count as a neighbour's silence.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from itertools import islice
 from types import MappingProxyType
 from typing import Final
 
@@ -74,6 +76,8 @@ _RECHECK_S: Final = 1.0  # a membership may be revoked or expire while keepalive
 _LATE_S: Final = 0.02  # later than this, the node itself was not scheduled in time
 _CLASH_S: Final = 3.0  # another node must have our identity for this time
 _CLASH_PAUSE_S: Final = 10.0  # above the time between two idle hellos
+_OTHERS_MAX: Final = 4  # links that are polled because a neighbour is silent
+_UPLINK_FAILS_S: Final = 0.2  # the links over an uplink that fails become silent within this time
 _TOGETHER: Final = 0.125  # of an interval: keepalives due within it leave at once
 
 # A neighbour after the change, and its state before; the same state if only the link to it changed, MTU or cost.
@@ -113,6 +117,10 @@ class HelloProtocol:
         self._dead_s = settings.dead_s
         self._timing = settings.timing  # where ``set_timing`` sets no other for a port
         self._timings: dict[int, Timing] = {}
+        self._uplinks: dict[int, int] = {}  # of ports whose links share one
+        self._failed_s: dict[int, float] = {}  # by uplink: when a link over it failed alone
+        self._is_probing = False  # some neighbour is
+        self._polled: set[int] = set()  # ports at which a neighbour has polled us
         self._incarnation = settings.incarnation
         self._due_s = float("inf")  # when the next call was requested
         self._next_s: float | None = None  # no timer is due before; None: to be computed
@@ -141,6 +149,28 @@ class HelloProtocol:
         """Request another keepalive timing on one port, from its next session on."""
         self._timings[index] = timing
         self._next_s = None
+
+    def set_uplink(self, index: int, uplink: int) -> None:
+        """State which uplink carries the links of a port: ports of one uplink have an address in common."""
+        self._uplinks[index] = uplink
+
+    def probe_uplink(self, uplink: int, now_s: float, *, is_restarted: bool = True) -> None:
+        """Poll all neighbours over an uplink whose address has changed; those that others outlive are lost soon.
+
+        Args:
+            is_restarted: polls that were sent before came from the former address.
+        """
+        for index, port in self.ports.items():
+            if self._uplinks.get(index) == uplink:
+                for neighbour in port.neighbours.values():
+                    if neighbour.keepalives is not None and neighbour.keepalives.is_alive:
+                        neighbour.keepalives.begin_probe(now_s, is_restarted=is_restarted)
+                        self._next_s, self._is_probing = None, True
+
+    def poll_polled(self) -> frozenset[int]:
+        """Return, once, the ports at which a neighbour has polled us: it may have another address now."""
+        polled, self._polled = frozenset(self._polled), set()
+        return polled
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now_s: float) -> list[Change]:
         """Begin to send hellos on a port, or update the MTU or cost (``COST_AUTO``: measured) of one that is up.
@@ -194,6 +224,11 @@ class HelloProtocol:
             port.observed[name] = endpoint
         self._next_s = None
         port.hurry(port.said_s + ANSWER_S)
+
+    def observed_at(self, index: int, name: Name) -> Endpoint | None:
+        """Return the endpoint that this end reports to a neighbour on a tunnel's port, or None."""
+        port = self.ports.get(index)
+        return None if port is None else port.observed.get(name)
 
     def observed_addresses(self) -> dict[tuple[int, Name], Endpoint]:
         """Return our own endpoints as neighbours that are up see them, by port and neighbour."""
@@ -322,7 +357,7 @@ class HelloProtocol:
         known.member, known.checked_s, known.incarnation_id = member, now.mono_s, hello.incarnation_id
         known.cost = port.cost_to(known.name)
         known.role = member.role  # a root may have changed a switch into a leaf
-        known.observed = next((endpoint for nonce, endpoint in hello.observed if nonce == port.nonce), None)
+        self._note_observed(port, known, hello, now.mono_s)
         had_proof, known.proof = known.proof is not None, proof
         self._note_clash(port, known, hello, now.mono_s)
         self._alive(known, now.mono_s)
@@ -516,6 +551,14 @@ class HelloProtocol:
         if port.echo in hello.conflicts:
             self.record_clash(neighbour.name, now_s)
 
+    def _note_observed(self, port: HelloPort, neighbour: Neighbour, hello: Hello, now_s: float) -> None:
+        """Note where a neighbour sees this end; another endpoint than before means that a NAT on the way has moved."""
+        before = neighbour.observed
+        neighbour.observed = next((endpoint for nonce, endpoint in hello.observed if nonce == port.nonce), None)
+        uplink = self._uplinks.get(port.index)
+        if uplink is not None and None not in (before, neighbour.observed) and before != neighbour.observed:
+            self.probe_uplink(uplink, now_s, is_restarted=False)
+
     def receive_keepalive(self, arrival: ReceivedFrame, header: Header, now: Timestamps) -> Neighbour:
         """Process a keepalive; return the neighbour that sent it.
 
@@ -535,6 +578,8 @@ class HelloProtocol:
             known.cost = port.cost_to(known.name)
             self._recosted.append(known)
         if known.keepalives.is_final_due:
+            self._polled.add(arrival.port)
+        if known.keepalives.is_final_due or self._is_probing:
             self._next_s = None  # any other change only delays timers
         self._alive(known, now.mono_s - arrival.waited_s)
         return known
@@ -560,6 +605,7 @@ class HelloProtocol:
         self._next_s = None
         self.ports.pop(index, None)
         self._timings.pop(index, None)
+        self._uplinks.pop(index, None)
         self._reported_addresses.pop(index, None)
 
     def drop_silent(self, now_s: float) -> list[Change]:
@@ -574,6 +620,7 @@ class HelloProtocol:
         for port in self.ports.values():
             silent = [n for n in port.neighbours.values() if now_s >= self._gone_at_s(n)]
             if silent:
+                self._note_failed(port, silent, now_s)
                 if any(each.is_proven for each in silent):
                     port.hurry(now_s)  # a neighbour that still receives us learns at once that we do not receive it
                 changes += self._lose(port, silent, NeighbourEvent.SILENCE)
@@ -583,6 +630,7 @@ class HelloProtocol:
         """Return the hellos, keepalives and cookies that are due."""
         self._next_s = None
         out, self._replies, self._reply_at_s = self._replies, [], float("inf")
+        self._request_polls(now_s)
         for port in self.ports.values():
             if not port.is_up:
                 continue
@@ -598,6 +646,8 @@ class HelloProtocol:
                     continue
                 is_suspect = session.suspect_at_s(neighbour.heard_s) <= now_s
                 if is_suspect or session.send_at_s <= now_s + session.out_interval_s * _TOGETHER:
+                    if is_suspect:
+                        session.note_poll(now_s)
                     port.keepalive_sequence += 1
                     timing = self._timings.get(port.index, self._timing)
                     frame = session.seal(
@@ -606,10 +656,33 @@ class HelloProtocol:
                         self._slowness.multiplier(timing, self._dead_s, now_s),
                         self._digest_for(port),
                         now_s,
-                        poll=is_suspect,
+                        poll=is_suspect or session.is_poll_due,
                     )
                     out.append(OutgoingFrames(port.index, neighbour.mac, [frame]))
         return out
+
+    def _request_polls(self, now_s: float) -> None:
+        """Poll the links that can show that only the link of a silent neighbour fails."""
+        for port in self.ports.values():
+            for neighbour in port.neighbours.values() if port.is_up else ():
+                session = neighbour.keepalives
+                if session is None or session.suspect_at_s(neighbour.heard_s) > now_s:
+                    continue
+                self._is_probing = True
+                since_s = now_s if session.probe is None else session.probe.since_s
+                for other in islice(self._others(neighbour, of_uplink=True), _OTHERS_MAX):
+                    if other.quality.confirmed_s < since_s:
+                        other.is_poll_due, other.send_at_s = True, now_s
+
+    def _others(self, neighbour: Neighbour, *, of_uplink: bool) -> Iterator[KeepaliveSession]:
+        """Return the sessions on other ports with the same neighbour, then, if asked, with others over its uplink."""
+        uplink = self._uplinks.get(neighbour.port)
+        ports = [each for index, each in self.ports.items() if index != neighbour.port]
+        found = [port.neighbours[neighbour.name] for port in ports if neighbour.name in port.neighbours]
+        if of_uplink and uplink is not None:
+            on_uplink = (port for port in ports if self._uplinks.get(port.index) == uplink)
+            found += (each for port in on_uplink for each in port.neighbours.values() if each.name != neighbour.name)
+        return (each.keepalives for each in found if each.keepalives is not None and each.keepalives.is_alive)
 
     def get_timer(self) -> float | None:
         """Return a monotonic second that is no later than the next hello, keepalive or silence of a neighbour."""
@@ -619,12 +692,13 @@ class HelloProtocol:
         return None if self._due_s == float("inf") else self._due_s
 
     def _look_ahead(self) -> float:
-        due_s = self._reply_at_s
+        due_s, self._is_probing = self._reply_at_s, False
         for port in self.ports.values():
             if port.is_up:
                 due_s = min(due_s, port.hello_at_s, port.answer_at_s)
             for neighbour in port.neighbours.values():
                 session, at_s = neighbour.keepalives, self._gone_at_s(neighbour)
+                self._is_probing = self._is_probing or (session is not None and session.probe is not None)
                 if session is not None and port.is_up:
                     at_s = min(at_s, session.send_at_s, session.suspect_at_s(neighbour.heard_s))
                 due_s = min(due_s, at_s)
@@ -640,7 +714,31 @@ class HelloProtocol:
             return neighbour.heard_s + self._dead_s + late_s
         flooded_until_s = self.ports[neighbour.port].admission.flooded_until_s  # its hellos may be among those refused
         hellos_end_s = max(neighbour.greeted_s, flooded_until_s) + _HELLOS_MISSED * HELLO_IDLE * self._hello_s
-        return min(neighbour.heard_s + session.detect_s, hellos_end_s) + late_s
+        return min(neighbour.heard_s + session.detect_s, hellos_end_s, self._failed_at_s(neighbour, session)) + late_s
+
+    def _note_failed(self, port: HelloPort, lost: list[Neighbour], now_s: float) -> None:
+        """Note that an uplink has failed, if it no longer reaches a node that another link reaches."""
+        for neighbour in lost:
+            session = neighbour.keepalives
+            if session is None or session.probe is None or session.probe.is_moved or port.index not in self._uplinks:
+                continue
+            if now_s >= self._failed_at_s(neighbour, session):
+                self._failed_s[self._uplinks[port.index]] = now_s
+                self._next_s = None
+
+    def _failed_at_s(self, neighbour: Neighbour, session: KeepaliveSession) -> float:
+        """Return when a probe ends the neighbour: never unless another link has answered since it began."""
+        probe = session.probe
+        if probe is None:
+            return float("inf")
+        for other in self._others(neighbour, of_uplink=probe.is_moved):
+            probe.note_other(other.quality.confirmed_s)
+        uplink = self._uplinks.get(neighbour.port)
+        if not probe.is_moved and uplink is not None:
+            failed_s = self._failed_s.get(uplink, float("-inf"))
+            if failed_s >= probe.since_s - _UPLINK_FAILS_S:
+                probe.note_other(probe.since_s)
+        return probe.fails_at_s(session.quality)
 
     def _alive(self, neighbour: Neighbour, heard_s: float) -> None:
         neighbour.heard_s, neighbour.lateness_s, neighbour.let_go_s = heard_s, self._lateness_s, None

@@ -10,13 +10,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from gdp.control.endpoint_record import CandidateType, EndpointRecord
+from gdp.control.endpoint_record import UPLINKS_MAX, CandidateType, EndpointRecord
 from gdp.control.endpoints import Endpoint
 from gdp.names import Name
 
 __all__ = [
     "DIAL_S",
     "REBIND_S",
+    "UNDERLAY_PREFIXES",
     "Dialer",
     "RebindSchedule",
     "TunnelId",
@@ -52,9 +53,12 @@ def planned_tunnels(uplinks: int, record: EndpointRecord) -> list[TunnelId]:
     return [TunnelId(record.name, *pair) for pair in pairs]
 
 
+UNDERLAY_PREFIXES: Final = tuple(f"gw{uplink}-" for uplink in range(UPLINKS_MAX))
+
+
 def underlay_ifname(me: Name, uplink: int) -> str:
     """Return the name of the WireGuard device of an uplink, unique on a host that has several network namespaces."""
-    return f"gw{uplink}-" + hashlib.sha256(b"gdp-underlay" + me).hexdigest()[:_DIGITS]
+    return UNDERLAY_PREFIXES[uplink] + hashlib.sha256(b"gdp-underlay" + me).hexdigest()[:_DIGITS]
 
 
 def tunnel_ifname(me: Name, tunnel: TunnelId) -> str:

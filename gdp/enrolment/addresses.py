@@ -14,7 +14,7 @@ from typing import Final
 
 from gdp.control.endpoints import Endpoint
 from gdp.errors import LocalError
-from gdp.trust.join_token import split_server
+from gdp.host_port import split_host_port
 
 __all__ = ["default_addresses", "default_directory", "duration_s", "endpoint_of", "is_private", "server_text"]
 
@@ -52,7 +52,7 @@ def server_text(text: str, port: int) -> str:
         return Endpoint(str(ipaddress.ip_address(text[1:-1] if is_bracketed else text)), port).to_text()
     if ":" not in text:
         text = f"{text}:{port}"
-    host, _ = split_server(text)
+    host, _ = split_host_port(text)
     if ":" not in host and not _HOST.fullmatch(host):
         raise LocalError(f"expected a host or an address, with or without a port, not {text!r}")
     return text
@@ -60,7 +60,7 @@ def server_text(text: str, port: int) -> str:
 
 def endpoint_of(server: str) -> Endpoint:
     """Return the numeric endpoint of ``host:port``. Raises ``LocalError``: the host has no address."""
-    host, port = split_server(server)
+    host, port = split_host_port(server)
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
     except OSError as error:

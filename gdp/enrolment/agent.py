@@ -14,7 +14,8 @@ import random
 import secrets
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Final
 
@@ -25,14 +26,18 @@ from gdp.crypto.identity import Identity
 from gdp.enrolment.channel import Channel, connect_any
 from gdp.enrolment.domain_client import ReceivedMail, delete_mail, fetch_mail, read_inbox
 from gdp.enrolment.member_files import MemberFiles
-from gdp.enrolment.member_setup import record_file_name
+from gdp.enrolment.member_setup import RELAY_FILE, record_file_name, update_relays
 from gdp.enrolment.wire import INSTANCE_BYTES, EnrolmentError, UnreachableError
 from gdp.errors import GdpError, LocalError, RemoteError
+from gdp.host_port import split_host_port
+from gdp.names import Name
 from gdp.nodes.config import SwitchConfig
 from gdp.nodes.control_client import NotRunningError, ask_node, find_control_socket
 from gdp.nodes.control_protocol import Command
 from gdp.nodes.endpoint_files import RECORD_SUFFIX, own_record
 from gdp.nodes.membership import load_policy
+from gdp.nodes.relay import relay_control_path
+from gdp.nodes.relay_config import RelayConfig
 from gdp.stores.files import public, read_public, write_all
 from gdp.stores.issue import install_delegation
 from gdp.stores.keyring import (
@@ -40,6 +45,7 @@ from gdp.stores.keyring import (
     NODE_CERTIFICATE,
     OWNER_PUBLIC,
     ROOT_CERTIFICATE,
+    load_card,
     load_identity,
     load_node_keys,
     load_public_key,
@@ -50,6 +56,7 @@ from gdp.stores.keyring import (
 from gdp.trust.delegation import Delegation
 from gdp.trust.domain import Policy
 from gdp.trust.enrolment import MEMBERS_MAX
+from gdp.trust.join_token import SERVERS_MAX
 
 __all__ = ["DELEGATION_KIND", "Agent", "MailHandler", "load_identity_at_any_time", "reload_node"]
 
@@ -190,6 +197,19 @@ class Agent:
         for path in peers.glob(f"*{RECORD_SUFFIX}"):
             if borders and path.name not in files:
                 path.unlink(missing_ok=True)
+        self._follow_relays({each.name: news.texts("relays", SERVERS_MAX) for each in borders})
+
+    def _follow_relays(self, relays: Mapping[Name, Sequence[str]]) -> None:
+        """Dial the relays where they are now: the relay ends, and whatever runs it starts it again."""
+        for endpoint in chain.from_iterable(relays.values()):
+            split_host_port(endpoint)
+        if not update_relays(self._files.directory, relays):
+            return
+        log.info("relays changed borders=%d", len(relays))
+        path = self._files.directory / RELAY_FILE
+        with contextlib.suppress(NotRunningError):
+            config = RelayConfig.load(path)
+            ask_node(relay_control_path(config, load_card(config.identity / CARD).name), Command.DRAIN, _RELOAD_S)
 
     def _take_mail(self, channel: Channel) -> None:
         fetch_mail(channel, self._files.inbox)

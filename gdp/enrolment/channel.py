@@ -31,11 +31,14 @@ from gdp.enrolment.wire import (
     read_message,
 )
 from gdp.errors import StatementError
-from gdp.trust.join_token import fingerprint_of, split_server
+from gdp.host_port import split_host_port
+from gdp.relay.client_hello import ENROLMENT_ALPN
+from gdp.trust.join_token import fingerprint_of
 
 __all__ = ["CONNECT_S", "Channel", "client_context", "connect", "connect_any"]
 
 CONNECT_S: Final = 10.0
+_TRY_S: Final = 3.0  # for a server that others follow: a firewall may let only one of their ports through
 _GREETING_MAX_BYTES: Final = 64 << 10
 _HOUR_S: Final = 3_600.0
 
@@ -46,6 +49,7 @@ def client_context() -> ssl.SSLContext:
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     context.check_hostname = False
     context.verify_mode = ssl.CERT_NONE
+    context.set_alpn_protocols([ENROLMENT_ALPN])  # by which a relay at the same port knows whose connection it is
     return context
 
 
@@ -123,12 +127,16 @@ def connect_any(servers: Sequence[str], fingerprint: bytes, *, timeout_s: float 
         UnreachableError: none can be reached; the text names each with its reason.
     """
     reasons = []
-    for each in servers:
+    for number, each in enumerate(servers, 1):
         try:
-            return connect(each, fingerprint, timeout_s=timeout_s)
+            wait_s = timeout_s if number == len(servers) else min(timeout_s, _TRY_S)
+            return connect(each, fingerprint, timeout_s=wait_s)
         except UnreachableError as error:
             reasons.append(str(error))
-    raise UnreachableError("; ".join(reasons))
+    raise UnreachableError(
+        f"the enrolment server is not reachable: {'; '.join(reasons)}; check the network, and that TCP to it is let"
+        " through"
+    )
 
 
 def connect(
@@ -143,7 +151,7 @@ def connect(
     end_s = time.monotonic() + timeout_s
     with contextlib.ExitStack() as stack:
         try:
-            plain = stack.enter_context(socket.create_connection(split_server(server), timeout=timeout_s))
+            plain = stack.enter_context(socket.create_connection(split_host_port(server), timeout=timeout_s))
             plain.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             peer = stack.enter_context(client_context().wrap_socket(plain))
             greeting = _receive(peer, end_s, _GREETING_MAX_BYTES)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import secrets
-import shutil
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,18 +16,20 @@ from typing import Final
 from gdp.control.endpoints import Endpoint
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
-from gdp.enrolment.domain_files import DOMAIN_FILE, DomainFiles
+from gdp.enrolment.domain_files import DOMAIN_FILE, HANDOVER_SOCKET, MEMBER_DAYS, DomainFiles
+from gdp.enrolment.draft import draft_of, publish_draft, reserve_space
 from gdp.enrolment.member_setup import MachinePlan, write_configuration
 from gdp.enrolment.registry import Registry
 from gdp.errors import LocalError
 from gdp.stores.files import public, read_public, write_all
 from gdp.stores.issue import make_domain, make_node, make_owner
 from gdp.stores.keyring import CARD, OWNER_PUBLIC, ROOT_CERTIFICATE, load_root
-from gdp.trust.join_token import JOIN_SECRET_BYTES, JoinRole, JoinToken, fingerprint_of, join_id, join_key
+from gdp.trust.join_token import JOIN_SECRET_BYTES, SERVERS_MAX, JoinRole, JoinToken, fingerprint_of, join_id, join_key
 
 __all__ = ["BORDER", "DomainPlan", "create_domain", "make_token"]
 
 BORDER: Final = "border"  # role and default label of the domain's own machine
+_STATE: Final = "enrolment"
 _NODES: Final = (("switch", Role.SWITCH), ("rib", Role.RIB), ("proxy", Role.PROXY))
 
 
@@ -63,16 +64,10 @@ def create_domain(plan: DomainPlan, *, unix_s: float | None = None) -> DomainFil
     directory, now = plan.directory, time.time() if unix_s is None else unix_s
     if directory.exists():
         raise LocalError(f"{directory}: is there already; gdp domain token makes a token of an existing domain")
-    draft = directory.parent / f".{directory.name}.{secrets.token_hex(8)}"
-    try:
-        directory.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
-        draft.mkdir(mode=0o700)
+    with draft_of(directory) as draft:
+        reserve_space(draft, "no domain was created").unlink()
         _fill(draft, plan, now)
-        draft.rename(directory)
-    except OSError as error:
-        raise LocalError(f"{directory}: {error.strerror}; name another --directory") from error
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
+        publish_draft(draft, directory)
     return DomainFiles.load(directory)
 
 
@@ -107,7 +102,9 @@ def _fill(draft: Path, plan: DomainPlan, unix_s: float) -> None:
     make_owner(draft / "owner")
     identities = list[Identity]()
     for folder, role in _NODES:
-        identities.append(make_node(draft / folder, role, plan.label, draft / "domain", unix_s=unix_s))
+        identities.append(
+            make_node(draft / folder, role, plan.label, draft / "domain", days=MEMBER_DAYS, unix_s=unix_s)
+        )
     public_texts = [each.to_text() for each in plan.public]
     loopback = f"127.0.0.1:{plan.listen}"
     machine = MachinePlan(
@@ -117,6 +114,7 @@ def _fill(draft: Path, plan: DomainPlan, unix_s: float) -> None:
         listen=plan.listen,
         public=public_texts,
         relay_port=plan.relay_port,
+        handover=f"{_STATE}/{HANDOVER_SOCKET}",
         has_rib=True,
     )
     write_configuration(draft, machine, ())
@@ -124,17 +122,17 @@ def _fill(draft: Path, plan: DomainPlan, unix_s: float) -> None:
         "domain: domain",
         "owner: owner",
         "switch: switch",
-        "state: enrolment",
+        f"state: {_STATE}",
         "peers: peers",
         "revocations: revocations",
         f"listen: {plan.listen}",
-        f"servers: {json.dumps(list(plan.servers))}",
+        f"servers: {json.dumps(list(dict.fromkeys([*plan.servers, *_relays(plan)]))[:SERVERS_MAX])}",
         f"public: {json.dumps(public_texts)}",
         f"relays: {json.dumps(_relays(plan))}",
     ]
     owner = read_public(draft / "owner" / OWNER_PUBLIC)
     write_all(draft, {DOMAIN_FILE: public("\n".join([*lines, ""]).encode()), OWNER_PUBLIC: public(owner)})
-    with Registry(draft / "enrolment") as registry:
+    with Registry(draft / _STATE) as registry:
         registry.add_machine(plan.label, BORDER, [each.member for each in identities], unix_s)
         for folder, identity in zip((folder for folder, _ in _NODES), identities, strict=True):
             registry.set_card(identity.name, read_public(draft / folder / CARD))

@@ -12,6 +12,7 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 from gdp.control.endpoint_record import EndpointRecord
@@ -22,6 +23,7 @@ from gdp.crypto.fields import Fields
 from gdp.crypto.identity import node_metadata
 from gdp.crypto.kem import KEM_PUBLIC_BYTES, KemPublicKey
 from gdp.crypto.keys import SIGNATURE_BYTES
+from gdp.crypto.statements import parse
 from gdp.crypto.x509_profile import SubjectInfo, read_request
 from gdp.enrolment.domain_files import DomainFiles
 from gdp.enrolment.member_setup import record_file_name
@@ -35,19 +37,20 @@ from gdp.enrolment.wire import (
     read_message,
     verify_member_proof,
 )
-from gdp.errors import LocalError, RemoteError, StatementError
+from gdp.errors import LocalError, RemoteError, StatementError, StoreError
 from gdp.names import Name
 from gdp.nodes.endpoint_files import own_record, public_candidates
 from gdp.stores.audit_log import AuditLog
 from gdp.stores.files import public, read_public, write_all
-from gdp.stores.issue import DAY_S, admit, renew
-from gdp.stores.keyring import OWNER_PUBLIC, ROOT_CERTIFICATE, load_identity, load_root
+from gdp.stores.issue import admit, renew
+from gdp.stores.keyring import NODE_CERTIFICATE, OWNER_PUBLIC, ROOT_CERTIFICATE, load_identity, load_root
 from gdp.trust.audit import Action, AuditTrail
 from gdp.trust.domain import Policy
 from gdp.trust.enrolment import MEMBERS_MAX, Application, token_id
 from gdp.trust.join_token import JOIN_ID_BYTES, JoinRole, join_proof
 from gdp.trust.mail import Mail
 from gdp.trust.node_descriptor import NodeDescriptor
+from gdp.trust.revocation import Revocation
 
 __all__ = ["PAGE", "EnrolmentDesk", "Session", "refusal_of"]
 
@@ -56,7 +59,6 @@ log = logging.getLogger(__name__)
 PAGE: Final = 64  # machines or mails in one response
 _PROOF_BYTES: Final = 32
 _EARLY_SHARE: Final = 0.1  # a membership with less of its life used is not renewed
-_RECORD_S: Final = DAY_S  # a border's record is made again after this time
 _WHAT: Final = "enrolment"
 
 
@@ -87,8 +89,9 @@ class EnrolmentDesk:
         self._trail = AuditTrail()
         self._trail.begin()
         self._audit = AuditLog(files.config.domain)
+        self._revocations: dict[Path, tuple[int, bytes]] = {}  # time of change, fingerprint of the certificate
         self._border: EndpointRecord | None = None
-        self._border_until_s = 0.0
+        self._border_certificate = b""
 
     @property
     def root(self) -> Root:
@@ -144,11 +147,11 @@ class EnrolmentDesk:
 
     def border_record(self, unix_s: float) -> EndpointRecord:
         """Return the border's endpoint record, which it signs itself."""
-        if self._border is None or unix_s >= self._border_until_s:
+        certificate = read_public(self._config.switch / NODE_CERTIFICATE)
+        if self._border is None or certificate != self._border_certificate:
             identity = load_identity(self._config.switch, unix_s)
             candidates = public_candidates([Endpoint.from_text(each) for each in self._config.public])
-            self._border = own_record(identity, 1, candidates)
-            self._border_until_s = min(unix_s + _RECORD_S, float(identity.member.not_after_unix_s))
+            self._border, self._border_certificate = own_record(identity, 1, candidates), certificate
         return self._border
 
     def identify(self, fields: Fields, binding: bytes, nonce: bytes, unix_s: float) -> Session:
@@ -185,18 +188,29 @@ class EnrolmentDesk:
         record, _ = EndpointRecord.verified(fields.bytes_("record"), Policy(root, []), unix_s)
         if not {record.name, *(each.name for each in cards)} <= nodes:
             raise EnrolmentError(Refusal.WRONG_NODES, "descriptors or an endpoint record of another machine's nodes")
+        if record.candidates:  # else a member could aim the border's packets at any address
+            raise EnrolmentError(
+                Refusal.WRONG_NODES, "a machine that joins states no endpoints here: it dials the border"
+            )
         for each in cards:
             self._registry.set_card(each.name, each.wire)
         if record.name != self.border_record(unix_s).name:
-            write_all(self._config.peers, {record_file_name(record.name): public(record.wire)}, force=True)
+            file = record_file_name(record.name)
+            write_all(self._config.peers, {file: public(record.wire)}, force=True)
+            try:
+                self._member(session.machine)
+            except EnrolmentError:  # removed in the meantime, perhaps before the file was there to be deleted
+                (self._config.peers / file).unlink(missing_ok=True)
+                raise
 
     def renew(self, session: Session, fields: Fields, unix_s: float) -> dict[str, object]:
         """Return new memberships of a machine's nodes; one that has just begun is returned as it is.
 
         Raises:
-            EnrolmentError: WRONG_NODES or NO_MEMBER.
+            EnrolmentError: WRONG_NODES, or NO_MEMBER: it was removed, or the root revoked a membership of it.
             StatementError: malformed, or not issued here.
         """
+        self._refuse_revoked(session.machine)
         nodes = {each.name: each for each in self._member(session.machine).nodes}
         wires, new = list[bytes](), list[Membership]()
         for wire in fields.byte_strings("certificates", MEMBERS_MAX):
@@ -230,17 +244,18 @@ class EnrolmentDesk:
         ]
         return {"ok": True, "nodes": listed}
 
-    def send(self, session: Session, fields: Fields) -> Name:
+    def send(self, session: Session, fields: Fields, unix_s: float) -> Name:
         """Store a mail and return its recipient.
 
         Raises:
             EnrolmentError: NO_MEMBER or MAILBOX_FULL.
-            StatementError: malformed, or not by this member.
+            StatementError: malformed, not by this member, or EXPIRED: under a membership that its recipient refuses.
         """
         self._member(session.machine)
         mail = Mail.from_wire(fields.bytes_("mail"))
         if mail.sender.subject.name != session.name:
             raise EnrolmentError(Refusal.WRONG_PROOF, "a mail by another sender")
+        mail.sender.validity.check(unix_s, "the membership in a mail")
         self._registry.add_mail(mail.to, session.name, mail.wire)
         return mail.to
 
@@ -302,6 +317,29 @@ class EnrolmentDesk:
             )
         if token.label and token.label != label:
             raise EnrolmentError(Refusal.WRONG_NODES, f"this token is for the label {token.label!r}, not {label!r}")
+
+    def _refuse_revoked(self, machine: int) -> None:
+        """Refuse a machine of which any membership was revoked, for example with ``gdp cert revoke``."""
+        known, folder = self._revocations, self._config.revocations
+        try:
+            present = {path: path.stat().st_mtime_ns for path in folder.iterdir()} if folder.exists() else {}
+        except OSError as error:
+            raise StoreError(f"{folder}: {error.strerror}") from error
+        for path, changed_ns in present.items():
+            if path not in known or known[path][0] != changed_ns:
+                try:
+                    known[path] = changed_ns, Revocation.read(parse(read_public(path))).fingerprint
+                except StatementError as error:
+                    known[path] = changed_ns, b""
+                    log.error("revocation not taken file=%s reason=%s", path, error)
+        for path in known.keys() - present.keys():
+            del known[path]
+        if self._registry.fingerprints(machine) & {fingerprint for _, fingerprint in known.values()}:
+            raise EnrolmentError(
+                Refusal.NO_MEMBER,
+                "a membership of this machine was revoked: remove the machine with gdp domain remove, then join again"
+                " with a new token",
+            )
 
     def _label_of(self, machine_id: int) -> str:
         machine = self._registry.machine(machine_id)

@@ -14,9 +14,11 @@ program remembers the number of the last mail that it has handled, and deletes m
 
 from __future__ import annotations
 
+import logging
 import re
 import secrets
 import time
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,19 +27,22 @@ from typing import Final
 from gdp.crypto.certificates import Membership
 from gdp.crypto.fields import Fields
 from gdp.crypto.identity import Identity
+from gdp.crypto.statements import parse
 from gdp.enrolment.channel import Channel, connect_any
 from gdp.enrolment.member_files import MemberFiles
 from gdp.enrolment.wire import INSTANCE_BYTES
 from gdp.errors import GdpError, LocalError, StatementError
 from gdp.names import Name
 from gdp.nodes.membership import load_policy
-from gdp.stores.files import private, read_private, write_all
+from gdp.stores.files import NewFile, private, read_private, write_all
 from gdp.stores.keyring import load_identity
 from gdp.trust.domain import Policy
 from gdp.trust.mail import Mail
 from gdp.trust.node_descriptor import NodeDescriptor
 
 __all__ = ["DomainClient", "Machine", "ReceivedMail", "delete_mail", "fetch_mail", "read_inbox"]
+
+log = logging.getLogger(__name__)
 
 MACHINES_PAGE: Final = 64
 MAIL_PAGE: Final = 64
@@ -159,9 +164,10 @@ class DomainClient:
             body: at most ``MAIL_BODY_MAX_BYTES``.
 
         Raises:
-            LocalError: kind or body are out of bounds.
+            LocalError: kind or body are out of bounds, or the membership has ended.
             EnrolmentError: no such node, its mailbox is full, or as ``Channel.request``.
         """
+        self.identity = load_identity(self._files.mail_identity, time.time())  # it may have been renewed
         self._channel.request({"op": "send", "mail": Mail.make(self.identity, to, kind, body, time.time())})
 
     def read_mails(self, since: int = 0) -> list[ReceivedMail]:
@@ -196,21 +202,32 @@ class DomainClient:
 def fetch_mail(channel: Channel, inbox: Path) -> int:
     """Move the mail that waits at the server into the inbox; return how many mails came.
 
-    A mail is deleted at the server only after it is on the disk here.
+    A mail is deleted at the server only after it is on the disk here. Of one sender at most a quarter of ``INBOX_MAX``
+    mails are kept, so that mail of a kind that no program here handles displaces no other; more is dropped and logged.
 
     Raises:
         EnrolmentError: as ``Channel.request``.
         LocalError: the inbox cannot be written, or holds ``INBOX_MAX`` mails already.
     """
-    fetched, count = 0, sum(1 for _ in inbox.glob("*.mail")) if inbox.exists() else 0
-    since = 0
+    held = _held_by_sender(inbox)
+    since = fetched = 0
     while page := channel.request({"op": "receive", "since": since}).maps("mail", MAIL_PAGE):
-        if count + fetched + len(page) > INBOX_MAX:
+        if held.total() + len(page) > INBOX_MAX:
             raise LocalError(f"{inbox}: holds {INBOX_MAX} mails; delete those that were handled")
-        files = {_mail_path(inbox, each.uint("n")).name: private(each.bytes_("m")) for each in page}
+        files = dict[str, NewFile]()
+        for each in page:
+            wire = each.bytes_("m")
+            sender = _sender_of(wire)
+            if held[sender] >= INBOX_MAX // 4:
+                log.warning(
+                    "mail dropped sender=%s reason=it has %d mails here already", sender.hex()[:6], held[sender]
+                )
+                continue
+            held[sender] += 1
+            files[_mail_path(inbox, each.uint("n")).name] = private(wire)
         write_all(inbox, files, force=True)
         since = max(each.uint("n") for each in page)
-        fetched += len(page)
+        fetched += len(files)
     return fetched
 
 
@@ -227,7 +244,8 @@ def read_inbox(inbox: Path, policy: Policy, recipient: Name, since: int) -> Iter
         try:
             mail = Mail.from_wire(read_private(path))
             sender = policy.verify_membership(mail.sender.wire, time.time())
-        except StatementError:
+        except StatementError as error:
+            log.warning("mail deleted file=%s reason=%s", path.name, error)
             path.unlink(missing_ok=True)
             continue
         if mail.to != recipient:
@@ -239,6 +257,26 @@ def read_inbox(inbox: Path, policy: Policy, recipient: Name, since: int) -> Iter
 def delete_mail(inbox: Path, number: int) -> None:
     """Delete a mail that was handled; no effect if it is gone."""
     _mail_path(inbox, number).unlink(missing_ok=True)
+
+
+def _held_by_sender(inbox: Path) -> Counter[bytes]:
+    """Return how many mails of each sender an inbox holds."""
+    held = Counter[bytes]()
+    for path in inbox.glob("*.mail"):
+        try:
+            held[_sender_of(read_private(path))] += 1
+        except LocalError:
+            if path.exists():  # else another program has handled and deleted it
+                raise
+    return held
+
+
+def _sender_of(wire: bytes) -> bytes:
+    """Return the name under which a mail is signed, unverified; empty if it is no mail."""
+    try:
+        return bytes(parse(wire).signer)
+    except StatementError:
+        return b""
 
 
 def _mail_path(inbox: Path, number: int) -> Path:

@@ -17,20 +17,15 @@ from pydantic import AfterValidator, Field
 
 from gdp.control.endpoints import Endpoint
 from gdp.errors import LocalError
+from gdp.host_port import checked_host_port
 from gdp.nodes.schema import Directory, ExistingFile, Section, Unique, load
-from gdp.trust.join_token import SERVERS_MAX, split_server
+from gdp.trust.join_token import SERVERS_MAX
 
-__all__ = ["DOMAIN_FILE", "DomainConfig", "DomainFiles"]
+__all__ = ["DOMAIN_FILE", "HANDOVER_SOCKET", "MEMBER_DAYS", "DomainConfig", "DomainFiles"]
 
 DOMAIN_FILE: Final = "domain.yaml"
-
-
-def _server(text: str) -> str:
-    try:
-        split_server(text)
-    except LocalError as error:
-        raise ValueError(str(error)) from error
-    return text
+HANDOVER_SOCKET: Final = "handover.sock"  # in the server's state: the relay gives it connections of its port
+MEMBER_DAYS: Final = 30.0  # also of the border's first memberships
 
 
 def _endpoint(text: str) -> str:
@@ -55,13 +50,13 @@ class DomainConfig(Section):
     peers: Directory
     revocations: Directory
     listen: int = Field(ge=0, le=65_535)
-    servers: Annotated[tuple[Annotated[str, AfterValidator(_server)], ...], Unique] = Field(
+    servers: Annotated[tuple[Annotated[str, AfterValidator(checked_host_port)], ...], Unique] = Field(
         min_length=1, max_length=SERVERS_MAX
     )
     public: Annotated[tuple[Annotated[str, AfterValidator(_endpoint)], ...], Unique] = ()
-    relays: Annotated[tuple[Annotated[str, AfterValidator(_server)], ...], Unique] = ()
+    relays: Annotated[tuple[Annotated[str, AfterValidator(checked_host_port)], ...], Unique] = ()
     trusts: Annotated[tuple[ExistingFile, ...], Unique] = ()
-    member_days: float = Field(default=30.0, ge=0.001, le=3_650.0)
+    member_days: float = Field(default=MEMBER_DAYS, ge=0.001, le=3_650.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

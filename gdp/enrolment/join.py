@@ -6,14 +6,11 @@ nothing behind. Private keys never leave this machine.
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import os
 import secrets
-import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -24,23 +21,24 @@ from gdp.crypto.fields import Fields
 from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.keys import PublicKey
 from gdp.enrolment.channel import Channel, connect_any
+from gdp.enrolment.draft import draft_of, publish_draft, reserve_space
 from gdp.enrolment.member_setup import MachinePlan, record_file_name, write_configuration
 from gdp.enrolment.wire import INSTANCE_BYTES, EnrolmentError, UnreachableError
 from gdp.errors import LocalError, RemoteError
+from gdp.host_port import split_host_port
 from gdp.nodes.endpoint_files import own_record
 from gdp.stores.files import public, read_public, write_all
 from gdp.stores.issue import install_membership, make_node_keys
 from gdp.stores.keyring import CARD, OWNER_PUBLIC
 from gdp.trust.domain import Policy
 from gdp.trust.enrolment import MEMBERS_MAX, apply
-from gdp.trust.join_token import SERVERS_MAX, JoinToken, join_id, join_key, join_proof, split_server
+from gdp.trust.join_token import SERVERS_MAX, JoinToken, join_id, join_key, join_proof
 
-__all__ = ["JoinRequest", "Joined", "join_domain"]
+__all__ = ["JoinRequest", "Joined", "join_domain", "prefer_server"]
 
 log = logging.getLogger(__name__)
 
-_RESERVED_BYTES: Final = 512 << 10  # held while the request is under way: what comes back then fits the disk
-_RESERVE: Final = "reserved"
+_UNUSED: Final = "the token was not used"
 _TRUSTS_MAX: Final = 64
 _BORDERS_MAX: Final = 16
 _RETRY_S: Final = 30.0
@@ -77,6 +75,11 @@ class Joined:
     server: str
 
 
+def prefer_server(token: JoinToken, server: str) -> JoinToken:
+    """Return a token that names a server first which answered: a firewall may block the others."""
+    return replace(token, servers=(server, *(each for each in token.servers if each != server)))
+
+
 def join_domain(
     request: JoinRequest, *, clock: Callable[[], float] = time.time, wait: Callable[[float], None] = time.sleep
 ) -> Joined:
@@ -91,18 +94,20 @@ def join_domain(
         raise LocalError(
             f"{request.directory}: is there already: this machine has joined; name another --directory, or remove it"
         )
-    with _draft_of(request.directory) as draft:
+    with draft_of(request.directory) as draft:
+        reserve_space(draft, _UNUSED).unlink()
         members = [
             (folder, make_node_keys(draft / folder, role, request.label)) for folder, role in request.token.role.nodes
         ]
-        _reserve(draft)
+        reserved = reserve_space(draft, _UNUSED)  # while the request is under way: what comes back then fits the disk
         fields, root, server = _ask(request, [keys for _, keys in members], wait)
-        (draft / _RESERVE).unlink()
+        reserved.unlink()
+        request = replace(request, token=prefer_server(request.token, server))
         identities, borders = _install(draft, request, members, fields, root, clock())
         record = own_record(identities[0], max(len(request.uplinks), 1), ())
         cards = [read_public(draft / folder / CARD) for folder, _ in members]
         _announce(request.token, identities[-1], {"op": "install", "cards": cards, "record": record.wire}, wait)
-        _rename(draft, request.directory)
+        publish_draft(draft, request.directory)
     return Joined(
         root=root,
         label=request.label,
@@ -153,9 +158,7 @@ def _repeated(
                 return send(channel), channel.root, channel.server
         except UnreachableError as error:
             if not has_connected or time.monotonic() >= end_s:
-                raise UnreachableError(
-                    f"the enrolment server is not reachable: {error}; check the network and that TCP is let through"
-                ) from error
+                raise
             log.info("enrolment repeated reason=%s", error)
             wait(_RETRY_EACH_S)
 
@@ -177,7 +180,7 @@ def _install(
         wires = fields.byte_strings("borders", _BORDERS_MAX)
         relays = fields.texts("relays", SERVERS_MAX)
         for each in relays:
-            split_server(each)
+            split_host_port(each)
         borders = tuple(EndpointRecord.verified(each, policy, unix_s)[0] for each in wires)
         if len(certificates) != len(nodes):
             raise LocalError("another number of memberships")
@@ -201,44 +204,3 @@ def _install(
     write_configuration(draft, plan, sorted(files))
     write_all(draft / "peers", {record_file_name(each.name): public(each.wire) for each in borders})
     return identities, borders
-
-
-@contextlib.contextmanager
-def _draft_of(directory: Path) -> Iterator[Path]:
-    """Yield a new private folder next to a directory; it is removed at the end if it was not renamed."""
-    draft = directory.parent / f".{directory.name}.{secrets.token_hex(8)}"
-    try:
-        directory.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
-        draft.mkdir(mode=0o700)
-    except OSError as error:
-        raise LocalError(f"{directory.parent}: {error.strerror}; name another --directory") from error
-    try:
-        yield draft
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
-
-
-def _reserve(draft: Path) -> None:
-    """Occupy the space of what comes back: a full disk is found before the token is used up."""
-    try:
-        handle = os.open(draft / _RESERVE, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-        with os.fdopen(handle, "wb") as file:
-            os.posix_fallocate(file.fileno(), 0, _RESERVED_BYTES)
-            os.fsync(file.fileno())
-    except OSError as error:
-        raise LocalError(
-            f"{draft.parent}: {error.strerror}: joining needs {_RESERVED_BYTES >> 10} KiB; free some space, then run"
-            " the command again: the token was not used"
-        ) from error
-
-
-def _rename(draft: Path, directory: Path) -> None:
-    try:
-        draft.rename(directory)
-        folder = os.open(directory.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
-    except OSError as error:
-        raise LocalError(f"{directory}: {error.strerror}") from error

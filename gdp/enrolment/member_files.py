@@ -22,22 +22,14 @@ from typing import Annotated, Final
 from pydantic import AfterValidator, Field
 
 from gdp.enrolment.wire import EnrolmentError
-from gdp.errors import LocalError
+from gdp.host_port import checked_host_port
 from gdp.nodes.schema import Directory, Domain, Section, Unique, load
 from gdp.stores.keyring import load_root
-from gdp.trust.join_token import SERVERS_MAX, fingerprint_of, split_server
+from gdp.trust.join_token import SERVERS_MAX, fingerprint_of
 
 __all__ = ["MEMBER_FILE", "MemberConfig", "MemberFiles"]
 
 MEMBER_FILE: Final = "member.yaml"
-
-
-def _server(text: str) -> str:
-    try:
-        split_server(text)
-    except LocalError as error:
-        raise ValueError(str(error)) from error
-    return text
 
 
 class MemberConfig(Section):
@@ -50,7 +42,7 @@ class MemberConfig(Section):
     proxy: Directory | None = None
     rib: Directory | None = None
     peers: Directory
-    servers: Annotated[tuple[Annotated[str, AfterValidator(_server)], ...], Unique] = Field(
+    servers: Annotated[tuple[Annotated[str, AfterValidator(checked_host_port)], ...], Unique] = Field(
         min_length=1, max_length=SERVERS_MAX
     )
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,15 +15,27 @@ from typing import Final
 
 from gdp.enrolment.member_files import MEMBER_FILE
 from gdp.names import Name
+from gdp.nodes.config import LISTEN_DEFAULT
 from gdp.nodes.endpoint_files import RECORD_SUFFIX
-from gdp.stores.files import public, write_all
+from gdp.stores.files import public, read_public, write_all
 from gdp.stores.keyring import DELEGATIONS
 
-__all__ = ["LISTEN_PORT", "RELAY_FILE", "RELAY_PORT", "MachinePlan", "record_file_name", "write_configuration"]
+__all__ = [
+    "LISTEN_PORT",
+    "RELAY_FILE",
+    "RELAY_PORT",
+    "WATCH_IFACE",
+    "MachinePlan",
+    "record_file_name",
+    "update_relays",
+    "write_configuration",
+]
 
-LISTEN_PORT: Final = 51_820  # of WireGuard; of the enrolment server the TCP port of this number
+LISTEN_PORT: Final = LISTEN_DEFAULT  # of WireGuard; of the enrolment server the TCP port of this number
 RELAY_PORT: Final = 443
 RELAY_FILE: Final = "relay.yaml"
+WATCH_IFACE: Final = "watch0"  # of a border: from there a launcher sees which replicas serve
+_BORDERS: Final = re.compile(r"^borders:\n(?:[ \t].*\n)*", re.MULTILINE)
 _FOLDERS: Final = ("peers", "revocations", "inbox", "state/switch", "state/rib", "state/proxy", "proxy.yaml.d")
 
 
@@ -37,6 +50,7 @@ class MachinePlan:
         public: UDP endpoints at which the tunnels can be reached from everywhere.
         uplinks: devices that each get a tunnel; none: routing decides.
         relay_port: TCP port at which a border relays; 0: it does not.
+        handover: socket of the enrolment server that takes connections of the relay's port; empty: none.
         relays: of each border, ``host:port`` of its relay, for networks that block UDP.
     """
 
@@ -47,6 +61,7 @@ class MachinePlan:
     public: Sequence[str] = ()
     uplinks: Sequence[str] = ()
     relay_port: int = 0
+    handover: str = ""
     relays: Mapping[Name, Sequence[str]] = field(default_factory=dict)
     has_proxy: bool = True
     has_rib: bool = False
@@ -79,6 +94,26 @@ def write_configuration(directory: Path, plan: MachinePlan, trusts: Sequence[str
     write_all(directory, {name: public(text.encode()) for name, text in texts.items()})
 
 
+def update_relays(directory: Path, relays: Mapping[Name, Sequence[str]]) -> bool:
+    """Write where the relays of borders are now into ``relay.yaml``; return whether that changed something.
+
+    Only the key ``borders`` is replaced. A machine without the file runs no relay, and a change to no relay at all
+    leaves what there is.
+
+    Raises:
+        LocalError: the file cannot be written.
+    """
+    path = directory / RELAY_FILE
+    if not path.exists() or not any(relays.values()):
+        return False
+    before = read_public(path).decode()
+    after, count = _BORDERS.subn(_borders({name: each for name, each in relays.items() if each}), before)
+    if not count or after == before:
+        return False
+    write_all(directory, {RELAY_FILE: public(after.encode())}, force=True)
+    return True
+
+
 def record_file_name(name: Name) -> str:
     """Return the name of a switch's file in a folder of peers."""
     return f"{name.to_text()}{RECORD_SUFFIX}"
@@ -92,7 +127,9 @@ def _member(plan: MachinePlan, trusts: Sequence[str]) -> str:
 
 
 def _switch(plan: MachinePlan, trusts: Sequence[str]) -> str:
-    attach = [*(["rib0"] if plan.has_rib else []), *(["proxy0"] if plan.has_proxy else [])]
+    attach = ["rib0"] if plan.has_rib else []
+    attach += ["proxy0"] if plan.has_proxy else []
+    attach += [WATCH_IFACE] if plan.has_rib else []
     links = {"listen": plan.listen, "peers": "peers"}
     public_line = f"  public: {json.dumps(list(plan.public))}\n" if plan.public else ""
     uplinks_line = f"  uplinks: {json.dumps(list(plan.uplinks))}\n" if plan.uplinks else ""
@@ -109,12 +146,17 @@ def _switch(plan: MachinePlan, trusts: Sequence[str]) -> str:
 
 
 def _relay(plan: MachinePlan, trusts: Sequence[str]) -> str:
-    lines = [f"server: {{port: {plan.relay_port}}}"] if plan.relay_port else []
-    if relays := {name: list(each) for name, each in plan.relays.items() if each}:
-        lines.append("borders:")
-        for name, endpoints in relays.items():
-            lines += [f'  - peer: "{name.to_text()}"', f"    endpoints: {json.dumps(endpoints)}"]
-    return _node("switch", trusts) + "revocations: revocations\n" + "\n".join([*lines, ""])
+    enrolment = f", enrolment: {plan.handover}" if plan.handover else ""
+    lines = [f"server: {{port: {plan.relay_port}{enrolment}}}"] if plan.relay_port else []
+    text = _node("switch", trusts) + "revocations: revocations\n" + "\n".join([*lines, ""])
+    return text + _borders({name: each for name, each in plan.relays.items() if each})
+
+
+def _borders(relays: Mapping[Name, Sequence[str]]) -> str:
+    lines = ["borders:"] if relays else []
+    for name, endpoints in relays.items():
+        lines += [f'  - peer: "{name.to_text()}"', f"    endpoints: {json.dumps(list(endpoints))}"]
+    return "\n".join([*lines, ""])
 
 
 def _proxy(trusts: Sequence[str]) -> str:

@@ -26,7 +26,8 @@ __all__ = ["MAILBOX_MAX", "MAILBOX_MAX_BYTES", "MachineRow", "Registry", "Stored
 
 MAILBOX_MAX: Final = 1_024  # mails that wait for one node
 MAILBOX_MAX_BYTES: Final = 4 << 20
-_SENDER_MAX: Final = 256  # of them, by one sender
+_SENDER_MAX: Final = MAILBOX_MAX // 4  # of them, by the nodes of one machine
+_SENDER_MAX_BYTES: Final = MAILBOX_MAX_BYTES // 4
 _FILE: Final = "registry.sqlite3"
 _TIMEOUT_S: Final = 10.0
 _DAY_S: Final = 86_400.0
@@ -54,6 +55,8 @@ CREATE TABLE IF NOT EXISTS mail (
 ) STRICT;
 CREATE INDEX IF NOT EXISTS mailboxes ON mail (recipient, id);
 """
+_MAILBOX: Final = "SELECT count(*), coalesce(sum(length(wire)), 0) FROM mail WHERE recipient = ?"
+_SAME_MACHINE: Final = "(SELECT name FROM nodes WHERE machine = (SELECT machine FROM nodes WHERE name = ?))"
 _MACHINE: Final = (
     "SELECT m.id, m.label, m.role, m.joined_unix_s, m.seen_unix_s, m.removed_unix_s, m.has_double FROM machines m"
 )
@@ -140,9 +143,13 @@ class Registry:
         with self._translated():
             os.close(os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
             self._file = sqlite3.connect(self._path, timeout=_TIMEOUT_S, isolation_level=None, check_same_thread=False)
-            self._file.execute("PRAGMA journal_mode=WAL")
-            self._file.execute("PRAGMA synchronous=FULL")  # a used token stays used after a crash
-            self._file.executescript(_TABLES)
+            try:
+                self._file.execute("PRAGMA journal_mode=WAL")
+                self._file.execute("PRAGMA synchronous=FULL")  # a used token stays used after a crash
+                self._file.executescript(_TABLES)
+            except sqlite3.Error:
+                self._file.close()
+                raise
 
     def close(self) -> None:
         """Close the file."""
@@ -196,13 +203,15 @@ class Registry:
         Of several requests at once exactly one succeeds; the same keys may repeat it.
 
         Raises:
-            EnrolmentError: USED by other keys, or LABEL_TAKEN; nothing has changed then.
+            EnrolmentError: USED by other keys, LABEL_TAKEN, or NO_MEMBER: its machine was removed since. Nothing has
+                changed then.
         """
         with self._writing() as file:
             row = file.execute("SELECT keys, machine, role FROM tokens WHERE id = ?", (identifier,)).fetchone()
             if row is None or (row[0] is not None and row[0] != keys):
                 raise EnrolmentError(Refusal.USED, "this token was used already")
             if row[1] is not None:
+                _refuse_removed(file, row[1])
                 return int(row[1])
             machine = self._insert_machine(file, label, row[2], unix_s)
             file.execute(
@@ -211,9 +220,19 @@ class Registry:
             )
             return machine
 
-    def complete_token(self, identifier: bytes, machine: int, members: Sequence[Membership], answer: bytes) -> None:
-        """Store what was issued for a token, and the response to a repeat of its request."""
+    def withdraw_tokens(self, label: str) -> None:
+        """Delete the unused tokens for machines with this label."""
         with self._writing() as file:
+            file.execute("DELETE FROM tokens WHERE label = ? AND keys IS NULL", (label,))
+
+    def complete_token(self, identifier: bytes, machine: int, members: Sequence[Membership], answer: bytes) -> None:
+        """Store what was issued for a token, and the response to a repeat of its request.
+
+        Raises:
+            EnrolmentError: NO_MEMBER, the machine was removed meanwhile; what was issued must not be handed out.
+        """
+        with self._writing() as file:
+            _refuse_removed(file, machine)
             for each in members:
                 _insert_node(file, machine, each)
             file.execute("UPDATE tokens SET answer = ? WHERE id = ?", (answer, identifier))
@@ -229,9 +248,15 @@ class Registry:
         return machine
 
     def renewed(self, members: Sequence[Membership]) -> None:
-        """Store renewed memberships of known nodes."""
+        """Store renewed memberships of known nodes.
+
+        Raises:
+            EnrolmentError: NO_MEMBER, their machine was removed meanwhile; they must not be handed out.
+        """
         with self._writing() as file:
             for each in members:
+                row = file.execute("SELECT machine FROM nodes WHERE name = ?", (each.name,)).fetchone()
+                _refuse_removed(file, 0 if row is None else row[0])
                 file.execute(
                     "UPDATE nodes SET certificate = ?, until_unix_s = ? WHERE name = ?",
                     (each.wire, each.not_after_unix_s, each.name),
@@ -289,6 +314,12 @@ class Registry:
                 ).fetchall()
             ]
 
+    def fingerprints(self, machine: int) -> frozenset[bytes]:
+        """Return the fingerprints of all memberships that the nodes of a machine ever had."""
+        query = "SELECT fingerprint FROM certificates WHERE name IN (SELECT name FROM nodes WHERE machine = ?)"
+        with self._translated(), self._lock:
+            return frozenset(row[0] for row in self._file.execute(query, (machine,)).fetchall())
+
     # mail
 
     def add_mail(self, recipient: Name, sender: Name, wire: bytes) -> None:
@@ -301,12 +332,12 @@ class Registry:
             ).fetchone()
             if known is None:
                 raise EnrolmentError(Refusal.NO_MEMBER, "the recipient is no member of this domain")
-            count, size, own = file.execute(
-                "SELECT count(*), coalesce(sum(length(wire)), 0), coalesce(sum(sender = ?), 0) FROM mail"
-                " WHERE recipient = ?",
-                (sender, recipient),
+            count, size = file.execute(_MAILBOX, (recipient,)).fetchone()
+            own_count, own_size = file.execute(
+                f"{_MAILBOX} AND sender IN {_SAME_MACHINE}", (recipient, sender)
             ).fetchone()
-            if count >= MAILBOX_MAX or size + len(wire) > MAILBOX_MAX_BYTES or own >= _SENDER_MAX:
+            is_full = count >= MAILBOX_MAX or size + len(wire) > MAILBOX_MAX_BYTES
+            if is_full or own_count >= _SENDER_MAX or own_size + len(wire) > _SENDER_MAX_BYTES:
                 raise EnrolmentError(Refusal.MAILBOX_FULL, "the recipient's mailbox is full; its machine may be off")
             file.execute("INSERT INTO mail (recipient, sender, wire) VALUES (?, ?, ?)", (recipient, sender, wire))
 
@@ -379,6 +410,12 @@ class Registry:
             yield
         except (sqlite3.Error, OSError) as error:
             raise StoreError(f"{self._path}: {error}") from error
+
+
+def _refuse_removed(file: sqlite3.Connection, machine: int) -> None:
+    query = "SELECT 1 FROM machines WHERE id = ? AND removed_unix_s IS NULL"
+    if file.execute(query, (machine,)).fetchone() is None:
+        raise EnrolmentError(Refusal.NO_MEMBER, "this machine was removed from the domain; join again with a new token")
 
 
 def _insert_node(file: sqlite3.Connection, machine: int, member: Membership) -> None:

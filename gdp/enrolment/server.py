@@ -17,11 +17,12 @@ from collections import OrderedDict, defaultdict
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final, TypeVar
 
 from gdp.crypto.fields import Fields
 from gdp.enrolment.desk import EnrolmentDesk, Session, refusal_of
-from gdp.enrolment.domain_files import DomainFiles
+from gdp.enrolment.domain_files import HANDOVER_SOCKET, DomainFiles
 from gdp.enrolment.registry import Registry
 from gdp.enrolment.server_tls import ServerTls, make_server_tls
 from gdp.enrolment.wire import (
@@ -36,9 +37,11 @@ from gdp.enrolment.wire import (
     read_message,
 )
 from gdp.errors import DropReason, GdpError, LocalError, StatementError
-from gdp.token_bucket import TokenBucket
+from gdp.ports.client_network import client_network
+from gdp.ports.listening import listen_tcp
+from gdp.token_bucket import TokenBucket, TokenBuckets
 
-__all__ = ["STRANGER_S", "EnrolmentServer", "bind_server", "serve_domain"]
+__all__ = ["STRANGER_S", "EnrolmentServer", "bind_handover", "bind_server", "serve_domain"]
 
 log = logging.getLogger(__name__)
 
@@ -49,11 +52,13 @@ _EACH_MAX: Final = 16  # strangers from one address
 _MEMBERS_MAX: Final = 4_096
 _EACH_MEMBER_MAX: Final = 8  # connections of one machine
 _ACCEPTS_PER_S: Final = 50.0  # a handshake costs about 1 ms
+_EACH_PER_S: Final = 25.0  # of them, of one address
+_EACH_BURST: Final = 100.0  # a site behind one NAT whose machines start together
+_LOOK_S: Final = 0.0005  # between connections above the share of their address, which cost no handshake
 _REQUEST_S: Final = 10.0  # for the bytes of one request, after its first
 _IDLE_S: Final = 2 * POLL_MAX_S
 _FLUSH_S: Final = 10.0
 _TLS_S: Final = 86_400.0
-_BACKLOG: Final = 128
 _INSTANCES_MAX: Final = 16  # remembered starts of one machine's agent
 
 _T = TypeVar("_T")
@@ -62,14 +67,24 @@ _T = TypeVar("_T")
 def bind_server(port: int, host: str = "") -> socket.socket:
     """Return a listening socket; an empty host: all addresses. Raises ``LocalError``: the port is taken."""
     try:
-        if not host and socket.has_dualstack_ipv6():
-            return socket.create_server(("", port), family=socket.AF_INET6, backlog=_BACKLOG, dualstack_ipv6=True)
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        return socket.create_server((host, port), family=family, backlog=_BACKLOG)
+        return listen_tcp(host, port)
     except OSError as error:
         raise LocalError(
             f"enrolment server: TCP port {port} cannot be listened on: {error.strerror or error}; choose another one"
         ) from error
+
+
+def bind_handover(path: Path) -> socket.socket:
+    """Return the socket at which a relay hands over connections. Raises ``LocalError``: it cannot be made."""
+    receiver = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+    try:
+        path.unlink(missing_ok=True)
+        receiver.bind(str(path))
+        path.chmod(0o600)
+    except OSError as error:
+        receiver.close()
+        raise LocalError(f"enrolment server: {path}: {error.strerror or error}") from error
+    return receiver
 
 
 @dataclass(slots=True, eq=False)
@@ -78,7 +93,7 @@ class _Connection:
 
     task: asyncio.Task[None] = field(init=False)
     peer: socket.socket
-    host: str
+    host: bytes  # as of ``client_network``
     session: Session | None = None
     is_attended: bool = False
     nonce: bytes = field(default_factory=lambda: os.urandom(NONCE_BYTES))
@@ -89,14 +104,23 @@ class EnrolmentServer:
 
     Args:
         make_tls: returns a fresh context; called at the start, and each day.
+        handover: of ``bind_handover``; None: no relay hands connections over.
     """
 
-    def __init__(self, listening: socket.socket, desk: EnrolmentDesk, make_tls: Callable[[], ServerTls]) -> None:
+    def __init__(
+        self,
+        listening: socket.socket,
+        desk: EnrolmentDesk,
+        make_tls: Callable[[], ServerTls],
+        handover: socket.socket | None = None,
+    ) -> None:
         self._listening = listening
+        self._handover = handover
         self._desk = desk
         self._make_tls = make_tls
         self._tls = make_tls()
         self._rate = TokenBucket(_ACCEPTS_PER_S, _ACCEPTS_PER_S)
+        self._each = TokenBuckets(_EACH_PER_S, _EACH_BURST)
         self._strangers: OrderedDict[_Connection, None] = OrderedDict()
         self._members: dict[int, OrderedDict[_Connection, None]] = defaultdict(OrderedDict)
         self._polling: dict[int, OrderedDict[bytes, None]] = defaultdict(OrderedDict)  # instances, the newest last
@@ -106,12 +130,17 @@ class EnrolmentServer:
     async def accept_connections(self) -> None:
         """Serve until cancelled; then every connection and the listening socket are closed."""
         self._listening.setblocking(False)
-        upkeep = asyncio.ensure_future(self._keep_up())
+        upkeep, loop = asyncio.ensure_future(self._keep_up()), asyncio.get_running_loop()
+        if self._handover is not None:
+            loop.add_reader(self._handover, self._take_handed, self._handover)
         try:
             while True:
                 await self._accept()
         finally:
             self._listening.close()
+            if self._handover is not None:
+                loop.remove_reader(self._handover)
+                self._handover.close()
             tasks = [upkeep, *(each.task for each in self._connections())]
             for task in tasks:
                 task.cancel()
@@ -125,7 +154,6 @@ class EnrolmentServer:
         wait_s = (1.0 - self._rate.left(time.monotonic())) / _ACCEPTS_PER_S
         if wait_s > 0:
             await asyncio.sleep(wait_s)  # further connections wait in the kernel's queue
-        self._rate.charge(time.monotonic(), 1.0)
         try:
             peer, address = await asyncio.get_running_loop().sock_accept(self._listening)
         except ConnectionAbortedError:
@@ -134,7 +162,32 @@ class EnrolmentServer:
             log.warning("enrolment connection not accepted reason=%s", error.strerror)
             await asyncio.sleep(1.0)
             return
-        connection = _Connection(peer=peer, host=str(address[0]))
+        host = client_network(str(address[0]))
+        if not self._each.spend(host, time.monotonic()):
+            peer.close()
+            await asyncio.sleep(_LOOK_S)
+            return
+        self._rate.charge(time.monotonic(), 1.0)
+        self._begin(peer, host)
+
+    def _take_handed(self, handover: socket.socket) -> None:
+        """Serve a connection that the relay accepted, whose rate it limits."""
+        try:
+            _, descriptors, _, _ = socket.recv_fds(handover, 1, 1)
+        except BlockingIOError:
+            return
+        for descriptor in descriptors:
+            peer = socket.socket(fileno=descriptor)
+            try:
+                peer.setblocking(False)
+                host = client_network(str(peer.getpeername()[0]))
+            except OSError:  # it is gone
+                peer.close()
+                continue
+            self._begin(peer, host)
+
+    def _begin(self, peer: socket.socket, host: bytes) -> None:
+        connection = _Connection(peer=peer, host=host)
         same = [each for each in self._strangers if each.host == connection.host]
         if len(same) >= _EACH_MAX:
             same[0].task.cancel()
@@ -231,7 +284,7 @@ class EnrolmentServer:
             case "nodes":
                 return await self._work(desk.nodes, session, fields, self._is_online)
             case "send":
-                recipient = await self._work(desk.send, session, fields)
+                recipient = await self._work(desk.send, session, fields, now)
                 for event in self._news.get(bytes(recipient), ()):
                     event.set()
                 return {"ok": True}
@@ -332,10 +385,16 @@ async def serve_domain(files: DomainFiles, listening: socket.socket) -> None:
         LocalError: the domain's keys cannot be read, or its folders cannot be written.
         StoreError: the registry cannot be opened.
     """
-    config = files.config
+    config, handover = files.config, None
     with contextlib.closing(listening), Registry(config.state) as registry:
         desk = EnrolmentDesk(files, registry)
-        server = EnrolmentServer(listening, desk, lambda: make_server_tls(config.domain, config.state, time.time()))
+        try:
+            handover = bind_handover(config.state / HANDOVER_SOCKET)
+        except LocalError as error:
+            log.warning("the relay's port does not enrol machines reason=%s", error)
+        server = EnrolmentServer(
+            listening, desk, lambda: make_server_tls(config.domain, config.state, time.time()), handover
+        )
         try:
             await server.accept_connections()
         finally:

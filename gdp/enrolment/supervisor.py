@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import os
 import shutil
 import signal
 import subprocess
@@ -88,10 +89,18 @@ async def _start(program: MachineProgram) -> asyncio.subprocess.Process:
             *program.argv,
             stdin=subprocess.DEVNULL,
             stdout=sys.stderr,
+            cwd="/",  # Python imports from the working directory, which others may be able to write to
+            env=_environment(),
             start_new_session=True,
         )
     except OSError as error:
         raise LocalError(f"{program.name}: {program.argv[0]} cannot be started: {error.strerror}") from error
+
+
+def _environment() -> dict[str, str]:
+    """Return this process's environment, whose folders of modules do not depend on the working directory."""
+    folders = [os.path.abspath(each) for each in os.environ.get("PYTHONPATH", "").split(os.pathsep) if each]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(folders)} if folders else dict(os.environ)
 
 
 async def _end(process: asyncio.subprocess.Process) -> None:

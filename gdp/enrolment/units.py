@@ -20,6 +20,18 @@ __all__ = ["UNIT_FOLDER", "has_systemd", "install_units", "remove_units", "unit_
 UNIT_FOLDER: Final = Path("/etc/systemd/system")
 _RUNNING: Final = Path("/run/systemd/system")  # sd_booted(3)
 _TIMEOUT_S: Final = 60.0
+_OF_DEVICES: Final = frozenset({"CAP_NET_ADMIN", "CAP_NET_RAW"})
+_FENCES: Final = """\
+PrivateDevices=yes
+PrivateTmp=yes
+ProtectControlGroups=yes
+ProtectKernelTunables=yes
+RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK
+RestrictNamespaces=yes
+SystemCallArchitectures=native
+SystemCallErrorNumber=EPERM
+SystemCallFilter=@system-service
+"""  # of programs that any host may connect to, and that touch no device
 _UNSAFE: Final = re.compile(r"[^A-Za-z0-9_.-]")
 
 
@@ -91,6 +103,7 @@ LockPersonality=yes
 RestrictRealtime=yes
 RestrictSUIDSGID=yes
 UMask=0077
+{"" if set(program.capabilities) & _OF_DEVICES else _FENCES}\
 
 [Install]
 WantedBy=multi-user.target

@@ -3,7 +3,7 @@
 Sans-I/O; the only codec that a data path imports. ``gdp/frame/layers.py`` is the normative definition; generated tests
 compare the two. Offsets count from the first byte after the EtherType (see ``spec.md``)::
 
-    0 version  1 kind  2 flags  3 hops left  4 key epoch (2)  6 payload length (2)  8 message number (8)
+    0 version  1 kind  2 flags  3 hops left, second path  4 key epoch (2)  6 payload length (2)  8 message number (8)
     16 part (4)  20 parts (4)  24 incarnation (8)  32 destination (32)  64 source (32)  96 payload
 """
 
@@ -16,6 +16,7 @@ from typing import Final, NamedTuple
 from gdp.errors import DropReason, FrameError
 from gdp.frame.kinds import ETHERTYPE, VERSION
 from gdp.limits import PARTS_MAX
+from gdp.names import NAME_BYTES
 
 __all__ = [
     "AAD_BYTES",
@@ -24,10 +25,12 @@ __all__ = [
     "FLAGS_AT",
     "HEADER_BYTES",
     "HOPS_AT",
+    "HOPS_MASK",
     "KIND_AT",
     "NUMBER_AT",
     "OVERHEAD_BYTES",
     "PARTS_AT",
+    "SECOND_PATH",
     "SOURCE_AT",
     "Header",
     "authenticated",
@@ -35,6 +38,8 @@ __all__ = [
     "encode",
     "ethernet",
     "layout",
+    "second_path_copy",
+    "second_path_key",
 ]
 
 ETHER_BYTES: Final = 14
@@ -48,6 +53,8 @@ PARTS_AT: Final = 20
 DESTINATION_AT: Final = 32
 SOURCE_AT: Final = 64
 AAD_BYTES: Final = HEADER_BYTES - 1
+HOPS_MASK: Final = 0x7F  # of the byte at ``HOPS_AT``: how many hops are left
+SECOND_PATH: Final = 0x80  # of the same byte: the copy for the second path
 
 _HEADER: Final = struct.Struct("!BBBBHHQIIQ32s32s")
 _BEHIND_VERSION: Final = struct.Struct("!xBBBHHQIIQ32s32s")
@@ -60,7 +67,7 @@ class Header(NamedTuple):
 
     kind: int
     flags: int
-    hops_left: int
+    hops_left: int  # the whole byte: hops in ``HOPS_MASK``, and ``SECOND_PATH``
     epoch: int
     length: int  # payload bytes
     number: int
@@ -107,6 +114,20 @@ def decode(frame: bytes | bytearray | memoryview, at: int = 0) -> Header:
 def authenticated(header: bytes) -> bytes:
     """Return the 95 bytes that a seal covers: a header (or a frame from it on) without hops left."""
     return header[:HOPS_AT] + header[HOPS_AT + 1 : HEADER_BYTES]
+
+
+def second_path_key(destination: bytes) -> bytes:
+    """Return the key of a forwarding table for the second path: 32 bytes, the destination with its last bit inverted.
+
+    What follows the destination in a key (the source) stays as it is.
+    """
+    last = NAME_BYTES - 1
+    return destination[:last] + bytes([destination[last] ^ 1]) + destination[NAME_BYTES:]
+
+
+def second_path_copy(frame: bytes) -> bytes:
+    """Return the copy of a frame (from the header on) for the second path: the same bytes but for one bit."""
+    return frame[:HOPS_AT] + bytes([frame[HOPS_AT] | SECOND_PATH]) + frame[HOPS_AT + 1 :]
 
 
 def ethernet(destination_mac: bytes, source_mac: bytes) -> bytes:

@@ -31,7 +31,7 @@ from scapy.packet import Packet, bind_layers
 from scapy.utils import strxor
 
 from gdp.errors import LocalError
-from gdp.frame.codec import HEADER_BYTES
+from gdp.frame.codec import HEADER_BYTES, HOPS_MASK, SECOND_PATH
 from gdp.frame.diagnostic import byte_string, diagnose
 from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, VERSION, Flag, Kind
 from gdp.limits import HOPS_MAX
@@ -71,6 +71,14 @@ class NameField(XStrFixedLenField):
         raise LocalError(f"a name is given as bytes or hex digits, not {type(x).__name__}")
 
 
+class HopsField(ByteField):
+    """Hops left in the lower seven bits; the highest bit marks the copy for the second path."""
+
+    def i2repr(self, _pkt: Packet | None, x: int) -> str:
+        """Return the hops left, and a word about the second path where the bit is set."""
+        return f"{x & HOPS_MASK} (second path)" if x & SECOND_PATH else str(x)
+
+
 class CborBytesField(StrField):
     """A CBOR byte string; the value excludes its head, and diagnostic notation shows it if it holds CBOR."""
 
@@ -106,7 +114,7 @@ class GDP(Packet):
         ByteField("version", VERSION),
         ByteEnumField("kind", Kind.DATA, KIND_NAMES),
         FlagsField("flags", 0, 8, FLAG_NAMES),
-        ByteField("hops_left", HOPS_MAX),
+        HopsField("hops_left", HOPS_MAX),
         ShortField("epoch", 0),
         ShortField("length", None),
         LongField("number", 0),
@@ -165,7 +173,7 @@ class GDP(Packet):
         """Return the line that Scapy shows for the frame."""
         source, destination = Name(self.source).short, Name(self.destination).short
         which = f"#{self.number} {self.part + 1}/{self.parts}"
-        return f"GDP {self.sprintf('%kind%')} {source} > {destination} {which} hops {self.hops_left}"
+        return f"GDP {self.sprintf('%kind%')} {source} > {destination} {which} hops {self.sprintf('%hops_left%')}"
 
 
 class Keepalive(Packet):

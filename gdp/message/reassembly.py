@@ -23,11 +23,12 @@ from typing import Protocol
 from gdp.crypto.envelope import digest_of, salt_of
 from gdp.crypto.header_batch import HeaderBatch
 from gdp.errors import DropReason, EnvelopeError, RemoteError
-from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, NUMBER_AT, PARTS_AT, Header
+from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, HOPS_MASK, NUMBER_AT, PARTS_AT, Header
 from gdp.frame.kinds import Flag
 from gdp.limits import HOPS_MAX, JOIN_MESSAGES_MAX, JOIN_PATIENCE_S, REPLAY_WINDOW_MESSAGES
 from gdp.message.reassembly_quota import ReassemblyQuota
 from gdp.message.replay import ReplayWindow
+from gdp.message.second_copies import SecondCopies
 from gdp.sansio import ReceivedFrame
 
 __all__ = ["ALL_PARTS", "OpensParts", "ReassembledMessage", "Reassembler", "VerifiesDigest"]
@@ -107,6 +108,9 @@ class Reassembler:
         budget: shared by all reassemblers of the node.
         patience_s: an unfinished message is dropped this long after its last new fragment.
         head_bytes: how many bytes come before each message; fewer than any first fragment has.
+
+    Attributes:
+        copies: delay of the second copies, of a source that sends each frame over two paths; None: it does not.
     """
 
     def __init__(
@@ -132,6 +136,7 @@ class Reassembler:
         self.drops: Counter[DropReason] = Counter()
         self.highest = -1  # highest message number of which an authentic fragment came
         self.new_parts = 0
+        self.copies: SecondCopies | None = None
         self._under_way = -1  # number of the message whose next fragments are expected
 
     def add_batch(self, arrivals: Sequence[ReceivedFrame], at: int, now_s: float) -> int:
@@ -185,12 +190,12 @@ class Reassembler:
         """Add one fragment; return the message that it completes, if any. Errors are counted in ``drops``."""
         number = header.number
         if self.window.is_finished(number):
-            self.drops[DropReason.LATE] += 1
+            self.drop_copy(header, DropReason.LATE, now_s)
             return None
         message, salt = self._unfinished.get(number), salt_of(frame)
         is_same = message is not None and message.parts == header.parts and message.salt == salt
         if is_same and message is not None and header.part in message.plain:
-            self.drops[DropReason.DUPLICATE] += 1
+            self.drop_copy(header, DropReason.DUPLICATE, now_s)
             return None
         try:
             opener = self._opener_of(header.epoch)
@@ -199,7 +204,7 @@ class Reassembler:
             self.drops[error.reason] += 1
             return None
         if header.parts == 1:
-            return self._take_whole(header, salt, plain, sealed, signature)
+            return self._take_whole(header, salt, plain, sealed, signature, now_s)
         if message is None and not self._free_space(number):
             self.drops[DropReason.MEMORY_FULL] += 1
             return None
@@ -207,8 +212,16 @@ class Reassembler:
             message = self._start(header, salt, opener, now_s)
         return self._keep(message, header, plain, sealed, signature, now_s)
 
+    def drop_copy(self, header: Header, reason: DropReason, now_s: float) -> None:
+        """Count a fragment that was here before: for ``reason``, or as a second copy where each has two."""
+        if self.copies is None:
+            self.drops[reason] += 1
+            return
+        self.drops[DropReason.SECOND_COPY] += 1
+        self.copies.handle_copy(header.number, header.part, now_s)
+
     def _take_whole(
-        self, header: Header, salt: bytes, plain: bytes, sealed: bytes, signature: bytes
+        self, header: Header, salt: bytes, plain: bytes, sealed: bytes, signature: bytes, now_s: float
     ) -> ReassembledMessage | None:
         number = header.number
         running = digest_of(header, salt)
@@ -221,13 +234,15 @@ class Reassembler:
         self.highest = max(self.highest, number)
         self.new_parts += 1
         self.window.finish(number)
+        if self.copies is not None:
+            self.copies.handle_first(number, 0, now_s)
         head, message = plain[: self._head_bytes], plain[self._head_bytes :]
         return ReassembledMessage(
             number=number,
             flags=header.flags & _SHARED_FLAGS,
             message=message,
             parts=1,
-            hops=max(HOPS_MAX - header.hops_left, 0),
+            hops=max(HOPS_MAX - (header.hops_left & HOPS_MASK), 0),
             head=head,
         )
 
@@ -262,7 +277,9 @@ class Reassembler:
         message.touched_s = now_s
         message.plain[header.part] = plain
         message.top = max(message.top, header.part)
-        message.hops = max(message.hops, HOPS_MAX - header.hops_left)
+        message.hops = max(message.hops, HOPS_MAX - (header.hops_left & HOPS_MASK))
+        if self.copies is not None:
+            self.copies.handle_first(number, header.part, now_s)
         if signature:
             message.signature = signature
         if in_order:

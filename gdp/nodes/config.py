@@ -24,6 +24,7 @@ from gdp.control.endpoints import Endpoint
 from gdp.control.hello import INTERVAL_MAX_MS, Timing
 from gdp.control.link_cost import COST_MAX
 from gdp.errors import LocalError
+from gdp.host_port import checked_host_port, split_host_port
 from gdp.limits import (
     ADVERTISEMENT_LEASE_S,
     COST_AUTO,
@@ -56,14 +57,16 @@ from gdp.ports.kernel.abi import ENTRIES_DEFAULT
 from gdp.stores.cluster_address import ClusterAddress
 from gdp.stores.files import read_private
 
-__all__ = ["DataPlane", "LeaseSeconds", "LinksConfig", "PortConfig", "Quotas", "RibConfig", "SwitchConfig"]
-
-
-def _server(text: str) -> str:
-    host, colon, port = text.rpartition(":")
-    if not (host and colon and port.isdecimal() and 0 < int(port) < 65_536):
-        raise ValueError(f"expected host:port, not {text!r}")
-    return text
+__all__ = [
+    "LISTEN_DEFAULT",
+    "DataPlane",
+    "LeaseSeconds",
+    "LinksConfig",
+    "PortConfig",
+    "Quotas",
+    "RibConfig",
+    "SwitchConfig",
+]
 
 
 def _endpoint(text: str) -> str:
@@ -74,7 +77,7 @@ def _endpoint(text: str) -> str:
 
 
 EndpointText = Annotated[str, AfterValidator(_endpoint)]
-ServerText = Annotated[str, AfterValidator(_server)]
+ServerText = Annotated[str, AfterValidator(checked_host_port)]
 DataPlane = Literal["auto", "kernel", "raw", "scapy"]
 
 LISTEN_DEFAULT: Final = 51_820  # UDP; the usual port of WireGuard
@@ -247,8 +250,7 @@ class ClusterConfig(Section):
         """
         file = self.password_file
         password = "" if file is None else read_private(file).decode("utf-8", "replace").strip()
-        split = (node.rpartition(":") for node in self.nodes)
-        nodes = tuple((host.strip("[]"), int(port)) for host, _, port in split)
+        nodes = tuple(map(split_host_port, self.nodes))
         return ClusterAddress(
             nodes=nodes, username=self.username, password=password, ca=self.ca, cert=self.cert, key=self.key
         )

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 from gdp.control.endpoint_record import CANDIDATES_MAX, Candidate, CandidateType, EndpointRecord
 from gdp.control.endpoints import Endpoint
 from gdp.crypto.identity import Identity
-from gdp.errors import DropReason, StatementError
+from gdp.errors import DropReason, LocalError, StatementError
 from gdp.nodes.config import LinksConfig
 from gdp.nodes.endpoint_files import own_record, public_candidates
 from gdp.nodes.tunnels import Tunnels
@@ -21,11 +22,28 @@ from gdp.ports.host_addresses import host_addresses
 from gdp.sansio import Timestamps
 from gdp.switch.core import SwitchCore
 
-__all__ = ["OwnEndpoints"]
+__all__ = ["OwnEndpoints", "listed_candidates"]
 
 log = logging.getLogger(__name__)
 
 _ADDRESSES_LOOK_S: Final = 10.0  # where no notification comes, such as for a device that moves between namespaces
+
+
+def listed_candidates(
+    public: Iterable[Candidate], seen: Iterable[Candidate], hosts: Sequence[Candidate]
+) -> tuple[Candidate, ...]:
+    """Return the candidates of a record, each endpoint once; a private one that a peer sees is listed twice.
+
+    Host candidates with private addresses are tried between neighbouring networks only. In a large private network
+    the peer may be further away, so it must see such an address as a reflexive one, too.
+
+    Args:
+        seen: as peers see this switch.
+        hosts: addresses of devices.
+    """
+    reached = {(each.uplink, each.endpoint) for each in hosts if not each.endpoint.is_private}
+    reflexive = {each for each in seen if (each.uplink, each.endpoint) not in reached}
+    return (*public, *sorted(reflexive), *hosts)
 
 
 class OwnEndpoints:
@@ -45,7 +63,10 @@ class OwnEndpoints:
         """Publish a record if the candidates differ from the published ones, or the RIB keeps a later record."""
         if self._monitor.poll() or now.mono_s >= self._hosts_s:
             self._hosts_s = now.mono_s + _ADDRESSES_LOOK_S
-            self._hosts = self._host_candidates()
+            try:
+                self._hosts = self._host_candidates()
+            except LocalError as error:
+                log.warning("own addresses not read, the former ones count on reason=%s", error)
         known, candidates = self._published, self._candidates()[:CANDIDATES_MAX]
         refusal = self._switch.endpoint_refusal
         sequence = time.time_ns() // 1_000_000
@@ -73,14 +94,13 @@ class OwnEndpoints:
 
     def _candidates(self) -> tuple[Candidate, ...]:
         public = public_candidates(self._config.public_endpoints(), len(self._tunnels.underlays))
-        hosts = {(each.uplink, each.endpoint) for each in self._hosts}
         uplinks = {found.port: tunnel.uplink for tunnel, found in self._tunnels.all.items()}
-        seen = {
-            Candidate(uplinks[port], CandidateType.REFLEXIVE, endpoint): None
+        seen = (
+            Candidate(uplinks[port], CandidateType.REFLEXIVE, endpoint)
             for (port, _), endpoint in self._switch.observed_addresses().items()
-            if port in uplinks and (uplinks[port], endpoint) not in hosts
-        }
-        return (*public, *sorted(seen), *self._hosts)
+            if port in uplinks
+        )
+        return listed_candidates(public, seen, self._hosts)
 
     def _host_candidates(self) -> tuple[Candidate, ...]:
         """Return the addresses of each uplink's device; without configured uplinks, those of all devices."""

@@ -23,6 +23,7 @@ from gdp.nodes.control_socket import ControlHandlers, ControlServer
 from gdp.nodes.control_status import node_status
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.membership import load_member
+from gdp.nodes.metrics import serve_metrics
 from gdp.nodes.node_log import LOOK_S
 from gdp.nodes.relay_config import RelayConfig
 from gdp.nodes.relay_context import RelayContext
@@ -80,7 +81,7 @@ def run_relay(config: RelayConfig, ready: Callable[[Identity, Relay], None]) -> 
         if config.sandbox:
             confine_relay(config)
         if config.metrics is not None:
-            stack.callback(_serve_metrics(relay.sources(), config.metrics.port))
+            stack.callback(serve_metrics(relay.sources(), config.metrics.port))
         log.info(
             "relay up name=%s role=%s server=%s", identity.name.short, identity.role.value, relay.server is not None
         )
@@ -228,12 +229,3 @@ def _control(loop: RelayLoop, path: Path, handlers: ControlHandlers) -> Iterator
 def _instance(switch: Name) -> Name:
     """Return the name under which the relay of a switch holds its lock, for the switch itself holds its own."""
     return Name(hashlib.sha256(b"gdp-relay-instance-1" + switch).digest())
-
-
-def _serve_metrics(sources: Sources, port: int) -> Callable[[], None]:
-    """Serve metrics on a loopback port; return the function that ends it."""
-    from gdp.telemetry.metrics import Metrics
-
-    metrics = Metrics(sources)
-    metrics.serve(port)
-    return metrics.close

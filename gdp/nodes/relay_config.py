@@ -15,7 +15,7 @@ from gdp.nodes.config import ServerText
 from gdp.nodes.schema import Directory, Domain, Metrics, NewFile, RequiredName, Section, Unique, load
 from gdp.relay.framing import MTU_MAX, MTU_MIN
 
-__all__ = ["RelayBorder", "RelayConfig", "RelayServer", "host_and_port"]
+__all__ = ["RelayBorder", "RelayConfig", "RelayServer"]
 
 RELAY_PORT: Final = 443
 CLIENTS_MAX: Final = 64
@@ -30,6 +30,7 @@ class RelayServer(Section):
 
     ``allow`` holds labels of members of the own domain, or names of any trusted switch; ``null``: all trusted
     switches. ``address: null`` listens on all of them. ``rate`` is in bytes a second for each client and direction.
+    ``enrolment`` is the socket at which the enrolment server of this host takes connections that come to this port.
     """
 
     port: int = Field(default=RELAY_PORT, ge=1, le=65_535)
@@ -37,6 +38,7 @@ class RelayServer(Section):
     allow: Annotated[tuple[str, ...], Unique] | None = None
     rate: int | None = Field(default=None, ge=RATE_MIN)
     clients_max: int = Field(default=CLIENTS_MAX, ge=1, le=1_000)
+    enrolment: NewFile | None = None
 
     @field_validator("allow")
     @classmethod
@@ -100,9 +102,3 @@ class RelayConfig(Section):
         if self.dead_ms < 2 * self.keepalive_ms:
             raise ValueError(f"dead_ms: at least twice keepalive_ms ({self.keepalive_ms})")
         return self
-
-
-def host_and_port(endpoint: str) -> tuple[str, int]:
-    """Return the parts of ``host:port``, without the brackets of an IPv6 address."""
-    host, _, port = endpoint.rpartition(":")
-    return host.removeprefix("[").removesuffix("]"), int(port)

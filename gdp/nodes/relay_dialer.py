@@ -20,8 +20,9 @@ from typing import Final, NamedTuple
 
 from gdp.crypto.certificates import Membership
 from gdp.errors import LocalError, StatementError
+from gdp.host_port import split_host_port
 from gdp.names import Name
-from gdp.nodes.relay_config import RelayBorder, host_and_port
+from gdp.nodes.relay_config import RelayBorder
 from gdp.nodes.relay_context import RelayContext
 from gdp.nodes.relay_link import RelayLink, RelayPort, prepare_socket
 from gdp.nodes.relay_server import port_status
@@ -326,7 +327,7 @@ class BorderDialer:
             self._connecting = None
 
     def _resolve(self) -> None:
-        endpoints = [host_and_port(each) for each in self._border.endpoints]
+        endpoints = [split_host_port(each) for each in self._border.endpoints]
         if all(_is_numeric(host) for host, _ in endpoints):
             self._take([_Candidate(host, host, port) for host, port in endpoints])
             return

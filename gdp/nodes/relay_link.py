@@ -192,7 +192,7 @@ class RelayLink:
         frames = connection.receive_bytes(data, moment)
         if self.port is None and connection.state is ConnectionState.OPEN:
             self.port = self._opened(self)
-        if frames and self.port is not None:
+        if self.port is not None:  # a connection that has just opened may owe what an earlier one of its client sent
             write = self.port.device.write
             for frame in frames:
                 if not write(frame):

@@ -19,24 +19,28 @@ from gdp.errors import LocalError, StatementError
 from gdp.names import Name
 from gdp.nodes.relay_config import RelayConfig, RelayServer
 from gdp.nodes.relay_context import RelayContext
+from gdp.nodes.relay_hello import HELLO_S, HelloWait, hand_over
 from gdp.nodes.relay_link import RelayLink, RelayPort, prepare_socket
 from gdp.nodes.relay_loop import RelayLoop
+from gdp.ports.client_network import client_network
+from gdp.ports.listening import listen_tcp
 from gdp.ports.sockets import AS_ROOT
 from gdp.ports.tap import TapDevice, tap_name
 from gdp.relay.admission import ClientAdmission, verified_switch
-from gdp.relay.connection import ConnectionCounters, RelayConnection
+from gdp.relay.connection import ConnectionCounters, Limits, RelayConnection
 from gdp.sansio import Timestamps
-from gdp.token_bucket import TokenBucket
+from gdp.token_bucket import TokenBucket, TokenBuckets
 
 __all__ = ["BorderServer", "listen_tls", "port_status"]
 
 log = logging.getLogger(__name__)
 
-_BACKLOG: Final = 128
 _HANDSHAKES_MAX: Final = 32  # unauthenticated connections at once
 _ACCEPTS_PER_S: Final = 50.0  # a handshake costs about a millisecond
+_EACH_PER_S: Final = 25.0  # of them, of one address
+_EACH_BURST: Final = 100.0  # a site behind one NAT whose machines start together
+_LOOKS_PER_S: Final = 2_000.0  # connections whose address is looked at: an address above its share costs no handshake
 _ACCEPT_PAUSE_S: Final = 0.1
-_ANY: Final = "::"
 
 
 def listen_tls(config: RelayServer) -> socket.socket:
@@ -45,11 +49,9 @@ def listen_tls(config: RelayServer) -> socket.socket:
     Raises:
         LocalError: the port is in use, needs a right, or the address is not of this host.
     """
-    dual = config.address is None and socket.has_dualstack_ipv6()
-    host = (_ANY if dual else "") if config.address is None else str(config.address)
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    host = "" if config.address is None else str(config.address)
     try:
-        listener = socket.create_server((host, config.port), family=family, backlog=_BACKLOG, dualstack_ipv6=dual)
+        listener = listen_tcp(host, config.port)
     except OSError as error:
         where = f"relay server: port {config.port}"
         if error.errno == errno.EADDRINUSE:
@@ -63,11 +65,12 @@ def listen_tls(config: RelayServer) -> socket.socket:
 
 @dataclass(slots=True)
 class _Client:
-    """A client that is or was connected; the device stays for its next connection."""
+    """A client that is or was connected; the device and the limits stay for its next connection."""
 
     member: Membership
     port: RelayPort
     last_s: float
+    limits: Limits | None
 
 
 class BorderServer:
@@ -88,7 +91,11 @@ class BorderServer:
         self._loop: RelayLoop = context.loop
         self._clients: dict[Name, _Client] = {}
         self._handshakes: set[RelayLink] = set()
+        self._hellos: set[HelloWait] = set()
         self._accepts = TokenBucket(_ACCEPTS_PER_S, _ACCEPTS_PER_S)
+        self._each = TokenBuckets(_EACH_PER_S, _EACH_BURST)
+        self._looks = TokenBucket(_LOOKS_PER_S, _LOOKS_PER_S)
+        self._turned_away = 0
         self._resume_s: float | None = None
         self._ended = ConnectionCounters()
         self.refusals = 0
@@ -105,7 +112,9 @@ class BorderServer:
         return self._server.port
 
     def handle_timer(self, now_s: float) -> float:
-        """Accept connections again after a pause; return the second of the next call."""
+        """Accept connections again after a pause, and end late hellos; return the second of the next call."""
+        for hello in [each for each in self._hellos if now_s >= each.since_s + HELLO_S]:
+            self._end_stranger(hello, "no hello in time")
         if self._resume_s is not None and now_s >= self._resume_s:
             self._resume_s = None
             self._loop.register(self._listener.fileno(), select.EPOLLIN, self._accept)
@@ -122,8 +131,8 @@ class BorderServer:
         if self._resume_s is None:
             self._loop.unregister(self._listener.fileno())
         self._listener.close()
-        for link in list(self._handshakes):
-            link.end("the border ends")
+        for stranger in self._strangers():
+            self._end_stranger(stranger, "the border ends")
         for client in list(self._clients.values()):
             if client.port.link is not None:
                 client.port.link.end("the border ends")
@@ -143,6 +152,7 @@ class BorderServer:
             "port": self._server.port,
             "clients": [self._client_status(client, now_s) for client in self._clients.values()],
             "refused": self.refusals,
+            "turned_away": self._turned_away,
             "last_refusal": self._last_refusal,
         }
 
@@ -159,32 +169,68 @@ class BorderServer:
     def _accept(self, events: int) -> None:
         del events
         now_s = time.monotonic()
-        if not self._accepts.spend(now_s):
+        if self._accepts.left(now_s) < 1.0 or not self._looks.spend(now_s):
             self._pause(now_s)
             return
         try:
-            peer, _ = self._listener.accept()
-            prepare_socket(peer, self._config.dead_ms)
+            peer, address = self._listener.accept()
+            if not self._each.spend(client_network(str(address[0])), now_s):
+                self._turned_away += 1
+                peer.close()
+                return
+            self._accepts.charge(now_s, 1.0)
         except (BlockingIOError, ConnectionAbortedError):
             return
         except OSError as error:  # no descriptors left, which this process cannot repair
             log.warning("connection not accepted reason=%s", error.strerror)
             self._pause(now_s)
             return
-        if len(self._handshakes) >= _HANDSHAKES_MAX:  # idle strangers do not keep a member out
-            min(self._handshakes, key=lambda each: each.since_s).end("too many handshakes at once")
+        peer.setblocking(False)
+        strangers = self._strangers()
+        if len(strangers) >= _HANDSHAKES_MAX:  # idle strangers do not keep a member out
+            self._end_stranger(min(strangers, key=lambda each: each.since_s), "too many handshakes at once")
+        if self._server.enrolment is None:
+            self._serve(peer)
+        else:
+            self._hellos.add(HelloWait(loop=self._loop, accepted=peer, chosen=self._choose))
+
+    def _choose(self, hello: HelloWait, peer: socket.socket, is_enrolment: bool) -> None:
+        self._hellos.discard(hello)
+        if not is_enrolment or self._server.enrolment is None:
+            self._serve(peer)
+            return
+        try:
+            hand_over(peer, self._server.enrolment)
+        except OSError as error:
+            log.info("connection not handed to the enrolment server reason=%s", error.strerror or error)
+
+    def _serve(self, peer: socket.socket) -> None:
+        """Begin the handshake of a relay connection."""
         connection = RelayConnection(
             context=self._context.tls(is_server=True),
             is_server=True,
             settings=self._context.settings(self._server.rate),
             authenticate=self._authenticate,
-            now_s=now_s,
+            now_s=time.monotonic(),
         )
-        self._handshakes.add(
-            RelayLink(
+        try:
+            prepare_socket(peer, self._config.dead_ms)
+            link = RelayLink(
                 loop=self._loop, connected=peer, connection=connection, opened=self._open, closed=self._ended_link
             )
-        )
+        except OSError as error:  # the peer is gone
+            log.info("connection gone before its handshake reason=%s", error.strerror)
+            peer.close()
+            return
+        self._handshakes.add(link)
+
+    def _strangers(self) -> list[RelayLink | HelloWait]:
+        return [*self._handshakes, *self._hellos]
+
+    def _end_stranger(self, stranger: RelayLink | HelloWait, reason: str) -> None:
+        if isinstance(stranger, HelloWait):
+            self._hellos.discard(stranger)
+        stranger.end(reason)
 
     def _pause(self, now_s: float) -> None:
         """Leave further connections in the kernel's queue for a moment."""
@@ -194,7 +240,8 @@ class BorderServer:
 
     def _authenticate(self, certificate: bytes, at: Timestamps) -> Membership:
         member = verified_switch(certificate, self._context.policy.verify_membership, at.unix_s)
-        self._admission.check(member, [name for name, each in self._clients.items() if each.port.link is not None])
+        connected = {name: each.member.domain for name, each in self._clients.items() if each.port.link is not None}
+        self._admission.check(member, connected)
         return member
 
     def _open(self, link: RelayLink) -> RelayPort | None:
@@ -204,7 +251,8 @@ class BorderServer:
         if member is None:
             raise LocalError("a connection is open without an authenticated client")
         try:
-            client = self._client_of(member)
+            client = self._client_of(member, link.connection.limits)
+            link.connection.limits = client.limits
             if client.port.link is not None:
                 client.port.link.end("replaced by a newer connection of the same client")
             client.port.attach(link)
@@ -216,8 +264,12 @@ class BorderServer:
         log.info("client up label=%s name=%s address=%s", member.label, member.name.short, link.remote)
         return client.port
 
-    def _client_of(self, member: Membership) -> _Client:
-        """Return the entry of a client, with a device; the longest disconnected one gives way to a new one."""
+    def _client_of(self, member: Membership, limits: Limits | None) -> _Client:
+        """Return the entry of a client, with a device; the longest disconnected one gives way to a new one.
+
+        Args:
+            limits: of a client that is new here.
+        """
         known = self._clients.get(member.name)
         if known is not None and not known.port.is_removed:
             return known
@@ -230,7 +282,7 @@ class BorderServer:
             self._forget(min(idle, key=lambda each: each.last_s))
         own = self._context.identity.name
         device = TapDevice(tap_name(own, member.name), self._context.alias, self._config.mtu)
-        client = _Client(member, RelayPort(self._loop, device), time.monotonic())
+        client = _Client(member, RelayPort(self._loop, device), time.monotonic(), limits)
         self._clients[member.name] = client
         return client
 

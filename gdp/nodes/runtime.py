@@ -65,6 +65,7 @@ class Runtime:
         self._streak = 0  # consecutive steps with frames and without a check of the timers
         self._deadline_s: float | None = None
         self._looks: list[_Look] = []
+        self._after_receive: list[Callable[[], None]] = []
         self._drain_until_s: float | None = None
         self._is_finished: Callable[[], bool] = lambda: True
         self.has_drained = False
@@ -161,6 +162,10 @@ class Runtime:
         """Call ``look`` from within the loop each ``period_s``, the first time at once."""
         self._looks.append(_Look(period_s, look))
 
+    def after_receive(self, look: Callable[[], None]) -> None:
+        """Call ``look`` each time that the core has handled frames; it must be cheap."""
+        self._after_receive.append(look)
+
     def unwatch(self, source: HasFileno) -> None:
         """Undo ``watch``, before the source is closed."""
         self._plane.unwatch(source)
@@ -184,6 +189,8 @@ class Runtime:
         moment = now()
         if arrivals:
             self._machine.receive(arrivals, moment)
+            for follow in self._after_receive:
+                follow()
         if self._deadline_s is not None and moment.mono_s >= self._deadline_s:
             self._machine.handle_timer(moment)
             self._deadline_s = self._machine.get_timer()

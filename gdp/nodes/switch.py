@@ -24,6 +24,7 @@ from gdp.nodes.data_plane import Chosen, choose_plane
 from gdp.nodes.link_rows import LinkRows, link_status
 from gdp.nodes.links import LINKS_LOOK_S, TunnelLinks
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
+from gdp.nodes.metrics import serve_metrics
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
 from gdp.nodes.relay_ports import RELAY_LOOK_S, RelayPorts
 from gdp.nodes.revocation_upkeep import load_revocations
@@ -123,7 +124,7 @@ def run_switch(
         revocations.start(runtime)
         _start_links(links, runtime, stack)
         if config.metrics is not None:
-            stack.callback(_serve_metrics(sources, config.metrics.port))
+            stack.callback(serve_metrics(sources, config.metrics.port))
         _log_start(identity, chosen)
         ready(identity, chosen.name, chosen.reason)
         runtime.run()
@@ -183,15 +184,6 @@ def _open_links(
     return TunnelLinks(
         config=config.links, identity=identity, policy=policy, switch=switch, runtime=runtime, underlays=underlays
     )
-
-
-def _serve_metrics(sources: Sources, port: int) -> Callable[[], None]:
-    """Serve metrics on a loopback port; return the function that ends it."""
-    from gdp.telemetry.metrics import Metrics
-
-    metrics = Metrics(sources)
-    metrics.serve(port)
-    return metrics.close
 
 
 def _control_handlers(
@@ -260,6 +252,8 @@ def _sources(switch: SwitchCore, chosen: Chosen, node_log: NodeLog, runtime: Run
     plane = chosen.plane
     links = LinkRows(switch.hello_protocol, plane.ports)
     runtime.every(LOOK_S, links.refresh)
+    two_paths = switch.multicast.path_counts()
+    runtime.every(LOOK_S, lambda _now: two_paths.update(switch.multicast.path_counts()))
 
     def frames() -> dict[str, int]:
         """Return the frame counts by direction."""
@@ -274,5 +268,6 @@ def _sources(switch: SwitchCore, chosen: Chosen, node_log: NodeLog, runtime: Run
         pending_frames=lambda: switch.resolver.pending_frames,
         waiting=node_log.metrics,
         links=lambda: links.rows,
+        two_paths=lambda: two_paths,
         clashes=lambda: switch.hello_protocol.clashes,
     )

@@ -17,7 +17,7 @@ from typing import Final
 
 from gdp.control.endpoint_record import UPLINKS_MAX, EndpointRecord
 from gdp.control.endpoints import Endpoint, inner_address, tunnel_vni
-from gdp.control.tunnel_plan import TunnelId, tunnel_ifname, underlay_ifname
+from gdp.control.tunnel_plan import UNDERLAY_PREFIXES, TunnelId, tunnel_ifname, underlay_ifname
 from gdp.crypto.identity import Identity
 from gdp.crypto.tunnel_key import TunnelKey
 from gdp.errors import LocalError
@@ -25,10 +25,11 @@ from gdp.limits import COST_AUTO
 from gdp.names import Name
 from gdp.nodes.config import LinksConfig
 from gdp.nodes.runtime import Runtime
+from gdp.ports.tunnel.outside_filter import OutsideFilter
 from gdp.ports.tunnel.path_mtu import route_mtu, tunnel_mtu
 from gdp.ports.tunnel.rate_limit import limit_rate
 from gdp.ports.tunnel.uplink_routes import mark_of, remove_leftovers
-from gdp.ports.tunnel.vxlan import make_vxlan, remove_link, set_link_mtu
+from gdp.ports.tunnel.vxlan import VXLAN_PORT, make_vxlan, remove_link, set_link_mtu
 from gdp.ports.tunnel.wireguard import PeerState, WireGuardDevice, open_wireguard
 from gdp.sansio import Timestamps
 from gdp.switch.core import SwitchCore
@@ -38,8 +39,9 @@ __all__ = ["Tunnel", "Tunnels", "open_underlays"]
 log = logging.getLogger(__name__)
 
 _OUTER_MTU: Final = 1_500  # until a route to an endpoint is known
-_MTU_LOOK_S: Final = 1.0
 _DEVICE_LOOK_S: Final = 1.0
+_STATES_PAUSE_S: Final = 0.02  # between two reads of the states of all peers
+_HANDSHAKE_S: Final = 3.0  # states are read often for this time after a handshake was requested
 _FORGET_S: Final = 60.0  # after this time no tree and no table entry names a removed port
 
 
@@ -54,6 +56,7 @@ class Tunnel:
         endpoint: where WireGuard sends to; None: it waits for the peer's packets.
         handshake_unix_s: of the last handshake; 0: there was none.
         is_direct: opened by decision of the switch, not by configuration.
+        dialled_s: when a handshake was requested last.
     """
 
     ifname: str
@@ -67,7 +70,7 @@ class Tunnel:
     is_direct: bool
     endpoint: Endpoint | None = None
     handshake_unix_s: float = 0.0
-    mtu_look_s: float = float("-inf")
+    dialled_s: float = float("-inf")
 
 
 @contextlib.contextmanager
@@ -81,6 +84,10 @@ def open_underlays(config: LinksConfig, identity: Identity) -> Iterator[tuple[Wi
     ifnames = [underlay_ifname(identity.name, uplink) for uplink in range(UPLINKS_MAX)]
     remove_leftovers(map(mark_of, ifnames))  # of a dead run, perhaps with more uplinks
     with contextlib.ExitStack() as stack:
+        try:
+            stack.callback(OutsideFilter(f"gdp-{ifnames[0]}", VXLAN_PORT, UNDERLAY_PREFIXES).close)
+        except LocalError as error:
+            log.warning("hosts that reach this one by IPv6 can send frames into its tunnels reason=%s", error)
         devices = []
         for uplink in range(max(len(config.uplinks), 1)):
             device = open_wireguard(
@@ -129,9 +136,14 @@ class Tunnels:
         self._relay_rate = relay_rate
         self._tunnels: dict[TunnelId, Tunnel] = {}
         self._device_look_s = float("-inf")
+        self._read_s = [float("-inf") for _ in underlays]  # when the states of peers were read
+        self._answered: list[TunnelId] = []  # not returned by ``look`` yet
+        self._is_read_due = [False for _ in underlays]
         self._closed: deque[tuple[float, int]] = deque()  # ports that the control plane may still name
-        for device in underlays:
-            runtime.watch(device, partial(self._handle_events, device))
+        for uplink, device in enumerate(underlays):
+            runtime.watch(device, partial(self._handle_events, uplink))
+        if underlays:
+            runtime.after_receive(self._look_at_polled)
 
     @property
     def underlays(self) -> tuple[WireGuardDevice, ...]:
@@ -170,6 +182,8 @@ class Tunnels:
         """
         underlay = self._underlays[tunnel.uplink]
         ifname, key = tunnel_ifname(self._me, tunnel), record.keys[tunnel.peer_uplink]
+        if not self._make_way(tunnel, key, now_s):
+            return False
         inner = inner_address(tunnel.peer, tunnel.peer_uplink)
         wireguard_mtu, mtu = _mtus(endpoint, underlay.fwmark)
         try:
@@ -181,6 +195,7 @@ class Tunnels:
             log.error("tunnel not made peer=%s reason=%s; it is tried again", tunnel.peer.short, error)
             self._remove(tunnel.uplink, ifname, key)
             return False
+        self._switch.hello_protocol.set_uplink(port, tunnel.uplink)
         self._tunnels[tunnel] = Tunnel(
             ifname=ifname,
             inner=inner,
@@ -190,6 +205,7 @@ class Tunnels:
             wireguard_mtu=wireguard_mtu,
             keepalive_s=keepalive_s,
             begun_s=now_s,
+            dialled_s=now_s,
             is_direct=is_direct,
             endpoint=endpoint,
         )
@@ -197,9 +213,23 @@ class Tunnels:
         log.info("tunnel made peer=%s ifname=%s endpoint=%s", tunnel.peer.short, ifname, at)
         return True
 
+    def _make_way(self, tunnel: TunnelId, key: bytes, now_s: float) -> bool:
+        """Return whether a tunnel may use a key: another peer's with the same key stays if it is up, else it is closed.
+
+        A record does not prove its key. Only who has the key can come up, and a device has one peer for each key.
+        """
+        for other, found in list(self._tunnels.items()):
+            if other.uplink == tunnel.uplink and other.peer != tunnel.peer and found.key == key:
+                if self.is_up(other):
+                    log.warning("tunnel not made peer=%s reason=%s has its key", tunnel.peer.short, other.peer.short)
+                    return False
+                self.close(other, now_s)
+        return True
+
     def dial(self, tunnel: TunnelId, endpoint: Endpoint | None) -> None:
         """Send a handshake to an endpoint, or to the last one again."""
         found, device = self._tunnels[tunnel], self._underlays[tunnel.uplink]
+        found.dialled_s = time.monotonic()
         try:
             device.set_peer(found.key, inner=found.inner, endpoint=endpoint, keepalive_s=found.keepalive_s)
             device.retry_handshake(found.key)
@@ -249,23 +279,58 @@ class Tunnels:
 
     def look(self, now: Timestamps) -> list[TunnelId]:
         """Follow where WireGuard hears each peer, and the MTU of the paths; return tunnels with a new handshake."""
-        if now.mono_s >= self._device_look_s:
+        is_device_due = now.mono_s >= self._device_look_s
+        if is_device_due:
             self._device_look_s = now.mono_s + _DEVICE_LOOK_S
-            for device in self._underlays:
+            for uplink, device in enumerate(self._underlays):
+                self._read_s[uplink] = now.mono_s
                 if device.poll():
                     self._remake(device)
-        states = [_states_of(device) for device in self._underlays]
-        answered = []
-        for tunnel, found in self._tunnels.items():
-            state = states[tunnel.uplink].get(found.key)
-            if state is not None and self._observe(tunnel, found, state):
-                answered.append(tunnel)
-            if now.mono_s >= found.mtu_look_s and self.is_up(tunnel):
-                found.mtu_look_s = now.mono_s + _MTU_LOOK_S
-                self._follow_mtu(tunnel, found)
+                self._report_move(uplink)
+            for tunnel, found in self._tunnels.items():
+                if self.is_up(tunnel):
+                    self._follow_mtu(tunnel, found)
+        for uplink, device in enumerate(self._underlays):
+            if is_device_due:
+                self._observe_all(uplink, device.known_peers())
+            elif self._is_read_due[uplink] or self._has_unknown(uplink, now.mono_s):
+                self._read_states(uplink, now.mono_s)
         while self._closed and now.mono_s >= self._closed[0][0]:
             self._switch.hello_protocol.remove_port(self._closed.popleft()[1])
+        answered, self._answered = self._answered, []
         return answered
+
+    def _has_unknown(self, uplink: int, now_s: float) -> bool:
+        """Return whether WireGuard may soon know more: a handshake was requested, or a peer has just come up."""
+        protocol = self._switch.hello_protocol
+        return any(
+            protocol.observed_at(found.port, tunnel.peer) is None
+            if self.is_up(tunnel)
+            else now_s < found.dialled_s + _HANDSHAKE_S
+            for tunnel, found in self._tunnels.items()
+            if tunnel.uplink == uplink
+        )
+
+    def _look_at_polled(self) -> None:
+        """Look at once where a peer is that has polled this switch: it learns so that its address has changed."""
+        ports = self._switch.hello_protocol.poll_polled()
+        if not ports:
+            return
+        now_s = time.monotonic()
+        for uplink in {tunnel.uplink for tunnel, found in self._tunnels.items() if found.port in ports}:
+            self._is_read_due[uplink] = True
+            if now_s >= self._read_s[uplink] + _STATES_PAUSE_S:
+                self._read_states(uplink, now_s)
+
+    def _read_states(self, uplink: int, now_s: float) -> None:
+        self._read_s[uplink], self._is_read_due[uplink] = now_s, False
+        self._observe_all(uplink, _states_of(self._underlays[uplink]))
+
+    def _observe_all(self, uplink: int, states: Mapping[bytes, PeerState]) -> None:
+        for tunnel, found in self._tunnels.items():
+            state = states.get(found.key) if tunnel.uplink == uplink else None
+            if state is not None and self._observe(tunnel, found, state):
+                self._answered.append(tunnel)
 
     def _observe(self, tunnel: TunnelId, found: Tunnel, state: PeerState) -> bool:
         """Record what WireGuard reports about a peer; return whether there is a new handshake."""
@@ -280,9 +345,16 @@ class Tunnels:
 
     # devices
 
-    def _handle_events(self, device: WireGuardDevice) -> None:
+    def _handle_events(self, uplink: int) -> None:
+        device = self._underlays[uplink]
         if device.handle_events():
             self._remake(device)
+        self._report_move(uplink)
+
+    def _report_move(self, uplink: int) -> None:
+        """Probe the neighbours over an uplink whose address has changed."""
+        if self._underlays[uplink].poll_move():
+            self._switch.hello_protocol.probe_uplink(uplink, time.monotonic())
 
     def _remake(self, device: WireGuardDevice) -> None:
         """Make the VXLAN devices on a device that was made again; their ports open when they appear."""
@@ -309,7 +381,10 @@ class Tunnels:
             limit_rate(ifname, self._relay_rate)
 
     def _follow_mtu(self, tunnel: TunnelId, found: Tunnel) -> None:
-        wireguard_mtu, mtu = _mtus(found.endpoint, self._underlays[tunnel.uplink].fwmark)
+        outer = self._underlays[tunnel.uplink].path_mtu(found.key)
+        if outer is None or found.endpoint is None:  # not known now
+            return
+        wireguard_mtu, mtu = tunnel_mtu(outer, is_ipv6=":" in found.endpoint.address)
         if (wireguard_mtu, mtu) == (found.wireguard_mtu, found.mtu):
             return
         found.wireguard_mtu, found.mtu = wireguard_mtu, mtu

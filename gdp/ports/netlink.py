@@ -75,6 +75,7 @@ class LinkAttribute(IntEnum):
     MTU = 4
     LINK = 5  # ifindex of the other end of a pair, in its namespace
     QDISC = 6
+    TXQLEN = 13
     LINKINFO = 18
     IFALIAS = 20
     STATS64 = 23

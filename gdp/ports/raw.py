@@ -21,7 +21,17 @@ from functools import lru_cache, partial
 from typing import Final
 
 from gdp.errors import DropReason, LocalError
-from gdp.frame.codec import ETHER_BYTES, FLAGS_AT, HEADER_BYTES, HOPS_AT, KIND_AT, OVERHEAD_BYTES
+from gdp.frame.codec import (
+    ETHER_BYTES,
+    FLAGS_AT,
+    HEADER_BYTES,
+    HOPS_AT,
+    HOPS_MASK,
+    KIND_AT,
+    OVERHEAD_BYTES,
+    SECOND_PATH,
+    second_path_key,
+)
 from gdp.frame.kinds import CONTROL_FROM, VERSION, Flag
 from gdp.names import NAME_BYTES
 from gdp.ports.mmsg import SLOTS, MmsgPool, make_batch, put_one
@@ -226,6 +236,8 @@ class RawPlane(NetdevPlane):
         run_key, run_hops, run_start, fits = b"", NOWHERE, 0, 0
         for at, size in zip(range(ETHER_BYTES, len(pool), step), sizes, strict=False):
             first, hops_left, length, key = glance(pool, at)
+            if hops_left & SECOND_PATH:
+                key = second_path_key(key)
             if key != run_key:
                 slot = at // step
                 self._send(sinks, run_hops, run_start, slot - run_start)
@@ -234,7 +246,7 @@ class RawPlane(NetdevPlane):
                     hops = get(key[:NAME_BYTES])
                 run_key, run_hops, run_start = key, hops or NOWHERE, slot
                 fits = self._narrowest(run_hops) if key not in sides or is_side(sides[key], port) else 0
-            if HEADER_BYTES + length <= size <= fits and hops_left > 1 and _FIRST <= first < _FIRST_CONTROL:
+            if HEADER_BYTES + length <= size <= fits and hops_left & HOPS_MASK > 1 and _FIRST <= first < _FIRST_CONTROL:
                 pool[at + HOPS_AT] = hops_left - 1
             else:
                 slot = at // step

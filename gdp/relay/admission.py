@@ -5,7 +5,7 @@ Sans-I/O. Every client has proven the possession of a membership's key before th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from gdp.crypto.certificates import Membership
@@ -34,26 +34,38 @@ class ClientAdmission:
     Args:
         own_domain: labels in ``allow`` count for this domain alone, because other domains choose their own.
         allow: labels of members of the own domain, and names in hex; None: all switches of trusted domains.
-        clients_max: connected clients at most.
+        clients_max: connected clients at most; half of them may be of other domains.
     """
 
     own_domain: Name
     allow: frozenset[str] | None
     clients_max: int
 
-    def check(self, member: Membership, connected: Collection[Name]) -> None:
+    def check(self, member: Membership, connected: Mapping[Name, Name]) -> None:
         """Return if this verified switch may connect.
 
         Args:
-            connected: names of the connected clients; a new connection of one of them replaces the old one.
+            connected: connected client -> its domain; a new connection of one of them replaces the old one.
 
         Raises:
             RelayRefusedError: the border does not relay for it, or has too many clients.
         """
         if self.allow is not None and not self._is_allowed(member):
             raise RelayRefusedError(f"the border does not relay for {member.label} (relay allow)")
-        if member.name not in connected and len(connected) >= self.clients_max:
+        if member.name in connected:
+            return
+        if len(connected) >= self.clients_max:
             raise RelayRefusedError(f"the border has its {self.clients_max} clients already (relay clients_max)")
+        others = sum(each != self.own_domain for each in connected.values())
+        if member.domain != self.own_domain and others >= self._others_max:
+            raise RelayRefusedError(
+                f"the border has its {self._others_max} clients of other domains already (relay clients_max)"
+            )
+
+    @property
+    def _others_max(self) -> int:
+        """Return how many clients of other domains there may be: they issue as many memberships as they like."""
+        return max(self.clients_max // 2, 1)
 
     def _is_allowed(self, member: Membership) -> bool:
         allow = self.allow or ()

@@ -29,13 +29,15 @@ from gdp.relay.tls_channel import RECORD_BYTES, TlsChannel, TlsError
 from gdp.sansio import Timestamps
 from gdp.token_bucket import TokenBucket
 
-__all__ = ["HANDSHAKE_S", "ConnectionCounters", "ConnectionSettings", "ConnectionState", "RelayConnection"]
+__all__ = ["HANDSHAKE_S", "ConnectionCounters", "ConnectionSettings", "ConnectionState", "Limits", "RelayConnection"]
 
 HANDSHAKE_S: Final = 5.0  # from the first byte to OPEN
 _BATCH_RECORDS: Final = 4  # of one call of ``data_to_send``
+_WAITING_MAX_BYTES: Final = 2 * _BATCH_RECORDS * RECORD_BYTES  # frames leave in batches of half of it
 _BURST_S: Final = 0.25
 _BURST_MIN_BYTES: Final = 2 * RECORD_BYTES
 
+Limits = tuple[TokenBucket, TokenBucket]
 Authenticate = Callable[[bytes, Timestamps], Membership]  # certificate, DER; raises RelayRefusedError
 
 
@@ -104,6 +106,7 @@ class RelayConnection:
         mtu: of the open connection.
         reason: why the connection is closed.
         was_refused: whether one of the ends refused the other, so that a new attempt is of little use soon.
+        limits: what the rate allows now in both directions: in, out; None: all. The connections of one client share it.
     """
 
     def __init__(
@@ -123,7 +126,7 @@ class RelayConnection:
         self._deframer = Deframer()
         self._queue = FrameQueue(settings.queue_bytes)
         self._begun_s = self._heard_s = self._sent_s = now_s
-        self._limits = _limits(settings.rate)
+        self.limits = _limits(settings.rate)
         self._counters = ConnectionCounters()
         self.state = ConnectionState.HANDSHAKE
         self.peer: Membership | None = None
@@ -147,7 +150,7 @@ class RelayConnection:
     @property
     def receive_size(self) -> int:
         """Return how many bytes to read at once: less under a rate, which would otherwise be exceeded in bursts."""
-        return RECORD_BYTES if self._limits is not None else _BATCH_RECORDS * RECORD_BYTES
+        return RECORD_BYTES if self.limits is not None else _BATCH_RECORDS * RECORD_BYTES
 
     def receive_bytes(self, data: bytes, now: Timestamps) -> list[memoryview]:
         """Take in ciphertext, empty at the end of the stream; return the frames in it."""
@@ -169,11 +172,13 @@ class RelayConnection:
             self.refuse(str(refusal))
         except (TlsError, FrameError) as error:
             self._close(str(error))
+        if self._tls.waiting_bytes > _WAITING_MAX_BYTES:  # each request for new keys is answered (RFC 8446, 4.6.3)
+            self._close("the other end requests more than it reads")
         size = sum(map(len, frames))
         self._counters.frames_in += len(frames)
         self._counters.bytes_in += size
-        if self._limits is not None:
-            self._limits[0].charge(now.mono_s, size)
+        if self.limits is not None:
+            self.limits[0].charge(now.mono_s, size)
         return frames
 
     def queue_frame(self, frame: bytes) -> None:
@@ -199,15 +204,15 @@ class RelayConnection:
 
     def pause_until_s(self, now_s: float) -> float:
         """Return the monotonic second until which the rate allows no reading; in the past: it does."""
-        return now_s if self._limits is None else now_s + self._owed_s(self._limits[0], now_s)
+        return now_s if self.limits is None else now_s + self._owed_s(self.limits[0], now_s)
 
     def get_timer(self, now_s: float) -> float:
         """Return the monotonic second of the next call of ``handle_timer``."""
         if self.state is not ConnectionState.OPEN:
             return self._begun_s + HANDSHAKE_S
         times = [self._heard_s + self._settings.dead_s, self._sent_s + self._settings.keepalive_s]
-        if self._limits is not None and len(self._queue):
-            times.append(now_s + self._owed_s(self._limits[1], now_s))
+        if self.limits is not None and len(self._queue):
+            times.append(now_s + self._owed_s(self.limits[1], now_s))
         return min(times)
 
     def handle_timer(self, now_s: float) -> None:
@@ -220,7 +225,7 @@ class RelayConnection:
                 self._close(f"no sign of life for {self._settings.dead_s:g} s")
             elif now_s >= self._sent_s + self._settings.keepalive_s:
                 self._sent_s = now_s
-                if not self._tls.has_data_to_send:  # else these bytes are a sign of life, too
+                if not self._tls.waiting_bytes:  # else these bytes are a sign of life, too
                     self._tls.write(KEEPALIVE)
 
     def refuse(self, sentence: str) -> None:
@@ -274,7 +279,7 @@ class RelayConnection:
         self.state = ConnectionState.OPEN
 
     def _encrypt_frames(self, now_s: float) -> None:
-        bucket = None if self._limits is None else self._limits[1]
+        bucket = None if self.limits is None else self.limits[1]
         for _ in range(_BATCH_RECORDS):
             if not len(self._queue) or (bucket is not None and bucket.left(now_s) < 0):
                 return
@@ -302,7 +307,7 @@ class RelayConnection:
             self._queue.clear()
 
 
-def _limits(rate: float | None) -> tuple[TokenBucket, TokenBucket] | None:
+def _limits(rate: float | None) -> Limits | None:
     """Return the buckets of both directions: in, out."""
     if rate is None:
         return None

@@ -55,9 +55,9 @@ class TlsChannel:
         return self._tls.getpeercert(binary_form=True) or b""
 
     @property
-    def has_data_to_send(self) -> bool:
-        """Return whether ciphertext is ready to be sent."""
-        return self._outgoing.pending > 0
+    def waiting_bytes(self) -> int:
+        """Return how many bytes of ciphertext are ready to be sent."""
+        return self._outgoing.pending
 
     def receive_bytes(self, data: bytes) -> list[bytes]:
         """Take in ciphertext; return the plaintext that it completes, maybe after the end of the handshake.

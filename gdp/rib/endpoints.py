@@ -159,12 +159,13 @@ class RibEndpoints:
         if known is not None and record.sequence <= known.record.sequence:
             raise StatementError(DropReason.STALE, "endpoint record")
         is_of_other = member.domain != self._policy.own
-        if known is None:
-            if len(self._kept) >= self._maximum:
-                raise StatementError(DropReason.QUOTA, "endpoint records")
-            if is_of_other and self._of_others >= min(ENDPOINT_RECORDS_OF_OTHERS_MAX, self._maximum // 2):
-                raise StatementError(DropReason.QUOTA, "endpoint records of other domains")
-            self._of_others += is_of_other
+        was_of_other = known is not None and known.member.domain != self._policy.own
+        if known is None and len(self._kept) >= self._maximum:
+            raise StatementError(DropReason.QUOTA, "endpoint records")
+        others_max = min(ENDPOINT_RECORDS_OF_OTHERS_MAX, self._maximum // 2)
+        if is_of_other and not was_of_other and self._of_others >= others_max:
+            raise StatementError(DropReason.QUOTA, "endpoint records of other domains")
+        self._of_others += is_of_other - was_of_other
         self._kept.pop(record.name, None)
         kept = self._kept[record.name] = _Kept(record, member, now.mono_s + ENDPOINT_LEASE_S)
         self._tell(kept, now.mono_s)

@@ -29,7 +29,9 @@ from gdp.session.session import (
     CALL_TIMEOUT_S,
     GOODBYE_S,
     LINGER_S,
+    Paths,
     Priority,
+    check_paths,
     checked_response,
     is_urgent,
 )
@@ -211,6 +213,7 @@ class AsyncSession(BaseSession[LoopDriver]):
         latched: int = 0,
         is_global: bool = True,
         description: bytes = b"",
+        paths: Paths = 1,
     ) -> AsyncPublisher:
         """Publish a name from now on; see ``Session.publisher``.
 
@@ -219,6 +222,7 @@ class AsyncSession(BaseSession[LoopDriver]):
             LocalError: the session publishes it already, or an option is out of bounds.
         """
         self.driver.check()
+        check_paths(paths)
         topic = self.core.resolve(name, Right.PUBLISH)
         made = self.core.advertise(
             topic,
@@ -227,13 +231,14 @@ class AsyncSession(BaseSession[LoopDriver]):
             latched=latched,
             is_global=is_global,
             description=description,
+            paths=paths,
         )
         publisher = AsyncPublisher(self, topic, made, reliable=reliable)
         self._opened.append(publisher)
         self.driver.schedule()
         return publisher
 
-    def subscribe(self, name: NameLike, *, queue: int = QUEUE_MESSAGES) -> AsyncSubscription:
+    def subscribe(self, name: NameLike, *, queue: int = QUEUE_MESSAGES, paths: Paths = 1) -> AsyncSubscription:
         """Subscribe to a name; see ``Session.subscribe``.
 
         Raises:
@@ -243,8 +248,9 @@ class AsyncSession(BaseSession[LoopDriver]):
         self.driver.check()
         if queue < 1:
             raise LocalError(f"queue is at least 1, not {queue}")
+        check_paths(paths)
         topic = self.core.resolve(name, Right.READ)
-        subscription = AsyncSubscription(self, topic, self.core.subscribe(topic, queue))
+        subscription = AsyncSubscription(self, topic, self.core.subscribe(topic, queue, paths))
         self._opened.append(subscription)
         self.driver.schedule()
         return subscription
@@ -257,6 +263,7 @@ class AsyncSession(BaseSession[LoopDriver]):
         workers: int = 1,
         priority: Priority = "normal",
         is_global: bool = True,
+        paths: Paths = 1,
     ) -> AsyncServer:
         """Serve a name; ``workers`` is how many requests are handled at one time. See ``Session.serve``.
 
@@ -267,8 +274,9 @@ class AsyncSession(BaseSession[LoopDriver]):
         self.driver.check()
         if workers < 1:
             raise LocalError(f"workers is at least 1, not {workers}")
+        check_paths(paths)
         topic = self.core.resolve(name, Right.SERVE)
-        core = self.core.serve(topic, at_once=workers, is_global=is_global, urgent=is_urgent(priority))
+        core = self.core.serve(topic, at_once=workers, is_global=is_global, urgent=is_urgent(priority), paths=paths)
         server = AsyncServer(self, topic, core, handler, workers)
         self._opened.append(server)
         self.driver.schedule()
@@ -281,6 +289,7 @@ class AsyncSession(BaseSession[LoopDriver]):
         *,
         timeout_s: float | None = CALL_TIMEOUT_S,
         replication: str | int | Replication = "all",
+        paths: Paths = 1,
     ) -> Response:
         """Send a request to the servers of a name and return the first response; see ``Session.call``.
 
@@ -291,8 +300,9 @@ class AsyncSession(BaseSession[LoopDriver]):
             DelegationError: the node may not call it.
         """
         self.driver.check()
+        check_paths(paths)
         topic, call = self._new_call(name, request, timeout_s, replication)
-        self.core.call(topic, call, time.monotonic())
+        self.core.call(topic, call, time.monotonic(), paths)
         self.driver.schedule()
         await self.driver.wait(lambda: call.is_done, None)
         if call.response is None:

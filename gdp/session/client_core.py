@@ -61,13 +61,21 @@ class ClientCore:
     """
 
     def __init__(
-        self, member: Participant, topic: Topic, label: str, *, start: int, is_global: bool = True, urgent: bool = False
+        self,
+        member: Participant,
+        topic: Topic,
+        label: str,
+        *,
+        start: int,
+        is_global: bool = True,
+        urgent: bool = False,
+        paths: int = 1,
     ) -> None:
         self._member = member
         self._name = topic.name
         self._label = label
         self._start = start
-        self._publisher: Publisher = member.call(topic, SERVING, is_global=is_global, urgent=urgent)
+        self._publisher: Publisher = member.call(topic, SERVING, is_global=is_global, urgent=urgent, paths=paths)
         self._dispatches: dict[Replication, Dispatch[Response]] = {}
         self._servers: dict[Name, int] = {}  # server to its incarnation
         self._leaving: set[Name] = set()

@@ -157,7 +157,15 @@ class SessionCore:
     # calls of a program
 
     def advertise(
-        self, topic: Topic, *, reliable: bool, urgent: bool, latched: int, is_global: bool, description: bytes
+        self,
+        topic: Topic,
+        *,
+        reliable: bool,
+        urgent: bool,
+        latched: int,
+        is_global: bool,
+        description: bytes,
+        paths: int = 1,
     ) -> Publisher:
         """Publish a name; see ``Participant.advertise``.
 
@@ -165,16 +173,16 @@ class SessionCore:
             LocalError: the name is published already in this session.
         """
         return self.member.advertise(
-            topic, description, reliable=reliable, depth=latched, is_global=is_global, urgent=urgent
+            topic, description, reliable=reliable, depth=latched, is_global=is_global, urgent=urgent, paths=paths
         )
 
-    def subscribe(self, topic: Topic, limit: int) -> Inbox:
+    def subscribe(self, topic: Topic, limit: int, paths: int = 1) -> Inbox:
         """Subscribe to a name.
 
         Raises:
             LocalError: the name is read, served or called already in this session.
         """
-        self.member.subscribe(topic)
+        self.member.subscribe(topic, paths=paths)
         inbox = self._receivers[topic.name] = Inbox(topic.name, limit)
         return inbox
 
@@ -184,14 +192,20 @@ class SessionCore:
             del self._receivers[inbox.name]
             self.member.unsubscribe(inbox.name)
 
-    def serve(self, topic: Topic, *, at_once: int | None, is_global: bool, urgent: bool) -> ServerCore:
+    def serve(self, topic: Topic, *, at_once: int | None, is_global: bool, urgent: bool, paths: int = 1) -> ServerCore:
         """Serve a name.
 
         Raises:
             LocalError: the name is read, served or called already in this session.
         """
         server = ServerCore(
-            self.member, topic, start=self._random_start(), at_once=at_once, is_global=is_global, urgent=urgent
+            self.member,
+            topic,
+            start=self._random_start(),
+            at_once=at_once,
+            is_global=is_global,
+            urgent=urgent,
+            paths=paths,
         )
         self._receivers[topic.name] = self._servers[topic.name] = server
         self._services.append(server)
@@ -204,15 +218,15 @@ class SessionCore:
             self._services.remove(server)
             server.close(now_s)
 
-    def call(self, topic: Topic, call: Call, now_s: float) -> None:
-        """Begin a call; the first call on a name advertises that this node calls it.
+    def call(self, topic: Topic, call: Call, now_s: float, paths: int = 1) -> None:
+        """Begin a call; the first call on a name advertises that this node calls it, and over how many paths.
 
         Raises:
             LocalError: the name is read or served already in this session.
         """
         client = self._clients.get(topic.name)
         if client is None:
-            client = ClientCore(self.member, topic, self.label(topic), start=self._random_start())
+            client = ClientCore(self.member, topic, self.label(topic), start=self._random_start(), paths=paths)
             self._receivers[topic.name] = self._clients[topic.name] = client
             self._services.append(client)
         client.begin(call, now_s)

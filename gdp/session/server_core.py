@@ -40,12 +40,20 @@ class ServerCore:
     """
 
     def __init__(
-        self, member: Participant, topic: Topic, *, start: int, at_once: int | None, is_global: bool, urgent: bool
+        self,
+        member: Participant,
+        topic: Topic,
+        *,
+        start: int,
+        at_once: int | None,
+        is_global: bool,
+        urgent: bool,
+        paths: int = 1,
     ) -> None:
         self._member = member
         self._name = topic.name
         self._serving: Serving[bytes] = Serving(start, at_once)
-        self._publisher = member.serve(topic, SERVING, is_global=is_global, urgent=urgent)
+        self._publisher = member.serve(topic, SERVING, is_global=is_global, urgent=urgent, paths=paths)
         self._seen_s: dict[Name, float] = {}  # when the clients of active calls were last alive
         self._check_at_s: float | None = None  # when clients are checked next; None: no call is active
         self._is_leaving = False

@@ -38,6 +38,7 @@ CALL_TIMEOUT_S: Final = 10.0
 LINGER_S: Final = 1.0
 GOODBYE_S: Final = 0.2  # how long a leaving node continues, so that its goodbye is sent
 Priority = Literal["normal", "urgent"]
+Paths = Literal[1, 2]
 
 _C = TypeVar("_C")
 
@@ -227,6 +228,7 @@ class Session(BaseSession[Driver]):
         latched: int = 0,
         is_global: bool = True,
         description: bytes = b"",
+        paths: Paths = 1,
     ) -> Publisher:
         """Publish a name from now on.
 
@@ -237,6 +239,7 @@ class Session(BaseSession[Driver]):
             latched: how many of the last messages late readers get.
             is_global: whether other domains can find the name.
             description: information that readers need to decode the messages; it travels sealed.
+            paths: 2: each frame travels over two disjoint paths, to readers that subscribe with 2 as well.
 
         Raises:
             DelegationError: the node may not publish it.
@@ -244,21 +247,29 @@ class Session(BaseSession[Driver]):
         """
         topic = self.core.resolve(name, Right.PUBLISH)
         urgent = is_urgent(priority)
+        check_paths(paths)
         made = self.driver.run(
             lambda: self.core.advertise(
-                topic, reliable=reliable, urgent=urgent, latched=latched, is_global=is_global, description=description
+                topic,
+                reliable=reliable,
+                urgent=urgent,
+                latched=latched,
+                is_global=is_global,
+                description=description,
+                paths=paths,
             )
         )
         publisher = Publisher(self, topic, made, reliable=reliable)
         self._opened.append(publisher)
         return publisher
 
-    def subscribe(self, name: NameLike, *, queue: int = QUEUE_MESSAGES) -> Subscription:
+    def subscribe(self, name: NameLike, *, queue: int = QUEUE_MESSAGES, paths: Paths = 1) -> Subscription:
         """Subscribe to a name; iterate over the returned object.
 
         Args:
             name: as for ``publisher``.
             queue: most messages that wait for the program; beyond it, and beyond 64 MiB, the oldest one is dropped.
+            paths: 2: each frame comes over two disjoint paths, from publishers with 2 as well.
 
         Raises:
             DelegationError: the node may not read it.
@@ -266,8 +277,9 @@ class Session(BaseSession[Driver]):
         """
         if queue < 1:
             raise LocalError(f"queue is at least 1, not {queue}")
+        check_paths(paths)
         topic = self.core.resolve(name, Right.READ)
-        subscription = Subscription(self, topic, self.driver.run(lambda: self.core.subscribe(topic, queue)))
+        subscription = Subscription(self, topic, self.driver.run(lambda: self.core.subscribe(topic, queue, paths)))
         self._opened.append(subscription)
         return subscription
 
@@ -298,6 +310,7 @@ class Session(BaseSession[Driver]):
         workers: int = 1,
         priority: Priority = "normal",
         is_global: bool = True,
+        paths: Paths = 1,
     ) -> Server:
         """Serve a name: ``handler`` gets each request and returns the response.
 
@@ -306,6 +319,7 @@ class Session(BaseSession[Driver]):
             handler: called in a worker thread. If it raises, the client gets the error's text, and may call another
             server.
             workers: number of threads, and so of requests that are handled at the same time.
+            paths: 2: requests and responses travel over two disjoint paths, of clients with 2 as well.
 
         Raises:
             DelegationError: the node may not serve it.
@@ -315,7 +329,10 @@ class Session(BaseSession[Driver]):
             raise LocalError(f"workers is at least 1, not {workers}")
         topic = self.core.resolve(name, Right.SERVE)
         urgent = is_urgent(priority)
-        core = self.driver.run(lambda: self.core.serve(topic, at_once=workers, is_global=is_global, urgent=urgent))
+        check_paths(paths)
+        core = self.driver.run(
+            lambda: self.core.serve(topic, at_once=workers, is_global=is_global, urgent=urgent, paths=paths)
+        )
         server = Server(self, topic, core, handler, workers)
         self._opened.append(server)
         return server
@@ -327,6 +344,7 @@ class Session(BaseSession[Driver]):
         *,
         timeout_s: float | None = CALL_TIMEOUT_S,
         replication: str | int | Replication = "all",
+        paths: Paths = 1,
     ) -> Response:
         """Send a request to the servers of a name and return the first response.
 
@@ -335,6 +353,7 @@ class Session(BaseSession[Driver]):
             timeout_s: longest wait for a server and its response; None: no limit.
             replication: ``"all"``: every server gets the request; ``"hedged"``: one server, and a second one if the
                 first is slow; a number: that many servers, the fastest ones; or a ``Replication``.
+            paths: 2: over two disjoint paths, to servers with 2 as well. The first call on a name decides.
 
         Raises:
             NoServerError: no server is available.
@@ -343,7 +362,8 @@ class Session(BaseSession[Driver]):
             DelegationError: the node may not call it.
         """
         topic, call = self._new_call(name, request, timeout_s, replication)
-        self.driver.run(lambda: self.core.call(topic, call, self.driver.now_s()))
+        check_paths(paths)
+        self.driver.run(lambda: self.core.call(topic, call, self.driver.now_s(), paths))
         self.driver.wait(lambda: call.is_done, None)
         if call.response is None:
             raise call.error or ClosedError("the session was closed during the call")
@@ -488,3 +508,13 @@ def is_urgent(priority: Priority) -> bool:
 
 def _deadline_s(driver: Driver, timeout_s: float | None) -> float | None:
     return None if timeout_s is None else driver.now_s() + timeout_s
+
+
+def check_paths(paths: int) -> None:
+    """Return if a number of paths is possible.
+
+    Raises:
+        LocalError: it is neither 1 nor 2.
+    """
+    if paths not in (1, 2):
+        raise LocalError(f"paths is 1 or 2, not {paths!r}")

@@ -199,16 +199,6 @@ class Sharing:
         """Return what is exposed and accepted. Raises ``LocalError``: the file is invalid."""
         return self._folder.read_state()
 
-    def renew_delegations(self, unix_s: float) -> ShareReport:
-        """Renew and redeliver the delegations of which two thirds are over; an agent calls this periodically.
-
-        Raises:
-            LocalError: the state cannot be read or written.
-        """
-        with self._change(unix_s) as at:
-            self._renew(at)
-        return at.report
-
     def work(self, unix_s: float) -> ShareReport:
         """Receive mail, apply accepted offers, delegate names that appeared, and renew; what fails is reported.
 

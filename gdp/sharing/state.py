@@ -176,9 +176,12 @@ class StateFolder:
         """Store an offer, in place of an earlier one of the same name; return the state that lists it.
 
         Raises:
-            LocalError: too many offers are stored, or the folder cannot be written.
+            LocalError: too many offers are stored, of all or of this sender, or the folder cannot be written.
         """
         name = delegation.name.to_text()
+        of_sender = sum(each.sender == sender for each in state.offers.values())
+        if name not in state.offers and of_sender >= OFFERS_MAX // 4:
+            raise LocalError(f"{self.folder}: {of_sender} offers of {sender} are stored; no more of it are taken")
         if name not in state.offers and len(state.offers) >= OFFERS_MAX:
             raise LocalError(f"{self.folder}: {OFFERS_MAX} offers are stored; no more are taken")
         save_delegation(self.folder / _OFFERS, delegation, force=True)

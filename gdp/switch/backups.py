@@ -30,8 +30,13 @@ class Backups:
         self._outbox = outbox
 
     def upstream(self, tree: Tree) -> tuple[Downstream, Name] | None:
-        """Return where to request a backup branch: the loop-free alternate towards the publisher, or None."""
-        if tree.is_backup or tree.upstream is None or tree.switch == self._me:
+        """Return where to request a backup branch: the loop-free alternate towards the publisher, or None.
+
+        A tree that follows a route has its second path instead.
+        """
+        if tree.path == 2:
+            return None
+        if tree.is_backup or tree.upstream is None or tree.switch == self._me or tree.guide is not None:
             return None
         way = self._paths.to_switch(tree.switch, tree.domain, tree.allowed)
         if way is None or way.alternate is None:

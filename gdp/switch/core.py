@@ -31,7 +31,7 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.errors import DropReason, FrameError, RemoteError, StatementError
-from gdp.frame.codec import HEADER_BYTES, Header, decode, encode
+from gdp.frame.codec import HEADER_BYTES, SECOND_PATH, Header, decode, encode
 from gdp.frame.kinds import CONTROL_FROM, Kind
 from gdp.limits import ADVERTISEMENTS_BURST, ADVERTISEMENTS_PER_S, HOPS_MAX, JOINS_BURST, JOINS_PER_S
 from gdp.names import Name
@@ -412,6 +412,8 @@ class SwitchCore:
         neighbour = self._sender(arrival)  # their frames cause no response and no query
         if header.destination == self.name:
             self._take_own(header, arrival, now)
+        elif header.hops_left & SECOND_PATH:
+            raise FrameError(DropReason.NO_SECOND_PATH)  # nothing is asked for it: the first copy travels anyway
         else:
             frame = arrival.frame[: HEADER_BYTES + header.length]
             sought = self.unicast.miss(header, frame, neighbour, now.mono_s)

@@ -30,6 +30,7 @@ from typing import Final, NamedTuple
 from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
 from gdp.limits import DIRECT_TUNNELS_MAX
 from gdp.names import Name
+from gdp.token_bucket import TokenBuckets
 
 __all__ = ["Action", "Close", "DirectTunnels", "Open", "Retry", "Slot", "slots_between"]
 
@@ -42,6 +43,8 @@ _JITTER: Final = 0.25  # of a pause, up or down
 _RECOVER_S: Final = 1.0  # a tunnel that was up may recover by itself: WireGuard follows a peer that moves
 _MOVED_S: Final = 5.0  # ... but not if a record has changed so shortly before: an end has moved
 _HOLD_S: Final = 2.5  # after a handshake, for the hello protocol
+_OPENS_PER_S: Final = 0.1  # of one peer's tunnel: each makes devices
+_OPENS_BURST: Final = 8.0
 _REDUNDANT_S: Final = 30.0  # a tunnel next to a local link is closed after this time
 _IPV4_PRIVATE_BITS: Final = 16  # two private addresses with this prefix may be in one network
 
@@ -147,8 +150,8 @@ def _class_of(candidate: Candidate) -> _Class | None:
         return _Class.PUBLIC
     if address.version == 6:
         return _Class.IPV6
-    is_private = candidate.type is CandidateType.HOST and any(address in each for each in _PRIVATE)
-    return _Class.HOST if is_private else _Class.REFLEXIVE
+    is_host = candidate.type is CandidateType.HOST and candidate.endpoint.is_private
+    return _Class.HOST if is_host else _Class.REFLEXIVE
 
 
 def _is_matched(
@@ -170,9 +173,6 @@ def _is_matched(
 
 
 _UNIQUE_LOCAL: Final = ipaddress.ip_network("fc00::/7")  # RFC 4193
-_PRIVATE: Final = tuple(
-    ipaddress.ip_network(each) for each in ("10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "100.64.0.0/10")
-)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -203,6 +203,8 @@ class DirectTunnels:
         self._maximum = maximum
         self._attempts: dict[Name, _Attempt] = {}
         self._own: EndpointRecord | None = None
+        self._ranks: dict[Name, bytes] = {}  # of the members at the last call of ``peers``
+        self._opens = TokenBuckets(_OPENS_PER_S, _OPENS_BURST)
 
     def peers(self, members: Iterable[Name], linked: Collection[Name]) -> list[Name]:
         """Return the switches whose records are of use, the most preferred first.
@@ -211,7 +213,8 @@ class DirectTunnels:
         compute, so that with more than ``maximum`` members both ends tend to choose each other.
         """
         others = {each for each in members if each != self._me and each not in linked} - self._attempts.keys()
-        return [*self._attempts, *sorted(others, key=self._rank)]
+        self._ranks = {name: self._rank(name) for name in others}
+        return [*self._attempts, *sorted(others, key=self._ranks.__getitem__)]
 
     def poll_actions(
         self,
@@ -270,6 +273,8 @@ class DirectTunnels:
     ) -> None:
         """Begin again if either record has changed; a tunnel that is up stays, unless the peer has another key."""
         is_rekeyed = record.keys != attempt.record.keys
+        if is_rekeyed and not self._opens.spend(record.name, now_s):
+            record, is_rekeyed = attempt.record, False  # the new one counts later
         is_changed = has_changed or not _is_same(record, attempt.record)
         attempt.record = record
         if not is_changed:
@@ -300,7 +305,7 @@ class DirectTunnels:
             if len(self._attempts) >= self._maximum:
                 return
             slots = slots_between(own, records[name])
-            if slots and name not in linked:
+            if slots and name not in linked and self._opens.spend(name, now_s):
                 self._attempts[name] = _Attempt(record=records[name], slots=slots, due_s=now_s)
 
     def _attempt(self, attempt: _Attempt, now_s: float) -> list[Action]:
@@ -334,7 +339,7 @@ class DirectTunnels:
         return pause_s * (1 - _JITTER + 2 * _JITTER * draw)
 
     def _rank(self, peer: Name) -> bytes:
-        return self._hash(peer, b"rank")
+        return self._ranks.get(peer) or self._hash(peer, b"rank")
 
     def _hash(self, peer: Name, about: bytes) -> bytes:
         return hashlib.sha256(b"gdp direct tunnel\0" + min(self._me, peer) + max(self._me, peer) + about).digest()

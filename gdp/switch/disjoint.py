@@ -16,7 +16,7 @@ from gdp.names import Name
 if TYPE_CHECKING:
     import networkx as nx
 
-__all__ = ["DirectedLink", "disjoint_paths"]
+__all__ = ["DirectedLink", "DirectedPath", "disjoint_paths"]
 
 _WEIGHT: Final = "weight"
 

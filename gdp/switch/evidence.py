@@ -61,6 +61,8 @@ class Evidence:
         proven = publisher.name, publisher.node, publisher.right, publisher.switch, publisher.sequence
         if proven != (join.topic, join.publisher, HEARS[reader.right], join.switch, join.version):
             raise StatementError(DropReason.NOT_DELEGATED, "a join to where the publisher's advertisement is not")
+        if (join.path == 2 or join.route) and min(reader.paths, publisher.paths) < 2:
+            raise StatementError(DropReason.NOT_DELEGATED, "two paths that reader and publisher do not both ask for")
         return reader
 
     def still_holds(self, place: Location, now: Timestamps) -> bool:

@@ -226,7 +226,12 @@ class Flooding:
             return
         up = [each for each in self._hello_protocol.all_up() if not self._is_leaf or each.domain == self._domain]
         switches = [each for each in up if each.role.is_switch]
-        links = tuple(sorted(Adjacency(n.name, n.domain, self._cost(n), n.mtu) for n in switches))
+        links = tuple(
+            sorted(
+                Adjacency(n.name, n.domain, self._cost(n), n.mtu, self._hello_protocol.ports[n.port].link_key(n))
+                for n in switches
+            )
+        )
         self._conflicts_seen = self._hello_protocol.conflicts.changes
         ribs = {
             AttachedRib(n.name, n.domain, n.nonce, n.incarnation_id, *n.proof)

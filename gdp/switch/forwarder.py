@@ -7,7 +7,8 @@ sections 3 and 7. The order of the checks:
 2. a kind from 0x80 on is for the neighbour itself: punt;
 3. hops left 0 or 1: drop, for it may not leave again; a payload longer than the received bytes: drop, truncated;
 4. look up destination and source, then destination alone; a miss: punt; an entry whose frames come from other sides:
-   drop, wrong side; an entry without hops: drop, no route;
+   drop, wrong side; an entry without hops: drop, no route. A copy for the second path has a key of its own, the
+   destination with its last bit inverted; a miss is a drop, because the first copy travels anyway;
 5. one copy to every hop, or to its alternate while the hop's port is down; a copy to a port that is down, or whose link
    is too narrow, is dropped alone.
 """
@@ -18,8 +19,19 @@ from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 from gdp.errors import DropReason
-from gdp.frame.codec import DESTINATION_AT, ETHER_BYTES, HEADER_BYTES, HOPS_AT, KIND_AT, OVERHEAD_BYTES, SOURCE_AT
+from gdp.frame.codec import (
+    DESTINATION_AT,
+    ETHER_BYTES,
+    HEADER_BYTES,
+    HOPS_AT,
+    HOPS_MASK,
+    KIND_AT,
+    OVERHEAD_BYTES,
+    SECOND_PATH,
+    second_path_key,
+)
 from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, VERSION
+from gdp.names import NAME_BYTES
 from gdp.switch.table import MACS_BYTES, Hop, Hops, is_side
 
 __all__ = ["PUNT", "Decision", "Drop", "Forward", "Punt", "decide", "rewrite"]
@@ -29,7 +41,6 @@ _ETHERTYPE: Final = ETHERTYPE.to_bytes(2, "big")
 _HOPS: Final = ETHER_BYTES + HOPS_AT
 _LENGTH: Final = ETHER_BYTES + 6
 _DESTINATION: Final = ETHER_BYTES + DESTINATION_AT
-_SOURCE: Final = ETHER_BYTES + SOURCE_AT
 
 
 class Drop(NamedTuple):
@@ -76,16 +87,19 @@ def decide(
         return Drop(DropReason.BAD_VERSION)
     if frame[ETHER_BYTES + KIND_AT] >= CONTROL_FROM:
         return PUNT
-    if frame[_HOPS] <= 1:
+    if frame[_HOPS] & HOPS_MASK <= 1:
         return Drop(DropReason.HOPS_EXPIRED)
     if len(frame) < OVERHEAD_BYTES + int.from_bytes(frame[_LENGTH : _LENGTH + 2], "big"):
         return Drop(DropReason.TRUNCATED)
     key = bytes(frame[_DESTINATION : ETHER_BYTES + HEADER_BYTES])
+    is_second = bool(frame[_HOPS] & SECOND_PATH)
+    if is_second:
+        key = second_path_key(key)
     hops = entries.get(key)
     if hops is None:
-        hops = entries.get(bytes(frame[_DESTINATION:_SOURCE]))
+        hops = entries.get(key[:NAME_BYTES])
     if hops is None:
-        return PUNT
+        return Drop(DropReason.NO_SECOND_PATH) if is_second else PUNT
     if key in sides and not is_side(sides[key], port):
         return Drop(DropReason.WRONG_SIDE)
     if not hops:
@@ -113,7 +127,7 @@ def _fit(hops: Hops, size: int, mtus: Mapping[int, int]) -> Forward:
 
 
 def rewrite(frame: bytes | bytearray | memoryview, macs: bytes) -> bytes:
-    """Return the copy that leaves: new addresses, one hop fewer, every other byte unchanged, padding included.
+    """Return the copy that leaves: new addresses, one hop fewer, every other byte unchanged (padding too).
 
     Args:
         frame: from the Ethernet header on, for which ``decide`` returned ``Forward``.

@@ -12,6 +12,9 @@ Make before break: where the upstream neighbour changes because of a better path
 ``_OVERLAP_S``; readers drop duplicates. Where the publisher has moved, the former one is left at once, for it may now
 have to take its messages from here.
 
+A reader and a publisher that both ask for two paths get two trees (``docs/explanation/two-paths.md``). The reader's
+switch chooses the routes of both (``path_pairs.py``), and the joins bring them along.
+
 A tree that has settled requests a backup branch from its loop-free alternate (``backups.py``). Where both paths part,
 the data plane uses the backup as soon as the port of the protected branch is down. The branch itself is lost a moment
 later. The backup then counts as a branch for ``_ACTIVE_S``, in which the downstream switch joins again.
@@ -21,14 +24,15 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
-from gdp.control.join import Join
+from gdp.control.join import Join, Route
 from gdp.control.neighbour import Neighbour
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import DropReason, StatementError
+from gdp.frame.codec import second_path_key
 from gdp.frame.kinds import Kind
 from gdp.limits import JOIN_LEASE_S, JOIN_REFRESH_S, READERS_MAX, TREES_MAX
 from gdp.message.shares import Shares
@@ -37,6 +41,7 @@ from gdp.switch.backups import Backups
 from gdp.switch.local_advertisements import LocalAdvertisements
 from gdp.switch.name_cache import Location
 from gdp.switch.outbox import Outbox
+from gdp.switch.path_pairs import PathPairs
 from gdp.switch.paths import Paths
 from gdp.switch.table import Table
 from gdp.switch.trees import Branch, Downstream, Tree, Trees
@@ -85,11 +90,14 @@ class MulticastTrees:
         self._paths = paths
         self._attached = attached
         self._outbox = outbox
+        self._pairs = PathPairs(identity.name, paths)
         self._backups = Backups(identity.name, policy.own, paths, outbox)
         self._readers: dict[Name, dict[Downstream, _Reader]] = {}
         self._reader_shares = Shares(READERS_MAX)
         self._readers_end_s = float("inf")  # no reader's lease ends before
         self._branch_shares = Shares(TREES_MAX)
+        self._paired: set[tuple[Name, Name]] = set()  # topics and publishers that readers here want over two paths
+        self._second: dict[Name, dict[Name, Tree]] = {}  # trees of second copies, by publisher and topic
         self.trees = Trees()
         self.drops: Counter[DropReason] = Counter()
 
@@ -141,40 +149,45 @@ class MulticastTrees:
                 self._place_at(tree, place.switch, place.domain, place.sequence, place.advertisement)
                 tree.allowed = allowed
             branch = Branch(
-                expires_s=reader.expires_s, mtu=self._outbox.mtu_of(at[0]), evidence=reader.advertisement.wire
+                expires_s=reader.expires_s,
+                mtu=self._outbox.mtu_of(at[0]),
+                evidence=reader.advertisement.wire,
+                wants_pair=reader.advertisement.paths == 2 and place.proof is not None and place.proof.paths == 2,
             )
             if not self._put_branch(tree, at, branch):
                 self.drops[DropReason.QUOTA] += 1
                 continue
+            self._route_pair(tree, now_s)
             self._install(tree)
             self._follow(tree, now_s)
             self._ask_upstream(tree, now_s)
 
     def publisher_attached(self, advertisement: Advertisement, now_s: float) -> None:
         """Handle a publisher's advertisement of its topic here: trees that pass here join it directly at once."""
-        tree = self.trees.get(advertisement.name, advertisement.node)
-        if tree is not None:
+        for tree in self.trees.both(advertisement.name, advertisement.node):
             version = max(advertisement.sequence, tree.version)
             self._place_at(tree, self._identity.name, self._policy.own, version, advertisement.wire)
             tree.renew_at_s = now_s
+            self._route_pair(tree, now_s)
 
     def publisher_moved(self, place: Location, now_s: float) -> None:
         """Reroute a publisher's tree to its new location, if it passes here and its readers allow the path there."""
-        tree = self.trees.get(place.name, place.advertiser)
-        if tree is not None and place.sequence >= tree.version and place.domain in tree.allowed:
-            self._place_at(tree, place.switch, place.domain, place.sequence, place.advertisement)
-            self._follow(tree, now_s)
+        for tree in self.trees.both(place.name, place.advertiser):
+            if place.sequence >= tree.version and place.domain in tree.allowed:
+                self._place_at(tree, place.switch, place.domain, place.sequence, place.advertisement)
+                self._route_pair(tree, now_s)
+                if tree.branches and not self._follow(tree, now_s):
+                    self._restate(tree)
 
     def below(self, topic: Name, publisher: Name) -> list[Downstream]:
         """Return the neighbouring switches that receive a tree from here."""
-        tree = self.trees.get(topic, publisher)
         readers = self._readers.get(topic, {})
-        return [] if tree is None else [at for at in tree.branches if at not in readers]
+        found = (at for tree in self.trees.both(topic, publisher) for at in tree.branches if at not in readers)
+        return list(dict.fromkeys(found))
 
     def publisher_gone(self, topic: Name, publisher: Name) -> None:
         """Remove the readers attached here from a tree whose publisher is gone."""
-        tree = self.trees.get(topic, publisher)
-        if tree is not None:
+        for tree in self.trees.both(topic, publisher):
             for at in self._readers.get(topic, {}):
                 self._cut(tree, at)
 
@@ -196,7 +209,7 @@ class MulticastTrees:
         """
         at = (neighbour.port, neighbour.mac)
         if join.lease_s == 0:
-            tree = self.trees.get(join.topic, join.publisher)
+            tree = self.trees.get(join.topic, join.publisher, join.path)
             if tree is not None and at in tree.branches and not _is_overtaken(join, tree.branches[at]):
                 self._cut(tree, at)
             return False
@@ -208,7 +221,8 @@ class MulticastTrees:
             raise StatementError(DropReason.WRONG_DOMAIN, "a backup for another domain")
         if self._paths.domain_of(join.switch) not in (None, join.domain):
             raise StatementError(DropReason.WRONG_DOMAIN, "the publisher's switch is of another domain")
-        tree = self._tree(join.topic, join.publisher, join.allowed)
+        self._check_route(join, neighbour)
+        tree = self._tree(join.topic, join.publisher, join.allowed, join.path)
         before = tree.branches.get(at)
         if before is not None and _is_overtaken(join, before):
             return False
@@ -226,6 +240,7 @@ class MulticastTrees:
             said_mtu=join.mtu,
             sequence=join.sequence,
             session=join.sender_session,
+            route=join.route,
         )
         branch.fit(self._outbox.mtu_of(neighbour.port))
         if join.backup_for != ZERO:
@@ -240,6 +255,19 @@ class MulticastTrees:
             else:
                 self._restate(tree)
         return is_behind and tree.switch != join.switch
+
+    def path_counts(self) -> dict[str, int]:
+        """Return how many flows to readers here want two paths, by what they have.
+
+        ``disjoint``: two paths without a shared link; ``shared``: both use a link that every path needs; ``single``:
+        there is one path at most.
+        """
+        counts = dict.fromkeys(("disjoint", "shared", "single"), 0)
+        for tree in (self.trees.get(*each) for each in self._paired):
+            if tree is not None and any(branch.wants_pair for branch in tree.branches.values()):
+                pair = self._pairs.present(tree.switch, tree.domain)
+                counts["single" if pair is None else "shared" if pair.is_shared else "disjoint"] += 1
+        return counts
 
     def neighbour_up(self, at: Downstream, now_s: float) -> None:
         """Repeat to a neighbour the joins that it received before its present session, whose state it has lost."""
@@ -278,21 +306,31 @@ class MulticastTrees:
 
         The upstream neighbour receives another branch's evidence at once, or when such evidence arrives here.
         """
-        tree = self.trees.get(topic, publisher)
-        if tree is None:
-            return
-        branch = tree.branches.get(at)
-        if branch is not None and not proves(branch.evidence):
-            branch.expires_s = min(branch.expires_s, until_s)
-        if not proves(tree.shown):
-            tree.is_doubted, tree.renew_at_s = True, now_s
-        self._install(tree)
+        for tree in self.trees.both(topic, publisher):
+            branch = tree.branches.get(at)
+            if branch is not None and not proves(branch.evidence):
+                branch.expires_s = min(branch.expires_s, until_s)
+            if not proves(tree.shown):
+                tree.is_doubted, tree.renew_at_s = True, now_s
+            self._install(tree)
 
     def reroute(self, now_s: float) -> None:
         """Join again where the path to a publisher has changed."""
+        for topic, publisher in list(self._paired):
+            tree = self.trees.get(topic, publisher)
+            if tree is None:
+                self._paired.discard((topic, publisher))
+            else:
+                self._route_pair(tree, now_s)
         for tree in self.trees.all():
-            if not self._follow(tree, now_s) and self._backups.protection(tree) != tree.protection:
+            if self._follow(tree, now_s):
+                continue
+            if self._backups.protection(tree) != tree.protection:
                 self._install(tree)
+            if tree.path == 2 or tree.asked_route or tree.guide is not None:
+                self._restate(tree)
+        for publisher in list(self._second):
+            self._install_to_publisher(publisher)
 
     def handle_timer(self, now_s: float) -> list[Name]:
         """Prune and renew trees; return the topics that lost their last reader here."""
@@ -304,8 +342,13 @@ class MulticastTrees:
                         orphaned.append(topic)
             ends = [reader.expires_s for readers in self._readers.values() for reader in readers.values()]
             self._readers_end_s = min(ends, default=float("inf"))
+        pairs_s = self._pairs.get_timer()
+        if pairs_s is not None and pairs_s <= now_s:
+            self._pairs.handle_timer(now_s)
+            self.reroute(now_s)
         for tree in self.trees.due(now_s):
-            self._tree_due(tree, now_s)
+            if self.trees.get(tree.topic, tree.publisher, tree.path) is tree:
+                self._tree_due(tree, now_s)
         return orphaned
 
     def _tree_due(self, tree: Tree, now_s: float) -> None:
@@ -332,15 +375,64 @@ class MulticastTrees:
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         tree_s = self.trees.next_event()
-        next_s = self._readers_end_s if tree_s is None else min(tree_s, self._readers_end_s)
+        times = (tree_s, self._pairs.get_timer(), self._readers_end_s)
+        next_s = min(time for time in times if time is not None)
         return None if next_s == float("inf") else next_s
 
-    def _tree(self, topic: Name, publisher: Name, allowed: frozenset[Name]) -> Tree:
-        tree = self.trees.get(topic, publisher)
+    def _check_route(self, join: Join, neighbour: Neighbour) -> None:
+        """Raise ``StatementError`` where a join must not have a route, or its route returns to here."""
+        if not join.route and join.path == 1:
+            return
+        if join.backup_for != ZERO:
+            raise StatementError(DropReason.MALFORMED, "a backup of a tree with a route")
+        if join.route and neighbour.domain != self._policy.own:
+            raise StatementError(DropReason.WRONG_DOMAIN, "a route through another domain")
+        if {self._identity.name, neighbour.name} & {link.name for link in join.route}:
+            raise StatementError(DropReason.MALFORMED, "a route with a loop")
+
+    def _route_pair(self, first: Tree, now_s: float) -> None:
+        """Route the readers here that want two paths, and keep the second tree for as long as there is a pair.
+
+        It follows the second tree; the caller follows the first one.
+        """
+        wanting = {at: branch for at, branch in first.branches.items() if branch.wants_pair}
+        if first.path != 1 or not (wanting or self.trees.get(first.topic, first.publisher, 2)):
+            return
+        if wanting:
+            self._paired.add((first.topic, first.publisher))
+        else:
+            self._paired.discard((first.topic, first.publisher))
+        pair = self._pairs.to(first.switch, first.domain, now_s) if wanting else None
+        for branch in wanting.values():
+            branch.route = () if pair is None else pair.first
+        second = self.trees.get(first.topic, first.publisher, 2)
+        if second is not None:
+            for at in [at for at, branch in second.branches.items() if branch.wants_pair and at not in wanting]:
+                self._cut(second, at)
+            if pair is None:  # copies are still under way on the path that remains, which the first tree takes over
+                for branch in second.branches.values():
+                    if branch.wants_pair:
+                        branch.expires_s = min(branch.expires_s, now_s + _OVERLAP_S)
+        if pair is None:
+            return
+        second = self._tree(first.topic, first.publisher, first.allowed, 2)
+        self._place_at(second, first.switch, first.domain, first.version, first.proof)
+        second.allowed = first.allowed
+        for at, branch in wanting.items():
+            if not self._put_branch(second, at, replace(branch, route=pair.second)):
+                self.drops[DropReason.QUOTA] += 1
+        if second.branches:
+            self._install(second)
+            if not self._follow(second, now_s):
+                self._restate(second)
+
+    def _tree(self, topic: Name, publisher: Name, allowed: frozenset[Name], path: int = 1) -> Tree:
+        tree = self.trees.get(topic, publisher, path)
         if tree is None:
             tree = Tree(
                 topic=topic,
                 publisher=publisher,
+                path=path,
                 switch=self._identity.name,
                 domain=self._policy.own,
                 allowed=allowed,
@@ -352,6 +444,48 @@ class MulticastTrees:
         tree.protection = self._backups.protection(tree)
         if not self._table.install(tree.key, tree.hops(self._outbox.mac_of()), tree.expires_s(), tree.sides):
             self.drops[DropReason.QUOTA] += 1
+        if tree.path == 2:
+            self._second.setdefault(tree.publisher, {})[tree.topic] = tree
+            self._install_to_publisher(tree.publisher)
+
+    def _uninstall(self, tree: Tree) -> None:
+        self._table.remove(tree.key)
+        trees = self._second.get(tree.publisher, {})
+        if tree.path == 2 and trees.pop(tree.topic, None) is not None:
+            self._install_to_publisher(tree.publisher)
+        if not trees:
+            self._second.pop(tree.publisher, None)
+
+    def _install_to_publisher(self, publisher: Name) -> None:
+        """Lead second copies to a publisher itself, such as AckNacks and answers, up one of its second trees.
+
+        Of several trees it is the one with the shortest route, so that these paths form no loop either.
+        """
+        macs, key = self._outbox.mac_of(), second_path_key(publisher)
+        best: tuple[int, Name] | None = None
+        for topic, tree in self._second.get(publisher, {}).items():
+            if tree.upstream is not None and tree.upstream[0] in macs and tree.branches:
+                found = len(tree.guide.route) if tree.guide is not None else 0, topic
+                best = found if best is None else min(best, found)
+        if best is None:
+            self._table.remove(key)
+            return
+        tree = self._second[publisher][best[1]]
+        port, mac = self._apart_from_ordinary(tree) or (0, b"")
+        if not self._table.install(key, ((port, mac + macs[port]),), tree.expires_s()):
+            self.drops[DropReason.QUOTA] += 1
+
+    def _apart_from_ordinary(self, second: Tree) -> Downstream | None:
+        """Return where second copies to the publisher of a second tree go: not over the link that first copies take.
+
+        Of parallel links to one neighbour the first copies take the cheapest, which may be that of the second tree.
+        """
+        first = self.trees.get(second.topic, second.publisher)
+        if first is None or first.upstream is None or first.upstream_name != second.upstream_name:
+            return second.upstream
+        ordinary = self._outbox.neighbour(first.upstream_name) if first.upstream_name is not None else None
+        is_taken = ordinary is not None and (ordinary.port, ordinary.mac) == second.upstream
+        return first.upstream if is_taken else second.upstream
 
     def _put_branch(self, tree: Tree, at: Downstream, branch: Branch) -> bool:
         """Add or replace a branch; return False, and remove a bare tree, where its neighbour has too many."""
@@ -372,7 +506,7 @@ class MulticastTrees:
             self._install(tree)
             self._restate(tree)
             return
-        self._table.remove(tree.key)
+        self._uninstall(tree)
         self._leave_former(tree)
         self._leave_backup(tree)
         self._leave(tree)
@@ -383,6 +517,13 @@ class MulticastTrees:
         if tree.switch == self._identity.name:
             attachment = self._attached.get(tree.topic, tree.publisher)
             return None if attachment is None else (attachment.port, attachment.mac, tree.publisher)
+        link = tree.next_link
+        if link is not None:
+            neighbour = self._outbox.neighbour_over(*link)
+            if neighbour is not None:
+                return neighbour.port, neighbour.mac, neighbour.name
+            if tree.path == 2:
+                return None  # the reader's switch chooses another route; the first tree carries every message
         way = self._paths.to_switch(tree.switch, tree.domain, tree.allowed)
         neighbour = None if way is None else self._outbox.neighbour(way.first)
         return None if neighbour is None else (neighbour.port, neighbour.mac, neighbour.name)
@@ -402,6 +543,7 @@ class MulticastTrees:
             self._part_from_above(tree, now_s, keep=upstream is not None)
             if upstream is not None:
                 tree.upstream, tree.upstream_name = upstream[:2], upstream[2]
+                tree.followed = () if tree.guide is None else tree.guide.route
                 if tree.backup is not None and tree.backup[0] == tree.upstream:
                     tree.backup = None  # an ordinary join replaces it
             self._install(tree)
@@ -413,7 +555,7 @@ class MulticastTrees:
         if not has_settled:
             tree.renew_at_s = now_s + _JOIN_AGAIN_S[tree.joins]
             tree.joins += 1
-        tree.asked_mtu = min(tree.mtu, self._outbox.mtu_of(upstream[0]))
+        tree.asked_mtu = self._mtu_over(tree, upstream[0])
         self._show(tree)
         if has_settled and self._paths.has_alternates:
             self._ask_for_backup(tree)
@@ -422,13 +564,21 @@ class MulticastTrees:
             self._install(tree)
 
     def _restate(self, tree: Tree) -> None:
-        """Send a join upstream at once: the tree's MTU, or whether it is only a backup, has changed."""
+        """Send a join upstream at once: the tree's MTU or route, or whether it is only a backup, has changed."""
         if tree.upstream is None:
             return
-        mtu = min(tree.mtu, self._outbox.mtu_of(tree.upstream[0]))
-        if mtu != tree.asked_mtu or tree.backup_for != tree.asked_backup_for:
+        if tree.asked_route != self._route_onwards(tree):
+            tree.joins, tree.renew_at_s = 0, 0.0  # due at once, and repeated like the first join
+            return
+        mtu = self._mtu_over(tree, tree.upstream[0])
+        if (tree.asked_mtu, tree.asked_backup_for) != (mtu, tree.backup_for):
             tree.asked_mtu = mtu
             self._show(tree)
+
+    def _mtu_over(self, tree: Tree, port: int) -> int:
+        """Return the MTU for a join over a port; the publisher gets that of both trees, since it sends one size."""
+        trees = self.trees.both(tree.topic, tree.publisher) if tree.switch == self._identity.name else (tree,)
+        return min(self._outbox.mtu_of(port), *(each.mtu for each in trees if each.branches))
 
     def _ask_for_backup(self, tree: Tree) -> None:
         """Request a backup branch from the neighbour that could replace the best one, or leave it."""
@@ -455,15 +605,25 @@ class MulticastTrees:
         evidence = self._evidence(tree)
         tree.is_doubted = tree.is_doubted and evidence == tree.shown
         tree.shown = evidence
-        tree.asked_backup_for = tree.backup_for
+        tree.asked_backup_for, tree.asked_route = tree.backup_for, self._route_onwards(tree)
         if tree.upstream is None or tree.upstream_name is None or not evidence:
             return
         backup_for = tree.backup_for or ZERO
         if backup_for != ZERO and self._paths.domain_of(tree.upstream_name) != self._policy.own:
             return  # backups are internal to a domain
         self._say(
-            tree, tree.upstream, tree.upstream_name, tree.asked_mtu, JOIN_LEASE_S, evidence, backup_for=backup_for
-        )
+            tree, tree.upstream, tree.upstream_name, tree.asked_mtu, JOIN_LEASE_S, evidence,
+            backup_for=backup_for, route=tree.asked_route,
+        )  # fmt: skip
+
+    def _route_onwards(self, tree: Tree) -> Route:
+        """Return the route for the upstream neighbour: what remains after the link to it."""
+        guide = tree.guide
+        if guide is None or tree.switch == self._identity.name:
+            return ()
+        neighbour = self._outbox.neighbour_over(*guide.route[0])
+        leads_there = neighbour is not None and (neighbour.port, neighbour.mac) == tree.upstream
+        return guide.route[1:] if leads_there else ()
 
     def _evidence(self, tree: Tree) -> bytes:
         """Return the advertisement to send upstream; of a leaf only an attached reader's, empty where none is.
@@ -473,6 +633,8 @@ class MulticastTrees:
         """
         if not self._is_leaf or tree.switch == self._identity.name:
             return tree.evidence
+        if (guide := tree.guide) is not None and guide.wants_pair:
+            return guide.evidence
         own = self._readers.get(tree.topic, {}).keys() & tree.branches.keys()
         return max((tree.branches[at] for at in own), key=lambda each: each.expires_s).evidence if own else b""
 
@@ -501,6 +663,8 @@ class MulticastTrees:
         """
         if tree.has_moved or tree.upstream_name is None:
             return False
+        if tree.path == 2 or tree.followed or tree.guide is not None:
+            return self._readers.get(tree.topic, {}).keys() >= tree.branches.keys()  # it is the end of its route
         if self._is_leaf:
             return True
         own = self._paths.to_switch(tree.switch, tree.domain, tree.allowed)
@@ -530,6 +694,7 @@ class MulticastTrees:
         evidence: bytes,
         *,
         backup_for: Name = ZERO,
+        route: Route = (),
     ) -> None:
         """Send a join, or with no lease a leave, to one upstream neighbour."""
         sessions = self._outbox.sessions_with(upstream[0], name)
@@ -552,6 +717,8 @@ class MulticastTrees:
             backup_for=backup_for,
             sender_session=own_session,
             proof=tree.proof if lease_s else b"",
+            path=tree.path,
+            route=route,
         )
         kind = Kind.JOIN if lease_s else Kind.LEAVE
         self._outbox.say_at(*upstream, kind, join.to_wire(self._identity.name, self._identity.key))

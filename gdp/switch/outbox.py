@@ -53,6 +53,14 @@ class Outbox:
         ]
         return min(found, key=lambda n: (n.cost, n.port), default=None)
 
+    def neighbour_over(self, name: Name, key: int) -> Neighbour | None:
+        """Return the neighbour of this name over the link with this key (``link_key``), or None."""
+        for index, port in self._hello_protocol.ports.items():
+            found = self._hello_protocol.neighbour(index, name)
+            if found is not None and port.link_key(found) == key:
+                return found
+        return None
+
     def sessions_with(self, port: int, name: Name) -> tuple[bytes, bytes] | None:
         """Return our port's nonce and a neighbour's echo, of their present sessions; None when it is not up."""
         neighbour = self._hello_protocol.neighbour(port, name)

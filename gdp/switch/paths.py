@@ -15,7 +15,8 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, NamedTuple
 
 from gdp.control.link_state import Adjacency, AttachedRib, LinkState, Scope
-from gdp.names import Name
+from gdp.names import ZERO, Name
+from gdp.switch.disjoint import DirectedLink, DirectedPath, disjoint_paths
 from gdp.switch.lsdb import LinkStateDatabase
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ __all__ = ["Path", "Paths"]
 
 _CACHE_MAX = 64
 _ALTERNATES_CACHE_MAX = 4_096
+_PAIRS_CACHE_MAX = 1_024
 _ALTERNATES_SWITCHES_MAX = 256  # above this, paths from every neighbour would keep a switch busy for too long
 
 
@@ -65,6 +67,8 @@ class Paths:
         self._refused: frozenset[Name] = frozenset()
         self._ways: dict[tuple[Name, frozenset[Name]], dict[Name, Path]] = {}
         self._alternates: dict[tuple[Name, Name, frozenset[Name]], Name | None] = {}
+        self._links: dict[DirectedLink, int] = {}  # cost of each link, parallel ones apart, of us and other domains
+        self._pairs: dict[tuple[Name, Name], tuple[DirectedPath, ...]] = {}
         self.has_alternates = False
 
     def to_switch(self, switch: Name, domain: Name, allowed: frozenset[Name]) -> Path | None:
@@ -211,6 +215,54 @@ class Paths:
         borders = {s.origin for s in states if any(link.domain != self._domain for link in s.links)}
         return {each: ways[each].distance for each in sorted(borders & self._members) if each in ways}
 
+    @property
+    def version(self) -> int:
+        """Return a number that rises with every change that may change a path."""
+        return self._link_states.version
+
+    def cost_of(self, path: DirectedPath) -> int | None:
+        """Return the cost of a path; None where one of its links is gone."""
+        self._refresh()
+        costs = [self._links.get(link) for link in path]
+        return None if None in costs else sum(cost for cost in costs if cost is not None)
+
+    def disjoint(self, switch: Name, domain: Name) -> tuple[DirectedPath, ...]:
+        """Return two paths to a switch that share as few links as possible; one or none, as ``disjoint_paths``.
+
+        To a switch of another domain they end at its borders, over links of our own domain and one link that leaves it.
+        """
+        self._refresh()
+        key = switch, domain
+        if key not in self._pairs:
+            if len(self._pairs) >= _PAIRS_CACHE_MAX:
+                self._pairs.clear()
+            self._pairs[key] = self._disjoint(switch, domain)
+        return self._pairs[key]
+
+    def _disjoint(self, switch: Name, domain: Name) -> tuple[DirectedPath, ...]:
+        from networkx import MultiDiGraph
+
+        ends = self._leaves - {self._me}
+        within = switch in self._members
+        borders = () if within else self._borders_to(switch, domain)
+        graph: nx.MultiDiGraph[Name] = MultiDiGraph()
+        for link, cost in self._links.items():
+            if link.start in ends or link.start not in self._members:
+                continue
+            if link.end in self._members or link.end in borders:
+                graph.add_edge(link.start, link.end, link.key, weight=cost)
+        for border in borders:
+            graph.add_edge(border, ZERO, 0, weight=1)
+        found = disjoint_paths(graph, self._me, switch if within else ZERO)
+        return found if within else tuple(dict.fromkeys(path[:-1] for path in found))
+
+    def _borders_to(self, switch: Name, domain: Name) -> frozenset[Name]:
+        """Return the borders of another domain behind which a switch is."""
+        if domain == self._domain:
+            return frozenset()  # a part of our own domain that is cut off
+        listed = self._borders_of.get((switch, domain)) or self._fallback_borders(domain)
+        return frozenset([*listed, *([switch] if switch in self._domains else [])])
+
     def _to_all(self, allowed: frozenset[Name], start: Name | None = None) -> dict[Name, Path]:
         """Return the paths from a switch, this one if not given, to all others."""
         self._refresh()
@@ -249,6 +301,7 @@ class Paths:
         self._version = self._link_states.version
         self._ways.clear()
         self._alternates.clear()
+        self._pairs.clear()
         home = self._link_states.states(Scope.DOMAIN)
         self._leaves = frozenset(state.origin for state in home if state.is_leaf)
         self._members = _reachable(self._me, home, self._domain, self._leaves)
@@ -275,6 +328,7 @@ class Paths:
         for state in [*inside, *beyond]:
             for rib in state.ribs:
                 self._ribs.setdefault(rib.name, {})[state.origin] = rib
+        self._links = _links([(s.origin, s.links) for s in [*inside, *beyond]])
         self._graph = _graph([(s.origin, s.links) for s in inside] + [(s.origin, s.links + s.inside) for s in beyond])
 
 
@@ -290,6 +344,16 @@ def _reachable(
         found |= joined
         todo += joined - leaves
     return frozenset(found)
+
+
+def _links(edges: Iterable[tuple[Name, tuple[Adjacency, ...]]]) -> dict[DirectedLink, int]:
+    """Return the cost of each link that both ends list with one key."""
+    costs: dict[DirectedLink, int] = {}
+    for origin, links in edges:
+        for link in links:
+            each = DirectedLink(origin, link.name, link.key)
+            costs[each] = min(costs.get(each, link.cost), link.cost)
+    return {each: costs[each] for each in sorted(costs) if DirectedLink(each.end, each.start, each.key) in costs}
 
 
 def _graph(edges: Iterable[tuple[Name, tuple[Adjacency, ...]]]) -> nx.DiGraph[Name]:

@@ -5,6 +5,10 @@ from downstream. A switch renews upstream for as long as a branch of its own sta
 
 A *backup* branch was requested by a switch that has the tree another way. It gets no copies while that path stands: in
 the forwarding table it is the alternate of the branch that it protects.
+
+A topic with ``paths: 2`` has two trees, the second one for second copies. Their joins bring routes, which the switches
+of the readers chose. Of several routes a tree follows the shortest: what remains of it shrinks with every switch, so
+that routes of different readers form no loop.
 """
 
 from __future__ import annotations
@@ -13,6 +17,8 @@ import heapq
 from dataclasses import dataclass, field
 from typing import Final
 
+from gdp.control.join import Route, RouteLink
+from gdp.frame.codec import second_path_key
 from gdp.limits import FRAME_MAX_BYTES
 from gdp.names import Name
 from gdp.switch.table import Hop, Hops, ProtectedHop, sides_of
@@ -20,7 +26,7 @@ from gdp.switch.table import Hop, Hops, ProtectedHop, sides_of
 __all__ = ["Branch", "Tree", "Trees"]
 
 Downstream = tuple[int, bytes]  # port, MAC of the downstream neighbour
-_Key = tuple[Name, Name]  # topic and publisher
+_Key = tuple[Name, Name, int]  # topic, publisher and path
 _HEAP_SLACK: Final = 1_024
 
 
@@ -36,6 +42,8 @@ class Branch:
     session: bytes = b""  # of the neighbour that sent it, within which the sequence rises
     backup_for: Name | None = None  # the switch that requested a backup; None: an ordinary branch
     active_until_s: float | None = None  # a backup whose protected branch was lost gets copies until then
+    route: Route = ()  # from here to the publisher's switch, as the reader's switch chose it
+    wants_pair: bool = False  # a reader attached here for which this switch chooses the routes
 
     @property
     def is_active(self) -> bool:
@@ -49,10 +57,11 @@ class Branch:
 
 @dataclass(slots=True, kw_only=True)
 class Tree:
-    """The tree of one topic and one publisher at this switch."""
+    """The tree of one topic and one publisher at this switch; ``path`` 2 is that of the second copies."""
 
     topic: Name
     publisher: Name
+    path: int = 1
     switch: Name  # where the publisher is attached
     domain: Name  # of that switch
     allowed: frozenset[Name]
@@ -61,6 +70,8 @@ class Tree:
     upstream_name: Name | None = None
     renew_at_s: float = 0.0
     asked_mtu: int = 0  # MTU in the last join
+    asked_route: Route = ()  # route in the last join
+    followed: Route = ()  # that the upstream neighbour was chosen by
     shown: bytes = b""  # evidence in the last join
     version: int = 0  # sequence number of ``proof``
     proof: bytes = b""  # the publisher's advertisement that ``switch`` was read from
@@ -77,7 +88,23 @@ class Tree:
     @property
     def key(self) -> bytes:
         """Return its key in the forwarding table."""
-        return bytes(self.topic) + bytes(self.publisher)
+        topic = bytes(self.topic) if self.path == 1 else second_path_key(self.topic)
+        return topic + bytes(self.publisher)
+
+    @property
+    def guide(self) -> Branch | None:
+        """Return the branch whose route this tree follows, or None: the shortest one, the present one before others."""
+        routed = [at for at, each in self.branches.items() if each.route]
+        if not routed:
+            return None
+        routes = {at: self.branches[at].route for at in routed}
+        return self.branches[min(routed, key=lambda at: (len(routes[at]), routes[at] != self.followed, at))]
+
+    @property
+    def next_link(self) -> RouteLink | None:
+        """Return the link to the upstream neighbour that the route names, or None without a route."""
+        guide = self.guide
+        return None if guide is None else guide.route[0]
 
     @property
     def mtu(self) -> int:
@@ -86,7 +113,9 @@ class Tree:
 
     @property
     def evidence(self) -> bytes:
-        """Return the advertisement of the reader whose branch has the longest lease."""
+        """Return the advertisement of the reader whose route it follows, or else whose branch has the longest lease."""
+        if (guide := self.guide) is not None:
+            return guide.evidence
         return max(self._wanted(), key=lambda branch: branch.expires_s).evidence
 
     @property
@@ -165,7 +194,7 @@ class Trees:
     """
 
     def __init__(self) -> None:
-        self._by_topic: dict[Name, dict[Name, Tree]] = {}
+        self._by_topic: dict[Name, dict[tuple[Name, int], Tree]] = {}
         self._size = 0
         self._touched: dict[_Key, Tree] = {}
         self._due_s: dict[_Key, float] = {}  # deadline of the valid heap entry
@@ -174,12 +203,17 @@ class Trees:
     def __len__(self) -> int:
         return self._size
 
-    def get(self, topic: Name, publisher: Name) -> Tree | None:
+    def get(self, topic: Name, publisher: Name, path: int = 1) -> Tree | None:
         """Return a tree, or None."""
-        tree = self._by_topic.get(topic, {}).get(publisher)
+        tree = self._by_topic.get(topic, {}).get((publisher, path))
         if tree is not None:
-            self._touched[topic, publisher] = tree
+            self._touched[topic, publisher, path] = tree
         return tree
+
+    def both(self, topic: Name, publisher: Name) -> list[Tree]:
+        """Return the trees of a topic and a publisher: none, one, or that of second copies too."""
+        found = [self.get(topic, publisher, path) for path in (1, 2)]
+        return [tree for tree in found if tree is not None]
 
     def all(self) -> list[Tree]:
         """Return every tree."""
@@ -188,25 +222,25 @@ class Trees:
     def of_topic(self, topic: Name) -> list[Tree]:
         """Return a topic's trees."""
         trees = list(self._by_topic.get(topic, {}).values())
-        self._touched.update({(topic, tree.publisher): tree for tree in trees})
+        self._touched.update({(topic, tree.publisher, tree.path): tree for tree in trees})
         return trees
 
     def put(self, tree: Tree) -> None:
         """Add a tree."""
         trees = self._by_topic.setdefault(tree.topic, {})
-        self._size += tree.publisher not in trees
-        trees[tree.publisher] = tree
-        self._touched[tree.topic, tree.publisher] = tree
+        self._size += (tree.publisher, tree.path) not in trees
+        trees[tree.publisher, tree.path] = tree
+        self._touched[tree.topic, tree.publisher, tree.path] = tree
 
     def remove(self, tree: Tree) -> None:
         """Remove a tree."""
         trees = self._by_topic.get(tree.topic, {})
-        if trees.pop(tree.publisher, None) is not None:
+        if trees.pop((tree.publisher, tree.path), None) is not None:
             self._size -= 1
         if not trees:
             self._by_topic.pop(tree.topic, None)
-        self._touched.pop((tree.topic, tree.publisher), None)
-        self._due_s.pop((tree.topic, tree.publisher), None)
+        self._touched.pop((tree.topic, tree.publisher, tree.path), None)
+        self._due_s.pop((tree.topic, tree.publisher, tree.path), None)
 
     def due(self, now_s: float) -> list[Tree]:
         """Return the trees with a timer that is due; each is returned again while that is so."""
@@ -216,7 +250,7 @@ class Trees:
             at_s, key = heapq.heappop(self._heap)
             if self._due_s.get(key) == at_s:
                 del self._due_s[key]
-                tree = self._by_topic[key[0]][key[1]]
+                tree = self._by_topic[key[0]][key[1], key[2]]
                 self._touched[key] = tree
                 due.append(tree)
         return due

@@ -60,6 +60,7 @@ class Metrics(Collector):
         yield from _gauges("gdp_waiting", "1: the node makes no progress for this reason", "reason", of.waiting)
         if of.links is not None:
             yield from _links(of.links())
+        yield from _gauges("gdp_two_paths", "Flows that want two paths, by what they have", "paths", of.two_paths)
         if of.clashes is not None:
             yield CounterMetricFamily(
                 "gdp_identity_clashes", "Signs of another node with this identity", value=of.clashes()

@@ -89,6 +89,7 @@ class Sources:
         calls: events of services with several servers: late and unexpected responses, hedged requests.
         waiting: 1 for each reason for which the node makes no progress, 0 for the others.
         links: to neighbours that are up.
+        two_paths: flows that want two paths, by what they have: disjoint, shared, single.
         clashes: signs of another node with this identity.
         latency: one-way, from the source's stamp to delivery.
     """
@@ -109,6 +110,7 @@ class Sources:
     calls: Counts | None = None
     waiting: Counts | None = None
     links: Callable[[], Sequence[LinkRow]] | None = None
+    two_paths: Counts | None = None
     clashes: Gauge | None = None
     latency: Callable[[], Histogram] | None = None
 

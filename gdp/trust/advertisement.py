@@ -20,7 +20,7 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType
 from gdp.crypto.subject import Subject
 from gdp.errors import DropReason, LocalError, StatementError
-from gdp.limits import ADVERTISEMENT_MAX_BYTES, CHAIN_MAX, LEASE_MAX_S, LEASE_MIN_S
+from gdp.limits import ADVERTISEMENT_MAX_BYTES, CHAIN_MAX, LEASE_MAX_S, LEASE_MIN_S, PATHS_MAX
 from gdp.names import ZERO, Name
 from gdp.trust.adcert import Chain
 from gdp.trust.right import Right
@@ -46,6 +46,7 @@ class Advertisement:
         wire: the bytes that were verified, to be relayed unchanged.
         previous: the switch that the node has come from, or ``ZERO``.
         exchange: the node's X25519 key in this run, for control messages to it; empty where it takes none.
+        paths: over how many disjoint paths the node wants to send or receive each frame of this name.
     """
 
     subject: Subject
@@ -60,6 +61,7 @@ class Advertisement:
     wire: bytes = field(repr=False)
     previous: Name = ZERO
     exchange: bytes = b""
+    paths: int = 1
 
     @property
     def name(self) -> Name:
@@ -115,6 +117,7 @@ class UnverifiedAdvertisement:
     rtcert: bytes
     previous: Name = ZERO
     exchange: bytes = b""
+    paths: int = 1
 
     @classmethod
     def from_statement(cls, statement: Statement) -> UnverifiedAdvertisement:
@@ -129,6 +132,9 @@ class UnverifiedAdvertisement:
         exchange = fields.bytes_("x")
         if len(exchange) not in (0, EXCHANGE_KEY_BYTES):
             raise StatementError(DropReason.MALFORMED, "an exchange key of the wrong length")
+        paths = fields.uint("paths", PATHS_MAX) if "paths" in fields else 1
+        if not paths:
+            raise StatementError(DropReason.MALFORMED, "no path at all")
         return cls(
             subject=Subject.from_fields(fields, fields.name("name")),
             right=Right.from_wire(fields.text("right")),
@@ -141,13 +147,16 @@ class UnverifiedAdvertisement:
             rtcert=fields.bytes_("rt"),
             previous=fields.name("prev") if "prev" in fields else ZERO,
             exchange=exchange,
+            paths=paths,
         )
 
     def to_fields(self) -> dict[str, object]:
         """Return the statement's body."""
         moved = {} if self.previous == ZERO else {"prev": self.previous}
+        several = {} if self.paths == 1 else {"paths": self.paths}
         return {
             **moved,
+            **several,
             **self.subject.to_fields(),
             "name": self.subject.name,
             "right": self.right.value,
@@ -175,6 +184,7 @@ def sign_advertisement(
     chain: Sequence[bytes] = (),
     previous: Name = ZERO,
     exchange: bytes = b"",
+    paths: int = 1,
 ) -> bytes:
     """Return a node's signed advertisement; costs about 50 us.
 
@@ -188,6 +198,7 @@ def sign_advertisement(
         chain: the AdCerts of the delegation.
         previous: the node's former switch, which is to be notified; ``ZERO``: it has not moved.
         exchange: its X25519 key in this run, for control messages to it; empty where it takes none.
+        paths: over how many disjoint paths each frame of the name is to travel, 1 to ``PATHS_MAX``.
 
     Raises:
         LocalError: a lease out of bounds, or more than one statement can carry.
@@ -206,6 +217,7 @@ def sign_advertisement(
         rtcert=rtcert,
         previous=previous,
         exchange=exchange,
+        paths=paths,
     )
     wire = identity.sign(StatementType.ADVERTISE, body.to_fields())
     if len(wire) > ADVERTISEMENT_MAX_BYTES:

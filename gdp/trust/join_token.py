@@ -26,6 +26,7 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 from gdp.crypto.certificates import Role, Root
 from gdp.errors import LocalError
+from gdp.host_port import split_host_port
 
 __all__ = [
     "JOIN_ID_BYTES",
@@ -37,7 +38,6 @@ __all__ = [
     "join_id",
     "join_key",
     "join_proof",
-    "split_server",
 ]
 
 JOIN_SECRET_BYTES: Final = 16
@@ -49,8 +49,6 @@ _KEY_BYTES: Final = 32
 _FINGERPRINT_BYTES: Final = 32
 _TIME_BYTES: Final = 5
 _CHECKSUM_BYTES: Final = 5
-_HOST_MAX: Final = 128
-_PORT_MAX: Final = 65_535
 _TEXT_MAX: Final = 4_096
 _MISTYPED: Final = "the token was typed or copied wrong: its checksum does not match; copy the whole line once more"
 
@@ -94,7 +92,7 @@ class JoinToken:
         if not 0 < len(self.servers) <= SERVERS_MAX:
             raise LocalError(f"a token names 1 to {SERVERS_MAX} servers")
         for each in self.servers:
-            split_server(each)
+            split_host_port(each)
         if len(self.root) != _FINGERPRINT_BYTES or len(self.secret) != JOIN_SECRET_BYTES:
             raise LocalError("a token has a fingerprint of 32 bytes and a secret of 16")
 
@@ -149,16 +147,6 @@ class JoinToken:
         if at != len(body):
             raise LocalError(_MISTYPED)
         return cls(root=root, secret=secret, role=role, expires_unix_s=expires, servers=tuple(servers))
-
-
-def split_server(text: str) -> tuple[str, int]:
-    """Return host and port of ``host:port``; IPv6 stands in brackets. Raises ``LocalError``: another form."""
-    host, colon, port = text.rpartition(":")
-    host = host[1:-1] if host.startswith("[") and host.endswith("]") else host
-    is_number = port.isascii() and port.isdecimal() and 0 < int(port) <= _PORT_MAX
-    if not (colon and host and is_number and host.isascii() and host.isprintable() and len(text) <= _HOST_MAX):
-        raise LocalError(f"expected host:port, not {text!r}")
-    return host, int(port)
 
 
 def fingerprint_of(root: Root) -> bytes:

@@ -94,6 +94,7 @@ class AdvertisementVerifier:
             wire=statement.wire,
             previous=body.previous,
             exchange=body.exchange,
+            paths=body.paths,
         )
         self._check_evidence(advertisement, unix_s)
         return advertisement

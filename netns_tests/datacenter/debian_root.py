@@ -33,7 +33,7 @@ _INCLUDED: Final = (
     "systemd-sysv",
     "util-linux",
 )
-_OFFERED: Final = ("python3-venv",)  # what user data installs beyond these
+_OFFERED: Final = ("python3-venv", "wireguard-go")  # what user data installs beyond these
 _PATIENCE_S: Final = 560.0
 _REPOSITORY: Final = "srv/packages"
 _CLOUD_CONFIG: Final = """datasource_list: [Ec2]

@@ -22,7 +22,7 @@ import pytest
 from gdp.host.run_registry import Run
 from netns_tests.datacenter.machine import BootedMachine
 from netns_tests.datacenter.metadata_service import InstanceDocument, MetadataService
-from netns_tests.datacenter.router import Admitted, Lease, Router
+from netns_tests.datacenter.router import Admitted, Router
 
 if TYPE_CHECKING:
     from moto.ec2.models import EC2Backend
@@ -34,16 +34,15 @@ UBUNTU: Final = "099720109477"  # owner of images of moto's account, which has n
 
 
 class DataCenter:
-    """Machines of all regions; ``attached``: called with the lease of each new machine before it boots."""
+    """Machines of all regions."""
 
-    def __init__(self, run: Run, image: Path, attached: Callable[[Lease], None] = lambda _: None) -> None:
+    def __init__(self, run: Run, image: Path) -> None:
         self.router = Router(run)
         self.machines: dict[str, BootedMachine] = {}  # also those that have ended
         self._documents: dict[IPv4Address, InstanceDocument] = {}
         self._metadata = MetadataService(self.router.namespace, self._documents.get)
         self._run = run
         self._image = image
-        self._attached = attached
         self._backends: dict[str, EC2Backend] = {}
         self._is_closed = False
         self._lock = threading.Lock()  # requests come from threads of the server, and change one record
@@ -59,7 +58,6 @@ class DataCenter:
                 base64.b64decode(str(instance.user_data or "")),
                 lambda: {tag["key"]: tag["value"] for tag in instance.get_tags()},
             )
-            self._attached(lease)
             self._backends[instance.id] = backend
 
             def ended() -> None:

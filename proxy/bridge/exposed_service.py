@@ -89,7 +89,11 @@ class ExposedService:
             seat.subscribe(self, *part, profile) for part, profile in zip(parts.topics, PROFILES, strict=False)
         ]
         self._publisher = site.member.serve(
-            topic, self._exchange.to_wire(), is_global=rule.is_global, urgent=rule.priority == "urgent"
+            topic,
+            self._exchange.to_wire(),
+            is_global=rule.is_global,
+            urgent=rule.priority == "urgent",
+            paths=rule.paths,
         )
         self._responses = ResponseSender(
             site=site,

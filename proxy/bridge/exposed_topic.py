@@ -126,6 +126,7 @@ class ExposedTopic:
             depth=self._qos.depth,
             is_global=rule.is_global,
             urgent=rule.priority == "urgent",
+            paths=rule.paths,
         )
 
     def _publish(self, event: MessageReceived, now_s: float) -> None:

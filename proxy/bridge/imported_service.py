@@ -87,7 +87,11 @@ class ImportedService:
         self._handles: list[int] = []
         self._topics: list[int] = []
         self._publisher = site.member.call(
-            topic, self._description(), is_global=flow_spec.rule.is_global, urgent=flow_spec.rule.priority == "urgent"
+            topic,
+            self._description(),
+            is_global=flow_spec.rule.is_global,
+            urgent=flow_spec.rule.priority == "urgent",
+            paths=flow_spec.rule.paths,
         )
         self._sender = RequestSender(
             site=site, service=topic.name, calls=self._calls, goals=self._goals, publisher=self._publisher

@@ -68,7 +68,7 @@ class ImportedTopic:
         self._tell_unmatched(ends)
         if ends and not self._is_joined:
             self._is_joined = True
-            self._site.member.subscribe(self._topic)
+            self._site.member.subscribe(self._topic, paths=self._flow_spec.rule.paths)
         elif not ends and self._is_joined:
             self._leave()
             self._output.drop_kept()

@@ -207,6 +207,11 @@ class MemberRow:
     def __exit__(self, *_: object) -> None:
         self._nodes.close()
 
+    @property
+    def switches(self) -> Sequence[Started]:
+        """Return the switch processes."""
+        return self._nodes.switches
+
     def endpoint(self, node: str, role: str, **settings: str | float) -> Started:
         """Start a role of the endpoint module at a member."""
         orders = json.dumps({"config": str(self._configs[node]), **settings})

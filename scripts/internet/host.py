@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from internet.lease_change import change_lease
 from internet.rules import LAN
 from internet.site import Lease, Site
 from internet.space import Space
@@ -69,12 +70,7 @@ class Host:
         """Give a device the addresses and routes that its site has for it now."""
         attachment = self._attachments[device]
         old, new = attachment.lease, attachment.site.lease(attachment.number)
-        lines = [*self._removal(device, old, attachment.metric), f"neigh flush dev {device}"]
-        for address, gateway in ((new.address, new.gateway), (new.address6, new.gateway6)):
-            if address:
-                lines.append(f"addr add {address} dev {device}" + (" nodad" if ":" in address else ""))
-                lines.append(f"route add default via {gateway} dev {device} metric {attachment.metric}")
-        self.space.ip(lines)
+        self.space.inside(lambda: change_lease(device, old, new, attachment.metric))
         attachment.lease = new
 
     def renumber(self, device: str = ETHERNET) -> None:
@@ -118,11 +114,3 @@ class Host:
         attachment = self._attachments[device]
         attachment.site.routers[0].wait_for_carrier(attachment.port, LAN)
         self.space.wait_for_carrier(device)
-
-    def _removal(self, device: str, lease: Lease, metric: int) -> list[str]:
-        lines = []
-        for address, gateway in ((lease.address, lease.gateway), (lease.address6, lease.gateway6)):
-            if address:
-                lines.append(f"route del default via {gateway} dev {device} metric {metric}")
-                lines.append(f"addr del {address} dev {device}")
-        return lines

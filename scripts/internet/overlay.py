@@ -74,6 +74,7 @@ class Overlay:
         is_border: bool = False,
         borders: Sequence[Host] = (),
         has_relay: bool = False,
+        uplinks: Sequence[str] = (),
         links: Yaml | None = None,
     ) -> None:
         """Make the keys and the configuration of a host's switch, which ``start`` starts.
@@ -82,6 +83,7 @@ class Overlay:
             is_border: others dial its public addresses.
             borders: to which it opens a tunnel. Each gets a record of this switch.
             has_relay: whether a relay runs next to it: the server of a border, or on standby towards the borders.
+            uplinks: devices with a tunnel each to every border; none: one tunnel, over the best route.
             links: more keys of ``links:``.
         """
         label = host.label
@@ -93,7 +95,7 @@ class Overlay:
         lease = host.lease(host.devices[0])
         own = [Endpoint(address.partition("/")[0], LISTEN) for address in (lease.address, lease.address6) if address]
         endpoints = own if is_border else []
-        record = own_record(made, 1, public_candidates(endpoints))
+        record = own_record(made, max(len(uplinks), 1), public_candidates(endpoints))
         write_all(self.folder / "records", {f"{label}{RECORD_SUFFIX}": public(record.wire)}, force=True)
         for one, other in ((label, border.label) for border in borders):
             self._copy_record(one, other)
@@ -106,6 +108,7 @@ class Overlay:
                 "listen": LISTEN,
                 "public": [each.to_text() for each in endpoints],
                 "peers": str(peers),
+                **({"uplinks": list(uplinks)} if uplinks else {}),
                 **(links or {}),
             },
             "relay": has_relay,
@@ -158,10 +161,13 @@ class Overlay:
 
     def tunnels(self, host: Host) -> dict[str, dict[str, object]]:
         """Return the status of the tunnels of a host's switch, by the label of the peer's host."""
-        answer = ask_node(find_control_socket(self.switch_folder(host.label)), Command.STATUS, _PATIENCE_S).result
-        rows = answer["links"]
+        rows = self.status(host)["links"]
         assert isinstance(rows, list)
         return {self._labels[str(row["peer"])]: row for row in rows}
+
+    def status(self, host: Host) -> Mapping[str, object]:
+        """Return the status of a host's switch."""
+        return ask_node(find_control_socket(self.switch_folder(host.label)), Command.STATUS, _PATIENCE_S).result
 
     def switch_folder(self, label: str) -> Path:
         """Return the directory of a switch's keys."""

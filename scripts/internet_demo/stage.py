@@ -132,6 +132,10 @@ class Stage:
         """Let a machine join by a token."""
         self._command(host, "join", token, f"--label={host.label}", *options)
 
+    def remove(self, label: str) -> None:
+        """Remove a machine from the domain."""
+        self._run(self.cloud_b, "domain", "remove", _DOMAIN, label, f"--directory={self._directory(self.cloud_b)}")
+
     def start(self, *hosts: Host) -> None:
         """Start the programs of machines, as the last step of their commands does; the kernel ends them with us."""
         for host in hosts:

@@ -17,10 +17,11 @@ from pathlib import Path
 import pytest
 from cryptography.hazmat.primitives.asymmetric import ec
 
+from fog.enrolment.bootstrap import joining_boot
 from fog.enrolment.listener import CONNECTION_S, CONNECTIONS_MAX, Listener, bind_tcp
 from fog.enrolment.responder import OPENED_MAX, Responder
 from fog.enrolment.tickets import Report, Tickets
-from fog.host.bundle import TICKET_FILE, install, pack
+from fog.host.bundle import JOIN_FILE, TICKET_FILE, install, pack
 from fog.host.enrolment import enrol
 from fog.machine import MachineBundle, MachineSpec
 from fog.providers.aws.provider import AwsProvider
@@ -45,6 +46,7 @@ from gdp.trust.enrolment import (
     open_request,
     seal_answer,
 )
+from gdp.trust.join_token import JOIN_SECRET_BYTES, JoinRole, JoinToken
 from tests.fog.enrolment.desk import CLUSTER, Desk, Machine, made_desk
 from tests.fog.providers.test_aws import Cloud, aws, cloud, spec
 from tests.fog.supervisor.test_supervisor import PLAN, Memory, journal, site, supervisor, work
@@ -86,6 +88,18 @@ def launchers_secrets(desk: Desk) -> list[bytes]:
     return [form for each in found for form in (each, each.hex().encode(), base64.b64encode(each))]
 
 
+def rented() -> MachineBundle:
+    """Return the bundle of a rented machine."""
+    token = JoinToken(
+        root=bytes(32),
+        secret=secrets.token_bytes(JOIN_SECRET_BYTES),
+        role=JoinRole.ROBOT,
+        expires_unix_s=int(time.time()) + 900,
+        servers=("198.51.100.7:51820",),
+    )
+    return joining_boot(CLUSTER, "m7", lambda node: ("run", node.package), token)
+
+
 @pytest.mark.parametrize("provider", ["aws", "skypilot", "local"])
 def test_a52_no_provider_tells_a_machine_a_private_key(
     desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, provider: str
@@ -103,7 +117,7 @@ def test_a52_no_provider_tells_a_machine_a_private_key(
 
     monkeypatch.setattr(SigningKey, "generate", staticmethod(counted))
     monkeypatch.setattr(KemPrivateKey, "generate", staticmethod(counted_kem))
-    boot = desk.boot(shares_host=provider == "local")
+    boot = desk.boot() if provider == "local" else rented()
     if provider == "local":
         install(tmp_path / "home", boot)
         reported = b"\n".join(path.read_bytes() for path in (tmp_path / "home").rglob("*") if path.is_file())
@@ -120,9 +134,9 @@ def test_a52_no_provider_tells_a_machine_a_private_key(
 
 
 def test_a52_ec2_receives_no_private_key(desk: Desk, cloud: Cloud, aws: AwsProvider) -> None:
-    reported = cloud.user_data(aws.create(spec("enrolled"), desk.boot(shares_host=False)))
+    reported = cloud.user_data(aws.create(spec("enrolled"), rented()))
     paths = [each["path"] for each in reported["write_files"]]
-    assert f"/var/lib/fog/{TICKET_FILE}" in paths
+    assert f"/var/lib/fog/{JOIN_FILE}" in paths
     assert not [path for path in paths if path.endswith(".key")]
     contents = [
         base64.b64decode(each["content"]) if "encoding" in each else each["content"].encode()

@@ -7,19 +7,24 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand
 
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.keys import SoftwareKey
 from gdp.crypto.statements import parse
 from gdp.crypto.x509_profile import to_pem
+from gdp.nodes.relay_tls import tls_context
 from gdp.relay.connection import ConnectionState, RelayConnection
+from gdp.relay.framing import ControlMessage, ControlType
 from gdp.relay.tls_channel import ALPN
 from gdp.sansio import Timestamps
 from gdp.trust.domain import Policy
 from gdp.trust.revocation import Revocation
 from gdp.trust.revocations import OPERATOR
-from tests.gdp.relay.ends import DAY_S, NOW, Ends, domain, ends, exchange, member
+from tests.gdp.relay.ends import DAY_S, NOW, Ends, at, domain, ends, exchange, member
 
 OPEN, CLOSED = ConnectionState.OPEN, ConnectionState.CLOSED
 
@@ -212,3 +217,58 @@ def test_a_refusal_shows_no_control_characters_of_the_other_end() -> None:
     server.refuse("go \x1b[2J away")
     exchange(client, server)
     assert client.reason == "go ?[2J away"
+
+
+class KeyUpdater:
+    """A client that writes TLS records of its own: requests to change keys (RFC 8446, section 4.6.3)."""
+
+    def __init__(self, both: Ends, folder: Path) -> None:
+        context = tls_context(both.member, both.member_policy, is_server=False)
+        context.keylog_filename = str(folder / "keys")
+        self._incoming, self._outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
+        self._tls = context.wrap_bio(self._incoming, self._outgoing)
+        self.server = both.server()
+        while not self._is_established():
+            self.server.receive_bytes(self._outgoing.read(), at(0.0))
+            self._incoming.write(self.server.data_to_send(0.0))
+        self.server.receive_bytes(self._outgoing.read(), at(0.0))
+        lines = (line.split() for line in (folder / "keys").read_text().splitlines())
+        (secret,) = (words[2] for words in lines if words[0] == "CLIENT_TRAFFIC_SECRET_0")
+        self._secret, self._sequence = bytes.fromhex(secret), 0
+        self.server.receive_bytes(self._record(ControlMessage.with_mtu(ControlType.OPEN, 1_350).to_wire(), 23), at(0.0))
+
+    def _is_established(self) -> bool:
+        try:
+            self._tls.do_handshake()
+        except ssl.SSLWantReadError:
+            return False
+        return True
+
+    def update(self) -> bytes:
+        """Return a record that requests new keys of the other end, and use new ones."""
+        record = self._record(bytes([24, 0, 0, 1, 1]), 22)  # key_update, update_requested; a handshake message
+        self._secret, self._sequence = self._expand(b"traffic upd", 48), 0
+        return record
+
+    def _record(self, content: bytes, kind: int) -> bytes:
+        head = bytes([23, 3, 3]) + (len(content) + 17).to_bytes(2, "big")
+        key, iv = self._expand(b"key", 32), self._expand(b"iv", 12)
+        nonce = (int.from_bytes(iv, "big") ^ self._sequence).to_bytes(12, "big")
+        self._sequence += 1
+        return head + AESGCM(key).encrypt(nonce, content + bytes([kind]), head)
+
+    def _expand(self, label: bytes, size: int) -> bytes:
+        info = size.to_bytes(2, "big") + bytes([6 + len(label)]) + b"tls13 " + label + b"\0"
+        return HKDFExpand(hashes.SHA384(), size, info).derive(self._secret)
+
+
+def test_a94_a_client_that_requests_new_keys_and_does_not_read_costs_little_memory(tmp_path: Path) -> None:
+    client = KeyUpdater(ends(), tmp_path)
+    assert client.server.state is OPEN
+    for _ in range(1_000):
+        client.server.receive_bytes(b"".join(client.update() for _ in range(10)), at(0.0))
+        if client.server.state is CLOSED:
+            break
+    assert client.server.state is CLOSED
+    assert client.server.reason == "the other end requests more than it reads"
+    assert len(client.server.data_to_send(0.0)) < 1 << 18

@@ -25,6 +25,8 @@ from fog.host.bundle import pack, read_programs
 from fog.host.managed_process import NODE_USER, ManagedProcess
 from fog.machine import MachineBundle, Program
 from fog.providers.cloud_init import HOME, Setup, cloud_config, placed
+from gdp.enrolment.programs import MachineProgram
+from gdp.enrolment.units import unit_texts
 from tests.fog.enrolment.desk import made_desk
 from tests.pages import ROOT
 
@@ -103,9 +105,26 @@ def test_a53_the_unit_has_every_fence(unit: Path) -> None:
     assert "User=gdp" in lines or unit.stem == "fog-machine"
 
 
+@needs_systemd
+@pytest.mark.parametrize(("name", "capability"), [("enrolment", "CAP_NET_BIND_SERVICE"), ("agent", "")])
+def test_a95_programs_of_a_joined_machine_that_need_no_device_are_fenced(
+    tmp_path: Path, name: str, capability: str
+) -> None:
+    """The enrolment server has the domain's root key, and any host may connect to it."""
+    capabilities = (capability,) if capability else ()
+    program = MachineProgram(name=name, title=name, argv=("/bin/true",), capabilities=capabilities)
+    ((title, text),) = unit_texts(tmp_path / "my lab", [program]).items()
+    (tmp_path / title).write_text(text)
+    words = ["systemd-analyze", "security", "--offline=true", "--no-pager", "--threshold=30"]
+    done = subprocess.run([*words, str(tmp_path / title)], capture_output=True, text=True, check=False)
+    if "unrecognized option" in done.stderr or "nknown" in done.stderr:
+        pytest.skip(done.stderr.strip())
+    assert done.returncode == 0, f"{done.stdout}{done.stderr}".splitlines()[-1]
+
+
 def test_a53_nodes_of_a_machine_are_the_users_code(tmp_path: Path) -> None:
     with made_desk(tmp_path) as desk:
-        boot = desk.boot("m1", shares_host=False)
+        boot = desk.boot("m1")
     programs = read_programs(pack(boot)["boot.json"])
     assert {each.name: each.is_users for each in programs if each.name in ("switch", "proxy")} == {
         "switch": False,

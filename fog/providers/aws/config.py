@@ -32,7 +32,7 @@ class AwsConfig(Section):
 
     Without ``regions``, all enabled regions of the account are used. ``images``, ``subnets`` and ``security_groups``
     map regions to values. Defaults are the newest image of that owner and name, the default VPC, and a new security
-    group. The group admits only what ``ssh`` and ``setup.vxlan`` need.
+    group. The group admits only what ``ssh`` needs: machines dial out to the border.
     """
 
     regions: tuple[str, ...] = ()

@@ -15,7 +15,6 @@ from fog.providers.aws.clients import filters
 from fog.providers.aws.config import AwsConfig
 from fog.providers.aws.errors import is_code
 from fog.providers.aws.run_request import Ground
-from fog.providers.cloud_init import VXLAN_PORT
 from gdp.errors import LocalError, StoreError
 
 if TYPE_CHECKING:
@@ -131,10 +130,6 @@ def _permissions(config: AwsConfig) -> list[IpPermissionTypeDef]:
     allowed: list[IpPermissionTypeDef] = []
     if config.ssh:
         allowed.append(_permission("tcp", 22, str(config.ssh.sources)))
-    if vxlan := config.setup.vxlan:
-        if vxlan.remote.version != 4:
-            raise LocalError("aws: vxlan.remote is an IPv4 address; for IPv6 configure `aws.security_groups`")
-        allowed.append(_permission("udp", VXLAN_PORT, f"{vxlan.remote}/32"))
     return allowed
 
 

@@ -39,7 +39,7 @@ class Reg(IntEnum):
 _SIZES: Final = {1: 0x10, 2: 0x08, 4: 0x00, 8: 0x18}
 _LOAD, _STORE_VALUE, _STORE, _IN_MEMORY = 0x01, 0x02, 0x03, 0x60
 _ALU64, _JUMP, _FROM_REGISTER = 0x07, 0x05, 0x08
-_ADD, _SUBTRACT, _SHIFT_LEFT, _MOVE = 0x00, 0x10, 0x60, 0xB0
+_ADD, _SUBTRACT, _AND, _SHIFT_LEFT, _EXCLUSIVE_OR, _MOVE = 0x00, 0x10, 0x50, 0x60, 0xA0, 0xB0
 _CONDITIONS: Final = {"==": 0x10, ">": 0x20, ">=": 0x30, "&": 0x40, "!=": 0x50, "<": 0xA0, "<=": 0xB0}
 _CALL, _EXIT, _WIDE, _BIG_ENDIAN = 0x85, 0x95, 0x18, 0xDC
 _MAP: Final = 1  # BPF_PSEUDO_MAP_FD
@@ -79,6 +79,14 @@ class Assembler:
     def subtract(self, to: Reg, value: Reg | int) -> None:
         """Subtract a value from ``to``, modulo 2**64."""
         self._compute(_SUBTRACT, to, value)
+
+    def mask(self, to: Reg, bits: int) -> None:
+        """Clear all bits of ``to`` but these."""
+        self._compute(_AND, to, bits)
+
+    def invert(self, to: Reg, bits: int) -> None:
+        """Invert these bits of ``to``."""
+        self._compute(_EXCLUSIVE_OR, to, bits)
 
     def shift_left(self, to: Reg, bits: int) -> None:
         """Shift ``to`` left by ``bits``."""

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from gdp.errors import DropReason
-from gdp.frame.codec import ETHER_BYTES, OVERHEAD_BYTES, layout
+from gdp.frame.codec import ETHER_BYTES, HOPS_MASK, OVERHEAD_BYTES, SECOND_PATH, layout
 from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, VERSION, Flag
 from gdp.names import NAME_BYTES
 from gdp.ports.kernel.abi import (
@@ -113,6 +113,7 @@ class ForwarderProgram(Assembler):
         self._one_hop()
         self._group()
         self._ends()
+        self._second_path()
         return self.assemble()
 
     def _only_ours(self) -> None:
@@ -155,13 +156,14 @@ class ForwarderProgram(Assembler):
         self.jump_if(Reg.R2, "!=", VERSION, "up")
         self.load(Reg.R2, _FRAME, self._at["kind"], 1)
         self.jump_if(Reg.R2, ">=", CONTROL_FROM, "up")
-        self.load(Reg.R2, _FRAME, self._at["hops_left"], 1)
-        self.jump_if(Reg.R2, "<=", 1, "up")
         self.load(Reg.R2, _FRAME, self._at["length"], 2)
         self.from_big_endian(Reg.R2, 16)
         self.load(Reg.R3, _SKB, _LEN, 4)
         self.subtract(Reg.R3, OVERHEAD_BYTES)
         self.jump_if(Reg.R2, ">", Reg.R3, "up")
+        self.load(Reg.R2, _FRAME, self._at["hops_left"], 1)
+        self.jump_if(Reg.R2, "&", SECOND_PATH, "second path")
+        self.jump_if(Reg.R2, "<=", 1, "up")
 
     def _look_up(self) -> None:
         """Look up destination and source, contiguous in the frame as in a key; then the destination alone."""
@@ -174,16 +176,36 @@ class ForwarderProgram(Assembler):
             self.load(Reg.R2, _FRAME, self._at["destination"] + at, 8)
             self.store(Reg.R10, _KEY + at, Reg.R2, 8)
             self.store(Reg.R10, _KEY + NAME_BYTES + at, 0, 8)
-        self.load_map(Reg.R1, self._maps.entries)
-        self.move(Reg.R2, Reg.R10)
-        self.add(Reg.R2, _KEY)
-        self.call(_LOOKUP)
+        self._find_entry()
         self.jump_if(Reg.R0, "==", 0, "up")
         self.label("known")
         self.move(_ENTRY, Reg.R0)
         self._find(self._maps.totals, 0)
         self.jump_if(Reg.R0, "==", 0, "up")
         self.move(_TOTALS, Reg.R0)
+
+    def _second_path(self) -> None:
+        """Look up a second copy by the destination with its last bit inverted. It costs other frames one jump.
+
+        A miss goes up: the map may have left an entry out.
+        """
+        self.label("second path")
+        self.mask(Reg.R2, HOPS_MASK)
+        self.jump_if(Reg.R2, "<=", 1, "up")
+        for at in range(0, 2 * NAME_BYTES, 8):
+            self.load(Reg.R2, _FRAME, self._at["destination"] + at, 8)
+            self.store(Reg.R10, _KEY + at, Reg.R2, 8)
+        last = NAME_BYTES - 1
+        self.load(Reg.R2, _FRAME, self._at["destination"] + last, 1)
+        self.invert(Reg.R2, 1)
+        self.store(Reg.R10, _KEY + last, Reg.R2, 1)
+        self._find_entry()
+        self.jump_if(Reg.R0, "!=", 0, "known")
+        for at in range(0, NAME_BYTES, 8):
+            self.store(Reg.R10, _KEY + NAME_BYTES + at, 0, 8)
+        self._find_entry()
+        self.jump_if(Reg.R0, "!=", 0, "known")
+        self.jump("up")
 
     def _from_its_side(self) -> None:
         """Check the reverse path: frames of a publisher must come from its direction."""
@@ -339,6 +361,13 @@ class ForwarderProgram(Assembler):
         self.load_map(Reg.R1, descriptor)
         self.move(Reg.R2, Reg.R10)
         self.add(Reg.R2, _INDEX)
+        self.call(_LOOKUP)
+
+    def _find_entry(self) -> None:
+        """Set R0 to the entry of the key on the stack, or 0."""
+        self.load_map(Reg.R1, self._maps.entries)
+        self.move(Reg.R2, Reg.R10)
+        self.add(Reg.R2, _KEY)
         self.call(_LOOKUP)
 
     def _frame_bytes(self, to: Reg) -> None:

@@ -36,6 +36,7 @@ __all__ = [
     "remove_route",
     "set_alias",
     "set_mtu",
+    "set_queue_length",
     "without_addresses",
 ]
 
@@ -115,6 +116,11 @@ def set_alias(ifindex: int, alias: str) -> None:
 def set_mtu(ifindex: int, mtu: int) -> None:
     """Set the MTU of a device, in bytes. Raises ``RefusedError``."""
     _set(ifindex, attribute(LinkAttribute.MTU, _NUMBER.pack(mtu)))
+
+
+def set_queue_length(ifindex: int, packets: int) -> None:
+    """Set how many packets a device queues before it drops. Raises ``RefusedError``."""
+    _set(ifindex, attribute(LinkAttribute.TXQLEN, _NUMBER.pack(packets)))
 
 
 def make_up(ifindex: int) -> None:

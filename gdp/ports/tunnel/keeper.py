@@ -45,8 +45,10 @@ from gdp.ports.tunnel.devices import (
     remove_own_device,
     set_alias,
     set_mtu,
+    set_queue_length,
     without_addresses,
 )
+from gdp.ports.tunnel.socket_buffers import SocketBuffers
 from gdp.ports.tunnel.uapi import SOCKET_FOLDER, UserspaceControl, socket_path
 from gdp.ports.tunnel.uplink_routes import UplinkRoutes, mark_of
 
@@ -63,6 +65,8 @@ _NO_NEW_PRIVS: Final = 38
 _START_S: Final = 5.0
 _END_S: Final = 0.3
 _LOOK_S: Final = 0.005
+_SOCKETS_S: Final = 1.0  # between looks for sockets that wireguard-go opened; no event says so
+_QUEUE_PACKETS: Final = 1_000  # as Ethernet devices; the 500 of TUN devices overflow in a burst of one window
 _RESTART_MIN_S, _RESTART_MAX_S = 0.1, 5.0
 _STABLE_S: Final = 10.0  # a process that lived this long is restarted at once
 _SAID_MAX_BYTES: Final = 4096
@@ -76,6 +80,7 @@ class _Child:
     process: subprocess.Popen[bytes]
     pidfd: int
     begun_s: float
+    buffers: SocketBuffers
     said: bytes = b""
 
     has_output: bool = True
@@ -201,6 +206,7 @@ class _Keeper:
         self._kernel_ifindex = 0
         self._routes: UplinkRoutes | None = None
         self._early: list[str] = []  # warnings before the device was ready
+        self._has_small_buffers = False
 
     def follow(self, uplink: str) -> None:
         """Let the device's packets leave by an uplink, until it is closed."""
@@ -318,6 +324,7 @@ class _Keeper:
             raise LocalError(f"{_TUN}: not permitted; {AS_ROOT}") from error
         device = self._found()
         set_alias(device.ifindex, self._alias)
+        set_queue_length(device.ifindex, _QUEUE_PACKETS)
         self._prepare(device)
 
     def _prepare(self, device: Device) -> None:
@@ -362,7 +369,8 @@ class _Keeper:
         while True:
             child = self._child
             if child is not None:
-                if not self.owner.wait(child.pidfd, *child.output):
+                self._enlarge_buffers(child)
+                if not self.owner.wait(child.pidfd, *child.output, timeout_s=_SOCKETS_S):
                     return
                 child.read()
                 if child.process.poll() is None:
@@ -383,6 +391,15 @@ class _Keeper:
                 self.owner.report(event="died", text=str(error))
             else:
                 self.owner.report(event="restarted", is_same=is_same)
+
+    def _enlarge_buffers(self, child: _Child) -> None:
+        """Enlarge the buffers of sockets that the program opened; the first refusal is a warning."""
+        try:
+            child.buffers.enlarge()
+        except LocalError as error:
+            if not self._has_small_buffers:
+                self._has_small_buffers = True
+                self.owner.report(event="warning", text=str(error))
 
     def _is_present(self) -> bool:
         """Return whether our TUN device still exists; another program may have removed it."""
@@ -417,7 +434,8 @@ class _Keeper:
         )
         assert process.stdout is not None
         os.set_blocking(process.stdout.fileno(), False)
-        return _Child(process, os.pidfd_open(process.pid), time.monotonic())
+        pidfd = os.pidfd_open(process.pid)
+        return _Child(process, pidfd, time.monotonic(), SocketBuffers(process.pid, pidfd))
 
 
 def _is_listening(ifname: str) -> bool:

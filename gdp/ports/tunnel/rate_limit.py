@@ -17,7 +17,7 @@ from typing import Final
 
 from gdp.errors import LocalError
 from gdp.ports.netlink import ROOT, NetlinkSocket, RefusedError, attribute
-from gdp.ports.tunnel.devices import find_device, refusal_text
+from gdp.ports.tunnel.devices import find_device, refusal_text, set_queue_length
 
 __all__ = ["limit_rate"]
 
@@ -26,14 +26,11 @@ _FRAME_BYTES: Final = 1_500
 _BURST_S: Final = 0.02
 _BURST_MIN_BYTES: Final = 16 << 10
 _QUEUE_MIN_FRAMES: Final = 16
-_RTM_SETLINK: Final = 19
 _RTM_NEWQDISC: Final = 36
 _CREATE_OR_REPLACE: Final = 0x400 | 0x100  # NLM_F_CREATE, NLM_F_REPLACE
-_INFO: Final = struct.Struct("=BxHiII")
 _TRAFFIC: Final = struct.Struct("=BxxxiIII")
 _NUMBER: Final = struct.Struct("=I")
 _RATE: Final = struct.Struct("=BBHhHI")
-_QUEUE_LENGTH: Final = 13  # IFLA_TXQLEN
 _KIND, _OPTIONS = 1, 2  # TCA_KIND, TCA_OPTIONS
 _PARAMETERS, _BURST = 1, 6  # TCA_TBF_PARMS, TCA_TBF_BURST
 _ETHERNET: Final = 1  # TC_LINKLAYER_ETHERNET
@@ -59,10 +56,7 @@ def limit_rate(ifname: str, bytes_per_s: int) -> None:
     options = attribute(_PARAMETERS, parameters) + attribute(_BURST, _NUMBER.pack(burst))
     with closing(NetlinkSocket()) as netlink:
         try:
-            length = _INFO.pack(socket.AF_UNSPEC, 0, device.ifindex, 0, 0) + attribute(
-                _QUEUE_LENGTH, _NUMBER.pack(frames)
-            )
-            netlink.change(_RTM_SETLINK, length)
+            set_queue_length(device.ifindex, frames)
             for kind, handle, parent, facts in (
                 (b"tbf\0", _BUCKET, ROOT, attribute(_OPTIONS, options)),
                 (b"pfifo_fast\0", _BANDS, _BUCKET_CLASS, b""),

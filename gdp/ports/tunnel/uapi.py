@@ -28,8 +28,14 @@ __all__ = ["SOCKET_FOLDER", "UserspaceControl", "parse_state", "request_text", "
 SOCKET_FOLDER: Final = Path("/var/run/wireguard")  # wireguard-go allows no other
 _TIMEOUT_S: Final = 1.0  # it replies within milliseconds; the limit keeps a stopped process from blocking a node
 _PAUSE_S: Final = 5.0
+_BIND_TRIES: Final = 10  # a keeper that enlarges the buffers of a socket holds its port open for a moment
+_BIND_PAUSE_S: Final = 0.02
 _REPLY_MAX_BYTES: Final = 4 << 20
 _NANO: Final = 1e-9
+
+
+class _PortTakenError(LocalError):
+    """The UDP port is in use."""
 
 
 def socket_path(ifname: str) -> Path:
@@ -49,7 +55,16 @@ class UserspaceControl:
 
     def apply(self, change: Change) -> None:
         """Change the device."""
-        self._ask(request_text(change))
+        request = request_text(change)
+        for left in reversed(range(_BIND_TRIES)):
+            try:
+                self._ask(request)
+            except _PortTakenError:
+                if not left:
+                    raise
+                time.sleep(_BIND_PAUSE_S)  # no event says that a port is free
+            else:
+                return
 
     def state(self) -> DeviceState:
         """Return the device's state."""
@@ -78,7 +93,7 @@ class UserspaceControl:
             raise ControlLostError(f"tunnel {self._ifname}: wireguard-go ended within a reply")
         number = abs(int(lines[-1][1]))
         if number == errno.EADDRINUSE:
-            raise LocalError(_in_use(self._ifname, request))
+            raise _PortTakenError(_in_use(self._ifname, request))
         if number:
             raise LocalError(f"tunnel {self._ifname}: wireguard-go refused a change: {os.strerror(number)}")
         return lines[:-1]

@@ -1,8 +1,8 @@
 """VXLAN devices: one point-to-point Ethernet link inside a tunnel, used as an ordinary port of a switch.
 
 I/O. Source: RFC 7348; ``IFLA_VXLAN_`` in ``include/uapi/linux/if_link.h``. A device learns no addresses: its only
-destination is the remote inner address. Its socket is bound to the tunnel's device, so that nothing outside the tunnel
-reaches it. WireGuard authenticates each packet, so the UDP checksum is left out (RFC 6935).
+destination is the remote inner address. Its socket receives from all devices; ``OutsideFilter`` drops what does not
+come from a tunnel. WireGuard authenticates each packet, so the UDP checksum is left out (RFC 6935).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from gdp.ports.tunnel.devices import (
 
 __all__ = ["VXLAN_PORT", "make_vxlan", "remove_link", "set_link_mtu"]
 
-VXLAN_PORT: Final = 4789  # RFC 7348, section 5
+VXLAN_PORT: Final = 24_789  # not 4789, where other programs on this host may receive from outside
 _ID, _LINK, _LEARNING, _PORT = 1, 3, 7, 15
 _REMOTE6, _LOCAL6 = 16, 17
 _ZERO_CSUM6_TX, _ZERO_CSUM6_RX = 19, 20

@@ -96,6 +96,7 @@ class WireGuardDevice:
         self.fwmark = fwmark
         self._peers: dict[bytes, _Peer] = {}
         self._states: dict[bytes, PeerState] = {}
+        self._has_moved = False  # not polled yet
         self._has_waiting = False  # changes that wireguard-go did not get
         self._heard: dict[
             bytes, tuple[int, float]
@@ -204,6 +205,15 @@ class WireGuardDevice:
             if key not in self._heard or self._heard[key][0] != state.received_bytes:
                 self._heard[key] = state.received_bytes, now_s
         return dict(self._states)
+
+    def known_peers(self) -> dict[bytes, PeerState]:
+        """Return the state of every peer at the last ``peers`` or ``poll``; costs nothing."""
+        return dict(self._states)
+
+    def poll_move(self) -> bool:
+        """Return, once, whether the address of this end, or the uplink, has changed."""
+        has_moved, self._has_moved = self._has_moved, False
+        return has_moved
 
     def path_mtu(self, public_key: bytes) -> int | None:
         """Return the MTU of the path to a peer's endpoint in bytes, as of the last ``poll``; None: not known now.
@@ -346,6 +356,7 @@ class WireGuardDevice:
         changes = self._routes.poll(endpoints).values()
         if any(now is not None and (before is None or before[:3] != now[:3]) for before, now in changes):
             log.info("address or uplink changed ifname=%s", self.ifname)
+            self._has_moved = True
             kicks = [kick for key, peer in self._peers.items() for kick in _kicked(key, peer.keepalive_s)]
             self._apply(Change(listen_port=self._port, peers=tuple(kicks)))
 

@@ -68,7 +68,7 @@ class Desk:
             until_unix_s=now_s + DAY_S,
         )
 
-    def boot(self, name: str = "m7", ticket: Ticket | None = None, *, shares_host: bool = True) -> MachineBundle:
+    def boot(self, name: str = "m7", ticket: Ticket | None = None) -> MachineBundle:
         return machine_boot(
             self.authority,
             CLUSTER,
@@ -76,7 +76,6 @@ class Desk:
             lambda node: ("run", node.package),
             ticket or self.ticket(name),
             iface="eth0",
-            shares_host=shares_host,
         )
 
     @contextmanager

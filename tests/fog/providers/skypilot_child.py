@@ -15,21 +15,34 @@ from dataclasses import asdict, replace
 import sky
 from sky import check, core, execution
 
+from fog.cluster import CloudNode, ClusterPlan, ExportedInterface, MachineRequest
+from fog.enrolment.bootstrap import joining_boot
 from fog.hardware import Hardware
-from fog.machine import MachineBundle, MachineSpec, Program
+from fog.machine import MachineSpec
 from fog.offer import Offer
 from fog.providers.skypilot.config import SkyPilotConfig
 from fog.providers.skypilot.provider import SkyPilotProvider
 from gdp.errors import GdpError
+from gdp.trust.join_token import JoinRole, JoinToken
+
+ECHO = ExportedInterface("service", "/echo", "std_srvs/srv/SetBool")
+PLAN = ClusterPlan("a-demo", (CloudNode("p", "e"),), (MachineRequest(Hardware(cpus=1)),), (ECHO,))
+TOKEN = JoinToken(
+    root=bytes(32), secret=bytes(16), role=JoinRole.ROBOT, expires_unix_s=2_000_000_000, servers=("192.0.2.1:51820",)
+)
 
 
 class Unserved:
-    """``sky`` in which each request is done at once."""
+    """``sky`` in which each request is done at once; ``tasks``: as YAML, as they came."""
+
+    def __init__(self) -> None:
+        self.tasks: list[dict[str, object]] = []
 
     def __getattr__(self, name: str) -> object:
         return getattr(sky, name)
 
-    def launch(self, task: object, cluster_name: str, dryrun: bool = False) -> object:
+    def launch(self, task: sky.Task, cluster_name: str, dryrun: bool = False) -> object:
+        self.tasks.append(task.to_yaml_config())
         return execution.launch(task, cluster_name=cluster_name, dryrun=dryrun)
 
     def status(self, refresh: object) -> object:
@@ -54,15 +67,16 @@ def outcome(step: Callable[[], object]) -> str:
 
 def main() -> None:
     enabled = check.check_capability(sky.clouds.CloudCapability.COMPUTE, quiet=True, clouds=["aws"])
-    provider = SkyPilotProvider(SkyPilotConfig(), Unserved())  # type: ignore[arg-type]
+    unserved = Unserved()
+    provider = SkyPilotProvider(SkyPilotConfig(), unserved)  # type: ignore[arg-type]
     offers = provider.offers(Hardware.from_text("cpu:16"), spot=True)
     spec = MachineSpec("a-demo", "m1", offers[0])
-    boot = MachineBundle({"own.key": b"\x00"}, (Program("switch", ("gdp-switch",)),))
+    boot = joining_boot(PLAN, "m1", lambda node: ("run", node.package), TOKEN)
 
     def dry_run(offer: Offer) -> str:
         return outcome(lambda: provider.dry_run(replace(spec, offer=offer), boot))
 
-    reported = {
+    reported: dict[str, object] = {
         "enabled": list(enabled.values()),
         "offers": [asdict(each) for each in offers],
         "gpu": [each.type_name for each in provider.offers(Hardware.from_text("T4"), spot=False)],
@@ -73,6 +87,9 @@ def main() -> None:
         "machines": outcome(lambda: provider.describe("a-demo")),
         "terminate": outcome(lambda: provider.terminate(["fog-a-demo-m1"])),
     }
+    read = sky.Task.from_yaml_config(unserved.tasks[0])  # SkyPilot's own parser, with its schema
+    types = [each.instance_type for each in read.resources]
+    reported["task"] = {"setup": read.setup, "run": read.run, "types": types}
     sys.__stdout__.write(f"\n{json.dumps(reported)}\n")  # type: ignore[union-attr]
 
 

@@ -16,7 +16,7 @@ from fog.machine import MachineBundle, MachineSpec, MachineState, Program
 from fog.offer import Offer
 from fog.providers.aws.config import AwsConfig, Ssh
 from fog.providers.aws.provider import AwsProvider
-from fog.providers.cloud_init import Setup, Vxlan
+from fog.providers.cloud_init import Setup
 from gdp.errors import LocalError, StoreError
 
 if TYPE_CHECKING:
@@ -170,17 +170,21 @@ def test_a_spot_machine_is_a_spot_machine_and_locked_down(cloud: Cloud, aws: Aws
     assert group["SecurityGroups"][0]["IpPermissions"] == []
 
 
+def login(sources: str, key_pair: str = "operator") -> Ssh:
+    """Return settings of logins from some addresses; a security group of their own belongs to them."""
+    return Ssh.model_validate({"key_pair": key_pair, "sources": sources, "key_file": "/keys/operator"})
+
+
 def test_only_what_is_asked_for_is_let_in(cloud: Cloud) -> None:
     cloud.client().create_key_pair(KeyName="operator")
-    ssh = Ssh.model_validate({"key_pair": "operator", "sources": "203.0.113.0/24", "key_file": "/keys/operator"})
-    open_ = provider(ssh=ssh, setup=Setup(vxlan=Vxlan.model_validate({"remote": "198.51.100.7"})))
+    open_ = provider(ssh=login("203.0.113.0/24"))
     made = open_.create(spec("open"), BOOT)
     assert open_.create(spec("open", "m2"), BOOT) != made
     groups = cloud.instance(made)["SecurityGroups"]
     assert len(groups) == 1
     (group,) = cloud.client().describe_security_groups(GroupIds=[groups[0]["GroupId"]])["SecurityGroups"]
     let_in = {(each["FromPort"], each["IpRanges"][0]["CidrIp"]) for each in group["IpPermissions"]}
-    assert let_in == {(22, "203.0.113.0/24"), (4789, "198.51.100.7/32")}
+    assert let_in == {(22, "203.0.113.0/24")}
     address = open_.describe("open")[0].address
     assert open_.shell(made)[-3:] == ["-i", "/keys/operator", f"admin@{address}"]
     open_.close()
@@ -317,7 +321,9 @@ def groups(cloud: Cloud) -> set[str]:
 
 
 def test_a_cleared_account_has_no_security_group_of_ours(cloud: Cloud) -> None:
-    own = provider(setup=Setup(vxlan=Vxlan.model_validate({"remote": "203.0.113.9"})))
+    for region in (EAST, WEST):
+        cloud.client(region).create_key_pair(KeyName="cleared")
+    own = provider(ssh=login("203.0.113.9/32", "cleared"))
     own.clear_account()  # those of the other tests
     before = groups(cloud)
     made = [own.create(spec("cleared", "m1"), BOOT), own.create(spec("cleared", "m2", WEST), BOOT)]
@@ -337,7 +343,8 @@ def test_a_group_of_machines_that_run_stays(cloud: Cloud, aws: AwsProvider) -> N
 
 
 def test_a_group_is_kept_until_its_machines_have_ended(cloud: Cloud, monkeypatch: pytest.MonkeyPatch) -> None:
-    own = provider(setup=Setup(vxlan=Vxlan.model_validate({"remote": "203.0.113.10"})))
+    cloud.client().create_key_pair(KeyName="ending")
+    own = provider(ssh=login("203.0.113.10/32", "ending"))
     own.terminate([own.create(spec("ending"), BOOT)])
     cloud.refuse(monkeypatch, "DependencyViolation", "delete_security_group")
     monkeypatch.setattr("fog.providers.aws.provider._END_S", 0.0)

@@ -14,14 +14,12 @@ from pathlib import Path
 import jsonschema
 import pytest
 import yaml
-from pydantic import ValidationError
 
 from fog.host.bundle import pack
 from fog.machine import MachineBundle, Program
 from fog.providers.cloud_init import (
     USER_DATA_MAX_BYTES,
     Setup,
-    Vxlan,
     cloud_config,
     placed,
     shell_script,
@@ -37,13 +35,12 @@ FILES = pack(
     )
 )
 HASH = "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08"
-TUNNEL = Setup(
+FULL = Setup(
     requirements=(
         f"https://example.org/gdp_ros-0.1.0-py3-none-any.whl#sha256={HASH}",
         f"my-nodes==1.0 --hash=sha256:{HASH}",
     ),
     packages=("libfcl-dev",),
-    vxlan=Vxlan.model_validate({"remote": "198.51.100.7", "id": 42}),
 )
 
 
@@ -61,7 +58,7 @@ def read_back(text: str) -> dict[str, tuple[bytes, int]]:
     return found
 
 
-@pytest.mark.parametrize("setup", [Setup(), TUNNEL])
+@pytest.mark.parametrize("setup", [Setup(), FULL])
 def test_the_schema_of_cloud_init_allows_it(setup: Setup) -> None:
     if not SCHEMA.is_file():
         pytest.skip("cloud-init's schema is not here: scripts/setup_cloud_schema.sh fetches it")
@@ -76,22 +73,22 @@ def test_the_schema_of_cloud_init_would_notice() -> None:
 
 
 def test_it_is_a_cloud_config_that_installs_and_starts() -> None:
-    text = cloud_config(FILES, TUNNEL)
+    text = cloud_config(FILES, FULL)
     assert text.startswith("#cloud-config\n")
     config = yaml.safe_load(text)
-    assert set(config) == {"package_update", "packages", "write_files", "runcmd"}
+    assert set(config) == {"apt", "package_update", "packages", "write_files", "runcmd"}
     assert {"python3-venv", "libfcl-dev"} <= set(config["packages"])
-    assert config["runcmd"][-1][4:] == ["fog-tunnel", "fog-machine", "fog-log@switch"]
+    assert config["runcmd"][-1][4:] == ["fog-machine", "fog-log@switch"]
     install = read_back(text)["/usr/local/sbin/fog-install"][0].decode()
     assert "--require-hashes --requirement /etc/fog-requirements.txt" in install
-    assert read_back(text)["/etc/fog-requirements.txt"][0].decode().splitlines() == list(TUNNEL.requirements)
+    assert read_back(text)["/etc/fog-requirements.txt"][0].decode().splitlines() == list(FULL.requirements)
 
 
 def test_user_data_is_small_and_the_same_each_time() -> None:
-    data = user_data(FILES, TUNNEL)
-    assert data == user_data(FILES, TUNNEL)
+    data = user_data(FILES, FULL)
+    assert data == user_data(FILES, FULL)
     assert len(data) < USER_DATA_MAX_BYTES
-    assert gzip.decompress(data).decode() == cloud_config(FILES, TUNNEL)
+    assert gzip.decompress(data).decode() == cloud_config(FILES, FULL)
 
 
 def test_too_much_for_ec2_is_refused_before_it_is_asked() -> None:
@@ -105,14 +102,6 @@ def test_a_file_outside_the_machines_folder_is_refused(path: str) -> None:
         placed({path: b""}, Setup())
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"remote": "a;b"}, {"remote": "1.2.3.4", "id": 0}, {"remote": "::1", "device": "x y"}]
-)
-def test_a_tunnel_that_cannot_be_is_refused(wrong: dict[str, object]) -> None:
-    with pytest.raises(ValidationError):
-        Vxlan.model_validate(wrong)
-
-
 def test_the_script_comes_to_the_same_files(tmp_path: Path) -> None:
     root, asked = tmp_path / "root", tmp_path / "asked"
     root.mkdir()
@@ -123,12 +112,12 @@ def test_the_script_comes_to_the_same_files(tmp_path: Path) -> None:
     sudo.chmod(0o755)
     subprocess.run(
         ["bash", "-s"],
-        input=shell_script(FILES, TUNNEL).encode(),
+        input=shell_script(FILES, FULL).encode(),
         env={"PATH": f"{tmp_path}:{os.environ['PATH']}"},
         timeout=30,
         check=True,
     )
-    for file in placed(FILES, TUNNEL):
+    for file in placed(FILES, FULL):
         there = root / file.path.lstrip("/")
         assert there.read_bytes() == file.content
         assert there.stat().st_mode & 0o777 == file.mode
@@ -136,7 +125,7 @@ def test_the_script_comes_to_the_same_files(tmp_path: Path) -> None:
 
 
 def test_the_installation_is_done_once_and_again_after_a_failure(tmp_path: Path) -> None:
-    installs = next(file for file in placed(FILES, TUNNEL) if file.path.endswith("fog-install")).content.decode()
+    installs = next(file for file in placed(FILES, FULL) if file.path.endswith("fog-install")).content.decode()
     subprocess.run(["sh", "-n"], input=installs.encode(), check=True)
     assert installs.index("complete ] && exit 0") < installs.index("pip install") < installs.index("touch")
 

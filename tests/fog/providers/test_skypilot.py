@@ -16,6 +16,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from pydantic import ValidationError
 
 from fog.hardware import Hardware
 from fog.machine import MachineBundle, MachineSpec, MachineState, Program
@@ -294,6 +295,16 @@ def test_the_real_package_takes_our_tasks_in_a_dry_run(home: Path) -> None:
     assert reported["no such region"].startswith("LocalError")
     assert "nowhere" in reported["no such region"]
     assert (reported["machines"], reported["terminate"]) == ("[]", "None")
+    task = reported["task"]
+    assert task["types"] == ["m6i.4xlarge"]
+    assert "systemctl enable --now --no-block fog-machine" in task["setup"]
+    assert task["run"].startswith("sudo journalctl --follow --unit fog-machine")
+
+
+@pytest.mark.parametrize("place", ["kubernetes", "k8s/kind-skypilot", "Kubernetes/lab", "ssh/pool"])
+def test_places_with_pods_are_refused_before_anything_costs(place: str) -> None:
+    with pytest.raises(ValidationError, match=r"is Kubernetes: its pods have no systemd and no CAP_NET_ADMIN"):
+        SkyPilotConfig(places=(place,))
 
 
 def test_names_too_long_for_a_label_are_refused() -> None:

@@ -120,7 +120,7 @@ def supervisor(site: Site, journal: Journal, provider: Memory) -> Supervisor:
     return Supervisor(
         site=site,
         journal=journal,
-        tickets=Tickets(site.enrolment_folder),
+        enrolment=Tickets(site.enrolment_folder),
         provider=provider,
         command=lambda _: ("run",),
         heard=lambda: None,

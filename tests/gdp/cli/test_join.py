@@ -47,7 +47,18 @@ def test_create_prints_one_line_that_a_person_copies(tmp_path: Path, capsys: pyt
     assert _run(*words) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 1
-    assert JoinToken.from_text(lines[0].removeprefix("gdp join ")).servers == ("203.0.113.7:51820",)
+    assert JoinToken.from_text(lines[0].removeprefix("gdp join ")).servers == (
+        "203.0.113.7:51820",
+        "203.0.113.7:443",
+    )
+
+
+def test_create_prints_a_token_for_each_machine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("domain", "create", "lab", "--public", "203.0.113.7", "--directory", str(tmp_path / "lab"), "--no-start")
+    assert _run(*words, "--tokens", "2") == 0
+    lines = capsys.readouterr().out.splitlines()
+    secrets = {JoinToken.from_text(each.removeprefix("gdp join ")).secret for each in lines}
+    assert len(lines) == len(secrets) == 2
 
 
 def test_what_create_writes_is_a_good_configuration_of_each_node(tmp_path: Path) -> None:

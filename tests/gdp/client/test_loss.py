@@ -171,7 +171,7 @@ def test_a_reader_that_said_goodbye_has_lost_nothing_when_it_comes_again() -> No
     pipe = Pipe(publisher_of())
     (first,) = live(pipe, b"a")
     stream(pipe, 1.0)
-    note = first.writer_proxy.close()
+    (note,) = first.writer_proxy.close()
     pipe.publisher.receive_acknack(decode(note), note, pipe.now_s)
     del pipe.ends[first.reader.name]
     stream(pipe, 1.0)

@@ -274,7 +274,7 @@ def test_a_goodbye_gives_the_window_back_at_once() -> None:
     pipe = Pipe(publisher_of())
     end = pipe.join(b"a")
     pipe.run(1.0)
-    note = end.writer_proxy.close()
+    (note,) = end.writer_proxy.close()
     pipe.publisher.receive_acknack(decode(note), note, pipe.now_s)
     assert pipe.publisher.readers == 0
     assert end.budget.held_bytes == 0

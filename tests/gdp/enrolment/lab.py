@@ -11,7 +11,7 @@ from pathlib import Path
 
 from gdp.control.endpoints import Endpoint
 from gdp.enrolment.create import DomainPlan, create_domain, make_token
-from gdp.enrolment.domain_files import DomainFiles
+from gdp.enrolment.domain_files import DOMAIN_FILE, DomainFiles
 from gdp.enrolment.join import Joined, JoinRequest, join_domain
 from gdp.enrolment.registry import Registry
 from gdp.enrolment.server import bind_server, serve_domain
@@ -45,8 +45,14 @@ class Lab:
 
 
 @contextmanager
-def running_lab(folder: Path, name: str = "lab", *, relay_port: int = 0) -> Iterator[Lab]:
-    """Create a domain and serve it while within."""
+def running_lab(
+    folder: Path, name: str = "lab", *, relay_port: int = 0, member_days: float | None = None
+) -> Iterator[Lab]:
+    """Create a domain and serve it while within.
+
+    Args:
+        member_days: how long memberships are valid; None: as the domain has it.
+    """
     listening = bind_server(0, "127.0.0.1")
     port = listening.getsockname()[1]
     plan = DomainPlan(
@@ -58,6 +64,10 @@ def running_lab(folder: Path, name: str = "lab", *, relay_port: int = 0) -> Iter
         relay_port=relay_port,
     )
     files = create_domain(plan)
+    if member_days is not None:
+        with (files.directory / DOMAIN_FILE).open("a", encoding="utf-8") as config:
+            config.write(f"member_days: {member_days}\n")
+        files = DomainFiles.load(files.directory)
     loop = asyncio.new_event_loop()
     task = loop.create_task(serve_domain(files, listening))
 

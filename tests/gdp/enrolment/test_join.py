@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gdp.control.endpoint_record import EndpointRecord
+from gdp.control.endpoint_record import CandidateType, EndpointRecord
 from gdp.crypto.certificates import Role
 from gdp.enrolment.member_files import MemberFiles
 from gdp.nodes.config import SwitchConfig
@@ -48,4 +48,4 @@ def test_the_border_gets_the_record_of_the_new_switch(lab: Lab) -> None:
     member = MemberFiles.load(lab.folder / "arm")
     record, _ = EndpointRecord.verified(wire, load_policy(member.domain), time.time())
     assert record.name == name
-    assert not record.is_reachable
+    assert all(each.type is not CandidateType.PUBLIC for each in record.candidates)

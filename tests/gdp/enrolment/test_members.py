@@ -16,12 +16,14 @@ from gdp.enrolment import agent as agent_module
 from gdp.enrolment import desk as desk_module
 from gdp.enrolment import registry as registry_module
 from gdp.enrolment.agent import DELEGATION_KIND, Agent
+from gdp.enrolment.desk import EnrolmentDesk
 from gdp.enrolment.domain_client import DomainClient
 from gdp.enrolment.removal import remove_machine
 from gdp.enrolment.wire import EnrolmentError, Refusal
 from gdp.errors import LocalError, StatementError
 from gdp.metadata import Metadata
 from gdp.names import Name
+from gdp.nodes.relay_config import RelayConfig
 from gdp.stores.issue import delegate
 from gdp.stores.keyring import CARD, load_identity
 from gdp.trust.mail import Mail
@@ -175,6 +177,22 @@ def test_the_agent_renews_memberships_in_time(lab: Lab, monkeypatch: pytest.Monk
         eventually(lambda: load_identity(node, time.time()).member.fingerprint != before.member.fingerprint)
         eventually(lambda: _state(lab.folder / "ada") == "connected")
     assert load_identity(node, time.time()).name == before.name
+
+
+def test_a_member_follows_where_the_relays_of_the_domain_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    relays, news = ["127.0.0.1:8443"], EnrolmentDesk.news
+    monkeypatch.setattr(EnrolmentDesk, "news", lambda desk, unix_s: {**news(desk, unix_s), "relays": relays})
+    with running_lab(tmp_path, relay_port=8_443) as lab:
+        lab.join("robot")
+        path = tmp_path / "robot/relay.yaml"
+        path.write_text(f"{path.read_text()}mtu: 1280\n")
+        with running(Agent(tmp_path / "robot", poll_s=0.2)):
+            eventually(lambda: _state(tmp_path / "robot") == "connected")
+            relays[:] = ["192.0.2.7:443", "[2001:db8::7]:443"]
+            eventually(lambda: "192.0.2.7" in path.read_text())
+        relay = RelayConfig.load(path)
+    assert [each.endpoints for each in relay.borders] == [tuple(relays)]
+    assert relay.mtu == 1280
 
 
 def test_a_membership_that_has_just_begun_is_not_issued_again(lab: Lab) -> None:

@@ -10,7 +10,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gdp.errors import DropReason, FrameError
-from gdp.frame.codec import AAD_BYTES, HEADER_BYTES, HOPS_AT, Header, authenticated, decode, encode, ethernet
+from gdp.frame.codec import (
+    AAD_BYTES,
+    HEADER_BYTES,
+    HOPS_AT,
+    HOPS_MASK,
+    SECOND_PATH,
+    Header,
+    authenticated,
+    decode,
+    encode,
+    ethernet,
+    second_path_copy,
+    second_path_key,
+)
 from tests.gdp.frame.frames import frames
 
 VECTORS = json.loads((Path(__file__).parents[2] / "vectors" / "frames.json").read_text())["frames"]
@@ -43,6 +56,24 @@ def test_a_seal_covers_everything_but_hops_left(made: tuple[Header, bytes, bytes
 def test_hops_left_stands_where_the_codec_says() -> None:
     header = Header(1, 2, 0x99, 4, 0, 5, 0, 1, 6, bytes(32), bytes(32))
     assert encode(header)[HOPS_AT] == 0x99
+
+
+@given(frames())
+def test_a_second_copy_differs_in_one_bit_outside_the_seal(made: tuple[Header, bytes, bytes]) -> None:
+    header, payload, padding = made
+    first = encode(header._replace(hops_left=header.hops_left & HOPS_MASK)) + payload + padding
+    second = second_path_copy(first)
+    assert [(at, a ^ b) for at, (a, b) in enumerate(zip(first, second, strict=True)) if a != b] == [
+        (HOPS_AT, SECOND_PATH)
+    ]
+    assert authenticated(second) == authenticated(first)
+
+
+@given(st.binary(min_size=32, max_size=64))
+def test_the_key_of_the_second_path_differs_in_the_last_bit_of_the_destination(key: bytes) -> None:
+    second = second_path_key(key)
+    assert [(at, a ^ b) for at, (a, b) in enumerate(zip(key, second, strict=True)) if a != b] == [(31, 1)]
+    assert second_path_key(second) == key
 
 
 def test_the_ethernet_header_carries_the_ethertype() -> None:

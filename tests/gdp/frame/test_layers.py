@@ -19,6 +19,7 @@ from gdp.frame.codec import (
     HEADER_BYTES,
     HOPS_AT,
     KIND_AT,
+    SECOND_PATH,
     SOURCE_AT,
     Header,
     decode,
@@ -178,6 +179,11 @@ def test_a_wrong_name_is_our_own_fault(wrong: object) -> None:
 def test_the_summary_tells_the_way_and_the_part() -> None:
     packet = GDP(kind=Kind.DATA, source=ALICE, destination=BOB, number=5, part=1, parts=3)
     assert packet.mysummary() == "GDP data 616…161 > 626…262 #5 2/3 hops 64"
+
+
+def test_a_second_copy_is_shown_with_its_hops() -> None:
+    packet = GDP(kind=Kind.DATA, source=ALICE, destination=BOB, number=5, hops_left=SECOND_PATH | 63)
+    assert packet.mysummary().endswith("hops 63 (second path)")
 
 
 # queries and responses

@@ -57,7 +57,7 @@ class Ends:
     def admit(self, certificate: bytes, moment: Timestamps) -> Membership:
         found = verified_switch(certificate, self.border_policy.verify_membership, moment.unix_s)
         own = self.border_policy.own
-        ClientAdmission(own_domain=own, allow=self.allow, clients_max=self.clients_max).check(found, [])
+        ClientAdmission(own_domain=own, allow=self.allow, clients_max=self.clients_max).check(found, {})
         return found
 
     def server(self, settings: ConnectionSettings = SETTINGS) -> RelayConnection:

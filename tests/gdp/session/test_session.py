@@ -163,6 +163,19 @@ def test_an_unknown_priority_is_refused(pair: Simulated) -> None:
         pair.sessions["robot"].publisher("camera", priority="high")  # type: ignore[arg-type]
 
 
+def test_an_impossible_number_of_paths_is_refused(pair: Simulated) -> None:
+    with pytest.raises(LocalError, match="1 or 2"):
+        pair.sessions["robot"].publisher("camera", paths=3)  # type: ignore[arg-type]
+
+
+def test_the_paths_of_a_name_are_advertised(pair: Simulated) -> None:
+    pair.sessions["robot"].publisher("camera", paths=2)
+    pair.sessions["server"].subscribe("camera", paths=2)
+    for label in ("robot", "server"):
+        advertised = pair.sessions[label].core.member.attachment.advertisements
+        assert [each.paths for each in advertised] == [1, 2]
+
+
 def test_a_session_that_closes_confirms_first_and_says_goodbye(pair: Simulated) -> None:
     publisher, subscription = crossing(pair)
     publisher.put(b"last")

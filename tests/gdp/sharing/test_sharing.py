@@ -193,7 +193,7 @@ def test_what_is_revoked_ends_at_the_node_and_is_not_given_again(site: Site, rob
 def test_a_revocation_covers_the_delegations_before_a_renewal(site: Site, robot: Machine, server: Machine) -> None:
     robot.sharing.share(robot.owner, "/goal", ["server"], site.now_s, type_name=STRING, days=30)
     site.now_s += 21 * DAY_S
-    robot.sharing.renew_delegations(site.now_s)
+    robot.sharing.work(site.now_s)
     spread: list[bytes] = []
     robot.sharing.revoke(robot.owner, "/goal", "server", kept_in(spread), site.now_s)
     assert len(spread) == 2
@@ -225,7 +225,7 @@ def test_delegations_are_renewed_at_two_thirds_of_their_life(site: Site, robot: 
     for _ in range(5):
         before = robot.held, server.held
         site.now_s += 19 * DAY_S
-        assert robot.sharing.renew_delegations(site.now_s).granted == []
+        assert robot.sharing.work(site.now_s).granted == []
         site.now_s += 1.5 * DAY_S
         assert site.upkeep() == []
         for machine, (old,) in zip((robot, server), before, strict=True):
@@ -239,7 +239,7 @@ def test_a_machine_that_has_left_the_domain_gets_no_renewal(site: Site, robot: M
     robot.sharing.expose(robot.exposing("/camera/image", "server", type_name=IMAGE), site.now_s)
     del site.directory.cards["server"]
     site.now_s += 21 * DAY_S
-    assert [each.label for each in robot.sharing.renew_delegations(site.now_s).granted] == ["robot"]
+    assert [each.label for each in robot.sharing.work(site.now_s).granted] == ["robot"]
 
 
 def test_what_could_not_be_delivered_is_delivered_later(site: Site, robot: Machine, server: Machine) -> None:
@@ -247,7 +247,7 @@ def test_what_could_not_be_delivered_is_delivered_later(site: Site, robot: Machi
     server.sharing.accept(importing("/camera/image"), site.now_s)
     site.now_s += 21 * DAY_S
     site.directory.is_down = True
-    problems = robot.sharing.renew_delegations(site.now_s).problems
+    problems = robot.sharing.work(site.now_s).problems
     assert "/camera/image is not delivered to server yet: the domain's server does not answer" in problems
     site.directory.is_down = False
     assert site.upkeep() == []

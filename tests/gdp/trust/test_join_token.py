@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import string
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gdp.errors import LocalError
-from gdp.trust.join_token import JoinRole, JoinToken, join_id, join_key, join_proof, split_server
+from gdp.trust.join_token import JoinRole, JoinToken, join_id, join_key, join_proof
 
 TOKEN = JoinToken(
     root=bytes(range(32)),
@@ -38,14 +40,12 @@ def test_a_token_does_not_show_its_secret_in_a_log() -> None:
     assert repr(TOKEN.secret) not in repr(TOKEN)
 
 
-@given(at=st.integers(4, len(TOKEN.to_text()) - 1), letter=st.sampled_from("abcdefghijklmnopqrstuvwxyz234567"))
-def test_one_wrong_character_is_recognised(at: int, letter: str) -> None:
+def test_every_single_wrong_character_is_recognised() -> None:
     text = TOKEN.to_text()
-    wrong = text[:at] + letter + text[at + 1 :]
-    assert _read(wrong) in (
-        TOKEN if wrong == text or at == len(text) - 1 else None,
-        None,
-    )  # its last bits carry nothing
+    for at in range(len(text)):
+        for letter in set(string.ascii_lowercase + string.digits) - {text[at]}:
+            read = _read(text[:at] + letter + text[at + 1 :])
+            assert read is None or (read == TOKEN and at == len(text) - 1)  # its last bits carry nothing
 
 
 @given(st.text(max_size=200))
@@ -78,9 +78,3 @@ def test_a_proof_holds_for_one_connection_only() -> None:
         for request in (b"e", b"f")
     }
     assert len(proofs) == 8
-
-
-@pytest.mark.parametrize("text", ["", "host", ":1", "host:", "host:0", "host:65536", "höst:1", "a" * 200 + ":1"])
-def test_what_is_no_host_and_port_is_refused(text: str) -> None:
-    with pytest.raises(LocalError, match="host:port"):
-        split_server(text)

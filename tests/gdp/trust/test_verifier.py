@@ -69,6 +69,16 @@ def test_a_good_advertisement_says_what_it_said() -> None:
     assert (found.lease_s, found.is_global, found.wire) == (60.0, True, GOOD)
 
 
+def test_an_advertisement_states_over_how_many_paths_its_frames_are_to_travel() -> None:
+    assert verifier().verify(GOOD, NOW).paths == 1
+    assert verifier().verify(forged(lambda body: body.update(paths=2)), NOW).paths == 2
+
+
+@pytest.mark.parametrize("paths", [0, 3, "2", True])
+def test_another_number_of_paths_is_malformed(paths: object) -> None:
+    assert refusal(forged(lambda body: body.update(paths=paths))) is DropReason.MALFORMED
+
+
 def test_an_advertisement_is_accepted_again_from_its_own_bytes() -> None:
     at = verifier()
     assert at.verify(at.verify(GOOD, NOW).wire, NOW) == at.verify(GOOD, NOW)

@@ -122,6 +122,26 @@ def test_feedback_reaches_every_client_on_every_machine_once(sites: Sites) -> No
     assert [each.feedback.heard for each in (caller, *others)] == [reported] * 3
 
 
+@pytest.mark.parametrize(
+    ("who", "to"),
+    [(ROBOT, "nuc2"), (ROBOT, "nuc3"), (SERVER, "nuc4"), (SERVER, "nuc3")],  # nuc3 is a switch of another domain
+)
+def test_a_goal_goes_on_while_a_machine_moves_to_another_switch(sites: Sites, who: str, to: str) -> None:
+    client, local, caller = pair(sites)
+    caller.goals.call(goal(1, 10))
+    assert sites.run(1, lambda: caller.goals.outcomes == [ACCEPTED])
+    caller.results.call(goal_id(1))
+    reported = [sequence(1, *range(count)) for count in range(40)]
+    sites.every(0.1, len(reported), lambda number: local.feedback.publish(reported[number]))
+    sites.world.network.call(1.55, lambda: sites.world.roam(who, to))
+    sites.run(8)
+    assert caller.feedback.heard == reported
+    local.results.waiting[0][1](result(1, 1, 2, 3))
+    assert sites.run(1, lambda: bool(caller.results.outcomes))
+    sites.run(5)
+    assert (caller.results.outcomes, len(local.results.waiting), client.faults) == ([result(1, 1, 2, 3)], 1, {})
+
+
 def test_a_goal_is_cancelled(sites: Sites) -> None:
     _, local, caller = pair(sites)
     caller.goals.call(goal(1, 10))

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gdp.errors import DropReason
-from gdp.frame.codec import DESTINATION_AT, ETHER_BYTES, HEADER_BYTES, SOURCE_AT
+from gdp.frame.codec import DESTINATION_AT, ETHER_BYTES, HEADER_BYTES, HOPS_AT, SECOND_PATH, SOURCE_AT, second_path_key
 from gdp.frame.kinds import Flag, Kind
 from gdp.ports.kernel import syscall
 from gdp.ports.kernel.assembler import Assembler, Reg
@@ -44,7 +44,7 @@ from tests.fixtures_forwarding import (
 
 TO_US = bytes(6)  # the loopback's address
 LEFT_TO_PYTHON = {DropReason.TRUNCATED, DropReason.BAD_ETHERTYPE, DropReason.BAD_VERSION, DropReason.HOPS_EXPIRED}
-LEFT_TO_PYTHON |= {DropReason.TOO_BIG}
+LEFT_TO_PYTHON |= {DropReason.TOO_BIG, DropReason.NO_SECOND_PATH}
 DESTINATION = slice(ETHER_BYTES + DESTINATION_AT, ETHER_BYTES + SOURCE_AT)  # left to Python with an entry for no source
 UNKNOWN_PORT = 9  # a port that the kernel does not know
 TO_UNKNOWN_PORT = (UNKNOWN_PORT, bytes(12))
@@ -77,6 +77,12 @@ def clear(table: Table) -> None:
     table.observe(None)
 
 
+def destination_of(given: bytes) -> bytes:
+    """Return the destination by which a frame is looked up."""
+    is_second = given[ETHER_BYTES + HOPS_AT] & SECOND_PATH
+    return second_path_key(given[DESTINATION]) if is_second else given[DESTINATION]
+
+
 def step(loaded: LoadedProgram, given: bytes) -> Step:
     before = loaded.counters()
     run = syscall.run(loaded.program_of(0), given)
@@ -96,7 +102,7 @@ def check(done: Step, given: bytes, entries: Mapping[bytes, Hops]) -> None:
     said = decide(given, entries, MTUS)
     if done.retval == UP:
         reasons = {said.reason} if isinstance(said, Drop) else set(said.lost) if isinstance(said, Forward) else set()
-        assert isinstance(said, Punt) or reasons & LEFT_TO_PYTHON or given[DESTINATION] + bytes(32) in entries
+        assert isinstance(said, Punt) or reasons & LEFT_TO_PYTHON or destination_of(given) + bytes(32) in entries
         assert (done.frame, done.drops, done.taken, done.copies) == (given, {}, 0, 0)
     elif done.retval == DROP:
         lost = (said.reason,) if isinstance(said, Drop) else said.lost if isinstance(said, Forward) else ()
@@ -136,10 +142,23 @@ def test_the_ordinary_is_not_left_to_python(loaded: LoadedProgram) -> None:
     assert retvals == [REDIRECT, REDIRECT, DROP]
 
 
+def test_a_second_copy_takes_the_entry_of_the_second_path_and_keeps_its_bit(loaded: LoadedProgram) -> None:
+    given = TO_US + frame(ONE, hops_left=SECOND_PATH | 64)[6:]
+    table = forwards(loaded, {ONE: (TO_WIDE,), second_path_key(ONE) + SOURCE: (TO_NARROW,)})
+    try:
+        done = step(loaded, given)
+    finally:
+        clear(table)
+    assert (done.retval, done.taken, done.copies) == (REDIRECT, 1, 1)
+    assert done.frame[:12] == TO_NARROW[1]
+    assert done.frame[ETHER_BYTES + HOPS_AT] == SECOND_PATH | 63
+
+
 NAMES = st.sampled_from([ONE, SPLIT, GONE, ANYBODY])
+KEYS = NAMES | NAMES.map(second_path_key)
 SOURCES = st.sampled_from([SOURCE, OTHER_SOURCE, bytes(32)])
 HOPS = st.sampled_from([NOWHERE, (TO_WIDE,), (TO_NARROW,), (TO_ABSENT,), (TO_UNKNOWN_PORT,)])
-TABLES = st.dictionaries(NAMES | st.builds(bytes.__add__, NAMES, SOURCES), HOPS, max_size=8)
+TABLES = st.dictionaries(KEYS | st.builds(bytes.__add__, KEYS, SOURCES), HOPS, max_size=8)
 NEAR = st.integers(-3, 3)
 
 
@@ -154,7 +173,7 @@ def frames(draw: st.DrawFn) -> bytes:
         source=draw(SOURCES),
         kind=draw(st.sampled_from([Kind.DATA, 0x7F, 0x80, 0xFF])),
         flags=draw(st.integers(0, 255)),
-        hops_left=draw(st.sampled_from([0, 1, 2, 64, 255])),
+        hops_left=draw(st.sampled_from([0, 1, 2, 64, 127, 128, 129, 130, 192, 255])),
         length=draw(st.none() | st.just(max(len(payload) + draw(NEAR), 0))),
         padding=bytes(draw(st.integers(0, 3))),
     )

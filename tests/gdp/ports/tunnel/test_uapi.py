@@ -75,19 +75,23 @@ def test_an_endpoint_of_another_form_counts_as_unknown() -> None:
 
 @contextlib.contextmanager
 def replying(folder: Path, monkeypatch: pytest.MonkeyPatch, reply: bytes | None) -> Iterator[list[bytes]]:
-    """Serve one request with this reply; None: never reply."""
+    """Serve requests with this reply; None: serve one, and never reply."""
     monkeypatch.setattr(uapi, "SOCKET_FOLDER", folder)
     monkeypatch.setattr(uapi, "_TIMEOUT_S", 0.2)
     heard: list[bytes] = []
     end = threading.Event()
 
     def serve() -> None:
-        connection, _ = listener.accept()
-        with connection:
-            heard.append(connection.recv(4096))
-            if reply is None:
-                end.wait()
-            else:
+        while True:
+            connection, _ = listener.accept()
+            with connection:
+                request = connection.recv(4096)
+                if not request:  # the test is over
+                    return
+                heard.append(request)
+                if reply is None:
+                    end.wait()
+                    return
                 connection.sendall(reply)
 
     with socket.socket(socket.AF_UNIX) as listener:
@@ -99,6 +103,9 @@ def replying(folder: Path, monkeypatch: pytest.MonkeyPatch, reply: bytes | None)
             yield heard
         finally:
             end.set()
+            if reply is not None:
+                with socket.socket(socket.AF_UNIX) as last:
+                    last.connect(str(folder / "wg.sock"))
             thread.join()
 
 
@@ -113,6 +120,12 @@ def replying(folder: Path, monkeypatch: pytest.MonkeyPatch, reply: bytes | None)
 def test_an_errno_becomes_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reply: bytes, text: str) -> None:
     with replying(tmp_path, monkeypatch, reply), pytest.raises(LocalError, match=text):
         UserspaceControl("wg").apply(Change(listen_port=51820))
+
+
+def test_a_port_that_is_taken_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with replying(tmp_path, monkeypatch, b"errno=98\n\n") as heard, pytest.raises(LocalError):
+        UserspaceControl("wg").apply(Change(listen_port=51820))
+    assert len(heard) > 1
 
 
 @pytest.mark.parametrize("reply", [b"", b"listen_port=1\n", None], ids=["nothing", "half a reply", "too late"])

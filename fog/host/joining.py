@@ -1,0 +1,78 @@
+"""Joining of a machine at its first start: it becomes a member of the border's domain with its token.
+
+I/O. It does what ``gdp join TOKEN --no-start`` does: keys are made here, and the domain's root is pinned by the token.
+Afterwards the file with the token is deleted; a machine without one does not join.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from fog.host.bundle import JOIN_FILE, MEMBER_FOLDER
+from gdp.enrolment.join import JoinRequest, join_domain
+from gdp.enrolment.member_files import MEMBER_FILE
+from gdp.enrolment.wire import UnreachableError
+from gdp.errors import LocalError
+from gdp.stores.files import read_private
+from gdp.trust.join_token import JoinToken
+
+__all__ = ["join", "join_file"]
+
+log = logging.getLogger(__name__)
+
+_DEADLINE_S: Final = 900.0  # the token has expired by then
+_PAUSE_MIN_S: Final = 0.2
+_PAUSE_MAX_S: Final = 5.0
+
+
+def join_file(token: JoinToken, label: str) -> bytes:
+    """Return the content of ``JOIN_FILE``."""
+    return json.dumps({"token": token.to_text(), "label": label}).encode()
+
+
+def join(home: Path, *, deadline_s: float = _DEADLINE_S, wait: Callable[[float], None] = time.sleep) -> bool:
+    """Join the domain of the token in a machine's folder; return whether there was one.
+
+    An enrolment server that cannot be reached is tried again: the network of a machine that boots may come late.
+
+    Raises:
+        EnrolmentError: the domain refuses the token, or no server was reachable within ``deadline_s``.
+        LocalError: the file is not valid, or the system refuses.
+    """
+    path, member = home / JOIN_FILE, home / MEMBER_FOLDER
+    if not path.exists():
+        return False
+    if not (member / MEMBER_FILE).exists():  # else it was stopped before the file was deleted
+        _join(_request(path, member), deadline_s, wait)
+    path.unlink()
+    return True
+
+
+def _request(path: Path, member: Path) -> JoinRequest:
+    try:
+        document = json.loads(read_private(path))
+        token, label = str(document["token"]), str(document["label"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise LocalError(f"{path}: token and label are expected: {error!r}") from error
+    return JoinRequest(token=JoinToken.from_text(token), label=label, directory=member)
+
+
+def _join(request: JoinRequest, deadline_s: float, wait: Callable[[float], None]) -> None:
+    end_s, pause_s = time.monotonic() + deadline_s, _PAUSE_MIN_S
+    while True:
+        try:
+            joined = join_domain(request)
+        except UnreachableError as error:
+            if time.monotonic() >= end_s:
+                raise
+            log.info("machine not joined yet reason=%s", error)
+            wait(pause_s)
+            pause_s = min(2 * pause_s, _PAUSE_MAX_S)
+            continue
+        log.info("machine joined domain=%s nodes=%d", joined.root.label, len(joined.identities))
+        return

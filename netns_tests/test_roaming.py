@@ -1,0 +1,126 @@
+"""Roaming through real tunnels: a reliable topic and a running call go on while a robot changes its uplink."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import pytest
+
+import gdp
+from gdp.trust.right import Right
+from internet.access import Access
+from internet.host import Host
+from internet.laboratory import Laboratory
+from internet.overlay import Overlay
+from internet.site import Site
+
+pytestmark = [
+    pytest.mark.netns,
+    pytest.mark.momentary("about tunnels, no lease of a name matters"),
+    pytest.mark.skipif(shutil.which("wireguard-go") is None, reason="wireguard-go is not installed"),
+    pytest.mark.skipif(os.geteuid() != 0, reason="wireguard-go needs root for its control socket"),
+]
+
+TOPIC, SERVICE = "flow", "plan"
+PATIENCE_S = 60.0
+OUTAGE_S = 10.0  # longer than the timers of neighbours, trees and readers
+
+
+@dataclass(slots=True)
+class Field:
+    """A robot that publishes and calls, and a server behind another NAT, which know one border only."""
+
+    laboratory: Laboratory
+    robot: Host
+    caller: gdp.Session
+    publisher: gdp.Publisher
+    subscription: gdp.Subscription
+    requests: list[bytes] = field(default_factory=list)
+    release: threading.Event = field(default_factory=threading.Event)
+    over: threading.Event = field(default_factory=threading.Event)
+    published: int = 0
+    read: list[int] = field(default_factory=list)
+
+    def serve(self, request: gdp.Request) -> bytes:
+        """Answer when the test says so."""
+        self.requests.append(request.payload)
+        self.release.wait(PATIENCE_S)
+        return request.payload
+
+    def publish(self) -> None:
+        """Publish numbers, a hundred a second, until the end."""
+        while not self.over.wait(0.01):
+            self.publisher.put(self.published.to_bytes(8, "big"))
+            self.published += 1
+
+    def read_until(self, number: int) -> None:
+        """Read until a number came."""
+        while number not in self.read[-1:]:
+            message = self.subscription.receive(timeout_s=PATIENCE_S)
+            self.read.append(int.from_bytes(message.payload, "big"))
+
+    def read_one_more(self) -> None:
+        """Read until a message comes that was published from now on."""
+        self.read_until(self.published)
+
+
+@pytest.fixture
+def roamer(laboratory: Laboratory) -> Iterator[Field]:
+    """Yield the robot and the server, between which messages flow."""
+    border = laboratory.add_host("border", laboratory.add_site("dc", Access.PUBLIC))
+    robot = laboratory.add_host("robot", laboratory.add_site("home", Access.PORT_RESTRICTED))
+    server = laboratory.add_host("server", laboratory.add_site("office", Access.PORT_RESTRICTED))
+    with Overlay(laboratory) as overlay:
+        overlay.add_switch(border, is_border=True)
+        for host in (robot, server):
+            overlay.add_switch(host, borders=[border])
+        overlay.start(border)
+        overlay.start_rib(border)
+        overlay.start(robot, server)
+        rights = {TOPIC: [Right.PUBLISH], SERVICE: [Right.CALL]}, {TOPIC: [Right.READ], SERVICE: [Right.SERVE]}
+        nodes = [overlay.add_node(host, given) for host, given in zip((robot, server), rights, strict=True)]
+        with overlay.open_session(robot, nodes[0]) as caller, overlay.open_session(server, nodes[1]) as callee:
+            subscription = callee.subscribe(TOPIC)
+            made = Field(laboratory, robot, caller, caller.publisher(TOPIC), subscription)
+            callee.serve(SERVICE, made.serve)
+            made.publisher.wait_for_readers(timeout_s=PATIENCE_S)
+            publishing = threading.Thread(target=made.publish)
+            publishing.start()
+            try:
+                made.read_one_more()
+                yield made
+            finally:
+                made.release.set()
+                made.over.set()
+                publishing.join(PATIENCE_S)
+
+
+def test_a_running_call_and_a_topic_outlive_changes_of_the_address_and_a_dead_access_point(roamer: Field) -> None:
+    robot, home = roamer.robot, roamer.robot.site()
+    with ThreadPoolExecutor(1) as pool:
+        call = pool.submit(roamer.caller.call, SERVICE, b"a long plan", timeout_s=3 * PATIENCE_S)
+        for change in (robot.renumber, home.renumber, lambda: robot.attach(_cafe(roamer))):
+            change()
+            roamer.read_one_more()
+        cafe = robot.site()
+        cafe.power_off()
+        time.sleep(OUTAGE_S)  # the outage itself
+        cafe.power_on()
+        roamer.read_one_more()
+        assert not call.done()
+        roamer.release.set()
+        assert call.result(PATIENCE_S).payload == b"a long plan"
+    roamer.over.set()
+    roamer.read_until(roamer.published - 1)
+    assert roamer.read == list(range(len(roamer.read)))  # nothing lost, nothing twice
+    assert roamer.requests == [b"a long plan"]
+
+
+def _cafe(roamer: Field) -> Site:
+    return roamer.laboratory.add_site("cafe", Access.SYMMETRIC)

@@ -1,0 +1,147 @@
+"""Fresh machine of a laboratory: a host with files of its own, on which a person types commands in root shells.
+
+I/O; needs root. A mount namespace hides the places where commands write (``HIDDEN``), so nothing is there before and
+nothing stays. Each command runs in a shell of its own, as in several terminals.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from gdp.errors import LocalError
+from internet.host import Host
+
+__all__ = ["HIDDEN", "FreshMachine", "Shell", "TypedCommand", "typed_commands"]
+
+HIDDEN: Final = ("/var/lib", "/run", "/dev/shm")
+_HOME: Final = "/run/root"
+_ROOT: Final = Path(__file__).resolve().parents[2]
+_END_S: Final = 20.0
+_LOOK_S: Final = 0.02
+_SHOWN: Final = 3_000  # characters of a log
+_BLOCK: Final = re.compile(r"^```\w*\n# on the ([\w-]+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+@dataclass(frozen=True, slots=True)
+class TypedCommand:
+    """A command, and the machine on which a person types it."""
+
+    machine: str
+    text: str
+
+
+def typed_commands(page: str) -> list[TypedCommand]:
+    """Return the commands that a page tells a person to type: the lines of blocks that begin ``# on the MACHINE``."""
+    blocks = [(found[1], found[2].splitlines()) for found in _BLOCK.finditer(page)]
+    return [
+        TypedCommand(machine, line.partition("  # ")[0].strip())
+        for machine, lines in blocks
+        for line in lines
+        if line and not line.startswith("#")
+    ]
+
+
+class Shell:
+    """A command that runs in a shell on a machine."""
+
+    def __init__(self, argv: Sequence[str], environment: Mapping[str, str], log: Path) -> None:
+        self._log = log
+        with log.open("wb") as output:
+            self._process = subprocess.Popen(
+                argv, stdin=subprocess.DEVNULL, stdout=output, stderr=output, env=environment, start_new_session=True
+            )
+
+    @property
+    def pid(self) -> int:
+        """Return the id of its process."""
+        return self._process.pid
+
+    @property
+    def text(self) -> str:
+        """Return what it has printed."""
+        return self._log.read_text(encoding="utf-8", errors="replace")
+
+    def exit_code(self, timeout_s: float) -> int:
+        """Return the exit code of the command. Raises ``LocalError``: it goes on after this time."""
+        try:
+            return self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired as error:
+            raise LocalError(f"goes on after {timeout_s:g} s: {self.text[-_SHOWN:]}") from error
+
+    def wait(self, timeout_s: float) -> None:
+        """Return when the command has ended well. Raises ``LocalError``: it failed, or goes on."""
+        if code := self.exit_code(timeout_s):
+            raise LocalError(f"exit code {code}: {self.text[-_SHOWN:]}")
+
+    def wait_for(self, words: str, timeout_s: float) -> None:
+        """Return when the command has printed some words. Raises ``LocalError``: it has ended, or does not."""
+        end_s = time.monotonic() + timeout_s
+        while words not in self.text:
+            if self._process.poll() is not None or time.monotonic() > end_s:
+                raise LocalError(f"did not print {words!r}: {self.text[-_SHOWN:]}")
+            time.sleep(_LOOK_S)
+
+    def end(self) -> None:
+        """End the command as Ctrl-C does."""
+        if self._process.poll() is None:
+            self._process.send_signal(signal.SIGINT)
+        try:
+            self._process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+class FreshMachine:
+    """A machine with empty folders; a context manager that ends its commands.
+
+    Args:
+        host: of a laboratory.
+
+    Raises:
+        LocalError: the kernel refuses the mounts.
+    """
+
+    def __init__(self, host: Host, folder: Path) -> None:
+        self.host = host
+        self._folder = folder
+        self._shells: list[Shell] = []
+        mounts = " && ".join(f"mount -t tmpfs -o mode=755 tmpfs {each}" for each in HIDDEN)
+        script = f"{mounts} && mkdir {_HOME} && echo mounted && exec sleep infinity"
+        argv = host.command(["unshare", "--mount", "--propagation", "private", "--", "sh", "-c", script])
+        self._holder = Shell(argv, os.environ, folder / f"{host.label}-mounts.log")
+        self._holder.wait_for("mounted", _END_S)
+
+    def __enter__(self) -> FreshMachine:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for shell in (*reversed(self._shells), self._holder):
+            shell.end()
+
+    def command(self, argv: Sequence[str]) -> list[str]:
+        """Return the command line that runs ``argv`` on the machine, with its files and environment."""
+        entered = ["nsenter", f"--mount=/proc/{self._holder.pid}/ns/mnt", "--", "env", f"HOME={_HOME}", *argv]
+        return self.host.command(entered)
+
+    def type(self, command: str) -> Shell:
+        """Start a command as a person types it in a root shell, in which the environment of Python is active."""
+        binaries = Path(sys.executable).parent
+        environment = {
+            "LANG": "C.UTF-8",
+            "PATH": f"{binaries}:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
+            "PYTHONPATH": str(_ROOT),
+        }
+        log = self._folder / f"{self.host.label}-{len(self._shells)}.log"
+        shell = Shell(self.command(["bash", "-c", f"exec {command}"]), environment, log)
+        self._shells.append(shell)
+        return shell
