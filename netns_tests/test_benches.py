@@ -32,7 +32,7 @@ needs_wireguard = pytest.mark.skipif(
         ["bundles.py", "--quick", "--no-save"],
         pytest.param(["tunnel.py", "--quick", "--no-save", "--only", "kernel"], marks=needs_wireguard),
         pytest.param(["first_topic.py", "--rounds", "1", "--no-save"], marks=[needs_ros2, needs_wireguard]),
-        ["uplink.py", "--quick", "--no-save", "--no-tcp", "--only", "line", "gdp"],
+        ["uplink.py", "--quick", "--no-save", "--no-tcp", "--fifo", "bdp", "--only", "line", "gdp"],
         pytest.param(["ros.py", "--quick", "--no-save", "--mtu", "9000"], marks=needs_ros2),
         pytest.param(["services.py", "--quick", "--no-save"], marks=needs_ros2),
         pytest.param(["fogros.py", "--quick", "--no-save", "--mtu", "9000"], marks=needs_ros2),
