@@ -259,7 +259,7 @@ def test_what_comes_and_goes_leaves_memory_and_descriptors_where_they_were(a: Pe
             " while any(node.count_subscribers(f'/churn_{at}') for at in range(10)): time.sleep(0.001)"
         )
 
-    rounds(5)
+    rounds(20)  # caches and the heap fill
     before = [(proxy.descriptors(), proxy.memory_kib()) for proxy in proxies]
     rounds(30)
     after = [(proxy.descriptors(), proxy.memory_kib()) for proxy in proxies]

@@ -28,6 +28,7 @@ _ROOT: Final = Path(__file__).resolve().parents[2]
 _END_S: Final = 20.0
 _LOOK_S: Final = 0.02
 _SHOWN: Final = 3_000  # characters of a log
+_INTERRUPTIBLE: Final = ("env", "--default-signal=INT")  # a background job of a shell script ignores the signal
 _BLOCK: Final = re.compile(r"^```\w*\n# on the ([\w-]+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
@@ -57,7 +58,12 @@ class Shell:
         self._log = log
         with log.open("wb") as output:
             self._process = subprocess.Popen(
-                argv, stdin=subprocess.DEVNULL, stdout=output, stderr=output, env=environment, start_new_session=True
+                [*_INTERRUPTIBLE, *argv],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                env=environment,
+                start_new_session=True,
             )
 
     @property
