@@ -9,7 +9,9 @@ from typing import Final
 
 # Frames
 HOPS_MAX: Final = 64  # hops left at the source
-PATHS_MAX: Final = 2  # disjoint paths over which one flow may send each frame
+PATHS_MAX: Final = 2  # disjoint paths of one flow
+SPREAD: Final = 3  # of an advertisement's ``paths``: large messages are striped over two paths
+STRIPES_FROM_PARTS: Final = 4  # a shorter message takes both paths
 FRAME_MAX_BYTES: Final = 65_535  # largest Ethernet frame any port may carry, header included
 MTU_MIN_BYTES: Final = 576  # a link below this is refused: a signed hello would need too many fragments
 MTU_NARROWINGS: Final = 4  # times that a publisher's path may become narrower, each of which has the cache sealed again

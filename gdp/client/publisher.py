@@ -26,11 +26,12 @@ from gdp.client.sequence_numbers import FIRST, SequenceState
 from gdp.errors import DropReason, EnvelopeError, RemoteError
 from gdp.frame.codec import Header, second_path_copy
 from gdp.frame.kinds import Flag
-from gdp.limits import MTU_MIN_BYTES, WINDOW_BYTES
+from gdp.limits import MTU_MIN_BYTES, SPREAD, WINDOW_BYTES
 from gdp.message.bundle import BUNDLE_BYTES
 from gdp.message.heartbeat import Heartbeat
 from gdp.message.loss import Losses, LossReason
 from gdp.message.send_window import SendWindow
+from gdp.message.striping import Striper
 from gdp.names import Name
 
 __all__ = ["Publisher"]
@@ -49,7 +50,8 @@ class Publisher:
         past: last numbers of an earlier publisher of the same topic, in this incarnation.
         patience: timeouts of its readers.
         address: destination of the frames; None: the topic.
-        paths: 2: a second copy of each frame is sent, marked for the second path, while there is one.
+        paths: 2: a second copy of each frame is sent, marked for the second path, while there is one. ``SPREAD``: large
+            messages are striped over both.
 
     Attributes:
         second_path_until_s: monotonic second until which there is a second path, as far as known here.
@@ -78,6 +80,7 @@ class Publisher:
         self.topic = topic
         self.paths = paths
         self.second_path_until_s = float("-inf")
+        self._striper = Striper() if paths == SPREAD else None
         self._is_reliable = reliable
         self.is_urgent = urgent
         self.has_more = False
@@ -276,6 +279,8 @@ class Publisher:
             is_copy = self.paths > 1 and error.reason is DropReason.REPLAYED
             self.drops[DropReason.SECOND_COPY if is_copy else error.reason] += 1
             return False
+        if self._striper is not None:
+            self._striper.handle_share(header.source, report.share)
         self._acknowledgements.handle_acknack(header.source, report, is_new=is_new, now_s=now_s)
         self._heartbeats.wanted |= is_old  # it has not received the new epoch yet
         return True
@@ -311,14 +316,20 @@ class Publisher:
         if mtu is None or not self._readers:
             return []
         self._queue.seal_deferred()
-        copies = 2 if self.paths > 1 and now_s < self.second_path_until_s else 1
-        limit = max(limit_bytes // (mtu * copies), 1)
+        has_pair = self.paths > 1 and now_s < self.second_path_until_s
+        limit = max(limit_bytes // (mtu * (2 if has_pair and self._striper is None else 1)), 1)
         frames = self._seal_status(now_s, mtu) if self._heartbeats.is_due(now_s) else []
+        heartbeats, repaired = len(frames), self._window.retransmissions
         frames += self._queue.frames_to_send(now_s, limit - len(frames))
         self.has_more = len(frames) >= limit
         if frames:
             self._acknowledgements.last_sent_s = now_s
-        return frames if copies == 1 else [*frames, *map(second_path_copy, frames)]
+        if not has_pair:
+            return frames
+        if self._striper is None:
+            return [*frames, *map(second_path_copy, frames)]
+        doubled = heartbeats + self._window.retransmissions - repaired
+        return self._striper.stripe(frames, doubled, self._readers.names())
 
     def _set_flags(self) -> None:
         queue = self._queue

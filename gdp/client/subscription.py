@@ -107,7 +107,7 @@ class Subscription:
     def set_advertisement(self, writer_proxy: WriterProxy, advertisement: Advertisement) -> None:
         """Set the newest advertisement of a publisher: it may want two paths, or no longer."""
         writer_proxy.advertisement_sequence, writer_proxy.advertisement = advertisement.sequence, advertisement
-        writer_proxy.paths = min(self.paths, advertisement.paths)
+        writer_proxy.paths = advertisement.paths if self.paths > 1 else 1
         private = self.private.get(writer_proxy.publisher)
         if private is not None:
             private.paths = writer_proxy.paths

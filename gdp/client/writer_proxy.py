@@ -29,9 +29,18 @@ from gdp.client.key_epochs import Secrets
 from gdp.client.reordering import ReorderingBuffer
 from gdp.crypto.envelope import Opener
 from gdp.errors import DropReason, EnvelopeError, RemoteError
-from gdp.frame.codec import SECOND_PATH, Header, second_path_copy
+from gdp.frame.codec import HOPS_AT, NUMBER_AT, SECOND_PATH, Header, second_path_copy
 from gdp.frame.kinds import Flag, Kind
-from gdp.limits import NACKS_PER_REPORT, NUMBER_MAX, REPLAY_WINDOW_MESSAGES, REPORT_IDLE_S, SEQUENCE_BYTES
+from gdp.limits import (
+    NACKS_PER_REPORT,
+    NUMBER_MAX,
+    REPLAY_WINDOW_MESSAGES,
+    REPORT_DELAY_S,
+    REPORT_IDLE_S,
+    SEQUENCE_BYTES,
+    SPREAD,
+    STRIPES_FROM_PARTS,
+)
 from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
 from gdp.message.heartbeat import Heartbeat, StreamStart
 from gdp.message.loss import Losses, LossReason
@@ -39,6 +48,7 @@ from gdp.message.reassembly import ReassembledMessage, Reassembler, VerifiesDige
 from gdp.message.reassembly_quota import ReassemblyQuota
 from gdp.message.renumbering import Renumbering
 from gdp.message.second_copies import DeferredRequests, SecondCopies
+from gdp.message.striping import StripedPaths
 from gdp.names import Name
 from gdp.sansio import ReceivedFrame
 from gdp.trust.advertisement import Advertisement
@@ -143,7 +153,7 @@ class WriterProxy:
         self._schedule = AckNackSchedule(self._data, now_s)
         self._order = ReorderingBuffer(publisher, budget)
         self._delivery = DeliveryQueue(publisher, incarnation, self._data.drops)
-        self._copies: SecondCopies | None = None
+        self._copies: SecondCopies | StripedPaths | None = None
         self._gap_until_s = float("inf")  # best effort, two paths: until then the slower one may bring what is missing
         self._gap_at = 0  # ... and the number that is missing
         self._held: deque[tuple[float, Heartbeat]] = deque()  # ... and what a Heartbeat says of it counts
@@ -171,14 +181,18 @@ class WriterProxy:
     @property
     def paths(self) -> int:
         """Return over how many paths frames of this publisher come, and reports to it go."""
-        return 1 if self._copies is None else 2
+        if self._copies is None:
+            return 1
+        return SPREAD if isinstance(self._copies, StripedPaths) else 2
 
     @paths.setter
     def paths(self, paths: int) -> None:
         """Set over how many paths frames come and reports go."""
         if paths != self.paths:
-            self._copies = SecondCopies() if paths > 1 else None
-            self._data.copies, self._status.copies = self._copies, None if self._copies is None else SecondCopies()
+            self._copies = None
+            if paths > 1:
+                self._copies = StripedPaths() if paths == SPREAD else SecondCopies()
+            self._data.copies, self._status.copies = self._copies, SecondCopies() if paths > 1 else None
 
     @property
     def drops(self) -> Counter[DropReason]:
@@ -248,6 +262,10 @@ class WriterProxy:
         """Process the frames of ``arrivals[at:]`` that continue the message under way; return how many."""
         taken = self._data.add_batch(arrivals, at, now_s)
         if taken:
+            if isinstance(self._copies, StripedPaths):
+                second = sum(each.frame[HOPS_AT] & SECOND_PATH > 0 for each in arrivals[at : at + taken])
+                number = int.from_bytes(arrivals[at].frame[NUMBER_AT : NUMBER_AT + 8], "big")
+                self._copies.handle_arrivals(number, taken - second, second, now_s)
             self._schedule.count(taken * len(arrivals[at].frame))
             if self.state is WriterProxyState.LIVE and self._is_reliable:
                 self._schedule.handle_run(now_s)
@@ -289,7 +307,8 @@ class WriterProxy:
         schedule.due_s = min(schedule.due_s, self._deferred.due_s)
         expected = self._order.expected
         part, sequence = self._data.progress(expected), self._delivery.sequence
-        report = AckNack(AckNackFlag.NONE, expected, part, missing, sequence, self.lost)
+        share = self._copies.poll_share() if isinstance(self._copies, StripedPaths) else 0
+        report = AckNack(AckNackFlag.NONE, expected, part, missing, sequence, self.lost, share)
         return self._over_paths(self._sealer.seal_all(report, now_s))
 
     def poll_delivered(self) -> list[Delivered]:
@@ -337,15 +356,25 @@ class WriterProxy:
             else:
                 reassembler.drops[DropReason.MEMORY_FULL] += 1
             return
+        striped = self._copies if isinstance(self._copies, StripedPaths) else None
+        is_done = reassembler.window.is_finished(header.number)
         seen, highest, refused = reassembler.new_parts, reassembler.highest, reassembler.drops[DropReason.MEMORY_FULL]
         joined = reassembler.add(header, frame, now_s)
-        if reassembler.new_parts > seen:
+        is_first = reassembler.new_parts > seen
+        if striped is not None and header.parts >= STRIPES_FROM_PARTS and not is_done and (is_first or not header.part):
+            second = int(header.hops_left & SECOND_PATH > 0)
+            striped.handle_arrivals(header.number, 1 - second, second, now_s)
+        if is_first:
             if self._is_reliable is None:
                 self._set_reliable(header.flags)
             self._schedule.count(header.length)
             if self.state is WriterProxyState.LIVE and self._is_reliable:
                 self._schedule.handle_part(header, highest, expected, now_s)
         if joined is not None:
+            if striped is not None:
+                striped.handle_complete(joined.number)
+                if striped.has_news:
+                    self._schedule.due_s = min(self._schedule.due_s, now_s + REPORT_DELAY_S)
             self._sealer.handle_message(joined.number, header.epoch, now_s)
             self._arrange(joined, now_s)
         elif (

@@ -2,7 +2,7 @@
 
 Sans-I/O. Source: RTPS 2.5, section 8.3.8.1. Wire form, big-endian::
 
-    flags (1) | next number (8) | next part (4) | next sequence number (8) | lost (8) | ranges (2)
+    flags (1) | share (1) | next number (8) | next part (4) | next sequence number (8) | lost (8) | ranges (2)
     for each range: number (8) | first part (4) | last part (4)
 """
 
@@ -17,7 +17,7 @@ from gdp.limits import NACKS_PER_REPORT
 
 __all__ = ["AckNack", "AckNackFlag", "MissingRange"]
 
-_HEAD: Final = struct.Struct("!BQIQQH")
+_HEAD: Final = struct.Struct("!BBQIQQH")
 _U64_MAX: Final = (1 << 64) - 1
 _RANGE: Final = struct.Struct("!QII")
 
@@ -42,7 +42,8 @@ class AckNack(NamedTuple):
     """Everything before (next_number, next_part) is held; of what follows, ``missing`` is known to be missing.
 
     Messages with sequence numbers before ``sequence`` were delivered, except ``lost`` of them. A report flagged NEW
-    names what its reader had of this incarnation of the publisher before, and zeros if nothing.
+    names what its reader had of this incarnation of the publisher before, and zeros if nothing. ``share`` is how much
+    of striped messages the second path is to carry, in 255ths.
     """
 
     flags: AckNackFlag
@@ -51,12 +52,13 @@ class AckNack(NamedTuple):
     missing: tuple[MissingRange, ...]
     sequence: int = 0
     lost: int = 0
+    share: int = 0
 
     def to_wire(self) -> bytes:
         """Return the wire form; ranges beyond ``NACKS_PER_REPORT`` wait for the next report."""
         ranges = self.missing[:NACKS_PER_REPORT]
         counts = min(self.sequence, _U64_MAX), min(self.lost, _U64_MAX)
-        head = _HEAD.pack(self.flags, self.next_number, self.next_part, *counts, len(ranges))
+        head = _HEAD.pack(self.flags, self.share, self.next_number, self.next_part, *counts, len(ranges))
         return head + b"".join(_RANGE.pack(*each) for each in ranges)
 
     @classmethod
@@ -64,8 +66,8 @@ class AckNack(NamedTuple):
         """Read the wire form. Raises ``FrameError``: the bytes are not exactly one AckNack."""
         if len(wire) < _HEAD.size:
             raise FrameError(DropReason.TRUNCATED, "report")
-        flags, number, part, sequence, lost, count = _HEAD.unpack_from(wire)
+        flags, share, number, part, sequence, lost, count = _HEAD.unpack_from(wire)
         if count > NACKS_PER_REPORT or len(wire) != _HEAD.size + count * _RANGE.size or flags > AckNackFlag.BYE:
             raise FrameError(DropReason.MALFORMED, "report")
         ranges = tuple(MissingRange(*each) for each in _RANGE.iter_unpack(wire[_HEAD.size :]))
-        return cls(AckNackFlag(flags), number, part, ranges, sequence, lost)
+        return cls(AckNackFlag(flags), number, part, ranges, sequence, lost, share)

@@ -29,6 +29,7 @@ from gdp.limits import HOPS_MAX, JOIN_MESSAGES_MAX, JOIN_PATIENCE_S, REPLAY_WIND
 from gdp.message.reassembly_quota import ReassemblyQuota
 from gdp.message.replay import ReplayWindow
 from gdp.message.second_copies import SecondCopies
+from gdp.message.striping import StripedPaths
 from gdp.sansio import ReceivedFrame
 
 __all__ = ["ALL_PARTS", "OpensParts", "ReassembledMessage", "Reassembler", "VerifiesDigest"]
@@ -136,7 +137,7 @@ class Reassembler:
         self.drops: Counter[DropReason] = Counter()
         self.highest = -1  # highest message number of which an authentic fragment came
         self.new_parts = 0
-        self.copies: SecondCopies | None = None
+        self.copies: SecondCopies | StripedPaths | None = None
         self._under_way = -1  # number of the message whose next fragments are expected
 
     def add_batch(self, arrivals: Sequence[ReceivedFrame], at: int, now_s: float) -> int:

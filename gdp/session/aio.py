@@ -31,12 +31,12 @@ from gdp.session.session import (
     LINGER_S,
     Paths,
     Priority,
-    check_paths,
     checked_response,
     is_urgent,
 )
 from gdp.session.settings import SessionConfig, settings_of
 from gdp.session.wire import message_to_wire
+from gdp.trust.advertisement import paths_value
 from gdp.trust.right import Right
 
 __all__ = ["AsyncPublisher", "AsyncServer", "AsyncSession", "AsyncSubscription", "open_session_async"]
@@ -222,7 +222,6 @@ class AsyncSession(BaseSession[LoopDriver]):
             LocalError: the session publishes it already, or an option is out of bounds.
         """
         self.driver.check()
-        check_paths(paths)
         topic = self.core.resolve(name, Right.PUBLISH)
         made = self.core.advertise(
             topic,
@@ -231,7 +230,7 @@ class AsyncSession(BaseSession[LoopDriver]):
             latched=latched,
             is_global=is_global,
             description=description,
-            paths=paths,
+            paths=paths_value(paths),
         )
         publisher = AsyncPublisher(self, topic, made, reliable=reliable)
         self._opened.append(publisher)
@@ -248,9 +247,8 @@ class AsyncSession(BaseSession[LoopDriver]):
         self.driver.check()
         if queue < 1:
             raise LocalError(f"queue is at least 1, not {queue}")
-        check_paths(paths)
         topic = self.core.resolve(name, Right.READ)
-        subscription = AsyncSubscription(self, topic, self.core.subscribe(topic, queue, paths))
+        subscription = AsyncSubscription(self, topic, self.core.subscribe(topic, queue, paths_value(paths)))
         self._opened.append(subscription)
         self.driver.schedule()
         return subscription
@@ -274,9 +272,10 @@ class AsyncSession(BaseSession[LoopDriver]):
         self.driver.check()
         if workers < 1:
             raise LocalError(f"workers is at least 1, not {workers}")
-        check_paths(paths)
         topic = self.core.resolve(name, Right.SERVE)
-        core = self.core.serve(topic, at_once=workers, is_global=is_global, urgent=is_urgent(priority), paths=paths)
+        core = self.core.serve(
+            topic, at_once=workers, is_global=is_global, urgent=is_urgent(priority), paths=paths_value(paths)
+        )
         server = AsyncServer(self, topic, core, handler, workers)
         self._opened.append(server)
         self.driver.schedule()
@@ -300,9 +299,8 @@ class AsyncSession(BaseSession[LoopDriver]):
             DelegationError: the node may not call it.
         """
         self.driver.check()
-        check_paths(paths)
         topic, call = self._new_call(name, request, timeout_s, replication)
-        self.core.call(topic, call, time.monotonic(), paths)
+        self.core.call(topic, call, time.monotonic(), paths_value(paths))
         self.driver.schedule()
         await self.driver.wait(lambda: call.is_done, None)
         if call.response is None:

@@ -27,6 +27,7 @@ from gdp.session.opened import BasePublisher, BaseServer, BaseSession, BaseSubsc
 from gdp.session.server_core import ServerCore
 from gdp.session.settings import settings_of
 from gdp.session.wire import message_to_wire
+from gdp.trust.advertisement import paths_value
 from gdp.trust.right import Right
 
 __all__ = ["Publisher", "Server", "Session", "Subscription", "open_session"]
@@ -38,7 +39,7 @@ CALL_TIMEOUT_S: Final = 10.0
 LINGER_S: Final = 1.0
 GOODBYE_S: Final = 0.2  # how long a leaving node continues, so that its goodbye is sent
 Priority = Literal["normal", "urgent"]
-Paths = Literal[1, 2]
+Paths = Literal[1, 2, "spread"]
 
 _C = TypeVar("_C")
 
@@ -239,7 +240,8 @@ class Session(BaseSession[Driver]):
             latched: how many of the last messages late readers get.
             is_global: whether other domains can find the name.
             description: information that readers need to decode the messages; it travels sealed.
-            paths: 2: each frame travels over two disjoint paths, to readers that subscribe with 2 as well.
+            paths: 2: each frame travels over two disjoint paths. ``spread``: large messages are striped over them. The
+                readers subscribe with either as well.
 
         Raises:
             DelegationError: the node may not publish it.
@@ -247,7 +249,6 @@ class Session(BaseSession[Driver]):
         """
         topic = self.core.resolve(name, Right.PUBLISH)
         urgent = is_urgent(priority)
-        check_paths(paths)
         made = self.driver.run(
             lambda: self.core.advertise(
                 topic,
@@ -256,7 +257,7 @@ class Session(BaseSession[Driver]):
                 latched=latched,
                 is_global=is_global,
                 description=description,
-                paths=paths,
+                paths=paths_value(paths),
             )
         )
         publisher = Publisher(self, topic, made, reliable=reliable)
@@ -269,7 +270,7 @@ class Session(BaseSession[Driver]):
         Args:
             name: as for ``publisher``.
             queue: most messages that wait for the program; beyond it, and beyond 64 MiB, the oldest one is dropped.
-            paths: 2: each frame comes over two disjoint paths, from publishers with 2 as well.
+            paths: 2 or ``spread``: frames come over two disjoint paths, as the publisher says if it uses two as well.
 
         Raises:
             DelegationError: the node may not read it.
@@ -277,9 +278,10 @@ class Session(BaseSession[Driver]):
         """
         if queue < 1:
             raise LocalError(f"queue is at least 1, not {queue}")
-        check_paths(paths)
         topic = self.core.resolve(name, Right.READ)
-        subscription = Subscription(self, topic, self.driver.run(lambda: self.core.subscribe(topic, queue, paths)))
+        subscription = Subscription(
+            self, topic, self.driver.run(lambda: self.core.subscribe(topic, queue, paths_value(paths)))
+        )
         self._opened.append(subscription)
         return subscription
 
@@ -329,9 +331,10 @@ class Session(BaseSession[Driver]):
             raise LocalError(f"workers is at least 1, not {workers}")
         topic = self.core.resolve(name, Right.SERVE)
         urgent = is_urgent(priority)
-        check_paths(paths)
         core = self.driver.run(
-            lambda: self.core.serve(topic, at_once=workers, is_global=is_global, urgent=urgent, paths=paths)
+            lambda: self.core.serve(
+                topic, at_once=workers, is_global=is_global, urgent=urgent, paths=paths_value(paths)
+            )
         )
         server = Server(self, topic, core, handler, workers)
         self._opened.append(server)
@@ -362,8 +365,7 @@ class Session(BaseSession[Driver]):
             DelegationError: the node may not call it.
         """
         topic, call = self._new_call(name, request, timeout_s, replication)
-        check_paths(paths)
-        self.driver.run(lambda: self.core.call(topic, call, self.driver.now_s(), paths))
+        self.driver.run(lambda: self.core.call(topic, call, self.driver.now_s(), paths_value(paths)))
         self.driver.wait(lambda: call.is_done, None)
         if call.response is None:
             raise call.error or ClosedError("the session was closed during the call")
@@ -508,13 +510,3 @@ def is_urgent(priority: Priority) -> bool:
 
 def _deadline_s(driver: Driver, timeout_s: float | None) -> float | None:
     return None if timeout_s is None else driver.now_s() + timeout_s
-
-
-def check_paths(paths: int) -> None:
-    """Return if a number of paths is possible.
-
-    Raises:
-        LocalError: it is neither 1 nor 2.
-    """
-    if paths not in (1, 2):
-        raise LocalError(f"paths is 1 or 2, not {paths!r}")

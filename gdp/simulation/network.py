@@ -37,6 +37,7 @@ class SimLink:
         delay_s: one way.
         jitter_s: largest random addition to the delay; frames may then overtake each other.
         loss: chance that a frame is lost, 0 to 1.
+        bytes_s: rate of each direction; frames beyond it wait in a queue without end.
     """
 
     delay_s: float = 0.0005
@@ -44,6 +45,13 @@ class SimLink:
     loss: float = 0.0
     mtu: int = 1_500
     is_up: bool = True
+    bytes_s: float = float("inf")
+    free_s: dict[bytes, float] = field(default_factory=dict)  # by receiver: when the last frame has left
+
+    def leaves_s(self, to: bytes, size: int, now_s: float) -> float:
+        """Queue a frame of ``size`` bytes towards a receiver; return when its last byte has left."""
+        self.free_s[to] = max(self.free_s.get(to, now_s), now_s) + size / self.bytes_s
+        return self.free_s[to]
 
 
 @dataclass(slots=True)
@@ -258,7 +266,8 @@ class SimNetwork:
             self.lost += 1
         else:
             delay_s = sim_link.delay_s + (self._random.random() * sim_link.jitter_s if sim_link.jitter_s else 0.0)
-            self._push(self._now_s + delay_s, lambda: self._arrive(sim_link, far, frame))
+            left_s = sim_link.leaves_s(far.mac, len(frame), self._now_s)
+            self._push(left_s + delay_s, lambda: self._arrive(sim_link, far, frame))
 
     def _arrive(self, sim_link: SimLink, end: _End, frame: bytes) -> None:
         if sim_link.is_up:

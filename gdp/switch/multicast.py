@@ -152,7 +152,7 @@ class MulticastTrees:
                 expires_s=reader.expires_s,
                 mtu=self._outbox.mtu_of(at[0]),
                 evidence=reader.advertisement.wire,
-                wants_pair=reader.advertisement.paths == 2 and place.proof is not None and place.proof.paths == 2,
+                wants_pair=reader.advertisement.paths > 1 and place.proof is not None and place.proof.paths > 1,
             )
             if not self._put_branch(tree, at, branch):
                 self.drops[DropReason.QUOTA] += 1

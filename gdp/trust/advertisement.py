@@ -20,13 +20,13 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType
 from gdp.crypto.subject import Subject
 from gdp.errors import DropReason, LocalError, StatementError
-from gdp.limits import ADVERTISEMENT_MAX_BYTES, CHAIN_MAX, LEASE_MAX_S, LEASE_MIN_S, PATHS_MAX
+from gdp.limits import ADVERTISEMENT_MAX_BYTES, CHAIN_MAX, LEASE_MAX_S, LEASE_MIN_S, SPREAD
 from gdp.names import ZERO, Name
 from gdp.trust.adcert import Chain
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
 
-__all__ = ["Advertisement", "UnverifiedAdvertisement", "sign_advertisement"]
+__all__ = ["Advertisement", "UnverifiedAdvertisement", "paths_value", "sign_advertisement"]
 
 _MS = 1_000
 
@@ -132,7 +132,7 @@ class UnverifiedAdvertisement:
         exchange = fields.bytes_("x")
         if len(exchange) not in (0, EXCHANGE_KEY_BYTES):
             raise StatementError(DropReason.MALFORMED, "an exchange key of the wrong length")
-        paths = fields.uint("paths", PATHS_MAX) if "paths" in fields else 1
+        paths = fields.uint("paths", SPREAD) if "paths" in fields else 1
         if not paths:
             raise StatementError(DropReason.MALFORMED, "no path at all")
         return cls(
@@ -198,7 +198,7 @@ def sign_advertisement(
         chain: the AdCerts of the delegation.
         previous: the node's former switch, which is to be notified; ``ZERO``: it has not moved.
         exchange: its X25519 key in this run, for control messages to it; empty where it takes none.
-        paths: over how many disjoint paths each frame of the name is to travel, 1 to ``PATHS_MAX``.
+        paths: over how many disjoint paths each frame of the name is to travel, 1 or 2; ``SPREAD``: striped over two.
 
     Raises:
         LocalError: a lease out of bounds, or more than one statement can carry.
@@ -225,3 +225,16 @@ def sign_advertisement(
             f"an advertisement of {len(wire)} bytes, above {ADVERTISEMENT_MAX_BYTES}: shorten metadata or delegations"
         )
     return wire
+
+
+def paths_value(paths: object) -> int:
+    """Return how an advertisement writes a number of paths.
+
+    Raises:
+        LocalError: it is neither 1, 2 nor ``spread``.
+    """
+    if paths == "spread":
+        return SPREAD
+    if paths not in (1, 2):
+        raise LocalError(f"paths is 1, 2 or 'spread', not {paths!r}")
+    return int(paths == 2) + 1

@@ -22,6 +22,7 @@ from gdp.names import Name
 from gdp.service.follower import Refuse
 from gdp.service.replication_messages import FollowerMessage
 from gdp.service.serving import Asked, Serving
+from gdp.trust.advertisement import paths_value
 from proxy.bridge.action_interface import CANCEL, GOAL, PROFILES, RESULT, ActionInterface
 from proxy.bridge.bridge_election import presence_of, sign
 from proxy.bridge.cancellation import TRIGGER, Cancellation
@@ -93,7 +94,7 @@ class ExposedService:
             self._exchange.to_wire(),
             is_global=rule.is_global,
             urgent=rule.priority == "urgent",
-            paths=rule.paths,
+            paths=paths_value(rule.paths),
         )
         self._responses = ResponseSender(
             site=site,

@@ -12,6 +12,7 @@ from gdp.client.participant import Topic
 from gdp.client.publisher import Publisher
 from gdp.errors import LocalError
 from gdp.message.loss import LossReason
+from gdp.trust.advertisement import paths_value
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.desired_flows import FlowSpec
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
@@ -126,7 +127,7 @@ class ExposedTopic:
             depth=self._qos.depth,
             is_global=rule.is_global,
             urgent=rule.priority == "urgent",
-            paths=rule.paths,
+            paths=paths_value(rule.paths),
         )
 
     def _publish(self, event: MessageReceived, now_s: float) -> None:

@@ -22,6 +22,7 @@ from gdp.service.dispatch import Dispatch, Failure
 from gdp.service.replication import ALL, Mode
 from gdp.service.replication_messages import INCARNATION_BITS
 from gdp.service.sequencer import Sequencer
+from gdp.trust.advertisement import paths_value
 from proxy.bridge.action_interface import CANCEL, GOAL, PROFILES, RESULT, ActionInterface
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.desired_flows import FlowSpec
@@ -91,7 +92,7 @@ class ImportedService:
             self._description(),
             is_global=flow_spec.rule.is_global,
             urgent=flow_spec.rule.priority == "urgent",
-            paths=flow_spec.rule.paths,
+            paths=paths_value(flow_spec.rule.paths),
         )
         self._sender = RequestSender(
             site=site, service=topic.name, calls=self._calls, goals=self._goals, publisher=self._publisher

@@ -14,6 +14,7 @@ from typing import NamedTuple
 from gdp.client.participant import Message, Topic
 from gdp.errors import LocalError, RemoteError
 from gdp.message.loss import Losses
+from gdp.trust.advertisement import paths_value
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.decoder import MessageDecoder
 from proxy.bridge.decoder_cache import DecoderCache
@@ -68,7 +69,7 @@ class ImportedTopic:
         self._tell_unmatched(ends)
         if ends and not self._is_joined:
             self._is_joined = True
-            self._site.member.subscribe(self._topic, paths=self._flow_spec.rule.paths)
+            self._site.member.subscribe(self._topic, paths=paths_value(self._flow_spec.rule.paths))
         elif not ends and self._is_joined:
             self._leave()
             self._output.drop_kept()

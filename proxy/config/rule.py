@@ -230,10 +230,11 @@ class Rule(Section):
     priority: Literal["normal", "urgent"] = Field(
         default="normal", description="`urgent`: goes before everything `normal`, wherever frames queue."
     )
-    paths: Literal[1, 2] = Field(
+    paths: Literal[1, 2, "spread"] = Field(
         default=1,
-        description="Over how many disjoint paths each frame travels. `2`, on both sides: twice, so that the cut of"
-        " one path costs no message and no time. Where there is one path only, each frame travels once.",
+        description="Over how many disjoint paths frames travel. `2`: each frame twice, so that the cut of one path"
+        " costs no message and no time. `spread`: the fragments of large messages are shared out by what each path"
+        " carries. Both sides state one of the two; the publisher's counts. Over a single path, frames travel once.",
     )
     ros: Literal[1, 2] | None = Field(
         default=None, description="Which ROS it is about, where the proxy speaks both. `null`: the one that there is."
