@@ -65,7 +65,7 @@ def test_the_cost_is_bounded_and_rises_with_time_and_loss(
 
 
 @given(SEEDS, st.sampled_from([0.0005, 0.005, 0.02, 0.2]))
-def test_after_its_first_measurement_a_noisy_link_changes_its_cost_at_most_once_in_a_minute(seed: int, base_s: float) -> None:
+def test_a_noisy_link_changes_its_measured_cost_at_most_once_in_a_minute(seed: int, base_s: float) -> None:
     assert len(changes(noisy(base_s, seed), 60.0)) <= 2  # the first measurement may be an extreme one
 
 

@@ -164,7 +164,7 @@ def test_an_unknown_priority_is_refused(pair: Simulated) -> None:
 
 
 def test_an_impossible_number_of_paths_is_refused(pair: Simulated) -> None:
-    with pytest.raises(LocalError, match="1 or 2"):
+    with pytest.raises(LocalError, match="1, 2 or 'spread'"):
         pair.sessions["robot"].publisher("camera", paths=3)  # type: ignore[arg-type]
 
 
