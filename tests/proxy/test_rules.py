@@ -57,7 +57,7 @@ BAD = [
     ("name: /a**", "name: expected a full ROS name"),
     (f"name: /{'a' * 512}", "name: expected a full ROS name"),
     ("name: 5", "name: expected a text, not 5"),
-    ("name: /a, paths: 3", "paths: expected 1 or 2, not 3"),
+    ("name: /a, paths: 3", "paths: expected 1, 2 or 'spread', not 3"),
     ("name: /a, kind: node", "kind: expected 'topic', 'service' or 'action', not 'node'"),
     ("name: /a, kind: node, type: x", "kind: expected 'topic', 'service' or 'action', not 'node'"),
     ("name: /a, type: Image", "type: expected the type of a topic as ROS 2 writes it, such as sensor_msgs/msg/Image"),

@@ -357,7 +357,8 @@ def test_an_uplink_that_cannot_be_attached_is_reported_once_and_tried_again(site
     journal.put_cluster(PLAN, time.time())
     work(ours, provider.gateways)
     ours.close()
-    assert [each.detail for each in journal.events("c") if each.what == "trouble"] == ["m1: attach uplink: not now"]
+    (trouble,) = [each.detail for each in journal.events("c") if each.what == "trouble"]
+    assert trouble in {"m1: attach uplink: not now", "m2: attach uplink: not now"}  # both are begun at once
 
 
 def test_the_gateway_is_one_for_all_clusters_of_a_site(site: Site, journal: Journal) -> None:
