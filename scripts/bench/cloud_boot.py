@@ -15,6 +15,7 @@ import json
 import logging
 import os
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Mapping
@@ -30,6 +31,9 @@ from skeleton import Options, Outcome, command_line, new_run, run_bench
 from fog.supervisor.record import Record
 from gdp.enrolment.registry import Registry
 from gdp.host.run_registry import RunRegistry
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
 from netns_tests.cloud_site import CloudSite, launch_file, start_echo, wheelhouse
 from netns_tests.datacenter.debian_root import debian_root, why_not
 from netns_tests.datacenter.machine import BootedMachine
