@@ -185,6 +185,17 @@ class Participant:
             if publisher is not None and publisher.is_read_by(writer_proxy.publisher)
         ]
 
+    def silent_peers(self, service: Name) -> list[Name]:
+        """Return the peers that have stopped reporting and may return, such as those behind a dead access point."""
+        publisher = self._publications.get(service)
+        return [
+            writer_proxy.publisher
+            for writer_proxy in self.writer_proxies_of(service)
+            if writer_proxy.state is WriterProxyState.LIVE
+            and publisher is not None
+            and publisher.is_silent(writer_proxy.publisher)
+        ]
+
     def withdraw(self, name: Name) -> None:
         """Stop publishing, serving or calling a name; an unused name is ignored.
 

@@ -136,6 +136,10 @@ class Publisher:
         """Return whether a tree is installed, and ``name`` is a reader, keeping up or not."""
         return self.mtu is not None and name in self._readers
 
+    def is_silent(self, name: Name) -> bool:
+        """Return whether ``name`` is a reader that has stopped reporting, and may return."""
+        return self._readers.is_suspended(name)
+
     @property
     def is_wanted(self) -> bool:
         """Return whether a message published now is for a reader, or for one that may return to its window."""

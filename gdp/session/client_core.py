@@ -163,6 +163,8 @@ class ClientCore:
         self._follow_at_s = now_s + _FOLLOW_S
         member = self._member
         peers = set(member.peers(self._name) or member.connected_peers(self._name))  # a slow server is better than none
+        if not peers:  # and a silent one may return: its calls go on
+            peers = self._servers.keys() & set(member.silent_peers(self._name))
         heard = {
             writer_proxy.publisher: writer_proxy
             for writer_proxy in member.writer_proxies_of(self._name)

@@ -49,6 +49,24 @@ def test_a_call_that_begins_before_its_server_is_there_waits_for_it(replicas: Si
     assert call.response == gdp.Response(b"y", replicas.sessions["edge"].name)
 
 
+@pytest.mark.parametrize("outage_s", [1.0, 10.0])
+def test_a_running_call_outlives_a_silence_of_its_only_server(replicas: Simulated, outage_s: float) -> None:
+    server = serve(replicas, "edge")
+    warm = begin(replicas)
+    respond(replicas, server, "edge", b"warm")
+    assert replicas.run(2.0, lambda: warm.is_done)
+    call = begin(replicas, timeout_s=60.0)
+    assert replicas.run(5.0, lambda: bool(server.turns))
+    lead = replicas.world.leads["s/edge"]
+    lead.loss = 1.0
+    replicas.run(outage_s)
+    assert not call.is_done
+    lead.loss = 0.0
+    respond(replicas, server, "edge", b"y")
+    assert replicas.run(10.0, lambda: call.is_done)
+    assert call.response == gdp.Response(b"y", replicas.sessions["edge"].name)
+
+
 def test_the_first_response_of_two_replicas_counts(replicas: Simulated) -> None:
     edge, cloud = serve(replicas, "edge"), serve(replicas, "cloud")
     warm = begin(replicas)
