@@ -11,7 +11,7 @@ streams.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final
 
 from gdp.client.attachment import Attachment
@@ -173,27 +173,21 @@ class Participant:
 
     def connected_peers(self, service: Name) -> list[Name]:
         """Return all connected peers, those that do not keep up included; ``peers`` returns a subset."""
-        publisher = self._publications.get(service)
-        writer_proxies = [
-            writer_proxy
-            for writer_proxy in self.writer_proxies_of(service)
-            if writer_proxy.state is WriterProxyState.LIVE
-        ]
-        return [
-            writer_proxy.publisher
-            for writer_proxy in writer_proxies
-            if publisher is not None and publisher.is_read_by(writer_proxy.publisher)
-        ]
+        return self._peers(service, Publisher.is_read_by)
 
     def silent_peers(self, service: Name) -> list[Name]:
         """Return the peers that have stopped reporting and may return, such as those behind a dead access point."""
+        return self._peers(service, Publisher.is_silent)
+
+    def _peers(self, service: Name, fits: Callable[[Publisher, Name], bool]) -> list[Name]:
+        """Return the peers with a live writer proxy whose state as readers of the service's publisher fits."""
         publisher = self._publications.get(service)
+        if publisher is None:
+            return []
         return [
             writer_proxy.publisher
             for writer_proxy in self.writer_proxies_of(service)
-            if writer_proxy.state is WriterProxyState.LIVE
-            and publisher is not None
-            and publisher.is_silent(writer_proxy.publisher)
+            if writer_proxy.state is WriterProxyState.LIVE and fits(publisher, writer_proxy.publisher)
         ]
 
     def withdraw(self, name: Name) -> None:
