@@ -14,7 +14,7 @@ import os
 import socket
 import time
 from collections import OrderedDict, defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -226,7 +226,7 @@ class EnrolmentServer:
             await self._write(writer, await self._work(self._desk.greeting, connection.nonce, time.time()))
             while await self._serve_one(reader, writer, connection, tls.binding, end_s):
                 pass
-        except (OSError, asyncio.IncompleteReadError, asyncio.TimeoutError):  # gone, or too slow
+        except (OSError, asyncio.IncompleteReadError):  # gone, or too slow
             pass
         finally:
             await _close(writer)
@@ -242,9 +242,11 @@ class EnrolmentServer:
         """Answer one request; return whether another one may follow."""
         idle_s = _IDLE_S if connection.session is not None else end_s - time.monotonic()
         try:
-            head = await asyncio.wait_for(reader.readexactly(LENGTH_BYTES), idle_s)
+            with _cut_after(writer, idle_s):
+                head = await reader.readexactly(LENGTH_BYTES)
             size = message_bytes(head, REQUEST_MAX_BYTES if connection.session else STRANGER_MAX_BYTES)
-            fields = read_message(await asyncio.wait_for(reader.readexactly(size), min(_REQUEST_S, idle_s)))
+            with _cut_after(writer, min(_REQUEST_S, idle_s)):
+                fields = read_message(await reader.readexactly(size))
             response = await self._response(connection, fields, binding)
             goes_on = True
         except GdpError as error:
@@ -260,7 +262,8 @@ class EnrolmentServer:
 
     async def _write(self, writer: asyncio.StreamWriter, fields: Mapping[str, object]) -> None:
         writer.write(encode_message(fields))
-        await asyncio.wait_for(writer.drain(), _REQUEST_S)
+        with _cut_after(writer, _REQUEST_S):
+            await writer.drain()
 
     async def _response(self, connection: _Connection, fields: Fields, binding: bytes) -> Mapping[str, object]:
         operation, now, desk = fields.text("op", 16), time.time(), self._desk
@@ -323,8 +326,11 @@ class EnrolmentServer:
                 left_s = end_s - time.monotonic()
                 if digest != known or status["mail"] or left_s <= 0:
                     return status
-                with contextlib.suppress(asyncio.TimeoutError):
-                    await asyncio.wait_for(event.wait(), left_s)
+                timer = asyncio.get_running_loop().call_later(left_s, event.set)
+                try:
+                    await event.wait()
+                finally:
+                    timer.cancel()
         finally:
             events.discard(event)
             if not events:
@@ -365,6 +371,16 @@ class EnrolmentServer:
 
     async def _work(self, function: Callable[..., _T], *arguments: object) -> _T:
         return await asyncio.get_running_loop().run_in_executor(self._worker, functools.partial(function, *arguments))
+
+
+@contextlib.contextmanager
+def _cut_after(writer: asyncio.StreamWriter, after_s: float) -> Iterator[None]:
+    """Cut the connection of a peer that is too slow. ``wait_for`` would lose a cancellation (CPython issue 86296)."""
+    timer = asyncio.get_running_loop().call_later(after_s, writer.transport.abort)
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 async def _close(writer: asyncio.StreamWriter) -> None:

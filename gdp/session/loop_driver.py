@@ -33,7 +33,7 @@ class LoopDriver:
         self._runtime = runtime
         self._plane = plane
         self._loop = asyncio.get_running_loop()
-        self._waiters: dict[asyncio.Future[None], Callable[[], bool]] = {}
+        self._waiters: dict[asyncio.Future[bool], Callable[[], bool]] = {}
         self._timer: asyncio.TimerHandle | None = None
         self._is_scheduled = False
         self._is_closed = False
@@ -63,18 +63,19 @@ class LoopDriver:
         if is_ready():
             return True
         self.check()
-        future = self._loop.create_future()
+        future: asyncio.Future[bool] = self._loop.create_future()
         self._waiters[future] = is_ready
+        timer = None
+        if deadline_s is not None:  # wait_for would lose a cancellation (CPython issue 86296)
+            timer = self._loop.call_later(deadline_s - time.monotonic(), _end_wait, future)
         try:
-            left_s = None if deadline_s is None else max(deadline_s - time.monotonic(), 0.0)
-            await asyncio.wait_for(future, left_s)
-        except asyncio.TimeoutError:
-            self.check()
-            return is_ready()
+            was_ready = await future
         finally:
             self._waiters.pop(future, None)
+            if timer is not None:
+                timer.cancel()
         self.check()
-        return True
+        return was_ready or is_ready()
 
     def schedule(self) -> None:
         """Schedule a step soon, because the node has new work."""
@@ -127,7 +128,7 @@ class LoopDriver:
             return
         for future, is_ready in list(self._waiters.items()):
             if not future.done() and is_ready():
-                future.set_result(None)
+                future.set_result(True)
 
     def _set_timer(self) -> None:
         if self._timer is not None:
@@ -140,5 +141,9 @@ class LoopDriver:
 
     def _wake_all(self) -> None:
         for future in list(self._waiters):
-            if not future.done():
-                future.set_result(None)
+            _end_wait(future)
+
+
+def _end_wait(future: asyncio.Future[bool]) -> None:
+    if not future.done():
+        future.set_result(False)

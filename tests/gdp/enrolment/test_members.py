@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import threading
 import time
@@ -263,3 +264,21 @@ def test_the_border_cannot_be_removed(lab: Lab) -> None:
 def test_an_unknown_machine_cannot_be_removed(lab: Lab) -> None:
     with pytest.raises(LocalError, match=r"no machine 'nothing'.*border"):
         remove_machine(lab.files, "nothing")
+
+
+def test_a_server_that_is_cancelled_in_the_middle_of_an_answer_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def cancel_server() -> None:
+        for task in asyncio.all_tasks():
+            if "serve_domain" in repr(task):
+                task.cancel()
+
+    async def drain(writer: asyncio.StreamWriter) -> None:
+        asyncio.get_running_loop().call_soon(cancel_server)
+
+    with running_lab(tmp_path) as lab:
+        lab.join("robot")
+        monkeypatch.setattr(asyncio.StreamWriter, "drain", drain)
+        with pytest.raises(EnrolmentError), DomainClient.open(lab.folder / "robot") as client:
+            client.nodes()
