@@ -82,7 +82,8 @@ class DropReason(IntEnum):
     UNCONCERNED = 44  # a revocation by an issuer of whose certificates none is held here
     THROUGH_LEAF = 45  # the path leads through a leaf, or a leaf sends for more than the nodes attached to it
     NO_SECOND_PATH = 46  # the second copy of a frame at a switch that has no second path for it
-    SECOND_COPY = 47  # the other path of a flow with two had brought it before
+    SECOND_COPY = 47  # a copy of a frame that is here: the other path, or one sent again against loss, brought it
+    LIFESPAN = 48  # a best-effort message that could not leave in time, before a frame of it was sealed
 
     @property
     def label(self) -> str:

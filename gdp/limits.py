@@ -30,9 +30,9 @@ REPLAY_WINDOW_MESSAGES: Final = 16_384
 
 # Retransmission
 WINDOW_BYTES: Final = 32 << 20  # what a reliable publisher caches for repairs
-FLIGHT_MIN_BYTES: Final = 192 << 10  # above twice REPORT_EVERY_BYTES, so that a window rarely waits for a timer
-FLIGHT_START_BYTES: Final = 256 << 10
-FLIGHT_MAX_BYTES: Final = 4 << 20
+PRIVATE_WAIT_BYTES: Final = 256 << 10  # of a unicast stream, while its reader does not know the public one
+FLIGHT_MAX_BYTES: Final = 4 << 20  # of one publisher; what a reader must be able to hold
+REPAIRS_MAX_BYTES: Final = 512 << 10  # of one publisher in a round trip, whatever its readers ask for
 FLIGHT_MESSAGES_MAX: Final = 8_192  # below REPLAY_WINDOW_MESSAGES
 REPORT_EVERY_BYTES: Final = 80 << 10  # a reader reports after this many new bytes
 # ... or, while nothing is missing, after a quarter of the bytes since the last loss, up to this
@@ -40,16 +40,19 @@ REPORT_EVERY_MAX_BYTES: Final = 384 << 10
 REPORT_DELAY_S: Final = 0.02  # ... or this long after the first fragment it has not reported
 REPORT_PAUSE_S: Final = 0.004  # ... within a message: its publisher may be waiting for a report
 REPORT_GAP_S: Final = 0.002  # ... or this long after it detected a gap: frames may overtake each other
+REPAIRS_ABOVE_PARTS: Final = 2  # a best-effort message of more fragments is repaired while that can be in time
+REPAIR_S: Final = 0.5  # ... which is this time, unless its publisher states a deadline
 PROBE_MIN_S: Final = 0.03
 PROBE_MAX_S: Final = 0.25
 REPORT_IDLE_S: Final = 1.0  # a live reader reports at least this often
+SENDS_MAX: Final = 3  # times that an urgent frame is sent against loss: 0.05 ** 3 is below 0.1 %
 READER_LEASE_S: Final = 6.0  # a reader that does not report for this time no longer blocks its publisher
 READER_GRACE_S: Final = 60.0  # ... but what it lacks is cached for this time, as far as the window allows
 CALL_LAG_S: Final = 1.0  # ... or a reader of requests that has not confirmed in this time what another server has
 CALL_IDLE_S: Final = 0.5  # a live server reports at least this often to its clients
 CALL_QUIET_S: Final = 2.0  # a server that does not report for this time is no peer meanwhile
 EPOCH_GRACE_S: Final = 10.0  # after a new epoch began, reports of readers under the previous one are still accepted
-NACKS_PER_REPORT: Final = 24  # ranges: a report, sealed and alone in its frame, fits the smallest supported link
+NACKS_PER_REPORT: Final = 23  # ranges: a report, sealed and alone in its frame, fits the smallest supported link
 
 # Control plane
 CONTROL_MAX_BYTES: Final = 16 << 10  # one statement with its evidence

@@ -69,5 +69,8 @@ class ProtocolCore(Protocol):
     def poll_neighbours(self) -> Mapping[int, frozenset[bytes]]:
         """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
 
-    def frames_to_send(self) -> list[OutgoingFrames]:
+    def frames_to_send(self, now_s: float) -> list[OutgoingFrames]:
         """Return, once, the frames to send; call again until it returns none."""
+
+    def frames_leave(self, now_s: float) -> None:
+        """Note that the frames returned last are sent now: preparing them took time."""

@@ -28,12 +28,21 @@ class TokenBucket:
             self._seen_s = now_s
         return self._tokens
 
+    def seconds_for(self, tokens: float) -> float:
+        """Return how long so many tokens take to refill."""
+        return max(tokens, 0.0) / self._per_s
+
     def spend(self, now_s: float, tokens: float = 1.0) -> bool:
         """Take tokens and return True, or return False and take none."""
         if self.left(now_s) < tokens:
             return False
         self._tokens -= tokens
         return True
+
+    def change(self, now_s: float, per_s: float, burst: float) -> None:
+        """Change the rate and the burst from now on; tokens above the new burst are gone."""
+        self._tokens = min(self.left(now_s), burst)
+        self._per_s, self._burst = per_s, burst
 
     def charge(self, now_s: float, tokens: float) -> None:
         """Take tokens, whether they are there or not; at most a full bucket is owed."""

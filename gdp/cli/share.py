@@ -18,6 +18,7 @@ import typer
 from gdp.cli import options
 from gdp.cli.machine import directory_of
 from gdp.cli.output import moment, show
+from gdp.client.send_options import DEADLINE_MAX_S, RATE_MAX_BITS_S, RATE_MIN_BITS_S, WEIGHT_MAX
 from gdp.enrolment.member_files import MEMBER_FILE
 from gdp.errors import GdpError, LocalError
 from gdp.sharing.folder_exchange import FolderExchange
@@ -72,6 +73,24 @@ Encoding = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option("--encoding", help="json, cbor or cdr: how messages travel."),
 ]
+DeadlineMs = Annotated[
+    Optional[float],  # noqa: UP045
+    typer.Option(
+        "--deadline-ms",
+        min=0.001,
+        max=1_000 * DEADLINE_MAX_S,
+        help="Best effort: a message that cannot leave within this time is dropped.",
+    ),
+]
+NoRepair = Annotated[bool, typer.Option("--no-repair", help="Best effort: lost parts are not sent again.")]
+Weight = Annotated[
+    Optional[int],  # noqa: UP045
+    typer.Option("--weight", min=1, max=WEIGHT_MAX, help="Share of a full path, next to others."),
+]
+MaxBits = Annotated[
+    Optional[float],  # noqa: UP045
+    typer.Option("--max-bits-s", min=RATE_MIN_BITS_S, max=RATE_MAX_BITS_S, help="Most bits of frames a second."),
+]
 Wait = Annotated[
     float, typer.Option("--wait", min=0.0, metavar="SECONDS", help="How long to wait for a name without a type.")
 ]
@@ -88,6 +107,10 @@ def expose(
     owner: OwnerDir = None,
     days: options.Days = SHARE_DAYS,
     encoding: Encoding = None,
+    deadline_ms: DeadlineMs = None,
+    no_repair: NoRepair = False,
+    weight: Weight = None,
+    max_bits_s: MaxBits = None,
     remove: Remove = False,
     wait: Wait = 3.0,
     directory: MachineDir = None,
@@ -102,6 +125,7 @@ def expose(
     \b
     Examples:
       gdp expose '/camera/**' --to server
+      gdp expose /camera/image --to server --deadline-ms 200 --max-bits-s 4e6
       gdp expose /plan --kind service --type nav_msgs/srv/GetPlan --to robot
       gdp expose /goal --from server
       gdp expose '/camera/**' --remove
@@ -127,6 +151,10 @@ def expose(
                 owner_key=load_owner(folder).public.compressed.hex(),
                 days=days,
                 encoding=encoding,
+                deadline_ms=deadline_ms,
+                repair="never" if no_repair else None,
+                weight=weight,
+                max_bits_s=max_bits_s,
             )
             report = sharing.expose(wanted, time.time())
         until_s = time.monotonic() + wait

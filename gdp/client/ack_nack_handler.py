@@ -23,6 +23,7 @@ from gdp.message.send_window import SendWindow
 __all__ = ["AckNackHandler"]
 
 _SETTLED_S: Final = 0.25  # after the last message of a best-effort topic, a Heartbeat states that it was the last
+_STUCK_S: Final = 1.0  # a best-effort reader without a whole message for so long learns by a Heartbeat what it lost
 
 
 class AckNackHandler:
@@ -70,9 +71,12 @@ class AckNackHandler:
             self._acknowledge(name, report, is_new=is_new, now_s=now_s)
         if not self._window.is_suspended(name):
             reader.behind_s = None
+        if is_new or sequence > reader.sequence:
+            reader.advanced_s = now_s
         reader.sequence, reader.lost = max(reader.sequence, sequence), max(reader.lost, report.lost)
         (sent, _), (sequence, _) = queue.sent, queue.sequences
-        is_settled = queue.is_acknowledged or now_s - self.last_sent_s > _SETTLED_S
+        is_stuck = now_s - reader.advanced_s >= _STUCK_S
+        is_settled = queue.is_acknowledged or is_stuck or now_s - self.last_sent_s > _SETTLED_S
         if report.sequence < sequence and is_settled and (report.next_number >= sent or not queue.is_acknowledged):
             self._heartbeats.wanted = True  # it does not know what it has lost behind its last message
 
@@ -87,11 +91,16 @@ class AckNackHandler:
                 self._window.suspend(name)
                 self._readers[name].behind_s = now_s
             else:
-                self._readers.suspend_again(name, now_s)
-                self._window.drop_reader(name)
-                self._heartbeats.wanted = True
+                self.exclude(name, now_s)
         for name, reader in self._readers.overdue(now_s):
             self._give_up(name, reader, now_s)
+
+    def exclude(self, name: bytes, now_s: float) -> None:
+        """Let a slow reader block the window no longer, for a penalty time."""
+        if self._window.has_reader(name):
+            self._readers.suspend_again(name, now_s)
+            self._window.drop_reader(name)
+            self._heartbeats.wanted = True
 
     def connect(self, name: bytes, incarnation: int, exchange: bytes, now_s: float) -> None:
         """Make a reader active that is known without an introduction; an active one is left unchanged.

@@ -5,6 +5,8 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
 from __future__ import annotations
 
+from typing import Final
+
 from gdp.frame.codec import Header
 from gdp.limits import (
     REPORT_DELAY_S,
@@ -17,6 +19,8 @@ from gdp.limits import (
 from gdp.message.reassembly import Reassembler
 
 __all__ = ["AckNackSchedule"]
+
+_FIRST_BYTES: Final = 3_000
 
 
 class AckNackSchedule:
@@ -36,11 +40,13 @@ class AckNackSchedule:
         self.due_s = due_s
         self.idle_s = REPORT_IDLE_S
         self._unreported_bytes = 0
+        self._total_bytes = 0
         self._clean_bytes = 0  # reported since something was last missing
 
     def count(self, size: int) -> None:
         """Count received bytes that no report confirms yet."""
         self._unreported_bytes += size
+        self._total_bytes += size
 
     def handle_run(self, now_s: float) -> None:
         """Reschedule after fragments that came in order."""
@@ -82,7 +88,9 @@ class AckNackSchedule:
     def _is_owed(self) -> bool:
         """Return whether enough bytes came for a report; the threshold grows while nothing is missing.
 
-        A writer's congestion window has grown by what was reported since the last loss, and must never run empty.
+        A writer's congestion window has grown by what was reported since the last loss, and must never run empty. At
+        first the writer knows nothing of the path, and two frames are enough.
         """
+        first_bytes = max(self._total_bytes // 8, _FIRST_BYTES)
         every_bytes = max(REPORT_EVERY_BYTES, min(self._clean_bytes // 4, REPORT_EVERY_MAX_BYTES))
-        return self._unreported_bytes >= every_bytes
+        return self._unreported_bytes >= min(first_bytes, every_bytes)

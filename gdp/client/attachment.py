@@ -67,6 +67,7 @@ class PendingAdvertisement:
     chain: tuple[bytes, ...]
     is_global: bool
     paths: int = 1
+    is_session: bool = False
     advertisement_at_s: float = 0.0
     is_taken: bool = False
     refused: DropReason | None = None
@@ -136,7 +137,10 @@ class Attachment:
 
     @property
     def _own_advertisement(self) -> PendingAdvertisement | None:
-        return next((each for each in self._advertisements.values() if each.right is Right.ATTACH), None)
+        for each in self._advertisements.values():
+            if each.right is Right.ATTACH:  # the first one: it is advertised from the start
+                return each
+        return None
 
     @property
     def advertisements(self) -> list[PendingAdvertisement]:
@@ -155,11 +159,23 @@ class Attachment:
         return self.hello_protocol.ports[self._switch.port].mtu
 
     def advertisement(
-        self, subject: Subject, right: Right, chain: tuple[bytes, ...], *, is_global: bool, paths: int = 1
+        self,
+        subject: Subject,
+        right: Right,
+        chain: tuple[bytes, ...],
+        *,
+        is_global: bool,
+        paths: int = 1,
+        is_session: bool = False,
     ) -> None:
-        """Advertise a name from now on; ``paths``: over how many disjoint paths its frames are to travel."""
+        """Advertise a name from now on.
+
+        Args:
+            paths: over how many disjoint paths its frames are to travel.
+            is_session: a session secret may authenticate its unicast streams.
+        """
         self._advertisements[subject.name, right] = PendingAdvertisement(
-            subject=subject, right=right, chain=chain, is_global=is_global, paths=paths
+            subject=subject, right=right, chain=chain, is_global=is_global, paths=paths, is_session=is_session
         )
 
     def renew(self, name: Name, chain: tuple[bytes, ...]) -> None:
@@ -278,15 +294,15 @@ class Attachment:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self.hello_protocol.get_timer(), self._sync.get_timer()]
+        times = [time for time in (self.hello_protocol.get_timer(), self._sync.get_timer()) if time is not None]
         if self._switch is not None:
             times += [each.advertisement_at_s for each in self._due_advertisements()]
-        return min((time for time in times if time is not None), default=None)
+        return min(times) if times else None
 
     def _due_advertisements(self) -> Iterable[PendingAdvertisement]:
         """Return the advertisements that may be sent: only the node's own name while another has this identity."""
         own = self._own_advertisement
-        return (own,) if own is not None and self.is_in_use else self._advertisements.values()
+        return (own,) if own is not None and own.refused is DropReason.IN_USE else self._advertisements.values()
 
     def frames_to_send(self) -> list[OutgoingFrames]:
         """Return, once, the frames to send."""
@@ -333,6 +349,7 @@ class Attachment:
             previous=self._former if now.mono_s - self._moved_s < _MOVED_S else ZERO,
             exchange=self._exchange if each.right in HEARS.values() else b"",
             paths=each.paths,
+            is_session=each.is_session,
         )
 
     def _rtcert_for(self, switch: Name) -> bytes:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from itertools import count
 
 from gdp.client.control_keys import ControlKeys
+from gdp.client.redundancy import CopyBudget
 from gdp.crypto.envelope import Signer
 from gdp.names import Name
 
@@ -21,15 +22,18 @@ class WriterIdentity:
     """Identity of one incarnation of a writer.
 
     Args:
+        signer: None: streams of this identity are under session secrets, and not signed.
         random_bytes: the system's randomness, called for each message that is sealed.
         notes: keys for the control datagrams of readers.
+        copies: budget of the copies that all its publishers send against loss.
     """
 
     name: Name
     incarnation: int
-    signer: Signer
+    signer: Signer | None
     random_bytes: Callable[[int], bytes]
     notes: ControlKeys
+    copies: CopyBudget = field(default_factory=CopyBudget, compare=False)
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,6 +20,7 @@ from gdp.client.identities import ReaderIdentity, WriterIdentity
 from gdp.client.publications import Publications
 from gdp.client.publisher import Publisher
 from gdp.client.reader_proxies import CALLS, TOPICS
+from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
 from gdp.client.subscription import Message, Subscription, Subscriptions, Topic
 from gdp.client.timer_queue import TimerQueue
 from gdp.client.unicast_stream import Party, PeerIncarnation
@@ -74,6 +75,7 @@ class Participant:
         self._subscriptions = Subscriptions(reader, self._verifier)
         self._messages: list[Message] = []
         self._under_way: tuple[WriterProxy, Subscription] | None = None  # whose next fragment is expected
+        self._sent_by: object = None  # the switch that carried the latest frames
         self._now_s = 0.0
         self._awake_s = 0.0  # since when this participant has been scheduled without a stall
         self.boundary = ErrorBoundary()
@@ -115,29 +117,72 @@ class Participant:
         is_global: bool = True,
         urgent: bool = False,
         paths: int = 1,
+        options: SendOptions = DEFAULT_OPTIONS,
     ) -> Publisher:
         """Publish a topic from now on; ``paths`` 2: each frame twice, over two disjoint paths where they exist."""
         self._check(topic, Right.PUBLISH, is_free=topic.name not in self._publications)
         publisher = self._publications.add(
-            topic.name, topic.secrets, description, reliable=reliable, depth=depth, urgent=urgent, paths=paths
-        )
+            topic.name, topic.secrets, description,
+            reliable=reliable, depth=depth, urgent=urgent, paths=paths, options=options,
+        )  # fmt: skip
         self._advertisement(topic, Right.PUBLISH, is_global=is_global, paths=paths)
         return publisher
 
     def serve(
-        self, topic: Topic, description: bytes, *, is_global: bool = True, urgent: bool = False, paths: int = 1
+        self,
+        topic: Topic,
+        description: bytes,
+        *,
+        is_global: bool = True,
+        urgent: bool = False,
+        paths: int = 1,
+        options: SendOptions = DEFAULT_OPTIONS,
+        is_session: bool = False,
     ) -> Publisher:
-        """Serve a name; return the stream that all its clients receive. ``respond`` sends to one of them."""
-        return self._join_service(topic, Right.SERVE, description, is_global=is_global, urgent=urgent, paths=paths)
+        """Serve a name; return the stream that all its clients receive. ``respond`` sends to one of them.
+
+        Args:
+            is_session: a session secret authenticates streams to and from one client, if that client asks for it too.
+        """
+        return self._join_service(
+            topic,
+            Right.SERVE,
+            description,
+            is_global=is_global,
+            urgent=urgent,
+            paths=paths,
+            options=options,
+            is_session=is_session,
+        )
 
     def call(
-        self, topic: Topic, description: bytes, *, is_global: bool = True, urgent: bool = False, paths: int = 1
+        self,
+        topic: Topic,
+        description: bytes,
+        *,
+        is_global: bool = True,
+        urgent: bool = False,
+        paths: int = 1,
+        options: SendOptions = DEFAULT_OPTIONS,
+        is_session: bool = False,
     ) -> Publisher:
         """Call a name from now on; return the stream of requests to all its servers. ``send_request`` sends to one.
 
         A request that is published while ``peers`` is empty reaches no server.
+
+        Args:
+            is_session: a session secret authenticates streams to and from one server, if that server asks for it too.
         """
-        return self._join_service(topic, Right.CALL, description, is_global=is_global, urgent=urgent, paths=paths)
+        return self._join_service(
+            topic,
+            Right.CALL,
+            description,
+            is_global=is_global,
+            urgent=urgent,
+            paths=paths,
+            options=options,
+            is_session=is_session,
+        )
 
     def respond(self, service: Name, client: Name, message: bytes) -> None:
         """Send a message to one client of a name that is served here.
@@ -278,16 +323,18 @@ class Participant:
     def _hand_out(self, fed: dict[WriterProxy, Subscription], now_s: float) -> None:
         for writer_proxy, subscription in fed.items():
             self._messages += subscription.poll_messages(writer_proxy.publisher)
-            self._report(writer_proxy, now_s)
+            if writer_proxy.get_timer() <= now_s:
+                self._reporting[writer_proxy] = None  # it states for how long it held back what it reports
+            self._writer_proxies_due.reschedule(writer_proxy)
         fed.clear()
 
     def _receive_one(self, arrival: ReceivedFrame, now: Timestamps, fed: dict[WriterProxy, Subscription]) -> None:
         try:
             header = decode(arrival.frame)
             if header.kind in _FOR_WRITER_PROXIES:
-                self._writer_proxy(header, arrival.frame, now.mono_s, fed)
+                self._writer_proxy(header, arrival, now.mono_s, fed)
             elif header.kind in _NOTES:
-                self._take_note(header, arrival.frame, now.mono_s)
+                self._take_note(header, arrival, now.mono_s)
             elif header.kind >= CONTROL_FROM:
                 statement = self.attachment.receive_control(arrival, header, now)
                 if statement is not None:
@@ -323,11 +370,14 @@ class Participant:
         if self.attachment.switch is None:
             return
         self._look_at_clock(now_s)
-        for frames in self._turns.poll_turn(now_s):
-            self.attachment.send(frames)
+        if self.attachment.switch != self._sent_by:
+            self._sent_by = self.attachment.switch
+            self._publications.attachment_changed(now_s)
         for writer_proxy in self._reporting:
             self._report(writer_proxy, now_s)
         self._reporting.clear()
+        for frames in self._turns.poll_turn(now_s):
+            self.attachment.send(frames)
 
     def _report(self, writer_proxy: WriterProxy, now_s: float) -> None:
         notes = writer_proxy.control_to_send(now_s)
@@ -346,7 +396,7 @@ class Participant:
         """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
         return self.attachment.hello_protocol.poll_addresses()
 
-    def frames_to_send(self) -> list[OutgoingFrames]:
+    def frames_to_send(self, now_s: float) -> list[OutgoingFrames]:
         """Return, once, the frames to send; call again until it returns none.
 
         So the first frames of a large message are under way while the next ones are being sealed. The topics take
@@ -354,9 +404,13 @@ class Participant:
         """
         out = self.attachment.frames_to_send()
         if not out and (self._turns or self._reporting):
-            self.flush(self._now_s)
+            self.flush(now_s)
             out = self.attachment.frames_to_send()
         return out
+
+    def frames_leave(self, now_s: float) -> None:
+        """Note that the frames returned last are sent now: sealing them took time."""
+        self._publications.frames_leave(now_s)
 
     def poll_messages(self) -> list[Message]:
         """Return, once, the messages that arrived, in order within each writer proxy."""
@@ -374,22 +428,36 @@ class Participant:
         if not is_free:
             raise LocalError(f"{topic.name.short} is in use already: {right.value} is refused for it")
 
-    def _advertisement(self, topic: Topic, right: Right, *, is_global: bool, paths: int) -> None:
+    def _advertisement(
+        self, topic: Topic, right: Right, *, is_global: bool, paths: int, is_session: bool = False
+    ) -> None:
         delegation = topic.delegation
-        self.attachment.advertisement(delegation.subject, right, delegation.chain, is_global=is_global, paths=paths)
+        self.attachment.advertisement(
+            delegation.subject, right, delegation.chain, is_global=is_global, paths=paths, is_session=is_session
+        )
 
     def _join_service(
-        self, topic: Topic, right: Right, description: bytes, *, is_global: bool, urgent: bool, paths: int
+        self,
+        topic: Topic,
+        right: Right,
+        description: bytes,
+        *,
+        is_global: bool,
+        urgent: bool,
+        paths: int,
+        options: SendOptions,
+        is_session: bool,
     ) -> Publisher:
         is_free = topic.name not in self._publications and self._subscriptions.get(topic.name) is None
         self._check(topic, right, is_free=is_free)
         publisher = self._publications.add(
             topic.name, topic.secrets, description,
             reliable=True, urgent=urgent, patience=CALLS if right is Right.CALL else TOPICS, paths=paths,
+            options=options,
         )  # fmt: skip
-        self._publications.enable_unicast(topic.name, topic.secrets, urgent=urgent, paths=paths)
-        self._subscriptions.add(topic, right, paths)
-        self._advertisement(topic, right, is_global=is_global, paths=paths)
+        self._publications.enable_unicast(topic.name, topic.secrets, urgent=urgent, paths=paths, options=options)
+        self._subscriptions.add(topic, right, paths, is_session=is_session)
+        self._advertisement(topic, right, is_global=is_global, paths=paths, is_session=is_session)
         return publisher
 
     def _look_at_clock(self, now_s: float) -> None:
@@ -403,25 +471,27 @@ class Participant:
             raise LocalError(f"no {right.value} of {service.short} here")
         self._publications.send_to(service, party, message, self._now_s)
 
-    def _writer_proxy(self, header: Header, frame: bytes, now_s: float, fed: dict[WriterProxy, Subscription]) -> None:
+    def _writer_proxy(
+        self, header: Header, arrival: ReceivedFrame, now_s: float, fed: dict[WriterProxy, Subscription]
+    ) -> None:
         """Pass a frame to its writer proxy, and add that to ``fed``."""
         found = self._subscriptions.find(header, now_s)
         if found is None:
             self._drops[DropReason.NOT_FOR_US] += 1
             return
         subscription, writer_proxy = found
-        writer_proxy.receive(header, frame, now_s)
+        writer_proxy.receive(header, arrival.frame, now_s, arrival.waited_s)
         fed[writer_proxy] = subscription
         if header.parts > 1:
             self._under_way = writer_proxy, subscription
 
-    def _take_note(self, header: Header, frame: bytes, now_s: float) -> None:
+    def _take_note(self, header: Header, arrival: ReceivedFrame, now_s: float) -> None:
         if header.destination != self.name:
             raise StatementError(DropReason.NOT_FOR_US)
         if header.kind == Kind.INTRODUCTION:
-            self._publications.receive_introduction(header, frame)
+            self._publications.receive_introduction(header, arrival.frame)
         else:
-            self._publications.receive_acknack(header, frame, now_s)
+            self._publications.receive_acknack(header, arrival.frame, now_s, arrival.waited_s)
 
     def _introduction(self) -> bytes:
         """Return the introduction of this incarnation; signed again if an earlier incarnation proves to be ahead."""
@@ -448,14 +518,13 @@ class Participant:
         """Return another party of a service that is connected now."""
         subscription = self._subscriptions.get(service)
         writer_proxy = None if subscription is None else subscription.writer_proxies.get(party)  # type: ignore[call-overload]
-        return (
-            None
-            if writer_proxy is None
-            else Party(
-                PeerIncarnation(writer_proxy.publisher, writer_proxy.incarnation),
-                writer_proxy.exchange,
-                writer_proxy.second_path_s,
-            )
+        if subscription is None or writer_proxy is None:
+            return None
+        return Party(
+            PeerIncarnation(writer_proxy.publisher, writer_proxy.incarnation),
+            writer_proxy.exchange,
+            writer_proxy.second_path_s,
+            subscription.has_session(writer_proxy),
         )
 
     def _revoke(self, statement: Statement, now: Timestamps) -> None:

@@ -12,7 +12,9 @@ from gdp.client.identities import WriterIdentity
 from gdp.client.key_epochs import Secrets
 from gdp.client.path_mtu import PathMtu
 from gdp.client.publisher import Publisher
+from gdp.client.reader_path import ReaderPaths
 from gdp.client.reader_proxies import TOPICS, ReaderTimeouts
+from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
 from gdp.client.send_scheduler import SendScheduler
 from gdp.client.sequence_numbers import SequenceRegistry
 from gdp.client.timer_queue import TimerQueue
@@ -43,6 +45,7 @@ class Publications:
         self._paths: dict[Name, PathMtu] = {}
         self._sequence_registry = SequenceRegistry()
         self._timers = TimerQueue[Publisher]()
+        self._reader_paths = ReaderPaths()
         self.turns = SendScheduler(self._timers.reschedule)
         self._drops: Counter[DropReason] = Counter()  # of closed publishers
         self._losses: Counter[LossReason] = Counter()
@@ -79,6 +82,7 @@ class Publications:
         urgent: bool,
         patience: ReaderTimeouts = TOPICS,
         paths: int = 1,
+        options: SendOptions = DEFAULT_OPTIONS,
     ) -> Publisher:
         """Publish a name from now on, above all numbers that were used for it before."""
         publisher = Publisher(
@@ -92,12 +96,22 @@ class Publications:
             past=self._sequence_registry.of(name),
             patience=patience,
             paths=paths,
+            reader_paths=self._reader_paths,
+            options=options,
         )
         publisher.published = self.turns.add
         self._publishers[name] = publisher
         return publisher
 
-    def enable_unicast(self, name: Name, secrets: Secrets, *, urgent: bool, paths: int = 1) -> None:
+    def enable_unicast(
+        self,
+        name: Name,
+        secrets: Secrets,
+        *,
+        urgent: bool,
+        paths: int = 1,
+        options: SendOptions = DEFAULT_OPTIONS,
+    ) -> None:
         """Enable unicast streams on a published name from now on."""
         self._private[name] = UnicastStreams(
             service=name,
@@ -107,6 +121,8 @@ class Publications:
             published=self.turns.add,
             urgent=urgent,
             paths=paths,
+            reader_paths=self._reader_paths,
+            options=options,
         )
 
     def remove(self, name: Name) -> bool:
@@ -159,16 +175,17 @@ class Publications:
             raise StatementError(DropReason.NOT_FOR_US)
         publisher.receive_introduction(header, frame)
 
-    def receive_acknack(self, header: Header, frame: bytes, now_s: float) -> None:
-        """Process a reader's sealed report.
+    def receive_acknack(self, header: Header, frame: bytes, now_s: float, waited_s: float = 0.0) -> None:
+        """Process a reader's sealed report, which came ``waited_s`` before.
 
         Raises:
             RemoteError: it concerns nothing that is published here, or there are too many unicast streams.
         """
         topic = topic_of(header, frame)
         publisher = self._publishers.get(topic) or self._stream(topic, header.source, now_s)  # type: ignore[call-overload]
-        publisher.receive_acknack(header, frame, now_s)
+        publisher.receive_acknack(header, frame, now_s, waited_s)
         self.turns.add(publisher)
+        self.turns.resume()  # the path may carry frames of other publishers, too
 
     def receive_join(self, join: Join, now_s: float) -> None:
         """Note that a tree is installed, and its MTU."""
@@ -191,16 +208,28 @@ class Publications:
             self.turns.add(publisher)
         for streams in self._private.values():
             streams.forget_idle(now_s)
+        if self._reader_paths.handle_timer(now_s):
+            self.turns.resume()
+
+    def frames_leave(self, now_s: float) -> None:
+        """Note that the frames polled last leave now."""
+        self._reader_paths.frames_leave(now_s)
+
+    def attachment_changed(self, now_s: float) -> None:
+        """Measure all paths anew: frames leave by another switch."""
+        self._reader_paths.attachment_changed(now_s)
+        self.turns.resume()
 
     def next_due(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        return self._timers.next_due()
+        times = [self._timers.next_due(), self._reader_paths.get_timer(), self.turns.next_due()]
+        return min((time for time in times if time is not None), default=None)
 
     def _stream(self, stream: bytes, reader: bytes, now_s: float) -> Publisher:
         """Return the unicast stream that a report concerns."""
         for service, streams in self._private.items():
             heard = self._heard(service, reader)
-            if heard is None or not streams.is_about(stream, heard.incarnation_id):
+            if heard is None or not streams.is_about(stream, heard):
                 continue
             known = streams.get(heard.incarnation_id)
             if known is not None:

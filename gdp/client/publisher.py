@@ -14,17 +14,23 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from typing import Final
+from typing import Final, TypeVar
 
 from gdp.client.ack_nack_handler import AckNackHandler
+from gdp.client.best_effort_cache import BestEffortCache
+from gdp.client.blocking_readers import BlockingReaders
 from gdp.client.heartbeat_schedule import HeartbeatSchedule
 from gdp.client.identities import WriterIdentity
 from gdp.client.key_epochs import KeyEpochs, Secrets
+from gdp.client.reader_path import ReaderPath, ReaderPaths
 from gdp.client.reader_proxies import TOPICS, ReaderProxies, ReaderTimeouts
+from gdp.client.redundancy import Redundancy
+from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
 from gdp.client.send_queue import SendQueue
+from gdp.client.sent_frames import SentFrames
 from gdp.client.sequence_numbers import FIRST, SequenceState
 from gdp.errors import DropReason, EnvelopeError, RemoteError
-from gdp.frame.codec import Header, second_path_copy
+from gdp.frame.codec import SECOND_PATH, Header, second_path_copy
 from gdp.frame.kinds import Flag
 from gdp.limits import MTU_MIN_BYTES, SPREAD, WINDOW_BYTES
 from gdp.message.bundle import BUNDLE_BYTES
@@ -33,10 +39,14 @@ from gdp.message.loss import Losses, LossReason
 from gdp.message.send_window import SendWindow
 from gdp.message.striping import Striper
 from gdp.names import Name
+from gdp.token_bucket import TokenBucket
 
 __all__ = ["Publisher"]
 
+_Number = TypeVar("_Number", int, float)
 _ALL: Final = 1 << 30
+_NEVER: Final = float("inf")
+_LIMIT_BURST_S: Final = 0.05  # of ``max_bits_s``: a burst of this time leaves at once
 
 
 class Publisher:
@@ -52,8 +62,13 @@ class Publisher:
         address: destination of the frames; None: the topic.
         paths: 2: a second copy of each frame is sent, marked for the second path, while there is one. ``SPREAD``: large
             messages are striped over both.
+        reader_paths: what may leave to each reader node; shared by all publishers of a participant.
+        options: how fresh, how much and how often its messages leave.
 
     Attributes:
+        options: as set last.
+        path_share: of what the path carries, 0 to 1; the other topics that wait have the rest.
+        redundancy: copies of its frames against loss.
         second_path_until_s: monotonic second until which there is a second path, as far as known here.
         published: called when frames are ready to be polled, and when the publisher closes.
         has_more: the last ``poll_frames`` reached its limit.
@@ -76,9 +91,18 @@ class Publisher:
         patience: ReaderTimeouts = TOPICS,
         address: Name | None = None,
         paths: int = 1,
+        reader_paths: ReaderPaths | None = None,
+        options: SendOptions = DEFAULT_OPTIONS,
     ) -> None:
         self.topic = topic
         self.paths = paths
+        self.options = options
+        self._reader_paths = ReaderPaths() if reader_paths is None else reader_paths
+        self.path_share = 1.0
+        self._blocking = BlockingReaders(patience.lag_s)
+        self._seen_s = 0.0
+        self._under_way = SentFrames(self._reader_paths, counts_losses=paths != SPREAD)
+        self._limit = _limit_of(options)
         self.second_path_until_s = float("-inf")
         self._striper = Striper() if paths == SPREAD else None
         self._is_reliable = reliable
@@ -88,13 +112,16 @@ class Publisher:
         self._keys = KeyEpochs(topic, source, secrets, address)
         self._window = SendWindow(history_depth=depth, first_number=past.next_number, lag_s=patience.lag_s)
         self._queue = SendQueue(
-            keys=self._keys, window=self._window, next_number=past.next_number, last_sequence=past.sequence
-        )
+            keys=self._keys, window=self._window, next_number=past.next_number, last_sequence=past.sequence,
+            options=options,
+        )  # fmt: skip
+        self._late = BestEffortCache(options)
         self._readers = ReaderProxies(topic, source, patience)
         self._heartbeats = HeartbeatSchedule(description, past.status_number)
         self._acknowledgements = AckNackHandler(
             readers=self._readers, queue=self._queue, window=self._window, heartbeats=self._heartbeats
         )
+        self.redundancy = Redundancy(budget=source.copies, is_enabled=urgent and options.fec)
         self._queue.depth = depth
         self._set_flags()
 
@@ -168,7 +195,7 @@ class Publisher:
     @property
     def repairs(self) -> int:
         """Return how many fragments were sent again."""
-        return self._window.retransmissions
+        return self._window.retransmissions + self._late.retransmissions
 
     def has_space(self) -> bool:
         """Return whether a message may be published without evicting an unacknowledged one."""
@@ -181,10 +208,26 @@ class Publisher:
     @property
     def acknowledged(self) -> int:
         """Return how many messages every reader has confirmed; of a best-effort topic, how many were sent."""
-        readers = self._readers.all() if self.confirms else []
+        if not self.confirms:
+            return self.sent
+        readers = self._readers.all()
         below = min([self._queue.first_waiting, *(each.sequence for each in readers)])
         lost = max((each.lost for each in readers), default=0)
         return min(self._queue.ledger.confirmed(below), max(self.messages - lost, 0))
+
+    @property
+    def sent(self) -> int:
+        """Return how many messages have left, not counting those that some reader is known not to get."""
+        return self._queue.ledger.confirmed(self._queue.sequences[0])
+
+    @property
+    def reader_lost(self) -> int:
+        """Return how many messages the reader that lost most reports as lost, those that never left included."""
+        return max((each.lost for each in self._readers.all()), default=0)
+
+    def is_reported(self) -> bool:
+        """Return whether nothing waits, and every reader has reported each message as delivered or lost."""
+        return self._queue.is_empty and all(each.sequence > self._queue.ledger.last for each in self._readers.all())
 
     def renew(self, secrets: Secrets, now_s: float) -> None:
         """Replace the topic's secrets; messages from now on are sealed under the newest epoch.
@@ -207,6 +250,15 @@ class Publisher:
         if self._heartbeats.describe(description):
             self.published(self)
 
+    def set_options(self, options: SendOptions) -> None:
+        """Change how fresh, how much and how often messages leave, those that wait included."""
+        if options.max_bits_s != self.options.max_bits_s:
+            self._limit = _limit_of(options)
+        self.options = options
+        self._queue.set_options(options)
+        self.redundancy.is_enabled = self.is_urgent and options.fec
+        self._late.set_options(options)
+
     def set_depth(self, depth: int) -> None:
         """Change how many messages are kept for late joiners; 0: none."""
         if depth == self._queue.depth:
@@ -218,9 +270,58 @@ class Publisher:
         self._heartbeats.wanted = True
         self.published(self)
 
+    def allowance(self, now_s: float) -> int:
+        """Return how many bytes of frames may leave now, as far as the paths to its readers permit; 0: none.
+
+        Of a topic that sends each frame over two paths, the round trip changes with the path whose copy comes first. So
+        no path governs it while there are two.
+        """
+        if self._limit is not None and self._limit.left(now_s) <= 0:
+            return 0
+        self._seen_s, urgent = now_s, self.is_urgent
+        if self._is_doubled(now_s):
+            return _ALL
+        allowances = [path.allowance(now_s, urgent=urgent) for path in self._paths()]
+        if self.confirms and len(allowances) > 1 and min(allowances) <= 0:
+            self._record_blocks(now_s)
+        return self._governed(allowances, _ALL)
+
+    def next_send_s(self, now_s: float) -> float | None:
+        """Return when ``allowance`` may be more than 0; None: not before a reader confirms something."""
+        due_s = -self._governed([-path.next_send_s() for path in self._paths()], -now_s)
+        if self._limit is not None and (left := self._limit.left(now_s)) <= 0:
+            due_s = max(due_s, now_s + self._limit.seconds_for(1 - left))
+        return None if due_s == _NEVER else due_s
+
+    def note_idle(self) -> None:
+        """Note that nothing waits, though the paths may permit more."""
+        for path in self._paths():
+            path.note_idle()
+
+    @property
+    def path_bytes_s(self) -> float | None:
+        """Return the bytes a second that this topic may expect of its path; None: not measured, and no limit."""
+        rate = self._governed([rate for path in self._paths() if (rate := path.controller.bytes_s)], 0.0)
+        shares = [rate * self.path_share] if rate else []
+        if self.options.max_bits_s is not None:
+            shares.append(self.options.max_bits_s / 8)
+        return min(shares, default=None)
+
+    @property
+    def path_loss(self) -> float:
+        """Return the share of frames that were lost lately on the worst path, 0 to 1."""
+        return max((path.controller.loss for path in self._paths()), default=0.0)
+
+    @property
+    def path_rtt_s(self) -> float | None:
+        """Return the smoothed round trip of the longest path in seconds; None: not measured."""
+        return max((trip for path in self._paths() if (trip := path.controller.rtt_s) is not None), default=None)
+
     def close(self) -> None:
         """Forget all readers and what waits for them; nothing is sent any more."""
+        self._under_way.keep(())
         self._queue.close()
+        self._late.close()
         self._acknowledgements.close()
         self.published(self)  # the last time: the caller that waits for its frames finds none
         self.published = lambda _: None
@@ -232,16 +333,21 @@ class Publisher:
             whether something has to be sealed again for it.
         """
         mtu = self._queue.mtu = max(mtu, MTU_MIN_BYTES)
+        self._reader_paths.set_mtu(self._readers, mtu)
+        self._late.drop_larger(mtu)
         is_resealed = self._queue.refragment_best_effort(mtu)
         move = self._queue.refragment(mtu)
         if move is not None:
             self._acknowledgements.renumber(move)
         return is_resealed or move is not None
 
-    def publish(self, message: bytes) -> int | None:
+    def publish(self, message: bytes, now_s: float | None = None) -> int | None:
         """Queue a message; return the count of published messages, or None when there is no reader.
 
         The message is confirmed when ``acknowledged`` reaches that count.
+
+        Args:
+            now_s: from when it ages, on a best-effort topic; None: from when frames are polled next.
 
         Raises:
             LocalError: above the limits.
@@ -253,7 +359,7 @@ class Publisher:
                 self.drops[DropReason.NO_READER] += 1
                 self.skip(LossReason.NO_READER)
             return None
-        self._queue.add(message, gather_bytes=WINDOW_BYTES if self._readers else BUNDLE_BYTES)
+        self._queue.add(message, gather_bytes=WINDOW_BYTES if self._readers else BUNDLE_BYTES, added_s=now_s)
         self.published(self)
         return self.messages
 
@@ -273,8 +379,11 @@ class Publisher:
         except RemoteError as error:
             self.drops[error.reason] += 1
 
-    def receive_acknack(self, header: Header, frame: bytes, now_s: float) -> bool:
-        """Process a reader's sealed report; return whether it is one. Errors are counted."""
+    def receive_acknack(self, header: Header, frame: bytes, now_s: float, waited_s: float = 0.0) -> bool:
+        """Process a reader's sealed report, which came ``waited_s`` before; return whether it is one.
+
+        Errors are counted.
+        """
         is_old = header.epoch != self._keys.epoch
         try:
             secret = self._keys.secret_of(header.epoch, now_s)
@@ -285,7 +394,14 @@ class Publisher:
             return False
         if self._striper is not None:
             self._striper.handle_share(header.source, report.share)
+        if not header.hops_left & SECOND_PATH:
+            self._under_way.handle_hops(header.source, header.hops_left, now_s)
+        self._under_way.handle_report(header.source, report, now_s, waited_s)
+        self.redundancy.handle_report(header.source, report, is_new=is_new)
         self._acknowledgements.handle_acknack(header.source, report, is_new=is_new, now_s=now_s)
+        if report.missing and not self.confirms:
+            newest = report.newest, report.newest_part
+            self._late.request(header.source, report.missing, now_s, newest=newest, rtt_s=self.path_rtt_s)
         self._heartbeats.wanted |= is_old  # it has not received the new epoch yet
         return True
 
@@ -303,37 +419,91 @@ class Publisher:
     def handle_timer(self, now_s: float) -> None:
         """Suspend silent readers, drop slow ones from the window, and probe those that owe a report."""
         self._acknowledgements.handle_timer(now_s)
+        for name in self._blocking.slow(self._window.sent_bytes, now_s):
+            self._acknowledgements.exclude(name, now_s)
+        self._late.drop_expired(now_s)
         self._heartbeats.wanted |= self._window.probe_due(now_s)
         self._heartbeats.handle_timer(now_s)
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         times = [self._window.next_probe(), self._window.next_slow_reader(), self._readers.next_silent()]
+        times += [self._late.get_timer(), self._blocking.get_timer()]
         if self._readers and self.mtu is not None:
-            times.append(self._heartbeats.get_timer())
+            times += [self._heartbeats.get_timer(), self.redundancy.get_timer()]
         return min((time for time in times if time is not None), default=None)
 
     def poll_frames(self, now_s: float, limit_bytes: int = _ALL) -> list[bytes]:
-        """Return frames that may be sent now, about ``limit_bytes`` at a time; the rest is sealed when it is polled."""
+        """Return about ``limit_bytes`` of frames; the rest is sealed when it is polled.
+
+        Heartbeats that are due leave in any case; with ``limit_bytes`` 0 nothing else does.
+        """
         self.has_more = False
         mtu = self._queue.mtu
         if mtu is None or not self._readers:
+            self.redundancy.clear()
+            if not self._readers:
+                self._queue.drop_unread()
             return []
         self._queue.seal_deferred()
+        if not self.confirms:
+            self._queue.bytes_s = self.path_bytes_s
+            self._heartbeats.wanted |= self._queue.drop_expired(now_s)
         has_pair = self.paths > 1 and now_s < self.second_path_until_s
-        limit = max(limit_bytes // (mtu * (2 if has_pair and self._striper is None else 1)), 1)
-        frames = self._seal_status(now_s, mtu) if self._heartbeats.is_due(now_s) else []
-        heartbeats, repaired = len(frames), self._window.retransmissions
-        frames += self._queue.frames_to_send(now_s, limit - len(frames))
-        self.has_more = len(frames) >= limit
+        status = self._seal_status(now_s, mtu) if self._heartbeats.is_due(now_s) else []
+        heartbeats, repaired = len(status), self.repairs
+        sent: list[bytes] = []
+        if limit_bytes > 0:
+            limit = max(limit_bytes // (mtu * (2 if has_pair and self._striper is None else 1)), 1)
+            sent = self._frames_to_send(now_s, limit)
+            self.has_more = len(sent) >= limit
+            if not self._is_doubled(now_s):
+                self._under_way.sent(sent, self._readers, now_s, self.repairs - repaired)
+            if self._limit is not None and sent:
+                self._limit.charge(now_s, sum(map(len, sent)))
+        frames = status + sent
         if frames:
             self._acknowledgements.last_sent_s = now_s
+        self.redundancy.handle_sent(frames[heartbeats:], self._readers, now_s, has_pair=has_pair)
+        frames += self.redundancy.poll_copies(now_s)
         if not has_pair:
             return frames
         if self._striper is None:
             return [*frames, *map(second_path_copy, frames)]
-        doubled = heartbeats + self._window.retransmissions - repaired
+        doubled = heartbeats + self.repairs - repaired
         return self._striper.stripe(frames, doubled, self._readers.names())
+
+    def _frames_to_send(self, now_s: float, limit: int) -> list[bytes]:
+        """Return at most ``limit`` frames: late repairs first."""
+        repairs = self._late.frames_to_send(now_s, limit)
+        new = self._queue.frames_to_send(now_s, limit - len(repairs)) if len(repairs) < limit else []
+        if not self.confirms:
+            self._late.record_sent(new, now_s)
+        return repairs + new
+
+    def _is_doubled(self, now_s: float) -> bool:
+        """Return whether each frame travels over two paths now."""
+        return self.paths > 1 and self._striper is None and now_s < self.second_path_until_s
+
+    def _record_blocks(self, now_s: float) -> None:
+        """Note which readers hold back the others."""
+        names = [name for name in self._readers if self._window.has_reader(name)]
+        paths = [(name, self._reader_paths.path(name, now_s)) for name in names]
+        allowances = [(name, path.allowance(now_s)) for name, path in paths if not path.is_silent]
+        self._blocking.record(allowances, self._window.sent_bytes, now_s)
+
+    def _paths(self) -> list[ReaderPath]:
+        """Return the paths to the readers that may govern: of a reliable topic those that keep up."""
+        names = [name for name in self._readers if self._window.has_reader(name)] if self.confirms else self._readers
+        return self._reader_paths.governing(names, self._seen_s)
+
+    def _governed(self, values: list[_Number], otherwise: _Number) -> _Number:
+        """Return the value of the path that governs.
+
+        A reliable topic goes as slowly as its slowest reader that counts. A best-effort topic goes as fast as its
+        fastest, because no reader of it waits for another.
+        """
+        return (min if self.confirms else max)(values, default=otherwise)
 
     def _set_flags(self) -> None:
         queue = self._queue
@@ -357,3 +527,11 @@ class Publisher:
         )
         wire = self._heartbeats.poll_heartbeat(state, now_s)
         return list(self._keys.status.seal(self._heartbeats.number, queue.flags, wire, mtu))
+
+
+def _limit_of(options: SendOptions) -> TokenBucket | None:
+    """Return the bucket of bytes of ``max_bits_s``."""
+    if options.max_bits_s is None:
+        return None
+    bytes_s = options.max_bits_s / 8
+    return TokenBucket(bytes_s, max(bytes_s * _LIMIT_BURST_S, 1.0))

@@ -90,6 +90,7 @@ class ReaderProxy:
     Attributes:
         incarnation_id: opens its reports.
         sequence: it has confirmed every message before this one, except ``lost`` of them that it counted as lost.
+        advanced_s: when ``sequence`` last rose.
         behind_s: since when its window has been suspended; None: it is not.
         confirmed: ``sequence`` at the end of a former incarnation; 0: not known.
     """
@@ -99,6 +100,7 @@ class ReaderProxy:
     heard_s: float
     sequence: int = 0
     lost: int = 0
+    advanced_s: float = 0.0
     behind_s: float | None = None
     confirmed: int = 0
     start: StreamStart | None = None  # None once it has begun to confirm
@@ -143,9 +145,10 @@ class ReaderProxies:
 
     def next_silent(self) -> float | None:
         """Return the monotonic second at which ``silent`` or ``overdue`` is no longer empty, or None."""
-        due_s = [reading.heard_s + READER_LEASE_S + 0.001 for reading in self._readers.values()]
-        due_s += [each.behind_s + READER_GRACE_S + 0.001 for each in self.all() if each.behind_s is not None]
-        return min(due_s, default=None)
+        due_s = [reading.heard_s + READER_LEASE_S for reading in self._readers.values()]
+        for readers in (self._readers, self._suspended):
+            due_s += [each.behind_s + READER_GRACE_S for each in readers.values() if each.behind_s is not None]
+        return min(due_s) + 0.001 if due_s else None
 
     def suspend(self, name: bytes, now_s: float) -> None:
         """Suspend a silent reader, until it reports again or is forgotten."""

@@ -6,7 +6,6 @@ Sans-I/O.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Final
 
 from gdp.limits import REPLAY_WINDOW_MESSAGES
@@ -79,7 +78,7 @@ class ReorderingBuffer:
         early = {number: self._pop(number) for number in list(self._waiting) if move.is_before(number)}
         for number in [number for number in self._waiting if number < self.expected]:
             self._pop(number)  # it was delivered under its old number
-        return [replace(joined, number=move.new_number(old)) for old, joined in early.items()]
+        return [joined._replace(number=move.new_number(old)) for old, joined in early.items()]
 
     def poll_all(self) -> list[ReassembledMessage]:
         """Remove and return what waits, in order."""

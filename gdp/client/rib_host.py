@@ -92,9 +92,13 @@ class RibHost:
         """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
         return self.attachment.hello_protocol.poll_addresses()
 
-    def frames_to_send(self) -> list[OutgoingFrames]:
+    def frames_to_send(self, now_s: float) -> list[OutgoingFrames]:
         """Return, once, the frames to send."""
+        del now_s  # nothing here is paced
         return self.attachment.frames_to_send()
+
+    def frames_leave(self, now_s: float) -> None:
+        """Do nothing: no path is measured here."""
 
     def _receive_statement(self, arrival: ReceivedFrame, now: Timestamps) -> list[tuple[bytes, Name]]:
         """Return the statement for the RIB that a frame completes, with its sender."""

@@ -16,8 +16,9 @@ from __future__ import annotations
 from collections import Counter, deque
 from typing import Final
 
-from gdp.client.best_effort_queue import BestEffortQueue, Carried
+from gdp.client.best_effort_queue import BestEffortQueue, Carried, is_expired
 from gdp.client.key_epochs import KeyEpochs
+from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
 from gdp.crypto.envelope import SIGNATURE_BYTES, Sealed, fragment_capacity
 from gdp.errors import DropReason
 from gdp.frame.kinds import Flag
@@ -41,6 +42,7 @@ class SendQueue:
         window: caches the frames of a topic whose readers acknowledge.
         next_number: number of the first message.
         last_sequence: highest sequence number in use.
+        options: how fresh its best-effort messages leave.
 
     Attributes:
         is_acknowledged: readers acknowledge what they get (reliable or latched topics).
@@ -50,9 +52,18 @@ class SendQueue:
         bundle_bytes: largest bundle; 0: each message has a seal of its own.
         moves: the latest renumberings.
         drops: messages dropped here, by reason.
+        bytes_s: bytes of frames per second that this topic may send now; None: unknown.
     """
 
-    def __init__(self, *, keys: KeyEpochs, window: SendWindow, next_number: int, last_sequence: int) -> None:
+    def __init__(
+        self,
+        *,
+        keys: KeyEpochs,
+        window: SendWindow,
+        next_number: int,
+        last_sequence: int,
+        options: SendOptions = DEFAULT_OPTIONS,
+    ) -> None:
         self._keys = keys
         self._window = window
         self.next_number = next_number
@@ -66,7 +77,9 @@ class SendQueue:
         self.drops: Counter[DropReason] = Counter()
         self._deferred = deque[tuple[int, bytes]]()  # (sequence number, message)
         self._gathered = Gathered()
-        self._best_effort = BestEffortQueue()
+        self.options = options
+        self.bytes_s: float | None = None
+        self._best_effort = BestEffortQueue(options.deadline_s)
 
     @property
     def is_empty(self) -> bool:
@@ -118,8 +131,11 @@ class SendQueue:
         self._deferred.append((self.ledger.next(), message))
         self._drop_deferred(self.depth)
 
-    def add(self, message: bytes, *, gather_bytes: int) -> None:
+    def add(self, message: bytes, *, gather_bytes: int, added_s: float | None = None) -> None:
         """Queue a message; small ones wait to be bundled, up to ``gather_bytes`` of them.
+
+        Args:
+            added_s: when it is published; None: when frames are polled next.
 
         Raises:
             LocalError: above the limits.
@@ -127,10 +143,10 @@ class SendQueue:
         self.seal_deferred()
         if self.depth or not self._gathered.is_small(message, self._bundle_capacity()):
             self.seal_gathered()
-            self._seal_message(message, self.ledger.last + 1)
+            self._seal_message(message, self.ledger.last + 1, added_s=added_s)
             self.ledger.next()
             return
-        self._gathered.add(self.ledger.next(), message)
+        self._gathered.add(self.ledger.next(), message, added_s)
         if self._gathered.held_bytes > gather_bytes:
             self._seal_next()
 
@@ -139,6 +155,11 @@ class SendQueue:
         self.seal_gathered()
         sequence = self.ledger.next()
         self.ledger.lose(sequence, sequence, reason)
+
+    def set_options(self, options: SendOptions) -> None:
+        """Change how fresh best-effort messages leave, those that wait included."""
+        self.options = options
+        self._best_effort.deadline_s = options.deadline_s
 
     def set_depth(self, depth: int) -> None:
         """Change how many messages are latched; what is beyond that is dropped."""
@@ -158,6 +179,29 @@ class SendQueue:
         while self._gathered:
             self._seal_next()
 
+    def drop_expired(self, now_s: float) -> bool:
+        """Drop best-effort messages that would come too late; return whether there were any. None is sealed for it."""
+        if self.is_acknowledged:
+            return False
+        gathered, options, dropped = self._gathered, self.options, 0
+        for each in self._best_effort.drop_expired(now_s, self.bytes_s, is_followed=bool(gathered)):
+            self._lose(each.sequence, each.messages, DropReason.LIFESPAN, LossReason.LIFESPAN)
+            dropped += each.messages
+        while gathered:
+            waited_s, has_newer = now_s - gathered.oldest_added_s(now_s), len(gathered) > 1
+            if not is_expired(waited_s, gathered.oldest_bytes, options.deadline_s, self.bytes_s, has_newer=has_newer):
+                break
+            self._lose(gathered.drop_oldest(), 1, DropReason.LIFESPAN, LossReason.LIFESPAN)
+            dropped += 1
+        return bool(dropped)
+
+    def drop_unread(self) -> None:
+        """Drop best-effort messages that wait: their readers are gone."""
+        for each in self._best_effort.drop_all():
+            self._lose(each.sequence, each.messages, DropReason.NO_READER, LossReason.NO_READER)
+        while self._gathered and not self.is_acknowledged:
+            self._lose(self._gathered.drop_oldest(), 1, DropReason.NO_READER, LossReason.NO_READER)
+
     def frames_to_send(self, now_s: float, limit: int) -> list[bytes]:
         """Return about ``limit`` frames that may be sent now, at least one; the rest is sealed when it is polled."""
         frames = self._best_effort.poll_frames(max(limit, 1))
@@ -173,7 +217,7 @@ class SendQueue:
         """Seal unsent best-effort messages again if one is too large for the path; return whether any was."""
         best_effort_queue = self._best_effort.requeue(mtu)
         for body, carried in best_effort_queue:
-            self._seal_message(body, carried.sequence, carried.messages)
+            self._seal_message(body, carried.sequence, carried.messages, carried.added_s)
         return bool(best_effort_queue)
 
     def refragment(self, mtu: int) -> Renumbering | None:
@@ -202,7 +246,7 @@ class SendQueue:
     def close(self) -> None:
         """Drop what waits; nothing is sent any more."""
         self.drops[DropReason.NO_READER] += len(self._gathered) + self._drop_deferred(0)
-        self._gathered, self._best_effort = Gathered(), BestEffortQueue()
+        self._gathered, self._best_effort = Gathered(), BestEffortQueue(self.options.deadline_s)
 
     def _has_best_effort_queue(self) -> bool:
         return self._window.sent[0] < self.next_number if self.is_acknowledged else bool(self._best_effort)
@@ -218,19 +262,18 @@ class SendQueue:
 
     def _seal_next(self) -> None:
         """Seal the part of the gathered messages that fits into one bundle."""
-        first, together = self._gathered.first, self._gathered.poll_batch(self._bundle_capacity())
-        self._seal_message(together[0] if len(together) == 1 else pack(together), first, len(together))
+        first, (together, added_s) = self._gathered.first, self._gathered.poll_batch(self._bundle_capacity())
+        self._seal_message(together[0] if len(together) == 1 else pack(together), first, len(together), added_s)
 
-    def _seal_message(self, body: bytes, sequence: int, messages: int = 1) -> None:
+    def _seal_message(self, body: bytes, sequence: int, messages: int = 1, added_s: float | None = None) -> None:
         """Number and seal a message, or a bundle of several; the oldest are dropped when too much waits."""
         assert self.mtu is not None
         number, ledger = self.next_number, self.ledger
         frames = self._seal(number, sequence.to_bytes(SEQUENCE_BYTES, "big") + body, self.mtu, is_bundle=messages > 1)
         self.next_number += 1
         if not self.is_acknowledged:
-            for dropped in self._best_effort.add(frames, Carried(number, sequence, messages)):
-                self.drops[DropReason.MEMORY_FULL] += dropped.messages
-                ledger.lose(dropped.sequence, dropped.sequence + dropped.messages - 1, LossReason.QUEUE_OVERFLOW)
+            for dropped in self._best_effort.add(frames, Carried(number, sequence, messages, added_s)):
+                self._lose(dropped.sequence, dropped.messages, DropReason.MEMORY_FULL, LossReason.QUEUE_OVERFLOW)
             return
         ledger.put(number, sequence, messages)
         evicted = self._window.add(number, frames, frames.size_bytes)
@@ -239,6 +282,11 @@ class SendQueue:
 
     def _seal(self, number: int, body: bytes | Sealed, mtu: int, *, is_bundle: bool) -> Sealed:
         return self._keys.data.seal(number, self.flags | _BUNDLE * is_bundle, body, mtu)
+
+    def _lose(self, sequence: int, messages: int, drop_reason: DropReason, reason: LossReason) -> None:
+        """Count messages that no reader gets."""
+        self.drops[drop_reason] += messages
+        self.ledger.lose(sequence, sequence + messages - 1, reason)
 
     def _drop_deferred(self, keep: int) -> int:
         """Drop the oldest deferred messages above ``keep``; return how many."""

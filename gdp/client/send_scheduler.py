@@ -1,6 +1,9 @@
-"""Send scheduler of a participant: the order in which its publishers send; urgent first, then round robin.
+"""Send scheduler of a participant: the order in which its publishers send, and when.
 
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: Linux ``sch_prio``.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Urgent publishers come first. The others share what their
+paths permit by deficit round robin, frame by frame. A publisher that had nothing to send has its first round before
+those that wait, so that no image delays a scan. Sources: Linux ``sch_prio``; M. Shreedhar and G. Varghese, Efficient
+Fair Queuing Using Deficit Round Robin, SIGCOMM 1995; RFC 8290, section 4 (new and old queues).
 """
 
 from __future__ import annotations
@@ -9,11 +12,14 @@ from collections.abc import Callable
 from typing import Final
 
 from gdp.client.publisher import Publisher
+from gdp.limits import MTU_MIN_BYTES
 
 __all__ = ["BYTES_AT_ONCE", "BYTES_WITH_URGENT", "SendScheduler"]
 
 BYTES_AT_ONCE: Final = 96 << 10  # of ordinary frames, before any other publisher has its turn
 BYTES_WITH_URGENT: Final = 64 << 10  # ... with an urgent topic, whose frames may have to wait for this amount
+_QUANTUM_FRAMES: Final = 2  # of a publisher of weight 1 in each round, where the path is the limit
+_NEVER: Final = float("inf")
 
 
 class SendScheduler:
@@ -26,42 +32,98 @@ class SendScheduler:
     def __init__(self, asked: Callable[[Publisher], None]) -> None:
         self._asked = asked
         self._urgent: dict[Publisher, None] = {}
-        self._ordinary: dict[Publisher, None] = {}  # the one whose turn it is comes first
+        self._new: dict[Publisher, None] = {}  # had nothing to send before
+        self._ordinary: dict[Publisher, int] = {}  # with the bytes left of its round; the one whose turn it is first
         self._at_once = BYTES_AT_ONCE
+        self._held_until_s: float | None = None  # the paths hold back all that wait
 
     def __bool__(self) -> bool:
-        return bool(self._urgent or self._ordinary)
+        return bool(self._urgent or self._new or self._ordinary) and self._held_until_s is None
 
     def add(self, publisher: Publisher) -> None:
         """Note that a publisher may have frames; one that already waits for its turn keeps its position."""
+        self._held_until_s = None
         if publisher.is_urgent:
             self._at_once = BYTES_WITH_URGENT
             self._urgent[publisher] = None
-        else:
-            self._ordinary[publisher] = None
+        elif publisher not in self._ordinary:
+            self._new[publisher] = None
+
+    def resume(self) -> None:
+        """Note that paths may permit more than before."""
+        self._held_until_s = None
+
+    def next_due(self) -> float | None:
+        """Return the monotonic second at which a path permits more; None: nothing waits, or for a reader's report."""
+        return None if self._held_until_s == _NEVER else self._held_until_s
 
     def poll_turn(self, now_s: float) -> list[list[bytes]]:
         """Return the frames that leave now, urgent and ordinary ones apart; an empty publisher leaves the queue."""
-        urgent = [frame for publisher in list(self._urgent) for frame in self._ask(publisher, self._urgent, now_s)]
-        urgent_bytes = sum(map(len, urgent))
-        if 0 < urgent_bytes < self._at_once // 2:
+        if self._held_until_s is not None and now_s < self._held_until_s:
+            return []
+        self._held_until_s = None
+        urgent, due_s = self._poll_urgent(now_s)
+        if 0 < sum(map(len, urgent)) < self._at_once // 2:
             return [urgent]  # it leaves now; the others' next chunk is sealed after that
-        ordinary: list[bytes] = []
-        left = self._at_once
-        for publisher in list(self._ordinary):
-            frames = self._ask(publisher, self._ordinary, now_s, left)
-            ordinary += frames
-            left -= sum(map(len, frames))
-            if left < self._at_once // 2:
-                break
+        self._ordinary = {**dict.fromkeys(self._new, 0), **self._ordinary}
+        self._new.clear()
+        ordinary, ordinary_due_s = self._poll_ordinary(now_s)
+        if not urgent and not ordinary and (self._urgent or self._ordinary):
+            self._held_until_s = min(due_s, ordinary_due_s)
         return [frames for frames in (urgent, ordinary) if frames]
 
-    def _ask(
-        self, publisher: Publisher, waiting: dict[Publisher, None], now_s: float, at_most_bytes: int | None = None
-    ) -> list[bytes]:
-        del waiting[publisher]
-        frames = publisher.poll_frames(now_s, at_most_bytes or self._at_once)
-        if publisher.has_more:
-            waiting[publisher] = None  # behind the others
+    def _poll_urgent(self, now_s: float) -> tuple[list[bytes], float]:
+        """Return urgent frames, and when a path permits more."""
+        frames: list[bytes] = []
+        due_s = _NEVER
+        for publisher in list(self._urgent):
+            allowance = publisher.allowance(now_s)
+            frames += self._poll(publisher, min(allowance, self._at_once), now_s)
+            if allowance <= 0:
+                due_s = min(due_s, _or_never(publisher.next_send_s(now_s)))
+            elif not publisher.has_more:
+                self._urgent.pop(publisher, None)
+        return frames, due_s
+
+    def _poll_ordinary(self, now_s: float) -> tuple[list[bytes], float]:
+        """Return one round of ordinary frames, and when a path permits more."""
+        frames: list[bytes] = []
+        due_s, left = _NEVER, self._at_once
+        weights = sum(publisher.options.weight for publisher in self._ordinary)
+        for publisher, left_of_round in list(self._ordinary.items()):
+            publisher.path_share = publisher.options.weight / weights
+            allowance = publisher.allowance(now_s)
+            if allowance <= 0:
+                frames += self._poll(publisher, 0, now_s)
+                due_s = min(due_s, _or_never(publisher.next_send_s(now_s)))
+                continue
+            is_shared = allowance < left and len(self._ordinary) > 1
+            deficit = left_of_round
+            if is_shared and deficit <= 0:
+                deficit += _QUANTUM_FRAMES * publisher.options.weight * (publisher.mtu or MTU_MIN_BYTES)
+            polled = self._poll(publisher, min(allowance, deficit if is_shared else left), now_s)
+            size = sum(map(len, polled))
+            frames += polled
+            left -= size
+            deficit = deficit - size if is_shared else 0
+            if not publisher.has_more:
+                self._ordinary.pop(publisher, None)
+            elif deficit > 0:
+                self._ordinary[publisher] = deficit  # its round goes on when the path permits
+            else:
+                self._ordinary.pop(publisher, None)
+                self._ordinary[publisher] = deficit  # behind the others
+            if left < self._at_once // 2:
+                break
+        return frames, due_s
+
+    def _poll(self, publisher: Publisher, limit_bytes: int, now_s: float) -> list[bytes]:
+        frames = publisher.poll_frames(now_s, limit_bytes)
         self._asked(publisher)
+        if limit_bytes > 0 and not publisher.has_more and len(self._ordinary) + len(self._urgent) + len(self._new) == 1:
+            publisher.note_idle()  # the path could carry more than there is
         return frames
+
+
+def _or_never(due_s: float | None) -> float:
+    return _NEVER if due_s is None else due_s

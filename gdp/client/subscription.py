@@ -73,6 +73,7 @@ class Subscription:
 
     Attributes:
         paths: over how many paths frames come, and reports go, where the peer wants the same.
+        is_session: a session secret authenticates the unicast streams of this name, where the peer wants the same.
         private: by writer.
         absent: publishers whose route has ended, with their incarnation, and where their writer proxies ended.
         past_losses: of closed writer proxies.
@@ -81,6 +82,7 @@ class Subscription:
     topic: Topic
     right: Right
     paths: int = 1
+    is_session: bool = False
     writer_proxies: dict[Name, WriterProxy] = field(default_factory=dict)
     private: dict[Name, UnicastReceiver] = field(default_factory=dict)
     absent: dict[Name, tuple[int, Ended]] = field(default_factory=dict)
@@ -104,6 +106,11 @@ class Subscription:
         """Return every writer proxy."""
         return [*self.writer_proxies.values(), *self.private.values()]
 
+    def has_session(self, writer_proxy: WriterProxy) -> bool:
+        """Return whether a session secret authenticates the unicast streams with a peer: both ends ask for it."""
+        advertisement = writer_proxy.advertisement
+        return self.is_session and advertisement is not None and advertisement.is_session
+
     def set_advertisement(self, writer_proxy: WriterProxy, advertisement: Advertisement) -> None:
         """Set the newest advertisement of a publisher: it may want two paths, or no longer."""
         writer_proxy.advertisement_sequence, writer_proxy.advertisement = advertisement.sequence, advertisement
@@ -125,11 +132,12 @@ class Subscription:
 
 
 class _UnicastRoute(NamedTuple):
-    """Route by which a party may send to us alone."""
+    """Route by which a party may send to us alone; ``verifier`` None: under a session secret."""
 
     subscription: Subscription
+    writer: Name
     stream: Name
-    verifier: VerifiesDigest
+    verifier: VerifiesDigest | None
 
 
 class StreamChanges(NamedTuple):
@@ -169,9 +177,14 @@ class Subscriptions:
         """Return the subscription of a name, or None."""
         return self._by_name.get(name)
 
-    def add(self, topic: Topic, right: Right, paths: int = 1) -> None:
-        """Read a name from now on; ``paths``: over how many paths its frames are to come."""
-        self._by_name[topic.name] = Subscription(topic=topic, right=right, paths=paths)
+    def add(self, topic: Topic, right: Right, paths: int = 1, *, is_session: bool = False) -> None:
+        """Read a name from now on.
+
+        Args:
+            paths: over how many paths its frames are to come.
+            is_session: a session secret may authenticate its unicast streams.
+        """
+        self._by_name[topic.name] = Subscription(topic=topic, right=right, paths=paths, is_session=is_session)
 
     def remove(self, name: Name) -> list[WriterProxy]:
         """Stop reading a name; return the writer proxies to close."""
@@ -191,7 +204,7 @@ class Subscriptions:
         if header.destination != self._reader.name:
             return None
         way = self._ways.get((header.source, header.incarnation))
-        return None if way is None else (way.subscription, self._private_writer_proxy(way, Name(header.source), now_s))
+        return None if way is None else (way.subscription, self._private_writer_proxy(way, now_s))
 
     def receive_response(self, answer: Response, now: Timestamps) -> StreamChanges:
         """Process a switch's response about a party: its advertisement, or its end.
@@ -217,10 +230,12 @@ class Subscriptions:
         if writer_proxy is not None:
             if advertisement.sequence <= writer_proxy.advertisement_sequence:
                 return change
-            if writer_proxy.incarnation == advertisement.incarnation:
+            known, is_restarted = writer_proxy.advertisement, writer_proxy.incarnation != advertisement.incarnation
+            if not is_restarted and known is not None and known.is_session == advertisement.is_session:
                 subscription.set_advertisement(writer_proxy, advertisement)
                 return change
-            writer_proxy.finish()
+            if is_restarted:
+                writer_proxy.finish()
             rest = [Message(answer.name, each, writer_proxy.description) for each in writer_proxy.poll_delivered()]
             change = StreamChanges([], self._detach(subscription, advertisement.node), rest)
         return change._replace(opened=self._open(subscription, advertisement, now.mono_s))
@@ -282,15 +297,14 @@ class Subscriptions:
         if subscription.right is Right.SERVE:
             writer_proxy.idle_s = CALL_IDLE_S
         if subscription.right is not Right.READ:
-            stream = self._stream_from(topic.name, writer_proxy)
-            self._ways[party, private_incarnation(stream)] = _UnicastRoute(
-                subscription, stream, advertisement.member.key
-            )
+            stream = self._stream_from(subscription, writer_proxy)
+            verifier = None if subscription.has_session(writer_proxy) else advertisement.member.key
+            self._ways[party, private_incarnation(stream)] = _UnicastRoute(subscription, party, stream, verifier)
         return [writer_proxy]
 
-    def _private_writer_proxy(self, way: _UnicastRoute, writer: Name, now_s: float) -> UnicastReceiver:
+    def _private_writer_proxy(self, way: _UnicastRoute, now_s: float) -> UnicastReceiver:
         """Return the receiver of a party's unicast stream to us."""
-        subscription = way.subscription
+        subscription, writer = way.subscription, way.writer
         writer_proxy = subscription.private.get(writer)
         if writer_proxy is None:
             public, ended = subscription.writer_proxies[writer], self._ended.get(way.stream) or _NOWHERE
@@ -307,10 +321,12 @@ class Subscriptions:
             writer_proxy.paths = public.paths
         return writer_proxy
 
-    def _stream_from(self, topic: Name, writer_proxy: WriterProxy) -> Name:
+    def _stream_from(self, subscription: Subscription, writer_proxy: WriterProxy) -> Name:
         """Return the name of the stream by which a writer proxy's publisher sends to us alone."""
+        writer = PeerIncarnation(writer_proxy.publisher, writer_proxy.incarnation)
         reader = PeerIncarnation(self._reader.name, self._reader.incarnation)
-        return private_name(topic, PeerIncarnation(writer_proxy.publisher, writer_proxy.incarnation), reader)
+        is_session = subscription.has_session(writer_proxy)
+        return private_name(subscription.topic.name, writer, reader, is_session=is_session)
 
     def _end_all(self, subscription: Subscription) -> list[WriterProxy]:
         for party in list(subscription.absent):
@@ -334,7 +350,7 @@ class Subscriptions:
         writer_proxy = subscription.writer_proxies.pop(party)
         subscription.past_losses.update(writer_proxy.losses)
         self._remember(subscription.topic.name + _key(party, writer_proxy.incarnation), writer_proxy)
-        self._ways.pop((party, private_incarnation(self._stream_from(subscription.topic.name, writer_proxy))), None)
+        self._ways.pop((party, private_incarnation(self._stream_from(subscription, writer_proxy))), None)
         private = subscription.private.pop(party, None)
         if private is None:
             return [writer_proxy]

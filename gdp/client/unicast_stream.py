@@ -8,6 +8,9 @@ by unicast"). It is an ordinary stream, with three differences:
   is derived from that name: a later incarnation of either end shares nothing with it.
 - There are no introductions. The writer knows its one reader by that reader's advertisement, and the reader expects
   number 1.
+
+Where both ends ask for it, a session secret authenticates the stream instead of signatures
+(``gdp/crypto/session_seal.py``). Such a stream has another name, so neither end takes one stream for the other.
 """
 
 from __future__ import annotations
@@ -19,11 +22,14 @@ from typing import Final, NamedTuple
 from gdp.client.identities import ReaderIdentity, WriterIdentity
 from gdp.client.key_epochs import Secrets
 from gdp.client.publisher import Publisher
+from gdp.client.reader_path import ReaderPaths
+from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
 from gdp.client.sequence_numbers import SequenceState
 from gdp.client.writer_proxy import Ended, WriterProxy, WriterProxyState
+from gdp.crypto.session_seal import session_secret
 from gdp.errors import DropReason
 from gdp.frame.codec import Header
-from gdp.limits import FLIGHT_START_BYTES, MTU_MIN_BYTES
+from gdp.limits import MTU_MIN_BYTES, PRIVATE_WAIT_BYTES
 from gdp.message.reassembly import VerifiesDigest
 from gdp.message.reassembly_quota import ReassemblyQuota
 from gdp.names import Name
@@ -41,6 +47,8 @@ __all__ = [
 IDLE_S: Final = 60.0  # without a reader and a message, after which a stream is forgotten
 # A second path by which frames of the reader came is taken to lead back to it for this time. It may be silent for long.
 _SECOND_PATH_S: Final = 60.0
+_SIGNED: Final = b"gdp-private-1"
+_SESSION: Final = b"gdp-private-session-1"
 
 
 class PeerIncarnation(NamedTuple):
@@ -53,23 +61,33 @@ class PeerIncarnation(NamedTuple):
 class Party(NamedTuple):
     """Incarnation of a connected node, and the X25519 key that its advertisement names.
 
-    ``second_path_s``: when a frame of it last came by a second path.
+    ``second_path_s``: when a frame of it last came by a second path. ``is_session``: a session secret authenticates the
+    streams between it and this node.
     """
 
     incarnation_id: PeerIncarnation
     exchange: bytes
     second_path_s: float = float("-inf")
+    is_session: bool = False
 
 
-def private_name(service: Name, writer: PeerIncarnation, reader: PeerIncarnation) -> Name:
-    """Return the name of the stream from one party to another on a service's name; the reverse is another stream."""
+def private_name(service: Name, writer: PeerIncarnation, reader: PeerIncarnation, *, is_session: bool = False) -> Name:
+    """Return the name of the stream from one party to another on a service's name; the reverse is another stream.
+
+    Args:
+        is_session: a session secret authenticates the stream; with signatures it is another stream.
+    """
     ends = b"".join(name + incarnation.to_bytes(8, "big") for name, incarnation in (writer, reader))
-    return Name(hashlib.sha256(b"gdp-private-1" + service + ends).digest())
+    return Name(hashlib.sha256((_SESSION if is_session else _SIGNED) + service + ends).digest())
 
 
 def private_incarnation(name: Name) -> int:
     """Return the source incarnation in the headers of a unicast stream."""
     return int.from_bytes(hashlib.sha256(b"gdp-private-incarnation-1" + name).digest()[:8], "big")
+
+
+def _session_secrets(shared: bytes, secrets: Secrets, stream: Name) -> Secrets:
+    return {epoch: session_secret(shared, secret, stream) for epoch, secret in secrets.items()}
 
 
 class UnicastStream(Publisher):
@@ -80,6 +98,8 @@ class UnicastStream(Publisher):
         mtu: smallest on the path; None if not known yet.
         past: of the same stream, if it was forgotten.
         paths: over how many paths each frame is sent.
+        reader_paths: what may leave to each reader node; shared by all publishers of a participant.
+        options: of the service.
     """
 
     def __init__(
@@ -94,12 +114,19 @@ class UnicastStream(Publisher):
         past: SequenceState,
         now_s: float,
         paths: int = 1,
+        reader_paths: ReaderPaths | None = None,
+        options: SendOptions = DEFAULT_OPTIONS,
     ) -> None:
         self.reader = party.incarnation_id
         self._exchange = party.exchange
         self._touched_s = now_s
-        name = private_name(service, PeerIncarnation(writer.name, writer.incarnation), self.reader)
+        own = PeerIncarnation(writer.name, writer.incarnation)
+        name = private_name(service, own, self.reader, is_session=party.is_session)
         source = replace(writer, incarnation=private_incarnation(name))
+        self._shared: bytes | None = None  # with the reader, if a session secret authenticates the stream
+        if party.is_session:
+            self._shared = writer.notes.shared(party.exchange)
+            source, secrets = replace(source, signer=None), _session_secrets(self._shared, secrets, name)
         super().__init__(
             topic=name,
             source=source,
@@ -110,6 +137,8 @@ class UnicastStream(Publisher):
             past=past,
             address=self.reader.name,
             paths=paths,
+            reader_paths=reader_paths,
+            options=options,
         )
         self.note_second_path(party.second_path_s)
         self.tree_stands(MTU_MIN_BYTES if mtu is None else mtu)
@@ -123,9 +152,14 @@ class UnicastStream(Publisher):
         self._touched_s = now_s
         self.connect(*self.reader, self._exchange, now_s)
 
-    def receive_acknack(self, header: Header, frame: bytes, now_s: float) -> bool:
+    def renew(self, secrets: Secrets, now_s: float) -> None:
+        """Replace the service's secrets."""
+        own = secrets if self._shared is None else _session_secrets(self._shared, secrets, self.topic)
+        super().renew(own, now_s)
+
+    def receive_acknack(self, header: Header, frame: bytes, now_s: float, waited_s: float = 0.0) -> bool:
         """Process the reader's report, which reactivates a silent reader."""
-        is_taken = super().receive_acknack(header, frame, now_s)
+        is_taken = super().receive_acknack(header, frame, now_s, waited_s)
         if is_taken:
             self.mark_in_use(now_s)
         return is_taken
@@ -144,7 +178,8 @@ class UnicastReceiver(WriterProxy):
     Args:
         name: of the stream.
         public: the writer proxy of the same writer's stream to all.
-        verifier: of the writer's signatures.
+        verifier: of the writer's signatures; None: a session secret authenticates the stream.
+        secrets: of the service.
         ended: where the same stream ended before, in this incarnation.
     """
 
@@ -154,13 +189,17 @@ class UnicastReceiver(WriterProxy):
         name: Name,
         reader: ReaderIdentity,
         public: WriterProxy,
-        verifier: VerifiesDigest,
+        verifier: VerifiesDigest | None,
         secrets: Secrets,
         budget: ReassemblyQuota,
         now_s: float,
         ended: Ended,
     ) -> None:
         self._public = public
+        self._shared: bytes | None = None  # with the writer, if a session secret authenticates the stream
+        if verifier is None:
+            self._shared = reader.notes.shared(public.exchange)
+            secrets = _session_secrets(self._shared, secrets, name)
         super().__init__(
             topic=name,
             reader=reader,
@@ -175,9 +214,13 @@ class UnicastReceiver(WriterProxy):
             introduces=False,
         )
 
-    def receive(self, header: Header, frame: bytes, now_s: float) -> None:
+    def receive(self, header: Header, frame: bytes, now_s: float, waited_s: float = 0.0) -> None:
         """Process one DATA or HEARTBEAT frame of this writer; one that is refused is requested again."""
-        if self._public.state is WriterProxyState.NEW and self.delivered_bytes >= FLIGHT_START_BYTES:
+        if self._public.state is WriterProxyState.NEW and self.delivered_bytes >= PRIVATE_WAIT_BYTES:
             self.refuse(DropReason.MEMORY_FULL)
         else:
-            super().receive(header, frame, now_s)
+            super().receive(header, frame, now_s, waited_s)
+
+    def renew(self, secrets: Secrets) -> None:
+        """Replace the service's secrets."""
+        super().renew(secrets if self._shared is None else _session_secrets(self._shared, secrets, self.topic))

@@ -12,6 +12,8 @@ from typing import Final
 from gdp.client.identities import WriterIdentity
 from gdp.client.key_epochs import Secrets
 from gdp.client.publisher import Publisher
+from gdp.client.reader_path import ReaderPaths
+from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
 from gdp.client.sequence_numbers import SequenceRegistry
 from gdp.client.unicast_stream import IDLE_S, Party, PeerIncarnation, UnicastStream, private_name
 from gdp.errors import DropReason, LocalError
@@ -31,6 +33,8 @@ class UnicastStreams:
         pasts: last numbers of forgotten streams; shared by all publishers of this incarnation.
         published: called with each stream that has frames to send.
         paths: over how many paths each frame is sent.
+        reader_paths: what may leave to each reader node; shared by all publishers of a participant.
+        options: of each stream.
     """
 
     def __init__(
@@ -43,14 +47,18 @@ class UnicastStreams:
         published: Callable[[Publisher], None],
         urgent: bool,
         paths: int = 1,
+        reader_paths: ReaderPaths | None = None,
+        options: SendOptions = DEFAULT_OPTIONS,
     ) -> None:
         self._service = service
+        self._reader_paths = reader_paths
         self._writer = writer
         self._secrets = secrets
         self._sequence_registry = sequence_registry
         self._published = published
         self._urgent = urgent
         self._paths = paths
+        self._options = options
         self._streams: dict[Name, UnicastStream] = {}  # by reader
         self._look_at_s = 0.0  # no stream is idle for long enough before
         self._drops: Counter[DropReason] = Counter()  # of closed streams
@@ -72,10 +80,10 @@ class UnicastStreams:
         """Return how many messages a reader did not get, as far as known here, by reason."""
         return sum((stream.losses.counts for stream in self), self._losses)
 
-    def is_about(self, stream: bytes, reader: PeerIncarnation) -> bool:
+    def is_about(self, stream: bytes, party: Party) -> bool:
         """Return whether this is the name of the stream to a reader, existing or not."""
-        known = self._streams.get(reader.name)
-        return stream == (known.topic if known is not None else self._name_of(reader))
+        known = self._streams.get(party.incarnation_id.name)
+        return stream == (known.topic if known is not None else self._name_of(party))
 
     def get(self, reader: PeerIncarnation) -> UnicastStream | None:
         """Return the stream to an incarnation of a reader, or None."""
@@ -96,7 +104,7 @@ class UnicastStreams:
         stream = self._streams.get(reader.name)
         if stream is None:
             self._free_space()
-            past = self._sequence_registry.of(self._name_of(reader))
+            past = self._sequence_registry.of(self._name_of(party))
             stream = self._streams[reader.name] = UnicastStream(
                 service=self._service,
                 writer=self._writer,
@@ -105,6 +113,8 @@ class UnicastStreams:
                 mtu=mtu,
                 urgent=self._urgent,
                 paths=self._paths,
+                reader_paths=self._reader_paths,
+                options=self._options,
                 past=past,
                 now_s=now_s,
             )
@@ -141,8 +151,9 @@ class UnicastStreams:
         for reader in [stream.reader for stream in self]:
             self.forget(reader)
 
-    def _name_of(self, reader: PeerIncarnation) -> Name:
-        return private_name(self._service, PeerIncarnation(self._writer.name, self._writer.incarnation), reader)
+    def _name_of(self, party: Party) -> Name:
+        own = PeerIncarnation(self._writer.name, self._writer.incarnation)
+        return private_name(self._service, own, party.incarnation_id, is_session=party.is_session)
 
     def _free_space(self) -> None:
         if len(self._streams) < STREAMS_MAX:

@@ -3,13 +3,14 @@
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
 A writer proxy begins ``NEW``: it sends introductions until a Heartbeat brings its start and the description. When
-``LIVE`` it delivers: a reliable topic in order and complete, a best-effort one in order and without waiting.
+``LIVE`` it delivers: a reliable topic in order and complete, a best-effort one in order and as fresh as repairs allow.
 
-It joins five parts:
+It joins six parts:
 
 - ``gdp/message/reassembly.py``: reassembly of the fragments;
 - ``reordering.py``: messages that wait behind a gap;
 - ``delivery.py``: messages in order, and losses;
+- ``gdp/message/late_repairs.py``: what is requested again of a best-effort topic, and how long that is awaited;
 - ``ack_nack_schedule.py``: when a report is due;
 - ``ack_nack_sealer.py``: the keys under which it is sealed.
 """
@@ -29,7 +30,7 @@ from gdp.client.key_epochs import Secrets
 from gdp.client.reordering import ReorderingBuffer
 from gdp.crypto.envelope import Opener
 from gdp.errors import DropReason, EnvelopeError, RemoteError
-from gdp.frame.codec import HOPS_AT, NUMBER_AT, SECOND_PATH, Header, second_path_copy
+from gdp.frame.codec import HOPS_AT, NUMBER_AND_PART, NUMBER_AT, SECOND_PATH, Header, second_path_copy
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import (
     NACKS_PER_REPORT,
@@ -41,8 +42,9 @@ from gdp.limits import (
     SPREAD,
     STRIPES_FROM_PARTS,
 )
-from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
+from gdp.message.acknack import FRAMES_MASK, AckNack, AckNackFlag, MissingRange
 from gdp.message.heartbeat import Heartbeat, StreamStart
+from gdp.message.late_repairs import LateRepairs
 from gdp.message.loss import Losses, LossReason
 from gdp.message.reassembly import ReassembledMessage, Reassembler, VerifiesDigest
 from gdp.message.reassembly_quota import ReassemblyQuota
@@ -93,6 +95,7 @@ class WriterProxy:
     """Reader's state of one incarnation of one publisher of a topic.
 
     Args:
+        writer: the key that must have signed; None: ``secrets`` are of a session, and messages have no signature.
         exchange: the publisher's X25519 key, as its advertisement names it.
         budget: memory of all writer proxies.
         ended: where an earlier writer proxy of the same ended. A latched topic's last messages come again, as its
@@ -117,7 +120,7 @@ class WriterProxy:
         reader: ReaderIdentity,
         publisher: Name,
         incarnation: int,
-        writer: VerifiesDigest,
+        writer: VerifiesDigest | None,
         exchange: bytes,
         secrets: Secrets,
         budget: ReassemblyQuota,
@@ -132,6 +135,7 @@ class WriterProxy:
         self.exchange = exchange
         self._reader = reader
         self._secrets = secrets
+        self._is_signed = writer is not None
         self._before = ended
         self._is_restarted = restarted
         self._described = 0  # number of the Heartbeat that brought it
@@ -158,6 +162,9 @@ class WriterProxy:
         self._gap_at = 0  # ... and the number that is missing
         self._held: deque[tuple[float, Heartbeat]] = deque()  # ... and what a Heartbeat says of it counts
         self._deferred = DeferredRequests()
+        self._received = 0  # verified DATA frames
+        self._newest = (0, -1, now_s)  # the highest of them: number, fragment, and when it came
+        self._late = LateRepairs(self._data, self._lag_s)
         self._is_reliable: bool | None = None
         self._sent = (0, 0)  # the publisher has sent everything before this (number, fragment)
         self.state = WriterProxyState.NEW
@@ -242,8 +249,8 @@ class WriterProxy:
         """Count a frame that is dropped unread."""
         self._data.drops[reason] += 1
 
-    def receive(self, header: Header, frame: bytes, now_s: float) -> None:
-        """Process one DATA or HEARTBEAT frame of this publisher."""
+    def receive(self, header: Header, frame: bytes, now_s: float, waited_s: float = 0.0) -> None:
+        """Process one DATA or HEARTBEAT frame of this publisher, which came ``waited_s`` before."""
         if header.incarnation != self.incarnation:
             self._data.drops[DropReason.WRONG_INCARNATION] += 1
             return
@@ -256,7 +263,7 @@ class WriterProxy:
             if joined is not None:
                 self._handle_status(joined, header.epoch, now_s)
         else:
-            self._handle_data(header, frame, now_s)
+            self._handle_data(header, frame, now_s, now_s - waited_s)
 
     def receive_run(self, arrivals: Sequence[ReceivedFrame], at: int, now_s: float) -> int:
         """Process the frames of ``arrivals[at:]`` that continue the message under way; return how many."""
@@ -267,7 +274,10 @@ class WriterProxy:
                 number = int.from_bytes(arrivals[at].frame[NUMBER_AT : NUMBER_AT + 8], "big")
                 self._copies.handle_arrivals(number, taken - second, second, now_s)
             self._schedule.count(taken * len(arrivals[at].frame))
-            if self.state is WriterProxyState.LIVE and self._is_reliable:
+            self._received += taken
+            number, part = NUMBER_AND_PART.unpack_from(arrivals[at + taken - 1].frame, NUMBER_AT)
+            self._note_newest(number, part, now_s - arrivals[at + taken - 1].waited_s)
+            if self.state is WriterProxyState.LIVE:
                 self._schedule.handle_run(now_s)
         return taken
 
@@ -276,9 +286,13 @@ class WriterProxy:
         is_final = self.state is WriterProxyState.LIVE and not self._is_reliable
         while self._held and self._held[0][0] <= now_s:
             self._apply_progress(self._held.popleft()[1], now_s)
+        is_released = self._late.give_up(now_s)
         if self._gap_until_s <= now_s:
-            if self._order:
-                self._skip_to(self._order.numbers[0])
+            numbers = self._order.numbers
+            if numbers and numbers[0] < self._late.hold(numbers, now_s):
+                self._skip_to(numbers[0])
+            self._deliver(now_s)
+        elif is_released:
             self._deliver(now_s)
         self._data.drop_expired(now_s, for_good=is_final)
         self._status.drop_expired(now_s, for_good=False)
@@ -287,13 +301,14 @@ class WriterProxy:
         """Return the monotonic second of the next timer."""
         expiries = [self._status.next_expiry(), self._data.next_expiry()]
         held_s = self._held[0][0] if self._held else float("inf")
-        due_s = min(self._schedule.due_s, self._gap_until_s, held_s)
+        due_s = min(self._schedule.due_s, self._gap_until_s, held_s, self._late.get_timer())
         return min([due_s, *(expiry for expiry in expiries if expiry is not None)])
 
     def control_to_send(self, now_s: float) -> list[bytes]:
         """Return the frames of the report that is due, if one is, and of an introduction if it is wanted."""
         schedule = self._schedule
-        if now_s < schedule.due_s:
+        late = self._late.poll_missing(now_s) if self._late.is_due(now_s) else ()
+        if now_s < schedule.due_s and not late:
             return []
         schedule.start_report()
         if self.state is WriterProxyState.NEW:
@@ -301,14 +316,19 @@ class WriterProxy:
             number, sequence = (self._before.number, self._before.sequence) if self._before.resumes else (0, 0)
             return self._over_paths(self._sealer.seal_first(AckNack(AckNackFlag.NEW, number, 0, (), sequence)))
         missing = self._missing() if self._is_reliable else ()
-        if self._copies is not None:
+        if (self._copies is not None or self._data.repeats.copies) and self._is_reliable:
             missing = self._deferred.poll_due(missing, self._lag_s(), now_s)
         schedule.handle_reported(now_s, is_missing=bool(missing))
         schedule.due_s = min(schedule.due_s, self._deferred.due_s)
         expected = self._order.expected
         part, sequence = self._data.progress(expected), self._delivery.sequence
         share = self._copies.poll_share() if isinstance(self._copies, StripedPaths) else 0
-        report = AckNack(AckNackFlag.NONE, expected, part, missing, sequence, self.lost, share)
+        newest, newest_part, came_s = self._newest
+        report = AckNack(
+            AckNackFlag.NONE, expected, part, missing or late, sequence, self.lost, share,
+            self._received, newest, max(newest_part, 0), max(round((now_s - came_s) * 1e6), 0),
+            self._data.frames & FRAMES_MASK,
+        )  # fmt: skip
         return self._over_paths(self._sealer.seal_all(report, now_s))
 
     def poll_delivered(self) -> list[Delivered]:
@@ -320,6 +340,7 @@ class WriterProxy:
         self._data.close()
         self._status.close()
         self._order.poll_all()
+        self._late.close()
         self._schedule.due_s = self._gap_until_s = float("inf")
         self._held.clear()
         report = AckNack(AckNackFlag.BYE, self._order.expected, 0, (), self._delivery.sequence, self.lost)
@@ -331,6 +352,11 @@ class WriterProxy:
         self._openers.clear()
         self._sealer.renew(secrets)
 
+    def _note_newest(self, number: int, part: int, came_s: float) -> None:
+        """Note a fragment, unless it is a repair: a later one came before."""
+        if (number, part) > self._newest[:2]:
+            self._newest = number, part, came_s
+
     def _over_paths(self, notes: list[bytes]) -> list[bytes]:
         """Return notes, and their second copies if there are two paths."""
         return notes if self._copies is None else [*notes, *map(second_path_copy, notes)]
@@ -341,11 +367,12 @@ class WriterProxy:
             secret = self._secrets.get(epoch)
             if secret is None:
                 raise EnvelopeError(DropReason.UNKNOWN_EPOCH, str(epoch))
-            opener = Opener(secret, kind, self.publisher, self.incarnation, self.topic)
+            ends = self.publisher, self.incarnation, self.topic
+            opener = Opener(secret, kind, *ends, is_signed=self._is_signed)
             self._openers[kind, epoch] = opener
         return opener
 
-    def _handle_data(self, header: Header, frame: bytes, now_s: float) -> None:
+    def _handle_data(self, header: Header, frame: bytes, now_s: float, came_s: float) -> None:
         reassembler, expected = self._data, self._order.expected
         if header.number > NUMBER_MAX:
             reassembler.drops[DropReason.MALFORMED] += 1
@@ -368,9 +395,15 @@ class WriterProxy:
             if self._is_reliable is None:
                 self._set_reliable(header.flags)
             self._schedule.count(header.length)
-            if self.state is WriterProxyState.LIVE and self._is_reliable:
+            self._received += 1
+            self._note_newest(header.number, header.part, came_s)
+            if self.state is WriterProxyState.LIVE:
                 self._schedule.handle_part(header, highest, expected, now_s)
+                if joined is None and not self._is_reliable:
+                    self._late.handle_part(header, now_s)
         if joined is not None:
+            if self.state is WriterProxyState.LIVE and not self._is_reliable:
+                self._late.handle_complete(joined.number, header.part, now_s)
             if striped is not None:
                 striped.handle_complete(joined.number)
                 if striped.has_news:
@@ -388,7 +421,7 @@ class WriterProxy:
     def _arrange(self, joined: ReassembledMessage, now_s: float) -> None:
         """Order a complete message, and deliver the consecutive ones."""
         order, delivery = self._order, self._delivery
-        skips = not self._is_reliable and self._lag_s() <= 0
+        skips = not self._is_reliable and self._lag_s() <= 0 and joined.number < self._late.hold((), now_s)
         if self.state is WriterProxyState.LIVE and (skips or joined.number == order.expected):
             if joined.number > order.expected:
                 self._skip_to(joined.number)
@@ -446,7 +479,7 @@ class WriterProxy:
         for move in status.moves:
             if move.is_before(order.expected):
                 self._renumber(move)
-        lag_s = self._lag_s()
+        lag_s = max(self._lag_s(), self._late.wait_s(status.oldest, now_s))
         if self._is_reliable or lag_s <= 0:
             self._apply_progress(status, now_s)
         else:
@@ -495,6 +528,8 @@ class WriterProxy:
 
     def _set_reliable(self, flags: int) -> None:
         self._is_reliable = self._delivery.is_reliable = bool(flags & _WAITING)
+        if self._is_reliable:
+            self._late.close()
 
     def _renumber(self, move: Renumbering) -> None:
         """Apply a renumbering, also to the messages that wait."""
@@ -511,6 +546,7 @@ class WriterProxy:
         for joined in self._order.skip_to(number):
             self._delivery.deliver(joined)
         self._data.forget(number)
+        self._late.forget(number)
 
     def _deliver(self, now_s: float) -> None:
         order = self._order
@@ -521,16 +557,16 @@ class WriterProxy:
             self._delivery.deliver(joined)
         if not order or self._is_reliable:
             return
-        lag_s = self._lag_s()
+        lag_s, free_to = self._lag_s(), self._late.hold(order.numbers, now_s)
         if lag_s > 0:
             is_same = self._gap_at == order.expected and now_s < gap_until_s < float("inf")
             self._gap_at, self._gap_until_s = order.expected, gap_until_s if is_same else now_s + lag_s
-        else:
-            self._skip_to(order.numbers[-1] + 1)
+        elif free := [number for number in order.numbers if number < free_to]:
+            self._skip_to(free[-1] + 1)
 
     def _lag_s(self) -> float:
-        """Return how long the slower path may take to bring what the faster one has lost; 0 with one path."""
-        return 0.0 if self._copies is None else self._copies.lag_s()
+        """Return how long a copy may take to bring what the faster path, or the first frame, did not; 0: none comes."""
+        return self._data.repeats.lag_s() if self._copies is None else self._copies.lag_s()
 
 
 def _below(ranges: list[tuple[int, int]], end: int) -> list[tuple[int, int]]:

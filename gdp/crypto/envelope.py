@@ -13,7 +13,7 @@ Each part is XAES-256-GCM under a key that belongs to (topic secret, kind, sourc
 of 24 bytes is salt || 0 (4) || message number || part. The additional data are the header without its hops-left field.
 The salt is drawn for each message, because copies of a process, such as two machines resumed from one snapshot, use the
 same numbers. The signature covers SHA-256 over the header fields that all parts share, the salt, each ciphertext and
-tag.
+tag. A stream under a session secret (``session_seal.py``) has no signature: only its two ends can make its seals.
 """
 
 from __future__ import annotations
@@ -145,6 +145,7 @@ class Sealer:
     Args:
         random_bytes: the system's randomness, drawn for each message and never ahead: values drawn before a machine was
             copied are no longer random.
+        signer: None: the messages are not signed, which is for a session secret alone.
         address: the destination in the headers; None: ``destination``, which the key is bound to.
     """
 
@@ -157,12 +158,13 @@ class Sealer:
         source: bytes,
         incarnation: int,
         destination: bytes,
-        signer: Signer,
+        signer: Signer | None,
         random_bytes: Callable[[int], bytes],
         address: bytes | None = None,
     ) -> None:
         self._keys = MessageKeys(seal_key(secret, kind, source, incarnation, destination))
         self._signer = signer
+        self._signature_bytes = 0 if signer is None else SIGNATURE_BYTES
         self._random_bytes = random_bytes
         self._fixed = (epoch, kind, incarnation, destination if address is None else address, source)
         self._last_number = -1
@@ -185,7 +187,7 @@ class Sealer:
             raise LocalError(f"message number {number} was sealed before")
         size = len(message) if isinstance(message, bytes) else message.message_bytes
         capacity = fragment_capacity(mtu)
-        parts = -(-(size + SIGNATURE_BYTES) // capacity)
+        parts = max(-(-(size + self._signature_bytes) // capacity), 1)
         if size > MESSAGE_MAX_BYTES + SEQUENCE_BYTES or parts > PARTS_MAX:
             raise LocalError(f"a message of {size} bytes in {parts} parts is above the limit")
         self._last_number = number
@@ -201,12 +203,20 @@ class Sealed(Sequence[bytes]):
     """The frames of one message, sealed in order and on request; always the same bytes."""
 
     def __init__(
-        self, *, aead: AESGCM, salt: bytes, signer: Signer, header: Header, message: bytes | Sealed, capacity: int
+        self,
+        *,
+        aead: AESGCM,
+        salt: bytes,
+        signer: Signer | None,
+        header: Header,
+        message: bytes | Sealed,
+        capacity: int,
     ) -> None:
         self._aead = aead
         self._salt = salt
         self._encrypt = aead.encrypt
         self._signer = signer
+        self._signature_bytes = 0 if signer is None else SIGNATURE_BYTES
         self._header = header
         self._origin: Sealed | None = None
         # Checks for bytes first: an ``isinstance`` check for ``Sealed``, an abstract class's, costs a microsecond.
@@ -216,9 +226,9 @@ class Sealed(Sequence[bytes]):
             self._message, self.message_bytes = memoryview(b""), message.message_bytes
             self._origin = message._origin or message
         self._capacity = capacity
-        self._running = digest_of(header, salt)
+        self._running = None if signer is None else digest_of(header, salt)
         self._frames: list[bytes] = []
-        self.size_bytes = self.message_bytes + header.parts * (HEADER_BYTES + SEAL_BYTES) + SIGNATURE_BYTES
+        self.size_bytes = self.message_bytes + header.parts * (HEADER_BYTES + SEAL_BYTES) + self._signature_bytes
 
     def __len__(self) -> int:
         return self._header.parts
@@ -251,7 +261,7 @@ class Sealed(Sequence[bytes]):
         plains = [
             decrypt(
                 _NONCE.pack(number, part),
-                frame[_BODY_AT : -SIGNATURE_BYTES if part == last else None],
+                frame[_BODY_AT : len(frame) - self._signature_bytes * (part == last)],
                 authenticated(frame),
             )
             for part, frame in enumerate(self._frames)
@@ -270,35 +280,52 @@ class Sealed(Sequence[bytes]):
     def _seal_full(self, end: int) -> None:
         """Seal the parts before ``end``, all of full length, on the fast path."""
         first, capacity, message = len(self._frames), self._capacity, self._message
-        encrypt, update, append = self._encrypt, self._running.update, self._frames.append
+        encrypt, running, append = self._encrypt, self._running, self._frames.append
         headers = HeaderBatch(self._header._replace(length=capacity + SEAL_BYTES), first, end - first, self._salt)
         begins = range(first * capacity, end * capacity, capacity)
         for begin, (header,), (additional,), (nonce,) in zip(begins, *headers.each(), strict=True):
             sealed = encrypt(nonce, message[begin : begin + capacity], additional)
-            update(sealed)
+            if running is not None:
+                running.update(sealed)
             append(header + sealed)
 
     def _seal_one(self, part: int) -> None:
         header, capacity = self._header, self._capacity
         plain = self._message[part * capacity : (part + 1) * capacity]
         is_last = part == header.parts - 1
-        length = len(plain) + SEAL_BYTES + (SIGNATURE_BYTES if is_last else 0)
+        length = len(plain) + SEAL_BYTES + self._signature_bytes * is_last
         kind, flags, hops_left, epoch, _, number, _, parts, incarnation, to, source = header
         flags |= _LAST * is_last
         head = encode(Header(kind, flags, hops_left, epoch, length, number, part, parts, incarnation, to, source))
         sealed = self._encrypt(_NONCE.pack(header.number, part), plain, authenticated(head))
-        self._running.update(sealed)
         frame = head + self._salt + sealed
+        if self._signer is not None and self._running is not None:
+            self._running.update(sealed)
+            if is_last:
+                frame += self._signer.sign_digest(self._running.digest())
         if is_last:
-            frame += self._signer.sign_digest(self._running.digest())
             self._message = self._message[:0]  # the frames hold all of it now
         self._frames.append(frame)
 
 
 class Opener:
-    """Opens the parts of one kind of message of one source's incarnation, under one epoch's key."""
+    """Opens the parts of one kind of message of one source's incarnation, under one epoch's key.
 
-    def __init__(self, secret: bytes, kind: int, source: bytes, incarnation: int, destination: bytes) -> None:
+    Args:
+        is_signed: the last part carries a signature; False for a session secret alone.
+    """
+
+    def __init__(
+        self,
+        secret: bytes,
+        kind: int,
+        source: bytes,
+        incarnation: int,
+        destination: bytes,
+        *,
+        is_signed: bool = True,
+    ) -> None:
+        self._signature_bytes = SIGNATURE_BYTES if is_signed else 0
         self._keys = MessageKeys(seal_key(secret, kind, source, incarnation, destination))
         self._known: dict[bytes, AESGCM] = {}  # by the salts of messages with opened parts
 
@@ -333,7 +360,7 @@ class Opener:
         return plains, payloads
 
     def open(self, header: Header, frame: bytes) -> tuple[bytes, bytes, bytes]:
-        """Return plaintext, ciphertext and tag as the signature covers them, and signature (only of the last part).
+        """Return plaintext, ciphertext and tag as the signature covers them, and the signature of a signed last part.
 
         Args:
             header: of this frame, already decoded.
@@ -346,7 +373,7 @@ class Opener:
         is_last = header.part == header.parts - 1
         if is_last != bool(header.flags & _LAST):
             raise EnvelopeError(DropReason.BAD_PARTS, "the last part is flagged as such, and no other")
-        sealed_end = end - SIGNATURE_BYTES if is_last else end
+        sealed_end = end - self._signature_bytes if is_last else end
         if sealed_end - HEADER_BYTES < SEAL_BYTES:
             raise EnvelopeError(DropReason.TRUNCATED, "shorter than a salt and a tag")
         salt, sealed = frame[HEADER_BYTES:_BODY_AT], frame[_BODY_AT:sealed_end]

@@ -27,6 +27,7 @@ __all__ = [
     "HOPS_AT",
     "HOPS_MASK",
     "KIND_AT",
+    "NUMBER_AND_PART",
     "NUMBER_AT",
     "OVERHEAD_BYTES",
     "PARTS_AT",
@@ -56,6 +57,7 @@ AAD_BYTES: Final = HEADER_BYTES - 1
 HOPS_MASK: Final = 0x7F  # of the byte at ``HOPS_AT``: how many hops are left
 SECOND_PATH: Final = 0x80  # of the same byte: the copy for the second path
 
+NUMBER_AND_PART: Final = struct.Struct("!QI")  # at ``NUMBER_AT``
 _HEADER: Final = struct.Struct("!BBBBHHQIIQ32s32s")
 _BEHIND_VERSION: Final = struct.Struct("!xBBBHHQIIQ32s32s")
 _ETHERTYPE: Final = ETHERTYPE.to_bytes(2, "big")

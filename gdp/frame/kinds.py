@@ -49,7 +49,7 @@ class Flag(IntFlag):
 
     NONE = 0
     LAST = 0x01  # the last fragment, which carries the signature
-    RELIABLE = 0x02  # readers request what they miss
+    RELIABLE = 0x02  # readers request all that they miss, and wait for it
     BUNDLE = 0x04  # several messages under one seal
     ALL_REPLICAS = 0x08
     LATCHED = 0x10  # late joiners get it too

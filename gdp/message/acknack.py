@@ -2,7 +2,8 @@
 
 Sans-I/O. Source: RTPS 2.5, section 8.3.8.1. Wire form, big-endian::
 
-    flags (1) | share (1) | next number (8) | next part (4) | next sequence number (8) | lost (8) | ranges (2)
+    flags (1) | share (1) | next number (8) | next part (4) | next sequence number (8) | lost (8) | received (4)
+    | newest number (8) | newest part (4) | held (4) | frames (4) | ranges (2)
     for each range: number (8) | first part (4) | last part (4)
 """
 
@@ -15,10 +16,12 @@ from typing import Final, NamedTuple
 from gdp.errors import DropReason, FrameError
 from gdp.limits import NACKS_PER_REPORT
 
-__all__ = ["AckNack", "AckNackFlag", "MissingRange"]
+__all__ = ["FRAMES_MASK", "AckNack", "AckNackFlag", "MissingRange"]
 
-_HEAD: Final = struct.Struct("!BBQIQQH")
+_HEAD: Final = struct.Struct("!BBQIQQIQIIIH")
+_U32_MAX: Final = (1 << 32) - 1
 _U64_MAX: Final = (1 << 64) - 1
+FRAMES_MASK: Final = (1 << 32) - 1
 _RANGE: Final = struct.Struct("!QII")
 
 
@@ -44,6 +47,11 @@ class AckNack(NamedTuple):
     Messages with sequence numbers before ``sequence`` were delivered, except ``lost`` of them. A report flagged NEW
     names what its reader had of this incarnation of the publisher before, and zeros if nothing. ``share`` is how much
     of striped messages the second path is to carry, in 255ths.
+
+    ``received`` counts the verified DATA frames of this incarnation, modulo 2^32; the newest of them was (newest,
+    newest_part), which came ``held_us`` microseconds before this report left. The writer measures the path by them.
+
+    ``frames`` counts the frames of messages that came, copies included, modulo 2**32.
     """
 
     flags: AckNackFlag
@@ -53,12 +61,18 @@ class AckNack(NamedTuple):
     sequence: int = 0
     lost: int = 0
     share: int = 0
+    received: int = 0
+    newest: int = 0
+    newest_part: int = 0
+    held_us: int = 0
+    frames: int = 0
 
     def to_wire(self) -> bytes:
         """Return the wire form; ranges beyond ``NACKS_PER_REPORT`` wait for the next report."""
         ranges = self.missing[:NACKS_PER_REPORT]
         counts = min(self.sequence, _U64_MAX), min(self.lost, _U64_MAX)
-        head = _HEAD.pack(self.flags, self.share, self.next_number, self.next_part, *counts, len(ranges))
+        path = self.received & _U32_MAX, self.newest, self.newest_part, min(self.held_us, _U32_MAX), self.frames
+        head = _HEAD.pack(self.flags, self.share, self.next_number, self.next_part, *counts, *path, len(ranges))
         return head + b"".join(_RANGE.pack(*each) for each in ranges)
 
     @classmethod
@@ -66,8 +80,8 @@ class AckNack(NamedTuple):
         """Read the wire form. Raises ``FrameError``: the bytes are not exactly one AckNack."""
         if len(wire) < _HEAD.size:
             raise FrameError(DropReason.TRUNCATED, "report")
-        flags, share, number, part, sequence, lost, count = _HEAD.unpack_from(wire)
+        flags, share, number, part, sequence, lost, *path, count = _HEAD.unpack_from(wire)
         if count > NACKS_PER_REPORT or len(wire) != _HEAD.size + count * _RANGE.size or flags > AckNackFlag.BYE:
             raise FrameError(DropReason.MALFORMED, "report")
         ranges = tuple(MissingRange(*each) for each in _RANGE.iter_unpack(wire[_HEAD.size :]))
-        return cls(AckNackFlag(flags), number, part, ranges, sequence, lost, share)
+        return cls(AckNackFlag(flags), number, part, ranges, sequence, lost, share, *path)

@@ -84,11 +84,11 @@ class ReaderPositions:
 
     def acked_at(self, otherwise: int) -> int:
         """Return the position that every active reader has acknowledged; ``otherwise`` without one."""
-        return min((each.acked_at for each in self.active.values()), default=otherwise)
+        return min([each.acked_at for each in self.active.values()], default=otherwise)
 
     def least_active(self) -> int:
         """Return the lowest message number that an active reader lacks."""
-        return min((each.next_number for each in self.active.values()), default=_BEYOND_ALL)
+        return min([each.next_number for each in self.active.values()], default=_BEYOND_ALL)
 
     def least(self) -> int:
         """Return the lowest message number that any reader lacks, suspended or not."""
@@ -127,10 +127,10 @@ class ReaderPositions:
     def next_slow(self) -> float | None:
         """Return the monotonic second at which a reader that lags behind another becomes slow, or None."""
         first_at = self._first_at()
-        behind = (each.mark_s for each in self.active.values() if each.acked_at < each.mark_at <= first_at)
+        behind = [each.mark_s for each in self.active.values() if each.acked_at < each.mark_at <= first_at]
         mark_s = min(behind, default=None)
         return None if mark_s is None else mark_s + self._lag_s + 0.001
 
     def _first_at(self) -> int:
         """Return the position of the most advanced active reader."""
-        return max((each.acked_at for each in self.active.values()), default=0)
+        return max([each.acked_at for each in self.active.values()], default=0)

@@ -52,6 +52,7 @@ class Gathered:
 
     def __init__(self) -> None:
         self._messages = deque[bytes]()
+        self._added_s = deque[float | None]()  # when each was published; None: unknown
         self.first = 0  # sequence number of the oldest
         self.held_bytes = 0
 
@@ -63,21 +64,52 @@ class Gathered:
         """Return whether several messages of this size fit into a bundle of ``capacity`` bytes."""
         return _SMALL * (len(message) + _LENGTH.size) <= capacity
 
-    def add(self, sequence: int, message: bytes) -> None:
-        """Add a message."""
+    @property
+    def oldest_bytes(self) -> int:
+        """Return about how many bytes of frames the oldest message takes with a seal of its own."""
+        return len(self._messages[0]) + _ALONE_BYTES
+
+    def oldest_added_s(self, now_s: float) -> float:
+        """Return when the oldest message was published; messages without a time wait from now on."""
+        added_s = self._added_s
+        at = len(added_s)
+        while at and added_s[at - 1] is None:  # the newest ones
+            at -= 1
+            added_s[at] = now_s
+        return now_s if added_s[0] is None else added_s[0]
+
+    def drop_oldest(self) -> int:
+        """Remove the oldest message; return its sequence number."""
+        self._remove_oldest()
+        self.first += 1
+        return self.first - 1
+
+    def add(self, sequence: int, message: bytes, added_s: float | None = None) -> None:
+        """Add a message that was published at ``added_s`` (monotonic seconds; None: unknown)."""
         if not self._messages:
             self.first = sequence
         self._messages.append(message)
+        self._added_s.append(added_s)
         self.held_bytes += len(message) + _ALONE_BYTES
 
-    def poll_batch(self, capacity: int) -> list[bytes]:
-        """Remove and return the oldest message, and those after it that fit into ``capacity`` bytes of wire form."""
+    def poll_batch(self, capacity: int) -> tuple[list[bytes], float | None]:
+        """Remove and return the oldest message, and those after it that fit into ``capacity`` bytes of wire form.
+
+        Returns:
+            the messages, and when the newest of them was published.
+        """
         together: list[bytes] = []
+        added_s: float | None = None
         while self._messages:
             capacity -= len(self._messages[0]) + _LENGTH.size
             if together and capacity < 0:
                 break
-            together.append(self._messages.popleft())
-            self.held_bytes -= len(together[-1]) + _ALONE_BYTES
+            message, added_s = self._remove_oldest()
+            together.append(message)
         self.first += len(together)
-        return together
+        return together, added_s
+
+    def _remove_oldest(self) -> tuple[bytes, float | None]:
+        message = self._messages.popleft()
+        self.held_bytes -= len(message) + _ALONE_BYTES
+        return message, self._added_s.popleft()

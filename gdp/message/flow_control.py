@@ -1,19 +1,16 @@
-"""Flow control of a reliable writer: congestion window, round-trip time, and the timer that probes silent readers.
+"""Flow control of a reliable writer: bytes under way, round-trip time, and the timer that probes silent readers.
 
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: window growth and halving after RFC 5681, sections 3.1
-and 3.2; round-trip estimate after RFC 6298, section 2, with Karn's rule. Positions count bytes of frames from the first
-message on.
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: round-trip estimate after RFC 6298, section 2, with
+Karn's rule. Positions count bytes of frames from the first message on.
 """
 
 from __future__ import annotations
 
 from typing import Final
 
-from gdp.limits import FLIGHT_MAX_BYTES, FLIGHT_MIN_BYTES, FLIGHT_START_BYTES, PROBE_MAX_S, PROBE_MIN_S
+from gdp.limits import FLIGHT_MAX_BYTES, PROBE_MAX_S, PROBE_MIN_S
 
 __all__ = ["FlowControl", "RoundTripEstimator"]
-
-_GROWTH_BYTES: Final = 16 << 10  # of the window in a round trip, above the threshold: these links are not narrow
 
 
 class RoundTripEstimator:
@@ -55,39 +52,28 @@ class RoundTripEstimator:
 class FlowControl:
     """Bound of the bytes under way, and the probe timer of silent readers.
 
+    How much the path carries is another question, which the congestion controllers answer (``gdp/congestion``).
+
     Attributes:
-        window_bytes: the congestion window.
+        window_bytes: what a reader must be able to hold.
         round_trip: estimate of the round-trip time.
     """
 
+    window_bytes: Final = FLIGHT_MAX_BYTES
+
     def __init__(self) -> None:
-        self.window_bytes = FLIGHT_START_BYTES
         self.round_trip = RoundTripEstimator()
-        self._threshold_bytes = FLIGHT_MAX_BYTES
-        self._halved_s = float("-inf")
         self._quiet_s = 0.0  # since when nothing was acknowledged
         self._probe_s = PROBE_MIN_S
 
     def handle_acknowledged(self, new_bytes: int, acked_at: int, now_s: float) -> None:
-        """Grow the window by an acknowledgement of ``new_bytes`` up to ``acked_at``, and restart the probe timer."""
+        """Process an acknowledgement of ``new_bytes`` up to ``acked_at``, and restart the probe timer."""
         if new_bytes <= 0:
             return
         self._quiet_s = now_s
-        if self.window_bytes < self._threshold_bytes:
-            self.window_bytes += new_bytes
-        else:
-            self.window_bytes += new_bytes * _GROWTH_BYTES // self.window_bytes
-        self.window_bytes = min(self.window_bytes, FLIGHT_MAX_BYTES)
         trip = self.round_trip
         trip.handle_acknowledged(acked_at, now_s)
         self._probe_s = min(max(3 * (trip.rtt_s or 0.0) + 4 * trip.deviation_s, PROBE_MIN_S), PROBE_MAX_S)
-
-    def handle_loss(self, now_s: float) -> None:
-        """Halve the window, at most once in a round trip."""
-        if now_s - self._halved_s > (self.round_trip.rtt_s or PROBE_MIN_S):
-            self._threshold_bytes = max(self.window_bytes // 2, FLIGHT_MIN_BYTES)
-            self.window_bytes = self._threshold_bytes
-            self._halved_s = now_s
 
     def restart_probe(self, now_s: float) -> None:
         """Restart the probe timer: nothing is under way."""

@@ -35,6 +35,7 @@ class LossReason(IntEnum):
     PUBLISHER_RESTARTED = 8  # its publisher started again in between
     READER_RESTARTED = 9  # this reader restarted
     DETACHED = 10  # the route to the publisher was gone in between
+    LIFESPAN = 11  # it could not leave its publisher in time, on a best-effort topic
 
     @property
     def label(self) -> str:

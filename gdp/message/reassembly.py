@@ -9,7 +9,7 @@ ciphertext until the hash has reached it.
 A holder of the topic's secret can make fragments that open, though never a message that verifies. So the effect of such
 a fragment is never permanent. A message whose signature is bad is forgotten, not finished. Of two counts of fragments,
 or two salts, the later one is valid. When there are too many unfinished messages, the one that is needed last is
-evicted.
+evicted. Without signatures, under a session secret, only the writer can make fragments that open.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from gdp.crypto.envelope import digest_of, salt_of
 from gdp.crypto.header_batch import HeaderBatch
@@ -27,20 +27,22 @@ from gdp.frame.codec import DESTINATION_AT, HEADER_BYTES, HOPS_MASK, NUMBER_AT, 
 from gdp.frame.kinds import Flag
 from gdp.limits import HOPS_MAX, JOIN_MESSAGES_MAX, JOIN_PATIENCE_S, REPLAY_WINDOW_MESSAGES
 from gdp.message.reassembly_quota import ReassemblyQuota
+from gdp.message.repeated_frames import REPEATED_PARTS_MAX, RepeatedFrames
 from gdp.message.replay import ReplayWindow
 from gdp.message.second_copies import SecondCopies
 from gdp.message.striping import StripedPaths
 from gdp.sansio import ReceivedFrame
 
-__all__ = ["ALL_PARTS", "OpensParts", "ReassembledMessage", "Reassembler", "VerifiesDigest"]
+__all__ = ["ALL_PARTS", "SCAN_PARTS", "OpensParts", "ReassembledMessage", "Reassembler", "VerifiesDigest"]
 
 ALL_PARTS = 0xFFFF_FFFF
 _SHARED_FLAGS = 0xFF & ~int(Flag.LAST)  # a plain number: an IntFlag's operators cost a microsecond each
+_URGENT = int(Flag.URGENT)
 _PREPAID_BYTES = 32 << 10  # memory is reserved ahead for this many bytes of a message whose fragments come in order
 _PART_OVERHEAD_BYTES = 128  # overhead of a kept fragment, in addition to its bytes
 _NUMBER_AND_PART = struct.Struct("!QI")
 _AHEAD_PARTS = 64  # heads made at once
-_SCAN_PARTS = 4_096  # above the fragments that an honest publisher has under way
+SCAN_PARTS = 4_096  # examined at once for what is missing: more than an honest publisher has under way
 
 
 class OpensParts(Protocol):
@@ -62,9 +64,8 @@ class VerifiesDigest(Protocol):
         """Verify a signature; raise a ``RemoteError`` if it is invalid."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReassembledMessage:
-    """A complete message, opened and verified."""
+class ReassembledMessage(NamedTuple):
+    """A complete message, opened and verified; a tuple because it is on the hot path."""
 
     number: int
     flags: int
@@ -77,6 +78,20 @@ class ReassembledMessage:
 class _Hash(Protocol):
     def update(self, data: bytes, /) -> None: ...
     def digest(self) -> bytes: ...
+
+
+class _Nothing:
+    """The hash of a message that has no signature."""
+
+    def update(self, data: bytes, /) -> None:
+        """Ignore a ciphertext."""
+
+    def digest(self) -> bytes:
+        """Return no digest."""
+        return b""
+
+
+_NOTHING = _Nothing()
 
 
 @dataclass(slots=True, kw_only=True)
@@ -105,20 +120,21 @@ class Reassembler:
     Args:
         source: name whose quota is charged.
         opener_of: returns the opener of a key epoch, or raises ``EnvelopeError`` (UNKNOWN_EPOCH).
-        writer: the key that must have signed.
+        writer: the key that must have signed; None: the openers are of a session secret, whose seals prove the writer.
         budget: shared by all reassemblers of the node.
         patience_s: an unfinished message is dropped this long after its last new fragment.
         head_bytes: how many bytes come before each message; fewer than any first fragment has.
 
     Attributes:
         copies: delay of the second copies, of a source that sends each frame over two paths; None: it does not.
+        repeats: copies of urgent frames over one path.
     """
 
     def __init__(
         self,
         source: bytes,
         opener_of: Callable[[int], OpensParts],
-        writer: VerifiesDigest,
+        writer: VerifiesDigest | None,
         budget: ReassemblyQuota,
         *,
         patience_s: float = JOIN_PATIENCE_S,
@@ -138,6 +154,7 @@ class Reassembler:
         self.highest = -1  # highest message number of which an authentic fragment came
         self.new_parts = 0
         self.copies: SecondCopies | StripedPaths | None = None
+        self.repeats = RepeatedFrames()
         self._under_way = -1  # number of the message whose next fragments are expected
 
     def add_batch(self, arrivals: Sequence[ReceivedFrame], at: int, now_s: float) -> int:
@@ -214,9 +231,10 @@ class Reassembler:
         return self._keep(message, header, plain, sealed, signature, now_s)
 
     def drop_copy(self, header: Header, reason: DropReason, now_s: float) -> None:
-        """Count a fragment that was here before: for ``reason``, or as a second copy where each has two."""
+        """Count a fragment that was here before: for ``reason``, or as a second copy where each may have one."""
         if self.copies is None:
-            self.drops[reason] += 1
+            is_repeat = header.flags & _URGENT and self.repeats.handle_copy(header.number, header.part, now_s)
+            self.drops[DropReason.SECOND_COPY if is_repeat else reason] += 1
             return
         self.drops[DropReason.SECOND_COPY] += 1
         self.copies.handle_copy(header.number, header.part, now_s)
@@ -225,10 +243,11 @@ class Reassembler:
         self, header: Header, salt: bytes, plain: bytes, sealed: bytes, signature: bytes, now_s: float
     ) -> ReassembledMessage | None:
         number = header.number
-        running = digest_of(header, salt)
-        running.update(sealed)
-        if not self._is_signed(signature, running):
-            return None
+        if self._writer is not None:
+            running = digest_of(header, salt)
+            running.update(sealed)
+            if not self._is_signed(self._writer, signature, running):
+                return None
         if number in self._unfinished:  # another sender stated a larger number of fragments
             self._drop(number)
             self.drops[DropReason.BAD_PARTS] += 1
@@ -237,6 +256,8 @@ class Reassembler:
         self.window.finish(number)
         if self.copies is not None:
             self.copies.handle_first(number, 0, now_s)
+        elif header.flags & _URGENT:
+            self.repeats.handle_first(number, 0, now_s)
         head, message = plain[: self._head_bytes], plain[self._head_bytes :]
         return ReassembledMessage(
             number=number,
@@ -257,7 +278,7 @@ class Reassembler:
             salt=salt,
             epoch=header.epoch,
             opener=opener,
-            running=digest_of(header, salt),
+            running=_NOTHING if self._writer is None else digest_of(header, salt),
             touched_s=now_s,
             header=header,
         )
@@ -281,6 +302,8 @@ class Reassembler:
         message.hops = max(message.hops, HOPS_MAX - (header.hops_left & HOPS_MASK))
         if self.copies is not None:
             self.copies.handle_first(number, header.part, now_s)
+        elif header.flags & _URGENT and header.parts <= REPEATED_PARTS_MAX:
+            self.repeats.handle_first(number, header.part, now_s)
         if signature:
             message.signature = signature
         if in_order:
@@ -303,7 +326,7 @@ class Reassembler:
     def _finish(self, header: Header, message: _PartialMessage) -> ReassembledMessage | None:
         number = header.number
         self._drop(number)
-        if not self._is_signed(message.signature, message.running):
+        if self._writer is not None and not self._is_signed(self._writer, message.signature, message.running):
             return None  # not finished: the writer's own fragments may still come
         self.window.finish(number)
         first, size = message.plain[0], self._head_bytes
@@ -317,9 +340,9 @@ class Reassembler:
             head=first[:size],
         )
 
-    def _is_signed(self, signature: bytes, running: _Hash) -> bool:
+    def _is_signed(self, writer: VerifiesDigest, signature: bytes, running: _Hash) -> bool:
         try:
-            self._writer.verify_digest(signature, running.digest())
+            writer.verify_digest(signature, running.digest())
         except RemoteError as error:
             self.drops[error.reason] += 1
             return False
@@ -327,6 +350,11 @@ class Reassembler:
 
     def _drop(self, number: int) -> None:
         self._release_memory(self._unfinished.pop(number).held_bytes)
+
+    @property
+    def frames(self) -> int:
+        """Return how many frames came that were new, or a copy against loss."""
+        return self.new_parts + self.repeats.copies
 
     @property
     def unfinished_bytes(self) -> int:
@@ -387,6 +415,13 @@ class Reassembler:
             self._drop(number)
         self.window.finish(number)
 
+    def give_up(self, number: int) -> None:
+        """Give up one message; its late fragments are dropped."""
+        if number in self._unfinished:
+            self._drop(number)
+            self.drops[DropReason.ABANDONED] += 1
+        self.window.finish(number)
+
     def forget(self, below: int) -> int:
         """Give up every message numbered under ``below``; return how many unfinished ones that ended."""
         ended = 0
@@ -427,7 +462,7 @@ class Reassembler:
         """Return the missing fragments of a message as inclusive ranges; of one never seen, ``(0, 2**32 - 1)``.
 
         Of the newest message only gaps count, unless ``to_end``: fragments beyond the highest one may be under way. No
-        more than ``_SCAN_PARTS`` fragments are examined; further gaps show when these are filled.
+        more than ``SCAN_PARTS`` fragments are examined; further gaps show when these are filled.
         """
         if self.window.is_finished(number):
             return []
@@ -436,7 +471,7 @@ class Reassembler:
             return [(0, ALL_PARTS)] if to_end or number < self.highest else []
         ranges: list[tuple[int, int]] = []
         lacking_from = message.hashed
-        seen_to = min(message.top + 1, message.hashed + _SCAN_PARTS)
+        seen_to = min(message.top + 1, message.hashed + SCAN_PARTS)
         for part in range(message.hashed, seen_to):
             if part in message.plain:
                 if lacking_from < part:
@@ -453,6 +488,14 @@ class Reassembler:
         """Return the first missing fragment of a message (0 for one never seen)."""
         message = self._unfinished.get(number)
         return 0 if message is None else message.hashed
+
+    def extent(self, number: int) -> tuple[int, int, float] | None:
+        """Return the count of fragments of an unfinished message, the highest one held, and when the last new one came.
+
+        None: the message is finished, or nothing of it is held.
+        """
+        message = self._unfinished.get(number)
+        return None if message is None else (message.parts, message.top, message.touched_s)
 
     def close(self) -> None:
         """Release all memory."""

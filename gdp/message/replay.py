@@ -15,10 +15,11 @@ __all__ = ["ReplayWindow"]
 class ReplayWindow:
     """The last ``size`` message numbers of one incarnation; older ones count as finished."""
 
-    __slots__ = ("_bits", "_size", "_top")
+    __slots__ = ("_bits", "_mask", "_size", "_top")
 
     def __init__(self, size: int = REPLAY_WINDOW_MESSAGES) -> None:
         self._size = size
+        self._mask = (1 << size) - 1
         self._top = -1  # highest finished number
         self._bits = 0  # bit i: number top - i is finished
 
@@ -36,7 +37,7 @@ class ReplayWindow:
         """Mark a message as finished: opened, or given up for good."""
         ahead = number - self._top
         if ahead > 0:
-            self._bits = (self._bits << ahead | 1) & ((1 << self._size) - 1) if ahead < self._size else 1
+            self._bits = (self._bits << ahead | 1) & self._mask if ahead < self._size else 1
             self._top = number
         elif -ahead < self._size:
             self._bits |= 1 << -ahead

@@ -2,8 +2,8 @@
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
-A bound limits the work that a reader can cause at its writer. All readers together get at most a congestion window of
-repairs in a round trip. Each reader has an allowance of fragments that are examined for its reports.
+A bound limits the work that a reader can cause at its writer. All readers together get a bounded size
+of repairs in a round trip. Each reader has an allowance of fragments that are examined for its reports.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class RetransmissionQueue:
         *,
         sent_at: int,
         rtt_s: float | None,
-        window_bytes: int,
+        round_bytes: int,
         now_s: float,
     ) -> bool:
         """Queue missing fragments that were sent, but not again within a round trip; return whether any was.
@@ -77,11 +77,11 @@ class RetransmissionQueue:
         Args:
             sent_at: position before which everything has been sent.
             rtt_s: estimated round-trip time; None: unknown.
-            window_bytes: the congestion window.
+            round_bytes: most bytes that are sent again in a round trip.
         """
         wait_s = max(1.5 * (rtt_s or 0.0), _ROUND_MIN_S)
         if now_s - self._round_s >= wait_s:
-            self._round_s, self._round_bytes = now_s, window_bytes
+            self._round_s, self._round_bytes = now_s, round_bytes
         allowance.refill(now_s)
         queued = False
         for number, first, last in missing:

@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 
-from gdp.limits import FLIGHT_MESSAGES_MAX, READER_LEASE_S, WINDOW_BYTES
+from gdp.limits import FLIGHT_MESSAGES_MAX, READER_LEASE_S, REPAIRS_MAX_BYTES, WINDOW_BYTES
 from gdp.message.acknack import AckNack
 from gdp.message.acknowledgement import ReaderPositions
 from gdp.message.flow_control import FlowControl
@@ -74,9 +74,9 @@ class SendWindow:
         return self._cache.held_bytes
 
     @property
-    def congestion_window_bytes(self) -> int:
-        """Return how many bytes may be under way."""
-        return self._flow.window_bytes
+    def sent_bytes(self) -> int:
+        """Return how many bytes of frames were sent for the first time, since the first message."""
+        return self._sent_at
 
     @property
     def retransmissions(self) -> int:
@@ -201,7 +201,7 @@ class SendWindow:
         return self._readers.next_slow()
 
     def handle_acknack(self, reader: bytes, report: AckNack, now_s: float) -> None:
-        """Process the report of a known reader: release, adapt the congestion window, and queue repairs."""
+        """Process the report of a known reader: release what all have, and queue repairs."""
         message = self._cache.messages.get(report.next_number)
         position = message.position(report.next_part) if message else self._cache.begin_of(report.next_number)
         suspended = self._readers.suspended.get(reader)
@@ -219,12 +219,11 @@ class SendWindow:
         self._readers.acknowledge(state, min(position, self._sent_at), now_s)
         acked_at = self._acked_at()
         self._flow.handle_acknowledged(acked_at - before, acked_at, now_s)
-        if self._request_repairs(reader, report, now_s):
-            self._flow.handle_loss(now_s)
+        self._request_repairs(reader, report, now_s)
         self._release_acknowledged()
 
     def frames_to_send(self, now_s: float, limit: int = 1 << 30) -> list[bytes]:
-        """Return frames that may be sent now: repairs first, then new ones as far as the congestion window allows."""
+        """Return at most ``limit`` frames: repairs first, then new ones as far as the readers can hold them."""
         frames: list[bytes] = []
         if self._repairs and (frames := self._repairs.frames_to_send(self._cache.messages, limit, now_s)):
             self._flow.round_trip.discard_sample()
@@ -283,16 +282,16 @@ class SendWindow:
         is_spare = is_spare and oldest is not None and oldest < readers.least_active()
         return self._budget_bytes if readers.suspended and is_spare else 2 * self._budget_bytes
 
-    def _request_repairs(self, reader: bytes, report: AckNack, now_s: float) -> bool:
-        """Queue the fragments that a reader lacks; return whether any was queued."""
+    def _request_repairs(self, reader: bytes, report: AckNack, now_s: float) -> None:
+        """Queue the fragments that a reader lacks."""
         position = self._readers.active.get(reader) or self._readers.suspended[reader]
-        return self._repairs.request(
+        self._repairs.request(
             report.missing,
             position.allowance,
             self._cache.messages,
             sent_at=self._sent_at,
             rtt_s=self._flow.round_trip.rtt_s,
-            window_bytes=self._flow.window_bytes,
+            round_bytes=REPAIRS_MAX_BYTES,
             now_s=now_s,
         )
 

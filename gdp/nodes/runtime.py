@@ -233,7 +233,9 @@ class Runtime:
         """Send the core's next frames; return whether there may be more."""
         for index, macs in self._machine.poll_neighbours().items():
             self._plane.set_neighbours(index, macs)
-        transmits = self._machine.frames_to_send()
+        transmits = self._machine.frames_to_send(time.monotonic())
+        if transmits:
+            self._machine.frames_leave(time.monotonic())
         for port, mac, frames in transmits:
             self._plane.transmit(port, mac, frames)
         return bool(transmits)

@@ -149,6 +149,9 @@ class MmsgBatch:
         got = self._receive(source.fileno(), self._in_at, self._take_max, _DONTWAIT, None)
         if got <= 0:  # no frames, or the device went down: the link monitor reports it
             return []
+        if got == 1:  # most calls, where messages are small
+            self._sizes[0] = size = self._taken[0] - ETHER_BYTES
+            return [size]
         sizes = [length - ETHER_BYTES for length in self._taken[:got].tolist()]
         self._sizes[:got] = memoryview(array("L", sizes))
         return sizes

@@ -62,6 +62,7 @@ class NetdevPlane(ABC):
         self._open_again_s = 0.0
         self._counters = Counters()
         self._polls = 0
+        self._audited_at = -1  # frames that had come by the last audit
         self._next_index = 0
         self._epoll = select.epoll()
         self._ready: dict[int, Callable[[], None]] = {}
@@ -121,7 +122,9 @@ class NetdevPlane(ABC):
             timeout_s = self._open_again(timeout_s)
         events = self._epoll.poll(timeout_s)
         self._polls += 1
-        if not events or not self._polls % _AUDIT_POLLS:
+        # A poll that does not wait, between two chunks of a message or while spinning, has nothing new to read.
+        is_idle = not events and (timeout_s != 0 or self._counters.frames_in != self._audited_at)
+        if is_idle or not self._polls % _AUDIT_POLLS:
             self._audit()
         if len(events) > 1:
             events.sort(key=lambda event: self._ranks[event[0]])
@@ -214,6 +217,7 @@ class NetdevPlane(ABC):
 
     def _audit(self) -> None:
         """Add the kernel's own drops to the counters."""
+        self._audited_at = self._counters.frames_in
         self._counters.drops[DropReason.PORT_FULL] += self._kernel_drops()
 
     def _know(self, port: Port) -> None:

@@ -79,7 +79,7 @@ class Plane(Protocol):
         """The live counts; any thread may read them.
 
         Frames that the kernel dropped at a full socket (``PORT_FULL``) are added in the next idle ``poll``, or in the
-        256th busy one.
+        256th busy one. An idle one that does not wait counts only if frames came since.
         """
 
     def poll(self, timeout_s: float | None) -> list[ReceivedFrame]:

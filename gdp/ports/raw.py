@@ -37,7 +37,15 @@ from gdp.names import NAME_BYTES
 from gdp.ports.mmsg import SLOTS, MmsgPool, make_batch, put_one
 from gdp.ports.netdev import NetdevPlane
 from gdp.ports.plane import MAC_BYTES, Port, ReceivedFrame
-from gdp.ports.sockets import TrafficClass, attach_drop_all_filter, kernel_drops, open_port, tell_neighbours
+from gdp.ports.sockets import (
+    TrafficClass,
+    attach_drop_all_filter,
+    keep_arrival_times,
+    kernel_drops,
+    open_port,
+    tell_neighbours,
+    waited_s,
+)
 from gdp.switch.forwarder import Drop, Forward, decide
 from gdp.switch.table import NOWHERE, Hops, Table, is_side
 from gdp.token_bucket import TokenBucket
@@ -102,6 +110,7 @@ class RawPlane(NetdevPlane):
         sockets = self._lanes[lane]
         opened = sockets[port.index] = open_port(port.ifname, lane, bypass_qdisc=self._bypass_qdisc)
         if self._entries is None:
+            keep_arrival_times(opened)
             ready = partial(self._punt_all, port.index, opened)
         else:
             ready = partial(self._forward_all, self._entries, self._sides, port.index, opened, sockets)
@@ -212,10 +221,10 @@ class RawPlane(NetdevPlane):
         batch = self._batch
         sizes = batch.receive(source)
         self._counters.frames_in += len(sizes)
-        pool, arrivals = batch.pool, self._arrivals
+        pool, arrivals, waited = batch.pool, self._arrivals, waited_s(source) if sizes else 0.0
         for slot, size in zip(range(0, len(pool), batch.slot_bytes), sizes, strict=False):
             mac, frame = _shape(size).unpack_from(pool, slot)
-            arrivals.append(ReceivedFrame(port, mac, frame))
+            arrivals.append(ReceivedFrame(port, mac, frame, waited))
 
     def _arrival(self, port: int, slot: int, size: int) -> ReceivedFrame:
         return ReceivedFrame(port, *_shape(size).unpack_from(self._batch.pool, slot))

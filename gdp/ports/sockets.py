@@ -18,9 +18,12 @@ queueing discipline with bands honours it (``pfifo_fast``, ``prio``, and the acc
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import fcntl
 import socket
 import struct
+import time
 from array import array
 from collections.abc import Iterable, Sequence
 from enum import Enum
@@ -36,11 +39,13 @@ __all__ = [
     "TrafficClass",
     "attach_drop_all_filter",
     "attach_ethertype_filter",
+    "keep_arrival_times",
     "kernel_drops",
     "large_buffers",
     "open_port",
     "steps_of",
     "tell_neighbours",
+    "waited_s",
 ]
 
 AS_ROOT: Final = "run this as root, or with scripts/privileged.sh"
@@ -55,6 +60,10 @@ _SO_SNDBUFFORCE: Final = 32
 _SO_RCVBUFFORCE: Final = 33
 _GREETING_BUFFER_BYTES: Final = 128 << 10  # about a hundred hellos: in a flood, more would be stale when read
 _BUFFER_BYTES: Final = 16 << 20  # a 921,600-byte message is 1.6 MB of socket memory at MTU 1500
+
+_SIOCGSTAMPNS: Final = 0x8907  # of 64-bit systems
+_TIMESPEC: Final = struct.Struct("@qq")
+_WAITED_MOST_S: Final = 10.0  # beyond that the system clock was set
 
 _Step = tuple[int, int, int, int]  # code, steps to jump if true, if false, value
 _LOAD_BYTE: Final = 0x30  # BPF_LD | BPF_B | BPF_ABS; a load beyond the frame's end rejects the frame
@@ -222,6 +231,27 @@ def _filter(opened: socket.socket, steps: Sequence[_Step]) -> None:
 def kernel_drops(opened: socket.socket) -> int:
     """Return how many frames the kernel dropped at this socket's full buffer since the last call."""
     return int(struct.unpack("=II", opened.getsockopt(_SOL_PACKET, _PACKET_STATISTICS, 8))[1])
+
+
+def keep_arrival_times(opened: socket.socket) -> None:
+    """Let the kernel keep the arrival time of the frame that was read last."""
+    with contextlib.suppress(OSError):  # the first call starts it, and finds none yet
+        fcntl.ioctl(opened, _SIOCGSTAMPNS, bytearray(_TIMESPEC.size))
+
+
+def waited_s(opened: socket.socket) -> float:
+    """Return for how many seconds the frame that was read last had waited at the socket; 0: not known.
+
+    Source: socket(7), SIOCGSTAMP. It is one system call for a batch of frames, and no work for each of them.
+    """
+    stamp = bytearray(_TIMESPEC.size)
+    try:
+        fcntl.ioctl(opened, _SIOCGSTAMPNS, stamp)
+    except OSError:
+        return 0.0
+    seconds, nanoseconds = _TIMESPEC.unpack(stamp)
+    since_s = (time.time_ns() - (seconds * 1_000_000_000 + nanoseconds)) * 1e-9
+    return since_s if 0.0 <= since_s < _WAITED_MOST_S else 0.0
 
 
 def large_buffers(opened: socket.socket) -> None:

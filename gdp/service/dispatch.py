@@ -93,6 +93,7 @@ class Dispatch(Generic[A]):
     Args:
         start: the first call's number, random in 64 bits.
         stops: whether servers that still owe a response receive a stop when a call has ended.
+        unicasts: a request to all servers goes to a server by its own stream while it is the only one.
 
     Attributes:
         late: responses that came for a call that had ended.
@@ -105,11 +106,13 @@ class Dispatch(Generic[A]):
         *,
         start: int,
         stops: bool = True,
+        unicasts: bool = False,
         calls_max: int = CALLS_MAX,
         held_max_bytes: int = HELD_MAX_BYTES,
     ) -> None:
         self._replication = replication
         self._stops = stops
+        self._unicasts = unicasts
         self._calls: Calls[_Call[A]] = Calls(calls_max, start)
         self._held_max_bytes = held_max_bytes
         self._held_bytes = 0
@@ -172,7 +175,7 @@ class Dispatch(Generic[A]):
         self._held_bytes += len(call.request)
         self._budget.earn()
         mode = self._replication.mode
-        if mode is Mode.ALL and not chosen:
+        if mode is Mode.ALL and not chosen and not (self._unicasts and len(self._servers) == 1):
             call.owing = dict.fromkeys(self._servers, now_s)
             call.tried.update(self._servers)
             self._effects.append(Ask(number, call.request, None))

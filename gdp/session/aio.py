@@ -15,6 +15,7 @@ from types import TracebackType
 from typing import TypeVar
 
 from gdp.client.participant import Topic
+from gdp.client.send_options import SendOptions
 from gdp.errors import LocalError
 from gdp.service.replication import Replication
 from gdp.session.core import QUEUE_MESSAGES
@@ -31,12 +32,13 @@ from gdp.session.session import (
     LINGER_S,
     Paths,
     Priority,
+    Sign,
     checked_response,
     is_urgent,
 )
 from gdp.session.settings import SessionConfig, settings_of
 from gdp.session.wire import message_to_wire
-from gdp.trust.advertisement import paths_value
+from gdp.trust.advertisement import paths_value, session_value
 from gdp.trust.right import Right
 
 __all__ = ["AsyncPublisher", "AsyncServer", "AsyncSession", "AsyncSubscription", "open_session_async"]
@@ -214,6 +216,10 @@ class AsyncSession(BaseSession[LoopDriver]):
         is_global: bool = True,
         description: bytes = b"",
         paths: Paths = 1,
+        deadline_s: float | None = None,
+        weight: int = 1,
+        max_bits_s: float | None = None,
+        repairs: bool = True,
     ) -> AsyncPublisher:
         """Publish a name from now on; see ``Session.publisher``.
 
@@ -231,6 +237,7 @@ class AsyncSession(BaseSession[LoopDriver]):
             is_global=is_global,
             description=description,
             paths=paths_value(paths),
+            options=SendOptions(deadline_s=deadline_s, weight=weight, max_bits_s=max_bits_s, repairs=repairs),
         )
         publisher = AsyncPublisher(self, topic, made, reliable=reliable)
         self._opened.append(publisher)
@@ -262,6 +269,7 @@ class AsyncSession(BaseSession[LoopDriver]):
         priority: Priority = "normal",
         is_global: bool = True,
         paths: Paths = 1,
+        sign: Sign = "always",
     ) -> AsyncServer:
         """Serve a name; ``workers`` is how many requests are handled at one time. See ``Session.serve``.
 
@@ -274,7 +282,12 @@ class AsyncSession(BaseSession[LoopDriver]):
             raise LocalError(f"workers is at least 1, not {workers}")
         topic = self.core.resolve(name, Right.SERVE)
         core = self.core.serve(
-            topic, at_once=workers, is_global=is_global, urgent=is_urgent(priority), paths=paths_value(paths)
+            topic,
+            at_once=workers,
+            is_global=is_global,
+            urgent=is_urgent(priority),
+            paths=paths_value(paths),
+            is_session=session_value(sign),
         )
         server = AsyncServer(self, topic, core, handler, workers)
         self._opened.append(server)
@@ -289,6 +302,7 @@ class AsyncSession(BaseSession[LoopDriver]):
         timeout_s: float | None = CALL_TIMEOUT_S,
         replication: str | int | Replication = "all",
         paths: Paths = 1,
+        sign: Sign = "always",
     ) -> Response:
         """Send a request to the servers of a name and return the first response; see ``Session.call``.
 
@@ -300,7 +314,7 @@ class AsyncSession(BaseSession[LoopDriver]):
         """
         self.driver.check()
         topic, call = self._new_call(name, request, timeout_s, replication)
-        self.core.call(topic, call, time.monotonic(), paths_value(paths))
+        self.core.call(topic, call, time.monotonic(), paths_value(paths), is_session=session_value(sign))
         self.driver.schedule()
         await self.driver.wait(lambda: call.is_done, None)
         if call.response is None:

@@ -55,6 +55,7 @@ class ClientCore:
     Args:
         label: word for the name in errors.
         start: number of the first call, random in 64 bits.
+        is_session: a session secret authenticates requests to one server and responses, if that server asks for it too.
 
     Raises:
         LocalError: no delegation, or the name is in use in this session.
@@ -70,12 +71,16 @@ class ClientCore:
         is_global: bool = True,
         urgent: bool = False,
         paths: int = 1,
+        is_session: bool = False,
     ) -> None:
         self._member = member
         self._name = topic.name
         self._label = label
         self._start = start
-        self._publisher: Publisher = member.call(topic, SERVING, is_global=is_global, urgent=urgent, paths=paths)
+        self._is_session = is_session
+        self._publisher: Publisher = member.call(
+            topic, SERVING, is_global=is_global, urgent=urgent, paths=paths, is_session=is_session
+        )
         self._dispatches: dict[Replication, Dispatch[Response]] = {}
         self._servers: dict[Name, int] = {}  # server to its incarnation
         self._leaving: set[Name] = set()
@@ -219,7 +224,7 @@ class ClientCore:
             return known
         # so that no two dispatches use the same numbers
         start = (self._start + (len(self._dispatches) << 48)) % (1 << 64)
-        dispatch = self._dispatches[replication] = Dispatch(replication, start=start)
+        dispatch = self._dispatches[replication] = Dispatch(replication, start=start, unicasts=self._is_session)
         for name in self._servers:
             dispatch.replica_joined(name, now_s)
             if name in self._leaving:

@@ -13,6 +13,7 @@ from typing import Final, Protocol
 from gdp.client.participant import Message as MemberMessage
 from gdp.client.participant import Participant, Topic
 from gdp.client.publisher import Publisher
+from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions, checked
 from gdp.errors import LocalError, RemoteError
 from gdp.metadata import Metadata
 from gdp.names import NAME_BYTES, Name
@@ -166,14 +167,22 @@ class SessionCore:
         is_global: bool,
         description: bytes,
         paths: int = 1,
+        options: SendOptions = DEFAULT_OPTIONS,
     ) -> Publisher:
         """Publish a name; see ``Participant.advertise``.
 
         Raises:
-            LocalError: the name is published already in this session.
+            LocalError: the name is published already in this session, or an option is out of bounds.
         """
         return self.member.advertise(
-            topic, description, reliable=reliable, depth=latched, is_global=is_global, urgent=urgent, paths=paths
+            topic,
+            description,
+            reliable=reliable,
+            depth=latched,
+            is_global=is_global,
+            urgent=urgent,
+            paths=paths,
+            options=checked(options),
         )
 
     def subscribe(self, topic: Topic, limit: int, paths: int = 1) -> Inbox:
@@ -192,7 +201,16 @@ class SessionCore:
             del self._receivers[inbox.name]
             self.member.unsubscribe(inbox.name)
 
-    def serve(self, topic: Topic, *, at_once: int | None, is_global: bool, urgent: bool, paths: int = 1) -> ServerCore:
+    def serve(
+        self,
+        topic: Topic,
+        *,
+        at_once: int | None,
+        is_global: bool,
+        urgent: bool,
+        paths: int = 1,
+        is_session: bool = False,
+    ) -> ServerCore:
         """Serve a name.
 
         Raises:
@@ -206,6 +224,7 @@ class SessionCore:
             is_global=is_global,
             urgent=urgent,
             paths=paths,
+            is_session=is_session,
         )
         self._receivers[topic.name] = self._servers[topic.name] = server
         self._services.append(server)
@@ -218,15 +237,22 @@ class SessionCore:
             self._services.remove(server)
             server.close(now_s)
 
-    def call(self, topic: Topic, call: Call, now_s: float, paths: int = 1) -> None:
-        """Begin a call; the first call on a name advertises that this node calls it, and over how many paths.
+    def call(self, topic: Topic, call: Call, now_s: float, paths: int = 1, *, is_session: bool = False) -> None:
+        """Begin a call; the first call on a name advertises that this node calls it, and its options.
 
         Raises:
             LocalError: the name is read or served already in this session.
         """
         client = self._clients.get(topic.name)
         if client is None:
-            client = ClientCore(self.member, topic, self.label(topic), start=self._random_start(), paths=paths)
+            client = ClientCore(
+                self.member,
+                topic,
+                self.label(topic),
+                start=self._random_start(),
+                paths=paths,
+                is_session=is_session,
+            )
             self._receivers[topic.name] = self._clients[topic.name] = client
             self._services.append(client)
         client.begin(call, now_s)

@@ -164,16 +164,16 @@ class ThreadDriver:
             try:
                 if self._commands:
                     self._run_commands()
-                publisher.publish(message)
+                publisher.publish(message, time.monotonic())
                 self._send(len(message))
             finally:
                 self._lock.release()
             if self._commands or self._followers:
                 self._after_release()
         elif len(message) > _COPY_MAX_BYTES or len(self._commands) >= _QUEUED_MAX:
-            self.run(partial(publisher.publish, message))
+            self.run(partial(publisher.publish, message, time.monotonic()))
         else:
-            self._commands.append(partial(_publish_or_log, publisher, message))
+            self._commands.append(partial(_publish_or_log, publisher, message, time.monotonic()))
             self._drain_or_wake()
 
     def wait(self, is_ready: Callable[[], bool], deadline_s: float | None) -> bool:
@@ -348,8 +348,8 @@ class ThreadDriver:
             raise ClosedError("the session is closed; open a new one")
 
 
-def _publish_or_log(publisher: Publisher, message: bytes) -> None:
+def _publish_or_log(publisher: Publisher, message: bytes, now_s: float) -> None:
     try:
-        publisher.publish(message)
+        publisher.publish(message, now_s)
     except GdpError as error:  # the size was checked before
         log.error("a message was not published reason=%s", error)

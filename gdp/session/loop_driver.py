@@ -49,8 +49,9 @@ class LoopDriver:
             ClosedError: the session is closed.
         """
         self.check()
-        publisher.publish(message)
-        self._member.flush(time.monotonic())
+        now_s = time.monotonic()
+        publisher.publish(message, now_s)
+        self._member.flush(now_s)
         self._runtime.send()
         self.schedule()
 

@@ -10,6 +10,7 @@ from typing import Generic, Protocol, TypeVar
 from gdp.client.participant import Topic
 from gdp.client.publisher import Publisher
 from gdp.errors import LocalError
+from gdp.message.loss import LossReason
 from gdp.names import Name
 from gdp.service.replication import Replication
 from gdp.session.client_core import Call
@@ -128,8 +129,23 @@ class BasePublisher(Opened[_D]):
 
     @property
     def confirmed(self) -> int:
-        """Return how many messages every reader has confirmed; without ``reliable``, how many were sent."""
-        return self._publisher.acknowledged
+        """Return how many messages every reader has confirmed; readers confirm none that is best effort."""
+        return self._publisher.acknowledged if self._publisher.confirms else 0
+
+    @property
+    def sent(self) -> int:
+        """Return how many messages have left this node, not counting those that some reader is known not to get."""
+        return self._publisher.sent
+
+    @property
+    def expired(self) -> int:
+        """Return how many messages were dropped here, because they could not leave in time."""
+        return self._publisher.losses.counts[LossReason.LIFESPAN]
+
+    @property
+    def reader_lost(self) -> int:
+        """Return how many messages the reader that lost most reports as lost, those that never left included."""
+        return self._publisher.reader_lost
 
     @property
     def lost(self) -> int:

@@ -30,6 +30,7 @@ class ServerCore:
     Args:
         start: number of the first call here, random in 64 bits.
         at_once: most requests that handlers process at the same time.
+        is_session: a session secret authenticates streams with one client, if that client asks for it too.
 
     Attributes:
         turns: requests for handlers, in order; a driver removes them.
@@ -49,11 +50,14 @@ class ServerCore:
         is_global: bool,
         urgent: bool,
         paths: int = 1,
+        is_session: bool = False,
     ) -> None:
         self._member = member
         self._name = topic.name
         self._serving: Serving[bytes] = Serving(start, at_once)
-        self._publisher = member.serve(topic, SERVING, is_global=is_global, urgent=urgent, paths=paths)
+        self._publisher = member.serve(
+            topic, SERVING, is_global=is_global, urgent=urgent, paths=paths, is_session=is_session
+        )
         self._seen_s: dict[Name, float] = {}  # when the clients of active calls were last alive
         self._check_at_s: float | None = None  # when clients are checked next; None: no call is active
         self._is_leaving = False

@@ -16,6 +16,7 @@ from types import TracebackType
 from typing import Final, Literal, TypeVar
 
 from gdp.client.participant import Topic
+from gdp.client.send_options import SendOptions
 from gdp.errors import LocalError
 from gdp.service.replication import Replication
 from gdp.session.core import QUEUE_MESSAGES
@@ -27,7 +28,7 @@ from gdp.session.opened import BasePublisher, BaseServer, BaseSession, BaseSubsc
 from gdp.session.server_core import ServerCore
 from gdp.session.settings import settings_of
 from gdp.session.wire import message_to_wire
-from gdp.trust.advertisement import paths_value
+from gdp.trust.advertisement import paths_value, session_value
 from gdp.trust.right import Right
 
 __all__ = ["Publisher", "Server", "Session", "Subscription", "open_session"]
@@ -40,6 +41,7 @@ LINGER_S: Final = 1.0
 GOODBYE_S: Final = 0.2  # how long a leaving node continues, so that its goodbye is sent
 Priority = Literal["normal", "urgent"]
 Paths = Literal[1, 2, "spread"]
+Sign = Literal["always", "session"]
 
 _C = TypeVar("_C")
 
@@ -230,6 +232,10 @@ class Session(BaseSession[Driver]):
         is_global: bool = True,
         description: bytes = b"",
         paths: Paths = 1,
+        deadline_s: float | None = None,
+        weight: int = 1,
+        max_bits_s: float | None = None,
+        repairs: bool = True,
     ) -> Publisher:
         """Publish a name from now on.
 
@@ -242,6 +248,11 @@ class Session(BaseSession[Driver]):
             description: information that readers need to decode the messages; it travels sealed.
             paths: 2: each frame travels over two disjoint paths. ``spread``: large messages are striped over them. The
                 readers subscribe with either as well.
+            deadline_s: without ``reliable``: a message that cannot leave whole within this time is dropped, above 0 and
+                at most 3600. None: a message that has waited for 0.1 s gives way to a newer one.
+            weight: share of a full path, next to other names of the same priority, 1 to 100.
+            max_bits_s: most bits of frames a second, 1e3 to 1e12. None: what the path carries.
+            repairs: without ``reliable``: lost parts of a message are sent again while that can be in time.
 
         Raises:
             DelegationError: the node may not publish it.
@@ -258,6 +269,7 @@ class Session(BaseSession[Driver]):
                 is_global=is_global,
                 description=description,
                 paths=paths_value(paths),
+                options=SendOptions(deadline_s=deadline_s, weight=weight, max_bits_s=max_bits_s, repairs=repairs),
             )
         )
         publisher = Publisher(self, topic, made, reliable=reliable)
@@ -313,6 +325,7 @@ class Session(BaseSession[Driver]):
         priority: Priority = "normal",
         is_global: bool = True,
         paths: Paths = 1,
+        sign: Sign = "always",
     ) -> Server:
         """Serve a name: ``handler`` gets each request and returns the response.
 
@@ -322,6 +335,8 @@ class Session(BaseSession[Driver]):
             server.
             workers: number of threads, and so of requests that are handled at the same time.
             paths: 2: requests and responses travel over two disjoint paths, of clients with 2 as well.
+            sign: ``session``: responses, and requests to one server, have no signature where the client says the same.
+            They prove their writer to the other end, and to no third party.
 
         Raises:
             DelegationError: the node may not serve it.
@@ -333,7 +348,12 @@ class Session(BaseSession[Driver]):
         urgent = is_urgent(priority)
         core = self.driver.run(
             lambda: self.core.serve(
-                topic, at_once=workers, is_global=is_global, urgent=urgent, paths=paths_value(paths)
+                topic,
+                at_once=workers,
+                is_global=is_global,
+                urgent=urgent,
+                paths=paths_value(paths),
+                is_session=session_value(sign),
             )
         )
         server = Server(self, topic, core, handler, workers)
@@ -348,6 +368,7 @@ class Session(BaseSession[Driver]):
         timeout_s: float | None = CALL_TIMEOUT_S,
         replication: str | int | Replication = "all",
         paths: Paths = 1,
+        sign: Sign = "always",
     ) -> Response:
         """Send a request to the servers of a name and return the first response.
 
@@ -357,6 +378,7 @@ class Session(BaseSession[Driver]):
             replication: ``"all"``: every server gets the request; ``"hedged"``: one server, and a second one if the
                 first is slow; a number: that many servers, the fastest ones; or a ``Replication``.
             paths: 2: over two disjoint paths, to servers with 2 as well. The first call on a name decides.
+            sign: as for ``serve``. The first call on a name decides.
 
         Raises:
             NoServerError: no server is available.
@@ -365,7 +387,10 @@ class Session(BaseSession[Driver]):
             DelegationError: the node may not call it.
         """
         topic, call = self._new_call(name, request, timeout_s, replication)
-        self.driver.run(lambda: self.core.call(topic, call, self.driver.now_s(), paths_value(paths)))
+        is_session = session_value(sign)
+        self.driver.run(
+            lambda: self.core.call(topic, call, self.driver.now_s(), paths_value(paths), is_session=is_session)
+        )
         self.driver.wait(lambda: call.is_done, None)
         if call.response is None:
             raise call.error or ClosedError("the session was closed during the call")

@@ -51,6 +51,8 @@ def check_exposed(files: ProxyFiles, state: ShareState, offers: Iterable[Offer],
     """
     check_name(wanted.name)
     kind_from_text(wanted.kind, wanted.type_name)
+    if wanted.kind != "topic" and (wanted.deadline_ms is not None or wanted.repair is not None):
+        raise LocalError(f"{wanted.name} is a {wanted.kind}; only topics have a deadline, and parts that stay lost")
     if (rule := files.find("expose", wanted.kind, wanted.name)) is not None:
         raise LocalError(
             f"{wanted.name} is exposed already by {rule.where}; give it to a node with gdp share {wanted.name} --with"
@@ -106,8 +108,7 @@ def render(folder: StateFolder, files: ProxyFiles, state: ShareState, used: Iter
     lines: dict[Side, list[str]] = {"expose": [], "import": []}
     for each in state.exposed:
         owner = PublicKey.from_compressed(bytes.fromhex(each.owner_key))
-        encoding = {} if each.encoding is None else {"encoding": each.encoding}
-        lines["expose"].append(_line(folder, files, each.kind, each.name, each.type_name, owner, encoding))
+        lines["expose"].append(_line(folder, files, each.kind, each.name, each.type_name, owner, each.rule_options))
     for side, offer in used:
         if files.find(side, offer.kind, offer.ros_name) is None:
             lines[side].append(_line(folder, files, offer.kind, offer.ros_name, offer.type_name, offer.owner, {}))
@@ -122,7 +123,7 @@ def _line(
     name: str,
     type_name: str,
     owner: PublicKey,
-    more: dict[str, str],
+    more: dict[str, object],
 ) -> str:
     path: Path = folder.owner_file(owner)
     rule = {"kind": kind, "name": name, **({"type": type_name} if type_name else {}), **more}

@@ -79,8 +79,11 @@ class Sharing:
             kept = [each for each in at.state.exposed if (each.kind, each.name) != (wanted.kind, wanted.name)]
             for each in at.state.exposed:
                 if each not in kept:
-                    merged = {"to": (*each.to, *(label for label in wanted.to if label not in each.to))}
-                    wanted = each.model_copy(update={**merged, "type_name": wanted.type_name or each.type_name})
+                    merged: dict[str, object] = {
+                        "to": (*each.to, *(label for label in wanted.to if label not in each.to))
+                    }
+                    merged |= {**wanted.rule_options, "type_name": wanted.type_name or each.type_name}
+                    wanted = each.model_copy(update=merged)
             at.state = at.state.model_copy(update={"exposed": (*kept, wanted)})
             self._apply(at, is_required=True)
             self._grant(at, restored=added)

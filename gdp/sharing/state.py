@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 from pydantic import Field, ValidationError
 
@@ -48,6 +48,7 @@ class ExposedName(Section):
         owner: directory of the owner.
         owner_key: the owner's public key, hex.
         days: life of each delegation.
+        encoding, deadline_ms, repair, weight, max_bits_s: keys of the rule; None: the rule's default.
     """
 
     kind: Kind
@@ -58,6 +59,16 @@ class ExposedName(Section):
     owner_key: str
     days: float
     encoding: str | None = None
+    deadline_ms: float | None = None
+    repair: Literal["never", "in-time"] | None = None
+    weight: int | None = None
+    max_bits_s: float | None = None
+
+    @property
+    def rule_options(self) -> dict[str, object]:
+        """Return the keys of the rule that are set."""
+        keys = ("encoding", "deadline_ms", "repair", "weight", "max_bits_s")
+        return {key: value for key in keys if (value := getattr(self, key)) is not None}
 
 
 class AcceptedName(Section):

@@ -291,9 +291,13 @@ class SwitchCore:
         """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
         return self.hello_protocol.poll_addresses()
 
-    def frames_to_send(self) -> list[OutgoingFrames]:
+    def frames_to_send(self, now_s: float) -> list[OutgoingFrames]:
         """Return, once, the frames to send: none while an older switch has this identity."""
+        del now_s  # nothing here is paced
         return [] if self.is_displaced else self._outbox.poll_frames()
+
+    def frames_leave(self, now_s: float) -> None:
+        """Do nothing: no path is measured here."""
 
     def _unwatch(self, orphaned: Iterable[Name]) -> None:
         for topic in orphaned:

@@ -26,7 +26,7 @@ from gdp.trust.adcert import Chain
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
 
-__all__ = ["Advertisement", "UnverifiedAdvertisement", "paths_value", "sign_advertisement"]
+__all__ = ["Advertisement", "UnverifiedAdvertisement", "paths_value", "session_value", "sign_advertisement"]
 
 _MS = 1_000
 
@@ -47,6 +47,7 @@ class Advertisement:
         previous: the switch that the node has come from, or ``ZERO``.
         exchange: the node's X25519 key in this run, for control messages to it; empty where it takes none.
         paths: over how many disjoint paths the node wants to send or receive each frame of this name.
+        is_session: a session secret may authenticate the unicast streams of this name that the node sends or receives.
     """
 
     subject: Subject
@@ -62,6 +63,7 @@ class Advertisement:
     previous: Name = ZERO
     exchange: bytes = b""
     paths: int = 1
+    is_session: bool = False
 
     @property
     def name(self) -> Name:
@@ -118,6 +120,7 @@ class UnverifiedAdvertisement:
     previous: Name = ZERO
     exchange: bytes = b""
     paths: int = 1
+    is_session: bool = False
 
     @classmethod
     def from_statement(cls, statement: Statement) -> UnverifiedAdvertisement:
@@ -148,15 +151,18 @@ class UnverifiedAdvertisement:
             previous=fields.name("prev") if "prev" in fields else ZERO,
             exchange=exchange,
             paths=paths,
+            is_session="session" in fields and fields.flag("session"),
         )
 
     def to_fields(self) -> dict[str, object]:
         """Return the statement's body."""
         moved = {} if self.previous == ZERO else {"prev": self.previous}
         several = {} if self.paths == 1 else {"paths": self.paths}
+        session = {"session": True} if self.is_session else {}
         return {
             **moved,
             **several,
+            **session,
             **self.subject.to_fields(),
             "name": self.subject.name,
             "right": self.right.value,
@@ -185,6 +191,7 @@ def sign_advertisement(
     previous: Name = ZERO,
     exchange: bytes = b"",
     paths: int = 1,
+    is_session: bool = False,
 ) -> bytes:
     """Return a node's signed advertisement; costs about 50 us.
 
@@ -199,6 +206,7 @@ def sign_advertisement(
         previous: the node's former switch, which is to be notified; ``ZERO``: it has not moved.
         exchange: its X25519 key in this run, for control messages to it; empty where it takes none.
         paths: over how many disjoint paths each frame of the name is to travel, 1 or 2; ``SPREAD``: striped over two.
+        is_session: a session secret may authenticate its unicast streams of the name, with nodes that say the same.
 
     Raises:
         LocalError: a lease out of bounds, or more than one statement can carry.
@@ -218,6 +226,7 @@ def sign_advertisement(
         previous=previous,
         exchange=exchange,
         paths=paths,
+        is_session=is_session,
     )
     wire = identity.sign(StatementType.ADVERTISE, body.to_fields())
     if len(wire) > ADVERTISEMENT_MAX_BYTES:
@@ -238,3 +247,14 @@ def paths_value(paths: object) -> int:
     if paths not in (1, 2):
         raise LocalError(f"paths is 1, 2 or 'spread', not {paths!r}")
     return int(paths == 2) + 1
+
+
+def session_value(sign: object) -> bool:
+    """Return whether an advertisement allows session secrets instead of signatures.
+
+    Raises:
+        LocalError: it is neither ``always`` nor ``session``.
+    """
+    if sign not in ("always", "session"):
+        raise LocalError(f"sign is 'always' or 'session', not {sign!r}")
+    return sign == "session"

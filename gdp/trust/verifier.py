@@ -95,6 +95,7 @@ class AdvertisementVerifier:
             previous=body.previous,
             exchange=body.exchange,
             paths=body.paths,
+            is_session=body.is_session,
         )
         self._check_evidence(advertisement, unix_s)
         return advertisement

@@ -25,6 +25,7 @@ class Party:
     right: Right
     name: str = SERVICE
     paths: int = 1
+    is_session: bool = False
     stream: Publisher = field(init=False)
     service: Name = field(init=False)
     got: list[Message] = field(default_factory=list)
@@ -43,7 +44,8 @@ class Party:
         topic = self.world.topic(self.name, self.member, [self.right], kind="service")
         self.service = topic.name
         take_part = self.member.serve if self.right is Right.SERVE else self.member.call
-        self.stream = take_part(topic, f"{self.right.value} by {self.label}".encode(), paths=self.paths)
+        described = f"{self.right.value} by {self.label}".encode()
+        self.stream = take_part(topic, described, paths=self.paths, is_session=self.is_session)
         self.world.network.send_pending(self.label)
 
     def publish(self, message: bytes) -> None:

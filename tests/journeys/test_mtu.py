@@ -174,7 +174,9 @@ def test_frames_too_large_for_a_link_that_shrank_under_them_are_counted() -> Non
     network.call(0.001, partial(network.set_mtu, sim_link, 1_000))  # by then they have passed two links of five
     network.run(NEWS_S)
     parts = -(-(20_000 + 64) // (USUAL - 96 - 16))
-    assert (too_big(flow), flow.numbers(SERVER)) == (parts - 1, [])  # the last fragment is a small one
+    assert 0 < too_big(flow) < parts  # the first window, whose last fragment may be a small one
+    assert flow.numbers(SERVER) == []
+    network.run(1)  # the publisher measures the path anew after what was lost
     flow.outlive()
 
 
@@ -216,7 +218,7 @@ def test_what_was_sealed_too_large_for_its_link_arrives_all_the_same() -> None:
     flow = flowing(wide(ring5()))
     network, sim_link = flow.world.network, flow.world.cables[MIDDLE]
     flow.stream(20, 0.0005, size=20_000)
-    network.call(0.004, partial(network.set_mtu, sim_link, 1_000))
+    network.call(0.001, partial(network.set_mtu, sim_link, 1_000))
     assert network.run(3, lambda: flow.has(SERVER, 20))  # sooner than a standing reader is evicted
     assert flow.numbers(SERVER) == list(range(20))
     assert too_big(flow) > 0
@@ -229,7 +231,7 @@ def test_of_two_readers_neither_gets_a_refragmented_message_twice() -> None:
     assert world.run_until_attached()
     flow = flowing(world, readers=(SERVER, "nuc2/near"))
     flow.stream(20, 0.002, size=20_000)
-    world.network.call(0.0123, partial(world.network.set_mtu, world.cables[MIDDLE], 1_000))
+    world.network.call(0.0025, partial(world.network.set_mtu, world.cables[MIDDLE], 1_000))
     assert world.network.run(3, lambda: flow.has(SERVER, 20) and flow.has("nuc2/near", 20))
     world.network.run(3)
     assert flow.numbers(SERVER) == flow.numbers("nuc2/near") == list(range(20))

@@ -10,7 +10,7 @@ from gdp.client.unicast_stream import private_name
 from gdp.client.writer_proxy import WriterProxyState
 from gdp.errors import DropReason, LocalError
 from gdp.frame.kinds import Kind
-from gdp.limits import ADVERTISEMENT_LEASE_S, CALL_LAG_S, CALL_QUIET_S, FLIGHT_START_BYTES
+from gdp.limits import ADVERTISEMENT_LEASE_S, CALL_LAG_S, CALL_QUIET_S, PRIVATE_WAIT_BYTES
 from gdp.names import Name
 from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology, chain
@@ -169,7 +169,7 @@ def test_what_a_client_may_ask_before_it_has_said_what_its_requests_are_is_bound
         ask(client, one, bytes([number]) * 20_000)
     world.network.run(2)
     (private,) = [writer_proxy for writer_proxy in one.member.writer_proxies() if writer_proxy is not public]
-    assert len(private._delivery) * 20_000 <= FLIGHT_START_BYTES + 20_000
+    assert len(private._delivery) * 20_000 <= PRIVATE_WAIT_BYTES + 20_000
     assert private.drops[DropReason.MEMORY_FULL] > 0
     public._schedule.due_s = world.network.now.mono_s
     public.state = WriterProxyState.LIVE

@@ -216,11 +216,11 @@ def test_a_second_copy_to_an_unknown_name_is_dropped_and_no_rib_is_asked() -> No
     switch = world.switches["s0"]
     (link,) = [each for each in switch.hello_protocol.all_up() if each.name == robot.name]
     header = Header(Kind.DATA, 0, SECOND_PATH | 64, 0, 0, 1, 0, 1, 1, b"\x55" * 32, robot.name)
-    switch.frames_to_send()
+    switch.frames_to_send(0.0)
     before = Counter(switch.drops())
     switch.receive([ReceivedFrame(link.port, link.mac, encode(header))], world.network.now)
     assert Counter(switch.drops()) - before == {DropReason.NO_SECOND_PATH: 1}
-    assert switch.frames_to_send() == []
+    assert switch.frames_to_send(0.0) == []
 
 
 def _frames(made: Pair, count: int) -> list[tuple[int, bytes]]:

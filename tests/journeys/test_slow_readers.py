@@ -69,8 +69,11 @@ class Behind:
     def poll_neighbours(self) -> Mapping[int, frozenset[bytes]]:
         return self._member.poll_neighbours()
 
-    def frames_to_send(self) -> list[OutgoingFrames]:
-        return self._member.frames_to_send()
+    def frames_to_send(self, now_s: float) -> list[OutgoingFrames]:
+        return self._member.frames_to_send(now_s)
+
+    def frames_leave(self, now_s: float) -> None:
+        self._member.frames_leave(now_s)
 
 
 def world_with_a_slow_one(frames_s: float) -> tuple[Simulation, Behind]:

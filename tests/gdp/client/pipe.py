@@ -13,6 +13,7 @@ from gdp.client.delivery import Delivered
 from gdp.client.identities import ReaderIdentity, WriterIdentity
 from gdp.client.key_epochs import Secrets
 from gdp.client.publisher import Publisher
+from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
 from gdp.client.writer_proxy import WriterProxy
 from gdp.crypto.keys import SigningKey
 from gdp.frame.codec import decode
@@ -33,11 +34,22 @@ def sequenced(sequence: int, body: bytes) -> bytes:
 
 
 def publisher_of(
-    *, incarnation: int = 1, secrets: Secrets = SECRETS, reliable: bool = True, depth: int = 0
+    *,
+    incarnation: int = 1,
+    secrets: Secrets = SECRETS,
+    reliable: bool = True,
+    depth: int = 0,
+    options: SendOptions = DEFAULT_OPTIONS,
 ) -> Publisher:
     source = source_of(Name(b"p" * 32), incarnation, WRITER)
     publisher = Publisher(
-        topic=TOPIC, source=source, secrets=secrets, description=b"what it is", reliable=reliable, depth=depth
+        topic=TOPIC,
+        source=source,
+        secrets=secrets,
+        description=b"what it is",
+        reliable=reliable,
+        depth=depth,
+        options=options,
     )
     publisher.tree_stands(1500)
     return publisher
@@ -73,12 +85,16 @@ class Pipe:
         self.incarnation = incarnation
         self.random = Random(seed)
         self.now_s = 100.0
+        self.delay_s = DELAY_S
         self.jitter_s = 0.0
         self.doubled = 0.0
+        self.batch_bytes = 1 << 30  # of frames that leave at once
+        self.pause_s = 0.0  # ... and how long after that the next ones leave
         self.ends: dict[bytes, End] = {}
         self.seen: list[bytes] = []  # every frame that went over the pipe
         self._events: list[tuple[float, int, Callable[[], None]]] = []
         self._order = count()
+        self._paused_until_s = 0.0
 
     @property
     def source(self) -> WriterIdentity:
@@ -126,6 +142,7 @@ class Pipe:
             self.publisher.handle_timer(self.now_s)
             for each in self.ends.values():
                 each.writer_proxy.handle_timer(self.now_s)
+                each.delivered += each.writer_proxy.poll_delivered()
         return True
 
     def _next_s(self) -> float:
@@ -134,7 +151,7 @@ class Pipe:
         return min((each for each in times if each is not None), default=float("inf"))
 
     def _flush(self) -> None:
-        for frame in self.publisher.poll_frames(self.now_s):
+        for frame in self._polled():
             self.seen.append(frame)
             for end in self.ends.values():
                 if not end.deaf and len(frame) <= end.mtu:
@@ -145,10 +162,19 @@ class Pipe:
                 self.seen.append(note)
                 self._send(note, end, partial(self.tell, note))
 
+    def _polled(self) -> list[bytes]:
+        if self.now_s < self._paused_until_s:
+            return self.publisher.poll_frames(self.now_s, 0)  # Heartbeats leave in any case
+        frames = self.publisher.poll_frames(self.now_s, self.batch_bytes)
+        if frames and self.pause_s:
+            self._paused_until_s = self.now_s + self.pause_s
+            heapq.heappush(self._events, (self._paused_until_s, next(self._order), lambda: None))
+        return frames
+
     def _send(self, frame: bytes, end: End, arrive: Callable[[], None]) -> None:
         for _ in range(2 if self.random.random() < self.doubled else 1):
             if self.random.random() >= end.loss:
-                due_s = self.now_s + DELAY_S + self.random.random() * self.jitter_s
+                due_s = self.now_s + self.delay_s + self.random.random() * self.jitter_s
                 heapq.heappush(self._events, (due_s, next(self._order), arrive))
 
     def _to_reader(self, end: End, frame: bytes) -> Callable[[], None]:

@@ -77,6 +77,24 @@ def test_a_forged_part_far_ahead_does_not_make_a_reader_ask_for_ever() -> None:
     assert pipe.run(1.0, lambda: end.messages == [b"real"])
 
 
+def test_forged_parts_do_not_keep_best_effort_messages_from_being_repaired() -> None:
+    pipe = Pipe(publisher_of(reliable=False))
+    end = pipe.join(b"a")
+    assert pipe.run(2.0, lambda: end.writer_proxy.state is WriterProxyState.LIVE)
+    for number in (2, *range(1_000, 1_100)):
+        give(pipe, end, forge(number, bytes(50_000))[7:8])
+    end.loss = 0.05
+    for at in range(30):
+        pipe.publish([b"%02d" % at + bytes(20_000)])
+        pipe.run(0.05)
+    pipe.run(1.0)
+    assert len(end.delivered) >= 29
+    assert end.numbers == sorted(end.numbers)
+    pipe.seen.clear()
+    pipe.run(10.0)
+    assert len(pipe.seen) < 15
+
+
 def test_absurd_numbers_before_the_first_status_do_not_stop_a_writer_proxy() -> None:
     pipe = Pipe(publisher_of())
     end = pipe.join(b"a")

@@ -283,3 +283,35 @@ def test_through_any_outages_published_is_delivered_or_lost(
     for end in (one, other):
         assert_complete(pipe, end)
     assert other.writer_proxy.lost == 0
+
+
+def best_effort_without_a_whole_message() -> tuple[Pipe, End]:
+    """Return a best-effort stream of 150 messages in 5 s, whose reader gets the last frame of each, and no other."""
+    pipe = Pipe(publisher_of(reliable=False))
+    (end,) = live(pipe, b"a")
+    end.mtu = 1_400
+    stream(pipe, 5.0, 1 / 30, size=4_000)
+    return pipe, end
+
+
+def test_a_reader_that_gets_no_message_whole_learns_while_they_flow_that_they_are_lost() -> None:
+    pipe, end = best_effort_without_a_whole_message()
+    assert pipe.publisher.messages == 150
+    assert end.writer_proxy.lost > 60
+    assert end.writer_proxy.losses.counts.keys() == {LossReason.GAP}
+
+
+def test_the_publisher_learns_what_a_best_effort_reader_lost() -> None:
+    pipe, end = best_effort_without_a_whole_message()
+    assert pipe.run(3.0, pipe.publisher.is_reported)
+    assert (pipe.publisher.sent, pipe.publisher.reader_lost, end.writer_proxy.lost) == (150, 150, 150)
+
+
+def test_what_waits_on_a_best_effort_topic_has_not_been_sent() -> None:
+    pipe = Pipe(publisher_of(reliable=False))
+    live(pipe, b"a")
+    for _ in range(3):
+        pipe.publisher.publish(bytes(4_000), pipe.now_s)
+    before = pipe.publisher.sent, pipe.publisher.acknowledged, pipe.publisher.is_reported()
+    pipe.run(0.1)
+    assert (before, pipe.publisher.sent) == ((0, 0, False), 3)

@@ -7,6 +7,7 @@ import gc
 import pytest
 
 from gdp.client.participant import Participant
+from gdp.client.send_options import SendOptions
 from gdp.errors import DropReason, LocalError
 from gdp.frame.kinds import Kind
 from gdp.sansio import ReceivedFrame
@@ -176,6 +177,24 @@ def sizes(world: Simulation) -> list[int]:
     ]
     ribs = [(host.rib.names, host.rib.watching) for host in world.ribs.values()]
     return [each for row in [*switches, *ribs] for each in row]
+
+
+def test_send_options_reach_the_publisher_of_a_topic() -> None:
+    world = ring()
+    member = world.members[ROBOT]
+    options = SendOptions(deadline_s=0.2, weight=3, max_bits_s=1e6, repairs=False)
+    topic = world.topic("/camera", member, [Right.PUBLISH])
+    assert member.advertise(topic, b"", reliable=False, options=options).options == options
+
+
+@pytest.mark.parametrize("right", [Right.SERVE, Right.CALL])
+def test_send_options_reach_the_stream_of_a_service(right: Right) -> None:
+    world = ring()
+    member = world.members[ROBOT]
+    options = SendOptions(weight=3, max_bits_s=1e6)
+    topic = world.topic("/plan", member, [right], kind="service")
+    join = member.serve if right is Right.SERVE else member.call
+    assert join(topic, b"", options=options).options == options
 
 
 def count_objects() -> int:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from gdp.client.publisher import Publisher
-from gdp.client.send_scheduler import BYTES_AT_ONCE, SendScheduler
+from gdp.client.send_options import SendOptions
+from gdp.client.send_scheduler import SendScheduler
 from gdp.frame.codec import decode
 from gdp.names import Name
 from tests.gdp.client.pipe import Pipe, publisher_of
@@ -17,15 +18,90 @@ def read_by_one() -> Publisher:
     return publisher
 
 
-def test_two_floods_take_turns_and_a_small_message_waits_for_one_chunk_at_most() -> None:
-    asked: list[Publisher] = []
-    turns, publishers = SendScheduler(asked.append), [read_by_one() for _ in range(3)]
-    for publisher, size in zip(publishers, (900_000, 900_000, 10), strict=True):
-        publisher.published = turns.add
-        publisher.publish(bytes(size))
-    taken = [turns.poll_turn(101.0) for _ in range(3)]
-    assert asked == [publishers[0], publishers[1], publishers[2], publishers[0]]
-    assert all(sum(len(frame) for frames in each for frame in frames) <= 2 * BYTES_AT_ONCE for each in taken)
+class Flood(Publisher):
+    """A publisher that always has frames, on a path that permits some bytes of all publishers together."""
+
+    def __init__(self, path: list[int], *, weight: int = 1, waiting: int = 1 << 30, urgent: bool = False) -> None:
+        self.path = path
+        self.options = SendOptions(weight=weight)
+        self.is_urgent = urgent
+        self.waiting = waiting
+        self.frames_out = 0
+        self.has_more = True
+
+    @property
+    def mtu(self) -> int:
+        return 1_500
+
+    def allowance(self, now_s: float) -> int:
+        return self.path[0]
+
+    def next_send_s(self, now_s: float) -> float | None:
+        return 5.0
+
+    def poll_frames(self, now_s: float, limit_bytes: int = 1 << 30) -> list[bytes]:
+        count = min(-(-limit_bytes // 1_500), self.waiting)
+        self.path[0] -= count * 1_500
+        self.frames_out += count
+        self.waiting -= count
+        self.has_more = self.waiting > 0
+        return [bytes(1_500)] * count
+
+    def note_idle(self) -> None:
+        pass
+
+
+def scheduled(*floods: Flood) -> SendScheduler:
+    turns = SendScheduler(lambda _: None)
+    for flood in floods:
+        turns.add(flood)
+    return turns
+
+
+def test_floods_on_a_thin_path_share_it_frame_by_frame_by_their_weights() -> None:
+    path = [0]
+    light, heavy = Flood(path), Flood(path, weight=3)
+    turns = scheduled(light, heavy)
+    for _ in range(4_000):
+        path[0] = 1_500  # as a paced path permits
+        turns.resume()
+        turns.poll_turn(0.0)
+        assert abs(heavy.frames_out - 3 * light.frames_out) <= 8
+    assert light.frames_out + heavy.frames_out == 4_000
+
+
+def test_a_small_message_waits_for_two_frames_of_a_flood_at_most() -> None:
+    path = [0]
+    flood, scan = Flood(path), Flood(path, waiting=1)
+    turns = scheduled(flood)
+    for at in range(10):
+        if at == 5:
+            before = flood.frames_out
+            turns.add(scan)
+        path[0] = 1_500
+        turns.resume()
+        turns.poll_turn(0.0)
+        if scan.frames_out:
+            break
+    assert scan.frames_out == 1
+    assert flood.frames_out - before <= 2
+
+
+def test_an_urgent_flood_leaves_before_an_ordinary_one() -> None:
+    path = [15_000]
+    ordinary, urgent = Flood(path), Flood(path, urgent=True, waiting=4)
+    turns = scheduled(ordinary, urgent)
+    turns.poll_turn(0.0)
+    assert (urgent.frames_out, ordinary.frames_out) == (4, 0)
+
+
+def test_what_the_path_holds_back_is_due_when_the_path_says_so() -> None:
+    turns = scheduled(Flood([0]))
+    assert turns.poll_turn(1.0) == []
+    assert not turns
+    assert turns.next_due() == 5.0
+    turns.resume()
+    assert turns
 
 
 def test_a_publisher_that_has_no_more_is_not_asked_again_until_it_has() -> None:

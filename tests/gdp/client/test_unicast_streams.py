@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from gdp.client.send_options import SendOptions
 from gdp.client.sequence_numbers import SequenceRegistry, SequenceState
 from gdp.client.unicast_stream import IDLE_S, Party, PeerIncarnation, private_incarnation, private_name
 from gdp.client.unicast_streams import STREAMS_MAX, UnicastStreams
@@ -34,6 +35,20 @@ def client(number: int) -> Party:
     return Party(PeerIncarnation(Name(number.to_bytes(32, "big")), number), EXCHANGE)
 
 
+def test_the_stream_to_each_reader_has_the_options_of_its_service() -> None:
+    options = SendOptions(weight=5, max_bits_s=2e6)
+    streams = UnicastStreams(
+        service=SERVICE,
+        writer=SERVER,
+        secrets=SECRETS,
+        sequence_registry=SequenceRegistry(),
+        published=lambda _: None,
+        urgent=False,
+        options=options,
+    )
+    assert streams.stream(client(1), 1500, 0.0).options == options
+
+
 def test_every_end_and_every_life_has_a_stream_of_its_own() -> None:
     server = PeerIncarnation(SERVER.name, SERVER.incarnation)
     names = {
@@ -49,6 +64,11 @@ def test_the_name_of_a_private_stream_is_this() -> None:
     name = private_name(SERVICE, PeerIncarnation(SERVER.name, SERVER.incarnation), CLIENT)
     assert name.to_text() == "a1d677801a4a75f965a64c1de83026087bc56cc0a2287107cbdbae66d3d8b19a"
     assert f"{private_incarnation(name):016x}" == "98ab1e4af377bf56"
+
+
+def test_a_session_stream_has_a_name_of_its_own() -> None:
+    ends = SERVICE, PeerIncarnation(SERVER.name, SERVER.incarnation), CLIENT
+    assert private_name(*ends, is_session=True) != private_name(*ends)
 
 
 def test_there_are_no_more_streams_than_the_bound_while_all_are_in_use() -> None:

@@ -74,6 +74,18 @@ def test_what_is_taken_stands_in_its_slots_and_can_leave_again(kind: Make, pair:
 
 
 @KINDS
+def test_a_single_frame_leaves_whole_after_shorter_ones_were_taken(kind: Make, pair: Pair) -> None:
+    batch = kind(200)
+    for frame in (b"one", b"two"):
+        pair[1].send(bytes(14) + frame)
+    batch.receive(pair[0])
+    pair[1].send(bytes(14) + b"a longer one")
+    assert batch.receive(pair[0]) == [12]
+    assert batch.forward(pair[0], 0, 1, MACS, no_drops()) == 1
+    assert received(pair[1]) == [ETHER + b"a longer one"]
+
+
+@KINDS
 def test_taking_from_an_empty_socket_gives_nothing(kind: Make, pair: Pair) -> None:
     assert kind(200).receive(pair[0]) == []
 

@@ -57,6 +57,16 @@ def test_all_are_asked_by_the_tree_and_the_first_answer_wins() -> None:
     assert (bench.ends, bench.dispatch.late) == ({call: ["b"]}, 1)
 
 
+def test_the_only_server_is_asked_by_its_own_stream_where_that_is_preferred() -> None:
+    dispatch = Dispatch[str](ALL, start=0, unicasts=True)
+    dispatch.replica_joined(A, 0.0)
+    for servers in ((A,), None):  # the second call begins when there are two
+        number = dispatch.begin(0.0, lambda _: b"?", None, lambda _: None, lambda *_: None)
+        assert dispatch.poll_effects()[-1] == Ask(number, b"?", servers)
+        dispatch.replica_joined(B, 0.0)
+        dispatch.poll_effects()
+
+
 def test_an_answer_of_one_that_was_not_asked_is_not_taken() -> None:
     bench = Bench(SOME)
     call = bench.begin()

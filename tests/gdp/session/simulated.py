@@ -57,7 +57,7 @@ class _Driver:
         return result
 
     def publish(self, publisher: Publisher, message: bytes) -> None:
-        publisher.publish(message)
+        publisher.publish(message, self.now_s())
         self._simulated.send(self._label)
 
     def wait(self, is_ready: Callable[[], bool], deadline_s: float | None) -> bool:

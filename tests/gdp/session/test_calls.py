@@ -170,3 +170,22 @@ def test_replication_is_given_as_a_word_or_a_number() -> None:
 def test_an_unknown_replication_is_refused(wrong: object) -> None:
     with pytest.raises(LocalError, match="'all', 'hedged' or a number"):
         replication_of(wrong)  # type: ignore[arg-type]
+
+
+def test_a_call_to_the_only_server_has_no_signature_where_both_ends_say_session(replicas: Simulated) -> None:
+    edge, robot = replicas.cores["edge"], replicas.cores["robot"]
+    topic = edge.resolve("plan", Right.SERVE)
+    server = edge.serve(topic, at_once=1, is_global=True, urgent=False, is_session=True)
+    calls = [Call(payload=b"x", timeout_s=5.0, replication=ALL) for _ in range(2)]
+    for call in calls:
+        robot.call(robot.resolve("plan", Right.CALL), call, replicas.now_s, is_session=True)
+        replicas.send("robot")
+        respond(replicas, server, "edge", b"y")
+    assert replicas.run(2.0, lambda: all(each.is_done for each in calls))
+    requests = [each for each in edge.member.writer_proxies() if each.topic != topic.name]
+    assert [each.delivered for each in requests] == [2]
+
+
+def test_an_impossible_kind_of_signature_is_refused(replicas: Simulated) -> None:
+    with pytest.raises(LocalError, match="'never'"):
+        replicas.sessions["edge"].serve("plan", lambda request: request.payload, sign="never")  # type: ignore[arg-type]

@@ -78,7 +78,8 @@ class Stub:
 
     def flush(self, now_s: float) -> None: ...
 
-    def publish(self, message: bytes) -> None:
+    def publish(self, message: bytes, now_s: float) -> None:
+        del now_s
         self.published.append(message)
 
 

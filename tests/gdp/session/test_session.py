@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 import gdp
+from gdp.client.send_options import SendOptions
 from gdp.errors import LocalError
 from gdp.message.loss import LossReason
 from gdp.metadata import Metadata
@@ -97,6 +98,50 @@ def test_a_flushed_message_is_confirmed(pair: Simulated) -> None:
     publisher.put(b"x")
     publisher.flush(timeout_s=5)
     assert publisher.confirmed == 1
+
+
+def test_a_best_effort_message_is_sent_and_never_confirmed(pair: Simulated) -> None:
+    publisher = pair.sessions["robot"].publisher("camera", reliable=False)
+    pair.sessions["server"].subscribe("camera")
+    publisher.wait_for_readers(timeout_s=5)
+    publisher.put(b"x")
+    publisher.flush(timeout_s=5)
+    assert (publisher.sent, publisher.confirmed, publisher.expired, publisher.reader_lost) == (1, 0, 0, 0)
+
+
+def test_a_message_that_cannot_leave_in_time_is_counted_and_its_reader_reports_it(pair: Simulated) -> None:
+    publisher = pair.sessions["robot"].publisher("camera", reliable=False, deadline_s=0.1, max_bits_s=8_000)
+    subscription = pair.sessions["server"].subscribe("camera")
+    publisher.wait_for_readers(timeout_s=5)
+    publisher.put(bytes(5_000))
+    pair.run(3.0)
+    assert (publisher.sent, publisher.expired, publisher.reader_lost, subscription.lost) == (0, 1, 1, 1)
+
+
+def test_the_options_of_a_publisher_reach_its_topic(pair: Simulated) -> None:
+    options = SendOptions(deadline_s=0.2, weight=3, max_bits_s=1e6, repairs=False)
+    publisher = pair.sessions["robot"].publisher(
+        "camera", reliable=False, deadline_s=0.2, weight=3, max_bits_s=1e6, repairs=False
+    )
+    assert publisher._publisher.options == options
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        ({"deadline_s": 0.0}, "deadline_s is above 0 and at most 3600 s, not 0.0"),
+        ({"deadline_s": float("nan")}, "deadline_s is above 0"),
+        ({"deadline_s": 3_601.0}, "deadline_s is above 0"),
+        ({"weight": 0}, "weight is a whole number from 1 to 100, not 0"),
+        ({"weight": 101}, "weight is a whole number"),
+        ({"max_bits_s": 999.0}, "max_bits_s is at least 1000"),
+        ({"max_bits_s": float("inf")}, "max_bits_s is at least 1000 and at most 1e\\+12"),
+    ],
+)
+def test_an_option_out_of_bounds_is_refused(pair: Simulated, options: dict[str, float], complaint: str) -> None:
+    with pytest.raises(LocalError, match=complaint):
+        pair.sessions["robot"].publisher("camera", **options)  # type: ignore[arg-type]
+    pair.sessions["robot"].publisher("camera").close()  # the name is still free
 
 
 def test_a_message_without_a_reader_is_counted_as_lost(pair: Simulated) -> None:

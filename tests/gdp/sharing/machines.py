@@ -123,10 +123,12 @@ class Machine:
         """Return the rights that its proxy has, by ROS name."""
         return {_ros_name(each): {right.value for right in each.rights} for each in self.held}
 
-    def exposing(self, name: str, *to: str, type_name: str = "", kind: str = "topic", days: float = 30) -> ExposedName:
+    def exposing(
+        self, name: str, *to: str, type_name: str = "", kind: str = "topic", days: float = 30, **options: object
+    ) -> ExposedName:
         """Return a name to expose under the machine's owner key."""
         key = load_owner(self.owner).public.compressed.hex()
-        fields = {"kind": kind, "name": name, "type_name": type_name, "to": to, "owner": self.owner}
+        fields = {"kind": kind, "name": name, "type_name": type_name, "to": to, "owner": self.owner, **options}
         return ExposedName.model_validate({**fields, "owner_key": key, "days": days})
 
     def start(self, stack: ExitStack) -> None:

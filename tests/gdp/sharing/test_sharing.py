@@ -8,12 +8,14 @@ from pathlib import Path
 
 import pytest
 
+from gdp.client.send_options import SendOptions
 from gdp.crypto.statements import parse
 from gdp.errors import LocalError
 from gdp.sharing.exchange import Mail, MailKind
 from gdp.sharing.issued import IssuedStore
 from gdp.sharing.state import AcceptedName, links_of
 from gdp.trust.revocation import Revocation
+from proxy.config.config import ProxyConfig
 from tests.gdp.sharing.machines import DAY_S, IMAGE, PLAN, STRING, Machine, Site, importing
 
 
@@ -127,6 +129,21 @@ def test_a_name_that_is_removed_ends_its_rule_and_what_was_installed_for_it(
     server.sharing.stop_accepting("import", "/camera/image", site.now_s)
     assert (robot.rules("expose"), server.rules("import"), server.held) == ([], [], [])
     assert not (robot.folder / "proxy.yaml.d" / "gdp-share.yaml").exists()
+
+
+def test_an_exposed_name_is_sent_as_it_was_asked_for(site: Site, robot: Machine) -> None:
+    wanted = robot.exposing(
+        "/camera/image", type_name=IMAGE, deadline_ms=200.0, repair="never", weight=3, max_bits_s=4e6
+    )
+    robot.sharing.expose(wanted, site.now_s)
+    (rule,) = ProxyConfig.load(robot.path).expose
+    assert rule.send_options() == SendOptions(deadline_s=0.2, weight=3, max_bits_s=4e6, repairs=False)
+
+
+def test_only_a_topic_has_a_deadline(site: Site, robot: Machine) -> None:
+    wanted = robot.exposing("/plan", "server", type_name=PLAN, kind="service", deadline_ms=200.0)
+    with pytest.raises(LocalError, match="only topics have a deadline"):
+        robot.sharing.expose(wanted, site.now_s)
 
 
 def test_a_second_recipient_is_added_to_an_exposed_name(site: Site, robot: Machine, server: Machine) -> None:

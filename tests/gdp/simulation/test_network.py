@@ -42,9 +42,12 @@ class Talker:
     def poll_neighbours(self) -> Mapping[int, frozenset[bytes]]:
         return {}
 
-    def frames_to_send(self) -> list[OutgoingFrames]:
+    def frames_to_send(self, now_s: float) -> list[OutgoingFrames]:
         out, self.out = self.out, []
         return out
+
+    def frames_leave(self, now_s: float) -> None:
+        pass
 
     def say(self, *frames: bytes) -> None:
         self.out.append(OutgoingFrames(0, BROADCAST, frames))

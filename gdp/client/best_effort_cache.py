@@ -1,0 +1,216 @@
+"""Best-effort cache: large messages of a best-effort topic that were sent lately, for repairs that are still in time.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). ``gdp/message/late_repairs.py`` is the reader's side.
+
+A message of up to ``REPAIRS_ABOVE_PARTS`` fragments is not cached: it rarely loses one, and the next message replaces
+it. The frames of others stay until the deadline of their topic, or until ``REPAIR_S`` after the last one was sent.
+Repairs cause no more than half as many bytes as were sent for the first time, however many readers request them.
+"""
+
+from __future__ import annotations
+
+import struct
+from bisect import bisect_right
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+from gdp.client.send_options import SendOptions
+from gdp.frame.codec import NUMBER_AT
+from gdp.limits import REPAIR_S, REPAIRS_ABOVE_PARTS
+from gdp.message.acknack import MissingRange
+from gdp.message.history_cache import CachedMessage
+from gdp.message.retransmission import RepairAllowance, RetransmissionQueue
+
+__all__ = ["CACHE_BYTES", "FIRST_CREDIT_BYTES", "BestEffortCache"]
+
+CACHE_BYTES: Final = 8 << 20  # of frames of one topic; the oldest messages go first
+_SHARE: Final = 0.5  # of the bytes sent for the first time: what repairs may add
+FIRST_CREDIT_BYTES: Final = 256 << 10
+_CREDIT_BYTES: Final = 1 << 20  # ... and may have saved up
+_READERS_MAX: Final = 1_024  # whose allowances are remembered
+# A fragment is sent again after one round trip, of which the queue of repairs waits 1.5. Readers repeat a request only
+# after the time that repairs took before, so it is no duplicate; and a longer wait is most of the time that is left.
+_ROUND_TRIPS: Final = 2 / 3
+_PATIENCE: Final = 1.5  # round trips, within which a fragment behind the newest arrival may be under way
+_NEWEST: Final = (1 << 64, 0)
+_EVERYTHING: Final = 1 << 62  # the position before which all cached frames were sent
+_NUMBER_PART_PARTS: Final = struct.Struct("!QII")
+
+
+@dataclass(slots=True, kw_only=True)
+class _Sending:
+    """Course of one message: what was sent of it, and when."""
+
+    until_s: float
+    frames: list[bytes] = field(default_factory=list)
+    held_bytes: int = 0
+    ends: list[int] = field(default_factory=list)  # count of fragments sent, after each batch
+    sent_s: list[float] = field(default_factory=list)  # ... and the time of the batch
+    is_repaired: bool = False
+
+
+class BestEffortCache:
+    """Cache of the frames of one best-effort topic, with the repairs that its readers requested.
+
+    Args:
+        options: of the topic; without ``repairs`` nothing is cached.
+    """
+
+    def __init__(self, options: SendOptions) -> None:
+        self._is_enabled = options.repairs
+        self._deadline_s = options.deadline_s
+        self._messages: OrderedDict[int, CachedMessage] = OrderedDict()
+        self._course: dict[int, _Sending] = {}
+        self._repairs = RetransmissionQueue()
+        self._allowances: OrderedDict[bytes, RepairAllowance] = OrderedDict()  # by reader
+        self._credit_bytes = float(FIRST_CREDIT_BYTES)
+        self._rtt_s: float | None = None
+        self.held_bytes = 0
+
+    def __len__(self) -> int:
+        return len(self._messages)
+
+    @property
+    def retransmissions(self) -> int:
+        """Return how many fragments were sent again."""
+        return self._repairs.retransmissions
+
+    def set_options(self, options: SendOptions) -> None:
+        """Change the options; without ``repairs`` what is cached is dropped."""
+        self._is_enabled, self._deadline_s = options.repairs, options.deadline_s
+        if not options.repairs:
+            self.close()
+
+    def record_sent(self, frames: Sequence[bytes], now_s: float) -> None:
+        """Add frames that are sent for the first time now, in order; the cost depends on the count of messages."""
+        at = 0 if self._is_enabled else len(frames)
+        while at < len(frames):
+            number, part, parts = _NUMBER_PART_PARTS.unpack_from(frames[at], NUMBER_AT)
+            count = min(parts - part, len(frames) - at)
+            if parts > REPAIRS_ABOVE_PARTS:
+                self._add(number, part, frames[at : at + count], now_s)
+            at += count
+
+    def request(
+        self,
+        reader: bytes,
+        missing: Sequence[MissingRange],
+        now_s: float,
+        *,
+        newest: tuple[int, int] = _NEWEST,
+        rtt_s: float | None = None,
+    ) -> None:
+        """Queue what a reader reports as missing, as far as it is cached, in time, and within the bounds.
+
+        Args:
+            newest: number and fragment that came last; a later one is missing only after 1.5 round trips.
+            rtt_s: smoothed round trip of the path; None: not measured.
+        """
+        self.drop_expired(now_s)
+        if not self._messages:
+            return
+        arrived_s = now_s - _PATIENCE * (rtt_s or self._rtt_s or 0.0)
+        missing = [
+            each for each in (self._clip(each, newest, arrived_s) for each in missing) if each.first <= each.last
+        ]
+        if not missing:
+            return
+        self._sample_round_trip(missing, now_s)
+        allowance = self._allowances.get(reader)
+        if allowance is None:
+            allowance = self._allowances[reader] = RepairAllowance()
+            if len(self._allowances) > _READERS_MAX:
+                self._allowances.popitem(last=False)
+        self._repairs.request(
+            missing,
+            allowance,
+            self._messages,
+            sent_at=_EVERYTHING,
+            rtt_s=None if self._rtt_s is None else max(_ROUND_TRIPS * self._rtt_s, _ROUND_TRIPS * (rtt_s or 0.0)),
+            round_bytes=int(self._credit_bytes),
+            now_s=now_s,
+        )
+
+    def frames_to_send(self, now_s: float, limit: int) -> list[bytes]:
+        """Return at most ``limit`` repairs that are still in time."""
+        if not self._repairs:
+            return []
+        self.drop_expired(now_s)
+        frames = self._repairs.frames_to_send(self._messages, limit, now_s)
+        self._credit_bytes -= sum(map(len, frames))
+        for frame in frames:
+            self._course[_NUMBER_PART_PARTS.unpack_from(frame, NUMBER_AT)[0]].is_repaired = True
+        return frames
+
+    def drop_expired(self, now_s: float) -> None:
+        """Drop the messages whose time is over."""
+        while self._messages and self._course[next(iter(self._messages))].until_s <= now_s:
+            self._drop(next(iter(self._messages)))
+
+    def drop_larger(self, mtu: int) -> None:
+        """Drop the messages whose frames no longer fit their path."""
+        for number in [number for number, each in self._messages.items() if len(each.frames[0]) > mtu]:
+            self._drop(number)
+
+    def get_timer(self) -> float | None:
+        """Return the monotonic second after which nothing needs to be cached, or None: nothing is."""
+        return self._course[next(reversed(self._messages))].until_s if self._messages else None
+
+    def close(self) -> None:
+        """Drop everything."""
+        for number in list(self._messages):
+            self._drop(number)
+        self._repairs.clear()
+
+    def _add(self, number: int, part: int, frames: Sequence[bytes], now_s: float) -> None:
+        course = self._course.get(number)
+        if course is None:
+            if part:
+                return  # the cache was too small for its beginning
+            self.drop_expired(now_s)
+            course = self._course[number] = _Sending(until_s=now_s + (self._deadline_s or REPAIR_S))
+            self._messages[number] = CachedMessage(course.frames, 0, 0)
+        size = sum(map(len, frames))
+        course.frames += frames
+        course.held_bytes += size
+        course.ends.append(part + len(frames))
+        course.sent_s.append(now_s)
+        if self._deadline_s is None:
+            course.until_s = now_s + REPAIR_S
+        self.held_bytes += size
+        self._credit_bytes = min(self._credit_bytes + _SHARE * size, _CREDIT_BYTES)
+        while self.held_bytes > CACHE_BYTES:
+            self._drop(next(iter(self._messages)))
+
+    def _clip(self, missing: MissingRange, newest: tuple[int, int], arrived_s: float) -> MissingRange:
+        """Return a range without what may be under way: sent after the newest arrival, and after ``arrived_s``."""
+        course = self._course.get(missing.number)
+        if course is None or (missing.number, missing.last) <= newest:
+            return missing
+        batches = bisect_right(course.sent_s, arrived_s)
+        sent_end = course.ends[batches - 1] if batches else 0
+        if missing.number == newest[0]:
+            sent_end = max(sent_end, newest[1])
+        return missing._replace(last=min(missing.last, sent_end - 1))
+
+    def _drop(self, number: int) -> None:
+        del self._messages[number]
+        self.held_bytes -= self._course.pop(number).held_bytes
+        self._repairs.forget(number)
+
+    def _sample_round_trip(self, missing: Sequence[MissingRange], now_s: float) -> None:
+        """Estimate the round-trip time: a reader finds a gap when it gets the fragment behind it.
+
+        Shorter samples count at once. Longer ones count little, as the first report may have been lost.
+        """
+        number, _, last = missing[-1]
+        course = self._course.get(number)
+        if course is None or course.is_repaired or last + 1 >= course.ends[-1]:
+            return
+        sample_s = now_s - course.sent_s[bisect_right(course.ends, last + 1)]
+        if self._rtt_s is None or sample_s < self._rtt_s:
+            self._rtt_s = sample_s
+        else:
+            self._rtt_s += (sample_s - self._rtt_s) / 8

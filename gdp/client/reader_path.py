@@ -1,0 +1,193 @@
+"""Paths to reader nodes: what may leave for each of them now, whatever the topic.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). One congestion controller (``gdp/congestion``) for each reader
+node is shared by all publishers of a participant that this node reads. A frame to several readers counts on the path of
+each, and leaves when all of them permit it, so the slowest reader governs. A reader that confirms nothing for a timeout
+no longer governs the others; alone, it gets two frames each timeout.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Final
+
+from gdp.congestion.controller import PathController
+from gdp.limits import MTU_MIN_BYTES
+
+__all__ = ["BURST_S", "ReaderPath", "ReaderPaths"]
+
+BURST_S: Final = 0.001  # frames of this time leave at once: a timer for each frame would cost more than it smooths
+_TIMEOUT_LEAST_S: Final = 0.3
+_TIMEOUT_TRIPS: Final = 4.0
+_TIMEOUT_MOST_S: Final = 4.0
+_SCAN_S: Final = 0.1
+_URGENT_SHARE: Final = 1.5  # of the window: urgent frames find space where the others have filled it
+_URGENT_FRAMES: Final = 8
+_FORGET_S: Final = 60.0
+_NEVER: Final = float("inf")
+_UNLIMITED: Final = 1 << 30
+
+
+class ReaderPath:
+    """Path to one reader node.
+
+    Attributes:
+        controller: its congestion controller.
+        is_silent: nothing was confirmed for a timeout, though something is under way.
+    """
+
+    def __init__(self, mtu: int, now_s: float) -> None:
+        self.controller = PathController(mtu)
+        self.is_silent = False
+        self._mtu = mtu
+        self._number = self._left = 0
+        self._hops: int | None = None
+        self._confirmed_s = now_s
+
+    def allowance(self, now_s: float, *, urgent: bool = False) -> int:
+        """Return how many bytes may leave now; 0: none."""
+        controller, mtu = self.controller, self._mtu
+        room = int(controller.limit) - controller.inflight
+        if urgent:
+            extra = max((_URGENT_SHARE - 1) * controller.window, _URGENT_FRAMES * mtu)
+            return max(room + int(extra), 0)
+        next_s = controller.next_send_s(min(room, mtu) if room > 0 else mtu)
+        if next_s is None or next_s > now_s + BURST_S:
+            return 0
+        room = max(room, mtu)  # an empty path carries a frame, whatever its window
+        pace = controller.pacing_bytes_s
+        if pace >= _UNLIMITED:
+            return room
+        return min(room, int((now_s + BURST_S - max(next_s, now_s - BURST_S)) * pace) + mtu)
+
+    def next_send_s(self) -> float:
+        """Return when the next frame may leave; infinity: not before something is confirmed."""
+        next_s = self.controller.next_send_s(self._mtu)
+        return _NEVER if next_s is None else next_s
+
+    def note_idle(self) -> None:
+        """Note that nothing waits, though more might leave."""
+        if self.controller.inflight < self.controller.limit:
+            self.controller.app_limited()
+
+    def sent(self, size: int, frames: int, now_s: float) -> int:
+        """Count frames that leave at once; return the number under which they are confirmed."""
+        if not self.controller.inflight:
+            self._confirmed_s = now_s
+        self._number += 1
+        self.controller.sent(self._number, size, now_s, frames)
+        return self._number
+
+    def frames_leave(self, now_s: float) -> None:
+        """Note that what was counted since the last call leaves now."""
+        for number in range(self._left + 1, self._number + 1):
+            self.controller.frames_leave(number, now_s)
+        self._left = self._number
+
+    def acknowledged(self, numbers: Iterable[int], lost: int, held_s: float | None, now_s: float) -> None:
+        """Take what a report confirms; ``lost`` of these frames did not arrive.
+
+        Args:
+            held_s: how long the reader held the report back; None: it gives no round trip.
+        """
+        before = self.controller.inflight
+        self.controller.acknowledged(numbers, now_s, held_s=held_s, lost=lost)
+        if self.controller.inflight < before:
+            self._confirmed_s = now_s
+
+    def handle_heard(self) -> None:
+        """Note that the reader is alive; what left during a silence and is not confirmed now was lost."""
+        if self.is_silent:
+            self.is_silent = False
+            self.controller.forget_all()
+
+    def handle_hops(self, hops: int, now_s: float) -> None:
+        """Note over how many hops a report came; another count means another path."""
+        if self._hops is not None and hops != self._hops:
+            self.controller.path_changed(now_s)
+        self._hops = hops
+
+    def set_mtu(self, mtu: int) -> None:
+        """Set the bytes of a full frame."""
+        if mtu != self._mtu:
+            self._mtu = mtu
+            self.controller.set_mtu(mtu)
+
+    def handle_timer(self, now_s: float) -> None:
+        """Start again if nothing was confirmed for too long."""
+        if not self.controller.inflight:
+            return
+        trip_s = self.controller.rtt_s or 0.0
+        if now_s - self._confirmed_s >= min(max(_TIMEOUT_TRIPS * trip_s, _TIMEOUT_LEAST_S), _TIMEOUT_MOST_S):
+            self.controller.timed_out(now_s)
+            self.is_silent, self._confirmed_s = True, now_s
+
+    def is_unused(self, now_s: float) -> bool:
+        """Return whether nothing was confirmed for so long that the path need not be remembered."""
+        return not self.controller.inflight and now_s - self._confirmed_s > _FORGET_S
+
+
+class ReaderPaths:
+    """Paths of one participant, by the name of the reader node."""
+
+    def __init__(self) -> None:
+        self._paths: dict[bytes, ReaderPath] = {}
+        self._scan_s: float | None = None
+        self._mtu = MTU_MIN_BYTES  # of new paths
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    def path(self, reader: bytes, now_s: float) -> ReaderPath:
+        """Return the path to a reader node; a new one begins without knowledge."""
+        path = self._paths.get(reader)
+        if path is None:
+            path = self._paths[reader] = ReaderPath(self._mtu, now_s)
+        if self._scan_s is None:
+            self._scan_s = now_s + _SCAN_S
+        return path
+
+    def get(self, reader: bytes) -> ReaderPath | None:
+        """Return the path to a reader node, or None."""
+        return self._paths.get(reader)
+
+    def set_mtu(self, readers: Iterable[bytes], mtu: int) -> None:
+        """Set the bytes of a full frame to some readers, and on new paths."""
+        self._mtu = mtu
+        for reader in readers:
+            if reader in self._paths:
+                self._paths[reader].set_mtu(mtu)
+
+    def governing(self, readers: Iterable[bytes], now_s: float) -> list[ReaderPath]:
+        """Return the paths that govern what leaves for these readers: silent ones only if all are."""
+        paths = [self.path(reader, now_s) for reader in readers]
+        return [path for path in paths if not path.is_silent] or paths[:1]
+
+    def attachment_changed(self, now_s: float) -> None:
+        """Start every path again: frames leave by another switch."""
+        for path in self._paths.values():
+            path.controller.path_changed(now_s)
+
+    def frames_leave(self, now_s: float) -> None:
+        """Note that what was counted since the last call leaves now."""
+        for path in self._paths.values():
+            path.frames_leave(now_s)
+
+    def handle_timer(self, now_s: float) -> bool:
+        """Let silent paths start again, and forget unused ones; return whether any may carry more now."""
+        if self._scan_s is None or now_s < self._scan_s:
+            return False
+        before = sum(path.is_silent for path in self._paths.values())
+        timed_out = False
+        for reader, path in list(self._paths.items()):
+            was_s = path.controller.inflight
+            path.handle_timer(now_s)
+            timed_out |= bool(was_s) and not path.controller.inflight
+            if path.is_unused(now_s):
+                del self._paths[reader]
+        self._scan_s = now_s + _SCAN_S if any(path.controller.inflight for path in self._paths.values()) else None
+        return timed_out or before != sum(path.is_silent for path in self._paths.values())
+
+    def get_timer(self) -> float | None:
+        """Return the monotonic second of the next ``handle_timer``, or None."""
+        return self._scan_s

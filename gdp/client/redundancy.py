@@ -1,0 +1,142 @@
+"""Redundancy against loss: how often urgent frames are sent, when their copies leave, and how many bytes they take.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: docs/explanation/loss.md.
+
+Each frame of an urgent message of one or two fragments is sent up to ``SENDS_MAX`` times, so that one of them arrives
+without a repair. The copies are the same sealed bytes. They leave a few milliseconds apart, because radio loses
+neighbouring frames together.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Final, Protocol
+
+from gdp.frame.codec import NUMBER_AT, PARTS_AT
+from gdp.limits import SENDS_MAX
+from gdp.message.acknack import AckNack
+from gdp.message.frame_loss import FrameLoss, Readers
+from gdp.message.repeated_frames import REPEATED_PARTS_MAX
+from gdp.token_bucket import TokenBucket
+
+__all__ = ["CopyBudget", "PathQuality", "Redundancy", "sends_for"]
+
+_OFFSETS_S: Final = (0.004, 0.007)  # of the second and the third sending after the first
+_SENDS: Final = ((0.001, 1), (0.025, 2))  # up to this loss, so many sendings leave at most 0.1 % undelivered
+_UNKNOWN: Final = 2  # sendings before anything is measured
+_SHARE: Final = 0.05  # of the path that copies may take
+_BYTES_S: Final = 64_000.0  # ... of a path of unknown rate: a twentieth of 10 Mbit/s
+_LEAST_BYTES_S: Final = 8_000.0
+_BURST_S: Final = 0.25
+_RATE_CHANGE: Final = 0.1
+_NUMBER: Final = slice(NUMBER_AT, NUMBER_AT + 8)
+_PARTS: Final = slice(PARTS_AT, PARTS_AT + 4)
+
+
+class PathQuality(Protocol):
+    """What is measured of the path to the readers, such as a congestion controller's figures."""
+
+    @property
+    def loss(self) -> float | None:
+        """Return the share of frames lost lately, 0 to 1; None: unknown."""
+
+    @property
+    def rtt_s(self) -> float | None:
+        """Return the round-trip time; None: unknown."""
+
+    @property
+    def bytes_s(self) -> float | None:
+        """Return how many bytes a second the path carries; None: unknown."""
+
+
+class CopyBudget:
+    """Bytes of copies that one participant may send, shared by its topics: a twentieth of the path."""
+
+    def __init__(self) -> None:
+        self._bytes_s = _BYTES_S
+        self._bucket = TokenBucket(_BYTES_S, _BYTES_S * _BURST_S)
+
+    def spend(self, now_s: float, size: int, path_bytes_s: float | None) -> bool:
+        """Take ``size`` bytes and return True, or return False and take none."""
+        bytes_s = _BYTES_S if path_bytes_s is None else max(path_bytes_s * _SHARE, _LEAST_BYTES_S)
+        if abs(bytes_s - self._bytes_s) > _RATE_CHANGE * self._bytes_s:
+            self._bytes_s = bytes_s
+            self._bucket.change(now_s, bytes_s, bytes_s * _BURST_S)
+        return self._bucket.spend(now_s, size)
+
+
+def sends_for(loss: float | None) -> int:
+    """Return how often an urgent frame is sent at a loss of frames (0 to 1; None: unknown)."""
+    if loss is None:
+        return _UNKNOWN
+    return next((sends for highest, sends in _SENDS if loss <= highest), SENDS_MAX)
+
+
+class Redundancy:
+    """Copies of one publisher's urgent frames.
+
+    Args:
+        budget: of all publishers of the participant.
+
+    Attributes:
+        is_enabled: the frames are urgent, and their rule allows copies.
+        path: what another measures of the path; None: the reports of the readers alone count.
+        copies: frames that were sent again against loss.
+    """
+
+    def __init__(self, *, budget: CopyBudget, is_enabled: bool) -> None:
+        self._budget = budget
+        self.is_enabled = is_enabled
+        self._reported = FrameLoss()
+        self._waiting = tuple(deque[tuple[float, bytes]]() for _ in _OFFSETS_S)
+        self.path: PathQuality | None = None
+        self.copies = 0
+
+    def loss(self, readers: Readers, now_s: float) -> float | None:
+        """Return the share of frames lost on the way to ``readers``, 0 to 1; None: unknown."""
+        measured = self._reported.loss(readers, now_s), None if self.path is None else self.path.loss
+        return max((each for each in measured if each is not None), default=None)
+
+    def handle_sent(self, frames: Sequence[bytes], readers: Readers, now_s: float, *, has_pair: bool = False) -> None:
+        """Note DATA frames that leave now, and queue their copies; ``has_pair``: each leaves over two paths."""
+        if not self.is_enabled or not frames:
+            return
+        self._reported.handle_sent(int.from_bytes(frame[_NUMBER], "big") for frame in frames)
+        sends = sends_for(self.loss(readers, now_s))
+        extra = (sends - 1) // 2 if has_pair else sends - 1
+        rate = None if self.path is None else self.path.bytes_s
+        for waiting, offset_s in zip(self._waiting[:extra], _OFFSETS_S, strict=False):
+            for frame in frames:
+                if int.from_bytes(frame[_PARTS], "big") > REPEATED_PARTS_MAX:
+                    continue
+                if not self._budget.spend(now_s, len(frame), rate):
+                    return
+                waiting.append((now_s + offset_s, frame))
+
+    def handle_report(self, reader: bytes, report: AckNack, *, is_new: bool) -> None:
+        """Process a reader's report; ``is_new``: the reader, or this incarnation of it, was unknown before."""
+        if is_new:
+            self._reported.forget(reader)
+        elif self.is_enabled and report.next_number:
+            self._reported.handle_report(reader, report.next_number, report.next_part, report.frames)
+
+    def poll_copies(self, now_s: float) -> list[bytes]:
+        """Remove and return the copies that are due."""
+        due: list[bytes] = []
+        for waiting in self._waiting:
+            while waiting and waiting[0][0] <= now_s:
+                due.append(waiting.popleft()[1])
+        if due:
+            self._reported.handle_sent(int.from_bytes(frame[_NUMBER], "big") for frame in due)
+            self.copies += len(due)
+        return due
+
+    def get_timer(self) -> float | None:
+        """Return the monotonic second at which a copy is due, or None."""
+        return min((waiting[0][0] for waiting in self._waiting if waiting), default=None)
+
+    def clear(self) -> None:
+        """Drop the copies that wait: there is no reader any more."""
+        for waiting in self._waiting:
+            waiting.clear()

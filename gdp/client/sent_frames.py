@@ -1,0 +1,157 @@
+"""Frames that one publisher has sent, until its readers' reports show what became of them.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
+
+A report states how many frames its reader has received, and the newest of them. Frames keep their order on a path. So
+everything that left up to that frame has arrived or is lost, and the count shows how many are lost. Frames that leave
+at once form flights of at most ``_FLIGHT_FRAMES``; a flight is confirmed as a whole. A frame that is sent again gives
+no round trip, because its confirmation may be that of the first time (Karn's rule).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+from gdp.client.reader_path import ReaderPath, ReaderPaths
+from gdp.frame.codec import NUMBER_AND_PART, NUMBER_AT
+from gdp.message.acknack import AckNack
+
+__all__ = ["SentFrames"]
+
+_FLIGHT_FRAMES: Final = 8
+_KEY: Final = slice(NUMBER_AT, NUMBER_AT + 12)  # message number and fragment, as in the header
+_KEYS_MAX: Final = 1 << 16
+_COUNT_MASK: Final = (1 << 32) - 1
+
+
+class _Flight(NamedTuple):
+    end: int  # count of frames sent up to its last one
+    number: int  # on the reader's path
+
+
+@dataclass(slots=True)
+class _Reader:
+    """What one reader has not confirmed yet."""
+
+    flights: deque[_Flight] = field(default_factory=deque)
+    resolved: int = 0  # count of frames whose fate is known
+    received: int = -1  # count in its latest report; -1: none yet
+    unseen: int = 0  # frames sent before it began to count
+    lost: int = 0
+
+
+class SentFrames:
+    """Frames of one publisher under way to its readers.
+
+    Args:
+        paths: of the participant.
+        counts_losses: frames keep their order; not so if they are striped over two paths.
+    """
+
+    def __init__(self, paths: ReaderPaths, *, counts_losses: bool = True) -> None:
+        self._paths = paths
+        self._counts_losses = counts_losses
+        self._readers: dict[bytes, _Reader] = {}
+        self._count = 0
+        self._places: dict[bytes, int] = {}  # frame -> count of frames sent up to it; oldest first
+
+    def sent(self, frames: Sequence[bytes], readers: Iterable[bytes], now_s: float, again: int = 0) -> None:
+        """Count frames that leave now to all readers; the first ``again`` of them were sent before.
+
+        Of several readers, those that have a frame already do not confirm it again. It then counts for the pace alone.
+        """
+        names = list(readers)
+        if len(self._readers) > len(names):
+            self.keep(names)
+        if again and len(names) > 1:
+            size = sum(map(len, frames[:again]))
+            for name in names:
+                self._paths.path(name, now_s).controller.charge(size, now_s)
+            frames, again = frames[again:], 0
+        for first in range(0, len(frames), _FLIGHT_FRAMES):
+            flight = frames[first : first + _FLIGHT_FRAMES]
+            size = sum(map(len, flight))
+            count = self._count
+            for frame in flight:
+                count += 1
+                if count - self._count + first > again:
+                    self._places[frame[_KEY]] = count
+            self._count = count
+            for name in names:
+                path = self._paths.path(name, now_s)
+                reader = self._readers.get(name)
+                if reader is None:
+                    reader = self._readers[name] = _Reader(resolved=count - len(flight))
+                reader.flights.append(_Flight(count, path.sent(size, len(flight), now_s)))
+        self._forget_places()
+
+    def handle_hops(self, name: bytes, hops: int, now_s: float) -> None:
+        """Note over how many hops a reader's report came."""
+        path = self._paths.get(name)
+        if path is not None:
+            path.handle_hops(hops, now_s)
+
+    def handle_report(self, name: bytes, report: AckNack, now_s: float, waited_s: float = 0.0) -> None:
+        """Confirm on the reader's path what a report shows, which came ``waited_s`` before."""
+        reader, path = self._readers.get(name), self._paths.get(name)
+        if path is not None:
+            if reader is not None and report.received:
+                self._confirm(reader, path, report, now_s, waited_s)
+            path.handle_heard()
+
+    def _confirm(self, reader: _Reader, path: ReaderPath, report: AckNack, now_s: float, waited_s: float) -> None:
+        while reader.flights and not path.controller.is_under_way(reader.flights[0].number):
+            reader.resolved = reader.flights.popleft().end  # it was given up with a silence
+        came = (report.received - reader.received) & _COUNT_MASK if reader.received >= 0 else 0
+        place = self._places.get(NUMBER_AND_PART.pack(report.newest, report.newest_part), 0)
+        if place <= reader.resolved:
+            self._confirm_repairs(reader, path, came, now_s)
+            if came <= _COUNT_MASK // 2:
+                reader.received = report.received
+            return
+        before, numbers = reader.resolved, []
+        while reader.flights and reader.flights[0].end <= place:
+            flight = reader.flights.popleft()
+            reader.resolved = flight.end
+            numbers.append(flight.number)
+        if not numbers:  # a part of one flight
+            return
+        if reader.received < 0 or came > _COUNT_MASK // 2:
+            reader.unseen, reader.lost = (place - report.received) & _COUNT_MASK, 0  # it has begun to count
+        reader.received = report.received
+        lost = (place - reader.unseen - report.received) & _COUNT_MASK
+        lost = 0 if lost > _COUNT_MASK // 2 else lost
+        new_lost, reader.lost = max(lost - reader.lost, 0), max(lost, reader.lost)
+        lost = min(new_lost, reader.resolved - before - 1) if self._counts_losses else 0
+        path.acknowledged(numbers, max(lost, 0), report.held_us / 1e6 + waited_s, now_s)
+
+    def _confirm_repairs(self, reader: _Reader, path: ReaderPath, came: int, now_s: float) -> None:
+        """Confirm frames that came, though none was newer than before: they were sent again."""
+        numbers = []
+        while reader.flights and 0 < reader.flights[0].end - reader.resolved <= came <= _COUNT_MASK // 2:
+            flight = reader.flights.popleft()
+            came -= flight.end - reader.resolved
+            reader.resolved = flight.end
+            numbers.append(flight.number)
+        if numbers:
+            path.acknowledged(numbers, 0, None, now_s)
+
+    def keep(self, readers: Iterable[bytes]) -> None:
+        """Take off the account what is under way to other readers than these: it will not be confirmed."""
+        for name in self._readers.keys() - set(readers):
+            path, reader = self._paths.get(name), self._readers.pop(name)
+            if path is not None:
+                path.controller.forget(flight.number for flight in reader.flights)
+
+    def _forget_places(self) -> None:
+        """Forget the places of frames that every reader has confirmed, and the oldest of too many."""
+        below = min((reader.resolved for reader in self._readers.values()), default=self._count)
+        places = self._places
+        while places:
+            key = next(iter(places))
+            if places[key] > below and len(places) <= _KEYS_MAX:
+                break
+            del places[key]

@@ -1,0 +1,5 @@
+"""Congestion control of one path: how many bytes may be under way, and when the next frame may leave.
+
+Sans-I/O. ``controller.py`` decides, ``states.py`` is its table, ``delivery_rate.py`` and ``filters.py`` measure,
+``cubic.py`` is the window in competition with TCP.
+"""

@@ -1,0 +1,41 @@
+"""Windowed extremes: the lowest or highest sample of the last seconds or rounds.
+
+Sans-I/O. Each sample costs constant time on average (a monotonic queue).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+__all__ = ["WindowedExtreme"]
+
+
+class WindowedExtreme:
+    """Highest sample of a window, or the lowest one.
+
+    Args:
+        is_lowest: which of both.
+    """
+
+    __slots__ = ("_sign", "_waiting")
+
+    def __init__(self, *, is_lowest: bool) -> None:
+        self._sign = 1.0 if is_lowest else -1.0
+        self._waiting = deque[tuple[float, float]]()  # moment, signed value; ascending in both
+
+    def add(self, at: float, value: float, oldest: float) -> None:
+        """Add a sample, and forget those before ``oldest``; moments never decrease."""
+        signed, waiting = self._sign * value, self._waiting
+        while waiting and waiting[-1][1] >= signed:
+            waiting.pop()
+        waiting.append((at, signed))
+        while waiting[0][0] < oldest:
+            waiting.popleft()
+
+    def value(self, default: float) -> float:
+        """Return the extreme; ``default`` where there is no sample."""
+        return self._sign * self._waiting[0][1] if self._waiting else default
+
+    def clear(self) -> None:
+        """Forget all samples."""
+        self._waiting.clear()
