@@ -18,16 +18,16 @@ __all__ = ["Offered", "SomeReplication", "carried", "replication_rule"]
 Offered: TypeAlias = Mapping[str, str | Mapping[str, object]]
 SomeReplication: TypeAlias = Replication | str | Mapping[str, object]
 
-_BOTH_SIDES: Final = ("encoding", "max_bytes", "metadata", "priority")
+_BOTH_SIDES: Final = ("encoding", "max_bytes", "max_bits_s", "metadata", "priority", "weight")
 _ROBOT_SIDE: Final[dict[Kind, tuple[str, ...]]] = {
     "topic": (),
-    "service": ("on_timeout", "replication", "state", "timeout_s"),
-    "action": ("on_timeout", "replication", "timeout_s"),
+    "service": ("on_timeout", "replication", "sign", "state", "timeout_s"),
+    "action": ("on_timeout", "replication", "sign", "timeout_s"),
 }
 _MACHINE_SIDE: Final[dict[Kind, tuple[str, ...]]] = {
-    "topic": ("max_hz",),
-    "service": ("at_once", "state", "state_node", "stop"),
-    "action": (),
+    "topic": ("deadline_ms", "max_hz", "repair"),
+    "service": ("at_once", "sign", "state", "state_node", "stop"),
+    "action": ("sign",),
 }
 _EXAMPLES: Final[dict[Kind, str]] = {
     "topic": "sensor_msgs/msg/Image",

@@ -28,6 +28,7 @@ from proxy.bridge.exposed_topic import ExposedTopic
 from proxy.bridge.faults import Fault
 from proxy.bridge.imported_service import ImportedService
 from proxy.bridge.imported_topic import ImportedTopic
+from proxy.bridge.sent_stats import SentStats
 from proxy.bridge.topic_stats import TopicStats
 from proxy.config.rule import Rule
 from proxy.endpoints.endpoint import Endpoint, EndpointError, Event, Graph, GraphEntity, Role, proxy_node_name
@@ -152,6 +153,12 @@ class Bridge:
         for flow in imported:
             flow.count_losses()
         return [*self._ended, *(flow.stats for flow in imported)]
+
+    @property
+    def best_effort(self) -> list[SentStats]:
+        """Return the statistics of the best-effort topics that are exposed now."""
+        exposed = [(spec.local, flow.publisher) for spec, flow in self.flows if isinstance(flow, ExposedTopic)]
+        return [SentStats.of(local, each) for local, each in exposed if each is not None and not each.confirms]
 
     @property
     def undelegated(self) -> list[FlowSpec]:

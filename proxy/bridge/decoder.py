@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from proxy.bridge.expander import Restore
 from proxy.serial.channel import Channel, RosVersion
 from proxy.serial.converter import MessageConverter, translated_channel
 from proxy.serial.schema import DefinitionError
@@ -53,11 +54,16 @@ class MessageDecoder:
                 raise DefinitionError(f"md5 {source.hash} there, {known.hash} here")
         return cls(source, encoding, replace(known, qos=source.qos), None)
 
-    def decode(self, body: bytes) -> bytes:
+    def decode(self, body: bytes, restore: Restore | None = None) -> bytes:
         """Return the local message of a body.
+
+        Args:
+            restore: what the remote message as ROS wrote it has to pass through, as ``MessageExpander`` says.
 
         Raises:
             RemoteError: it does not fit its description, or has no local form.
         """
         raw = self._serializer.decode(body)
+        if restore is not None:
+            raw = restore(raw)
         return raw if self._converter is None else self._converter.convert(raw)

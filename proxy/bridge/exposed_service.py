@@ -22,7 +22,7 @@ from gdp.names import Name
 from gdp.service.follower import Refuse
 from gdp.service.replication_messages import FollowerMessage
 from gdp.service.serving import Asked, Serving
-from gdp.trust.advertisement import paths_value
+from gdp.trust.advertisement import paths_value, session_value
 from proxy.bridge.action_interface import CANCEL, GOAL, PROFILES, RESULT, ActionInterface
 from proxy.bridge.bridge_election import presence_of, sign
 from proxy.bridge.cancellation import TRIGGER, Cancellation
@@ -95,6 +95,8 @@ class ExposedService:
             is_global=rule.is_global,
             urgent=rule.priority == "urgent",
             paths=paths_value(rule.paths),
+            options=rule.send_options(),
+            is_session=session_value(rule.sign),
         )
         self._responses = ResponseSender(
             site=site,

@@ -13,16 +13,17 @@ from gdp.client.publisher import Publisher
 from gdp.errors import LocalError
 from gdp.message.loss import LossReason
 from gdp.trust.advertisement import paths_value
+from proxy.bridge.adaptation import adaptation_of
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.desired_flows import FlowSpec
+from proxy.bridge.encoder import MessageEncoder, compressor_of, description_of
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault
 from proxy.bridge.rate_limit import RateLimiter
 from proxy.bridge.stream_qos import Change, LiveQos, RecordedQos, StreamQos
 from proxy.endpoints.endpoint import EndpointError, Event, GraphEntity, MessageReceived, TypeResolved
 from proxy.serial.channel import Channel
-from proxy.serial.serializer import Serializer
-from proxy.wire.message import RosMessage, TopicDescription
+from proxy.wire.message import RosMessage
 
 __all__ = ["ExposedTopic"]
 
@@ -57,8 +58,10 @@ class ExposedTopic:
         self.published = Counter[int]()
         self.published_bytes = Counter[int]()
         self._channels: tuple[Channel, ...] = ()  # as the endpoint describes them
-        self._serializers: list[Serializer] = []
+        self._encoders: list[MessageEncoder] = []
+        self._compressor = compressor_of(flow_spec.rule)
         self._pace = RateLimiter(flow_spec.rule.max_hz)
+        self._adaptation = adaptation_of(flow_spec.rule)
         self.handle = self._subscribe()
         try:
             # Remote readers may come before a message.
@@ -110,15 +113,18 @@ class ExposedTopic:
         rule = self._flow_spec.rule
         self._channels = tuple(channels)
         described = self._qos.describe(channels, rule.global_name_of(self._flow_spec.local))
-        self._serializers = [Serializer(channel, rule.encoding) for channel in described]
-        opaque = {each.opaque for each in self._serializers if each.opaque}
+        self._encoders = [MessageEncoder(channel, rule, self._compressor) for channel in described]
+        opaque = {each.serializer.opaque for each in self._encoders if each.serializer.opaque}
         if opaque and rule.encoding != "cdr":
             detail = f"messages travel as bytes, unread: {', '.join(sorted(opaque))}"
             self._site.faults.report(self._flow_spec.local, Fault.UNKNOWN_TYPE, detail)
-        wire = TopicDescription(rule.encoding, described).to_wire()
+        for fault, why in {each.obstacle for each in self._encoders if each.obstacle is not None}:
+            self._site.faults.report(self._flow_spec.local, fault, f"messages are not reduced: {why}")
+        wire = description_of(rule, described).to_wire()
         if self.publisher is not None:
             self.publisher.describe(wire)
             self.publisher.set_depth(self._qos.depth)
+            self.publisher.set_options(self._qos.options)
             return
         self.publisher = self._site.member.advertise(
             self._topic,
@@ -128,6 +134,7 @@ class ExposedTopic:
             is_global=rule.is_global,
             urgent=rule.priority == "urgent",
             paths=paths_value(rule.paths),
+            options=self._qos.options,
         )
 
     def _publish(self, event: MessageReceived, now_s: float) -> None:
@@ -147,20 +154,30 @@ class ExposedTopic:
             publisher.skip(LossReason.NO_READER)
             self._count(event)
             return
+        adaptation = self._adaptation
+        if adaptation is not None and not adaptation.may_send(publisher, now_s):
+            traffic.thinned += 1
+            return
         if not publisher.has_space():
+            if adaptation is not None:
+                adaptation.handle_refused(now_s)
             self._site.faults.report(
                 self._flow_spec.local, Fault.TOO_FAST, "messages come faster than readers confirm them"
             )
             publisher.skip(LossReason.WINDOW_OVERFLOW)
             return
-        body = self._serializers[event.channel].encode(event.raw)
-        message = RosMessage(event.channel, event.stamp_ns, body).to_wire()
+        body, steps = self._encoders[event.channel].encode(
+            event.raw, rule.quality if adaptation is None else adaptation.quality
+        )
+        message = RosMessage(event.channel, event.stamp_ns, body, steps).to_wire()
         try:
-            publisher.publish(message)
+            count = publisher.publish(message, now_s)
         except LocalError as error:
             self._site.faults.report(self._flow_spec.local, Fault.TOO_LARGE, str(error))
             publisher.skip(LossReason.TOO_LARGE)
             return
+        if adaptation is not None and count is not None:
+            adaptation.handle_sent(count, len(message), now_s)
         traffic.sent(len(message))
         self._count(event)
 

@@ -37,6 +37,7 @@ class Fault(str, Enum):
     NO_SERVER = "no-server"
     TIMED_OUT = "timed-out"
     REFUSED = "refused"  # a service or the overlay refused
+    NO_LIBRARY = "no-library"  # a reduction needs one that this machine lacks
     OTHER_BRIDGE = "other-bridge"  # another proxy of this graph carries it already
 
 

@@ -22,7 +22,7 @@ from gdp.service.dispatch import Dispatch, Failure
 from gdp.service.replication import ALL, Mode
 from gdp.service.replication_messages import INCARNATION_BITS
 from gdp.service.sequencer import Sequencer
-from gdp.trust.advertisement import paths_value
+from gdp.trust.advertisement import paths_value, session_value
 from proxy.bridge.action_interface import CANCEL, GOAL, PROFILES, RESULT, ActionInterface
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.desired_flows import FlowSpec
@@ -79,6 +79,7 @@ class ImportedService:
                 ALL if self._goals is not None and part == CANCEL else flow_spec.rule.spread,
                 start=random_start,
                 stops=self._goals is None or part == RESULT,  # every server has the goal, until one has its result
+                unicasts=session_value(flow_spec.rule.sign),
             )
             for part in range(len(self._parts.services))
         )
@@ -93,6 +94,8 @@ class ImportedService:
             is_global=flow_spec.rule.is_global,
             urgent=flow_spec.rule.priority == "urgent",
             paths=paths_value(flow_spec.rule.paths),
+            options=flow_spec.rule.send_options(),
+            is_session=session_value(flow_spec.rule.sign),
         )
         self._sender = RequestSender(
             site=site, service=topic.name, calls=self._calls, goals=self._goals, publisher=self._publisher

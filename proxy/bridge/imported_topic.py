@@ -20,12 +20,14 @@ from proxy.bridge.decoder import MessageDecoder
 from proxy.bridge.decoder_cache import DecoderCache
 from proxy.bridge.desired_flows import FlowSpec
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
+from proxy.bridge.expander import MessageExpander
 from proxy.bridge.faults import Fault
 from proxy.bridge.local_output import ChannelPublishers, LocalOutput, MergedPublisher
 from proxy.bridge.rate_limit import RateLimiter
 from proxy.bridge.topic_stats import SAMPLES_MAX, TopicStats
 from proxy.endpoints.endpoint import EndpointError, Event, GraphEntity
 from proxy.endpoints.qos import unmatched
+from proxy.reduce.picture import LibraryError
 from proxy.serial.schema import DefinitionError
 from proxy.wire.message import RosMessage, TopicDescription
 
@@ -35,8 +37,9 @@ _SAMPLES_MAX = 4_096  # latencies kept of a live topic
 
 
 class _Decoded(NamedTuple):
-    """Decoder and output of one remote channel."""
+    """Expander, decoder and output of one remote channel."""
 
+    expander: MessageExpander
     incoming: MessageDecoder
     handle: int  # of the local output
 
@@ -82,6 +85,8 @@ class ImportedTopic:
             self._receive(message, now_s)
         except RemoteError as error:
             self._refuse(Fault.MALFORMED, str(error))
+        except LibraryError as error:
+            self._refuse(Fault.NO_LIBRARY, str(error))
         except LocalError as error:
             self._refuse(Fault.REFUSED, str(error))
 
@@ -149,8 +154,8 @@ class ImportedTopic:
         if ros_message.channel >= len(channels):
             self._refuse(Fault.MALFORMED, f"a message of channel {ros_message.channel}, of {len(channels)} described")
             return
-        incoming, handle = channels[ros_message.channel]
-        raw = incoming.decode(ros_message.body)
+        expander, incoming, handle = channels[ros_message.channel]
+        raw = incoming.decode(*expander.expand(ros_message))
         if len(raw) > rule.max_bytes:
             detail = f"a message of {len(raw)} bytes; the rule's max_bytes is {rule.max_bytes}"
             self._refuse(Fault.TOO_LARGE, detail)
@@ -171,6 +176,7 @@ class ImportedTopic:
             return None
         try:
             incoming = [self._output.decoder(source, description.encoding) for source in sources]
+            expanders = [MessageExpander(description, source, self._flow_spec.rule.max_bytes) for source in sources]
         except DefinitionError as error:
             self._site.faults.report(what, Fault.OTHER_TYPE, f"the far side's definition does not fit: {error}")
             return None
@@ -179,4 +185,4 @@ class ImportedTopic:
         except LocalError as error:
             self._site.faults.report(what, self._output.refusal, str(error))
             return None
-        return tuple(map(_Decoded, incoming, handles))
+        return tuple(map(_Decoded, expanders, incoming, handles))

@@ -10,9 +10,10 @@ from dataclasses import replace
 from enum import Enum
 from typing import Protocol
 
+from gdp.client.send_options import SendOptions
 from proxy.config.rule import Rule
 from proxy.endpoints.endpoint import GraphEntity
-from proxy.endpoints.qos import DEPTH_MAX, default, kept, request
+from proxy.endpoints.qos import DEPTH_MAX, deadline_s, default, kept, request
 from proxy.serial.channel import Channel, Qos
 
 __all__ = ["Change", "LiveQos", "RecordedQos", "StreamQos"]
@@ -40,6 +41,10 @@ class StreamQos(Protocol):
     @property
     def depth(self) -> int:
         """Return the number of messages for late joiners."""
+
+    @property
+    def options(self) -> SendOptions:
+        """Return how fresh, how much and how often messages leave."""
 
     def receive_publishers(self, ends: Sequence[GraphEntity]) -> Change:
         """Update the local publishers; return the consequence."""
@@ -81,6 +86,11 @@ class LiveQos:
             return max(kept(self._offers), DEPTH_MAX if self._is_latched and self._publishers > 1 else 1)
         return kept(self._offers)
 
+    @property
+    def options(self) -> SendOptions:
+        """Return the rule's values; where it has no deadline, that of the local publishers."""
+        return self._rule.send_options(deadline_s(self._offers))
+
     def receive_publishers(self, ends: Sequence[GraphEntity]) -> Change:
         """Update the local publishers; return the consequence."""
         publishers, offers, depth = self._publishers, self._offers, self.depth
@@ -110,6 +120,7 @@ class RecordedQos:
     def __init__(self, rule: Rule) -> None:
         self._rule = rule
         self._recorded_depth = 0
+        self._recorded_deadline_s: float | None = None
 
     @property
     def request(self) -> Qos | None:
@@ -126,6 +137,11 @@ class RecordedQos:
         """Return the largest recorded depth of a latched channel, and at least 1 where the rule latches."""
         return max(self._recorded_depth, int(self._rule.latched))
 
+    @property
+    def options(self) -> SendOptions:
+        """Return the rule's values; where it has no deadline, that of the recorded publishers."""
+        return self._rule.send_options(self._recorded_deadline_s)
+
     def receive_publishers(self, ends: Sequence[GraphEntity]) -> Change:
         """Return NONE: the publishers of a recording do not change."""
         del ends
@@ -133,6 +149,7 @@ class RecordedQos:
 
     def describe(self, channels: Sequence[Channel], topic: str) -> tuple[Channel, ...]:
         """Return the channels under the topic name that all sides use."""
+        self._recorded_deadline_s = deadline_s([profile for channel in channels for profile in channel.qos])
         self._recorded_depth = max(map(_recorded_depth, channels), default=0)
         return tuple(replace(channel, topic=topic) for channel in channels)
 

@@ -61,7 +61,7 @@ def replay(
 
     Exit 1: a message of a reliable topic was too large, had no reader, or was not confirmed by each reader; this
     includes latched topics. Also if the overlay refused a topic, or the recording exceeds its memory or time. Best
-    effort is sent without confirmation.
+    effort is sent without confirmation; what was dropped here, and what a reader lost, is stated at the end.
     """
     del version  # its callback ends the command
     set_up_logging(verbose=verbose)
@@ -148,6 +148,7 @@ def _report(reader: BagReader, replay: Replay, unconfirmed: Sequence[Unconfirmed
             sent=replay.sent,
             confirmed=replay.confirmed,
             best_effort=replay.sent_best_effort,
+            best_effort_topics=[each.to_fields() for each in replay.best_effort()],
             unconfirmed=[asdict(each) for each in unconfirmed],
             topics=_topic_fields(replay),
             unread=reader.unread or None,
@@ -156,9 +157,12 @@ def _report(reader: BagReader, replay: Replay, unconfirmed: Sequence[Unconfirmed
     confirming = [each for each in replay.topics if each.publisher.confirms]
     reliable = sum(each.flow.published.total() for each in confirming)
     lines = [f"{reliable} messages sent, {replay.confirmed} confirmed"] if confirming else []
-    if reliable < replay.sent:
-        lines.append(f"{replay.sent - reliable} messages sent, best effort")
+    best_effort = replay.best_effort()
+    if best_effort:
+        lines.append(f"{replay.sent_best_effort} messages sent best effort, not confirmed")
     typer.echo("; ".join(lines) or "0 messages sent")
+    for stats in best_effort:
+        typer.echo(f"  {stats.words()}")
     if reader.unread:
         typer.echo(f"the recording could not be read to its end: {reader.unread}", err=True)
     for each in unconfirmed:

@@ -29,7 +29,7 @@ from gdp.nodes.schema import Directory, Domain, Ifname, Metrics, NewFile, Sectio
 from proxy.config.drop_ins import DROP_INS, DropIns, add_drop_in_rules
 from proxy.config.graph import RosGraphConfig
 from proxy.config.matching import Fault, clashes
-from proxy.config.rule import Rule
+from proxy.config.rule import REDUCTIONS, Rule
 from proxy.serial.serializer import Encoding
 
 __all__ = ["DIALECT", "Encoding", "ProxyConfig", "Record", "RosGraphConfig", "Rule"]
@@ -151,7 +151,7 @@ class ProxyConfig(Section):
         """Yield the keys that have no meaning on their side."""
         for side, rules, only in (
             ("expose", self.expose, {"replication": "import"}),
-            ("import", self.imports, dict.fromkeys(("stop", "at_once", "state_node"), "expose")),
+            ("import", self.imports, dict.fromkeys(("stop", "at_once", "state_node", *REDUCTIONS), "expose")),
         ):
             for index, rule in enumerate(rules):
                 for key in only.keys() & rule.model_fields_set:

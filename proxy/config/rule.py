@@ -19,6 +19,7 @@ from pydantic import (
 )
 from pydantic.config import JsonDict, JsonValue
 
+from gdp.client.send_options import DEADLINE_MAX_S, RATE_MAX_BITS_S, RATE_MIN_BITS_S, WEIGHT_MAX, SendOptions
 from gdp.crypto.keys import PublicKey
 from gdp.errors import GdpError, LocalError
 from gdp.limits import MESSAGE_MAX_BYTES
@@ -38,21 +39,27 @@ from gdp.ros_names import (
 )
 from gdp.service.replication import Mode, Replication
 from gdp.stores.files import read_private
+from proxy.config.reduction import Region, SomeAdapt, SomeCompress
+from proxy.reduce.cloud import CLOUD
+from proxy.reduce.image import IMAGE
+from proxy.reduce.picture import QUALITY, PictureFormat
 from proxy.serial.serializer import Encoding
 
-__all__ = ["DOMAIN_MAX", "SALT", "Rule"]
+__all__ = ["DOMAIN_MAX", "REDUCTIONS", "SALT", "Rule"]
 
 CALL_S: Final = 5.0
 CALL_MAX_S: Final = 86_400.0
 COPIES_MAX: Final = 1_024
 AT_ONCE_MAX: Final = 65_536
 RATE_MAX_HZ: Final = 1e6
+VOXEL_MAX_M: Final = 1e3
 DOMAIN_MAX: Final = 232  # ports of a higher domain would exceed 65535; DDSI-RTPS 2.5, section 9.6.2
 
 SALT: Final = "salt"  # the key of the unguessable part
+REDUCTIONS: Final = ("compress", "image", "quality", "voxel_m", "region", "adapt")  # keys about sending less
 _OWN_KEYS: Final = ("kind", "name", "type")
-_OF_TOPICS: Final = ("reliable", "latched", "max_hz")
-_OF_CALLS: Final = ("timeout_s", "on_timeout", "replication")
+_OF_TOPICS: Final = ("reliable", "latched", "max_hz", "deadline_ms", "repair", *REDUCTIONS)
+_OF_CALLS: Final = ("timeout_s", "on_timeout", "replication", "sign")
 _OF_SERVICES: Final = ("stop", "at_once", "state", "state_node")
 _FOREIGN: Final[dict[Kind, tuple[str, ...]]] = {
     "topic": (*_OF_CALLS, *_OF_SERVICES),
@@ -182,11 +189,63 @@ class Rule(Section):
         le=RATE_MAX_HZ,
         description="Topics: most messages a second that cross; more are left out and counted. `null`: all.",
     )
+    deadline_ms: float | None = Field(
+        default=None,
+        gt=0,
+        le=1_000 * DEADLINE_MAX_S,
+        description="Topics without `reliable`, under `expose`: a message that cannot leave whole within this time is"
+        " dropped whole and counted. `null`: as the publisher's QoS says (lifespan, else deadline); without both, a"
+        " message that has waited for 0.1 s gives way to a newer one.",
+    )
+    repair: Literal["never", "in-time"] = Field(
+        default="in-time",
+        description="Topics without `reliable`, under `expose`: `in-time`: lost parts of a message are sent again while"
+        " that can be in time. `never`: they stay lost.",
+    )
+    weight: int = Field(
+        default=1,
+        ge=1,
+        le=WEIGHT_MAX,
+        description="The share of a full path that it gets, next to others of the same `priority` on this machine.",
+    )
+    max_bits_s: float | None = Field(
+        default=None,
+        ge=RATE_MIN_BITS_S,
+        le=RATE_MAX_BITS_S,
+        description="Most bits of frames a second that this machine sends for it. `null`: what the path carries.",
+    )
     max_bytes: int = Field(
         default=MESSAGE_MAX_BYTES,
         ge=1,
         le=MESSAGE_MAX_BYTES,
         description="Larger messages, as ROS wrote them, do not cross and are counted.",
+    )
+    compress: SomeCompress = Field(
+        default=None,
+        description="Topics, under `expose`: how bodies are compressed, `zstd` for short. One that would not shrink"
+        " travels as it is. `null`: not.",
+    )
+    image: PictureFormat | None = Field(
+        default=None,
+        description="Topics of sensor_msgs/msg/Image, under `expose`: images travel as `jpeg` or `png`, and are images"
+        " again on the other side. Encodings without such a file travel as they are. `null`: all do.",
+    )
+    quality: int = Field(default=QUALITY, ge=1, le=100, description="With `image: jpeg`: its quality.")
+    voxel_m: float | None = Field(
+        default=None,
+        gt=0,
+        le=VOXEL_MAX_M,
+        description="Topics of sensor_msgs/msg/PointCloud2, under `expose`: edge in metres of the voxels of which only"
+        " the first point crosses. `null`: all points do.",
+    )
+    region: Region | None = Field(
+        default=None,
+        description="Topics of images and point clouds, under `expose`: the part that crosses. `null`: all.",
+    )
+    adapt: SomeAdapt = Field(
+        default=None,
+        description="Topics, under `expose`: rate and JPEG quality follow what the path carries, so that the newest"
+        " message is fresh. `true`: between the usual bounds.",
     )
     timeout_s: CallSeconds | None = Field(
         default=CALL_S,
@@ -235,6 +294,17 @@ class Rule(Section):
         description="Over how many disjoint paths frames travel. `2`: each frame twice, so that the cut of one path"
         " costs no message and no time. `spread`: the fragments of large messages are shared out by what each path"
         " carries. Both sides state one of the two; the publisher's counts. Over a single path, frames travel once.",
+    )
+    fec: Literal["auto", "never"] = Field(
+        default="auto",
+        description="Redundancy against measured loss. `auto`: small `urgent` messages are sent up to three times, some"
+        " milliseconds apart, within a twentieth of the path. `never`: each frame is sent once.",
+    )
+    sign: Literal["always", "session"] = Field(
+        default="always",
+        description="Services and actions, on both sides: `session` where requests to one server and responses need no"
+        " signature. A secret of the two proxies authenticates them if both say so. They prove their writer to the"
+        " other proxy, and to no third party.",
     )
     ros: Literal[1, 2] | None = Field(
         default=None, description="Which ROS it is about, where the proxy speaks both. `null`: the one that there is."
@@ -303,6 +373,20 @@ class Rule(Section):
         """Return how requests are distributed over servers."""
         return Replication(Mode(self.replication.mode), self.replication.copies, self.replication.budget)
 
+    def send_options(self, deadline_s: float | None = None) -> SendOptions:
+        """Return how messages leave this machine.
+
+        Args:
+            deadline_s: what the local publishers state; it holds where the rule has no deadline.
+        """
+        return SendOptions(
+            deadline_s=deadline_s if self.deadline_ms is None else self.deadline_ms / 1_000,
+            weight=self.weight,
+            max_bits_s=self.max_bits_s,
+            repairs=self.repair == "in-time",
+            fec=self.fec == "auto",
+        )
+
     def matches(self, local_name: str) -> bool:
         """Return whether the rule applies to a local name."""
         return matches(self.name, local_name) if self.is_pattern else local_name == self.local
@@ -367,14 +451,30 @@ class Rule(Section):
             raise ValueError("a pattern cannot be remapped; write a rule for each name")
         return text
 
-    @field_validator("wants_reliable", "wants_latched", "max_hz")
+    @field_validator("wants_reliable", "wants_latched", "max_hz", "deadline_ms", "repair", *REDUCTIONS)
     @classmethod
     def _is_of_topics(cls, value: object, info: ValidationInfo) -> object:
         if info.data.get("kind", "topic") != "topic":
             raise ValueError("only topics have this")
         return value
 
-    @field_validator("timeout_s", "on_timeout", "replication")
+    @field_validator("image", "voxel_m", "region")
+    @classmethod
+    def _is_of_type(cls, value: object, info: ValidationInfo) -> object:
+        types = {"image": (IMAGE,), "voxel_m": (CLOUD,), "region": (IMAGE, CLOUD)}[str(info.field_name)]
+        type_name = info.data.get("type_name", "")
+        if value is not None and type_name and type_name not in types:
+            raise ValueError(f"only topics of {' or '.join(types)} have this")
+        return value
+
+    @field_validator("quality")
+    @classmethod
+    def _is_of_jpeg(cls, value: int, info: ValidationInfo) -> int:
+        if info.data.get("image", "jpeg") != "jpeg":
+            raise ValueError("this needs 'image: jpeg'")
+        return value
+
+    @field_validator("timeout_s", "on_timeout", "replication", "sign")
     @classmethod
     def _is_of_calls(cls, value: object, info: ValidationInfo) -> object:
         if info.data.get("kind", "service") == "topic":

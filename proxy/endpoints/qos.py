@@ -11,11 +11,12 @@ from typing import Final
 
 from proxy.serial.channel import NEVER, Qos
 
-__all__ = ["DEPTH_MAX", "default", "depth_of", "kept", "offer", "request", "unmatched"]
+__all__ = ["DEPTH_MAX", "deadline_s", "default", "depth_of", "kept", "offer", "request", "unmatched"]
 
 DEPTH_MAX: Final = 64  # messages kept for late joiners of one topic
 _DEPTH: Final = 10  # where none is known; ROS 2's own default
 _OFFERED_MAX: Final = 1_000  # of the proxy's own publishers, whatever a remote one states
+_INFINITE_FROM_S: Final = 2_147_483_647  # DDS's own infinite value
 _READER_DEPTH: Final = 1_000  # of the proxy's own subscriptions: a burst waits here, not at its publisher
 
 
@@ -31,6 +32,17 @@ def depth_of(profile: Qos) -> int:
     if profile.history == "keep_all":
         return DEPTH_MAX
     return profile.depth or (1 if profile.durability == "transient_local" else _DEPTH)
+
+
+def deadline_s(offers: Sequence[Qos]) -> float | None:
+    """Return for how many seconds the messages of these publishers are of use; None: for any time.
+
+    A lifespan says so. Without it, a best-effort reader has no use for a message that is older than one deadline
+    period. Messages come without their sender, so the longest time counts.
+    """
+    times = [_seconds(each.lifespan) or _seconds(each.deadline) for each in offers]
+    known = [time for time in times if time is not None]
+    return max(known) if known and len(known) == len(times) else None
 
 
 def request(offers: Sequence[Qos]) -> Qos:
@@ -70,6 +82,13 @@ def offer(sources: Sequence[Qos], wants: Sequence[Qos], *, is_latched: bool | No
         latched=is_latched or bool(insisting),
         depth=min(max(depth, 1), _OFFERED_MAX),
     )
+
+
+def _seconds(duration: tuple[int, int]) -> float | None:
+    """Return a duration in seconds; None: infinite, or not stated."""
+    if duration == (0, 0) or duration[0] >= _INFINITE_FROM_S:
+        return None
+    return duration[0] + duration[1] / 1e9
 
 
 def unmatched(want: Qos) -> str:

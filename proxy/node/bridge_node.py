@@ -55,6 +55,7 @@ def run(path: Path, settings: ProxyConfig, *, json: bool) -> None:
             )
             node.drains = True
             node.on_reload = lambda: _reload(path, settings, node, bridge)
+            node.best_effort = lambda: bridge.best_effort
             node.undelegated = lambda: [_described(each) for each in bridge.undelegated]
             for endpoint in endpoints:
                 node.runtime.watch(endpoint)
@@ -63,11 +64,14 @@ def run(path: Path, settings: ProxyConfig, *, json: bool) -> None:
             finally:
                 for endpoint in endpoints:
                     node.runtime.unwatch(endpoint)
+            best_effort = bridge.best_effort
             bridge.close()
             node.member.leave()
             node.linger(GOODBYE_S)
         if json:
-            emit("done", topics=[stats.to_fields() for stats in bridge.stats], faults=dict(node.faults.counts))
+            sent = [stats.to_fields() for stats in best_effort]
+            topics = [stats.to_fields() for stats in bridge.stats]
+            emit("done", topics=topics, best_effort_topics=sent, faults=dict(node.faults.counts))
         else:
             for stats in bridge.stats:
                 median_ms = percentile(sorted(stats.latencies_ms), 0.5)
@@ -75,6 +79,9 @@ def run(path: Path, settings: ProxyConfig, *, json: bool) -> None:
                     median = "-" if median_ms is None else f"{median_ms:.1f} ms"
                     lost = f", {stats.losses.words()}" if stats.losses.total else ""
                     typer.echo(f"  {stats.topic}: {stats.received} received, median {median}{lost}")
+            for sent_stats in best_effort:
+                if not sent_stats.is_whole:
+                    typer.echo(f"  {sent_stats.words()}")
             carried = f"{node.traffic.messages_out} messages sent, {node.traffic.messages_in} received"
             typer.echo(f"{carried}, {node.faults.total} faults")
 
@@ -136,6 +143,7 @@ def _tell_progress(node: ProxyNode, bridge: Bridge) -> None:
             for each in stats
             if each.latencies_ms or each.lost
         ],
+        best_effort_topics=[each.to_fields() for each in bridge.best_effort if not each.is_whole],
     )
 
 

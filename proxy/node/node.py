@@ -38,12 +38,14 @@ from gdp.ports.plane import Plane
 from gdp.telemetry.sources import Sources, count_list
 from proxy.bridge.counters import Traffic
 from proxy.bridge.faults import Faults
+from proxy.bridge.sent_stats import SentStats
 from proxy.config.config import ProxyConfig, Record
 
 __all__ = ["GOODBYE_S", "ProxyNode", "open_topics", "run_node"]
 
 log = logging.getLogger(__name__)
 
+BEST_EFFORT_MAX: Final = 32  # topics in one status; each has less than 1 KiB
 UNDELEGATED_MAX: Final = 100  # flows in one status; each has less than 2 KiB of a response's 256
 GOODBYE_S: Final = 0.2  # time in which a leaving node still sends
 
@@ -56,6 +58,7 @@ class ProxyNode:
         on_reload: reads the configuration again; raises ``GdpError`` where the old one stays. None: not supported.
         is_leaving: a SIGUSR1 or a drain arrived: answer what is under way, then end.
         has_drained: all that was under way was answered.
+        best_effort: returns what became of best-effort messages of exposed topics.
         undelegated: returns the flows that only lack a delegation, as fields of the status.
         drains: whether the command checks ``is_leaving``; else a SIGUSR1 ends it at once.
     """
@@ -67,6 +70,7 @@ class ProxyNode:
     node_log: NodeLog
     credentials: Credentials
     on_reload: Callable[[], None] | None = None
+    best_effort: Callable[[], Sequence[SentStats]] = tuple
     undelegated: Callable[[], Sequence[Mapping[str, str]]] = tuple
     is_leaving: bool = False
     drains: bool = False
@@ -112,7 +116,9 @@ class ProxyNode:
             attached = self.member.attachment.is_attached
             missing = list(self.undelegated())[:UNDELEGATED_MAX]
             uptime_s = time.monotonic() - self.begun_s
-            return node_status(self.identity, sources, uptime_s=uptime_s, attached=attached, undelegated=missing)
+            sent = [each.to_fields() for each in self.best_effort() if not each.is_whole][:BEST_EFFORT_MAX]
+            more = {"attached": attached, "undelegated": missing, "best_effort_topics": sent}
+            return node_status(self.identity, sources, uptime_s=uptime_s, **more)
 
         return ControlHandlers(reload=self.reload, status=status, drain=self.drain, is_drained=lambda: self.has_drained)
 

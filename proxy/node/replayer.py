@@ -14,6 +14,7 @@ from gdp.client.publisher import Publisher
 from gdp.message.loss import LossReason
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.exposed_topic import ExposedTopic
+from proxy.bridge.sent_stats import SentStats
 from proxy.node.node import ProxyNode
 from proxy.node.recording_bridge import work
 from proxy.recordings.endpoint import ReplayEndpoint
@@ -21,6 +22,7 @@ from proxy.recordings.endpoint import ReplayEndpoint
 __all__ = ["Replay", "ReplayedTopic", "Unconfirmed"]
 
 STALL_S: Final = 20.0  # after this time without any acknowledgement, readers are given up
+REPORT_S: Final = 5.0  # after this time, what readers of best-effort topics have not reported is unknown
 TICK_S: Final = 0.5
 
 _WHY: Final = {
@@ -28,6 +30,7 @@ _WHY: Final = {
     LossReason.GIVEN_UP: "given up for a reader that fell silent or behind",
     LossReason.WINDOW_OVERFLOW: "pushed out of the full window",
     LossReason.TOO_LARGE: "above the rule's max_bytes",
+    LossReason.LIFESPAN: "too late to leave",
 }
 
 
@@ -110,9 +113,12 @@ class Replay:
 
     @property
     def sent_best_effort(self) -> int:
-        """Return the number of messages sent on best-effort topics, which have no confirmation."""
-        publishers = [each.publisher for each in self.topics if not each.publisher.confirms]
-        return sum(publisher.messages - publisher.losses.total for publisher in publishers)
+        """Return the number of messages that left on best-effort topics, which have no confirmation."""
+        return sum(each.sent for each in self.best_effort())
+
+    def best_effort(self) -> list[SentStats]:
+        """Return the statistics of the best-effort topics."""
+        return [SentStats.of(each.topic, each.publisher) for each in self.topics if not each.publisher.confirms]
 
     @property
     def too_large(self) -> int:
@@ -153,17 +159,24 @@ class Replay:
         return not runtime.is_stopped
 
     def finish(self) -> bool:
-        """Wait until readers have confirmed all possible messages; return False when they stop, or when stopped."""
-        progress, stalled_s = self.confirmed, time.monotonic()
+        """Wait until readers have confirmed all possible messages; return False when they stop, or when stopped.
+
+        Readers of best-effort topics have ``REPORT_S`` to report what they lost.
+        """
+        progress, stalled_s = (self.confirmed, self.sent_best_effort), time.monotonic()
         while any(each.publisher.is_wanted and not each.publisher.is_acknowledged() for each in self.topics):
             if self._node.runtime.is_stopped:
                 return False
             self._step(TICK_S)
-            if self.confirmed != progress:
-                progress, stalled_s = self.confirmed, time.monotonic()
+            now = self.confirmed, self.sent_best_effort
+            if now != progress:
+                progress, stalled_s = now, time.monotonic()
             elif time.monotonic() - stalled_s > STALL_S:
                 return False
-        return True
+        best_effort = [each.publisher for each in self.topics if not each.publisher.confirms]
+        report_until_s = time.monotonic() + REPORT_S
+        self._node.runtime.run(lambda: all(each.is_reported() for each in best_effort), report_until_s)
+        return not self._node.runtime.is_stopped
 
     def _continue(self) -> bool:
         """Run the node while waiting for the recording; return whether it was not stopped."""

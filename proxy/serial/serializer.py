@@ -28,7 +28,7 @@ from proxy.serial.schema import Array as ArrayType
 from proxy.serial.schema import DefinitionError, Record, Sequence, Text, Type, parse
 from proxy.serial.writer import Writer, write_with
 
-__all__ = ["Codec", "Encoding", "Serializer", "canonical"]
+__all__ = ["Codec", "Encoding", "Serializer", "canonical", "native_codec"]
 
 _LITTLE: Final = b"\x00\x01"  # CDR_LE
 _BIG: Final = b"\x00\x00"  # CDR_BE
@@ -114,11 +114,20 @@ def canonical(channel: Channel, raw: bytes) -> bytes:
     A message that does not fit the definition is returned unchanged.
     """
     try:
-        codec = _native(channel.type_name, channel.definition, channel.definition_format, channel.ros)
+        codec = native_codec(channel)
     except DefinitionError:
         return raw
     tree = codec.to_tree(raw)
     return raw if tree is None else codec.to_raw(tree)
+
+
+def native_codec(channel: Channel) -> Codec:
+    """Return the codec whose trees hold numbers as bits, texts and arrays of numbers as memoryviews.
+
+    Raises:
+        DefinitionError: the channel has no usable definition.
+    """
+    return _native(channel.type_name, channel.definition, channel.definition_format, channel.ros)
 
 
 def _json(body: bytes) -> object:

@@ -54,6 +54,19 @@ def test_a_service_that_keeps_state_says_so_on_both_sides_and_is_asked_in_one_wa
     assert carried.served == {"state": "ordered", "state_node": "/counter"}
 
 
+def test_send_options_of_a_topic_are_for_the_machine_that_publishes_it() -> None:
+    topic = {"type": "nav_msgs/msg/OccupancyGrid", "deadline_ms": 500, "repair": "never", "weight": 3}
+    (carried,) = cluster(topics={"/map": topic}).cluster_spec.carried or ()
+    assert carried.options == {"weight": 3}
+    assert carried.served == {"deadline_ms": 500, "repair": "never", "weight": 3}
+
+
+def test_a_service_without_signatures_says_so_on_both_sides() -> None:
+    offered = {"/plan": {"type": "nav_msgs/srv/GetPlan", "sign": "session"}}
+    (carried,) = cluster(services=offered).cluster_spec.carried or ()
+    assert carried.options["sign"] == carried.served["sign"] == "session"
+
+
 def test_what_is_found_out_gets_the_keys_for_all() -> None:
     cluster_spec = cluster(replication=Replication(Mode.SOME, copies=2)).cluster_spec
     assert cluster_spec.carried is None

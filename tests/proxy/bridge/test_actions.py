@@ -81,16 +81,17 @@ class ActionClient:
         return all(client.sees_server() for client in (self.goals, self.cancels, self.results))
 
 
-def pair(sites: Sites) -> tuple[Machine, ActionServer, ActionClient]:
+def pair(sites: Sites, rule: str = RULE) -> tuple[Machine, ActionServer, ActionClient]:
     """Return the client's machine, an action server and a far client that sees it."""
-    server, client = sites.add(SERVER, expose=[RULE]), sites.add(ROBOT, imports=[RULE])
+    server, client = sites.add(SERVER, expose=[rule]), sites.add(ROBOT, imports=[rule])
     local, caller = ActionServer(server.graph), ActionClient(client.graph)
     assert sites.run(3, caller.sees_server)
     return client, local, caller
 
 
-def test_a_goal_that_takes_longer_than_every_timeout_ends_with_its_result(sites: Sites) -> None:
-    client, local, caller = pair(sites)
+@pytest.mark.parametrize("sign", ["always", "session"])
+def test_a_goal_that_takes_longer_than_every_timeout_ends_with_its_result(sites: Sites, sign: str) -> None:
+    client, local, caller = pair(sites, f"{RULE}, sign: {sign}")
     caller.goals.call(goal(1, 10))
     assert sites.run(1, lambda: caller.goals.outcomes == [ACCEPTED])
     caller.results.call(goal_id(1))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from gdp.client.send_options import SendOptions
 from proxy.serial.channel import RosVersion
 from tests.proxy.bridge import known
 from tests.proxy.bridge.clients import Client, LocalServer
@@ -36,13 +37,22 @@ def served(sites: Sites) -> tuple[LocalServer, Client]:
     return local, caller
 
 
-def test_the_first_call_is_answered(sites: Sites) -> None:
-    server, client = pair(sites)
+@pytest.mark.parametrize("sign", ["always", "session"])
+def test_the_first_call_is_answered(sites: Sites, sign: str) -> None:
+    server, client = pair(sites, f"{SWITCH}, sign: {sign}", f"{SWITCH}, sign: {sign}")
     LocalServer(server.graph, answer=lambda raw: switched(f"got {raw[-1]}"))
     caller = Client(client.graph)
     assert sites.run(1, caller.sees_server)
     caller.call(switch(on=True))
     assert sites.run(0.2, lambda: caller.outcomes == [switched("got 1")])
+
+
+def test_both_sides_of_a_service_send_as_their_rules_say(sites: Sites) -> None:
+    server, client = pair(sites, f"{SWITCH}, weight: 5, max_bits_s: 2000000", f"{SWITCH}, weight: 9")
+    LocalServer(server.graph)
+    assert sites.run(3, Client(client.graph).sees_server)
+    options = [publisher.options for machine in (server, client) for publisher in machine.member.publishers()]
+    assert options == [SendOptions(weight=5, max_bits_s=2e6), SendOptions(weight=9)]
 
 
 def test_a_server_that_appears_late_is_seen_within_a_second_and_its_first_call_answered(sites: Sites) -> None:

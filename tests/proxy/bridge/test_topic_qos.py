@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from gdp.client.send_options import SendOptions
 from proxy.endpoints.qos import default
 from proxy.serial.channel import Qos, RosVersion
 from tests.proxy.bridge import known
@@ -121,6 +122,31 @@ def test_a_rule_may_say_otherwise_than_the_publisher(sites: Sites) -> None:
     sites.every(0.01, 50, lambda number: talker.publish(string(str(number))))
     sites.run(5)
     assert 0 < len(ear.heard) < 50  # no lost message is repaired
+
+
+def options_of(machine: Machine) -> SendOptions:
+    (publisher,) = machine.member.publishers()
+    return publisher.options
+
+
+def test_the_send_options_are_those_of_the_rule(sites: Sites) -> None:
+    robot, _ = pair(sites, ", deadline_ms: 150, weight: 7, max_bits_s: 4000000, repair: never, fec: never")
+    robot.graph.publish("/talker", "/chatter", STRING, replace(BEST_EFFORT, lifespan=(9, 0)))
+    sites.run(1)
+    assert options_of(robot) == SendOptions(deadline_s=0.15, weight=7, max_bits_s=4e6, repairs=False, fec=False)
+
+
+def test_without_a_deadline_in_the_rule_the_publishers_state_it_at_any_time(sites: Sites) -> None:
+    robot, _ = pair(sites)
+    robot.graph.publish("/first", "/chatter", STRING, replace(BEST_EFFORT, lifespan=(0, 250_000_000)))
+    sites.run(1)
+    before = options_of(robot)
+    later = robot.graph.publish("/later", "/chatter", STRING, replace(BEST_EFFORT, deadline=(2, 0)))
+    sites.run(1)
+    assert (before, options_of(robot)) == (SendOptions(deadline_s=0.25), SendOptions(deadline_s=2.0))
+    later.close()
+    sites.run(1)
+    assert options_of(robot) == SendOptions(deadline_s=0.25)
 
 
 def test_a_latched_message_reaches_who_joins_later_on_the_far_side(sites: Sites) -> None:

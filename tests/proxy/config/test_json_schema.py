@@ -76,8 +76,16 @@ def _with_rule(text: str) -> str:
 
 def test_an_editor_takes_the_good_rules_and_underlines_the_bad() -> None:
     assert [text for text in GOOD if not _accepts(_with_rule(text))] == []
-    of_two_keys = "name: /a/*, remap: /b"  # left to the command
-    assert [text for text, _ in BAD if _accepts(_with_rule(text))] == [of_two_keys]
+    of_two_keys = [  # left to the command
+        "name: /a/*, remap: /b",
+        "name: /a, compress: {dictionary: none}",
+        "name: /a, type: std_msgs/msg/String, image: png",
+        "name: /a, image: png, quality: 5",
+        "name: /a, type: sensor_msgs/msg/Image, voxel_m: 1",
+        "name: /a, region: {x: [2, 1]}",
+        "name: /a, adapt: {min_hz: 5, max_hz: 2}",
+    ]
+    assert [text for text, _ in BAD if _accepts(_with_rule(text))] == of_two_keys
 
 
 def test_an_editor_knows_the_other_keys_too() -> None:

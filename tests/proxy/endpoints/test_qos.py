@@ -7,7 +7,7 @@ from itertools import product
 
 import pytest
 
-from proxy.endpoints.qos import DEPTH_MAX, default, depth_of, kept, offer, request, unmatched
+from proxy.endpoints.qos import DEPTH_MAX, deadline_s, default, depth_of, kept, offer, request, unmatched
 from proxy.serial.channel import NEVER, Qos
 
 LATCHED = default(latched=True, depth=5)
@@ -35,6 +35,26 @@ def test_what_is_offered_matches_every_reader_and_is_no_less_than_any_source(
 ) -> None:
     offered = offer(sources, wants, is_latched=None)
     assert all(match(offered, each) for each in (*wants, *sources))
+
+
+SHORT, LONG = replace(EASY, lifespan=(0, 250_000_000)), replace(EASY, deadline=(2, 0))
+
+
+@pytest.mark.parametrize(
+    ("offers", "seconds"),
+    [
+        ([SHORT], 0.25),
+        ([LONG], 2.0),
+        ([replace(SHORT, deadline=(2, 0))], 0.25),
+        ([SHORT, LONG], 2.0),
+        ([SHORT, EASY], None),
+        ([replace(EASY, lifespan=(0, 0), deadline=(2_147_483_647, 0))], None),
+        ([], None),
+    ],
+    ids=["lifespan", "deadline", "lifespan first", "the longest", "one without", "infinite", "no publisher"],
+)
+def test_messages_are_of_use_for_as_long_as_their_publishers_say(offers: list[Qos], seconds: float | None) -> None:
+    assert deadline_s(offers) == seconds
 
 
 def test_the_most_that_publishers_have_in_common_is_requested() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import select
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -224,6 +225,15 @@ def test_a_replayed_topic_is_reliable_unless_its_rule_says_otherwise(sites: Site
         robot = join(sites, ROBOT, endpoint, expose=[CHATTER, other])
         sites.run(1)
         assert sorted(each.confirms for each in robot.member.publishers()) == [False, True]
+
+
+def test_a_replayed_message_is_of_use_for_the_lifespan_that_was_recorded(sites: Sites, tmp_path: Path) -> None:
+    path = tmp_path / "sent.mcap"
+    record(path, 2, [string(2, qos=(replace(PLAIN, lifespan=(0, 500_000_000)),))])
+    for endpoint in opened(path):
+        robot = join(sites, ROBOT, endpoint, expose=[f"{CHATTER}, reliable: false"])
+        sites.run(1)
+        assert [each.options.deadline_s for each in robot.member.publishers()] == [0.5]
 
 
 def test_a_late_recorder_gets_the_last_message_of_a_latched_recording(sites: Sites, tmp_path: Path) -> None:

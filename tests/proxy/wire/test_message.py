@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from gdp.crypto.cbor import Value, encode
 from gdp.errors import DropReason, LocalError, RemoteError
 from proxy.serial.channel import Channel
-from proxy.wire.message import CHANNELS_MAX, RosMessage, TopicDescription
+from proxy.wire.message import CHANNELS_MAX, RosMessage, Step, TopicDescription
 
 CHANNEL = Channel(topic="/chatter", type_name="std_msgs/msg/String", ros=2)
 
 
-@given(st.integers(0, 65_535), st.integers(0, (1 << 64) - 1), st.binary(max_size=200))
-def test_a_ros_message_comes_back_as_it_was(channel: int, stamp_ns: int, body: bytes) -> None:
-    ros_message = RosMessage(channel, stamp_ns, body)
+@given(
+    st.integers(0, CHANNELS_MAX - 1),
+    st.integers(0, (1 << 64) - 1),
+    st.binary(max_size=200),
+    st.sampled_from((Step(0), Step.IMAGE, Step.ZSTD, Step.IMAGE | Step.ZSTD)),
+)
+def test_a_ros_message_comes_back_as_it_was(channel: int, stamp_ns: int, body: bytes, steps: Step) -> None:
+    ros_message = RosMessage(channel, stamp_ns, body, steps)
     assert RosMessage.from_wire(ros_message.to_wire()) == ros_message
 
 
@@ -34,14 +42,32 @@ def test_a_ros_message_of_another_version_says_so() -> None:
     assert caught.value.reason is DropReason.BAD_VERSION
 
 
-def test_a_description_comes_back_as_it_was() -> None:
-    description = TopicDescription("cbor", (CHANNEL,) * 3)
+def test_a_step_that_is_unknown_here_is_refused_as_of_another_version() -> None:
+    with pytest.raises(RemoteError) as caught:
+        RosMessage.from_wire(b"\x01\x80" + bytes(9))
+    assert caught.value.reason is DropReason.BAD_VERSION
+
+
+@pytest.mark.parametrize(
+    "reductions", [{}, {"is_compressed": True}, {"is_compressed": True, "dictionary": b"d" * 90}, {"image": "png"}]
+)
+def test_a_description_comes_back_as_it_was(reductions: dict[str, Any]) -> None:
+    description = TopicDescription("cbor", (CHANNEL,) * 3, **reductions)
     assert TopicDescription.from_wire(description.to_wire()) == description
 
 
 def test_more_channels_than_allowed_are_refused_at_home() -> None:
     with pytest.raises(LocalError):
         TopicDescription("json", (CHANNEL,) * (CHANNELS_MAX + 1)).to_wire()
+
+
+@pytest.mark.parametrize(
+    "field", [{"z": "lz77"}, {"z": 1}, {"i": "gif"}, {"i": b"jpeg"}, {"d": "text"}, {"d": bytes(33 << 10)}]
+)
+def test_a_reduction_that_is_unknown_here_is_refused(field: dict[str, Value]) -> None:
+    fields: dict[str, Value] = {"e": "cdr", "c": [CHANNEL.to_wire()], **field}
+    with pytest.raises(RemoteError):
+        TopicDescription.from_wire(encode(fields))
 
 
 @given(st.binary(max_size=100))

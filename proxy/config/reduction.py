@@ -1,0 +1,127 @@
+"""Sections of a rule about sending less: compression, region, and adaptation to the path.
+
+Section of a configuration file. Validation reads a dictionary file and changes nothing.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Final, Literal
+
+from pydantic import BeforeValidator, Field, ValidationInfo, WithJsonSchema, model_validator
+from pydantic.config import JsonDict
+
+from gdp.errors import LocalError
+from gdp.nodes.schema import Section, relative
+from proxy.reduce.adaptive import MIN_HZ, MIN_QUALITY
+from proxy.reduce.compression import LEVEL_MAX, check_dictionary
+from proxy.reduce.picture import QUALITY
+from proxy.reduce.region import Bounds
+from proxy.reduce.region import Region as RegionBounds
+
+__all__ = ["Adapt", "Compress", "Region", "SomeAdapt", "SomeCompress"]
+
+_LEVEL: Final = 3
+_RATE_MAX_HZ: Final = 1e6
+
+
+def _dictionary(value: object, info: ValidationInfo) -> object:
+    """Read the dictionary file that ``dictionary`` names; a value that is not text is passed on and refused as such."""
+    if not isinstance(value, str):
+        return value
+    path = relative(Path(value), info)
+    try:
+        return check_dictionary(path.read_bytes())
+    except OSError as error:
+        raise ValueError(f"expected a dictionary of zstd --train: {path}: {error.strerror}") from error
+    except LocalError as error:
+        raise ValueError(f"expected a dictionary of zstd --train: {path}: {error}") from error
+
+
+def _bounds(value: object) -> object:
+    if isinstance(value, list):
+        value = tuple(value)
+    if isinstance(value, tuple) and len(value) == 2 and all(isinstance(each, int | float) for each in value):
+        low, high = value
+        if not low < high:
+            raise ValueError("expected [low, high] with low below high")
+    return value
+
+
+Dictionary = Annotated[bytes, BeforeValidator(_dictionary), WithJsonSchema({"type": "string", "minLength": 1})]
+SomeBounds = Annotated[Bounds | None, BeforeValidator(_bounds)]
+
+
+class Compress(Section):
+    """How the bodies of a topic are compressed."""
+
+    codec: Literal["zstd"] = Field(default="zstd", description="`zstd` (RFC 8878).")
+    level: int = Field(default=_LEVEL, ge=1, le=LEVEL_MAX, description="1 (fast) to 19 (small).")
+    dictionary: Dictionary | None = Field(
+        default=None,
+        repr=False,
+        description="A dictionary file of `zstd --train`, at most 32 KiB; readers get it with the"
+        " topic's description. `null`: none.",
+    )
+
+
+class Region(Section):
+    """The part of an image or a point cloud that crosses."""
+
+    x: SomeBounds = Field(default=None, description="`[low, high]`: pixels from the left, or metres.")
+    y: SomeBounds = Field(default=None, description="`[low, high]`: pixels from the top, or metres.")
+    z: SomeBounds = Field(default=None, description="`[low, high]` in metres, of point clouds.")
+
+    @property
+    def bounds(self) -> RegionBounds:
+        """Return the bounds along each axis."""
+        return RegionBounds(self.x, self.y, self.z)
+
+
+class Adapt(Section):
+    """Bounds between which rate and JPEG quality follow the path."""
+
+    min_hz: float = Field(default=MIN_HZ, gt=0, le=_RATE_MAX_HZ, description="The rate never falls below this.")
+    max_hz: float | None = Field(
+        default=None, gt=0, le=_RATE_MAX_HZ, description="The highest rate. `null`: the rule's `max_hz`, or all."
+    )
+    min_quality: int = Field(default=MIN_QUALITY, ge=1, le=100, description="The lowest JPEG quality.")
+    max_quality: int | None = Field(
+        default=None, ge=1, le=100, description="The highest JPEG quality. `null`: the rule's `quality`."
+    )
+
+    @model_validator(mode="after")
+    def _is_ordered(self) -> Adapt:
+        if self.max_hz is not None and self.max_hz < self.min_hz:
+            raise ValueError("max_hz is below min_hz")
+        if (QUALITY if self.max_quality is None else self.max_quality) < self.min_quality:
+            raise ValueError("max_quality is below min_quality")
+        return self
+
+
+def _compress(value: object) -> object:
+    return {"codec": value} if isinstance(value, str) else value
+
+
+def _adapt(value: object) -> object:
+    if isinstance(value, bool):
+        return {} if value else None
+    return value
+
+
+def _or_codec(schema: JsonDict) -> None:
+    _add(schema, {"const": "zstd"})
+
+
+def _or_flag(schema: JsonDict) -> None:
+    _add(schema, {"type": "boolean"})
+
+
+def _add(schema: JsonDict, short: JsonDict) -> None:
+    forms = schema.get("anyOf")
+    if isinstance(forms, list):
+        schema["anyOf"] = [short, *forms]
+
+
+SomeCompress = Annotated[Compress | None, BeforeValidator(_compress), Field(json_schema_extra=_or_codec)]
+SomeAdapt = Annotated[Adapt | None, BeforeValidator(_adapt), Field(json_schema_extra=_or_flag)]
