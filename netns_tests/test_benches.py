@@ -28,6 +28,7 @@ needs_wireguard = pytest.mark.skipif(
         ["messages.py", "--quick", "--mtu", "9000", "--offloads", "off"],
         ["library.py", "--rounds", "1", "--count", "5"],
         ["thread_offload.py", "--rounds", "1", "--count", "5"],
+        ["packet_rings.py", "--rounds", "1", "--count", "128"],
         ["priority.py", "--quick", "--no-save"],
         ["bundles.py", "--quick", "--no-save"],
         pytest.param(["tunnel.py", "--quick", "--no-save", "--only", "kernel"], marks=needs_wireguard),

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import chain
 from random import Random
+from typing import ClassVar
 from weakref import WeakKeyDictionary
 
 import pytest
@@ -294,7 +295,7 @@ def test_what_the_kernel_drops_is_counted(
     plane = make(["p0"], None)
     for _ in range(500):
         ends[IN].send(frame(ONE, bytes(1_000)))
-    while plane.poll(0) or not _idle(plane):
+    while plane.poll(0.001) or not _idle(plane):
         continue
     counters = plane.counters
     assert counters.drops[DropReason.PORT_FULL] > 0
@@ -447,3 +448,33 @@ def test_a_watched_file_wakes_the_poll(node: Plane) -> None:
 def test_polling_with_nothing_to_do_returns_nothing(node: Plane) -> None:
     node.poll(0)
     assert node.poll(0) == []
+
+
+def test_a_poll_that_does_not_wait_reads_the_kernels_drops_only_after_frames_came(space: Space) -> None:
+    space.veth("p0", "q0", IN_MAC, PEER_MACS[IN])
+    plane, reads = _Auditing(["p0"]), _Auditing.reads
+    try:
+        plane.poll(0)
+        before = len(reads)
+        plane.poll(0)
+        assert len(reads) == before
+        with far_end("q0") as end:
+            end.send(MARK)
+        poll_until(plane, lambda: plane.counters.frames_in == 1)
+        plane.poll(0)
+        plane.poll(0)
+        assert len(reads) == before + 1
+        plane.poll(0.001)
+        assert len(reads) == before + 2
+    finally:
+        plane.close()
+
+
+class _Auditing(RawPlane):
+    """Plane that notes when it reads the kernel's drops."""
+
+    reads: ClassVar[list[int]] = []
+
+    def _kernel_drops(self) -> int:
+        self.reads.append(1)
+        return super()._kernel_drops()

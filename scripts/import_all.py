@@ -17,7 +17,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 EXTRAS = frozenset(
-    {"boto3", "botocore", "cyclonedds", "genmsg", "genpy", "launch", "launch_ros", "pkcs11", "rclpy", "redis"}
+    {"boto3", "botocore", "cyclonedds", "genmsg", "genpy", "launch", "launch_ros", "PIL", "pkcs11", "rclpy", "redis"}
     | {"ros2cli", "ros2launch", "rosidl_parser", "roslib", "rospy", "rpyutils", "scapy", "sky"}
 )  # packages that an installation may lack
 

@@ -98,14 +98,14 @@ class End:
         self.member.subscribe(self.topics[topic])
         return self.topics[topic].name
 
-    def serve(self, name: str) -> Name:
+    def serve(self, name: str, *, is_session: bool = False) -> Name:
         """Serve a name; return its overlay name."""
-        self.member.serve(self.topics[name], b"bench")
+        self.member.serve(self.topics[name], b"bench", is_session=is_session)
         return self.topics[name].name
 
-    def call(self, name: str) -> Publisher:
+    def call(self, name: str, *, is_session: bool = False) -> Publisher:
         """Call a name from now on; return the stream that all its servers receive."""
-        return self.member.call(self.topics[name], b"bench")
+        return self.member.call(self.topics[name], b"bench", is_session=is_session)
 
     def name_of(self, name: str) -> Name:
         """Return the overlay name of a topic or service."""

@@ -3,6 +3,8 @@
 Five machines in namespaces, A - s1 - s2 - s3 - B, and in turn on them, round by round:
 
     gdp-kernel, gdp-raw   switches, RIB and two members: encrypted, signed, verified, reliable; in json, cbor and cdr
+    gdp-kernel-unicast    the same as a request to one server and its response, without the library
+    gdp-kernel-session    the same under ``sign: session``: a key of the two ends, no signature
     zenoh-mtls            three routers; mutual TLS on every hop
     zenoh-tcp             the same without TLS
     cyclone               Cyclone DDS, unsecured, reliable; the three forward IPv4 in the kernel
@@ -11,6 +13,7 @@ Five machines in namespaces, A - s1 - s2 - s3 - B, and in turn on them, round by
     sudo .venv/bin/python scripts/bench/messages.py --quick             # one round of few messages: does it work?
     sudo .venv/bin/python scripts/bench/messages.py --only gdp-raw --only zenoh-mtls --mtu 1500 --size 921600
     sudo .venv/bin/python scripts/bench/messages.py --realtime          # every baseline under SCHED_FIFO
+    sudo .venv/bin/python scripts/bench/messages.py --load half         # other processes take half of each core
 
 Messages go one at a time, as in a control loop. A figure of a round is the median (or p99) of its messages. The table
 shows the median of the rounds, and in brackets their lowest and highest. Only the whole bench writes under
@@ -25,6 +28,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+from background_load import LOADS, SHARE
 from peers.baseline import Baseline
 from peers.cyclone_net import CycloneNet
 from peers.exchange import ANSWER, SIZE_MIN, Load
@@ -49,6 +53,8 @@ def baselines_of(only: Sequence[str], encodings: tuple[str, ...], spin_s: float)
     every: tuple[Baseline, ...] = (
         GdpNet("kernel", encodings, spin_s),
         GdpNet("raw", encodings, spin_s),
+        GdpNet("kernel", ("cdr",), spin_s, "unicast"),
+        GdpNet("kernel", ("cdr",), spin_s, "session"),
         ZenohNet(secured=True),
         ZenohNet(secured=False),
         CycloneNet(),
@@ -60,8 +66,9 @@ def panels_of(over: Rounds, plan: Plan) -> list[Panel]:
     """Return a panel for each case: medians, whiskers to the p99."""
     ours = [label for label in plan.labels if label.startswith("gdp")]
     return [
-        panel_of(over, case_of(size, mtu, offloads=on), MEDIAN, plan.labels, p99=P99, ours=ours)
+        panel_of(over, case_of(size, mtu, offloads=on, loaded=loaded), MEDIAN, plan.labels, p99=P99, ours=ours)
         for size, mtu, on in plan.cases
+        for loaded in plan.loads
     ]
 
 
@@ -77,6 +84,12 @@ def arguments(names: Sequence[str]) -> argparse.ArgumentParser:
     parser.add_argument("--mtu", type=int, action="append", help="bytes after the Ethernet header; may be repeated")
     parser.add_argument("--size", type=size_of, action="append", help="bytes of a message; may be repeated")
     parser.add_argument("--offloads", choices=("off", "on", "both"), default="both", help="of the veth devices")
+    parser.add_argument(
+        "--load",
+        choices=tuple(LOADS),
+        default="both",
+        help="none, or processes that take half of each core, or each in turn (default: %(default)s)",
+    )
     parser.add_argument("--encoding", action="append", choices=ENCODINGS, help="of ours; may be repeated")
     parser.add_argument(
         "--busy-poll-us", type=int, default=SPIN_US, help="as busy_poll_us of proxy.yaml (default: %(default)s)"
@@ -119,6 +132,7 @@ def plan_of(options: argparse.Namespace) -> Plan:
         baselines_of(options.only or (), tuple(options.encoding or ENCODINGS), options.busy_poll_us / 1e6),
         Load(tuple(options.size or SIZES), QUICK_COUNT if options.quick else options.count),
         1 if options.quick else options.rounds,
+        LOADS[options.load],
     )
 
 
@@ -133,7 +147,7 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
         "messages",
         "Messages over three machines, an answer back",
         turns.over,
-        targets_of(turns.over, [label for label in plan.labels if label.startswith("gdp")], plan.cases),
+        targets_of(turns.over, [label for label in plan.labels if label.startswith("gdp")], plan.cases, plan.loads),
         {
             "rounds": plan.rounds,
             "messages a round": [plan.load.repeats(size) for size in plan.load.sizes],
@@ -141,6 +155,7 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
             "scheduler": "SCHED_FIFO" if options.realtime else "ordinary",
             "ends of gdp spin, us": options.busy_poll_us,
             "shared memory": "off everywhere",
+            "load": f"{SHARE:.0%} of each core" if True in plan.loads else "none",
             **{f"offloads {'on' if on else 'off'}": text for on, text in turns.offload_states.items()},
             "trouble": turns.notes or "none",
         },
@@ -151,7 +166,8 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
 
 def is_whole(options: Options) -> bool:
     """Return whether all cases are measured, so that the figures are written to ``docs/benchmarks``."""
-    return not (options.quick or options.only or options.mtu or options.size or options.offloads != "both")
+    has_part = options.quick or options.only or options.mtu or options.size
+    return not has_part and options.offloads == options.load == "both"
 
 
 def main() -> None:

@@ -12,10 +12,10 @@ With ``bridged`` the direct path is as long as the other one: three more namespa
 
 A node is started ``direct`` or not. Direct nodes meet over the cable, in a ROS domain of their own. The others have a
 domain for each end, so that nothing but the proxies joins them, and reach their proxy inside their namespace.
-All nodes use UDP over IPv4, because the shared memory of Fast DDS crosses the namespaces of one host. The discovery
-range ``LOCALHOST`` would enable it again, so the range is ``SUBNET``, and the namespaces confine. Socket buffers have
-4 MiB (as far as ``net.core.rmem_max`` allows). The default ones do not hold a camera image, and the middleware's
-retransmissions would then dominate the time. ROS 2's guide to tuning recommends the same.
+A and B have a ``/dev/shm`` each. So the nodes and the proxy of one machine share memory, as Fast DDS does on a robot,
+and between the machines it uses UDP over IPv4. Socket buffers (as far as ``net.core.rmem_max`` allows) and shared
+memory segments have 4 MiB. The default ones do not hold a camera image, and the middleware's retransmissions would
+then dominate the time. ROS 2's guide to tuning recommends the same.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from typing import Final, Literal
 from devices import add_address, add_bridge
 from machine import processor_s
 from peers.process import Started
-from testbed import SOCKET_BUFFER_BYTES as BUFFER_BYTES
+from ros_environment import BUFFER_BYTES, ros_environment
 from testbed import Lab, OverlayNodes
 from topologies import LEFT, MIDDLE, RIGHT, ROW, flat_topology
 
@@ -54,13 +54,19 @@ _BRIDGE: Final = "bridge"
 
 @dataclass(frozen=True, slots=True)
 class Carried:
-    """Topic or service that the proxies carry. ``source``: location of its publishers, or its server."""
+    """Topic or service that the proxies carry.
+
+    Attributes:
+        source: location of its publishers, or its server.
+        sign: of a service, as in its rules.
+    """
 
     name: str
     type_name: str
     encoding: Encoding
     source: str = LEFT
     kind: Literal["topic", "service"] = "topic"
+    sign: Literal["always", "session"] = "always"
 
     @property
     def metadata(self) -> Metadata:
@@ -70,7 +76,7 @@ class Carried:
     def rule(self, owner: Path) -> dict[str, object]:
         """Return its rule in either proxy's configuration."""
         keys = {"name": self.name, "kind": self.kind, "type": self.type_name, "encoding": self.encoding}
-        return {**keys, "owner": str(owner)}
+        return {**keys, "owner": str(owner), **({"sign": self.sign} if self.kind == "service" else {})}
 
 
 class Row:
@@ -81,16 +87,20 @@ class Row:
         carried: what the proxies carry.
         mtu: of every device, the cable included.
         bridged: whether the direct path leads through three bridges instead of one cable.
+        shared_memory: whether the processes of one machine share memory; else they use UDP there too.
 
     Raises:
         LocalError: the kernel refuses.
         FailedError: a process did not come up; also where ROS 2 is not installed.
     """
 
-    def __init__(self, run: Run, carried: Sequence[Carried], *, mtu: int, bridged: bool = False) -> None:
+    def __init__(
+        self, run: Run, carried: Sequence[Carried], *, mtu: int, bridged: bool = False, shared_memory: bool = True
+    ) -> None:
         direct = (LEFT, *(_BRIDGES if bridged else ()), RIGHT)
         links = [*pairwise(ROW), *pairwise(direct)]
-        self._lab = Lab(run, flat_topology(links, mtu=mtu, rib="s2", members=(LEFT, RIGHT)))
+        topology = flat_topology(links, mtu=mtu, rib="s2", members=(LEFT, RIGHT))
+        self._lab = Lab(run, topology, own_shared_memory=(LEFT, RIGHT) if shared_memory else ())
         for before, node, after in zip(direct, direct[1:-1], direct[2:], strict=False):
             self._lab.inside(node, partial(add_bridge, _BRIDGE, (before, after)))
         for node, device in ((LEFT, direct[1]), (RIGHT, direct[-2])):
@@ -101,7 +111,7 @@ class Row:
             proxies = []
             for node in (LEFT, RIGHT):
                 argv = ["-m", "proxy.cli.proxy", "--config", self._admit(node, carried)]
-                environment = self._nodes.ros_environment(_DOMAINS[node])
+                environment = self._environment(node, _DOMAINS[node])
                 proxies.append(undo.enter_context(self._lab.start(node, "proxy", argv, environment)))
             for proxy in proxies:
                 proxy.read_line(READY_S)
@@ -120,12 +130,15 @@ class Row:
 
     def process(self, node: str, what: str, arguments: Sequence[str], *, direct: bool) -> Started:
         """Start a Python process with a ROS node at A or B."""
-        environment = self._nodes.ros_environment(DIRECT_DOMAIN if direct else _DOMAINS[node])
+        environment = self._environment(node, DIRECT_DOMAIN if direct else _DOMAINS[node])
         return self._lab.start(node, what, arguments, [*environment, f"CYCLONEDDS_URI={_cyclone(node)}"])
 
     def proxies_cpu_s(self) -> float:
         """Return the processor time that both proxies have used."""
         return sum(processor_s(pid) for pid in self.proxies)
+
+    def _environment(self, node: str, domain: int) -> list[str]:
+        return ros_environment(self._nodes.files, domain, shared_memory=self._lab.has_shared_memory(node))
 
     def _admit(self, node: str, carried: Sequence[Carried]) -> str:
         """Give a proxy the delegations of its side, and write its configuration; return the file."""

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Final
 
 import skeleton
+from background_load import LOADS, SHARE, load_of
 from peers.process import FailedError, figures_of
 from plot import Panel, panel_of
 from report import Rounds, Target
@@ -42,6 +43,7 @@ class Turn:
     Args:
         encoding: how proxies carry messages; None: they go directly.
         counts: further columns, each with its key in the report.
+        variant: how the proxies' rule differs, for the name of the row.
         report: measures; gets the row, the encoding and the number of the round, from 1; may raise ``FailedError``.
     """
 
@@ -50,11 +52,12 @@ class Turn:
     encoding: Encoding | None
     counts: Mapping[str, str]
     report: Callable[[Row, Encoding | None, int], Measured]
+    variant: str = ""
 
     @property
     def contender(self) -> str:
         """Return the row of its figures."""
-        return DIRECT if self.encoding is None else f"overlay, {self.encoding}"
+        return DIRECT if self.encoding is None else f"overlay, {self.encoding}{self.variant}"
 
     @property
     def columns(self) -> list[str]:
@@ -128,6 +131,12 @@ def parse(description: str | None, *, seconds: float, mtus: Sequence[int], quick
         description, rounds=rounds, seconds=seconds, quick=quick, has_record=True, has_plot=True
     )
     parser.add_argument("--mtu", type=int, action="append", help="bytes after the Ethernet header; may be repeated")
+    parser.add_argument(
+        "--load",
+        choices=tuple(LOADS),
+        default="none",
+        help="none, or processes that take half of each core, or each in turn (default: %(default)s)",
+    )
     options = skeleton.parse(parser)
     options.mtus = tuple(dict.fromkeys(options.mtu or mtus))
     return options
@@ -154,8 +163,14 @@ def _measure(bench: Bench, options: Options, runs: RunRegistry) -> skeleton.Outc
             run = stack.enter_context(skeleton.new_run(runs))
             rows[mtu] = stack.enter_context(Row(run, bench.carried, mtu=mtu))
         trials = [
-            skeleton.Trial(each.case, each.contender, each.columns, partial(each.measure, rows[each.mtu]))
+            skeleton.Trial(
+                each.case + (", cores half taken" if loaded else ""),
+                each.contender,
+                each.columns,
+                partial(_measure_turn, each, rows[each.mtu], loaded),
+            )
             for each in bench.turns
+            for loaded in LOADS[options.load]
         ]
         recorder.interleave(trials, options.rounds)
     over = recorder.rounds
@@ -163,9 +178,15 @@ def _measure(bench: Bench, options: Options, runs: RunRegistry) -> skeleton.Outc
         "rounds": options.rounds,
         "seconds": options.seconds,
         **bench.settings,
+        "load": f"{SHARE:.0%} of each core" if options.load != "none" else "none",
         "socket buffers, B": min(BUFFER_BYTES, int(_RMEM_MAX.read_text(encoding="ascii"))),
         "trouble": recorder.notes or "none",
     }
     return skeleton.Outcome(
         bench.name, bench.title, over, bench.targets(over), settings, lambda: list(bench.panels(over))
     )
+
+
+def _measure_turn(turn: Turn, row: Row, loaded: bool, number: int) -> dict[str, float]:
+    with load_of(loaded):
+        return turn.measure(row, number)

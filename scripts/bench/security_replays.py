@@ -141,8 +141,11 @@ class _Stepped:
     def get_timer(self) -> float | None:
         return self._machine.get_timer()
 
-    def frames_to_send(self) -> list[OutgoingFrames]:
-        return self._machine.frames_to_send()
+    def frames_to_send(self, now_s: float) -> list[OutgoingFrames]:
+        return self._machine.frames_to_send(now_s)
+
+    def frames_leave(self, now_s: float) -> None:
+        self._machine.frames_leave(now_s)
 
 
 class RecordingNetwork(SimNetwork):

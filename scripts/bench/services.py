@@ -3,6 +3,8 @@
     one at a time    a client calls, waits for the answer, calls again: how long a call takes
     1,000/s          50 clients in one node call in turn, none waits for the others: whether all are answered
 
+The row ``overlay, cdr, session`` has ``sign: session`` in its rules: a key of the two proxies, no signature.
+
 Each is compared with the same two nodes joined by one cable (``direct``), in turn, round by round. Targets: at most 1.5
 ms more a call than direct; every one of 1,000 calls a second answered.
 
@@ -32,11 +34,14 @@ RATE: Final = 1_000
 LOAD: Final = f"{RATE:,} calls/s from {CLIENTS} clients"
 ENCODINGS: Final[dict[str, tuple[Encoding, ...]]] = {ONE: ("cdr", "json"), LOAD: ("cdr",)}
 ADDED_MS: Final = 1.5
+SESSION: Final = ", session"
 MTU: Final = 1_500
 _DONE_S: Final = 40.0
 
 
-def measure(case: str, seconds: float, row: Row, encoding: Encoding | None, number: int) -> Measured:
+def measure(
+    case: str, seconds: float, row: Row, encoding: Encoding | None, number: int, *, variant: str = ""
+) -> Measured:
     """Return the client's report, and the cores that the proxies used.
 
     Raises:
@@ -45,13 +50,13 @@ def measure(case: str, seconds: float, row: Row, encoding: Encoding | None, numb
     del number
     count = round(RATE * seconds)
     call = Call(MODULE, "serve", "call" if case == ONE else "load", seconds, _DONE_S)
-    service = service_of(encoding or "cdr")
+    service = service_of(encoding or "cdr", variant)
     return call.measure(row, direct=encoding is None, service=service, clients=CLIENTS, rate=RATE, count=count)
 
 
-def service_of(encoding: Encoding) -> str:
+def service_of(encoding: Encoding, variant: str = "") -> str:
     """Return the name of the service that proxies carry so."""
-    return f"/lamp_{encoding}"
+    return f"/lamp_{encoding}{'_session' if variant else ''}"
 
 
 def case_of(case: str, mtu: int) -> str:
@@ -82,7 +87,20 @@ def bench_of(options: Options) -> Bench:
         for case, own in ENCODINGS.items()
         for encoding in (None, *own)
     ]
+    turns += [
+        Turn(
+            case_of(case, mtu),
+            mtu,
+            "cdr",
+            COUNTS,
+            partial(measure, case, options.seconds, variant=SESSION),
+            variant=SESSION,
+        )
+        for mtu in options.mtus
+        for case in ENCODINGS
+    ]
     carried = [Carried(service_of(encoding), TYPE, encoding, source=RIGHT, kind="service") for encoding in encodings]
+    carried.append(Carried(service_of("cdr", SESSION), TYPE, "cdr", source=RIGHT, kind="service", sign="session"))
     return Bench("services", "Calls of a ROS 2 service over three kernel switches", carried, turns, targets_of)
 
 

@@ -12,10 +12,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import TypeVar
 
 import yaml
 from peers.process import FailedError, Started
+from shared_memory import SharedMemory
 from topologies import MIDDLE
 
 from gdp.host import netns_files
@@ -28,19 +29,6 @@ from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE
 from gdp.trust.right import Right
 from ring.credentials import OverlayCredentials
 
-SOCKET_BUFFER_BYTES: Final = 4 << 20
-_PROFILE: Final = f"""<?xml version="1.0" encoding="UTF-8" ?>
-<dds xmlns="http://www.eprosima.com"><profiles>
- <transport_descriptors><transport_descriptor>
-  <transport_id>udp</transport_id><type>UDPv4</type>
-  <sendBufferSize>{SOCKET_BUFFER_BYTES}</sendBufferSize><receiveBufferSize>{SOCKET_BUFFER_BYTES}</receiveBufferSize>
- </transport_descriptor></transport_descriptors>
- <participant profile_name="participant" is_default_profile="true"><rtps>
-  <userTransports><transport_id>udp</transport_id></userTransports><useBuiltinTransports>false</useBuiltinTransports>
- </rtps></participant>
-</profiles></dds>
-"""
-
 T = TypeVar("T")
 
 
@@ -49,17 +37,30 @@ class Lab:
 
     Args:
         priorities: SCHED_FIFO priority by the first word of a process's name; empty: the ordinary scheduler.
+        own_shared_memory: these machines have a ``/dev/shm`` each; the others see the one of the host.
 
     Raises:
         LocalError: the kernel refuses.
     """
 
-    def __init__(self, run: Run, topology: Topology, *, priorities: Mapping[str, int] | None = None) -> None:
+    def __init__(
+        self,
+        run: Run,
+        topology: Topology,
+        *,
+        priorities: Mapping[str, int] | None = None,
+        own_shared_memory: Sequence[str] = (),
+    ) -> None:
         self.run = run
         self.directory = run.directory
         self.topology = topology
         self.namespaces = Namespaces(topology, run)
         self._priorities = priorities or {}
+        self._memories = {node: SharedMemory(run, node) for node in own_shared_memory}
+
+    def has_shared_memory(self, node: str) -> bool:
+        """Return whether a machine has a ``/dev/shm`` of its own."""
+        return node in self._memories
 
     def inside(self, node: str, work: Callable[[], T]) -> T:
         """Call ``work`` in a machine's namespace."""
@@ -67,7 +68,9 @@ class Lab:
 
     def command(self, node: str, argv: Sequence[str], environment: Sequence[str] = ()) -> list[str]:
         """Return the command line that runs ``argv`` on a machine; ``environment`` holds ``KEY=value``."""
-        return self.namespaces.command(node, ["env", *environment, *argv] if environment else list(argv))
+        inner = ["env", *environment, *argv] if environment else list(argv)
+        memory = self._memories.get(node)
+        return self.namespaces.command(node, memory.command(inner) if memory else inner)
 
     def start(
         self,
@@ -153,22 +156,6 @@ class OverlayNodes:
     def owner_key(self) -> Path:
         """The public key of the owner of all names."""
         return self.files / "owner" / OWNER_PUBLIC
-
-    def ros_environment(self, domain: int) -> list[str]:
-        """Return the environment of a ROS process: UDP alone, and socket buffers that hold a camera image.
-
-        Shared memory of Fast DDS would cross the namespaces of one host, and the discovery range ``LOCALHOST`` switches
-        it on again. So the range is ``SUBNET``, and the namespaces confine.
-        """
-        profile = self.files / "dds.xml"
-        profile.write_text(_PROFILE, encoding="utf-8")
-        return [
-            f"ROS_DOMAIN_ID={domain}",
-            "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET",
-            "RMW_IMPLEMENTATION=rmw_fastrtps_cpp",
-            f"FASTRTPS_DEFAULT_PROFILES_FILE={profile}",  # its name before Fast DDS 3
-            f"FASTDDS_DEFAULT_PROFILES_FILE={profile}",
-        ]
 
     def _identity(self, node: str) -> Path:
         return self.files / "nodes" / f"proxy-{node}"

@@ -24,6 +24,7 @@ from typing import Final
 
 from bench_path import ROOT
 from peers.process import Started
+from ros_environment import ros_environment
 from testbed import Lab, OverlayNodes
 from topologies import flat_topology
 
@@ -191,7 +192,7 @@ class Field:
     def process(self, node: str, what: str, arguments: Sequence[str]) -> Started:
         """Start a Python process in a namespace, in its ROS domain, with one thread for linear algebra."""
         threads = ["OPENBLAS_NUM_THREADS=1", "OMP_NUM_THREADS=1"]  # a machine here has one core
-        environment = [*self._nodes.ros_environment(self._domain(node)), *threads]
+        environment = [*ros_environment(self._nodes.files, self._domain(node)), *threads]
         return self._lab.start(node, what, arguments, environment)
 
     def _domain(self, node: str) -> int:

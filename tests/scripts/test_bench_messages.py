@@ -19,11 +19,12 @@ from rosbags.typesys import Stores, get_typestore
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "scripts" / "bench"))
 
+from background_load import BackgroundLoad
 from peers.certificates import make_certificates
 from peers.chain import LEFT, NODES, RIGHT, address, routes
 from peers.cyclone_net import cyclone_xml
 from peers.exchange import ANSWER, IMAGE, SIZE_MIN, Load, answer_to, exchange, image
-from peers.figures import MEDIAN, case_of, targets_of
+from peers.figures import CPU, MEDIAN, case_of, targets_of
 from peers.jsonl import EndSettings
 from report import Rounds
 from topologies import row
@@ -207,7 +208,7 @@ def test_a_contender_that_is_not_here_reaches_nothing_and_says_why() -> None:
     over, case = Rounds(), case_of(100, 1_500, offloads=False)
     over.add("zenoh-mtls", case, MEDIAN, 1.0)
     over.absent("gdp-kernel cdr", "no CAP_BPF")
-    (target,) = targets_of(over, ["gdp-kernel cdr"], [(100, 1_500, False)])
+    target = targets_of(over, ["gdp-kernel cdr"], [(100, 1_500, False)])[0]
     assert target.met is None
     assert "no CAP_BPF" in str(target)
 
@@ -216,7 +217,32 @@ def test_only_what_was_run_is_asked_for_and_only_of_rows_that_carry_bytes_as_the
     over = Rounds()
     assert targets_of(over, ["gdp-raw cdr"], [(10_000, 1_500, False)]) == []
     targets = targets_of(over, ["gdp-raw json", "gdp-raw cdr"], [(100, 1_500, False), (921_600, 9_000, True)])
-    assert [target.what.split(",")[0] for target in targets] == ["gdp-raw cdr / zenoh-mtls", "gdp-raw cdr - cyclone"]
+    compared = [target.what.split(",")[0] for target in targets if "CPU" not in target.what]
+    assert compared == ["gdp-raw cdr / zenoh-mtls", "gdp-raw cdr - cyclone"]
+
+
+def test_the_processor_time_of_each_end_is_asked_for_a_small_message() -> None:
+    over, case = Rounds(), case_of(100, 1_500, offloads=False)
+    over.add("gdp-raw cdr", case, CPU["sender"], 0.1)
+    over.add("gdp-raw cdr", case, CPU["receiver"], 0.2)
+    targets = [each for each in targets_of(over, ["gdp-raw cdr"], [(100, 1_500, False)]) if "CPU" in each.what]
+    assert [(each.target, each.met) for each in targets] == [(0.12, True), (0.12, False)]
+
+
+def test_a_ratio_with_the_cores_half_taken_has_a_target_of_its_own() -> None:
+    over, case = Rounds(), case_of(100, 1_500, offloads=False, loaded=True)
+    over.add("gdp-raw cdr", case, MEDIAN, 0.7)
+    over.add("zenoh-mtls", case, MEDIAN, 1.0)
+    (target,) = targets_of(over, ["gdp-raw cdr"], [(100, 1_500, False)], (True,))
+    assert (target.target, target.met) == (0.8, True)
+
+
+def test_the_background_load_ends_with_its_block() -> None:
+    with BackgroundLoad() as load:
+        processes = list(load._processes)
+        assert len(processes) == len(os.sched_getaffinity(0))
+        assert all(each.poll() is None for each in processes)
+    assert all(each.returncode is not None for each in processes)
 
 
 def test_the_ends_stand_at_the_two_ends() -> None:

@@ -92,7 +92,7 @@ class HostileSwitch:
         tree = next(each for each in multicast.trees.all() if each.upstream is not None)
         while tree.upstream is not None and tree.upstream_name is not None:
             multicast._say(tree, tree.upstream, tree.upstream_name, _MTU, _LEASE_S, tree.evidence)
-            for transmit in self._switch.frames_to_send():
+            for transmit in self._switch.frames_to_send(time.monotonic()):
                 yield from transmit.frames
 
     def revocations(self) -> _Frames:

@@ -1,6 +1,7 @@
 """Endpoint process of GDP at A and B: a session of the library, or a member of the overlay without it.
 
-Process of its own, started by ``gdp_net.py``. Each message is encoded, encrypted, signed, verified, ordered,
+Process of its own, started by ``gdp_net.py``; or a client and a server without the library, for requests and
+responses. Each message is encoded, encrypted, signed, verified, ordered,
 acknowledged and decoded. That is all that a proxy does except for ROS.
 
 Each encoding has a topic of its own, ``/ping/json`` for one; answers come back on ``/pong``. ``bench/library.py`` runs
@@ -22,6 +23,7 @@ from member_endpoint import End
 import gdp
 from gdp.client.publisher import Publisher
 from gdp.errors import LocalError
+from gdp.names import Name
 from gdp.nodes.memory_tuning import tune_memory
 from peers.exchange import IMAGE, PATIENCE_S, answer_to, exchange
 from peers.jsonl import EndSettings, say
@@ -140,6 +142,72 @@ class InternalEndpoint:
         return self._publishers[topic].repairs
 
 
+class UnicastEndpoint:
+    """Client or server of a name: a message is a request to the one server, and an answer its response.
+
+    Args:
+        is_session: a session secret authenticates both, instead of signatures.
+    """
+
+    def __init__(self, config: Path, spin_s: float, *, is_session: bool) -> None:
+        self._end = End(config, spin_s)
+        self._is_session = is_session
+        self._labels: dict[bytes, str] = {}
+        self._called: list[Name] = []
+        self._arrived = deque[tuple[str, bytes]]()
+        self._asked: tuple[Name, Name] | None = None  # service and client of the newest request
+
+    def advertise(self, topic: str) -> Callable[[bytes], None]:
+        """Call a name; answers (``PONG``) go to the client of the newest request instead."""
+        if topic == PONG:
+            return self._respond
+        self._end.call(topic, is_session=self._is_session)
+        service = self._end.name_of(topic)
+        self._called.append(service)
+        self._labels[service] = PONG
+
+        def send(message: bytes) -> None:
+            (server,) = self._end.member.peers(service)
+            self._end.member.send_request(service, server, message)
+            self._flush()
+
+        return send
+
+    def subscribe(self, topic: str) -> None:
+        """Serve a name; answers need no subscription."""
+        if topic != PONG:
+            self._labels[self._end.serve(topic, is_session=self._is_session)] = topic
+
+    def wait_for_readers(self, deadline_s: float) -> None:
+        """Wait until each name that is called has a server; raises ``TimeoutError``."""
+        if not self._end.runtime.run(lambda: all(map(self._end.member.peers, self._called)), deadline_s):
+            raise TimeoutError("no server: the overlay did not come up")
+
+    def receive(self, deadline_s: float) -> tuple[str, bytes] | None:
+        """Return the next request or response with its topic; None when the monotonic second passed."""
+        while not self._arrived:
+            if time.monotonic() >= deadline_s:
+                return None
+            self._end.runtime.step(deadline_s)
+            for each in self._end.member.poll_messages():
+                self._asked = each.topic, Name(each.delivered.publisher)
+                self._arrived.append((self._labels[each.topic], each.delivered.message))
+        return self._arrived.popleft()
+
+    def resent(self, topic: str) -> int:
+        """Return how many parts of the streams to all servers were sent again: nothing is sent on them."""
+        return sum(each.repairs for each in self._end.member.publishers() if each.topic == self._end.name_of(topic))
+
+    def _respond(self, message: bytes) -> None:
+        if self._asked is not None:
+            self._end.member.respond(*self._asked, message)
+            self._flush()
+
+    def _flush(self) -> None:
+        self._end.member.flush(time.monotonic())
+        self._end.runtime.send()
+
+
 class GdpWay:
     """A's side of one encoding."""
 
@@ -191,15 +259,22 @@ def _pong(end: Endpoint, encodings: list[Encoding]) -> None:
             send(answer_to(serializers[topic].decode(body)))
 
 
+def endpoint_of(path: str, config: Path, spin_s: float) -> Endpoint:
+    """Return an endpoint of a kind, as ``GdpNet`` names it."""
+    if path == "library":
+        return LibraryEndpoint(config, spin_s)
+    if path == "internal":
+        return InternalEndpoint(config, spin_s)
+    return UnicastEndpoint(config, spin_s, is_session=path == "session")
+
+
 def main() -> None:
     """Run ``ping`` or ``pong``."""
     settings = EndSettings.from_argument()
     wanted = settings.own["encodings"].split()
     encodings: list[Encoding] = [each for each in get_args(Encoding) if each in wanted]
     config, spin_s = Path(settings.own["config"]), float(settings.own["spin_s"])
-    end: Endpoint = (
-        LibraryEndpoint(config, spin_s) if settings.own["path"] == "library" else InternalEndpoint(config, spin_s)
-    )
+    end = endpoint_of(settings.own["path"], config, spin_s)
     if settings.role == "ping":
         _ping(end, encodings, settings)
     else:

@@ -30,7 +30,8 @@ class GdpNet:
         plane: as ``gdp-switch --data-plane``.
         encodings: measured one after the other, by the same processes.
         spin_s: seconds for which endpoints poll for frames before they sleep.
-        path: kind of endpoint, ``library`` or ``internal``.
+        path: kind of endpoint: ``library`` or ``internal``; ``unicast`` or ``session``: a request and its response,
+            signed or under a session secret.
     """
 
     def __init__(self, plane: str, encodings: tuple[str, ...], spin_s: float, path: str = "library") -> None:
@@ -60,8 +61,11 @@ class GdpNet:
     def _end(self, nodes: OverlayNodes, node: str, load: Load, pids: dict[str, list[int]]) -> Started:
         pings = [ping_topic(encoding) for encoding in self._encodings]
         published, read = (pings, [PONG]) if node == LEFT else ([PONG], pings)
+        rights = {Right.PUBLISH: published, Right.READ: read}
+        if self._path in ("unicast", "session"):
+            rights = {Right.CALL if node == LEFT else Right.SERVE: pings}
         own = {
-            "config": str(nodes.admit_member(node, {Right.PUBLISH: published, Right.READ: read})),
+            "config": str(nodes.admit_member(node, rights)),
             "encodings": " ".join(self._encodings),
             "spin_s": str(self._spin_s),
             "path": self._path,

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 
+from background_load import load_of
 from report import Rounds, percentile, progress
 
 from gdp.host.run_registry import RunRegistry
@@ -27,13 +28,18 @@ __all__ = ["Plan", "Turns"]
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Combinations to measure in every round."""
+    """Combinations to measure in every round.
+
+    Attributes:
+        loads: whether other processes take half of each core; one value, or both.
+    """
 
     mtus: tuple[int, ...]
     offloads: tuple[bool, ...]
     baselines: tuple[Baseline, ...]
     load: Load
     rounds: int
+    loads: tuple[bool, ...] = (False,)
 
     @property
     def cases(self) -> list[tuple[int, int, bool]]:
@@ -75,37 +81,40 @@ class Turns:
                 for chain in chains:
                     for on in self.plan.offloads:
                         self.offload_states[on] = chain.set_offloads(on=on)
-                        self._round(number, chain, on)
+                        for loaded in self.plan.loads:
+                            with load_of(loaded):
+                                self._round(number, chain, on, loaded)
 
-    def _round(self, number: int, chain: Chain, on: bool) -> None:
+    def _round(self, number: int, chain: Chain, on: bool, loaded: bool) -> None:
+        load = ", cores half taken" if loaded else ""
         for baseline in self.plan.baselines:
             if baseline.name in self._absent:
                 continue
-            where = f"round {number}/{self.plan.rounds}, MTU {chain.mtu}, offloads {_word(on)}: {baseline.name}"
+            where = f"round {number}/{self.plan.rounds}, MTU {chain.mtu}, offloads {_word(on)}{load}: {baseline.name}"
             begun_s = time.monotonic()
             try:
                 measured = baseline.measure(chain, self.plan.load)
             except FailedError as error:
                 progress(f"{where} FAILED: {error}")
-                self._miss(baseline, chain.mtu, on, where, str(error))
+                self._miss(baseline, chain.mtu, on, loaded, where, str(error))
                 continue
             self._seen.add(baseline.name)
-            self._add(measured, chain.mtu, on)
+            self._add(measured, chain.mtu, on, loaded)
             resent = sum({each.label: each.resent for each in measured}.values())
             if resent:
                 self.notes.append(f"{where}: {resent} parts sent again")
             progress(f"{where}, {time.monotonic() - begun_s:.1f} s")
 
-    def _add(self, measured: Sequence[Measured], mtu: int, on: bool) -> None:
+    def _add(self, measured: Sequence[Measured], mtu: int, on: bool, loaded: bool) -> None:
         for each in measured:
-            case = case_of(each.size, mtu, offloads=on)
+            case = case_of(each.size, mtu, offloads=on, loaded=loaded)
             self.over.add(each.label, case, MEDIAN, 1e3 * percentile(each.rtt_s, 0.5))
             self.over.add(each.label, case, P99, 1e3 * percentile(each.rtt_s, 0.99))
             for place, column in CPU.items():
                 if place in each.cpu_s:
                     self.over.add(each.label, case, column, 1e3 * each.cpu_s[place])
 
-    def _miss(self, baseline: Baseline, mtu: int, on: bool, where: str, reason: str) -> None:
+    def _miss(self, baseline: Baseline, mtu: int, on: bool, loaded: bool, where: str, reason: str) -> None:
         """Record a failure: a baseline that never came up is absent, any other has no figures in this round."""
         if baseline.name not in self._seen:
             self._absent.add(baseline.name)
@@ -116,7 +125,7 @@ class Turns:
         for label in baseline.labels:
             for size in self.plan.load.sizes:
                 for column in (MEDIAN, P99, *CPU.values()):
-                    self.over.add(label, case_of(size, mtu, offloads=on), column, None)
+                    self.over.add(label, case_of(size, mtu, offloads=on, loaded=loaded), column, None)
 
 
 def _word(on: bool) -> str:

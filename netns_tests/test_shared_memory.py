@@ -1,0 +1,129 @@
+"""Shared memory of the benches' machines: used within one, and never between two."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "scripts" / "bench"))
+
+from devices import add_address
+from ros_environment import ros_environment
+from testbed import Lab
+
+from gdp.host.run_registry import RunRegistry
+from gdp.simulation.topology import chain
+from tests.proxy.endpoints.ros2_net import Peer, needs
+
+needs("std_msgs")
+
+pytestmark = pytest.mark.netns
+
+DOMAIN = 144
+IMAGE_BYTES = 900_000
+IMAGES = 20
+QUIET_S = 0.3  # shared memory takes less than a millisecond
+OCTETS = "sum(int(line.split()[1]) for line in open('/proc/net/dev').read().splitlines()[2:])"
+
+
+@pytest.fixture
+def lab() -> Iterator[Lab]:
+    """Machines s1 and s2 at the ends of a cable with IPv4."""
+    run = RunRegistry().start()
+    try:
+        made = Lab(run, chain(2), own_shared_memory=("s1", "s2"))
+        for node, device, address in (("s1", "s2", "10.97.0.1"), ("s2", "s1", "10.97.0.2")):
+            made.inside(node, partial(add_address, device, address))
+        yield made
+    finally:
+        run.end()
+
+
+def peer(lab: Lab, node: str, name: str) -> Peer:
+    """Start a node on a machine, whose Fast DDS has shared memory and UDP."""
+    made = Peer(name, lab.command(node, [], ros_environment(lab.directory, DOMAIN, shared_memory=True)), {})
+    made.tell("!from std_msgs.msg import String")
+    return made
+
+
+def test_nothing_crosses_between_machines_while_their_cable_is_cut(lab: Lab) -> None:
+    talker, listener = peer(lab, "s1", "talker"), peer(lab, "s2", "listener")
+    try:
+        listener.tell("!listen(String, '/news')")
+        talker.tell("!out = talk(String, '/news')")
+        talker.waits_for("out.get_subscription_count()", 1)
+        talker.tell("out.publish(String(data='before'))")
+        listener.waits_for("len(heard['/news'])", 1)
+        lab.namespaces.cut("s1", "s2")
+        talker.tell("out.publish(String(data='while cut'))")
+        time.sleep(QUIET_S)  # no event says that nothing arrives
+        assert listener.tell("len(heard['/news'])") == 1
+        lab.namespaces.restore_link("s1", "s2")
+        listener.waits_for("len(heard['/news'])", 2)
+    finally:
+        talker.end()
+        listener.end()
+
+
+def test_nodes_of_one_machine_exchange_large_messages_through_shared_memory(lab: Lab) -> None:
+    talker, listener = peer(lab, "s1", "talker"), peer(lab, "s1", "listener")
+    try:
+        listener.tell("!listen(String, '/images')")
+        talker.tell("!out = talk(String, '/images')")
+        talker.waits_for("out.get_subscription_count()", 1)
+        before = int(str(talker.tell(OCTETS)))
+        for number in range(1, IMAGES + 1):
+            talker.tell(f"out.publish(String(data='x' * {IMAGE_BYTES}))")
+            listener.waits_for("len(heard['/images'])", number)
+        assert int(str(talker.tell(OCTETS))) - before < IMAGE_BYTES  # discovery and acknowledgements
+    finally:
+        talker.end()
+        listener.end()
+
+
+def test_files_in_shared_memory_appear_on_their_machine_alone(lab: Lab) -> None:
+    write = "import pathlib; pathlib.Path('/dev/shm/gdp-test').touch()"
+    look = "import os; print('gdp-test' in os.listdir('/dev/shm'))"
+    subprocess.run(lab.command("s1", [sys.executable, "-c", write]), check=True)
+    found = [
+        subprocess.run(lab.command(node, [sys.executable, "-c", look]), check=True, capture_output=True, text=True)
+        for node in ("s1", "s2")
+    ]
+    assert [each.stdout.strip() for each in found] == ["True", "False"]
+    assert not Path("/dev/shm/gdp-test").exists()
+
+
+ORPHAN = """
+import sys, tempfile, signal
+from pathlib import Path
+sys.path.append(sys.argv[2])
+from testbed import Lab
+from gdp.host.run_registry import RunRegistry
+from gdp.simulation.topology import chain
+tempfile.tempdir = sys.argv[1]
+lab = Lab(RunRegistry(Path(sys.argv[1]) / "runs").start(), chain(1), own_shared_memory=("s1",))
+print(lab.directory, flush=True)
+signal.pause()
+"""
+
+
+def test_the_memory_of_a_killed_run_is_swept_by_the_next(tmp_path: Path) -> None:
+    bench = Path(__file__).resolve().parents[1] / "scripts" / "bench"
+    argv = [sys.executable, "-c", ORPHAN, str(tmp_path), str(bench)]
+    where = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True, env=where) as process:
+        assert process.stdout is not None
+        directory = process.stdout.readline().strip()
+        process.send_signal(signal.SIGKILL)
+    assert directory in Path("/proc/self/mounts").read_text(encoding="utf-8")
+    assert len(RunRegistry(tmp_path / "runs").sweep()) == 1
+    assert directory not in Path("/proc/self/mounts").read_text(encoding="utf-8")
+    assert not Path(directory).exists()

@@ -1,0 +1,269 @@
+"""Bytes that each reduction of a rule saves, and the CPU time of a message that it costs at both ends.
+
+Recordings and frames of ../shared/data are used where they are there, else synthetic messages, as the case says.
+
+.venv/bin/python scripts/bench/reduce.py
+.venv/bin/python scripts/bench/reduce.py --quick --no-save
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from peers.process import FailedError
+from plot import Panel, panel_of
+from report import Rounds, Target
+from rosbags.typesys import Stores, get_typestore
+from skeleton import Options, Outcome, command_line, run_bench
+
+from gdp.host.run_registry import RunRegistry
+from proxy.bridge.decoder import MessageDecoder
+from proxy.bridge.encoder import MessageEncoder, compressor_of, description_of
+from proxy.bridge.expander import MessageExpander
+from proxy.config.reduction import Compress, Region
+from proxy.config.rule import Rule
+from proxy.recordings.reader import BagReader
+from proxy.reduce.image import IMAGE
+from proxy.serial.channel import Channel
+from proxy.wire.message import RosMessage
+
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:
+    from backports import zstd
+
+try:
+    from PIL import Image
+except ImportError:  # the extra `images` is not installed
+    HAS_FRAMES = False
+else:
+    HAS_FRAMES = True
+
+DATA: Final = Path(__file__).resolve().parents[3] / "shared" / "data"
+PLAIN: Final = "as it is"
+MESSAGES: Final = 60  # of a case, the first ones
+MAX_BYTES: Final = 24 << 20
+LEVELS: Final = (1, 3, 9)
+QUALITIES: Final = (1, 10, 30, 50, 70, 80, 90, 95, 100)
+FOCAL_PIXELS: Final = 525.0  # of the camera of the recorded depth frames
+DEPTH_UNITS: Final = 5_000.0  # to the metre, of those frames
+STORE: Final = get_typestore(Stores.ROS2_JAZZY)
+CLOUD: Final = "sensor_msgs/msg/PointCloud2"
+
+Settings = Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """Messages of one topic as ROS wrote them, and the reductions that are tried on them."""
+
+    name: str
+    channel: Channel
+    messages: Sequence[bytes]
+    reductions: Mapping[str, Settings]
+
+
+def zstd_of(level: int, dictionary: bytes | None = None) -> Settings:
+    """Return the keys of a rule that compresses."""
+    return {"compress": Compress.model_construct(codec="zstd", level=level, dictionary=dictionary)}
+
+
+def described(type_name: str) -> Channel:
+    """Return the description of a standard type."""
+    definition, _ = STORE.generate_msgdef(type_name, ros_version=2)
+    return Channel("/a", type_name, 2, definition=definition, definition_format="msg")
+
+
+def image(encoding: str, pixels: npt.NDArray[Any]) -> bytes:
+    """Return the message of an image, [height, width] or [height, width, channels]."""
+    types, (height, width) = STORE.types, pixels.shape[:2]
+    stamp = types["builtin_interfaces/msg/Time"](sec=1, nanosec=2)
+    header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="camera")
+    data = np.ascontiguousarray(pixels).view(np.uint8).ravel()
+    fields = {"height": height, "width": width, "encoding": encoding, "step": data.size // height}
+    message = types[IMAGE](header=header, is_bigendian=0, data=data, **fields)
+    return bytes(STORE.serialize_cdr(message, IMAGE))
+
+
+def frames(pattern: str) -> list[npt.NDArray[Any]]:
+    """Return recorded frames; none where the data or the library to read them is missing."""
+    if not HAS_FRAMES:
+        return []
+    return [np.asarray(Image.open(path)) for path in sorted((DATA / "rgbd").glob(pattern))]
+
+
+def recorded(bag: str, topic_type: str) -> tuple[Channel, list[bytes]] | None:
+    """Return the first messages of a type; None where the recording is missing."""
+    path = DATA / "bags" / bag
+    if not path.exists():
+        return None
+    found: list[bytes] = []
+    channel: Channel | None = None
+    with BagReader(path) as reader:
+        for message in reader.messages():
+            each = reader.channels[message.channel]
+            if each.type_name == topic_type and (channel is None or each == channel):
+                channel = each
+                found.append(message.raw)
+                if len(found) >= 10 * MESSAGES:
+                    break
+    return None if channel is None else (channel, found)
+
+
+def smooth(generator: np.random.Generator) -> npt.NDArray[np.float64]:
+    """Return a synthetic picture, [480, 640] of 0 to 255: slow waves and little noise."""
+    rows, columns = np.mgrid[0:480, 0:640]
+    waves = 128 + 60 * np.sin(rows / 37) + 50 * np.cos(columns / 53)
+    return np.asarray(np.clip(waves + generator.normal(0, 3, waves.shape), 0, 255))
+
+
+def cases() -> list[Case]:
+    """Return all cases with their messages."""
+    generator = np.random.default_rng(1)
+    colours, depths = frames("color_*.png"), frames("depth_*.pgm")
+    origin = "recorded" if colours else "synthetic"
+    bgr = [each[:, :, 2::-1] for each in colours] or [np.stack([smooth(generator)] * 3, -1).astype(np.uint8)]
+    grey = [each.mean(axis=-1).astype(np.uint8) for each in bgr]
+    depth = [each.astype(np.uint16) for each in depths] or [(20 * smooth(generator)).astype(np.uint16)]
+    compressed = {f"zstd {level}": zstd_of(level) for level in LEVELS}
+    jpegs: dict[str, Settings] = {f"jpeg {each}": {"image": "jpeg", "quality": each} for each in QUALITIES}
+    png: dict[str, Settings] = {"png": {"image": "png"}}
+    channel = described(IMAGE)
+    found = [
+        Case(f"image bgr8 640x480, {origin}", channel, [image("bgr8", each) for each in bgr], jpegs | png | compressed),
+        Case(
+            f"image mono8 640x480, {origin}", channel, [image("mono8", one) for one in grey], jpegs | png | compressed
+        ),
+        Case(f"image 16UC1 640x480, {origin}", channel, [image("16UC1", each) for each in depth], png | compressed),
+    ]
+    half: dict[str, Settings] = {"region, half of the width": {"region": Region(x=(0, 320))}}
+    found[0] = Case(found[0].name, channel, found[0].messages, {**found[0].reductions, **half})
+    found.append(_points(depth, origin))
+    optional = [
+        _of_bag("tilt_laser.bag", "sensor_msgs/msg/LaserScan", "scan of 1,078 beams"),
+        _of_bag("ros_numpy_test.bag", "nav_msgs/msg/OccupancyGrid", "map"),
+        _short("tilt_laser.bag", "sensor_msgs/msg/Imu"),
+        _short("rosbag2_test", "geometry_msgs/msg/PoseStamped"),
+    ]
+    return [*found, *(each for each in optional if each is not None)]
+
+
+def cloud(points: npt.NDArray[np.float32]) -> bytes:
+    """Return the message of a point cloud, float32 [points, 4]: x, y, z, intensity."""
+    types, count = STORE.types, len(points)
+    stamp = types["builtin_interfaces/msg/Time"](sec=1, nanosec=2)
+    header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="camera")
+    field = types["sensor_msgs/msg/PointField"]
+    named = [field(name=name, offset=4 * at, datatype=7, count=1) for at, name in enumerate(("x", "y", "z", "i"))]
+    data = np.ascontiguousarray(points, np.float32).view(np.uint8).ravel()
+    sizes = {"height": 1, "width": count, "point_step": 16, "row_step": 16 * count}
+    message = types[CLOUD](header=header, fields=named, is_bigendian=False, data=data, is_dense=True, **sizes)
+    return bytes(STORE.serialize_cdr(message, CLOUD))
+
+
+def _points(depths: Sequence[npt.NDArray[np.uint16]], origin: str) -> Case:
+    """Return clouds of every second row and column of depth frames, in metres."""
+    messages = list[bytes]()
+    for depth in depths:
+        rows, columns = np.mgrid[0 : depth.shape[0] : 2, 0 : depth.shape[1] : 2]
+        z = depth[::2, ::2] / DEPTH_UNITS
+        x, y = (columns - 319.5) * z / FOCAL_PIXELS, (rows - 239.5) * z / FOCAL_PIXELS
+        points = np.stack([x, y, z, rows + columns], -1).reshape(-1, 4)
+        messages.append(cloud(points[points[:, 2] > 0].astype(np.float32)))
+    thinned: dict[str, Settings] = {f"voxel_m {edge:g}": {"voxel_m": edge} for edge in (0.02, 0.05, 0.1)}
+    both: dict[str, Settings] = {"voxel_m 0.05, zstd 3": {"voxel_m": 0.05, **zstd_of(3)}}
+    half: dict[str, Settings] = {"region, half of the width": {"region": Region(x=(0, 100))}}
+    compressed = {f"zstd {level}": zstd_of(level) for level in LEVELS}
+    name = f"point cloud of depth 320x240, {origin}"
+    return Case(name, described(CLOUD), messages, thinned | half | compressed | both)
+
+
+def _of_bag(bag: str, type_name: str, what: str) -> Case | None:
+    found = recorded(bag, type_name)
+    if found is None:
+        return None
+    return Case(f"{what}, recorded", *found, {f"zstd {level}": zstd_of(level) for level in LEVELS})
+
+
+def _short(bag: str, type_name: str) -> Case | None:
+    found = recorded(bag, type_name)
+    if found is None:
+        return None
+    channel, messages = found
+    half = len(messages) // 2
+    dictionary: bytes = zstd.train_dict(messages[:half], 4_096).dict_content
+    reductions = {"zstd 3": zstd_of(3), "zstd 3, dictionary of 4 KiB": zstd_of(3, dictionary)}
+    return Case(f"{type_name}, recorded", channel, messages[half:], reductions)
+
+
+def measure_one(case: Case, settings: Settings, passes: int) -> dict[str, float]:
+    """Return median bytes of a message and the median CPU time at each end, in ms.
+
+    Raises:
+        FailedError: a message of a lossless reduction changed.
+    """
+    rule = Rule.model_construct(encoding="cdr", **settings)
+    messages = case.messages[:MESSAGES]
+    encoder = MessageEncoder(case.channel, rule, compressor_of(rule))
+    description = description_of(rule, (case.channel,))
+    expander = MessageExpander(description, case.channel, MAX_BYTES)
+    decoder = MessageDecoder(case.channel, "cdr", case.channel, None)
+    quality = rule.quality
+    is_lossless = not {"voxel_m", "region", "quality"} & settings.keys()
+    sizes, sending, receiving = list[int](), list[float](), list[float]()
+    for _ in range(max(passes * MESSAGES // len(messages), 1)):
+        for raw in messages:
+            begin = time.thread_time_ns()
+            body, steps = encoder.encode(raw, quality)
+            wire = RosMessage(0, 0, body, steps).to_wire()
+            middle = time.thread_time_ns()
+            received = decoder.decode(*expander.expand(RosMessage.from_wire(wire)))
+            end = time.thread_time_ns()
+            sizes.append(len(wire))
+            sending.append((middle - begin) / 1e6)
+            receiving.append((end - middle) / 1e6)
+            if is_lossless and received != raw:
+                raise FailedError(f"{case.name}: a message changed")
+    return {
+        "bytes": statistics.median(sizes),
+        "sending, ms": statistics.median(sending),
+        "receiving, ms": statistics.median(receiving),
+    }
+
+
+def measure(options: Options, runs: RunRegistry) -> Outcome:
+    """Measure every reduction on every case, round by round."""
+    del runs
+    over = Rounds()
+    every = cases()
+    for _ in range(options.rounds):
+        for case in every:
+            for name, settings in {PLAIN: {}, **case.reductions}.items():
+                for column, value in measure_one(case, settings, options.passes).items():
+                    over.add(name, case.name, column, value)
+    targets: list[Target] = []
+    for case in every:
+        for name in case.reductions:
+            what = f"{case.name}: {name} / {PLAIN}, bytes"
+            targets.append(over.ratio(what, name, PLAIN, case.name, "bytes", None))
+    settings = {"rounds": options.rounds, "messages of a figure": options.passes * MESSAGES}
+    title = "Bytes and CPU time of reduced messages"
+    return Outcome("reduce", title, over, targets, settings, lambda: _panels(over, every))
+
+
+def _panels(over: Rounds, every: Sequence[Case]) -> list[Panel]:
+    return [panel_of(over, case.name, "bytes", [PLAIN, *case.reductions]) for case in (*every[:1], *every[3:5])]
+
+
+if __name__ == "__main__":
+    parser = command_line(__doc__, rounds=3, quick={"rounds": 1, "passes": 1}, has_record=True, has_plot=True)
+    parser.add_argument("--passes", type=int, default=2, help="messages of a figure, in 60 (default: %(default)s)")
+    run_bench(parser, measure)

@@ -1,0 +1,36 @@
+"""The bench of reductions: its synthetic messages come back, and what it reports is measured."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from reduce import CLOUD, Case, cloud, described, image, measure_one, smooth, zstd_of
+
+from proxy.config.reduction import Region
+from proxy.reduce.image import IMAGE
+from proxy.reduce.picture import HAS_LIBRARY
+
+PICTURE = smooth(np.random.default_rng(1)).astype(np.uint8)
+
+
+def test_a_synthetic_map_shrinks_and_comes_back() -> None:
+    case = Case("image", described(IMAGE), [image("mono8", np.zeros((48, 64), np.uint8))], {})
+    found = measure_one(case, zstd_of(3), 0)
+    assert found["bytes"] < 200
+    assert found["sending, ms"] > 0
+
+
+@pytest.mark.skipif(not HAS_LIBRARY, reason="Pillow is not installed")
+def test_a_synthetic_picture_is_smaller_as_a_jpeg_than_as_a_png() -> None:
+    case = Case("image", described(IMAGE), [image("mono8", PICTURE)], {})
+    sizes = [
+        measure_one(case, settings, 0)["bytes"] for settings in ({"image": "jpeg", "quality": 50}, {"image": "png"})
+    ]
+    assert sizes[0] < sizes[1] < PICTURE.size
+
+
+def test_half_of_a_cloud_is_half_of_its_bytes() -> None:
+    points = np.random.default_rng(1).uniform(-1, 1, (1_000, 4)).astype(np.float32)
+    case = Case("cloud", described(CLOUD), [cloud(points)], {})
+    found = measure_one(case, {"region": Region(x=(0, 2))}, 0)
+    assert found["bytes"] < 0.6 * len(cloud(points))
