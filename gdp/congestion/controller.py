@@ -10,6 +10,8 @@ What differs from Copa:
   noise of a clock. The root keeps equal flows equal.
 - Next to a flow that fills the queue the window follows CUBIC itself, from half of the path on, and grows back to that
   half after a loss. An AIMD of a frame each round trip, as in Copa, would need minutes behind a queue of a second.
+- A flow that had the path for itself for ``_ALONE_S`` keeps that half for ``_CLAIM_S``, whatever is lost. Else the slow
+  start of the other one takes nearly all of a long queue, and CUBIC needs a minute to win it back.
 - The window only grows while it is used, so a camera that pauses keeps a window that was measured.
 - Reports confirm many frames at once. What has arrived and is not reported yet does not count against the window, as
   BBR does with what was acknowledged in excess (section 4.6.4.2).
@@ -62,6 +64,7 @@ _STANDING_S: Final = 0.005  # a shorter queue is no competitor
 _EMPTY_SHARE: Final = 0.1  # of the highest queue; Copa, section 2.2
 _PROBE_S: Final = (10.0, 60.0)  # first pause before a probe, and the longest one
 _PROBE_SHARE: Final = 0.5
+_CLAIM_S, _ALONE_S = 10.0, 2.0
 
 
 class PathController:
@@ -111,6 +114,7 @@ class PathController:
         self._probe_from_s = 0.0
         self._cubic: Cubic | None = None
         self._lost_until_s = 0.0
+        self._claims_until_s = 0.0
         self._probe_pause_s = _PROBE_S[0]
         self._probe_at_s = self._probe_begun_s = 0.0
 
@@ -320,6 +324,8 @@ class PathController:
         elif self.state is State.COMPETITIVE and self._cubic is not None:
             if may_grow:
                 self._cubic.acknowledged(size / self._mtu, now_s, self._srtt_s or _FIRST_RTT_S)
+            if now_s < self._claims_until_s:
+                self._cubic.raise_to(self._half_window() / self._mtu)
             self.window = self._cubic.window * self._mtu
             if now_s >= self._probe_at_s:
                 self._signal(Signal.PROBE_DUE, now_s)
@@ -426,6 +432,7 @@ class PathController:
         product = self.bytes_s * self._empty_path_s
         least = float(_LEAST_FRAMES * self._mtu)
         self._velocity, self._same, self._direction = 1.0, 0, 0
+        alone_s = self._empty_s - self._entered_s  # of the state before
         self._empty_s = self._entered_s = now_s  # losses before this moment are of another window
         if self.state is State.DELAY:
             self._cubic = None
@@ -437,6 +444,7 @@ class PathController:
         elif self.state is State.COMPETITIVE:
             if self._cubic is None:
                 self._capacity = self._peaks.value(0.0)
+                self._claims_until_s = now_s + _CLAIM_S if alone_s >= _ALONE_S else 0.0
                 self._cubic = Cubic(max(self.window, self._half_window()) / self._mtu, now_s)
             else:
                 self._cubic.resume(now_s - self._probe_begun_s)

@@ -58,6 +58,10 @@ class Cubic:
         peak = self.window * (1 + self._beta) / 2 if self.window < self._max else self.window  # fast convergence
         self._begin(max(self.window * self._beta, least), max(peak, peak_least), now_s)
 
+    def raise_to(self, least: float) -> None:
+        """Raise the window to so many frames at least."""
+        self.window = max(self.window, least)
+
     def resume(self, pause_s: float) -> None:
         """Continue after a time that does not count."""
         self._epoch_s += pause_s

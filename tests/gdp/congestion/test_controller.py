@@ -145,6 +145,28 @@ def test_next_to_a_cubic_flow_each_has_35_to_65_percent(fifo_s: float) -> None:
     assert 0.35 <= cubic.share(15, 75, link.bits_s) <= 0.65
 
 
+@pytest.mark.parametrize(("fifo_s", "least"), [(RTT_S, 0.4), (SECOND, 0.25)])
+def test_half_of_a_path_that_was_measured_alone_is_kept_next_to_a_slow_start(fifo_s: float, least: float) -> None:
+    link, flow, cubic = path(10, fifo_s=fifo_s), own(), Flow(CubicSender(), start_s=5)
+    link.add(flow)
+    link.add(cubic)
+    link.run(25)
+    assert flow.share(8, 18, link.bits_s) >= least
+    assert cubic.share(8, 18, link.bits_s) >= 0.35
+
+
+@pytest.mark.parametrize("fifo_s", [RTT_S, SECOND])
+def test_a_later_rate_that_is_lower_is_no_other_flow(fifo_s: float) -> None:
+    link, flow = path(20, fifo_s=fifo_s), own()
+    link.add(flow)
+    rates_s = (5e6, 12e6, 3e6, 20e6, 2e6, 8e6)
+    for at, bits_s in enumerate(rates_s):
+        link.at(5 + 3 * at, lambda bits_s=bits_s: link.set_rate(bits_s))
+    link.run(30)
+    assert link.queue_quantile(5, 0.5) <= 0.015
+    assert link.queue_quantile(5, 0.9) <= 0.2  # what was under way at each change has to leave
+
+
 @pytest.mark.parametrize("fifo_s", [RTT_S, SECOND])
 def test_the_queue_is_short_again_within_ten_seconds_after_a_cubic_flow_has_ended(fifo_s: float) -> None:
     link, flow = path(10, fifo_s=fifo_s), own()
