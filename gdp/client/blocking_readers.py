@@ -51,7 +51,7 @@ class BlockingReaders:
             block.checked_s = now_s
 
     def slow(self, sent_bytes: int, now_s: float) -> list[bytes]:
-        """Return the readers that must no longer block the others; all are measured anew after the lag."""
+        """Return the readers that must no longer block the others; all are measured again after the lag."""
         slow = []
         for name, block in list(self._blocks.items()):
             if now_s - block.since_s < self._lag_s:

@@ -216,7 +216,7 @@ class Publications:
         self._reader_paths.frames_leave(now_s)
 
     def attachment_changed(self, now_s: float) -> None:
-        """Measure all paths anew: frames leave by another switch."""
+        """Measure all paths again: frames leave by another switch."""
         self._reader_paths.attachment_changed(now_s)
         self.turns.resume()
 

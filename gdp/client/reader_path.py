@@ -47,18 +47,18 @@ class ReaderPath:
     def allowance(self, now_s: float, *, urgent: bool = False) -> int:
         """Return how many bytes may leave now; 0: none."""
         controller, mtu = self.controller, self._mtu
-        room = int(controller.limit) - controller.inflight
+        free = int(controller.limit) - controller.inflight
         if urgent:
             extra = max((_URGENT_SHARE - 1) * controller.window, _URGENT_FRAMES * mtu)
-            return max(room + int(extra), 0)
-        next_s = controller.next_send_s(min(room, mtu) if room > 0 else mtu)
+            return max(free + int(extra), 0)
+        next_s = controller.next_send_s(min(free, mtu) if free > 0 else mtu)
         if next_s is None or next_s > now_s + BURST_S:
             return 0
-        room = max(room, mtu)  # an empty path carries a frame, whatever its window
+        free = max(free, mtu)  # an empty path carries a frame, whatever its window
         pace = controller.pacing_bytes_s
         if pace >= _UNLIMITED:
-            return room
-        return min(room, int((now_s + BURST_S - max(next_s, now_s - BURST_S)) * pace) + mtu)
+            return free
+        return min(free, int((now_s + BURST_S - max(next_s, now_s - BURST_S)) * pace) + mtu)
 
     def next_send_s(self) -> float:
         """Return when the next frame may leave; infinity: not before something is confirmed."""

@@ -249,7 +249,7 @@ class Session(BaseSession[Driver]):
             paths: 2: each frame travels over two disjoint paths. ``spread``: large messages are striped over them. The
                 readers subscribe with either as well.
             deadline_s: without ``reliable``: a message that cannot leave whole within this time is dropped, above 0 and
-                at most 3600. None: a message that has waited for 0.1 s gives way to a newer one.
+                at most 3600. None: a message that has waited for 50 ms gives way to a newer one.
             weight: share of a full path, next to other names of the same priority, 1 to 100.
             max_bits_s: most bits of frames a second, 1e3 to 1e12. None: what the path carries.
             repairs: without ``reliable``: lost parts of a message are sent again while that can be in time.

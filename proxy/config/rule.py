@@ -195,7 +195,7 @@ class Rule(Section):
         le=1_000 * DEADLINE_MAX_S,
         description="Topics without `reliable`, under `expose`: a message that cannot leave whole within this time is"
         " dropped whole and counted. `null`: as the publisher's QoS says (lifespan, else deadline); without both, a"
-        " message that has waited for 0.1 s gives way to a newer one.",
+        " message that has waited for 50 ms gives way to a newer one.",
     )
     repair: Literal["never", "in-time"] = Field(
         default="in-time",

@@ -176,7 +176,7 @@ def test_frames_too_large_for_a_link_that_shrank_under_them_are_counted() -> Non
     parts = -(-(20_000 + 64) // (USUAL - 96 - 16))
     assert 0 < too_big(flow) < parts  # the first window, whose last fragment may be a small one
     assert flow.numbers(SERVER) == []
-    network.run(1)  # the publisher measures the path anew after what was lost
+    network.run(1)  # the publisher measures the path again after what was lost
     flow.outlive()
 
 

@@ -60,11 +60,11 @@ def lose(pipe: Pipe, end: End, *losses: tuple[int, int]) -> None:
     """Let these (message number, fragment) be lost once each, on their way to the reader."""
     left, receive = set(losses), end.writer_proxy.receive
 
-    def filtered(header: Header, frame: bytes, now_s: float) -> None:
+    def filtered(header: Header, frame: bytes, now_s: float, waited_s: float = 0.0) -> None:
         if header.kind == Kind.DATA and (header.number, header.part) in left:
             left.discard((header.number, header.part))
         else:
-            receive(header, frame, now_s)
+            receive(header, frame, now_s, waited_s)
 
     end.writer_proxy.receive = filtered  # type: ignore[method-assign]
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 
 from gdp.congestion.controller import PathController
@@ -161,7 +163,7 @@ def test_a_later_rate_that_is_lower_is_no_other_flow(fifo_s: float) -> None:
     link.add(flow)
     rates_s = (5e6, 12e6, 3e6, 20e6, 2e6, 8e6)
     for at, bits_s in enumerate(rates_s):
-        link.at(5 + 3 * at, lambda bits_s=bits_s: link.set_rate(bits_s))
+        link.at(5 + 3 * at, partial(link.set_rate, bits_s))
     link.run(30)
     assert link.queue_quantile(5, 0.5) <= 0.015
     assert link.queue_quantile(5, 0.9) <= 0.2  # what was under way at each change has to leave
