@@ -61,6 +61,7 @@ class SendWindow:
         self._best_effort_queue = deque[tuple[int, int]]()  # (number, first fragment not sent), oldest first
         self._newest = first_number - 1
         self._sent_at = 0
+        self._sent_before = 0  # messages before this one were sent, if under an old number
         self.evicted = 0
 
     @property
@@ -157,6 +158,7 @@ class SendWindow:
         Args:
             frames: number, frames and their size; as in ``add``.
         """
+        self._sent_before = move.new_number(max(self._sent_before, self.sent[0]))
         for number in list(self._cache.messages):
             self._release(number)
         self._repairs.clear()
@@ -166,9 +168,7 @@ class SendWindow:
         positions = self._readers.all()
         for position in positions:
             position.next_number = move.new_number(position.next_number)
-        least = self._readers.least_active() if self._readers.active else 0
-        while self._best_effort_queue and self._best_effort_queue[0][0] < least:
-            self._sent_at = self._cache.messages[self._best_effort_queue.popleft()[0]].end_at
+        self._skip_received()
         for position in positions:
             position.acked_at = position.mark_at = self._sent_at
         self._release_acknowledged()
@@ -215,6 +215,7 @@ class SendWindow:
             self.resume(reader, now_s)
         state = self._readers.active[reader]
         state.next_number = max(state.next_number, report.next_number)
+        self._skip_received()
         before = self._acked_at()
         self._readers.acknowledge(state, min(position, self._sent_at), now_s)
         acked_at = self._acked_at()
@@ -274,6 +275,14 @@ class SendWindow:
             else:
                 self._best_effort_queue.popleft()
         return frames
+
+    def _skip_received(self) -> None:
+        """Do not send again, under its new number, what every active reader has received under its old one."""
+        least = min(self._readers.least_active(), self._sent_before) if self._readers.active else 0
+        while self._best_effort_queue and self._best_effort_queue[0][0] < least:
+            self._sent_at = self._cache.messages[self._best_effort_queue.popleft()[0]].end_at
+            for reader in self._readers.active.values():
+                reader.acked_at = max(reader.acked_at, self._sent_at)
 
     def _budget_now(self) -> int:
         """Return how many bytes may be cached: fewer if the oldest message is cached for suspended readers alone."""

@@ -13,6 +13,7 @@ from gdp.limits import (
     REPAIRS_MAX_BYTES,
 )
 from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
+from gdp.message.renumbering import Renumbering
 from gdp.message.send_window import SendWindow
 
 A, B = b"a" * 32, b"b" * 32
@@ -145,6 +146,21 @@ def test_a_reader_that_reports_unsent_messages_does_not_make_them_unsent() -> No
     window.handle_acknack(A, has((1 << 64) - 1), 0.1)
     sent += window.frames_to_send(0.1)
     assert sent == [frame for number in range(1, 6) for frame in message(number, 100)]
+
+
+def test_what_every_reader_received_under_an_old_number_is_not_sent_again() -> None:
+    window = window_of(4, 100, (A, B))
+    window.frames_to_send(0.0, 300)
+    window.renumber(Renumbering(1, 4, 6), [(n, message(n, 200), 200 * PART) for n in range(6, 10)])
+    window.frames_to_send(0.1, 50)
+    window.handle_acknack(A, has((1 << 64) - 1), 0.2)
+    assert window.sent == (6, 50)
+    window.handle_acknack(B, has(8), 0.2)
+    assert window.sent == (8, 0)
+    assert window.acknowledged == 7
+    window.handle_acknack(B, has((1 << 64) - 1), 0.3)
+    assert window.sent == (9, 0)  # it was never sent: no reader has it
+    assert window.frames_to_send(0.3) == message(9, 200)
 
 
 def test_the_slowest_reader_holds_the_window() -> None:
