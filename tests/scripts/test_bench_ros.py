@@ -44,7 +44,8 @@ def test_the_proxies_carry_all_that_nodes_of_the_overlay_use(options: Options) -
     carried = [{each.name for each in bench.carried} for bench in benches(options)]
     used = [
         {topic for kind, each in ros.ENCODINGS.items() for encoding in each for topic in ros.topics_of(kind, encoding)},
-        {services.service_of(encoding) for each in services.ENCODINGS.values() for encoding in each},
+        {services.service_of(encoding) for each in services.ENCODINGS.values() for encoding in each}
+        | {services.service_of("cdr", services.SESSION)},
         {
             fogros.prefix_of(task, encoding) + part.topic
             for task in TASKS
