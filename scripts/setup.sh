@@ -102,6 +102,8 @@ if [[ "$extras" == "$dev" ]]; then
     command -v softhsm2-util >/dev/null || package softhsm2 "tests keep keys in its tokens"
     command -v wireguard-go >/dev/null || package wireguard-go "tests make tunnels with it; no kernel module is needed"
     command -v nft >/dev/null || [[ -x /usr/sbin/nft ]] || package nftables "tests of NAT make it with nft"
+    command -v conntrack >/dev/null || [[ -x /usr/sbin/conntrack ]] || package conntrack "tests let a NAT forget with it"
+    command -v wg >/dev/null || package wireguard-tools "the bench of uplinks starts a peer with it"
     command -v mmdebstrap >/dev/null || package mmdebstrap "tests boot a cloud machine from a minimal Debian"
     command -v openssl >/dev/null || package openssl "tests read our certificates with it"
 fi
