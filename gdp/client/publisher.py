@@ -121,7 +121,7 @@ class Publisher:
         self._acknowledgements = AckNackHandler(
             readers=self._readers, queue=self._queue, window=self._window, heartbeats=self._heartbeats
         )
-        self.redundancy = Redundancy(budget=source.copies, is_enabled=urgent and options.fec)
+        self.redundancy = Redundancy(budget=source.copies, path=self, is_enabled=urgent and options.fec)
         self._queue.depth = depth
         self._set_flags()
 
@@ -308,6 +308,11 @@ class Publisher:
         return min(shares, default=None)
 
     @property
+    def capacity_bytes_s(self) -> float | None:
+        """Return how many bytes a second the narrowest path carries; None: not measured."""
+        return min((rate for path in self._paths() if (rate := path.controller.capacity_bytes_s)), default=None)
+
+    @property
     def path_loss(self) -> float:
         """Return the share of frames that were lost lately on the worst path, 0 to 1."""
         return max((path.controller.loss for path in self._paths()), default=0.0)
@@ -465,7 +470,11 @@ class Publisher:
         if frames:
             self._acknowledgements.last_sent_s = now_s
         self.redundancy.handle_sent(frames[heartbeats:], self._readers, now_s, has_pair=has_pair)
-        frames += self.redundancy.poll_copies(now_s)
+        copies = self.redundancy.poll_copies(now_s)
+        if copies:
+            for path in self._paths():
+                path.controller.charge(sum(map(len, copies)), now_s)
+        frames += copies
         if not has_pair:
             return frames
         if self._striper is None:

@@ -35,18 +35,14 @@ _PARTS: Final = slice(PARTS_AT, PARTS_AT + 4)
 
 
 class PathQuality(Protocol):
-    """What is measured of the path to the readers, such as a congestion controller's figures."""
+    """What is measured of the path to the readers."""
 
     @property
-    def loss(self) -> float | None:
-        """Return the share of frames lost lately, 0 to 1; None: unknown."""
+    def path_loss(self) -> float:
+        """Return the share of frames lost lately, 0 to 1; 0 also if nothing is measured."""
 
     @property
-    def rtt_s(self) -> float | None:
-        """Return the round-trip time; None: unknown."""
-
-    @property
-    def bytes_s(self) -> float | None:
+    def capacity_bytes_s(self) -> float | None:
         """Return how many bytes a second the path carries; None: unknown."""
 
 
@@ -78,24 +74,24 @@ class Redundancy:
 
     Args:
         budget: of all publishers of the participant.
+        path: what is measured of the path, and not by the reports of the readers.
 
     Attributes:
         is_enabled: the frames are urgent, and their rule allows copies.
-        path: what another measures of the path; None: the reports of the readers alone count.
         copies: frames that were sent again against loss.
     """
 
-    def __init__(self, *, budget: CopyBudget, is_enabled: bool) -> None:
+    def __init__(self, *, budget: CopyBudget, path: PathQuality, is_enabled: bool) -> None:
         self._budget = budget
+        self._path = path
         self.is_enabled = is_enabled
         self._reported = FrameLoss()
         self._waiting = tuple(deque[tuple[float, bytes]]() for _ in _OFFSETS_S)
-        self.path: PathQuality | None = None
         self.copies = 0
 
     def loss(self, readers: Readers, now_s: float) -> float | None:
         """Return the share of frames lost on the way to ``readers``, 0 to 1; None: unknown."""
-        measured = self._reported.loss(readers, now_s), None if self.path is None else self.path.loss
+        measured = self._reported.loss(readers, now_s), self._path.path_loss or None
         return max((each for each in measured if each is not None), default=None)
 
     def handle_sent(self, frames: Sequence[bytes], readers: Readers, now_s: float, *, has_pair: bool = False) -> None:
@@ -105,7 +101,7 @@ class Redundancy:
         self._reported.handle_sent(int.from_bytes(frame[_NUMBER], "big") for frame in frames)
         sends = sends_for(self.loss(readers, now_s))
         extra = (sends - 1) // 2 if has_pair else sends - 1
-        rate = None if self.path is None else self.path.bytes_s
+        rate = self._path.capacity_bytes_s
         for waiting, offset_s in zip(self._waiting[:extra], _OFFSETS_S, strict=False):
             for frame in frames:
                 if int.from_bytes(frame[_PARTS], "big") > REPEATED_PARTS_MAX:

@@ -110,6 +110,7 @@ class PathController:
         self._last_rate = self._capacity = 0.0
         self._recent = WindowedExtreme(is_lowest=False)
         self._peaks = WindowedExtreme(is_lowest=False)
+        self._capacities = WindowedExtreme(is_lowest=False)
         self._full_rounds = 0
         self._probe_from_s = 0.0
         self._cubic: Cubic | None = None
@@ -122,6 +123,11 @@ class PathController:
     def bytes_s(self) -> float:
         """Return the highest delivery rate of the last rounds; 0 before the first one."""
         return self._rates.value(0.0)
+
+    @property
+    def capacity_bytes_s(self) -> float | None:
+        """Return the highest rate of the last minute while more waited to be sent; None: nothing waited yet."""
+        return self._capacities.value(0.0) or None
 
     @property
     def base_rtt_s(self) -> float:
@@ -226,6 +232,8 @@ class PathController:
             self._peaks.add(now_s, sample.bytes_s, now_s - _CAPACITY_WINDOW_S)
             self._recent.add(self._round, sample.bytes_s, self._round - _RECENT_ROUNDS)
             self._last_rate = sample.bytes_s
+            if not sample.is_app_limited and 2 * newest.inflight >= self.window:
+                self._capacities.add(now_s, sample.bytes_s, now_s - _CAPACITY_WINDOW_S)
         self._note_queue(now_s)
         self._adapt(size, newest, now_s)
         if lost:

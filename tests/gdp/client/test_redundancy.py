@@ -18,9 +18,8 @@ NAME = b"n" * 32
 class Measured:
     """Figures of a path."""
 
-    loss: float | None = None
-    rtt_s: float | None = None
-    bytes_s: float | None = None
+    path_loss: float
+    capacity_bytes_s: float | None
 
 
 def frame(number: int, parts: int = 1, size: int = 200) -> bytes:
@@ -30,9 +29,8 @@ def frame(number: int, parts: int = 1, size: int = 200) -> bytes:
 
 def redundancy(loss: float | None = None, bytes_s: float | None = None, *, is_enabled: bool = True) -> Redundancy:
     """Return the redundancy of one publisher with a budget of its own."""
-    made = Redundancy(budget=CopyBudget(), is_enabled=is_enabled)
-    made.path = Measured(loss=loss, bytes_s=bytes_s)
-    return made
+    path = Measured(loss or 0.0, bytes_s)
+    return Redundancy(budget=CopyBudget(), path=path, is_enabled=is_enabled)
 
 
 @pytest.mark.parametrize(
@@ -84,7 +82,7 @@ def test_copies_take_a_twentieth_of_the_path(path: float | None, share: float) -
 
 def test_topics_share_one_budget() -> None:
     budget = CopyBudget()
-    topics = [Redundancy(budget=budget, is_enabled=True) for _ in range(10)]
+    topics = [Redundancy(budget=budget, path=Measured(0.0, None), is_enabled=True) for _ in range(10)]
     size = 0
     for step in range(10_000):
         for each in topics:

@@ -79,6 +79,17 @@ def test_a_flow_that_offers_little_gets_all_of_it_and_keeps_the_queue_empty() ->
     assert link.queue_quantile(3, 0.99) <= 0.005
 
 
+def test_the_capacity_is_known_once_more_waited_than_the_path_carries() -> None:
+    link, flow = path(10, fifo_s=SECOND), own(offered_bytes_s=312_500)
+    link.add(flow)
+    assert isinstance(flow.sender, PathController)
+    link.run(10)
+    assert flow.sender.capacity_bytes_s is None
+    link.at(10, lambda: setattr(flow, "offered_bytes_s", float("inf")))
+    link.run(20)
+    assert flow.sender.capacity_bytes_s == pytest.approx(1.25e6, rel=0.1)
+
+
 def test_a_pause_does_not_inflate_the_window() -> None:
     link, flow = path(10, fifo_s=SECOND), own()
     link.add(flow)
