@@ -29,6 +29,7 @@ needs_wireguard = pytest.mark.skipif(
         ["library.py", "--rounds", "1", "--count", "5"],
         ["thread_offload.py", "--rounds", "1", "--count", "5"],
         ["packet_rings.py", "--rounds", "1", "--count", "128"],
+        ["segments.py", "--rounds", "1", "--count", "1"],
         ["priority.py", "--quick", "--no-save"],
         ["bundles.py", "--quick", "--no-save"],
         pytest.param(["tunnel.py", "--quick", "--no-save", "--only", "kernel"], marks=needs_wireguard),
