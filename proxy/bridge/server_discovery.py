@@ -75,26 +75,24 @@ class ServerDiscovery:
         heard = {
             writer_proxy.publisher: writer_proxy for writer_proxy in writer_proxies if writer_proxy.publisher in peers
         }
+        for name, writer_proxy in heard.items():  # first, so that calls of a server that goes now find them
+            if name not in self.servers:
+                self._add(name, writer_proxy.incarnation, writer_proxy.description, now_s)
         for name, server in list(self.servers.items()):
             writer_proxy = heard.get(name)
-            if writer_proxy is not None and (writer_proxy.incarnation, writer_proxy.description) == (
-                server.incarnation,
-                server.description,
-            ):
+            if writer_proxy is None:
+                self._remove(name, now_s)
                 continue
-            same = (
-                server.described_again(writer_proxy.description)
-                if writer_proxy and writer_proxy.incarnation == server.incarnation
-                else None
-            )
+            incarnation, description = writer_proxy.incarnation, writer_proxy.description
+            if (incarnation, description) == (server.incarnation, server.description):
+                continue
+            same = server.described_again(description) if incarnation == server.incarnation else None
             if same is not None:
                 self.servers[name] = same
                 self._announce(name, same, now_s)
             else:
                 self._remove(name, now_s)
-        for name, writer_proxy in heard.items():
-            if name not in self.servers:
-                self._add(name, writer_proxy.incarnation, writer_proxy.description, now_s)
+                self._add(name, incarnation, description, now_s)
         if not self.servers and self._is_open:
             self._is_open = False
             self._closed(_SERVER_GONE)

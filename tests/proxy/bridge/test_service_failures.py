@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from gdp.limits import READER_LEASE_S
+from gdp.names import Name
 from tests.proxy.bridge import known
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, switch, switched
@@ -206,6 +207,25 @@ def test_one_of_two_servers_that_dies_does_not_fail_the_call(sites: Sites) -> No
     sites.run(READER_LEASE_S + 2)
     assert caller.outcomes == []
     assert caller.sees_server()
+    second.waiting[0][1](switched("yes"))
+    assert sites.run(1, lambda: caller.outcomes == [switched("yes")])
+
+
+def test_a_call_goes_to_a_server_that_returns_in_the_moment_in_which_the_last_one_goes(
+    sites: Sites, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, client, local, caller = pair(sites, ", timeout_s: 60")
+    other = sites.add(OTHER, expose=[SWITCH])
+    second = LocalServer(other.graph)
+    sites.run(3)
+    caller.call(switch(on=True))
+    assert sites.run(1, lambda: local.asked == second.asked == 1)
+    connected = list[Name]()
+    monkeypatch.setattr(client.member, "peers", lambda _: connected)
+    for label in (SERVER, OTHER):
+        connected[:] = [sites.name(label)]
+        sites.run(1)
+    assert caller.outcomes == []
     second.waiting[0][1](switched("yes"))
     assert sites.run(1, lambda: caller.outcomes == [switched("yes")])
 
