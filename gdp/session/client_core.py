@@ -176,11 +176,8 @@ class ClientCore:
             if writer_proxy.publisher in peers
         }
         for name, incarnation in list(self._servers.items()):
-            if name not in heard or heard[name].incarnation != incarnation:
-                del self._servers[name]
-                self._leaving.discard(name)
-                for dispatch in self._dispatches.values():
-                    dispatch.replica_lost(name, now_s, _GONE)
+            if name in heard and heard[name].incarnation != incarnation:  # it restarted
+                self._remove(name, now_s)
         for name, writer_proxy in heard.items():
             is_new = name not in self._servers
             self._servers[name] = writer_proxy.incarnation
@@ -191,10 +188,18 @@ class ClientCore:
                 self._leaving.add(name)
                 for dispatch in self._dispatches.values():
                     dispatch.replica_leaving(name)
+        for name in [name for name in self._servers if name not in heard]:  # last: its calls find one that returned now
+            self._remove(name, now_s)
         if self._servers and self._unasked:
             waiting, self._unasked = self._unasked, []
             for call in waiting:
                 self._dispatch(call, now_s)
+
+    def _remove(self, name: Name, now_s: float) -> None:
+        del self._servers[name]
+        self._leaving.discard(name)
+        for dispatch in self._dispatches.values():
+            dispatch.replica_lost(name, now_s, _GONE)
 
     def _dispatch(self, call: Call, now_s: float) -> None:
         dispatch = self._dispatch_of(call.replication, now_s)

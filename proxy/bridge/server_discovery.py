@@ -79,11 +79,10 @@ class ServerDiscovery:
             if name not in self.servers:
                 self._add(name, writer_proxy.incarnation, writer_proxy.description, now_s)
         for name, server in list(self.servers.items()):
-            writer_proxy = heard.get(name)
-            if writer_proxy is None:
+            if name not in heard:
                 self._remove(name, now_s)
                 continue
-            incarnation, description = writer_proxy.incarnation, writer_proxy.description
+            incarnation, description = heard[name].incarnation, heard[name].description
             if (incarnation, description) == (server.incarnation, server.description):
                 continue
             same = server.described_again(description) if incarnation == server.incarnation else None

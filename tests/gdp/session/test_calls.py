@@ -6,6 +6,7 @@ import pytest
 
 import gdp
 from gdp.errors import LocalError
+from gdp.names import Name
 from gdp.service.replication import ALL, Mode
 from gdp.session.client_core import Call
 from gdp.session.core import replication_of
@@ -65,6 +66,23 @@ def test_a_running_call_outlives_a_silence_of_its_only_server(replicas: Simulate
     respond(replicas, server, "edge", b"y")
     assert replicas.run(10.0, lambda: call.is_done)
     assert call.response == gdp.Response(b"y", replicas.sessions["edge"].name)
+
+
+def test_a_call_goes_to_a_server_that_returns_in_the_moment_in_which_the_last_one_goes(
+    replicas: Simulated, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    edge, cloud = serve(replicas, "edge"), serve(replicas, "cloud")
+    replicas.run(3.0)
+    call = begin(replicas, timeout_s=60.0)
+    assert replicas.run(5.0, lambda: bool(edge.turns) and bool(cloud.turns))
+    connected = list[Name]()
+    monkeypatch.setattr(replicas.cores["robot"].member, "peers", lambda _: connected)
+    for label in ("edge", "cloud"):
+        connected[:] = [replicas.sessions[label].name]
+        replicas.run(2.0)
+    assert not call.is_done
+    respond(replicas, cloud, "cloud", b"y")
+    assert replicas.run(2.0, lambda: call.response == gdp.Response(b"y", replicas.sessions["cloud"].name))
 
 
 def test_the_first_response_of_two_replicas_counts(replicas: Simulated) -> None:
