@@ -56,11 +56,24 @@ class Pose:
         return math.acos(max(-1.0, min(1.0, (trace - 1) / 2)))
 
 
+class _OrderedDetector(Detector):  # type: ignore[misc]  # the binding is untyped
+    """Detector that is freed before its family.
+
+    pupil-apriltags 1.0.4.post11 frees the family first, and the detector then writes to it.
+    """
+
+    def __del__(self) -> None:
+        library, detector = vars(self).get("libc"), vars(self).get("tag_detector_ptr")
+        if library is not None and detector is not None:
+            library.apriltag_detector_destroy(detector)
+            library.tag36h11_destroy(self.tag_families[_FAMILY])
+
+
 class TagCamera:
     """Camera that draws the tag, and finds it (10 to 20 ms of one core)."""
 
     def __init__(self) -> None:
-        self._detector = Detector(families=_FAMILY, nthreads=1, quad_decimate=2.0)
+        self._detector = _OrderedDetector(families=_FAMILY, nthreads=1, quad_decimate=2.0)
         family = self._detector.tag_families[_FAMILY].contents
         self._cells = _pattern(family)
         self._module_m = _SIZE_M / int(family.width_at_border)
