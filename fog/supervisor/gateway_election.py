@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from fog.supervisor.reconcile import Timeouts
 from fog.supervisor.record import Record
 
-__all__ = ["Election", "elect", "is_settling"]
+__all__ = ["Election", "elect", "excused_names"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,10 +57,24 @@ def elect(group: Sequence[Record], label: str, now_s: float, patience: Timeouts)
     return None
 
 
-def is_settling(group: Sequence[Record], label: str, now_s: float, patience: Timeouts) -> bool:
-    """Return whether the gateway is too new to interpret unreachable machines behind it."""
-    since_s = max((_last_s(each) for each in group if each.gateway == label), default=0.0)
-    return now_s - since_s < patience.gateway_s
+def excused_names(group: Sequence[Record], label: str, now_s: float, patience: Timeouts) -> frozenset[str]:
+    """Return which machines of a group are kept although their replicas may be unreachable.
+
+    While a gateway is new, silence behind it says nothing about any machine. What fell silent before the paths were
+    formed again may need longer, as after a partition. So may a gateway behind which a replica is heard: it forwards,
+    and its release would cut off the others.
+    """
+    settled_s = max((_last_s(each) for each in group if each.gateway == label), default=0.0) + patience.gateway_s
+    if now_s < settled_s:
+        return frozenset(each.name for each in group)
+    forwards = any(each.is_serving and each.gateway != label for each in group)
+    return frozenset(
+        each.name
+        for each in group
+        if each.unreachable_unix_s is not None
+        and now_s - each.unreachable_unix_s < patience.partition_timeout_s
+        and (each.unreachable_unix_s < settled_s or (forwards and each.gateway == label))
+    )
 
 
 def _is_suspect(gateway: Record, there: Sequence[Record], now_s: float, patience: Timeouts) -> bool:

@@ -12,7 +12,7 @@ from functools import partial
 from fog.machine import Machine, MachineState
 from fog.providers.provider import GatewayProvider
 from fog.supervisor.event_log import EventLog
-from fog.supervisor.gateway_election import elect, is_settling
+from fog.supervisor.gateway_election import elect, excused_names
 from fog.supervisor.journal import Journal
 from fog.supervisor.machine_actions import ATTACH, DETACH, MachineActions
 from fog.supervisor.reconcile import Timeouts
@@ -40,7 +40,7 @@ class GatewayUplinks:
             records: of the cluster; records whose role changes are replaced.
 
         Returns:
-            Names of machines that may be unreachable because their gateway is new.
+            Names of machines that may be unreachable because of their gateway, and are kept.
         """
         provider = self._actions.provider
         if not isinstance(provider, GatewayProvider):
@@ -62,8 +62,8 @@ class GatewayUplinks:
                 if old is not None:
                     self._events.put(old, "", "", now_s)
                 self._events.put(new, "gateway", f"of {label}: {election.reason}", now_s)
-            if is_settling(group, label, now_s, self._patience):
-                excused.update(each.name for each in group if each.spec.cluster == cluster)
+            own = [each for each in group if each.spec.cluster == cluster]
+            excused |= excused_names(group, label, now_s, self._patience) & {each.name for each in own}
         for record in records:
             if record.id and record.name in seen and not self._actions.runner.is_busy(cluster, record.name):
                 self._reconcile_uplink(provider, record, seen[record.name])

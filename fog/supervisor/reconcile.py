@@ -23,7 +23,8 @@ class Timeouts:
     Args:
         boot_s: from the request of a machine until its replica serves.
         unreachable_timeout_s: limit for an unreachable replica while another replica is reachable.
-        partition_timeout_s: the same while no replica is reachable; the cause is then probably a network partition.
+        partition_timeout_s: the same where the network is probably the cause: no replica is reachable, or the gateway
+            changed.
         drain_s: from the drain request to a machine until its release.
         release_s: until the release of a machine that still exists is repeated.
         credential_renewal_s: another machine replaces it this long before its credentials expire.

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from fog.supervisor.gateway_election import elect, is_settling
+from fog.supervisor.gateway_election import elect, excused_names
 from fog.supervisor.reconcile import Release, Timeouts, decide
 from fog.supervisor.record import Outcome, Record
 from tests.fog.supervisor.machines import NOW_S, SPOT, offer, record, serving
@@ -108,9 +108,31 @@ def test_behind_a_silent_gateway_each_machine_is_tried_once() -> None:
 def test_silence_means_nothing_behind_a_new_gateway() -> None:
     others = [silent(each, NOW_S - 2.0) for each in (gateway(serving("m1"), NOW_S - 1.0), serving("m2"))]
     group = [*others, serving("m3", "west")]
-    assert is_settling(others, "edge", NOW_S, PATIENCE)
-    assert not is_settling(others, "edge", NOW_S + PATIENCE.gateway_s, PATIENCE)
+    assert excused_names(others, "edge", NOW_S, PATIENCE) == {"m1", "m2"}
     wanted = (SPOT, SPOT, SPOT)
     assert decide(wanted, group, NOW_S, PATIENCE, excused=["m1", "m2"]) == []
     released = [each.name for each in decide(wanted, group, NOW_S, PATIENCE) if isinstance(each, Release)]
     assert released == ["m1", "m2"]
+
+
+def test_a_machine_that_fell_silent_as_the_gateway_changed_has_the_time_of_a_partition() -> None:
+    m1, m2 = gateway(serving("m1"), NOW_S - PATIENCE.gateway_s), serving("m2")
+    late_s = NOW_S - PATIENCE.partition_timeout_s
+    assert excused_names([m1, silent(m2, NOW_S - 4.0)], "edge", NOW_S, PATIENCE) == {"m2"}
+    assert excused_names([m1, silent(m2, late_s)], "edge", NOW_S, PATIENCE) == frozenset()
+    assert excused_names([m1, silent(m2, NOW_S)], "edge", NOW_S, PATIENCE) == frozenset()  # with settled paths
+    assert excused_names([m1, m2], "edge", NOW_S, PATIENCE) == frozenset()
+
+
+@pytest.mark.parametrize(
+    ("since_s", "other", "is_kept"),
+    [
+        (NOW_S - 4.0, serving("m2"), True),
+        (NOW_S - 4.0, silent(serving("m2"), NOW_S - 4.0), False),
+        (NOW_S - PATIENCE.partition_timeout_s, serving("m2"), False),
+    ],
+    ids=["forwards", "does not forward", "for too long"],
+)
+def test_a_silent_gateway_that_forwards_is_kept_for_longer(since_s: float, other: Record, is_kept: bool) -> None:
+    group = [silent(gateway(serving("m1")), since_s), other]
+    assert ("m1" in excused_names(group, "edge", NOW_S, PATIENCE)) is is_kept
