@@ -6,7 +6,8 @@ I/O. ::
                                           only for a double NAT           |
                                                        a delay line of two devices, where asked for
 
-Links between routers and the core have link-local addresses only. A site of public access owns a block of eight
+Links between routers and the core have link-local addresses only, and each end knows the other's MAC address, as on a
+point-to-point link: a lost ARP request would be repeated after a second. A site of public access owns a block of eight
 addresses. Behind a NAT the outermost router has one, and all sites use the same private addresses. An IPv6 site has
 a prefix of 48 bits.
 """
@@ -31,9 +32,10 @@ __all__ = ["Lease", "Site"]
 
 _CORE_END, _ROUTER_END = "169.254.0.1", "169.254.0.2"  # RFC 3927, on every link towards the core
 _CORE_END6, _ROUTER_END6 = "fe80::1", "fe80::2"
+_CORE_ENDS, _ROUTER_ENDS = (_CORE_END, _CORE_END6), (_ROUTER_END, _ROUTER_END6)
 _HOME: Final = IPv4Network("192.168.1.0/24")
 _CARRIER: Final = IPv4Network("100.64.0.0/24")  # RFC 6598
-_BRIDGE_MAC: Final = b"\x02gdp"  # fixed, because a bridge otherwise takes the address of one of its ports
+_MAC: Final = b"\x02gdp"  # fixed, because a bridge otherwise takes the address of one of its ports
 _FIRST_HOST: Final = 10
 _MAPPING_TIMEOUTS: Final = ("nf_conntrack_udp_timeout", "nf_conntrack_udp_timeout_stream")
 
@@ -73,10 +75,10 @@ class Site:
             Space(laboratory.run, f"{label}-{name}", forwards=True) for name in ("router", "carrier")[:count]
         )
         self._block, self._prefix = laboratory.take_block(), laboratory.take_prefix()
+        self._core_mac, self._wan_mac = self._next_mac(), self._next_mac()
         for router in self.routers:
-            mac = (_BRIDGE_MAC + laboratory.next_index().to_bytes(2, "big")).hex(":")
             router.ip(
-                [f"link add {LAN} address {mac} type bridge forward_delay 0 mcast_snooping 0", f"link set {LAN} up"]
+                [f"link add {LAN} address {self._next_mac()} type bridge forward_delay 0 mcast_snooping 0", f"link set {LAN} up"]
             )
         if count == 2:
             home, carrier = self.routers
@@ -207,14 +209,18 @@ class Site:
         if self._line is not None:
             self._line.close()
 
+    def _next_mac(self) -> str:
+        return (_MAC + self._laboratory.next_index().to_bytes(2, "big")).hex(":")
+
     def _join_core(self, *, has_line: bool) -> None:
         number, outer = self._laboratory.next_index(), self._outer
+        core_end, router_end = f"index {number} address {self._core_mac}", f"address {self._wan_mac} netns {outer.path}"
         if not has_line:
-            self._core.ip([f"link add {self.uplink} index {number} type veth peer {WAN} netns {outer.path}"])
+            self._core.ip([f"link add {self.uplink} {core_end} type veth peer name {WAN} {router_end}"])
             return
         line = Space(self._laboratory.run, f"{self.label}-line")
-        self._core.ip([f"link add {self.uplink} index {number} type veth peer core netns {line.path}"])
-        outer.ip([f"link add {WAN} index {number} type veth peer site netns {line.path}"])
+        self._core.ip([f"link add {self.uplink} {core_end} type veth peer core netns {line.path}"])
+        outer.ip([f"link add {WAN} index {number} address {self._wan_mac} type veth peer site netns {line.path}"])
         line.set({f"ipv6/conf/{device}/disable_ipv6": 1 for device in ("core", "site")})
         line.ip(["link set core up", "link set site up"])
         self._line = LineProcess(self._laboratory.run, line, "core", "site")
@@ -225,11 +231,13 @@ class Site:
             f"link set {self.uplink} up",
             f"addr replace {_CORE_END}/32 dev {self.uplink} scope link",
             f"addr replace {_CORE_END6}/64 dev {self.uplink} nodad",
+            *(f"neigh replace {end} lladdr {self._wan_mac} dev {self.uplink} nud permanent" for end in _ROUTER_ENDS),
         ]
         outer = [
             f"link set {WAN} up",
             f"addr replace {_ROUTER_END}/32 dev {WAN} scope link",
             f"addr replace {_ROUTER_END6}/64 dev {WAN} nodad",
+            *(f"neigh replace {end} lladdr {self._core_mac} dev {WAN} nud permanent" for end in _CORE_ENDS),
         ]
         if self._has4:
             core.append(f"route replace {self._block} via {_ROUTER_END} dev {self.uplink} onlink")
