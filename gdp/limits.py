@@ -95,6 +95,9 @@ LINK_STATE_LEASE_S: Final = 100.0
 LINK_STATE_AGE_MAX_S: Final = CLOCKS_APART_S + LINK_STATE_LEASE_S  # by two clocks
 JOIN_REFRESH_S: Final = 2.0
 JOIN_LEASE_S: Final = 7.0
+# A join has some five frames, and is lost with any of them. So it is repeated more often over a link that loses frames.
+JOINS_LOST_FROM: Final = 0.01  # share of frames
+JOIN_REFRESH_LOSSY_S: Final = 0.5
 
 WAIT_REPORT_S: Final = 5.0  # a node that makes no progress for this time reports why
 

@@ -34,7 +34,7 @@ from gdp.crypto.identity import Identity
 from gdp.errors import DropReason, StatementError
 from gdp.frame.codec import second_path_key
 from gdp.frame.kinds import Kind
-from gdp.limits import JOIN_LEASE_S, JOIN_REFRESH_S, READERS_MAX, TREES_MAX
+from gdp.limits import JOIN_LEASE_S, JOIN_REFRESH_LOSSY_S, JOIN_REFRESH_S, JOINS_LOST_FROM, READERS_MAX, TREES_MAX
 from gdp.message.shares import Shares
 from gdp.names import ZERO, Name
 from gdp.switch.backups import Backups
@@ -552,6 +552,8 @@ class MulticastTrees:
         if upstream is None or not tree.is_wanted_below:
             return
         has_settled = tree.joins >= len(_JOIN_AGAIN_S)
+        if has_settled and self._outbox.loss_to(upstream[0], upstream[2]) >= JOINS_LOST_FROM:
+            tree.renew_at_s = now_s + JOIN_REFRESH_LOSSY_S
         if not has_settled:
             tree.renew_at_s = now_s + _JOIN_AGAIN_S[tree.joins]
             tree.joins += 1

@@ -66,6 +66,12 @@ class Outbox:
         neighbour = self._hello_protocol.neighbour(port, name)
         return None if neighbour is None else (self._hello_protocol.ports[port].nonce, neighbour.echo)
 
+    def loss_to(self, port: int, name: Name) -> float:
+        """Return the share of keepalives to a neighbour that it reports as lost, 0 to 1; 0 also if it is not up."""
+        neighbour = self._hello_protocol.neighbour(port, name)
+        session = None if neighbour is None else neighbour.keepalives
+        return 0.0 if session is None else session.quality.loss_out
+
     def hop(self, neighbour: Neighbour) -> Hop:
         """Return the table's hop to a neighbour."""
         return neighbour.port, neighbour.mac + self._hello_protocol.ports[neighbour.port].mac
