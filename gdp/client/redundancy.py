@@ -27,7 +27,7 @@ _SENDS: Final = ((0.001, 1), (0.025, 2))  # up to this loss, so many sendings le
 _UNKNOWN: Final = 2  # sendings before anything is measured
 _SHARE: Final = 0.05  # of the path that copies may take
 _BYTES_S: Final = 64_000.0  # ... of a path of unknown rate: a twentieth of 10 Mbit/s
-_PARITY_SHARE: Final = 0.1  # of the path that parity may take
+_PARITY_SHARE: Final = 0.15  # of the path that parity may take
 _PARITY_BYTES_S: Final = 125_000.0  # ... of a path of unknown rate: a tenth of 10 Mbit/s
 _LEAST_BYTES_S: Final = 8_000.0
 _BURST_S: Final = 0.25
@@ -72,7 +72,7 @@ class CopyBudget:
 
 
 def parity_budget() -> CopyBudget:
-    """Return the budget of a participant's parity frames: a tenth of the path, and as much as a second gives at once.
+    """Return the budget of a participant's parity frames: 15 % of the path, and as much as a second gives at once.
 
     A large message, which is what parity is for, has all of it at its end.
     """

@@ -18,9 +18,7 @@ def block(k: int, size: int, seed: int = 1) -> list[bytes]:
     return [rng.randbytes(size) for _ in range(k)]
 
 
-@given(
-    k=st.integers(1, DATA_MAX), m=st.integers(1, PARITY_MAX), size=st.integers(1, 40), seed=st.integers(0, 1 << 32)
-)
+@given(k=st.integers(1, DATA_MAX), m=st.integers(1, PARITY_MAX), size=st.integers(1, 40), seed=st.integers(0, 1 << 32))
 def test_any_k_of_all_shards_give_the_block(k: int, m: int, size: int, seed: int) -> None:
     shards = block(k, size, seed)
     parity = encode(shards, m)
@@ -76,9 +74,7 @@ def test_bounds_are_checked_before_encoding(k: int, m: int, sizes: tuple[int, ..
         encode([bytes(size) for size in sizes], m)
 
 
-@pytest.mark.parametrize(
-    ("here", "came"), [({0: b"a"}, {}), ({0: b"a"}, {0: b"ab"}), ({0: b"a"}, {PARITY_MAX: b"a"})]
-)
+@pytest.mark.parametrize(("here", "came"), [({0: b"a"}, {}), ({0: b"a"}, {0: b"ab"}), ({0: b"a"}, {PARITY_MAX: b"a"})])
 def test_too_little_or_shards_of_other_lengths_do_not_decode(here: dict[int, bytes], came: dict[int, bytes]) -> None:
     with pytest.raises(LocalError):
         decode(here, came, 2)
