@@ -4,9 +4,9 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: docs/explanati
 has the blocks, ``gdp/message/frame_recovery.py`` is the reader's side.
 
 The count follows the measured loss: the least with which at most ``_TARGET`` of the messages need a repair, if frames
-are lost independently. Where messages with parity are requested nevertheless, because losses come in bursts, the count
-grows by a margin: one frame for each such message, while each other one takes a fiftieth off (a leaky form of the outer
-loop of link adaptation in LTE).
+are lost independently. If losses come in bursts, readers request messages that have parity. Each such message adds one
+frame to a margin, and each other one takes a fiftieth off. This is a leaky form of the outer loop of link adaptation in
+LTE.
 
 The first ``_AT_ONCE`` parity frames of a span leave at once, since the message waits for them. They delay what follows.
 """

@@ -6,8 +6,8 @@ The frames of unfinished messages whose flag announces parity are kept as they c
 with its parity, the lost frames are rebuilt. They then take the way of frames that came: their seals are checked there,
 so wrong parity costs the block, and delivers nothing wrong.
 
-A gap is not requested while its parity may be under way. This wait ends with a pause of the writer, with the last
-parity frame, when more is missing than parity can fill, and in any case after ``WAIT_MAX_S``.
+A gap is not requested while its parity may be under way. This wait ends with the last parity frame, or when more is
+missing than parity can fill. A pause of the writer ends it, too, and ``WAIT_MAX_S`` in any case.
 """
 
 from __future__ import annotations
