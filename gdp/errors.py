@@ -84,6 +84,7 @@ class DropReason(IntEnum):
     NO_SECOND_PATH = 46  # the second copy of a frame at a switch that has no second path for it
     SECOND_COPY = 47  # a copy of a frame that is here: the other path, or one sent again against loss, brought it
     LIFESPAN = 48  # a best-effort message that could not leave in time, before a frame of it was sealed
+    UNUSED_PARITY = 49  # a parity frame whose block lost nothing, or was filled before
 
     @property
     def label(self) -> str:

@@ -24,6 +24,7 @@ NUMBER_MAX: Final = (1 << 64) - 2  # message numbers have 64 bits, and each must
 PARTS_MAX: Final = 1 << 17  # 64 MiB over the smallest link
 JOIN_SOURCE_BYTES: Final = 48 << 20  # reassembly memory of one source, as long as no other one needs its fair share
 JOIN_TOTAL_BYTES: Final = 96 << 20  # reassembly memory of a node; a third of it holds the largest message
+RECOVERY_BYTES: Final = 8 << 20  # ... of it frames of one stream that are kept to restore lost ones from parity
 JOIN_MESSAGES_MAX: Final = 1_024  # unfinished messages of one source
 JOIN_PATIENCE_S: Final = 5.0  # an unfinished best-effort message is dropped after this time without a new fragment
 REPLAY_WINDOW_MESSAGES: Final = 16_384

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from itertools import count
 
 from gdp.client.control_keys import ControlKeys
-from gdp.client.redundancy import CopyBudget
+from gdp.client.redundancy import CopyBudget, parity_budget
 from gdp.crypto.envelope import Signer
 from gdp.names import Name
 
@@ -26,6 +26,7 @@ class WriterIdentity:
         random_bytes: the system's randomness, called for each message that is sealed.
         notes: keys for the control datagrams of readers.
         copies: budget of the copies that all its publishers send against loss.
+        parity: budget of the parity frames that they send.
     """
 
     name: Name
@@ -34,6 +35,7 @@ class WriterIdentity:
     random_bytes: Callable[[int], bytes]
     notes: ControlKeys
     copies: CopyBudget = field(default_factory=CopyBudget, compare=False)
+    parity: CopyBudget = field(default_factory=parity_budget, compare=False)
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ from typing import Final
 
 from gdp.client.identities import WriterIdentity
 from gdp.crypto.envelope import Sealer
+from gdp.crypto.parity_seal import ParitySealer
 from gdp.errors import DropReason, EnvelopeError, LocalError
 from gdp.frame.kinds import Kind
 from gdp.limits import EPOCH_GRACE_S
@@ -82,6 +83,18 @@ class KeyEpochs:
         self.epoch = epoch
         self.data = self._sealer(Kind.DATA)
         self.status = self._sealer(Kind.HEARTBEAT)
+        self._parity: ParitySealer | None = None
+
+    @property
+    def parity(self) -> ParitySealer:
+        """Return what seals parity frames under the newest epoch."""
+        if self._parity is None:
+            writer = self._writer
+            self._parity = ParitySealer(
+                secret=self.secret, epoch=self.epoch, source=writer.name, incarnation=writer.incarnation,
+                destination=self._topic, address=self._address,
+            )  # fmt: skip
+        return self._parity
 
     def _sealer(self, kind: Kind) -> Sealer:
         writer = self._writer

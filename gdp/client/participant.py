@@ -44,7 +44,7 @@ from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.verifier import AdvertisementVerifier
 
-_FOR_WRITER_PROXIES: Final = (int(Kind.DATA), int(Kind.HEARTBEAT))
+_FOR_WRITER_PROXIES: Final = (int(Kind.DATA), int(Kind.HEARTBEAT), int(Kind.PARITY))
 _NOTES: Final = (int(Kind.ACKNACK), int(Kind.INTRODUCTION))
 # a participant that is called later than this, although hellos are due, was not scheduled
 _STALL_S: Final = 2 * HELLO_S

@@ -22,6 +22,7 @@ from gdp.client.blocking_readers import BlockingReaders
 from gdp.client.heartbeat_schedule import HeartbeatSchedule
 from gdp.client.identities import WriterIdentity
 from gdp.client.key_epochs import KeyEpochs, Secrets
+from gdp.client.parity_sender import ParitySender
 from gdp.client.reader_path import ReaderPath, ReaderPaths
 from gdp.client.reader_proxies import TOPICS, ReaderProxies, ReaderTimeouts
 from gdp.client.redundancy import Redundancy
@@ -69,6 +70,7 @@ class Publisher:
         options: as set last.
         path_share: of what the path carries, 0 to 1; the other topics that wait have the rest.
         redundancy: copies of its frames against loss.
+        parity: parity frames of its large messages.
         second_path_until_s: monotonic second until which there is a second path, as far as known here.
         published: called when frames are ready to be polled, and when the publisher closes.
         has_more: the last ``poll_frames`` reached its limit.
@@ -122,6 +124,7 @@ class Publisher:
             readers=self._readers, queue=self._queue, window=self._window, heartbeats=self._heartbeats
         )
         self.redundancy = Redundancy(budget=source.copies, path=self, is_enabled=urgent and options.fec)
+        self.parity = ParitySender(keys=self._keys, budget=source.parity, is_enabled=paths == 1 and options.fec)
         self._queue.depth = depth
         self._set_flags()
 
@@ -257,6 +260,7 @@ class Publisher:
         self.options = options
         self._queue.set_options(options)
         self.redundancy.is_enabled = self.is_urgent and options.fec
+        self.parity.is_enabled = self.paths == 1 and options.fec
         self._late.set_options(options)
 
     def set_depth(self, depth: int) -> None:
@@ -403,6 +407,7 @@ class Publisher:
             self._under_way.handle_hops(header.source, header.hops_left, now_s)
         self._under_way.handle_report(header.source, report, now_s, waited_s)
         self.redundancy.handle_report(header.source, report, is_new=is_new)
+        self.parity.handle_report({each.number for each in report.missing})
         self._acknowledgements.handle_acknack(header.source, report, is_new=is_new, now_s=now_s)
         if report.missing and not self.confirms:
             newest = report.newest, report.newest_part
@@ -447,9 +452,12 @@ class Publisher:
         mtu = self._queue.mtu
         if mtu is None or not self._readers:
             self.redundancy.clear()
+            self.parity.clear()
             if not self._readers:
                 self._queue.drop_unread()
             return []
+        loss = self.redundancy.loss(self._readers, now_s)
+        self._queue.has_parity = self.parity.is_wanted(loss, self.path_rtt_s, self.options.deadline_s)
         self._queue.seal_deferred()
         if not self.confirms:
             self._queue.bytes_s = self.path_bytes_s
@@ -458,22 +466,28 @@ class Publisher:
         status = self._seal_status(now_s, mtu) if self._heartbeats.is_due(now_s) else []
         heartbeats, repaired = len(status), self.repairs
         sent: list[bytes] = []
+        parity: list[bytes] = []
+        parity_after: list[bytes] = []
         if limit_bytes > 0:
             limit = max(limit_bytes // (mtu * (2 if has_pair and self._striper is None else 1)), 1)
-            sent = self._frames_to_send(now_s, limit)
-            self.has_more = len(sent) >= limit
+            parity = self.parity.poll_frames(limit)
+            sent = self._frames_to_send(now_s, limit - len(parity)) if len(parity) < limit else []
+            self.parity.handle_sent(sent, loss, self.capacity_bytes_s, now_s)
+            left = limit - len(parity) - len(sent)
+            self.has_more = left <= len(self.parity)
+            parity_after = self.parity.poll_frames(max(left, 0))
             if not self._is_doubled(now_s):
                 self._under_way.sent(sent, self._readers, now_s, self.repairs - repaired)
-            if self._limit is not None and sent:
-                self._limit.charge(now_s, sum(map(len, sent)))
-        frames = status + sent
+            if self._limit is not None and (leaving := sum(map(len, parity + sent + parity_after))):
+                self._limit.charge(now_s, leaving)
+        frames = status + parity + sent + parity_after
         if frames:
             self._acknowledgements.last_sent_s = now_s
-        self.redundancy.handle_sent(frames[heartbeats:], self._readers, now_s, has_pair=has_pair)
+        self.redundancy.handle_sent(sent, self._readers, now_s, has_pair=has_pair)
         copies = self.redundancy.poll_copies(now_s)
-        if copies:
+        if extra_bytes := sum(map(len, copies + parity + parity_after)):
             for path in self._paths():
-                path.controller.charge(sum(map(len, copies)), now_s)
+                path.controller.charge(extra_bytes, now_s)
         frames += copies
         if not has_pair:
             return frames

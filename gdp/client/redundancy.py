@@ -20,13 +20,15 @@ from gdp.message.frame_loss import FrameLoss, Readers
 from gdp.message.repeated_frames import REPEATED_PARTS_MAX
 from gdp.token_bucket import TokenBucket
 
-__all__ = ["CopyBudget", "PathQuality", "Redundancy", "sends_for"]
+__all__ = ["CopyBudget", "PathQuality", "Redundancy", "parity_budget", "sends_for"]
 
 _OFFSETS_S: Final = (0.004, 0.007)  # of the second and the third sending after the first
 _SENDS: Final = ((0.001, 1), (0.025, 2))  # up to this loss, so many sendings leave at most 0.1 % undelivered
 _UNKNOWN: Final = 2  # sendings before anything is measured
 _SHARE: Final = 0.05  # of the path that copies may take
 _BYTES_S: Final = 64_000.0  # ... of a path of unknown rate: a twentieth of 10 Mbit/s
+_PARITY_SHARE: Final = 0.15  # of the path that parity may take
+_PARITY_BYTES_S: Final = 125_000.0  # ... of a path of unknown rate: a tenth of 10 Mbit/s
 _LEAST_BYTES_S: Final = 8_000.0
 _BURST_S: Final = 0.25
 _RATE_CHANGE: Final = 0.1
@@ -47,19 +49,34 @@ class PathQuality(Protocol):
 
 
 class CopyBudget:
-    """Bytes of copies that one participant may send, shared by its topics: a twentieth of the path."""
+    """Bytes against loss that one participant may send, shared by its topics; of copies a twentieth of the path.
 
-    def __init__(self) -> None:
-        self._bytes_s = _BYTES_S
-        self._bucket = TokenBucket(_BYTES_S, _BYTES_S * _BURST_S)
+    Args:
+        share: of the path.
+        unknown_bytes_s: bytes a second while the rate of the path is not known.
+        burst_s: of this time, at once.
+    """
+
+    def __init__(self, share: float = _SHARE, unknown_bytes_s: float = _BYTES_S, burst_s: float = _BURST_S) -> None:
+        self._share, self._unknown_bytes_s, self._burst_s = share, unknown_bytes_s, burst_s
+        self._bytes_s = unknown_bytes_s
+        self._bucket = TokenBucket(unknown_bytes_s, unknown_bytes_s * burst_s)
 
     def spend(self, now_s: float, size: int, path_bytes_s: float | None) -> bool:
         """Take ``size`` bytes and return True, or return False and take none."""
-        bytes_s = _BYTES_S if path_bytes_s is None else max(path_bytes_s * _SHARE, _LEAST_BYTES_S)
+        bytes_s = self._unknown_bytes_s if path_bytes_s is None else max(path_bytes_s * self._share, _LEAST_BYTES_S)
         if abs(bytes_s - self._bytes_s) > _RATE_CHANGE * self._bytes_s:
             self._bytes_s = bytes_s
-            self._bucket.change(now_s, bytes_s, bytes_s * _BURST_S)
+            self._bucket.change(now_s, bytes_s, bytes_s * self._burst_s)
         return self._bucket.spend(now_s, size)
+
+
+def parity_budget() -> CopyBudget:
+    """Return the budget of a participant's parity frames: 15 % of the path, and as much as a second gives at once.
+
+    A large message, which is what parity is for, has all of it at its end.
+    """
+    return CopyBudget(_PARITY_SHARE, _PARITY_BYTES_S, burst_s=1.0)
 
 
 def sends_for(loss: float | None) -> int:

@@ -18,6 +18,7 @@ from typing import Final
 
 from gdp.client.best_effort_queue import BestEffortQueue, Carried, is_expired
 from gdp.client.key_epochs import KeyEpochs
+from gdp.client.parity_sender import PARITY_BYTES, is_protected
 from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
 from gdp.crypto.envelope import SIGNATURE_BYTES, Sealed, fragment_capacity
 from gdp.errors import DropReason
@@ -32,6 +33,7 @@ from gdp.message.send_window import SendWindow
 __all__ = ["SendQueue"]
 
 _BUNDLE: Final = int(Flag.BUNDLE)
+_PARITY: Final = int(Flag.PARITY)
 
 
 class SendQueue:
@@ -53,6 +55,7 @@ class SendQueue:
         moves: the latest renumberings.
         drops: messages dropped here, by reason.
         bytes_s: bytes of frames per second that this topic may send now; None: unknown.
+        has_parity: messages sealed from now on leave space for parity frames, and announce them.
     """
 
     def __init__(
@@ -79,6 +82,7 @@ class SendQueue:
         self._gathered = Gathered()
         self.options = options
         self.bytes_s: float | None = None
+        self.has_parity = False
         self._best_effort = BestEffortQueue(options.deadline_s)
 
     @property
@@ -281,7 +285,10 @@ class SendQueue:
         ledger.forget(self.oldest)
 
     def _seal(self, number: int, body: bytes | Sealed, mtu: int, *, is_bundle: bool) -> Sealed:
-        return self._keys.data.seal(number, self.flags | _BUNDLE * is_bundle, body, mtu)
+        flags = self.flags | _BUNDLE * is_bundle
+        if self.has_parity and is_protected(len(body) if isinstance(body, bytes) else body.message_bytes, mtu):
+            return self._keys.data.seal(number, flags | _PARITY, body, mtu - PARITY_BYTES)
+        return self._keys.data.seal(number, flags, body, mtu)
 
     def _lose(self, sequence: int, messages: int, drop_reason: DropReason, reason: LossReason) -> None:
         """Count messages that no reader gets."""

@@ -5,9 +5,10 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 A writer proxy begins ``NEW``: it sends introductions until a Heartbeat brings its start and the description. When
 ``LIVE`` it delivers: a reliable topic in order and complete, a best-effort one in order and as fresh as repairs allow.
 
-It joins six parts:
+It joins seven parts:
 
 - ``gdp/message/reassembly.py``: reassembly of the fragments;
+- ``gdp/message/frame_recovery.py``: lost frames from parity;
 - ``reordering.py``: messages that wait behind a gap;
 - ``delivery.py``: messages in order, and losses;
 - ``gdp/message/late_repairs.py``: what is requested again of a best-effort topic, and how long that is awaited;
@@ -29,8 +30,9 @@ from gdp.client.identities import ReaderIdentity
 from gdp.client.key_epochs import Secrets
 from gdp.client.reordering import ReorderingBuffer
 from gdp.crypto.envelope import Opener
+from gdp.crypto.parity_seal import ParityOpener
 from gdp.errors import DropReason, EnvelopeError, RemoteError
-from gdp.frame.codec import HOPS_AT, NUMBER_AND_PART, NUMBER_AT, SECOND_PATH, Header, second_path_copy
+from gdp.frame.codec import HOPS_AT, NUMBER_AND_PART, NUMBER_AT, SECOND_PATH, Header, decode, second_path_copy
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import (
     NACKS_PER_REPORT,
@@ -43,6 +45,7 @@ from gdp.limits import (
     STRIPES_FROM_PARTS,
 )
 from gdp.message.acknack import FRAMES_MASK, AckNack, AckNackFlag, MissingRange
+from gdp.message.frame_recovery import FrameRecovery
 from gdp.message.heartbeat import Heartbeat, StreamStart
 from gdp.message.late_repairs import LateRepairs
 from gdp.message.loss import Losses, LossReason
@@ -58,6 +61,7 @@ from gdp.trust.advertisement import Advertisement
 __all__ = ["Ended", "WriterProxy", "WriterProxyState"]
 
 ANNOUNCE_S: Final = 0.1
+_NEVER: Final = float("inf")
 _LATCHED: Final = int(Flag.LATCHED)
 _WAITING: Final = int(Flag.RELIABLE | Flag.LATCHED)  # topics whose readers wait for what is missing
 
@@ -140,6 +144,8 @@ class WriterProxy:
         self._is_restarted = restarted
         self._described = 0  # number of the Heartbeat that brought it
         self._openers: dict[tuple[int, int], Opener] = {}
+        self._parity_openers: dict[int, ParityOpener] = {}
+        self._recovery = FrameRecovery(publisher, budget)
         self._sealer = AckNackSealer(
             topic=topic,
             reader=reader,
@@ -164,7 +170,7 @@ class WriterProxy:
         self._deferred = DeferredRequests()
         self._received = 0  # verified DATA frames
         self._newest = (0, -1, now_s)  # the highest of them: number, fragment, and when it came
-        self._late = LateRepairs(self._data, self._lag_s)
+        self._late = LateRepairs(self._data, self._lag_s, self._recovery.awaited_s)
         self._is_reliable: bool | None = None
         self._sent = (0, 0)  # the publisher has sent everything before this (number, fragment)
         self.state = WriterProxyState.NEW
@@ -217,6 +223,11 @@ class WriterProxy:
         return self._delivery.delivered_bytes
 
     @property
+    def recovered(self) -> int:
+        """Return how many lost frames parity has restored."""
+        return self._recovery.recovered
+
+    @property
     def losses(self) -> Losses:
         """Return which messages are known to be lost, and why."""
         return self._delivery.losses
@@ -250,7 +261,7 @@ class WriterProxy:
         self._data.drops[reason] += 1
 
     def receive(self, header: Header, frame: bytes, now_s: float, waited_s: float = 0.0) -> None:
-        """Process one DATA or HEARTBEAT frame of this publisher, which came ``waited_s`` before."""
+        """Process one DATA, HEARTBEAT or PARITY frame of this publisher, which came ``waited_s`` before."""
         if header.incarnation != self.incarnation:
             self._data.drops[DropReason.WRONG_INCARNATION] += 1
             return
@@ -262,6 +273,8 @@ class WriterProxy:
             joined = self._status.add(header, frame, now_s)
             if joined is not None:
                 self._handle_status(joined, header.epoch, now_s)
+        elif header.kind == Kind.PARITY:
+            self._handle_parity(header, frame, now_s)
         else:
             self._handle_data(header, frame, now_s, now_s - waited_s)
 
@@ -273,6 +286,7 @@ class WriterProxy:
                 second = sum(each.frame[HOPS_AT] & SECOND_PATH > 0 for each in arrivals[at : at + taken])
                 number = int.from_bytes(arrivals[at].frame[NUMBER_AT : NUMBER_AT + 8], "big")
                 self._copies.handle_arrivals(number, taken - second, second, now_s)
+            self._recovery.keep_run(arrivals, at, taken, now_s)
             self._schedule.count(taken * len(arrivals[at].frame))
             self._received += taken
             number, part = NUMBER_AND_PART.unpack_from(arrivals[at + taken - 1].frame, NUMBER_AT)
@@ -296,12 +310,14 @@ class WriterProxy:
             self._deliver(now_s)
         self._data.drop_expired(now_s, for_good=is_final)
         self._status.drop_expired(now_s, for_good=False)
+        self._recovery.drop_expired(now_s)
 
     def get_timer(self) -> float:
         """Return the monotonic second of the next timer."""
         expiries = [self._status.next_expiry(), self._data.next_expiry()]
         held_s = self._held[0][0] if self._held else float("inf")
         due_s = min(self._schedule.due_s, self._gap_until_s, held_s, self._late.get_timer())
+        due_s = min(due_s, self._recovery.next_expiry())
         return min([due_s, *(expiry for expiry in expiries if expiry is not None)])
 
     def control_to_send(self, now_s: float) -> list[bytes]:
@@ -315,11 +331,11 @@ class WriterProxy:
             schedule.due_s = now_s + ANNOUNCE_S
             number, sequence = (self._before.number, self._before.sequence) if self._before.resumes else (0, 0)
             return self._over_paths(self._sealer.seal_first(AckNack(AckNackFlag.NEW, number, 0, (), sequence)))
-        missing = self._missing() if self._is_reliable else ()
+        missing, awaited_s = self._missing(now_s) if self._is_reliable else ((), _NEVER)
         if (self._copies is not None or self._data.repeats.copies) and self._is_reliable:
             missing = self._deferred.poll_due(missing, self._lag_s(), now_s)
         schedule.handle_reported(now_s, is_missing=bool(missing))
-        schedule.due_s = min(schedule.due_s, self._deferred.due_s)
+        schedule.due_s = min(schedule.due_s, self._deferred.due_s, awaited_s)
         expected = self._order.expected
         part, sequence = self._data.progress(expected), self._delivery.sequence
         share = self._copies.poll_share() if isinstance(self._copies, StripedPaths) else 0
@@ -327,7 +343,7 @@ class WriterProxy:
         report = AckNack(
             AckNackFlag.NONE, expected, part, missing or late, sequence, self.lost, share,
             self._received, newest, max(newest_part, 0), max(round((now_s - came_s) * 1e6), 0),
-            self._data.frames & FRAMES_MASK,
+            (self._data.frames - self._recovery.recovered) & FRAMES_MASK,
         )  # fmt: skip
         return self._over_paths(self._sealer.seal_all(report, now_s))
 
@@ -339,6 +355,7 @@ class WriterProxy:
         """Release all memory; return the frames of the goodbye."""
         self._data.close()
         self._status.close()
+        self._recovery.close()
         self._order.poll_all()
         self._late.close()
         self._schedule.due_s = self._gap_until_s = float("inf")
@@ -350,6 +367,7 @@ class WriterProxy:
         """Replace the topic's secrets; an epoch that is still among them opens as before."""
         self._secrets = secrets
         self._openers.clear()
+        self._parity_openers.clear()
         self._sealer.renew(secrets)
 
     def _note_newest(self, number: int, part: int, came_s: float) -> None:
@@ -372,7 +390,28 @@ class WriterProxy:
             self._openers[kind, epoch] = opener
         return opener
 
-    def _handle_data(self, header: Header, frame: bytes, now_s: float, came_s: float) -> None:
+    def _handle_parity(self, header: Header, frame: bytes, now_s: float) -> None:
+        """Restore what is lost, as far as parity suffices; it arrives now, and counts as lost on the way."""
+        try:
+            if self._data.window.is_finished(header.number):
+                raise EnvelopeError(DropReason.UNUSED_PARITY, "its message is complete")
+            opener = self._parity_openers.get(header.epoch)
+            if opener is None:
+                secret = self._secrets.get(header.epoch)
+                if secret is None:
+                    raise EnvelopeError(DropReason.UNKNOWN_EPOCH, str(header.epoch))
+                opener = ParityOpener(secret, self.publisher, self.incarnation, self.topic)
+                self._parity_openers[header.epoch] = opener
+            restored = self._recovery.add_parity(header, opener.open(header, frame), now_s)
+        except EnvelopeError as error:
+            self._data.drops[error.reason] += 1
+            return
+        for each in restored:
+            self._handle_data(decode(each), each, now_s, now_s, is_restored=True)
+
+    def _handle_data(
+        self, header: Header, frame: bytes, now_s: float, came_s: float, *, is_restored: bool = False
+    ) -> None:
         reassembler, expected = self._data, self._order.expected
         if header.number > NUMBER_MAX:
             reassembler.drops[DropReason.MALFORMED] += 1
@@ -395,13 +434,19 @@ class WriterProxy:
             if self._is_reliable is None:
                 self._set_reliable(header.flags)
             self._schedule.count(header.length)
-            self._received += 1
+            if is_restored:
+                self._recovery.recovered += 1
+            else:
+                self._received += 1
+            if joined is None:
+                self._recovery.keep(header, frame, now_s)
             self._note_newest(header.number, header.part, came_s)
             if self.state is WriterProxyState.LIVE:
                 self._schedule.handle_part(header, highest, expected, now_s)
                 if joined is None and not self._is_reliable:
                     self._late.handle_part(header, now_s)
         if joined is not None:
+            self._recovery.forget(header.number)
             if self.state is WriterProxyState.LIVE and not self._is_reliable:
                 self._late.handle_complete(joined.number, header.part, now_s)
             if striped is not None:
@@ -441,20 +486,28 @@ class WriterProxy:
             order.expected += 1
             self._deliver(now_s)
 
-    def _missing(self) -> tuple[MissingRange, ...]:
-        """Return what is known to be missing: gaps below the newest fragment, and all that a Heartbeat announced."""
+    def _missing(self, now_s: float) -> tuple[tuple[MissingRange, ...], float]:
+        """Return what is known to be missing, and the first second at which parity may no longer fill what else is.
+
+        That is gaps below the newest fragment, and all that a Heartbeat announced.
+        """
         missing: list[MissingRange] = []
+        due_s = _NEVER
         sent_number, sent_part = self._sent
         end = max(self._data.highest + 1, sent_number + (sent_part > 0))
         for number in self._data.window.unfinished(self._order.expected, end):
             capacity = NACKS_PER_REPORT - len(missing)
             if capacity <= 0:
                 break
+            awaited_s = self._recovery.awaited_s(number, now_s)
+            if awaited_s > now_s:
+                due_s = min(due_s, awaited_s)
+                continue
             ranges = self._data.missing(number, capacity, to_end=number < sent_number)
             if not ranges and number == sent_number:
                 ranges = _below(self._data.missing(number, capacity, to_end=True), sent_part)
             missing += [MissingRange(number, *each) for each in ranges]
-        return tuple(missing)
+        return tuple(missing), due_s
 
     def _handle_status(self, joined: ReassembledMessage, epoch: int, now_s: float) -> None:
         try:
@@ -547,6 +600,7 @@ class WriterProxy:
             self._delivery.deliver(joined)
         self._data.forget(number)
         self._late.forget(number)
+        self._recovery.forget_below(number)
 
     def _deliver(self, now_s: float) -> None:
         order = self._order

@@ -23,6 +23,7 @@ class Kind(IntEnum):
     HEARTBEAT = 0x02  # sealed: what a publisher still holds, and the topic's description
     ACKNACK = 0x03  # sealed: what a reader has and lacks, to the publisher
     INTRODUCTION = 0x04  # sealed: identity of a reader and its key for reports, to the publisher
+    PARITY = 0x05  # sealed: a coded form of some frames of one message, which restores lost ones, publisher to readers
     RIB_REQUEST = 0x10  # a statement to a RIB
     RIB_ANSWER = 0x11  # a statement from a RIB
     RELOCATE = 0x12  # a statement of a node's new switch to its former one
@@ -54,3 +55,4 @@ class Flag(IntFlag):
     ALL_REPLICAS = 0x08
     LATCHED = 0x10  # late joiners get it too
     URGENT = 0x20  # goes before frames without the flag, wherever frames queue
+    PARITY = 0x40  # parity frames may follow the message's frames

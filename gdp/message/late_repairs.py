@@ -93,11 +93,18 @@ class LateRepairs:
     Args:
         data: reassembles the writer's messages.
         lag_s: returns how long the slower of two paths may take to bring what the faster one has lost.
+        awaited_s: returns until when parity may fill the gaps of a message, in monotonic seconds; 0: none is awaited.
     """
 
-    def __init__(self, data: Reassembler, lag_s: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        data: Reassembler,
+        lag_s: Callable[[], float],
+        awaited_s: Callable[[int, float], float] = lambda _number, _now_s: 0.0,
+    ) -> None:
         self._data = data
         self._lag_s = lag_s
+        self._awaited_s = awaited_s
         self._incomplete: dict[int, _Incomplete] = {}
         self._due_s = _NEVER  # when something may be requested
         self._hold_s = _NEVER  # until when complete messages wait
@@ -198,6 +205,9 @@ class LateRepairs:
                 self._due_s = now_s
                 break
             extent = self._data.extent(number) if now_s < entry.until_s else None
+            if extent is not None and (awaited_s := self._awaited_s(number, now_s)) > now_s:
+                self._due_s = min(self._due_s, max(awaited_s, self._next_s(entry)))
+                continue
             if extent is not None:
                 ranges = self._poll_ranges(number, entry, extent, NACKS_PER_REPORT - len(missing), now_s)
                 missing += [MissingRange(number, *each) for each in ranges]

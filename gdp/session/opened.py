@@ -157,6 +157,11 @@ class BasePublisher(Opened[_D]):
         """Return how many fragments were retransmitted because a reader lacked them."""
         return self._publisher.repairs
 
+    @property
+    def can_restore(self) -> bool:
+        """Return whether large messages get parity against loss: the rule allows it, and NumPy is installed."""
+        return self._publisher.parity.is_enabled and self._publisher.parity.is_available
+
     def _check(self, payload: bytes) -> None:
         """Return if a message may be published."""
         if self._is_closed:

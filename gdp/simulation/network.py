@@ -36,7 +36,8 @@ class SimLink:
     Args:
         delay_s: one way.
         jitter_s: largest random addition to the delay; frames may then overtake each other.
-        loss: chance that a frame is lost, 0 to 1.
+        loss: share of frames that are lost, 0 to 1.
+        burst_frames: mean length of a run of lost frames in one direction (Gilbert's model); 1: they are independent.
         bytes_s: rate of each direction; frames beyond it wait in a queue without end.
     """
 
@@ -46,7 +47,19 @@ class SimLink:
     mtu: int = 1_500
     is_up: bool = True
     bytes_s: float = float("inf")
+    burst_frames: float = 1.0
     free_s: dict[bytes, float] = field(default_factory=dict)  # by receiver: when the last frame has left
+    in_burst: set[bytes] = field(default_factory=set)  # receivers whose last frame was lost
+
+    def loses(self, to: bytes, chance: float) -> bool:
+        """Return whether a frame towards a receiver is lost; ``chance``: random, 0 to 1."""
+        into = self.loss
+        if self.burst_frames > 1:
+            leaves = 1 / self.burst_frames
+            into = 1 - leaves if to in self.in_burst else leaves * self.loss / max(1 - self.loss, leaves * self.loss)
+        is_lost = chance < into
+        (self.in_burst.add if is_lost else self.in_burst.discard)(to)
+        return is_lost
 
     def leaves_s(self, to: bytes, size: int, now_s: float) -> float:
         """Queue a frame of ``size`` bytes towards a receiver; return when its last byte has left."""
@@ -263,7 +276,7 @@ class SimNetwork:
             tap(self._now_s, own.node, far.node, frame)
         if not sim_link.is_up or len(frame) - ETHER_BYTES > sim_link.mtu:
             self.drops[DropReason.PORT_DOWN if not sim_link.is_up else DropReason.TOO_BIG] += 1
-        elif sim_link.loss and self._random.random() < sim_link.loss:
+        elif sim_link.loss and sim_link.loses(far.mac, self._random.random()):
             self.lost += 1
         else:
             delay_s = sim_link.delay_s + (self._random.random() * sim_link.jitter_s if sim_link.jitter_s else 0.0)

@@ -298,7 +298,8 @@ class Rule(Section):
     fec: Literal["auto", "never"] = Field(
         default="auto",
         description="Redundancy against measured loss. `auto`: small `urgent` messages are sent up to three times, some"
-        " milliseconds apart, within a twentieth of the path. `never`: each frame is sent once.",
+        " milliseconds apart, within a twentieth of the path. Messages of three or more fragments get parity frames,"
+        " within a quarter of their frames and 15 % of the path. `never`: each frame is sent once.",
     )
     sign: Literal["always", "session"] = Field(
         default="always",

@@ -141,7 +141,11 @@ class ProxyNode:
             drops=[lambda: counters.drops, lambda: count_list(member.drops())],
             messages=self.traffic.messages,
             message_bytes=self.traffic.message_bytes,
-            repairs=lambda: {"sent": sum(publisher.repairs for publisher in member.publishers())},
+            repairs=lambda: {
+                "sent": sum(publisher.repairs for publisher in member.publishers()),
+                "parity": sum(publisher.parity.sent for publisher in member.publishers()),
+                "recovered": sum(writer_proxy.recovered for writer_proxy in member.writer_proxies()),
+            },
             lost=lambda: by_label(member.lost()),
             unconfirmed=lambda: by_label(member.unconfirmed()),
             faults=lambda: self.faults.counts,

@@ -77,9 +77,8 @@ class Site:
         self._block, self._prefix = laboratory.take_block(), laboratory.take_prefix()
         self._core_mac, self._wan_mac = self._next_mac(), self._next_mac()
         for router in self.routers:
-            router.ip(
-                [f"link add {LAN} address {self._next_mac()} type bridge forward_delay 0 mcast_snooping 0", f"link set {LAN} up"]
-            )
+            bridge = f"{LAN} address {self._next_mac()} type bridge forward_delay 0 mcast_snooping 0"
+            router.ip([f"link add {bridge}", f"link set {LAN} up"])
         if count == 2:
             home, carrier = self.routers
             port = laboratory.next_device()

@@ -22,12 +22,13 @@ from gdp.crypto.statements import Fields, Statement, parse
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
 from gdp.crypto.x509_profile import read_request
-from gdp.errors import FrameError, LocalError, RemoteError, StatementError
+from gdp.errors import EnvelopeError, FrameError, LocalError, RemoteError, StatementError
 from gdp.frame import codec
 from gdp.frame.kinds import Flag, Kind
 from gdp.message import bundle
 from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
 from gdp.message.heartbeat import Heartbeat, StreamStart
+from gdp.message.parity import Parity
 from gdp.names import Name
 from gdp.trust.adcert import AdCert
 from gdp.trust.advertisement import UnverifiedAdvertisement
@@ -223,6 +224,7 @@ DECODERS: Final = (
     ),
     Decoder("report", AckNack.from_wire, (_REPORT.to_wire(),), (FrameError,)),
     Decoder("status", Heartbeat.from_wire, (_STATUS.to_wire(),), (FrameError,)),
+    Decoder("parity", Parity.from_wire, (Parity(3, 1, 2, bytes(40)).to_wire(),), (EnvelopeError,)),
     Decoder("bundle", bundle.unpack, (bundle.pack([b"a", b"bc"]),), (FrameError,)),
     Decoder(
         "name", lambda data: Name.from_text(data.decode("latin-1")), (_A.to_text().encode(),), (LocalError, ValueError)

@@ -180,7 +180,7 @@ class Pipe:
     def _to_reader(self, end: End, frame: bytes) -> Callable[[], None]:
         def arrive() -> None:
             header = decode(frame)
-            assert header.kind in (Kind.DATA, Kind.HEARTBEAT)
+            assert header.kind in (Kind.DATA, Kind.HEARTBEAT, Kind.PARITY)
             end.writer_proxy.receive(header, frame, self.now_s)
             end.delivered += end.writer_proxy.poll_delivered()
 
