@@ -12,6 +12,8 @@ What differs from Copa:
   half after a loss. An AIMD of a frame each round trip, as in Copa, would need minutes behind a queue of a second.
 - A flow that had the path for itself for ``_ALONE_S`` keeps that half for ``_CLAIM_S``, whatever is lost. Else the slow
   start of the other one takes nearly all of a long queue, and CUBIC needs a minute to win it back.
+- A queue that empties shows no departure where the FIFO is short: both flows have given way. For ``_TRIAL_S`` after a
+  competition, a rate under ``_TRIAL_SHARE`` of the one before shows that the other flow is still there.
 - The window only grows while it is used, so a camera that pauses keeps a window that was measured.
 - Reports confirm many frames at once. What has arrived and is not reported yet does not count against the window, as
   BBR does with what was acknowledged in excess (section 4.6.4.2).
@@ -65,6 +67,7 @@ _EMPTY_SHARE: Final = 0.1  # of the highest queue; Copa, section 2.2
 _PROBE_S: Final = (10.0, 60.0)  # first pause before a probe, and the longest one
 _PROBE_SHARE: Final = 0.5
 _CLAIM_S, _ALONE_S = 10.0, 2.0
+_TRIAL_S, _TRIAL_SHARE, _TRIAL_ROUNDS = 10.0, 0.8, 6
 
 
 class PathController:
@@ -118,6 +121,7 @@ class PathController:
         self._claims_until_s = 0.0
         self._probe_pause_s = _PROBE_S[0]
         self._probe_at_s = self._probe_begun_s = 0.0
+        self._shared_rate, self._trial_rounds, self._was_alone = 0.0, 0, False
 
     @property
     def bytes_s(self) -> float:
@@ -377,13 +381,26 @@ class PathController:
                 self._empty_s = max(self._empty_s, now_s - patience_s / 2)  # it falls: its end may be near
             if now_s - self._empty_s > patience_s and self.queue_s > _STANDING_S:
                 self._signal(Signal.QUEUE_STANDS, now_s)
+            elif self._cubic is not None:
+                self._try_alone(sample, now_s)
         elif self.state is State.COMPETITIVE:
-            self._full_rounds = self._full_rounds + 1 if self._last_rate > _FULL_SHARE * self._capacity else 0
+            is_full = self._was_alone and self._last_rate > _FULL_SHARE * self._capacity
+            self._full_rounds = self._full_rounds + 1 if is_full else 0
             if self._full_rounds >= _FULL_ROUNDS:  # the other flow has little of the path: is it still there?
                 self._full_rounds = 0
                 self._signal(Signal.PROBE_DUE, now_s)
         self._round_delivered, self._lost_frames, self._round_frames = self._rate.delivered, 0, 0
         self._round_window, self._was_used = self.window, False
+
+    def _try_alone(self, sample: RateSample | None, now_s: float) -> None:
+        """Find out after a competition whether the other flow takes what this one has given up."""
+        if now_s - self._entered_s > _TRIAL_S:
+            self._cubic, self._probe_pause_s, self._shared_rate = None, _PROBE_S[0], 0.0
+        elif sample is not None and not sample.is_app_limited:
+            self._trial_rounds += 1
+            is_less = self._recent.value(0.0) < _TRIAL_SHARE * self._shared_rate
+            if is_less and self._trial_rounds >= _TRIAL_ROUNDS:
+                self._signal(Signal.QUEUE_STANDS, now_s)
 
     def _drain(self) -> None:
         """Leave a long queue at once: less than what arrives in the round trip of the empty path."""
@@ -443,8 +460,10 @@ class PathController:
         alone_s = self._empty_s - self._entered_s  # of the state before
         self._empty_s = self._entered_s = now_s  # losses before this moment are of another window
         if self.state is State.DELAY:
-            self._cubic = None
-            self._probe_pause_s = _PROBE_S[0]
+            self._trial_rounds = 0
+            if before is State.COMPETITIVE:
+                self._shared_rate = max(self._shared_rate, self._recent.value(0.0))
+                self._probe_begun_s = now_s
             if before is not State.COMPETITIVE:
                 self.window = max(product, least)
             else:
@@ -452,7 +471,8 @@ class PathController:
         elif self.state is State.COMPETITIVE:
             if self._cubic is None:
                 self._capacity = self._peaks.value(0.0)
-                self._claims_until_s = now_s + _CLAIM_S if alone_s >= _ALONE_S else 0.0
+                self._was_alone = alone_s >= _ALONE_S  # else the capacity is not known
+                self._claims_until_s = now_s + _CLAIM_S if self._was_alone else 0.0
                 self._cubic = Cubic(max(self.window, self._half_window()) / self._mtu, now_s)
             else:
                 self._cubic.resume(now_s - self._probe_begun_s)
@@ -461,5 +481,6 @@ class PathController:
             self._probe_at_s = now_s + self._probe_pause_s
         elif self.state is State.PROBE:
             self._probe_begun_s, self._probe_from_s = now_s, self._standing_s
+            self._shared_rate = max(self._shared_rate, self._recent.value(0.0))
             self.window = max(_PROBE_SHARE * product, least)
         self._round_window = self.window

@@ -28,7 +28,7 @@ class Signal(Enum):
     """What was measured."""
 
     PATH_FULL = "path full"  # the queue grows, or the delivery rate does not
-    QUEUE_STANDS = "queue stands"  # it has not been nearly empty for some round trips
+    QUEUE_STANDS = "queue stands"  # not nearly empty for some round trips, or only because this flow gave way
     QUEUE_EMPTY = "queue empty"
     PROBE_DUE = "probe due"
     PROBE_OVER = "probe over"

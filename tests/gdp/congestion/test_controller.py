@@ -158,6 +158,18 @@ def test_next_to_a_cubic_flow_each_has_35_to_65_percent(fifo_s: float) -> None:
     assert 0.35 <= cubic.share(15, 75, link.bits_s) <= 0.65
 
 
+@pytest.mark.parametrize("fifo_s", [RTT_S / 2, RTT_S, 2 * RTT_S])
+@pytest.mark.parametrize("is_first", [False, True])
+def test_next_to_a_cubic_flow_on_a_fast_path_each_has_35_to_65_percent(fifo_s: float, *, is_first: bool) -> None:
+    link, flow = path(100, fifo_s=fifo_s), own(start_s=0 if is_first else 5)
+    cubic = Flow(CubicSender(), start_s=5 if is_first else 0)
+    link.add(flow)
+    link.add(cubic)
+    link.run(35)
+    assert 0.35 <= flow.share(15, 35, link.bits_s) <= 0.65
+    assert 0.35 <= cubic.share(15, 35, link.bits_s) <= 0.65
+
+
 @pytest.mark.parametrize(("fifo_s", "least"), [(RTT_S, 0.4), (SECOND, 0.25)])
 def test_half_of_a_path_that_was_measured_alone_is_kept_next_to_a_slow_start(fifo_s: float, least: float) -> None:
     link, flow, cubic = path(10, fifo_s=fifo_s), own(), Flow(CubicSender(), start_s=5)
