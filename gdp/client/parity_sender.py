@@ -28,7 +28,7 @@ from gdp.limits import REPAIRS_ABOVE_PARTS
 from gdp.message import erasure
 from gdp.message.parity import OVERHEAD_BYTES, SHARD_OVERHEAD_BYTES, Parity, blocks_of, shard_of, span_of
 
-__all__ = ["PARITY_BYTES", "ParitySender", "is_protected", "is_useful", "parity_for"]
+__all__ = ["PARITY_BYTES", "RTT_MIN_S", "ParitySender", "is_protected", "is_useful", "parity_for"]
 
 PARITY_BYTES: Final = OVERHEAD_BYTES + TAG_BYTES  # so much smaller are the frames of a message with parity
 LOSS_MIN, LOSS_MAX = 0.001, 0.2  # less needs no parity, and more is no loss that parity can fill
@@ -132,10 +132,10 @@ class ParitySender:
         """Note DATA frames that leave now, and queue the parity of the spans that they complete.
 
         Args:
-            loss: measured share of lost frames; None: unknown.
+            loss: measured share of lost frames, 0 to 1; None: unknown.
             path_bytes_s: what the path carries; None: unknown.
         """
-        if not self.is_enabled:
+        if not self.is_enabled or loss is None:
             return
         for frame in frames:
             if not frame[FLAGS_AT] & _PARITY:
@@ -149,7 +149,7 @@ class ParitySender:
             self._part += 1
             span = span_of(part, parts)
             if self._part == span.stop:
-                self._add(span, parts, loss or 0.0, path_bytes_s, now_s)
+                self._add(span, parts, loss, path_bytes_s, now_s)
                 self._frames = []
 
     def handle_report(self, numbers: Iterable[int]) -> None:

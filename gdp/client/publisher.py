@@ -22,7 +22,7 @@ from gdp.client.blocking_readers import BlockingReaders
 from gdp.client.heartbeat_schedule import HeartbeatSchedule
 from gdp.client.identities import WriterIdentity
 from gdp.client.key_epochs import KeyEpochs, Secrets
-from gdp.client.parity_sender import ParitySender
+from gdp.client.parity_sender import RTT_MIN_S, ParitySender
 from gdp.client.reader_path import ReaderPath, ReaderPaths
 from gdp.client.reader_proxies import TOPICS, ReaderProxies, ReaderTimeouts
 from gdp.client.redundancy import Redundancy
@@ -125,6 +125,7 @@ class Publisher:
         )
         self.redundancy = Redundancy(budget=source.copies, path=self, is_enabled=urgent and options.fec)
         self.parity = ParitySender(keys=self._keys, budget=source.parity, is_enabled=paths == 1 and options.fec)
+        self._loss: float | None = None  # of frames, where parity may save time
         self._queue.depth = depth
         self._set_flags()
 
@@ -261,6 +262,7 @@ class Publisher:
         self._queue.set_options(options)
         self.redundancy.is_enabled = self.is_urgent and options.fec
         self.parity.is_enabled = self.paths == 1 and options.fec
+        self._measure_loss(self._seen_s)
         self._late.set_options(options)
 
     def set_depth(self, depth: int) -> None:
@@ -408,6 +410,7 @@ class Publisher:
         self._under_way.handle_report(header.source, report, now_s, waited_s)
         self.redundancy.handle_report(header.source, report, is_new=is_new)
         self.parity.handle_report({each.number for each in report.missing})
+        self._measure_loss(now_s)
         self._acknowledgements.handle_acknack(header.source, report, is_new=is_new, now_s=now_s)
         if report.missing and not self.confirms:
             newest = report.newest, report.newest_part
@@ -456,8 +459,6 @@ class Publisher:
             if not self._readers:
                 self._queue.drop_unread()
             return []
-        loss = self.redundancy.loss(self._readers, now_s)
-        self._queue.has_parity = self.parity.is_wanted(loss, self.path_rtt_s, self.options.deadline_s)
         self._queue.seal_deferred()
         if not self.confirms:
             self._queue.bytes_s = self.path_bytes_s
@@ -472,7 +473,8 @@ class Publisher:
             limit = max(limit_bytes // (mtu * (2 if has_pair and self._striper is None else 1)), 1)
             parity = self.parity.poll_frames(limit)
             sent = self._frames_to_send(now_s, limit - len(parity)) if len(parity) < limit else []
-            self.parity.handle_sent(sent, loss, self.capacity_bytes_s, now_s)
+            if self._loss is not None:
+                self.parity.handle_sent(sent, self._loss, self.capacity_bytes_s, now_s)
             left = limit - len(parity) - len(sent)
             self.has_more = left <= len(self.parity)
             parity_after = self.parity.poll_frames(max(left, 0))
@@ -514,6 +516,13 @@ class Publisher:
         paths = [(name, self._reader_paths.path(name, now_s)) for name in names]
         allowances = [(name, path.allowance(now_s)) for name, path in paths if not path.is_silent]
         self._blocking.record(allowances, self._window.sent_bytes, now_s)
+
+    def _measure_loss(self, now_s: float) -> None:
+        """Note whether messages get parity from now on; reports change that, not each poll."""
+        trip_s = self.path_rtt_s if self.parity.is_enabled else None
+        is_long = trip_s is not None and trip_s >= RTT_MIN_S
+        self._loss = self.redundancy.loss(self._readers, now_s) if is_long else None
+        self._queue.has_parity = self.parity.is_wanted(self._loss, trip_s, self.options.deadline_s)
 
     def _paths(self) -> list[ReaderPath]:
         """Return the paths to the readers that may govern: of a reliable topic those that keep up."""

@@ -83,6 +83,7 @@ def traffic(settings: Settings, direction: Direction) -> None:
             "due": tally.due,
             "sent": tally.sent,
             "ages_s": list(tally.ages_s.values()),
+            "whole": tally.whole,
             "broken": tally.broken,
             "doubled": tally.doubled,
         }

@@ -254,7 +254,7 @@ def test_the_idle_age_of_an_answer_includes_its_request() -> None:
 
 def test_an_answer_is_due_for_each_request_that_was() -> None:
     mix = streams("jpeg")
-    silent = {each.name: {"due": 0, "sent": 0, "ages_s": [], "broken": 0, "doubled": 0} for each in mix}
+    silent = {each.name: {"due": 0, "sent": 0, "ages_s": [], "whole": 0, "broken": 0, "doubled": 0} for each in mix}
     robot = {**silent, "service request": {**silent["service request"], "due": 9, "sent": 8}}
     found = merged(mix, robot, silent)
     assert (found["service request"].due, found["service answer"].due) == (9, 9)
@@ -325,7 +325,9 @@ def test_a_message_outside_the_window_or_not_whole_is_not_an_arrival() -> None:
         cloud.take(stream, make_message(1, due_ns, bytes(100)), 300)
     cloud.take(stream, b"short", 300)
     tally = cloud.tallies["tf"]
-    assert (list(tally.ages_s), tally.doubled, tally.broken) == ([1], 1, 1)
+    assert (list(tally.ages_s), tally.doubled, tally.broken, tally.whole) == ([1], 1, 1, 0)
+    cloud.take(stream, make_message(2, 50, bytes(100)), 150)
+    assert (list(tally.ages_s), tally.whole) == ([1], 1)  # it arrived in the window, and was due before
 
 
 def test_the_grid_of_the_command_line_is_every_combination_of_what_was_chosen() -> None:

@@ -42,12 +42,14 @@ class Tally:
         due: messages of the window that were due.
         sent: of those, messages that the system took in time; a publisher that waits misses the others.
         ages_s: of the whole messages that arrived, by number.
+        whole: whole messages that arrived in the window, whenever they were due.
         broken, doubled: messages that were not whole, or arrived again.
     """
 
     due: int = 0
     sent: int = 0
     ages_s: dict[int, float] = field(default_factory=dict)
+    whole: int = 0
     broken: int = 0
     doubled: int = 0
 
@@ -97,6 +99,7 @@ class Exchange:
             tally.broken += 1
             return
         number, due_ns = opened
+        tally.whole += window.has(now_ns)
         if window.has(due_ns):
             if number in tally.ages_s:
                 tally.doubled += 1

@@ -50,6 +50,7 @@ class Report:
     broken: int = 0
     doubled: int = 0
     refusals: Mapping[str, int] = field(default_factory=dict)
+    whole: int = 0  # that arrived in the window, whenever they were due
 
 
 def merged(mix: Sequence[Stream], robot: Mapping[str, Any], cloud: Mapping[str, Any]) -> dict[str, Report]:
@@ -59,7 +60,9 @@ def merged(mix: Sequence[Stream], robot: Mapping[str, Any], cloud: Mapping[str, 
         source, sink = (robot, cloud) if each.direction == "up" else (cloud, robot)
         sent, arrived = source[each.name], sink[each.name]
         due = robot[each.answers]["due"] if each.answers else sent["due"]
-        found[each.name] = Report(due, sent["sent"], arrived["ages_s"], arrived["broken"], arrived["doubled"])
+        found[each.name] = Report(
+            due, sent["sent"], arrived["ages_s"], arrived["broken"], arrived["doubled"], whole=arrived["whole"]
+        )
     return found
 
 

@@ -14,12 +14,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 
-__all__ = ["CAMERA_BYTES", "SERVICE_ANSWER", "Direction", "Stream", "carried_s", "make_message", "open_message",
-           "streams", "wire_bytes"]  # fmt: skip
+__all__ = ["CAMERA_BYTES", "RELIABLE", "SERVICE_ANSWER", "Direction", "Stream", "carried_s", "make_message",
+           "open_message", "streams", "wire_bytes"]  # fmt: skip
 
 Direction = Literal["up", "down"]
 CAMERA_BYTES: Final = {"raw": 921_600, "jpeg": 40_000}  # 640x480 rgb8; the same as JPEG
 SERVICE_ANSWER: Final = "service answer"
+RELIABLE: Final = "reliable"  # in place of a camera: raw images alone, none of which may be dropped
 _HEAD: Final = struct.Struct("!IQ")
 _TAIL: Final = struct.Struct("!I")
 _FRAME_PAYLOAD: Final = 1_400  # of 1,500 bytes; what is left is for addresses, security and order of every system
@@ -47,7 +48,9 @@ class Stream:
 
 
 def streams(camera: str) -> tuple[Stream, ...]:
-    """Return the traffic of a robot with a camera of ``CAMERA_BYTES``; QoS as ROS publishes such topics."""
+    """Return the traffic of a robot with a camera of ``CAMERA_BYTES``, with QoS as ROS publishes it; or ``RELIABLE``."""
+    if camera == RELIABLE:
+        return (Stream("images", CAMERA_BYTES["raw"], 1 / 30, "up", reliable=True, bulk=True),)
     return (
         Stream("cmd_vel", 100, 1 / 50, "down", reliable=True, urgent=True),
         Stream("tf", 500, 1 / 100, "up", reliable=True, urgent=True),

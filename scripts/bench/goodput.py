@@ -1,0 +1,73 @@
+"""Goodput bench: a reliable topic of raw images over a link that loses frames, next to Zenoh.
+
+The link is that of ``uplink.py``: a rate, a round trip, random loss and a drop-tail FIFO of one bandwidth-delay product
+in each direction. Images of 921,600 bytes are due 30 times a second, which is more than the link carries; a publisher
+that waits misses some. Whole images that arrive in the window count.
+
+    sudo .venv/bin/python scripts/bench/goodput.py                  # writes docs/benchmarks/goodput.json
+    sudo .venv/bin/python scripts/bench/goodput.py --loss 5 --no-save
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from report import Rounds
+from skeleton import Options, Outcome, Recorder, Trial, command_line, new_run, run_bench
+from testbed import Lab
+from thin_link.conditions import LOSSES, Conditions
+from thin_link.line import thin_link_lab
+from thin_link.systems import SYSTEMS
+from thin_link.traffic import CAMERA_BYTES, RELIABLE, streams
+from uplink import OURS, exchange
+
+from gdp.host.run_registry import RunRegistry
+
+GOODPUT, SHARE, LATE = "goodput, Mbit/s", "link share", "relay late p99, ms"
+ROWS: Final = (OURS, "zenoh-tls-block", "zenoh-quic-block")
+TARGET: Final = 5.0
+_IMAGE: Final = streams(RELIABLE)[0]
+
+
+def goodput(lab: Lab, link: Conditions, name: str, options: Options) -> dict[str, float]:
+    """Return the figures of one system on a link."""
+    used, reports = exchange(lab, link, SYSTEMS[name], options, with_tcp=False)
+    return {
+        GOODPUT: reports[_IMAGE.name].whole * 8 * CAMERA_BYTES["raw"] / options.seconds / 1e6,
+        SHARE: used.up.share,
+        LATE: used.late_ms,
+    }
+
+
+def measure(options: Options, runs: RunRegistry) -> Outcome:
+    """Measure every system, round by round."""
+    recorder = Recorder()
+    link = Conditions.of(options.rate, options.rtt, options.loss, "bdp", seed=options.seed, traces=Path())
+    for number in range(1, options.rounds + 1):
+        with new_run(runs) as run:
+            lab = thin_link_lab(run, tcp_control=options.tcp_control)
+            for name in ROWS:
+                work = partial(goodput, lab, link, name, options)
+                trial = Trial(link.name, name, (GOODPUT, SHARE, LATE), lambda _, work=work: work())  # type: ignore[misc]
+                recorder.attempt(trial, number, options.rounds)
+    over: Rounds = recorder.rounds
+    settings = {"rounds": options.rounds, "seconds of each figure": options.seconds, "TCP": options.tcp_control}
+    settings["trouble"] = recorder.notes or "none"
+    targets = [
+        over.ratio(f"{GOODPUT}: {OURS} / {other}", OURS, other, link.name, GOODPUT, TARGET if at == 0 else 1.0)
+        for at, other in enumerate(ROWS[1:])
+    ]
+    return Outcome("goodput", "Reliable images over a link that loses frames", over, targets, settings)
+
+
+if __name__ == "__main__":
+    parser = command_line(__doc__, rounds=3, seconds=15.0, quick={"rounds": 1, "seconds": 3.0}, has_record=True)
+    parser.add_argument("--rate", default="100", help="Mbit/s (default: %(default)s)")
+    parser.add_argument("--rtt", type=float, default=60.0, help="ms (default: %(default)s)")
+    parser.add_argument("--loss", choices=list(LOSSES), default="1", help="of frames, %% (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=1, help="of the losses (default: %(default)s)")
+    parser.add_argument("--tcp-control", default="cubic", help="of TCP under TLS (default: %(default)s)")
+    parser.set_defaults(camera=RELIABLE)
+    run_bench(parser, measure)
