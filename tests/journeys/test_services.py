@@ -358,6 +358,23 @@ def test_calls_go_on_while_the_client_roams() -> None:
     outlive(world, client, server)
 
 
+def test_a_running_action_goes_on_while_its_client_roams() -> None:
+    world = ring()
+    server, client = pair(world)
+    server.answers = False
+    client.publish(b"goal")
+    assert world.network.run(2, lambda: bool(server.collect()))
+    steps = [b"feedback %d" % number for number in range(60)]
+    for number, step in enumerate(steps):
+        world.network.call(0.1 * number, partial(server.publish, step))
+    world.network.call(1.55, lambda: world.roam(ROBOT, "nuc3"))
+    world.network.call(6.0, lambda: server.answer(client.member.name, b"result"))
+    assert work(world, client, until_s=20, have=61)
+    assert [each.delivered.message for each in client.got if not each.private] == steps
+    assert [each.delivered.message for each in client.got if each.private] == [b"result"]
+    outlive(world, client, server)
+
+
 def test_a_client_whose_delegation_is_revoked_is_answered_no_more() -> None:
     world = ring()
     server, client = pair(world)
