@@ -518,8 +518,12 @@ class Publisher:
         self._blocking.record(allowances, self._window.sent_bytes, now_s)
 
     def _measure_loss(self, now_s: float) -> None:
-        """Note whether messages get parity from now on; reports change that, not each poll."""
-        trip_s = self.path_rtt_s if self.parity.is_enabled else None
+        """Note whether messages get parity from now on; reports change that, not each poll.
+
+        The round trip of the empty path counts, because a busy machine lengthens the others on any link.
+        """
+        controllers = [path.controller for path in self._paths()] if self.parity.is_enabled else []
+        trip_s = max((each.base_rtt_s for each in controllers if each.rtt_s is not None), default=None)
         is_long = trip_s is not None and trip_s >= RTT_MIN_S
         self._loss = self.redundancy.loss(self._readers, now_s) if is_long else None
         self._queue.has_parity = self.parity.is_wanted(self._loss, trip_s, self.options.deadline_s)
