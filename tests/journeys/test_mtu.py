@@ -8,8 +8,8 @@ from functools import partial
 
 import pytest
 
-from gdp.errors import DropReason
 from gdp.client.send_options import SendOptions
+from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
 from gdp.limits import MTU_HOLD_S, MTU_NARROWINGS
 from gdp.simulation.simulation import Simulation
