@@ -48,7 +48,7 @@ class Stream:
 
 
 def streams(camera: str) -> tuple[Stream, ...]:
-    """Return the traffic of a robot with a camera of ``CAMERA_BYTES``, with QoS as ROS publishes it; or ``RELIABLE``."""
+    """Return the traffic of a robot with a camera of ``CAMERA_BYTES``, with QoS as in ROS, or ``RELIABLE``."""
     if camera == RELIABLE:
         return (Stream("images", CAMERA_BYTES["raw"], 1 / 30, "up", reliable=True, bulk=True),)
     return (
