@@ -39,6 +39,7 @@ class _Reader:
     flights: deque[_Flight] = field(default_factory=deque)
     resolved: int = 0  # count of frames whose fate is known
     received: int = -1  # count in its latest report; -1: none yet
+    partial: int = 0  # frames of the oldest flight that came, of frames sent again
     unseen: int = 0  # frames sent before it began to count
     lost: int = 0
 
@@ -104,7 +105,7 @@ class SentFrames:
 
     def _confirm(self, reader: _Reader, path: ReaderPath, report: AckNack, now_s: float, waited_s: float) -> None:
         while reader.flights and not path.controller.is_under_way(reader.flights[0].number):
-            reader.resolved = reader.flights.popleft().end  # it was given up with a silence
+            reader.resolved, reader.partial = reader.flights.popleft().end, 0  # it was given up with a silence
         came = (report.received - reader.received) & _COUNT_MASK if reader.received >= 0 else 0
         place = self._places.get(NUMBER_AND_PART.pack(report.newest, report.newest_part), 0)
         if place <= reader.resolved:
@@ -112,7 +113,7 @@ class SentFrames:
             if came <= _COUNT_MASK // 2:
                 reader.received = report.received
             return
-        before, numbers = reader.resolved, []
+        before, numbers, reader.partial = reader.resolved, [], 0
         while reader.flights and reader.flights[0].end <= place:
             flight = reader.flights.popleft()
             reader.resolved = flight.end
@@ -129,13 +130,21 @@ class SentFrames:
         path.acknowledged(numbers, max(lost, 0), report.held_us / 1e6 + waited_s, now_s)
 
     def _confirm_repairs(self, reader: _Reader, path: ReaderPath, came: int, now_s: float) -> None:
-        """Confirm frames that came, though none was newer than before: they were sent again."""
+        """Confirm frames that came, though none was newer than before: they were sent again.
+
+        A report by which nothing more came shows that the rest of a flight is lost. Else a flight that lost one frame
+        would block the window until the timeout.
+        """
+        came = came if came <= _COUNT_MASK // 2 else 0
+        is_over = not came and reader.partial > 0
+        came += reader.partial
         numbers = []
-        while reader.flights and 0 < reader.flights[0].end - reader.resolved <= came <= _COUNT_MASK // 2:
+        while reader.flights and (0 < reader.flights[0].end - reader.resolved <= came or is_over):
             flight = reader.flights.popleft()
-            came -= flight.end - reader.resolved
-            reader.resolved = flight.end
+            came = max(came - flight.end + reader.resolved, 0)
+            reader.resolved, is_over = flight.end, False
             numbers.append(flight.number)
+        reader.partial = came if reader.flights else 0
         if numbers:
             path.acknowledged(numbers, 0, None, now_s)
 
