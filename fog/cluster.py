@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import KW_ONLY, asdict, dataclass, field
+from dataclasses import KW_ONLY, asdict, dataclass, field, replace
 from typing import Literal
 
 from fog.hardware import Hardware
+from fog.scaling import ScalingPolicy, policy_from_keys
 from gdp.errors import LocalError
 
 __all__ = ["CloudNode", "ClusterPlan", "ExportedInterface", "MachineRequest", "RobotNode"]
@@ -55,11 +56,17 @@ class MachineRequest:
 
     Args:
         region: empty: chosen by the supervisor, a different one for each machine if possible.
+        may_be_on_demand: of a spot machine: while none is to be had, one on demand takes its place.
     """
 
     hardware: Hardware
     region: str = ""
     is_spot: bool = False
+    may_be_on_demand: bool = False
+
+    def on_demand(self) -> MachineRequest:
+        """Return the same machine on demand."""
+        return replace(self, is_spot=False, may_be_on_demand=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +78,8 @@ class ClusterPlan:
         budget_usd: when its machines have cost this much, they are released; None: no limit.
         availability: share of time for which at least one machine is to serve; ``fog launch`` adds as many machines as
             that needs. None: ``machines`` is the full list.
+        pushed_unix_s: machines that were requested before have earlier software, and are replaced; None: none is.
+        scale: between which numbers of machines the cluster moves, beginning with ``machines``; None: it does not.
     """
 
     name: str
@@ -81,10 +90,18 @@ class ClusterPlan:
     idle_s: float | None = None
     budget_usd: float | None = None
     availability: float | None = None
+    pushed_unix_s: float | None = None
+    scale: ScalingPolicy | None = None
+
+    def resized(self, count: int) -> tuple[MachineRequest, ...]:
+        """Return so many machines: the first of the plan, and more like its last one in other regions."""
+        more = max(count - len(self.machines), 0)
+        return (*self.machines[:count], *[replace(self.machines[-1], region="")] * more)
 
     def to_json(self) -> str:
         """Return the text that ``from_json`` reads."""
-        return json.dumps(asdict(self), sort_keys=True)
+        scale = None if self.scale is None else self.scale.to_keys()
+        return json.dumps({**asdict(self), "scale": scale}, sort_keys=True)
 
     @classmethod
     def from_json(cls, text: str) -> ClusterPlan:
@@ -100,7 +117,12 @@ class ClusterPlan:
                 for each in items["nodes"]
             ]
             machines = [
-                MachineRequest(Hardware(**each["hardware"]), each["region"], each["is_spot"])
+                MachineRequest(
+                    Hardware(**each["hardware"]),
+                    each["region"],
+                    each["is_spot"],
+                    each.get("may_be_on_demand", False),
+                )
                 for each in items["machines"]
             ]
             carried = [ExportedInterface(**each) for each in items["carried"]]
@@ -112,6 +134,8 @@ class ClusterPlan:
                 idle_s=items["idle_s"],
                 budget_usd=items["budget_usd"],
                 availability=items.get("availability"),
+                pushed_unix_s=items.get("pushed_unix_s"),
+                scale=None if items.get("scale") is None else policy_from_keys(items["scale"]),
             )
         except json.JSONDecodeError as error:
             raise LocalError(f"line {error.lineno}: JSON is expected: {error.msg}") from error

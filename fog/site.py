@@ -43,6 +43,7 @@ from gdp.errors import LocalError
 from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.nodes.config import LeaseSeconds, SwitchConfig
 from gdp.nodes.schema import Directory, ExistingFile, Ifname, Section, Unique, load, relative
+from gdp.stores.checkout import ignore_folder
 from gdp.stores.files import private, read_private, write_all
 from gdp.stores.issue import make_domain, make_node, make_owner
 from gdp.stores.ownership import refuse_foreign_folder
@@ -403,6 +404,7 @@ def _identifier(folder: Path) -> tuple[str, bool]:
     path = folder / _SITE
     if not path.exists():
         write_all(folder, {_SITE: private(json.dumps({"id": secrets.token_hex(_ID_BYTES)}).encode())})
+        ignore_folder(folder)
     try:
         said = json.loads(read_private(path))
         return str(said["id"]), bool(said.get("replica_gateway", False))

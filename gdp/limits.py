@@ -88,6 +88,7 @@ HELLO_S: Final = 0.25  # between hellos on a port, until keepalives of its neigh
 HELLO_IDLE: Final = 16  # hello intervals between two hellos, from then on
 DEAD_S: Final = 0.9  # a neighbour that sends no keepalives is lost after this time of silence
 KEEPALIVE_MS: Final = 70  # between keepalives to a neighbour that is up
+SCAPY_KEEPALIVE_MS: Final = 500  # ... with the data plane that builds each frame by Scapy: some hundred frames a second
 DETECT_MULTIPLIER: Final = 3  # missed keepalives after which it is lost
 COST_DEFAULT: Final = 10  # of a link
 COST_AUTO: Final = 0  # of a port: the cost of its links is measured
@@ -136,6 +137,14 @@ RELAY_RATE_MAX: Final = (1 << 32) - 1
 DIRECT_TUNNELS_MAX: Final = 32  # of one switch to others that are behind a NAT, too
 LINK_STATES_PER_S: Final = 10.0  # of one origin that are accepted, and flooded
 LINK_STATES_BURST: Final = 100.0
+
+# Diagnostics
+DIAGNOSTICS_PER_S: Final = 32.0  # requests of one member that a node answers
+DIAGNOSTICS_BURST: Final = 64.0
+DIAGNOSTIC_FRAMES_PER_S: Final = 1_024.0  # frames of one neighbour that are read for it, before a signature is verified
+DIAGNOSTIC_FRAMES_BURST: Final = 2_048.0
+DIAGNOSTIC_REPLY_MAX_BYTES: Final = 8_000  # longest reply that one request may ask for, and pays with its own length
+DIAGNOSTIC_WAIT_S: Final = 1.0  # a node that must query a RIB first answers within this time
 
 # Revocations
 REVOCATIONS_PER_ROOT: Final = 262_144  # of one trusted domain

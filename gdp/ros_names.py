@@ -17,8 +17,10 @@ __all__ = [
     "NAME_FORM",
     "NAME_MAX_CHARS",
     "PATTERN_FORM",
+    "PREFIX_FORM",
     "TYPE_FORMS",
     "Kind",
+    "covers",
     "fits_kind",
     "is_name",
     "is_pattern",
@@ -29,6 +31,7 @@ Kind: TypeAlias = Literal["topic", "service", "action"]
 
 NAME_MAX_CHARS: Final = 512
 NAME_FORM: Final = r"(?:/[A-Za-z0-9_]+)+"
+PREFIX_FORM: Final = r"(?:[A-Za-z0-9_]+(?:/[A-Za-z0-9_]+)*)?"  # a namespace without its first slash; empty: the root
 # matches names, too; in ECMAScript's syntax
 PATTERN_FORM: Final = r"(?:/(?:\*\*|\*|\*?[A-Za-z0-9_]+(?:\*[A-Za-z0-9_]+)*\*?))+"
 
@@ -39,7 +42,8 @@ TYPE_FORMS: Final[dict[Kind, tuple[str, str]]] = {  # pattern in ECMAScript's sy
     "service": (f"{_WORD}/srv/{_WORD}", "std_srvs/srv/SetBool"),
     "action": (f"{_WORD}/action/{_WORD}", "test_msgs/action/Fibonacci"),
 }
-_VISIBLE: Final = "(?!_)[A-Za-z0-9_]+"
+_ANY: Final = "[A-Za-z0-9_]+"
+_VISIBLE: Final = f"(?!_){_ANY}"
 
 
 def is_name(text: str) -> bool:
@@ -57,19 +61,24 @@ def matches(pattern: str, name: str) -> bool:
     return _compiled(pattern).fullmatch(name) is not None
 
 
+def covers(pattern: str, name: str) -> bool:
+    """Return whether a full name is the pattern, or matches it with hidden segments included."""
+    return pattern == name or ("*" in pattern and _compiled(pattern, hides=False).fullmatch(name) is not None)
+
+
 def fits_kind(type_name: str, kind: Kind) -> bool:
     """Return whether a type, as ROS 2 writes it, is valid for a topic, a service or an action."""
     return re.fullmatch(TYPE_FORMS[kind][0], type_name) is not None
 
 
 @functools.lru_cache(maxsize=1024)
-def _compiled(pattern: str) -> re.Pattern[str]:
-    return re.compile("".join(map(_segment, pattern.split("/")[1:])))
+def _compiled(pattern: str, *, hides: bool = True) -> re.Pattern[str]:
+    return re.compile("".join(_segment(text, _VISIBLE if hides else _ANY) for text in pattern.split("/")[1:]))
 
 
-def _segment(text: str) -> str:
+def _segment(text: str, whole: str) -> str:
     if text == "**":
-        return f"(?:/{_VISIBLE})+"
+        return f"(?:/{whole})+"
     if text == "*":
-        return f"/{_VISIBLE}"
-    return "/" + ("(?!_)" if text[0] == "*" else "") + text.replace("*", "[A-Za-z0-9_]*")
+        return f"/{whole}"
+    return "/" + ("(?!_)" if text[0] == "*" and whole == _VISIBLE else "") + text.replace("*", "[A-Za-z0-9_]*")

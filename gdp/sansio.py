@@ -6,7 +6,7 @@ frames and the time, and takes out frames to send and the time of the next call.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple, Protocol
 
 __all__ = ["BROADCAST", "OutgoingFrames", "ProtocolCore", "ReceivedFrame", "Timestamps"]
@@ -53,6 +53,9 @@ class ProtocolCore(Protocol):
             mtu: bytes after the Ethernet header.
             cost: of its links; ``COST_AUTO``: measured.
         """
+
+    def count_arrivals(self, frames_from: Callable[[int], int]) -> None:
+        """Learn how to count the frames that have come from a port, those too that a data plane keeps from the core."""
 
     def receive(self, arrivals: Sequence[ReceivedFrame], now: Timestamps) -> None:
         """Process received frames; never raises for what they contain."""

@@ -33,15 +33,15 @@ Rights = Mapping[str, Mapping[str, Collection[Right]]]  # by node and name
 class SessionLab:
     """Running processes. ``folder / label`` is the directory of a node; its device is the label and a 0."""
 
-    def __init__(self, run: Run, undo: ExitStack, rights: Rights) -> None:
+    def __init__(self, run: Run, undo: ExitStack, rights: Rights, types: Mapping[str, str]) -> None:
         self.folder = run.directory
         self._run = run
         self._undo = undo
         self._spaces = Namespaces(Topology((), (DomainPlan(_MACHINE, (_MACHINE,)),), ()), run)
         if rights:
-            self._make_nodes(rights)
+            self._make_nodes(rights, types)
 
-    def _make_nodes(self, rights: Rights) -> None:
+    def _make_nodes(self, rights: Rights, types: Mapping[str, str]) -> None:
         make_domain(self.folder / "domain", _MACHINE)
         make_owner(self.folder / "owner")
         attach = ["rib0", *(f"{label}0" for label in rights)]
@@ -53,7 +53,7 @@ class SessionLab:
             (node / "delegations").mkdir(exist_ok=True)
             for name, given in names.items():
                 kind = "service" if {Right.SERVE, Right.CALL} & set(given) else "topic"
-                metadata = Metadata({"kind": kind, "name": name})
+                metadata = Metadata({"kind": kind, "name": name, **({"type": types[name]} if name in types else {})})
                 install_delegation(node, delegate(self.folder / "owner", node / CARD, metadata, list(given)))
 
     def start(self, *argv: str) -> subprocess.Popen[str]:
@@ -105,12 +105,16 @@ def _end(process: subprocess.Popen[str]) -> None:
 
 
 @contextmanager
-def session_lab(rights: Rights) -> Iterator[SessionLab]:
-    """Run a lab whose nodes have these rights, without rights only an empty machine; end it on leaving."""
+def session_lab(rights: Rights, types: Mapping[str, str] | None = None) -> Iterator[SessionLab]:
+    """Run a lab whose nodes have these rights, without rights only an empty machine; end it on leaving.
+
+    Args:
+        types: ROS types of names.
+    """
     run = RunRegistry().start()
     with ExitStack() as undo:
         undo.callback(run.end)
-        yield SessionLab(run, undo, rights)
+        yield SessionLab(run, undo, rights, types or {})
 
 
 def lines_of(process: subprocess.Popen[str], count: int) -> Sequence[str]:

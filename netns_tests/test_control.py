@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from websockets.sync.client import connect
 
 from gdp.nodes.control_client import find_control_socket
 from netns_tests.spaces import Space
@@ -120,3 +121,27 @@ def test_the_socket_of_a_killed_node_is_replaced(nodes: Nodes) -> None:
     again = nodes.commands.start("proxy.cli.proxy", "proxy")
     again.until('"ready"')
     assert nodes.gdp("status", "proxy")[0] == 0
+
+
+def test_the_live_view_shows_running_nodes_that_dropped_their_rights(space: Space, nodes: Nodes) -> None:
+    space.ip("set", "lo", "up")
+    home = nodes.commands.home
+    words = [word for name in ("switch", "rib", "proxy") for word in ("--node", str(home / name))]
+    command = [sys.executable, "-m", "gdp.cli.gdp", "dashboard", "--json", *words]
+    with subprocess.Popen(
+        command, cwd=home, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, text=True
+    ) as view:
+        try:
+            assert view.stdout is not None
+            ready = json.loads(view.stdout.readline())
+            with connect(ready["url"].replace("http", "ws") + "live") as page:
+                structure = json.loads(page.recv(PATIENCE_S))
+                figures = [json.loads(page.recv(PATIENCE_S)) for _ in range(2)][-1]
+        finally:
+            view.terminate()
+        assert view.wait(PATIENCE_S) == 0
+    assert sorted(role for _, role, _, _, is_near in structure["nodes"] if is_near) == ["proxy", "rib", "switch"]
+    assert len(structure["links"]) == 2
+    assert all(rtt_ms is not None for _, _, rtt_ms, _ in figures["links"])
+    assert any(there + back > 0 for there, back, _, _ in figures["links"])
+    assert structure["names"]

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from websockets.sync.client import ClientConnection, connect
 
 from fog.supervisor.journal import Journal
 from fog.supervisor.record import Record
@@ -124,6 +125,106 @@ def test_calls_go_on_while_machines_are_taken_and_killed_and_the_supervisor_is(f
     fog.run("down")
     assert json.loads(fog.run("ls", "--json")) == []
     assert not left_of(fog)
+
+
+def test_the_live_view_shows_machines_first_answers_and_a_loss(fog: Fog) -> None:
+    fog.run("launch", str(_LAUNCH), "--detach")
+    first, second = fog.serving()
+    words = [sys.executable, "-m", "fog_demo.caller", "--ros-args", "-p", "rate_hz:=20.0"]
+    caller = subprocess.Popen(words, env=fog.environment, cwd=fog.state.parent, stdout=subprocess.DEVNULL)
+    words = [sys.executable, "-m", "gdp.cli.gdp", "dashboard", "--json"]
+    view = subprocess.Popen(words, env=fog.environment, stdout=subprocess.PIPE, text=True)
+    try:
+        assert view.stdout is not None
+        url = json.loads(view.stdout.readline())["url"]
+        with connect(url.replace("http", "ws", 1) + "live", max_size=None) as page:
+            shown = Shown(page)
+            shown.until(lambda: shown.serving() == 2 and len(shown.first_answers()) == 2)
+            assert {each["name"] for each in shown.cluster()["machines"]} >= {first, second}
+            before = sum(shown.first_answers().values())
+            shown.until(lambda: sum(shown.first_answers().values()) > before + 20)
+            fog.run("local", "kill", first)
+            shown.until(lambda: any(first in text for text in shown.bad))
+            shown.until(lambda: shown.serving() == 2 and first not in fog.serving())
+        view.send_signal(signal.SIGINT)
+        assert view.wait(PATIENCE_S) == 0
+    finally:
+        for each in (caller, view):
+            each.kill()
+            each.communicate()
+
+
+_SCALED = """
+from fog import FogCluster, LaunchDescription, Node, SpotMachine
+
+def generate_launch_description():
+    FogCluster(
+        name="echo",
+        cloud_nodes=[Node(package="fog_demo", executable="echo")],
+        deployments=[SpotMachine(hardware="cpu:1", on_demand=True)],
+        services={"/echo": "std_srvs/srv/SetBool"},
+        replication="hedged",
+        scale={"min": 1, "max": 2, "target_calls_per_s": 10},
+    )
+    return LaunchDescription([])
+"""
+
+
+def test_load_adds_a_machine_and_one_on_demand_takes_the_place_of_a_spot_machine_that_is_not_to_be_had(
+    fog: Fog, tmp_path: Path
+) -> None:
+    (tmp_path / "scaled.launch.py").write_text(_SCALED)
+    fog.run("local", "sold-out")
+    fog.run("launch", str(tmp_path / "scaled.launch.py"), "--detach")
+    (first,) = fog.living()
+    assert not first.spec.offer.is_spot
+    fog.run("local", "sold-out", "--off")
+    words = [sys.executable, "-m", "fog_demo.caller", "--ros-args", "-p", "rate_hz:=20.0"]
+    caller = subprocess.Popen(words, env=fog.environment, cwd=fog.state.parent, stdout=subprocess.PIPE, text=True)
+    try:
+        fog.until(lambda: len(fog.serving()) == 2, "a second machine for the load")
+        caller.send_signal(signal.SIGINT)
+        last = json.loads(caller.communicate(timeout=PATIENCE_S)[0].splitlines()[-1])
+    finally:
+        caller.kill()
+        caller.wait()
+    assert last["failed"] == last["wrong"] == last["unserved"] == 0
+    assert [each.spec.offer.is_spot for each in fog.living()] == [False, True]
+    assert "scaled" in fog.events()
+
+
+class Shown:
+    """What a page of the live view has received."""
+
+    def __init__(self, page: ClientConnection) -> None:
+        self._page = page
+        self._structure: dict[str, Any] = {}
+        self._figures: dict[str, Any] = {}
+        self.bad: list[str] = []
+
+    def until(self, is_met: Callable[[], object]) -> None:
+        end_s = time.monotonic() + _MACHINES_S
+        while not self._figures or not is_met():
+            assert time.monotonic() < end_s, (self._structure, self._figures, self.bad)
+            message = json.loads(self._page.recv(PATIENCE_S))
+            if message["kind"] == "structure":
+                self._structure = message
+            elif message["kind"] == "figures":
+                self._figures = message
+                self.bad += [each["text"] for each in message["events"] if each["is_bad"] or each["what"] == "cluster"]
+
+    def cluster(self) -> dict[str, Any]:
+        (found,) = (each for each in self._structure["clusters"] if each["name"] == "echo")
+        return dict(found)
+
+    def serving(self) -> int:
+        clusters = [each for each in self._structure["clusters"] if each["name"] == "echo"]
+        return int(clusters[0]["serving"]) if clusters else 0
+
+    def first_answers(self) -> dict[str, float]:
+        """Return the first answers to ``/echo`` by server."""
+        echo = {row[0] for row in self._structure["names"] if row[1] == "/echo"}
+        return {row[2]: row[4] for row in self._figures["replicas"] if row[0] in echo and row[4]}
 
 
 def test_down_ends_everything_though_launch_and_supervisor_were_killed_and_the_journal_is_gone(fog: Fog) -> None:

@@ -17,9 +17,11 @@ import pytest
 from gdp.errors import GdpError
 from gdp.nodes.control_client import ask_node, find_control_socket
 from gdp.nodes.control_protocol import Command
+from gdp.stores.keyring import CARD, load_card
 from internet.access import Access
 from internet.host import Host
 from internet.laboratory import Laboratory
+from netns_tests.traces import traced
 
 pytestmark = pytest.mark.netns
 
@@ -59,6 +61,16 @@ def up(directory: Path) -> set[object]:
     return {each["label"] for each in links(directory) if each["up"] is True}
 
 
+def devices(directory: Path) -> set[object]:
+    """Return the devices of a machine's tunnels."""
+    return {each["device"] for each in links(directory)}
+
+
+def switch_name(directory: Path) -> str:
+    """Return the name of a machine's switch."""
+    return load_card(directory / "switch" / CARD).name.to_text()
+
+
 def eventually(found: Callable[[], bool], logs: Path) -> None:
     """Wait until something holds."""
     end_s = time.monotonic() + PATIENCE_S
@@ -92,5 +104,11 @@ def test_machines_behind_nats_join_with_tokens_and_a_removed_one_has_no_tunnel(
             each["label"]: each for each in json.loads(run("domain", "ls", "lab", "--directory", str(lab), "--json"))
         }
         assert rows.keys() == {"border", "robot", "arm"}
+        (path,) = traced("two WireGuard tunnels", switch_name(tmp_path / "arm"), tmp_path / "robot" / "switch")
+        assert [hop["label"] for hop in path["hops"]] == ["robot", "border", "arm"]
+        assert [hop["in"]["label"] for hop in path["hops"][1:]] == ["robot", "border"]
+        assert {path["hops"][0]["out"]["port"], path["hops"][1]["in"]["port"]} <= devices(tmp_path / "robot") | devices(
+            lab
+        )
         run("domain", "remove", "lab", "robot", "--directory", str(lab))
         eventually(lambda: {each["label"] for each in links(lab)} == {"arm"}, tmp_path)

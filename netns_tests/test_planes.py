@@ -24,7 +24,7 @@ from gdp.ports import raw, sockets
 from gdp.ports.kernel.plane import KernelPlane
 from gdp.ports.mmsg import PlainBatch
 from gdp.ports.netdev import NetdevPlane
-from gdp.ports.plane import BROADCAST, Plane, ReceivedFrame
+from gdp.ports.plane import BROADCAST, MAC_BYTES, Plane, ReceivedFrame
 from gdp.ports.raw import RawPlane
 from gdp.ports.scapy_plane import ScapyPlane
 from gdp.switch.table import Table
@@ -188,6 +188,16 @@ def test_frames_of_all_fixtures_in_one_burst_get_each_its_own_decision(
         assert sorted(ends[port].recv(1 << 16) for _ in expected) == sorted(expected)
     reasons = list(chain.from_iterable(case.drops for case in order))
     assert [switch.counters.drops[reason] for reason in DropReason] == [reasons.count(reason) for reason in DropReason]
+
+
+def test_a_plane_counts_what_came_from_each_port_punted_forwarded_or_dropped(
+    switch: Plane, ends: dict[int, socket.socket]
+) -> None:
+    for case in CASES:
+        ends[IN].send(case.frame)
+    ends[WIDE].send(WIDE_MAC + MARK[MAC_BYTES:])
+    take_in(switch, len(CASES) + 1)
+    assert [switch.frames_from(port) for port in (IN, WIDE, NARROW)] == [len(CASES), 1, 0]
 
 
 def test_an_entry_installed_while_it_runs_counts_at_once(make: MakePlane, ends: dict[int, socket.socket]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import socket
@@ -52,6 +53,14 @@ with gdp.open("server") as server:
     subscription = server.subscribe("a")
     print("reads", flush=True)
     print([int.from_bytes(subscription.receive(60).payload[:2], "big") for _ in range(500)] == list(range(500)))
+"""
+
+_PROBE = """
+from http.client import HTTPConnection
+asking = HTTPConnection("127.0.0.1", 9107)
+asking.request("GET", "/readyz")
+answer = asking.getresponse()
+print(answer.status, answer.read().decode())
 """
 
 
@@ -114,6 +123,21 @@ def test_a_killed_relay_leaves_nothing_and_heals_when_it_starts_again(lab: Relay
     assert lab.member.devices() == {"lo", "eth0"}
     lab.start_relay(lab.member)
     wait_for(lab.is_joined)
+
+
+def test_a_relay_answers_probes_and_is_ready_once_it_has_its_border(lab: RelayLab) -> None:
+    def is_ready() -> bool:
+        done = lab.member.run(sys.executable, "-c", _PROBE)
+        assert done.returncode == 0, done.stderr
+        code, text = done.stdout.split(" ", 1)
+        assert (code == "200") is json.loads(text)["ready"], text
+        return code == "200"
+
+    lab.start_relay(lab.member, metrics={"port": 9107})
+    assert not is_ready()
+    wait_for(lambda: "no connection to border" in lab.member.run(sys.executable, "-c", _PROBE).stdout)
+    lab.start_relay(lab.border)
+    wait_for(is_ready)
 
 
 def test_a_change_of_address_is_followed_without_waiting_for_a_timeout(lab: RelayLab) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,10 +14,16 @@ from pathlib import Path
 from typing import Final
 
 import pytest
+from scapy.utils import RawPcapReader
 
+from gdp.client.capture_opener import Outcome
+from gdp.errors import LocalError
+from gdp.frame.kinds import ETHERTYPE, Kind
+from gdp.host.cgroups import Cgroup
 from gdp.host.run_registry import RunRegistry
 from netns_tests.lifetimes import LEASE_S, Lifetime, noted
 from proxy.recordings.reader import BagReader
+from tests.tshark import assert_same, needs_tshark, shown_by_tshark, tshark
 
 pytestmark = pytest.mark.netns
 
@@ -118,7 +125,7 @@ def test_larger_frames_carry_an_image_in_fewer_parts(demo: Path, tmp_path: Path)
 
 @pytest.mark.momentary("this plane forwards like the others, a hundred times slower; leases are no matter of a plane")
 def test_the_scapy_plane_carries_the_same(tmp_path: Path) -> None:
-    crossed(tmp_path, make_demo(tmp_path, 0.1), "--data-plane", "scapy")
+    crossed(tmp_path, make_demo(tmp_path, 0.1, "--without-images"), "--data-plane", "scapy")
 
 
 def test_with_a_link_cut_in_the_middle_all_still_arrives_by_the_other_way(longer: Path, tmp_path: Path) -> None:
@@ -146,6 +153,35 @@ def test_an_eavesdropper_in_the_middle_learns_no_topic_no_type_and_no_content(de
     samples = {raw[at : at + 24] for raw in longest.values() for at in (40, len(raw) // 2) if len(set(raw[at:])) > 8}
     assert len(seen) > sum(map(len, longest.values()))
     assert [secret for secret in secrets | words | samples if secret in seen] == []
+
+
+@needs_tshark
+@pytest.mark.momentary(FAST)
+def test_wireshark_shows_of_each_captured_frame_what_scapy_shows_and_each_message_to_the_reader(tmp_path: Path) -> None:
+    bag, seen, plain = make_demo(tmp_path, 0.3), tmp_path / "seen.pcap", tmp_path / "plain.pcapng"
+    records = RunRegistry()
+    before = {each.run for each in records.all()}
+    crossed(tmp_path, bag, "--rate", 0, "--pcap", seen, "--keep")
+    (run,) = (records.resume(each.run) for each in records.all() if each.run not in before and each.kept)
+    reader = shutil.copytree(run.directory / "nodes" / "proxy-nuc5", tmp_path / "reader")
+    run.end()
+    argv = [sys.executable, "-m", "gdp.cli.gdp", "decrypt-pcap", seen, "--node", reader, "-o", plain, "--json"]
+    ended = subprocess.run([*map(str, argv)], capture_output=True, text=True, env=WHERE, check=True, timeout=60)
+    with RawPcapReader(str(seen)) as capture:
+        frames = [data for data, _ in capture if data[12:14] == ETHERTYPE.to_bytes(2, "big")]
+    kinds = {Kind(frame[15]) for frame in frames}
+    assert {Kind.DATA, Kind.HEARTBEAT, Kind.ACKNACK, Kind.INTRODUCTION, Kind.KEEPALIVE, Kind.HELLO} <= kinds
+    shown = shown_by_tshark(seen, tmp_path)
+    assert_same(frames, shown)
+    assert [fields for fields in shown if "gdp.malformed.reason" in fields] == []
+    rows = json.loads(ended.stdout)["names"]
+    assert sum(row["frames"] for row in rows) == len(frames)
+    assert {reason for row in rows for reason in row["not_opened"]} == {Outcome.ACK_NACK.value}
+    fields = ("-Y", "gdp_opened.rosbody.body", "-T", "fields", "-e", "gdp_opened.topic", "-e", "gdp_opened.sequence")
+    opened = {tuple(line.split()) for line in tshark(plain, *fields, folder=tmp_path).splitlines()}
+    with BagReader(bag) as sent:
+        assert len(opened) == sent.count
+        assert len({topic for topic, _ in opened}) == len({channel.topic for channel in sent.channels})
 
 
 @pytest.mark.momentary(FAST)
@@ -220,6 +256,40 @@ def test_what_a_killed_run_left_is_gone_with_the_next(longer: Path, demo: Path, 
     assert left_of(run) != []
     crossed(tmp_path, demo, "--rate", 0)
     assert left_of(run) == []
+
+
+@pytest.mark.momentary(FAST)
+def test_machines_have_their_cores_by_control_groups_which_the_next_run_removes(
+    longer: Path, demo: Path, tmp_path: Path
+) -> None:
+    probe = Cgroup(f"gdp-test-{os.getpid()}")
+    try:
+        probe.make()
+        probe.share_cpu(1)
+    except LocalError as error:
+        pytest.skip(f"no control groups with weights here: {error}")
+    finally:
+        probe.remove()
+    process, run = started(longer, "--cores")
+    members = [path.read_text().split() for path in Path("/sys/fs/cgroup").glob(f"**/gdp-{run}-*/cgroup.procs")]
+    with process:
+        process.kill()
+    assert members
+    assert all(members)
+    weights = {
+        path.parent.name.removeprefix(f"gdp-{run}-"): int(path.read_text())
+        for pattern in ("cpu.weight", "cpu.shares")
+        for path in Path("/sys/fs/cgroup").glob(f"**/gdp-{run}-*/{pattern}")
+    }
+    assert weights.keys() == {f"nuc{number}" for number in range(1, 6)}
+    assert {node: weight / weights["nuc1"] for node, weight in weights.items() if node != "nuc1"} == dict.fromkeys(
+        ("nuc2", "nuc3", "nuc4", "nuc5"), 2.0
+    )
+    result = crossed(tmp_path, demo, "--rate", 0, "--cores")
+    settings = result["settings"]
+    assert isinstance(settings, dict)
+    assert settings["cores"] == {"nuc1": 2, "nuc2": 4, "nuc3": 4, "nuc4": 4, "nuc5": 4}
+    assert list(Path("/sys/fs/cgroup").glob(f"**/gdp-{run}-*")) == []
 
 
 def test_a_kept_ring_stands_until_it_is_taken_down(demo: Path) -> None:

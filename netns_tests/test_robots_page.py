@@ -1,12 +1,11 @@
 """Page on robots, run by its own commands on two machines, with real nodes as robot and server.
 
-``pkill`` and the keyboard input between two commands use process numbers: a namespace shares its processes.
+The keyboard input between two commands uses process numbers: a namespace shares its processes.
 """
 
 from __future__ import annotations
 
 import shutil
-import signal
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -137,9 +136,6 @@ class Reader:
     def _run(self, line: str, home: Path) -> str:
         if line.startswith(_RUN_ON) and "--check" not in line:
             self._terminals.start(line, home)
-            return ""
-        if line.startswith("pkill -HUP -f "):
-            self._terminals.signal(line.rsplit(maxsplit=1)[-1], signal.SIGHUP)
             return ""
         words = [*self._terminals.words(home), "bash", "-ec", line]
         done = subprocess.run(

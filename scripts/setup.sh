@@ -5,8 +5,9 @@
 #   scripts/setup.sh --ros2   to run where no ROS 2 is installed: with a real one from the package index
 #   scripts/setup.sh --dev    to test as well, with all that tests use: ROS 2, Cyclone DDS, SkyPilot, ROS 1 from Debian
 #
-# Needs: python3 >= 3.10. System packages are installed only where something is missing, and only as root. Python packages
-# are those of requirements/, by version and hash: pip refuses anything else.
+# Needs: python3 >= 3.10; PYTHON=/usr/bin/python3 chooses one, such as the distribution's next to a ROS. System
+# packages are installed only where something is missing, and only as root. Python packages are those of requirements/,
+# by version and hash: pip refuses anything else.
 set -euo pipefail
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
@@ -25,13 +26,13 @@ fail() { say "$@"; exit 1; }
 
 find_python() {
     local candidate
-    for candidate in python3 python3.14 python3.13 python3.12 python3.11 python3.10; do
+    for candidate in ${PYTHON:-python3 python3.14 python3.13 python3.12 python3.11 python3.10}; do
         if "$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null; then
             command -v "$candidate"
             return
         fi
     done
-    fail "python3 of version 3.10 or later is needed; found: $(python3 --version 2>&1 || true)"
+    fail "python3 of version 3.10 or later is needed; found: $("${PYTHON:-python3}" --version 2>&1 || true)"
 }
 
 # package <name> <why>: installs one Debian package
@@ -105,7 +106,23 @@ if [[ "$extras" == "$dev" ]]; then
     command -v conntrack >/dev/null || [[ -x /usr/sbin/conntrack ]] || package conntrack "tests let a NAT forget with it"
     command -v wg >/dev/null || package wireguard-tools "the bench of uplinks starts a peer with it"
     command -v mmdebstrap >/dev/null || package mmdebstrap "tests boot a cloud machine from a minimal Debian"
+    command -v dh >/dev/null || package debhelper "a test builds the Debian package"
+    command -v lintian >/dev/null || package lintian "a test checks the Debian package with it"
+    command -v buildah >/dev/null || package buildah "a test builds the image with it"
     command -v openssl >/dev/null || package openssl "tests read our certificates with it"
+    command -v chromium >/dev/null || package chromium "tests open the page of the live view in it"
+    command -v chromedriver >/dev/null || package chromium-driver "tests drive chromium with it"
+    command -v mandoc >/dev/null || package mandoc "a test checks the manual pages with it"
+    for shell in zsh fish; do
+        command -v "$shell" >/dev/null || package "$shell" "tests complete words in it"
+    done
+    if ! command -v promtool >/dev/null; then
+        # not a system service: tests use promtool alone
+        mask=/etc/systemd/system/prometheus.service
+        if [[ -d /run/systemd/system && ! -e "$mask" ]]; then ln -s /dev/null "$mask"; fi
+        RUNLEVEL=1 package prometheus "tests check alert rules with its promtool"
+    fi
+    command -v tshark >/dev/null || package tshark "tests compare our Wireshark dissector with Scapy"
 fi
 
 if ! "$venv/bin/python" -c 'import pip' 2>/dev/null; then

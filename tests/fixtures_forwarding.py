@@ -148,6 +148,18 @@ CASES = [
     Case("one hop left", frame(ONE, hops_left=1), drops=(DropReason.HOPS_EXPIRED,)),
     Case("no hops left", frame(ONE, hops_left=0), drops=(DropReason.HOPS_EXPIRED,)),
     Case("a miss with one hop left", frame(UNKNOWN, hops_left=1), drops=(DropReason.HOPS_EXPIRED,)),
+    _forwarded("a diagnostic request", frame(ONE, kind=Kind.DIAGNOSTIC_REQUEST), WIDE),
+    _forwarded("a diagnostic request to two", frame(BOTH, kind=Kind.DIAGNOSTIC_REQUEST, hops_left=2), WIDE, NARROW),
+    Case("a diagnostic request ends here", frame(ONE, kind=Kind.DIAGNOSTIC_REQUEST, hops_left=1), punted=True),
+    Case("a diagnostic request with no hops left", frame(ONE, kind=Kind.DIAGNOSTIC_REQUEST, hops_left=0), punted=True),
+    Case(
+        "the second copy of a diagnostic request",
+        frame(ONE, kind=Kind.DIAGNOSTIC_REQUEST, hops_left=SECOND | 1),
+        drops=(DropReason.HOPS_EXPIRED,),
+    ),
+    Case(
+        "a diagnostic reply ends", frame(ONE, kind=Kind.DIAGNOSTIC_REPLY, hops_left=1), drops=(DropReason.HOPS_EXPIRED,)
+    ),
     Case("a payload that is not there", frame(ONE, length=8), drops=(DropReason.TRUNCATED,)),
     Case("half a header", frame(ONE)[:61], drops=(DropReason.TRUNCATED,)),
     Case("one byte short of a header", frame(ONE, b"")[:-1], drops=(DropReason.TRUNCATED,)),

@@ -75,6 +75,9 @@ def _parse(command: Any, words: list[str]) -> None:
     """Parse a command line like the command, without running it."""
     program, *rest = words
     while hasattr(command, "commands"):
+        if "rules" in command.commands and rest[0] not in command.commands:
+            command = typer.main.get_command(APPS["gdp-delegate"])  # what gdp delegate does without a command
+            break
         program, *rest = rest
         command = command.commands[program]
     command.make_context(program, rest)
@@ -193,7 +196,8 @@ def _furnish(folder: Path, text: str) -> None:
     example = yaml.safe_load(text)
     domain = example["domain"]
     rules = [*example.get("expose", ()), *example.get("import", ())]
-    for file in [domain["root"], *domain.get("trusts", ()), *(rule["owner"] for rule in rules)]:
+    owners = {rule.get("owner", example.get("owner")) for rule in rules}
+    for file in [domain["root"], *domain.get("trusts", ()), *owners]:
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
         (folder / file).write_bytes(SigningKey.generate().public.to_pem())
     for key in {"identity", "delegations", "revocations"} & example.keys():

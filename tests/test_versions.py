@@ -4,14 +4,34 @@ from __future__ import annotations
 
 import importlib
 import sys
+from collections.abc import Iterator
 from importlib import metadata
+from typing import Any
 
 import pytest
 
 import gdp
+from gdp.cli.version import versioned
 
 _SCRIPTS = metadata.distribution("gdp-ros").entry_points.select(group="console_scripts")
 _COMMANDS = {each.name: each.value for each in _SCRIPTS}
+
+
+def _lines(command: Any, *before: str) -> Iterator[list[str]]:
+    """Yield the words of a command and of every command below it."""
+    yield [*before]
+    for name, each in getattr(command, "commands", {}).items():
+        yield from _lines(each, *before, name)
+
+
+@pytest.mark.parametrize("name", sorted(_COMMANDS))
+def test_every_command_below_it_knows_h_and_version(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    command = versioned(importlib.import_module(_COMMANDS[name].split(":")[0]).app)
+    for words in _lines(command):
+        for option, text in (("-h", f"Usage: {' '.join([name, *words])}"), ("--version", metadata.version("gdp-ros"))):
+            with pytest.raises(SystemExit) as ended:
+                command(args=[*words, option], prog_name=name)
+            assert (ended.value.code, text in capsys.readouterr().out) == (0, True)
 
 
 @pytest.mark.parametrize("command", sorted(_COMMANDS))

@@ -6,26 +6,21 @@ I/O; each verb is a function of another module. Exit status: 0 done, 2 wrong inp
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib import metadata
-from typing import Annotated
 
 import typer
 
 from fog.cli import scale, status
 from fog.cli.down import down
 from fog.cli.launch import launch
+from fog.cli.logs import logs
 from fog.cli.plan import cost_table, plan
 from fog.cli.wheels import wheels_command
 from fog.providers.local.cli import local_app
 from fog.site import open_site
+from gdp.cli.completion import allow_completion
+from gdp.cli.version import HELP, Version, versioned
 
 __all__ = ["app", "main"]
-
-
-def _print_version(wanted: bool) -> None:
-    if wanted:
-        typer.echo(f"fog {metadata.version('gdp-ros')}")
-        raise typer.Exit
 
 
 app = typer.Typer(
@@ -34,13 +29,14 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings=HELP,
 )
 app.command("launch")(launch)
 app.command("ls")(status.ls)
 app.command("status")(status.status)
 app.add_typer(scale.scale, name="scale")
-app.command("logs")(scale.logs)
+app.command("push")(scale.push)
+app.command("logs")(logs)
 app.command("ssh")(scale.ssh)
 app.command("cost")(status.cost)
 app.command("plan")(plan)
@@ -52,17 +48,14 @@ app.add_typer(local_app(lambda: open_site(None).state / "local"), name="local")
 
 
 @app.callback()
-def _fog(
-    version: Annotated[
-        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="print the version and end")
-    ] = False,
-) -> None:
-    del version
+def _fog(version: Version = False) -> None:
+    del version  # the option's callback ends the command
 
 
 def main(arguments: Sequence[str] | None = None, *, name: str = "fog") -> None:
     """Run the command and exit with its status."""
-    app(args=None if arguments is None else list(arguments), prog_name=name)
+    allow_completion(name)
+    versioned(app)(args=None if arguments is None else list(arguments), prog_name=name)
 
 
 if __name__ == "__main__":

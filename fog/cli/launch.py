@@ -27,6 +27,7 @@ from fog.site import Site, save_topology, with_gateway
 from fog.supervisor.background import LOG, ensure
 from fog.supervisor.infrastructure import command_of, open_provider, set_up
 from fog.supervisor.journal import Entry, Journal
+from gdp.cli.console import Columns
 from gdp.errors import LocalError
 
 __all__ = ["GatewayKind", "begin", "follow", "launch"]
@@ -74,6 +75,7 @@ def launch(
     gateway: Gateway = None,
     region: Regions = None,
     ends_with: EndsWith = "",
+    columns: Columns = None,
     as_json: AsJson = False,
 ) -> None:
     """Start a launch file's cluster; when its replicas serve, run the robot's nodes until they end or Ctrl-C.
@@ -88,6 +90,7 @@ def launch(
       fog launch demo.launch.py
       fog launch demo.launch.py rate:=10 --detach
     """
+    del columns  # the option's callback sets it
     from fog.cli.launch_view import BY_HAND, Priced, loaded_from, show_plan  # half a second to import
 
     def priced(here: Site) -> Priced:

@@ -96,6 +96,7 @@ def priced(said: Priced) -> dict[str, object]:
         "usd_per_month": None if per_hour is None else round(per_hour * HOURS_A_MONTH, 2),
         "budget_usd": plan.budget_usd,
         "idle_s": plan.idle_s,
+        "scale": None if plan.scale is None else plan.scale.to_keys(),
         "availability": target
         and {
             "target": target.availability,
@@ -139,12 +140,14 @@ def _lines(said: Priced, fields: dict[str, object], ends: str) -> list[Text]:
     plan, loaded, target = said.loaded.plan, said.loaded, said.target
     limits = [f"after {duration_text(plan.idle_s)} without a call"] if plan.idle_s else []
     limits += [f"after {plan.budget_usd:g} USD"] if plan.budget_usd else []
+    scale = plan.scale
     carried = [f"{each.kind} {each.name} ({each.type_name})" for each in plan.carried]
     unknown = "found out by starting the nodes once on this machine"
     replicas = {each.gateway: None for each in map(said.gateway, said.choice) if each is not None and each.replica}
     lines = [
         ("price", f"{fields['usd_per_hour']} USD/h, {fields['usd_per_month']} USD/month"),
         ("ends", ", ".join([ends, *limits])),
+        *([] if scale is None else [("scale", f"{scale.min_machines} to {scale.max_machines} machines")]),
         *(("latency", line) for line in latency_lines(said.latencies)),
         *(("gateway", f"{name}: one of these machines") for name in replicas),
         *(("cloud", _words(node)) for node in plan.nodes),

@@ -38,11 +38,16 @@ class Market:
 def market(provider: Provider, machines: Sequence[MachineRequest], latencies: Latencies) -> Market:
     """Query a provider, and measure the latency of regions where it is unknown."""
     offers: dict[Offer, None] = {}
-    for hardware, is_spot in dict.fromkeys((each.hardware, each.is_spot) for each in machines):
+    asked = [(each.hardware, is_spot) for each in machines for is_spot in (True, False) if _is_asked(each, is_spot)]
+    for hardware, is_spot in dict.fromkeys(asked):
         offers |= dict.fromkeys(provider.offers(hardware, spot=is_spot))
     regions = list(dict.fromkeys(offer.region for offer in offers))
     latencies.refresh(regions, time.time())
     return Market(tuple(offers), latencies.lookup(regions, time.time()))
+
+
+def _is_asked(wanted: MachineRequest, is_spot: bool) -> bool:
+    return is_spot == wanted.is_spot or wanted.may_be_on_demand
 
 
 def in_regions(machines: Sequence[MachineRequest], regions: Sequence[str]) -> tuple[MachineRequest, ...]:
@@ -68,8 +73,18 @@ def choices(found: Market, machines: Sequence[MachineRequest]) -> list[Offer | N
         try:
             chosen.append(choose(found.offers, [each], found.latency_ms, used=used)[0].offer)
         except LocalError:
-            chosen.append(None)
+            chosen.append(_on_demand(found, each, used))
     return chosen
+
+
+def _on_demand(found: Market, wanted: MachineRequest, used: Sequence[str]) -> Offer | None:
+    """Return the offer on demand that takes the place of a spot machine."""
+    if not wanted.may_be_on_demand:
+        return None
+    try:
+        return choose(found.offers, [wanted.on_demand()], found.latency_ms, used=used)[0].offer
+    except LocalError:
+        return None
 
 
 def refusal(provider: Provider, machines: Sequence[MachineRequest], chosen: Sequence[Offer | None]) -> str:

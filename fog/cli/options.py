@@ -15,10 +15,21 @@ import typer
 from fog.site import Site, open_site, peek_site
 from fog.supervisor.background import ensure
 from fog.supervisor.journal import Cluster, Journal
+from fog.supervisor.record import Record
 from gdp.cli.node import failing_clearly
 from gdp.errors import LocalError
 
-__all__ = ["AsJson", "ClusterName", "ClusterOption", "SiteFile", "State", "opened", "peeked", "the_cluster"]
+__all__ = [
+    "AsJson",
+    "ClusterName",
+    "ClusterOption",
+    "SiteFile",
+    "State",
+    "machine_of",
+    "opened",
+    "peeked",
+    "the_cluster",
+]
 
 # The command line's library reads these annotations at run time, on Python 3.10 too: hence Optional.
 SiteFile = Annotated[
@@ -69,3 +80,14 @@ def the_cluster(journal: Journal, name: str | None) -> Cluster:
     if not up:
         raise LocalError("no cluster is up; start one with: fog launch FILE")
     raise LocalError(f"which cluster? There are {', '.join(each.plan.name for each in up)}")
+
+
+def machine_of(journal: Journal, cluster: str | None, name: str) -> Record:
+    """Return the record of a machine that has an id."""
+    plan = the_cluster(journal, cluster).plan
+    records = journal.machines(plan.name)
+    found = next((each for each in records if each.name == name), None)
+    if found is None or not found.id:
+        living = ", ".join(each.name for each in records if not each.is_gone) or "none"
+        raise LocalError(f"{plan.name} has no machine {name}: there are {living}")
+    return found

@@ -24,6 +24,7 @@ from fog.plan.choice import BY_BOTH, Weights
 from fog.plan.cost import HOURS_A_MONTH
 from fog.plan.duration import duration_text, seconds_from_text
 from fog.site import peek_site
+from gdp.cli.console import Columns, folding
 from gdp.cli.node import failing_clearly
 from gdp.errors import LocalError
 
@@ -68,6 +69,7 @@ def plan(
     have: Have = [],  # noqa: B006
     latency: Latency = [],  # noqa: B006
     usd_per_ms: PerMs = BY_BOTH.usd_per_hour_per_ms,
+    columns: Columns = None,
     as_json: AsJson = False,
 ) -> None:
     """Say how many replicas the wanted availability takes, where, at what price, and what that assumes.
@@ -78,6 +80,7 @@ def plan(
     Example:
       fog plan --target 0.0005 --uptime 15h --recovery 20min --hardware cpu:16
     """
+    del columns  # the option's callback sets it
     with failing_clearly():
         wanted = Hardware.from_text(hardware)
         standing = _standing(have)
@@ -104,6 +107,7 @@ def cost_table(
     region: Regions = [],  # noqa: B006
     provider: Provider = "aws",
     everything: All = False,
+    columns: Columns = None,
     site: SiteFile = None,
     state: State = None,
     as_json: AsJson = False,
@@ -116,6 +120,7 @@ def cost_table(
     Example:
       fog prices --hardware T4 --region us-east-1
     """
+    del columns  # the option's callback sets it
     with failing_clearly():
         wanted = Hardware.from_text(hardware)
         on_demand = {(o.region, o.type_name): o for o in price_list(provider, wanted, spot=False, regions=region)}
@@ -149,8 +154,8 @@ def cost_table(
             typer.echo(json.dumps({"provider": provider, "sources": list(_sources(provider)), "offers": rows}))
             return
         shown = rows if everything else rows[:_MOST_ROWS]
-        columns = _right("ms", "on demand /h", "spot /h", "spot /month")
-        table = Table("region", "type", "hardware", *columns, "taken a month")
+        prices = _right("ms", "on demand /h", "spot /h", "spot /month")
+        table = folding(Table("region", "type", "hardware", *prices, "taken a month"))
         for row in shown:
             usd = spots.get((str(row["region"]), str(row["type"])))
             table.add_row(
@@ -180,7 +185,7 @@ def _show(question: Question, result: Answer) -> None:
         f"[bold]replicas: {result.replicas}[/bold] ({len(result.choices)} to be added): none is up for "
         f"{result.p_system:.4%} of the time, and {question.target:.4%} is allowed; one is down for {result.p_vm:.3%}",
     )
-    table = Table("if machines", *_right("replicas", "none up", "in a year"))
+    table = folding(Table("if machines", *_right("replicas", "none up", "in a year")))
     table.add_row("are placed as below", str(result.replicas), *_chance(result.p_system))
     table.add_row("are independent", str(pool.replicas), *_chance(pool.chance))
     if "spot" in question.kinds:
@@ -191,7 +196,7 @@ def _show(question: Question, result: Answer) -> None:
         table.add_row("stay as short as recorded", str(as_recorded.replicas), *_chance(as_recorded.chance))
     console.print(table)
     if result.choices:
-        table = Table("region", "type", "kind", "USD/h", "USD/month", "why", title="the choice")
+        table = folding(Table("region", "type", "kind", "USD/h", "USD/month", "why", title="the choice"))
         for choice in result.choices:
             offer = choice.offer
             kind = "spot" if offer.is_spot else "on-demand"

@@ -1,4 +1,4 @@
-"""``fog scale``, ``logs``, ``ssh`` and ``supervise``: verbs for existing clusters and machines.
+"""``fog scale``, ``push``, ``ssh`` and ``supervise``: verbs for existing clusters and machines.
 
 I/O.
 """
@@ -15,18 +15,15 @@ import typer
 
 from fog.cli.launch import follow
 from fog.cli.market import choices, market, refusal
-from fog.cli.options import AsJson, ClusterOption, SiteFile, State, opened, the_cluster
+from fog.cli.options import AsJson, ClusterOption, SiteFile, State, machine_of, opened, the_cluster
 from fog.cli.views import print_json, stage
-from fog.enrolment.bootstrap import PROXY
-from fog.supervisor.background import LOG, ensure
-from fog.supervisor.final_logs import MACHINE
+from fog.cluster import ClusterPlan
+from fog.supervisor.background import ensure
 from fog.supervisor.infrastructure import open_provider, set_up
-from fog.supervisor.journal import Journal
-from fog.supervisor.record import Record
-from gdp.cli.node import Verbose, set_up_logging
+from gdp.cli.node import Format, Level, LogFormat, LogLevel, Verbose, set_up_logging
 from gdp.errors import LocalError
 
-__all__ = ["logs", "scale", "ssh", "supervise"]
+__all__ = ["push", "scale", "ssh", "supervise"]
 
 _LINES: Final = 50
 _WAIT_S: Final = 600.0
@@ -62,6 +59,7 @@ def up(
     """
     with opened(site, state) as (here, journal):
         plan = the_cluster(journal, cluster).plan
+        _refuse_autoscaled(plan)
         more = [replace(plan.machines[-1], region="")] * count
         with closing(open_provider(here)) as provider:
             offers = choices(market(provider, more, here.latencies), more)
@@ -98,6 +96,7 @@ def down(
     """
     with opened(site, state) as (here, journal):
         plan = the_cluster(journal, cluster).plan
+        _refuse_autoscaled(plan)
         left = len(plan.machines) - count
         if left < 1:
             raise LocalError(f"{plan.name} has {len(plan.machines)} machines; to end it: fog down {plan.name}")
@@ -107,35 +106,27 @@ def down(
         _say({"cluster": plan.name, "machines": left}, as_json=as_json)
 
 
-def logs(
-    machine: Machine,
-    program: Program = PROXY,
-    cluster: ClusterOption = None,
-    lines: Lines = _LINES,
-    site: SiteFile = None,
-    state: State = None,
-) -> None:
-    """Show the last lines that a program of a machine wrote; MACHINE may be supervisor.
+def push(cluster: ClusterOption = None, site: SiteFile = None, state: State = None, as_json: AsJson = False) -> None:
+    """Bring the present wheels and workspace to a cluster: each machine is replaced, and serves until then.
 
-    Of a machine that was lost the last lines of each program are kept, and shown with a word on how it ended.
+    New machines fetch what the section software of fog.yaml names. What is under way is answered.
 
     \b
     Examples:
-      fog logs m1 node
-      fog logs supervisor
+      fog push
+      fog push --cluster planner --json
     """
     with opened(site, state) as (here, journal):
-        if machine == "supervisor":
-            path = here.state / LOG
-            text = path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
-            typer.echo("\n".join(text.splitlines()[-lines:]))
-            return
-        record = _machine(journal, cluster, machine)
-        if record.is_gone:
-            typer.echo(_final_log_lines(journal, record, program or MACHINE, lines))
-            return
-        with closing(open_provider(here)) as provider:
-            typer.echo(provider.log(record.id, program, lines).rstrip("\n"))
+        plan = the_cluster(journal, cluster).plan
+        if here.provider != "local" and here.software.is_empty:
+            raise LocalError(
+                f"{plan.name}: fog.yaml has no software to push; name software.wheels or software.workspace"
+            )
+        now_s = time.time()
+        journal.put_cluster(replace(plan, pushed_unix_s=now_s), now_s, why="software pushed")
+        ensure(here)
+        there = sum(not each.is_gone for each in journal.machines(plan.name))
+        _say({"cluster": plan.name, "replaces": there}, as_json=as_json)
 
 
 def ssh(machine: Machine, cluster: ClusterOption = None, site: SiteFile = None, state: State = None) -> None:
@@ -146,7 +137,7 @@ def ssh(machine: Machine, cluster: ClusterOption = None, site: SiteFile = None, 
       fog ssh m1
     """
     with opened(site, state) as (here, journal):
-        record = _machine(journal, cluster, machine)
+        record = machine_of(journal, cluster, machine)
         if record.is_gone:
             raise LocalError(f"{record.name} is gone: {stage(record)}, {record.reason}")
         with closing(open_provider(here)) as provider:
@@ -155,7 +146,13 @@ def ssh(machine: Machine, cluster: ClusterOption = None, site: SiteFile = None, 
 
 
 def supervise(
-    site: SiteFile = None, state: State = None, stay: Stay = False, lock: Lock = None, verbose: Verbose = False
+    site: SiteFile = None,
+    state: State = None,
+    stay: Stay = False,
+    lock: Lock = None,
+    verbose: Verbose = False,
+    log_level: LogLevel = Level.INFO,
+    log_format: LogFormat = Format.TEXT,
 ) -> None:
     """Keep clusters as they are wanted. Other verbs start it by themselves, in the background.
 
@@ -165,31 +162,15 @@ def supervise(
     """
     from fog.supervisor.process import supervise as be_supervisor
 
-    set_up_logging(verbose=verbose)
+    set_up_logging(verbose=verbose, level=log_level, form=log_format)
     with opened(site, state, supervised=False) as (here, _):
         be_supervisor(here, stays=stay, lock=lock)
 
 
-def _machine(journal: Journal, cluster: str | None, name: str) -> Record:
-    """Return the record of a machine that has an id."""
-    plan = the_cluster(journal, cluster).plan
-    records = journal.machines(plan.name)
-    found = next((each for each in records if each.name == name), None)
-    if found is None or not found.id:
-        living = ", ".join(each.name for each in records if not each.is_gone) or "none"
-        raise LocalError(f"{plan.name} has no machine {name}: there are {living}")
-    return found
-
-
-def _final_log_lines(journal: Journal, record: Record, program: str, lines: int) -> str:
-    """Return the final log lines of a machine that is gone."""
-    kept = journal.stored_logs(record.spec.cluster, record.name)
-    gone = f"{record.name} is gone: {stage(record)}, {record.reason}"
-    if not kept:
-        raise LocalError(f"{gone}; its logs went with it")
-    if program not in kept:
-        raise LocalError(f"{gone}; kept are the last lines of {', '.join(kept)}")
-    return "\n".join([f"# {gone}; its last lines:", *kept[program].splitlines()[-lines:]])
+def _refuse_autoscaled(plan: ClusterPlan) -> None:
+    if plan.scale is not None:
+        least, most = plan.scale.min_machines, plan.scale.max_machines
+        raise LocalError(f"{plan.name} scales itself, {least} to {most} machines; launch it again with another scale")
 
 
 def _say(fields: dict[str, object], *, as_json: bool) -> None:

@@ -33,6 +33,7 @@ from fog.site import Site
 from fog.supervisor.background import pid_of
 from fog.supervisor.journal import Cluster, Journal
 from fog.supervisor.record import Record
+from gdp.cli.console import Columns
 
 __all__ = ["cost", "ls", "status"]
 
@@ -47,13 +48,20 @@ Follow = Annotated[bool, typer.Option("--follow", "-f", help="go on as things ha
 Last = Annotated[Optional[int], typer.Option("--last", "-n", min=1, help="only so many events")]  # noqa: UP045
 
 
-def ls(all_: Everything = False, site: SiteFile = None, state: State = None, as_json: AsJson = False) -> None:
+def ls(
+    all_: Everything = False,
+    columns: Columns = None,
+    site: SiteFile = None,
+    state: State = None,
+    as_json: AsJson = False,
+) -> None:
     """List clusters.
 
     \b
     Example:
       fog ls
     """
+    del columns  # the option's callback sets it
     with opened(site, state) as (_, journal):
         rows = [_fields(journal, each) for each in journal.clusters() if all_ or each.is_up or _left(journal, each)]
         if as_json:
@@ -70,6 +78,7 @@ def status(
     events: Events = False,
     follow: Follow = False,
     last: Last = None,
+    columns: Columns = None,
     site: SiteFile = None,
     state: State = None,
     as_json: AsJson = False,
@@ -82,6 +91,7 @@ def status(
       fog status planner --events --last 50
       fog status --follow
     """
+    del columns  # the option's callback sets it
     with opened(site, state) as (here, journal):
         found = the_cluster(journal, cluster)
         name = found.plan.name
@@ -106,13 +116,20 @@ def status(
             raise typer.Exit(0) from None
 
 
-def cost(cluster: ClusterName = None, site: SiteFile = None, state: State = None, as_json: AsJson = False) -> None:
+def cost(
+    cluster: ClusterName = None,
+    columns: Columns = None,
+    site: SiteFile = None,
+    state: State = None,
+    as_json: AsJson = False,
+) -> None:
     """Show what clusters have cost and cost now, by the prices at which their machines were asked for.
 
     \b
     Example:
       fog cost
     """
+    del columns  # the option's callback sets it
     with opened(site, state) as (_, journal):
         clusters = journal.clusters() if cluster is None else [journal.cluster(cluster)]
         rows = [cost_fields(each, journal.machines(each.plan.name), time.time()) for each in clusters]

@@ -20,7 +20,8 @@ from fog.latency.known import NO_ENDPOINT, Latency
 from fog.plan.cost import HOURS_A_MONTH
 from fog.plan.duration import duration_text
 from fog.supervisor.journal import Cluster, Entry
-from fog.supervisor.record import Record, cost_usd
+from fog.supervisor.record import Record, cost_usd, stage
+from gdp.cli.console import console, folding
 
 __all__ = [
     "a_console",
@@ -39,7 +40,6 @@ __all__ = [
     "stage",
 ]
 
-_PIPE_COLUMNS: Final = 10_000  # a program that reads a pipe needs whole lines
 _STYLES: Final = {
     "serving": "green",
     "unreachable": "red",
@@ -55,27 +55,6 @@ _STYLES: Final = {
     "gone": "dim",
     "released": "dim",
 }
-
-
-def stage(record: Record, *, is_watched: bool = True) -> str:
-    """Return the state of a machine as one word.
-
-    Args:
-        is_watched: whether a watch reports which machines serve; otherwise the best state is *running*.
-    """
-    if record.is_gone:
-        return "gone" if record.ending is None else record.ending.value
-    if record.is_released:
-        return "leaving"
-    if record.drained_unix_s is not None:
-        return "draining"
-    if record.noticed_unix_s is not None:
-        return "notice"
-    if record.is_serving:
-        return "serving" if is_watched else "running"
-    if record.served_unix_s is not None:
-        return "unreachable"
-    return "requested" if not record.id else "booting" if record.up_unix_s is None else "up"
 
 
 def machine_fields(
@@ -225,18 +204,15 @@ def _detail(entry: Entry) -> Text:
 
 
 def a_console(*, stderr: bool = False) -> Console:
-    """Return a console: as wide as the terminal, or without a terminal as wide as its output."""
-    console = Console(stderr=stderr, highlight=False)
-    if not console.is_terminal:
-        console.width = _PIPE_COLUMNS
-    return console
+    """Return a console: as wide as ``--columns`` or the terminal, or without a terminal as wide as its output."""
+    return console(stderr=stderr)
 
 
 def show(*parts: RenderableType) -> None:
     """Print tables."""
-    console = a_console()
+    shown = a_console()
     for part in parts:
-        console.print(part)
+        shown.print(part)
 
 
 def print_json(value: object) -> None:
@@ -263,7 +239,7 @@ def _table(*headings: str) -> Table:
     table = Table(box=None, pad_edge=False, header_style="bold")
     for heading in headings:
         table.add_column(heading, justify="right" if heading.startswith("USD") else "left")
-    return table
+    return folding(table)
 
 
 def _moment(unix_s: object, form: str = "%Y-%m-%d %H:%M") -> str:

@@ -52,7 +52,7 @@ def add_rules(
             if matching.imported(config.imports, metadata_of(each).name(key), metadata_of(each)) is None
         ]
         if lacking:
-            _add_rules(path, authority, cluster, lacking)
+            _add_rules(path, authority, cluster, lacking, config.prefix)
         authority.grant_access(config.identity, config.delegations, carried, days=days)
 
 
@@ -109,12 +109,15 @@ def _drop_in(path: Path, cluster: str) -> Path:
     return drop_in_directory(path) / f"fog-{cluster}.yaml"
 
 
-def _add_rules(path: Path, authority: Authority, cluster: str, carried: Sequence[ExportedInterface]) -> None:
+def _add_rules(
+    path: Path, authority: Authority, cluster: str, carried: Sequence[ExportedInterface], prefix: str | None
+) -> None:
     """Append rules to the drop-in file of a cluster; restore it if the proxy does not accept the result."""
     file = _drop_in(path, cluster)
     before = read_drop_in(file)
     owner = os.path.relpath(authority.owner_key, file.parent)
-    lines = [f"- {json.dumps({**robot_rule(each), 'owner': owner})}\n" for each in carried]
+    own = {"prefix": ""} if prefix else {}  # a cluster's names are those of all robots
+    lines = [f"- {json.dumps({**robot_rule(each), **own, 'owner': owner})}\n" for each in carried]
     write_drop_in(path, file.name, (before or _HEAD.format(cluster=cluster)) + "".join(lines))
     try:
         ProxyConfig.load(path)

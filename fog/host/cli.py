@@ -16,8 +16,9 @@ import typer
 
 from fog.host.agent import MachineAgent
 from fog.host.bundle import JOIN_FILE, TICKET_FILE
-from gdp.cli.node import Verbose, emit, failing_clearly, set_up_logging
-from gdp.cli.version import Version
+from gdp.cli.completion import allow_completion
+from gdp.cli.node import Format, Level, LogFormat, LogLevel, Verbose, emit, failing_clearly, set_up_logging
+from gdp.cli.version import HELP, Version
 
 __all__ = ["main"]
 
@@ -32,11 +33,13 @@ Json = Annotated[bool, typer.Option("--json", help="Say at the end why, as a lin
 AwaitGo = Annotated[bool, typer.Option("--await-go", hidden=True)]
 
 
-@app.command(epilog="Example: fog-machine --home /var/lib/fog/machine")
+@app.command(context_settings=HELP, epilog="Example: fog-machine --home /var/lib/fog/machine")
 def machine(
     home: Home,
     json: Json = False,
     verbose: Verbose = False,
+    log_level: LogLevel = Level.INFO,
+    log_format: LogFormat = Format.TEXT,
     await_go: AwaitGo = False,
     version: Version = False,
 ) -> None:
@@ -46,7 +49,7 @@ def machine(
     Its folder's status.json tells how they are, logs/ what they say.
     """
     del version  # the option ends the command
-    set_up_logging(verbose=verbose)
+    set_up_logging(verbose=verbose, level=log_level, form=log_format)
     with failing_clearly():
         host = MachineAgent(home.resolve())
         if await_go and not sys.stdin.readline():
@@ -88,6 +91,7 @@ def _become_member(home: Path) -> str:
 
 def main() -> None:
     """Run the command."""
+    allow_completion("fog-machine")
     app(prog_name="fog-machine")
 
 

@@ -6,7 +6,7 @@ Sans-I/O.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -14,6 +14,7 @@ from fog.cluster import CloudNode, ClusterPlan, ExportedInterface, MachineReques
 from fog.launch.interfaces import Offered, SomeReplication, carried, replication_rule
 from fog.launch.machines import CloudMachine, filled
 from fog.plan.duration import seconds_from_text
+from fog.scaling import ScalingPolicy, policy_from_keys
 from gdp.errors import LocalError
 
 __all__ = ["ClusterSpec"]
@@ -41,6 +42,7 @@ class ClusterSpec:
     keep: bool
     notes: tuple[str, ...]
     availability: float | None = None
+    scale: ScalingPolicy | None = None
 
     @classmethod
     def checked(
@@ -58,6 +60,7 @@ class ClusterSpec:
         budget_usd: float | None,
         keep: bool,
         availability: float | None = None,
+        scale: Mapping[str, object] | None = None,
     ) -> ClusterSpec:
         """Check the keywords of a ``FogCluster``."""
         if name and not re.fullmatch(_NAME, name):
@@ -66,7 +69,13 @@ class ClusterSpec:
             raise LocalError("replicas and availability: say how many there are, or how available they are to be")
         if availability is not None and not 0 < availability < 1:
             raise LocalError(f"availability={availability}: expected a share of time between 0 and 1, such as 0.9995")
-        machines, notes = filled(deployments, len(deployments) if availability is not None else replicas)
+        policy = None if scale is None else policy_from_keys(scale)
+        if policy is not None and (replicas is not None or availability is not None):
+            raise LocalError("scale, replicas and availability: say one of them")
+        count = len(deployments) if availability is not None else replicas
+        if policy is not None:
+            count = max(policy.min_machines, len(deployments))
+        machines, notes = filled(deployments, count)
         defaults: dict[str, object] = {}
         if replication is not None:
             defaults["replication"] = replication_rule(replication)
@@ -90,6 +99,7 @@ class ClusterSpec:
             keep=keep,
             notes=notes,
             availability=availability,
+            scale=policy,
         )
 
     def plan(self, nodes: Sequence[CloudNode], found: Sequence[ExportedInterface] = ()) -> ClusterPlan:
@@ -106,6 +116,7 @@ class ClusterSpec:
             idle_s=self.idle_s,
             budget_usd=self.budget_usd,
             availability=self.availability,
+            scale=self.scale,
         )
 
     def carry(self, kind_name_type: Sequence[tuple[str, str, str]]) -> tuple[ExportedInterface, ...]:

@@ -6,7 +6,7 @@ Source: FogROS2-FT, Listing 1.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from fog.launch.cluster_spec import ClusterSpec
 from fog.launch.interfaces import Offered, SomeReplication
@@ -35,6 +35,8 @@ class FogCluster:
         budget_usd: when the machines have cost this much they are released.
         availability: share of time for which at least one machine is to serve, such as 0.9995, instead of ``replicas``:
             ``fog launch`` adds copies of the listed machines until it is reached, and prints its assumptions.
+        scale: between which numbers of machines the cluster moves, by load and by schedule within a budget: a map with
+            ``max``, and ``min``, ``target_ms``, ``target_calls_per_s``, ``schedule``, ``budget_usd_per_h``.
         keep: leave the cluster running when the launch ends.
 
     Raises:
@@ -57,6 +59,7 @@ class FogCluster:
         budget_usd: float | None = None,
         keep: bool = False,
         availability: float | None = None,
+        scale: Mapping[str, object] | None = None,
     ) -> None:
         super().__init__()
         self.cloud_nodes = tuple(cloud_nodes)
@@ -73,5 +76,6 @@ class FogCluster:
             budget_usd=budget_usd,
             keep=keep,
             availability=availability,
+            scale=scale,
         )
         record(self)

@@ -26,8 +26,8 @@ _ROBOT_SIDE: Final[dict[Kind, tuple[str, ...]]] = {
 }
 _MACHINE_SIDE: Final[dict[Kind, tuple[str, ...]]] = {
     "topic": ("deadline_ms", "max_hz", "repair"),
-    "service": ("at_once", "sign", "state", "state_node", "stop"),
-    "action": ("sign",),
+    "service": ("at_once", "readiness", "sign", "state", "state_node", "stop"),
+    "action": ("readiness", "sign"),
 }
 _EXAMPLES: Final[dict[Kind, str]] = {
     "topic": "sensor_msgs/msg/Image",

@@ -47,9 +47,18 @@ class CloudMachine:
 
 @dataclass(frozen=True, slots=True)
 class SpotMachine(CloudMachine):
-    """Cheaper machine that its provider may preempt; another machine then replaces it."""
+    """Cheaper machine that its provider may preempt; another machine then replaces it.
+
+    Args:
+        on_demand: while no spot machine is to be had, one on demand takes its place.
+    """
 
     is_spot: ClassVar[bool] = True
+    on_demand: bool = False
+
+    def wanted(self) -> MachineRequest:
+        """Return the request for a plan."""
+        return MachineRequest(self._read, self.region, self.is_spot, self.on_demand)
 
 
 def filled(

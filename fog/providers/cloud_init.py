@@ -284,8 +284,8 @@ exit 1
         offline = "--no-index --no-deps --no-compile --no-cache-dir"
         steps.append(f"{pip} {offline} --requirement {_SOFTWARE}/requirements.txt")
         steps.append(f"mkdir -p {_WORKSPACE}")
-        unpack = f"tar --extract --gzip --no-same-owner --file {_SOFTWARE}/{WORKSPACE} --directory {_WORKSPACE}"
-        steps.append(f"[ ! -e {_SOFTWARE}/{WORKSPACE} ] || {unpack}")
+        unpack = f'tar --extract --gzip --no-same-owner --file "$each" --directory {_WORKSPACE}'
+        steps.append(f'for each in {_SOFTWARE}/{WORKSPACE}/*.tar.gz; do\n[ ! -e "$each" ] || {unpack}\ndone')
     if setup.has_requirements:
         steps.append(f"{pip} --requirement {_REQUIREMENTS}")
     return (

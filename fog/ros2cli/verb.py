@@ -19,6 +19,7 @@ __all__ = [
     "LsVerb",
     "PlanVerb",
     "PricesVerb",
+    "PushVerb",
     "ScaleVerb",
     "SshVerb",
     "StatusVerb",
@@ -68,6 +69,10 @@ class ScaleVerb(VerbExtension):
 
 class LogsVerb(VerbExtension):
     """Show what a machine's programs wrote."""
+
+
+class PushVerb(VerbExtension):
+    """Bring the present software to a cluster's machines."""
 
 
 class SshVerb(VerbExtension):

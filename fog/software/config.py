@@ -15,6 +15,7 @@ from gdp.nodes.schema import Directory, Section
 __all__ = ["SOFTWARE_PORT", "SoftwareConfig"]
 
 SOFTWARE_PORT: Final = 4781
+IGNORED: Final = (".git/", "__pycache__/", "*.pyc")
 
 
 class SoftwareConfig(Section):
@@ -25,6 +26,10 @@ class SoftwareConfig(Section):
     )
     workspace: Directory | None = Field(
         default=None, description="`install` folder of a colcon workspace; it comes to /opt/fog-workspace."
+    )
+    ignore: tuple[str, ...] = Field(
+        default=IGNORED,
+        description="Patterns of what is left out of the workspace, in addition to its file `.fogignore`.",
     )
     address: Annotated[str, AfterValidator(reachable_place)] | None = Field(
         default=None,

@@ -1,7 +1,8 @@
 """Download of the software of a machine: ``fog-fetch SOFTWARE.json FOLDER``, with Python's standard library only.
 
 I/O; its source travels in user data, and runs before anything is installed. The server's certificate is pinned. A file
-appears in FOLDER only when its size and SHA-256 are those of the manifest; files that are there are not fetched again.
+appears in FOLDER only when its size and SHA-256 are those of the manifest; files that are there with that content are
+not fetched again, and archives of a workspace that the manifest no longer has are removed.
 """
 
 import hashlib
@@ -27,6 +28,7 @@ def fetch(described: "dict[str, str]", folder: str) -> None:
     with open(manifest, "rb") as file:
         files = json.load(file)
     lines = []
+    _remove_others(os.path.join(folder, "workspace"), {os.path.basename(each["name"]) for each in files})
     for each in files:
         path = os.path.join(folder, each["name"])
         _get(opener, url, path, each["sha256"], each["size"])
@@ -37,7 +39,7 @@ def fetch(described: "dict[str, str]", folder: str) -> None:
 
 
 def _get(opener: urllib.request.OpenerDirector, url: str, path: str, sha256: str, most_bytes: int) -> None:
-    if os.path.exists(path):
+    if os.path.exists(path) and _sha256(path) == sha256:
         return
     os.makedirs(os.path.dirname(path), exist_ok=True)
     found, size = hashlib.sha256(), 0
@@ -51,7 +53,21 @@ def _get(opener: urllib.request.OpenerDirector, url: str, path: str, sha256: str
             file.write(piece)
     if size > most_bytes or found.hexdigest() != sha256:
         raise OSError(f"{path} is not the file that was promised")
-    os.rename(path + ".part", path)
+    os.replace(path + ".part", path)
+
+
+def _sha256(path: str) -> str:
+    found = hashlib.sha256()
+    with open(path, "rb") as file:
+        while piece := file.read(PIECE_BYTES):
+            found.update(piece)
+    return found.hexdigest()
+
+
+def _remove_others(folder: str, kept: "set[str]") -> None:
+    for name in os.listdir(folder) if os.path.isdir(folder) else ():
+        if name not in kept:
+            os.remove(os.path.join(folder, name))
 
 
 if __name__ == "__main__":

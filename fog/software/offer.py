@@ -1,25 +1,25 @@
 """Files of a site that its machines fetch: read, hashed, and the workspace packed.
 
-I/O. The archive of a workspace is the same bytes for the same files, so a machine that has it is up to date.
+I/O. A workspace travels as one archive for each package, by content (``workspace.py``).
 """
 
 from __future__ import annotations
 
-import gzip
 import hashlib
-import tarfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from fog.software.config import SoftwareConfig
 from fog.software.manifest import Artifact, manifest_bytes
+from fog.software.workspace import packed_parts, parts_of, remove_unused
 from gdp.errors import LocalError
 
-__all__ = ["WHEELS", "WORKSPACE", "Offered", "offered", "signature"]
+__all__ = ["WHEELS", "WORKSPACE", "Offered", "offered", "remove_unused_archives", "signature"]
 
 WHEELS: Final = "wheels"
-WORKSPACE: Final = "workspace.tar.gz"
+WORKSPACE: Final = "workspace"
+_PARTS: Final = "workspace"  # folder of archives in the scratch folder
 _PIECE_BYTES: Final = 1 << 20
 
 
@@ -42,7 +42,7 @@ class Offered:
 
 
 def offered(config: SoftwareConfig, scratch: Path) -> Offered:
-    """Read and hash all files; ``scratch``: folder for the archive of the workspace.
+    """Read and hash all files; ``scratch``: folder for the archives of the workspace.
 
     Raises:
         LocalError: a folder has no wheel, or a file cannot be read.
@@ -53,19 +53,29 @@ def offered(config: SoftwareConfig, scratch: Path) -> Offered:
         for path in _wheels(config):
             _add(f"{WHEELS}/{path.name}", path, entries, files)
         if config.workspace is not None:
-            packed = scratch / WORKSPACE
-            _pack(config.workspace, packed)
-            _add(WORKSPACE, packed, entries, files)
+            parts = parts_of(config.workspace, config.ignore)
+            for name, packed in packed_parts(config.workspace, parts, scratch / _PARTS).items():
+                _add(f"{WORKSPACE}/{name}", packed, entries, files)
     except OSError as error:
         raise LocalError(f"software: {error.filename}: {error.strerror}") from error
     return Offered(manifest_bytes(entries), files)
 
 
-def signature(config: SoftwareConfig) -> tuple[tuple[str, int, int], ...]:
-    """Return a value that changes when a file of the software does: names, sizes and times of all files."""
-    paths = [*_wheels(config), *(_below(config.workspace) if config.workspace is not None else ())]
-    stats = [(str(path), path.lstat()) for path in paths]
-    return tuple((name, has.st_size, has.st_mtime_ns) for name, has in stats)
+def signature(config: SoftwareConfig) -> tuple[tuple[str, int, int] | str, ...]:
+    """Return a value that changes when a file of the software does: names, sizes and times of all files.
+
+    Raises:
+        LocalError: as ``offered``.
+    """
+    stats = [(str(path), path.lstat()) for path in _wheels(config)]
+    parts = [] if config.workspace is None else parts_of(config.workspace, config.ignore)
+    return (*((name, has.st_size, has.st_mtime_ns) for name, has in stats), *(part.digest for part in parts))
+
+
+def remove_unused_archives(config: SoftwareConfig, scratch: Path) -> None:
+    """Remove the archives of earlier workspaces; only before machines fetch."""
+    parts = [] if config.workspace is None else parts_of(config.workspace, config.ignore)
+    remove_unused(parts, scratch / _PARTS)
 
 
 def _wheels(config: SoftwareConfig) -> list[Path]:
@@ -85,26 +95,3 @@ def _add(name: str, path: Path, entries: list[Artifact], files: dict[str, Path])
             size += len(piece)
     entries.append(Artifact(name, size, digest.hexdigest()))
     files[digest.hexdigest()] = path
-
-
-def _pack(folder: Path, packed: Path) -> None:
-    """Write an archive of a folder: sorted, owned by root, without times."""
-    with (
-        packed.open("wb") as raw,
-        gzip.GzipFile(fileobj=raw, mode="wb", filename="", mtime=0) as zipped,
-        tarfile.open(fileobj=zipped, mode="w|") as archive,
-    ):
-        for path in _below(folder):
-            entry = archive.gettarinfo(str(path), arcname=str(path.relative_to(folder)))
-            entry.uid = entry.gid = entry.mtime = 0
-            entry.uname = entry.gname = ""
-            if entry.isreg():
-                with path.open("rb") as content:
-                    archive.addfile(entry, content)
-            elif entry.isdir() or entry.issym():
-                archive.addfile(entry)
-
-
-def _below(folder: Path) -> list[Path]:
-    """Return what is in a folder, each folder before its content; links are not followed."""
-    return sorted(folder.rglob("*"))

@@ -3,7 +3,7 @@
 I/O, one folder of the site's state, private::
 
     software.json      key of URLs, TLS key and certificate
-    workspace.tar.gz   archive of the workspace
+    workspace/         archives of the workspace, by content
 
 A machine's URL is ``/EXPIRY.MAC/SHA256``: it names no path, expires, and works without a record, also after a restart
 of the supervisor. Each file can be fetched a few times with one URL. The certificate is self-signed. User data has it,
@@ -36,7 +36,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from fog.software.config import SoftwareConfig
-from fog.software.offer import Offered, offered, signature
+from fog.software.offer import Offered, offered, remove_unused_archives, signature
 from gdp.stores.files import private, read_private, write_all
 
 __all__ = ["SOFTWARE_FILE", "SoftwareServer"]
@@ -77,6 +77,7 @@ class SoftwareServer:
         self._config = config
         self._url = url
         self._now = now
+        remove_unused_archives(config, folder)
         self._signature = signature(config)
         self._offered = offered(config, folder)
         self._files: dict[str, Path | bytes] = {}

@@ -274,7 +274,12 @@ def _record(items: dict[str, object]) -> Record:
                 spec=MachineSpec(
                     spec["cluster"], spec["name"], Offer(**{**offer, "hardware": Hardware(**offer["hardware"])})
                 ),
-                wanted=MachineRequest(Hardware(**wanted["hardware"]), wanted["region"], wanted["is_spot"]),
+                wanted=MachineRequest(
+                    Hardware(**wanted["hardware"]),
+                    wanted["region"],
+                    wanted["is_spot"],
+                    wanted.get("may_be_on_demand", False),
+                ),
                 issued_credentials=IssuedCredentials(
                     issued_credentials["proxy"],
                     issued_credentials["until_unix_s"],

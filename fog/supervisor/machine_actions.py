@@ -16,6 +16,7 @@ from fog.enrolment.credentials import IssuedCredentials
 from fog.latency.known import Latencies
 from fog.machine import Machine, MachineSpec, MachineState
 from fog.offer import Offer
+from fog.plan.choice import Choice
 from fog.providers.provider import GatewayProvider, Provider
 from fog.site import Site
 from fog.supervisor.actions import ActionRunner
@@ -23,9 +24,10 @@ from fog.supervisor.event_log import EventLog
 from fog.supervisor.final_logs import decode_logs, encode_logs
 from fog.supervisor.journal import FINAL_LOGS, Journal
 from fog.supervisor.machine_credentials import CredentialIssuer
-from fog.supervisor.placement import place
+from fog.supervisor.placement import place, stopgap
 from fog.supervisor.reconcile import Action, Drain, Launch
 from fog.supervisor.record import Outcome, Record
+from gdp.errors import LocalError
 
 __all__ = ["ATTACH", "DETACH", "MachineActions"]
 
@@ -95,7 +97,7 @@ class MachineActions:
     def apply(self, plan: ClusterPlan, action: Action, records: list[Record], now_s: float) -> None:
         """Begin a decided action on a machine; a busy machine keeps its action."""
         if isinstance(action, Launch):
-            self._launch(plan, action.wanted, records, now_s)
+            self._launch(plan, action, records, now_s)
             return
         (record,) = (each for each in records if each.name == action.name)
         if self.runner.is_busy(plan.name, record.name):
@@ -160,13 +162,37 @@ class MachineActions:
                 self._journal.write_event(now_s, cluster, name, "orphan", "no cluster wants it: returned")
             self.release(plan, name, machine.id, is_lost=name in lost)
 
-    def _launch(self, plan: ClusterPlan, wanted: MachineRequest, records: list[Record], now_s: float) -> None:
+    def _choose(self, plan: ClusterPlan, action: Launch, records: Sequence[Record], now_s: float) -> Choice | None:
+        """Return the offer for a machine, and the reason; None: it is too early to ask again.
+
+        Raises:
+            GdpError: no offer fits, or the provider does not answer.
+        """
+        wanted = action.wanted
+        falls_back = wanted.may_be_on_demand and not action.is_spot_only
+        try:
+            offers = self._offers.get(self.provider, wanted, now_s)
+            latency_ms = self._offers.latencies.ms((each.region for each in offers), now_s)
+            choice = place(wanted, offers, records, now_s, latency_ms)
+        except LocalError:
+            if not wanted.may_be_on_demand:
+                raise
+            choice = None  # no spot machine is offered now
+        if choice is not None or not falls_back:
+            return choice
+        offers = self._offers.get(self.provider, wanted.on_demand(), now_s)
+        latency_ms = self._offers.latencies.ms((each.region for each in offers), now_s)
+        budget = None if plan.scale is None else plan.scale.budget_usd_per_h
+        choice = stopgap(wanted, offers, records, now_s, latency_ms, budget_usd_per_h=budget)
+        return None if choice is None else replace(choice, why=f"no spot machine is to be had: {choice.why}")
+
+    def _launch(self, plan: ClusterPlan, action: Launch, records: list[Record], now_s: float) -> None:
         begun_s = self._journal.cluster(plan.name).begun_unix_s
         past = [each for each in self._journal.machines(plan.name) if each.is_gone and each.asked_unix_s >= begun_s]
-        offers = self._offers.get(self.provider, wanted, now_s)
-        latency_ms = self._offers.latencies.ms((each.region for each in offers), now_s)
-        choice = place(wanted, offers, [*past, *records], now_s, latency_ms)
+        choice = self._choose(plan, action, [*past, *records], now_s)
         resting = f"{plan.name} rests"
+        if choice is None and action.is_spot_only:
+            return  # one on demand serves until a spot machine is to be had
         if choice is None:
             self._events.add_trouble(
                 plan.name, "machines fail one after another: it is too early to ask again", key=resting
@@ -184,7 +210,7 @@ class MachineActions:
             now_s,
             uplink=uplink,
         )
-        record = Record(spec, wanted, IssuedCredentials("", until_unix_s), now_s)
+        record = Record(spec, action.wanted, IssuedCredentials("", until_unix_s), now_s)
         records.append(record)
         detail = f"{offer.region} {offer.type_name}, {offer.usd_per_hour:.4f} USD an hour: {choice.why}"
         self._events.put(record, "requested", detail, now_s)

@@ -14,7 +14,7 @@ from fog.offer import Offer
 from fog.plan.choice import Choice, choose
 from fog.supervisor.record import Outcome, Record
 
-__all__ = ["held_until", "place", "wary_until"]
+__all__ = ["held_until", "place", "stopgap", "wary_until"]
 
 _WARY_S: Final = 60.0  # after a loss; each further loss doubles it
 _WARY_MAX_S: Final = 3_600.0
@@ -57,6 +57,33 @@ def place(
     if held and not any(free.hardware.fits(each.hardware) and each.is_spot == free.is_spot for each in open_):
         return None
     return choose(open_, [free], latency_ms, used=used, avoid=avoid)[0]
+
+
+def stopgap(
+    wanted: MachineRequest,
+    offers: Sequence[Offer],
+    records: Sequence[Record],
+    now_s: float,
+    latency_ms: Mapping[str, float] | None = None,
+    *,
+    budget_usd_per_h: float | None = None,
+) -> Choice | None:
+    """Return an offer on demand in place of a spot machine; None: it is too early, or above the budget.
+
+    Args:
+        offers: on demand, with enough hardware.
+        records: of the cluster; failures of spot machines do not count here.
+        budget_usd_per_h: most that all machines may cost in an hour.
+
+    Raises:
+        LocalError: no offer fits, now or later.
+    """
+    counted = [each for each in records if not each.is_gone or not each.spec.offer.is_spot]
+    choice = place(wanted.on_demand(), offers, counted, now_s, latency_ms)
+    if choice is None or budget_usd_per_h is None:
+        return choice
+    spent = sum(each.spec.offer.usd_per_hour for each in records if not each.is_gone)
+    return choice if spent + choice.offer.usd_per_hour <= budget_usd_per_h else None
 
 
 def wary_until(records: Iterable[Record], now_s: float) -> float:

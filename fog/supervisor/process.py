@@ -27,11 +27,13 @@ from fog.supervisor.background import held
 from fog.supervisor.infrastructure import command_of, open_provider, set_up
 from fog.supervisor.journal import Journal
 from fog.supervisor.reconcile import Timeouts
+from fog.supervisor.snapshot import supervisor_snapshot
 from fog.supervisor.supervisor import Supervisor
 from fog.supervisor.watch import Watch
 from fog.topology import Gateway
 from gdp.errors import StoreError
 from gdp.host.processes import Process
+from gdp.host.service_notifier import service_notifier
 from gdp.nodes.control_socket import CONTROL_SOCKET, ControlHandlers, serve_control_in_thread
 
 __all__ = ["supervise"]
@@ -55,10 +57,11 @@ def supervise(site: Site, *, stays: bool = False, lock: int | None = None) -> No
     with (
         held(site, lock),
         closing(Journal(site.journal)) as journal,
+        service_notifier() as notifier,
         _enrolment(site) as enrolment,
         _software(site, timeouts.boot_s) as software,
     ):
-        _run(site, journal, enrolment, timeouts, software, stays=stays)
+        _run(site, journal, enrolment, timeouts, software, notifier.beat, stays=stays)
 
 
 @contextmanager
@@ -96,6 +99,7 @@ def _run(
     enrolment: Tickets | DomainMembers,
     timeouts: Timeouts,
     software: Callable[[], Mapping[str, bytes]],
+    beat: Callable[[], None],
     *,
     stays: bool,
 ) -> None:
@@ -122,6 +126,7 @@ def _run(
     handlers = ControlHandlers(
         reload=supervisor.wake,
         status=partial(_status, site, supervisor, time.monotonic()),
+        snapshot=partial(_snapshot, site),
         drain=drain,
         is_drained=drained.is_set,
     )
@@ -153,7 +158,7 @@ def _run(
                 done_at_s = time.monotonic()
             elif time.monotonic() - done_at_s >= _DONE_S:
                 break
-            supervisor.wait()
+            supervisor.wait(beat)
     finally:
         supervisor.close()
         drained.set()  # no action runs any more, and all results are in the journal
@@ -185,6 +190,12 @@ def _status(site: Site, supervisor: Supervisor, begun_s: float) -> dict[str, obj
         "machines": machines,
         "actions": supervisor.running_actions,
     }
+
+
+def _snapshot(site: Site) -> dict[str, object]:
+    """Return the supervisor's fields of a live view; called from the thread of the control socket."""
+    with closing(Journal(site.journal)) as journal:
+        return supervisor_snapshot(journal)
 
 
 def _offered(site: Site, journal: Journal) -> tuple[tuple[str, ...], Gateway]:

@@ -1,4 +1,4 @@
-"""Message counters of proxies on this host, for the idle limit of clusters.
+"""Counters of messages and calls of proxies on this host, for idle limits and scaling of clusters.
 
 I/O. The counters come from the control socket of a proxy. If the socket of a robot's proxy cannot be reached, as in a
 container, its metrics port is queried. The count includes topics, so it is never less than the number of calls.
@@ -8,19 +8,21 @@ Source: Prometheus text exposition format, version 0.0.4.
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from http.client import HTTPException
 from pathlib import Path
 from typing import Final
 from urllib.request import urlopen
 
 from fog.enrolment.robot_config import control_socket_of
+from fog.scaling import CallCounts
 from gdp.errors import GdpError
 from gdp.names import Name
 from gdp.nodes.control_client import ask_node, find_control_socket_of
 from gdp.nodes.control_protocol import Command
 from proxy.config.config import ProxyConfig
 
-__all__ = ["received_by", "sent_by"]
+__all__ = ["calls_of", "received_by", "sent_by"]
 
 _SENT: Final = re.compile(rb'^gdp_messages_total\{direction="out"\} (\S+)$', re.MULTILINE)
 _TIMEOUT_S: Final = 0.5
@@ -52,6 +54,35 @@ def sent_by(proxy: Path) -> int | None:
         return _count(control_socket_of(config.identity, config.control_socket), "out")
     except GdpError:
         return None if config.metrics is None else _sent_by_metrics(config.metrics.port)
+
+
+def calls_of(proxy: Path, services: Collection[str]) -> CallCounts | None:
+    """Return the answered calls of a robot's proxy since its start; None: no response.
+
+    Args:
+        proxy: its ``proxy.yaml``.
+        services: overlay names of the services that count, 64 hex digits each.
+
+    Raises:
+        ConfigError: the file is not a proxy configuration.
+    """
+    config = ProxyConfig.load(proxy)
+    try:
+        socket = control_socket_of(config.identity, config.control_socket)
+        match ask_node(socket, Command.STATUS, _TIMEOUT_S).result:
+            case {"calls": dict(calls)}:
+                counts = [_answered(calls[name]) for name in services if name in calls]
+                return CallCounts(sum(each.ended for each in counts), sum(each.total_ms for each in counts))
+    except GdpError:
+        return None
+    return None  # of an earlier version
+
+
+def _answered(fields: object) -> CallCounts:
+    match fields:
+        case {"ended": int(ended), "total_ms": int() | float() as total_ms}:
+            return CallCounts(ended, float(total_ms))
+    return CallCounts(0, 0.0)
 
 
 def _count(socket: Path, direction: str) -> int | None:

@@ -29,6 +29,7 @@ class Timeouts:
         release_s: until the release of a machine that still exists is repeated.
         credential_renewal_s: another machine replaces it this long before its credentials expire.
         gateway_s: after a gateway change, until unreachable machines behind the gateway count.
+        spot_retry_s: after it began to serve, until a spot machine is tried in place of one on demand.
     """
 
     boot_s: float = 90.0
@@ -38,13 +39,15 @@ class Timeouts:
     release_s: float = 5.0
     credential_renewal_s: float = 1_800.0
     gateway_s: float = 3.0
+    spot_retry_s: float = 600.0
 
 
 @dataclass(frozen=True, slots=True)
 class Launch:
-    """Action: request a machine."""
+    """Action: request a machine; ``is_spot_only``: one on demand serves in its place already."""
 
     wanted: MachineRequest
+    is_spot_only: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +78,7 @@ def decide(
     *,
     liveness_known: bool = True,
     excused: Collection[str] = (),
+    pushed_unix_s: float | None = None,
 ) -> list[Action]:
     """Return the actions that bring a cluster closer to its desired state.
 
@@ -82,6 +86,7 @@ def decide(
         wanted: one request per machine; empty: all machines are released at once.
         records: of the cluster; machines that are gone are ignored.
         liveness_known: the overlay reports which machines serve; otherwise a machine that is up counts as serving.
+        pushed_unix_s: machines that were requested before are replaced, and serve until then; None: none is.
         excused: names of machines that are unreachable for an external reason, and are kept.
     """
     there = [record for record in records if not record.is_gone]
@@ -91,9 +96,8 @@ def decide(
             for each in there
             if not each.is_released or now_s - (each.released_unix_s or now_s) >= patience.release_s
         ]
-    view = _View(
-        now_s, patience, liveness_known, any(_serves(each, liveness_known=liveness_known) for each in there), excused
-    )
+    is_any_serving = any(_serves(each, liveness_known=liveness_known) for each in there)
+    view = _View(now_s, patience, liveness_known, is_any_serving, excused, pushed_unix_s)
     actions: list[Action] = []
     fit: list[Record] = []  # kept if wanted
     leaving: list[Record] = []  # serve until others do, or until their time ends
@@ -102,13 +106,18 @@ def decide(
             actions.append(ended)
         elif each.is_released or each.drained_unix_s is not None:
             continue
-        elif each.noticed_unix_s is not None or view.is_old(each):
+        elif each.noticed_unix_s is not None or view.is_old(each) or view.is_stopgap(each):
             leaving.append(each)
         else:
             fit.append(each)
     fit.sort(key=lambda each: (not view.serves(each), each.up_unix_s is None, each.asked_unix_s))
     kept, missing = _match(wanted, fit)
-    actions += [Launch(each) for each in missing]
+    stopgaps = [each for each in leaving if each.noticed_unix_s is None and view.is_stopgap(each)]
+    for request in missing:
+        place = next((each for each in stopgaps if each.wanted == request), None)
+        if place is not None:
+            stopgaps.remove(place)
+        actions.append(Launch(request, is_spot_only=place is not None))
     spare = [each for each in fit if each not in kept]
     owed = len(wanted) - sum(view.serves(each) for each in kept)  # number of machines that should serve in addition
     for each in [*spare, *sorted(leaving, key=lambda each: -(each.leaves_at_unix_s or now_s))]:
@@ -135,12 +144,21 @@ class _View:
     liveness_known: bool
     is_any_serving: bool
     excused: Collection[str]
+    pushed_unix_s: float | None
 
     def serves(self, record: Record) -> bool:
         return _serves(record, liveness_known=self.liveness_known)
 
     def is_old(self, record: Record) -> bool:
+        if self.pushed_unix_s is not None and record.asked_unix_s < self.pushed_unix_s:
+            return True
         return record.issued_credentials.until_unix_s - self.patience.credential_renewal_s <= self.now_s
+
+    def is_stopgap(self, record: Record) -> bool:
+        """Return whether a machine on demand has served long enough in place of a spot machine."""
+        if record.is_on_plan or record.served_unix_s is None:
+            return False
+        return self.now_s - record.served_unix_s >= self.patience.spot_retry_s
 
     def is_due(self, record: Record) -> bool:
         """Return whether half of the notice period is over; calls in progress need the rest."""
@@ -189,4 +207,5 @@ def _match(wanted: Sequence[MachineRequest], fit: Sequence[Record]) -> tuple[lis
 
 def _does(record: Record, wanted: MachineRequest) -> bool:
     offer = record.spec.offer
-    return wanted.hardware.fits(offer.hardware) and offer.is_spot == wanted.is_spot
+    is_kind = offer.is_spot == wanted.is_spot or wanted.may_be_on_demand
+    return wanted.hardware.fits(offer.hardware) and is_kind

@@ -12,7 +12,7 @@ from fog.cluster import MachineRequest
 from fog.enrolment.credentials import IssuedCredentials
 from fog.machine import Machine, MachineSpec, MachineState
 
-__all__ = ["Outcome", "Record", "cost_usd", "update_record"]
+__all__ = ["Outcome", "Record", "cost_usd", "stage", "update_record"]
 
 
 class Outcome(Enum):
@@ -76,6 +76,11 @@ class Record:
         return not self.is_gone and self.served_unix_s is not None and self.unreachable_unix_s is None
 
     @property
+    def is_on_plan(self) -> bool:
+        """Return whether it is of the requested kind: not one on demand in place of a spot machine."""
+        return self.spec.offer.is_spot == self.wanted.is_spot
+
+    @property
     def is_outgoing(self) -> bool:
         """Return whether it has a notice, or was drained or released."""
         return self.noticed_unix_s is not None or self.drained_unix_s is not None or self.is_released
@@ -90,6 +95,27 @@ class Record:
         return replace(
             self, state=MachineState.GONE, gone_unix_s=now_s, ending=ending, reason=reason, unreachable_unix_s=None
         )
+
+
+def stage(record: Record, *, is_watched: bool = True) -> str:
+    """Return the state of a machine as one word.
+
+    Args:
+        is_watched: whether a watch reports which machines serve; otherwise the best state is *running*.
+    """
+    if record.is_gone:
+        return "gone" if record.ending is None else record.ending.value
+    if record.is_released:
+        return "leaving"
+    if record.drained_unix_s is not None:
+        return "draining"
+    if record.noticed_unix_s is not None:
+        return "notice"
+    if record.is_serving:
+        return "serving" if is_watched else "running"
+    if record.served_unix_s is not None:
+        return "unreachable"
+    return "requested" if not record.id else "booting" if record.up_unix_s is None else "up"
 
 
 def cost_usd(record: Record, now_s: float) -> float:

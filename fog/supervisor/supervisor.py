@@ -10,6 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Final, TypeAlias
 
 from fog.cluster import CloudNode, ClusterPlan
@@ -19,6 +20,7 @@ from fog.enrolment.tickets import Tickets
 from fog.machine import Machine, MachineState
 from fog.providers.provider import Provider
 from fog.site import Site
+from fog.supervisor.autoscaling import Autoscaling
 from fog.supervisor.event_log import EventLog
 from fog.supervisor.events import changes
 from fog.supervisor.gateway_uplinks import GatewayUplinks
@@ -39,6 +41,7 @@ Heard: TypeAlias = "Mapping[str, frozenset[str]]"  # service -> proxies that ser
 
 _GRACE_POLLS: Final = 5  # polls in which a new machine may be missing
 _GRACE_MIN_S: Final = 2.0
+_UNREADY_S: Final = 60.0  # a replica that does not pass its readiness probe for so long is replaced
 _NEWS_S: Final = 0.25  # another process writes which machines have joined, and notifies no other
 PATIENCE: Final = Timeouts()
 
@@ -89,6 +92,7 @@ class Supervisor:
         )
         self._gateways = GatewayUplinks(journal, self._events, self._actions, patience)
         self._limits = UsageLimits(site, journal)
+        self._scaling = Autoscaling(site, journal)
         self._robots = RobotAccess(site, on_names)
         self._known: Heard | None = None  # what the overlay reported at the last reconciliation
         self._settled: set[str] = set()  # clusters that are down without leftovers
@@ -112,11 +116,17 @@ class Supervisor:
         """Make ``wait`` return at once; callable from any thread."""
         self._woken.set()
 
-    def wait(self) -> None:
-        """Wait until the next reconciliation is due, a machine has joined, or other replicas serve than before."""
+    def wait(self, beat: Callable[[], None] = lambda: None) -> None:
+        """Wait until the next reconciliation is due, a machine has joined, or other replicas serve than before.
+
+        Args:
+            beat: called before each step of the wait.
+        """
         left_s = self._actions.provider.poll_s
+        beat()
         while left_s > 0 and not self._woken.wait(min(left_s, _NEWS_S)) and not self._has_news():
             left_s -= _NEWS_S
+            beat()
         self._woken.clear()
 
     def _has_news(self) -> bool:
@@ -160,7 +170,8 @@ class Supervisor:
             self._robots.grant(plan)  # its errors are reported before a machine costs money
         seen = {each.spec.name: each for each in self._actions.provider.describe(plan.name)}
         heard, now_s = self._heard(), time.time()
-        names = [] if self._site.watch is None else _services(plan, self._owner_key)
+        services = _services(plan, self._owner_key)
+        names = [] if self._site.watch is None else services
         records = self._observe(plan, names, seen, heard, now_s)
         excused = self._gateways.reconcile(plan.name, records, seen, now_s)
         self._actions.release_orphans(plan, records, seen, now_s)
@@ -168,15 +179,25 @@ class Supervisor:
             self._journal.unwant(plan.name, why, now_s)
             self.wake()
             return
-        wanted = plan.machines if cluster.is_up else ()
+        wanted = self._scaling.machines(cluster, services, records, now_s) if cluster.is_up else ()
         liveness_known = not names or heard is not None
-        for action in decide(wanted, records, now_s, self._patience, liveness_known=liveness_known, excused=excused):
+        patience = _patience(plan, self._patience)
+        for action in decide(
+            wanted,
+            records,
+            now_s,
+            patience,
+            liveness_known=liveness_known,
+            excused=excused,
+            pushed_unix_s=plan.pushed_unix_s,
+        ):
             self._actions.apply(plan, action, records, now_s)
         if is_new and not self._robots.has(plan):
             self._robots.grant(plan)
         if not cluster.is_up and all(each.is_gone for each in records) and not self._actions.runner.is_busy(plan.name):
             self._settled.add(plan.name)
             self._limits.reset(plan.name)
+            self._scaling.reset(plan.name)
             self._robots.remove(plan.name)
 
     def _observe(
@@ -212,6 +233,13 @@ class Supervisor:
         """Release a machine whose token was misused, unless it is busy."""
         if not self._actions.runner.is_busy(plan.name, name):
             self._actions.release(plan, name, machine, is_lost=True)
+
+
+def _patience(plan: ClusterPlan, patience: Timeouts) -> Timeouts:
+    """Return the time limits of a cluster: a replica that is not ready has time to become so before it is replaced."""
+    if not any("readiness" in each.served for each in plan.carried):
+        return patience
+    return replace(patience, unreachable_timeout_s=max(patience.unreachable_timeout_s, _UNREADY_S))
 
 
 def _services(plan: ClusterPlan, owner_key: bytes) -> list[str]:

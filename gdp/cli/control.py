@@ -12,6 +12,7 @@ from typing import Annotated, Final, Optional
 import typer
 
 from gdp.cli import options
+from gdp.cli.completion import complete_node
 from gdp.cli.output import show
 from gdp.errors import LocalError
 from gdp.nodes.control_client import NotRunningError, find_control_socket, request_control
@@ -25,7 +26,9 @@ _DRAIN_S: Final = 60.0
 
 NodeDirectory = Annotated[
     Optional[Path],  # noqa: UP045
-    typer.Argument(metavar="NODE_DIR", help="Directory of the node's keys, or of the state of fog."),
+    typer.Argument(
+        metavar="NODE_DIR", autocompletion=complete_node, help="Directory of the node's keys, or of the state of fog."
+    ),
 ]
 Socket = Annotated[
     Optional[Path],  # noqa: UP045

@@ -1,17 +1,23 @@
 """``gdp delegate``: commands by which an owner lets a node act on a name, and a node lets a switch attract its traffic.
 
-I/O.
+I/O. Files without a command are the command ``rules``, so ``gdp delegate --owner owner proxy.yaml`` is enough.
 """
 
 from __future__ import annotations
 
+import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated, Any, Final, Optional
 
 import typer
+from typer.core import TyperGroup
 
 from gdp.cli import options
+from gdp.cli.delegations import described, ls, show_file
+from gdp.cli.doors import run_of_proxy
+from gdp.cli.extension import ANY_ARGUMENTS
 from gdp.cli.output import (
     epochs_from_text,
     metadata_from_options,
@@ -20,21 +26,42 @@ from gdp.cli.output import (
     span,
 )
 from gdp.cli.salt import SaltFile
+from gdp.cli.version import HELP, versioned
 from gdp.crypto.statements import parse
 from gdp.crypto.validity import Validity
-from gdp.errors import LocalError
+from gdp.errors import GdpError, LocalError
 from gdp.names import Name
 from gdp.stores.audit_log import note_once
+from gdp.stores.checkout import work_tree_of
 from gdp.stores.files import private, public, write_all
 from gdp.stores.issue import DELEGATION_DAYS, delegate, delegate_route, install_delegation
 from gdp.stores.keyring import load_card, load_delegation, load_owner, load_root
 from gdp.trust.adcert import AdCert
 from gdp.trust.audit import Action
-from gdp.trust.delegation import Delegation
 
-__all__ = ["app"]
+__all__ = ["app", "main"]
 
-app = typer.Typer(no_args_is_help=True, help="Let a node act on a name, or a switch attract a node's traffic.")
+_RULES: Final = "rules"
+
+
+class _RulesByDefault(TyperGroup):
+    """Commands of which ``rules`` is the one that is meant where none is named."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Insert ``rules`` before the arguments if they name no command and no option of this group."""
+        known = {*self.commands, *ctx.help_option_names, "--version"}
+        return super().parse_args(ctx, [_RULES, *args] if args and args[0] not in known else args)
+
+
+app = typer.Typer(
+    cls=_RulesByDefault,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings=HELP,
+    help="Let nodes act on names: all that proxies need by their files, or one name; or a switch attract a node's"
+    " traffic. The command rules is the default: gdp delegate --owner owner robot/proxy.yaml",
+)
 
 OwnerDir = Annotated[Path, typer.Option("--owner", metavar="DIR", help="the owner's directory")]
 CardFile = Annotated[Path, typer.Option("--card", metavar="FILE", help="the node's card (node.card)")]
@@ -47,6 +74,16 @@ TrustedRoot = Annotated[
 ]
 OutFile = Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="where to write it")]
 NodeDir = Annotated[Path, typer.Option("--node", metavar="DIR", help="the node's directory")]
+
+
+@app.command(_RULES, context_settings=ANY_ARGUMENTS)
+def rules(context: typer.Context) -> None:
+    """Give each proxy the delegations that the rules of its file need."""
+    run_of_proxy("delegate", context.args)
+
+
+app.command("ls", no_args_is_help=True)(ls)
+app.command("show", no_args_is_help=True)(show_file)
 
 
 @app.command("name")
@@ -98,7 +135,9 @@ def name(
         owner, face, metadata, rights_from_text(right), epochs_from_text(epochs), days=days, may_delegate=may_delegate
     )
     write_all(out.parent, {out.name: private(made.to_wire())}, force=force)
-    show({**_described(made), "label": face.label, "delegation": str(out)}, as_json=as_json)
+    if (tree := work_tree_of(out)) is not None:
+        typer.echo(f"{out} is private and lies in the git work tree {tree}; do not commit it", err=True)
+    show({**described(made), "label": face.label, "delegation": str(out)}, as_json=as_json)
 
 
 @app.command("install")
@@ -116,7 +155,7 @@ def install(
     """
     given = load_delegation(file)
     path = install_delegation(node, given, force=force)
-    show({**_described(given), "delegation": str(path)}, as_json=as_json)
+    show({**described(given), "delegation": str(path)}, as_json=as_json)
 
 
 @app.command("route")
@@ -170,15 +209,13 @@ def revoke(
     who, about = given.node.to_text(), given.name.to_text()
     note_once(owner, Action.REVOKED, "delegation", who=who, about=about, unix_s=time.time())
     write_all(out.parent, {out.name: public(statement)}, force=force)
-    show({**_described(given), "revocation": str(out)}, as_json=as_json)
+    show({**described(given), "revocation": str(out)}, as_json=as_json)
 
 
-def _described(delegation: Delegation) -> dict[str, object]:
-    validity = AdCert.from_statement(parse(delegation.chain[-1])).validity if delegation.chain else None
-    return {
-        "name": delegation.name.to_text(),
-        "node": delegation.node.to_text(),
-        "rights": sorted(right.value for right in delegation.rights),
-        "epochs": sorted(delegation.grants),
-        **(span(validity) if validity is not None else {}),
-    }
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run these commands as the program ``gdp-delegate``; ``arguments``: by default those of this process."""
+    try:
+        versioned(app)(args=None if arguments is None else list(arguments), prog_name="gdp-delegate")
+    except GdpError as error:
+        typer.echo(f"gdp-delegate: {error}", err=True)
+        sys.exit(2)

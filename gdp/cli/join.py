@@ -16,6 +16,7 @@ from typing import Annotated, Final, Optional
 import typer
 
 from gdp.cli import options
+from gdp.cli.doors import suggest_rules
 from gdp.cli.machine import (
     BORDER_SEEN_S,
     AtDirectory,
@@ -23,6 +24,7 @@ from gdp.cli.machine import (
     Start,
     directory_of,
     paths_up,
+    run_programs,
     say,
     start_machine,
 )
@@ -31,11 +33,12 @@ from gdp.cli.output import show
 from gdp.enrolment.agent import Agent
 from gdp.enrolment.channel import connect_any
 from gdp.enrolment.join import JoinRequest, join_domain, prefer_server
-from gdp.enrolment.member_files import MemberFiles
+from gdp.enrolment.machine_programs import Machine, check_program, read_machine
 from gdp.enrolment.preflight import check_tunnels
-from gdp.enrolment.programs import programs_of
+from gdp.enrolment.programs import missing_ros
 from gdp.sharing.member_exchange import MemberExchange
 from gdp.sharing.upkeep import ShareUpkeep
+from gdp.stores.keyring import CARD
 from gdp.trust.join_token import JoinToken
 
 __all__ = ["agent", "join", "run_agent", "up"]
@@ -47,6 +50,8 @@ LabelText = Annotated[
     Optional[str],  # noqa: UP045
     typer.Option("--label", help="the machine's name for people; by default its host name"),
 ]
+MachinePath = Annotated[Path, typer.Argument(metavar="PATH", help="The machine's folder, or its machine.yaml.")]
+Suggest = Annotated[bool, typer.Option("--suggest", help="Only write proxy.yaml, or proxy.yaml.suggested next to one.")]
 Uplinks = Annotated[
     list[str], typer.Option("--uplink", metavar="IFACE", help="a device with a tunnel of its own; repeatable")
 ]
@@ -89,19 +94,52 @@ def join(
         start_machine(directory, no_systemd=no_systemd, observed=_say_border)
 
 
-def up(directory: options.Directory, no_systemd: NoSystemd = False, as_json: options.Json = False) -> None:
-    """Start the programs of a machine that has joined or created a domain.
+def up(
+    path: MachinePath,
+    suggest: Suggest = False,
+    no_systemd: NoSystemd = False,
+    as_json: options.Json = False,
+) -> None:
+    """Start the programs of a machine: switch, RIB where it has one, and proxy.
+
+    A machine that joined or created a domain starts as systemd units, or in the foreground. Nodes that were configured
+    by hand, in machine.yaml or in files of their own, run in the foreground until Ctrl-C; gdp service install makes
+    units. What ends is restarted, with growing pauses. The log is one, and each line begins with its program. The exit
+    code is 1 if a program has failed. Without a proxy.yaml, the first start looks at the ROS graph, and writes one with
+    a commented rule for each name.
 
     \b
-    Example:
+    Examples:
       gdp up /var/lib/gdp/lab --no-systemd
+      gdp up robot
+      gdp up robot/machine.yaml
+      gdp up robot --suggest
     """
-    check_tunnels()
+    machine = read_machine(path)
+    if suggest or _lacks_proxy_file(machine):
+        suggest_rules(machine.directory)
+        if suggest:
+            return
+        machine = read_machine(path)
     if as_json:
-        programs = [each.name for each in programs_of(MemberFiles.load(directory))]
-        show({"directory": str(directory), "programs": programs}, as_json=True)
+        names = [each.name for each in machine.programs]
+        show({"directory": str(machine.directory), "programs": names}, as_json=True)
         sys.stdout.flush()
-    start_machine(directory, no_systemd=no_systemd, observed=_say_border)
+    if machine.is_member:
+        check_tunnels()
+        start_machine(machine.directory, no_systemd=no_systemd, observed=_say_border)
+        return
+    for each in machine.programs:
+        check_program(each)
+    run_programs(machine.programs)
+
+
+def _lacks_proxy_file(machine: Machine) -> bool:
+    """Return whether a machine has keys of a proxy, but no configuration of it, and can run one."""
+    if machine.missing_proxy is not None:
+        return True
+    has_keys = (machine.directory / "proxy" / CARD).is_file()
+    return has_keys and all(each.name != "proxy" for each in machine.programs) and not missing_ros()
 
 
 def agent(directory: options.Directory, as_json: options.Json = False) -> None:

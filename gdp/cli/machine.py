@@ -10,7 +10,7 @@ import contextlib
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Final, Optional
 
@@ -19,15 +19,15 @@ import typer
 from gdp.cli.node import set_up_logging
 from gdp.enrolment.addresses import default_directory
 from gdp.enrolment.member_files import MemberFiles
-from gdp.enrolment.programs import missing_ros, programs_of
-from gdp.enrolment.supervisor import supervise
+from gdp.enrolment.programs import MachineProgram, missing_ros, programs_of
+from gdp.enrolment.supervisor import Failures, supervise
 from gdp.enrolment.units import has_systemd, install_units, unit_texts
 from gdp.errors import GdpError
 from gdp.host.interruption import Interrupted, interruptible
 from gdp.nodes.control_client import ask_node, find_control_socket
 from gdp.nodes.control_protocol import Command
 
-__all__ = ["AtDirectory", "NoSystemd", "Start", "directory_of", "paths_up", "say", "start_machine"]
+__all__ = ["AtDirectory", "NoSystemd", "Start", "directory_of", "paths_up", "run_programs", "say", "start_machine"]
 
 BORDER_SEEN_S: Final = 20.0
 _EACH_S: Final = 0.5
@@ -70,18 +70,30 @@ def start_machine(directory: Path, *, no_systemd: bool, observed: Callable[[Path
         if observed is not None:
             observed(directory)
         return
-    set_up_logging(verbose=False)
-    say(f"running {', '.join(each.name for each in programs)} in the foreground; Ctrl-C ends them")
 
     async def started() -> None:
         """Observe without holding up the supervisor."""
         if observed is not None:
             await asyncio.get_running_loop().run_in_executor(None, observed, directory)
 
+    run_programs(programs, started)
+
+
+def run_programs(programs: Sequence[MachineProgram], started: Callable[[], Awaitable[None]] | None = None) -> None:
+    """Run programs in the foreground until Ctrl-C, and exit: with 1 if one of them has failed, else with 0.
+
+    Raises:
+        LocalError: a program cannot be started at all.
+    """
+    set_up_logging(verbose=False)
+    say(f"running {', '.join(each.name for each in programs)} in the foreground; Ctrl-C ends them")
+    failures = Failures()
     try:
-        asyncio.run(interruptible(supervise(programs, started)))
+        asyncio.run(interruptible(supervise(programs, started, failures)))
     except Interrupted:
-        sys.exit(0)
+        if failures.names:
+            say(f"gdp: failed: {', '.join(sorted(failures.names))}; the log has their last words")
+        sys.exit(1 if failures.names else 0)
 
 
 def paths_up(directory: Path, deadline_s: float = BORDER_SEEN_S) -> tuple[list[str], bool]:

@@ -10,24 +10,34 @@ import logging
 import os
 import sys
 from collections.abc import Iterator
+from enum import Enum
 from pathlib import Path
 from typing import Annotated, Final
 
 import orjson
 import typer
 
-from gdp.errors import ConfigError, GdpError
+from gdp.cli.log_lines import JsonLines
+from gdp.errors import ConfigError, GdpError, LocalError
+from gdp.nodes.config import UplinkPlane
 
 __all__ = [
     "WRONG",
     "AwaitIface",
     "Check",
     "Config",
+    "Format",
+    "FoundConfig",
     "Json",
+    "Level",
+    "LogFormat",
+    "LogLevel",
+    "MemberPlane",
     "Verbose",
     "emit",
     "emit_wait",
     "failing_clearly",
+    "member_plane",
     "set_up_logging",
 ]
 
@@ -39,26 +49,70 @@ _OURS: Final = ("gdp", "proxy", "fog")
 WRONG: Final = 2  # exit code of a wrong configuration
 
 Config = Annotated[Path, typer.Option("--config", help="The YAML file; see docs/reference/configuration.md.")]
+FoundConfig = Annotated[
+    Path | None, typer.Option("--config", help="The YAML file; by default the one that this machine has.")
+]
 Check = Annotated[bool, typer.Option("--check", help="Validate the configuration and end.")]
 AwaitIface = Annotated[
     float,
     typer.Option(min=0.0, metavar="SECONDS", help="Wait so long for the device, which a switch may just be making."),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Say what happens as lines of JSON on standard output.")]
-Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Log decisions, too.")]
+MemberPlane = Annotated[str | None, typer.Option("--data-plane", help="raw or scapy; instead of the file's.")]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Log decisions, too; as --log-level debug.")]
 
 
-def set_up_logging(*, verbose: bool) -> None:
-    """Log to standard error: life-cycle steps, or decisions as well."""
-    level = logging.DEBUG if verbose else logging.INFO
-    logging.basicConfig(level=level, stream=sys.stderr, format="%(asctime)s %(levelname)s %(name)s %(message)s")
+class Level(str, Enum):
+    """Least serious level that is logged."""
+
+    DEBUG = "debug"
+    INFO = "info"
+    WARNING = "warning"
+    ERROR = "error"
+
+
+class Format(str, Enum):
+    """Form of a log line."""
+
+    TEXT = "text"
+    JSON = "json"
+
+
+LogLevel = Annotated[
+    Level,
+    typer.Option("--log-level", help="debug: decisions; info: steps; warning: what is degraded; error: failures."),
+]
+LogFormat = Annotated[Format, typer.Option("--log-format", help="Lines on standard error: text, or objects of JSON.")]
+
+
+def set_up_logging(
+    *, verbose: bool, quiet: bool = False, level: Level = Level.INFO, form: Format = Format.TEXT
+) -> None:
+    """Log to standard error: life-cycle steps, or decisions as well.
+
+    Args:
+        verbose: log decisions, whatever the level.
+        quiet: log warnings alone unless ``verbose``.
+    """
+    least = logging.DEBUG if verbose else logging.WARNING if quiet else getattr(logging, level.name)
+    logging.basicConfig(level=least, stream=sys.stderr, format="%(asctime)s %(levelname)s %(name)s %(message)s")
     for handler in logging.getLogger().handlers:
         handler.addFilter(_is_ours_or_serious)
+        if form is Format.JSON:
+            handler.setFormatter(JsonLines())
 
 
 def _is_ours_or_serious(record: logging.LogRecord) -> bool:
     """Exclude debug messages of libraries: pyroute2 sets its own level and would print every netlink message."""
     return record.levelno >= logging.WARNING or record.name.partition(".")[0] in _OURS
+
+
+def member_plane(text: str) -> UplinkPlane:
+    """Return the data plane of a RIB or proxy. Raises ``LocalError``: there is no such one."""
+    known: dict[str, UplinkPlane] = {"raw": "raw", "scapy": "scapy"}
+    if text not in known:
+        raise LocalError(f"--data-plane is {' or '.join(known)}, not {text}")
+    return known[text]
 
 
 def emit(event: str, **fields: object) -> None:

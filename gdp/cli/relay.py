@@ -9,9 +9,22 @@ from typing import Annotated
 
 import typer
 
-from gdp.cli.node import Check, Config, Json, Verbose, emit, failing_clearly, set_up_logging
+from gdp.cli.completion import allow_completion
+from gdp.cli.node import (
+    Check,
+    Config,
+    Format,
+    Json,
+    Level,
+    LogFormat,
+    LogLevel,
+    Verbose,
+    emit,
+    failing_clearly,
+    set_up_logging,
+)
 from gdp.cli.output import show
-from gdp.cli.version import Version
+from gdp.cli.version import HELP, Version
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.nodes.control_client import ask_node
@@ -29,6 +42,7 @@ _STATUS_S = 10.0
 
 
 @app.command(
+    context_settings=HELP,
     epilog="Examples: gdp-relay --config relay.yaml; gdp-relay --config relay.yaml --check prints the device of each"
     " border, which is an optional port of the switch; gdp-relay --config relay.yaml --status",
 )
@@ -38,6 +52,8 @@ def relay(
     check: Check = False,
     json: Json = False,
     verbose: Verbose = False,
+    log_level: LogLevel = Level.INFO,
+    log_format: LogFormat = Format.TEXT,
     version: Version = False,
 ) -> None:
     """Carry a switch's frames through TLS where the network blocks UDP, until Ctrl-C. It is slower than a tunnel.
@@ -46,7 +62,7 @@ def relay(
     which has a carrier only while the connection is open.
     """
     del version  # the option's callback ends the command
-    set_up_logging(verbose=verbose)
+    set_up_logging(verbose=verbose, level=log_level, form=log_format)
     with failing_clearly():
         settings = RelayConfig.load(config)
         if check or status:
@@ -84,6 +100,7 @@ def _report_ready(identity: Identity, relay: Relay, *, json: bool) -> None:
 
 def main() -> None:
     """Run the command."""
+    allow_completion("gdp-relay")
     app(prog_name="gdp-relay")
 
 

@@ -7,8 +7,25 @@ from __future__ import annotations
 
 import typer
 
-from gdp.cli.node import AwaitIface, Check, Config, Json, Verbose, emit, emit_wait, failing_clearly, set_up_logging
-from gdp.cli.version import Version
+from gdp.cli.completion import allow_completion
+from gdp.cli.node import (
+    AwaitIface,
+    Check,
+    Config,
+    Format,
+    Json,
+    Level,
+    LogFormat,
+    LogLevel,
+    MemberPlane,
+    Verbose,
+    emit,
+    emit_wait,
+    failing_clearly,
+    member_plane,
+    set_up_logging,
+)
+from gdp.cli.version import HELP, Version
 from gdp.crypto.certificates import Role
 from gdp.names import Name
 from gdp.nodes.config import RibConfig
@@ -21,20 +38,25 @@ __all__ = ["main"]
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 
-@app.command(epilog="Example: gdp-rib --config rib.yaml")
+@app.command(context_settings=HELP, epilog="Example: gdp-rib --config rib.yaml")
 def rib(
     config: Config,
     await_iface: AwaitIface = 0.0,
+    data_plane: MemberPlane = None,
     check: Check = False,
     json: Json = False,
     verbose: Verbose = False,
+    log_level: LogLevel = Level.INFO,
+    log_format: LogFormat = Format.TEXT,
     version: Version = False,
 ) -> None:
     """Answer queries for the nodes that advertise a name in one trust domain, until Ctrl-C."""
     del version  # the option's callback ends the command
-    set_up_logging(verbose=verbose)
+    set_up_logging(verbose=verbose, level=log_level, form=log_format)
     with failing_clearly():
         settings = RibConfig.load(config)
+        if data_plane is not None:
+            settings = settings.model_copy(update={"data_plane": member_plane(data_plane)})
         if check:
             identity, _ = load_member(settings.identity, settings.domain, Role.RIB)
             _report("checked", f"configuration good: RIB {identity.name.short}", identity.name, json=json)
@@ -56,6 +78,7 @@ def _report(event: str, text: str, name: Name, *, json: bool) -> None:
 
 def main() -> None:
     """Run the command."""
+    allow_completion("gdp-rib")
     app(prog_name="gdp-rib")
 
 

@@ -131,6 +131,8 @@ def expose(
       gdp expose '/camera/**' --remove
     """
     directory = _machine_directory(directory)
+    if source is None:
+        name = ProxyFiles.read(directory / _PROXY_FILE).shared_name(name)
     with _sharing(directory, exchange, owner) as sharing:
         if remove:
             _show_change(name, sharing.stop_exposing(kind, name, time.time()), as_json=as_json)

@@ -1,17 +1,21 @@
-"""Option ``--version`` of every command.
+"""Options ``--version`` and ``-h`` of every command and sub-command.
 
 I/O.
 """
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Callable, Iterator
+from typing import Annotated, Any, Final
 
 import typer
+from typer.main import get_command
 
 import gdp
 
-__all__ = ["Version"]
+__all__ = ["HELP", "Version", "versioned"]
+
+HELP: Final = {"help_option_names": ["-h", "--help"]}  # context settings; sub-commands inherit them
 
 
 def _print_and_end(context: typer.Context, is_wanted: bool) -> None:
@@ -23,3 +27,31 @@ def _print_and_end(context: typer.Context, is_wanted: bool) -> None:
 Version = Annotated[
     bool, typer.Option("--version", is_eager=True, callback=_print_and_end, help="Print the version and end.")
 ]
+
+
+def versioned(app: typer.Typer) -> Callable[..., object]:
+    """Return the command of an application, with the option ``--version`` on every sub-command."""
+    command, option = get_command(app), _option()
+    for each in _all_of(command):
+        if not any("--version" in param.opts for param in each.params):
+            each.params.append(option)
+    return command
+
+
+def _option() -> Any:
+    """Return the option as the command line's library makes it; its class differs among the library's versions."""
+    only = typer.Typer(add_completion=False)
+
+    @only.command()
+    def command(version: Version = False) -> None:
+        del version
+
+    (option,) = get_command(only).params
+    option.expose_value = False
+    return option
+
+
+def _all_of(command: Any) -> Iterator[Any]:
+    yield command
+    for each in getattr(command, "commands", {}).values():
+        yield from _all_of(each)

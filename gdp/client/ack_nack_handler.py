@@ -78,7 +78,7 @@ class AckNackHandler:
         is_stuck = now_s - reader.advanced_s >= _STUCK_S
         is_settled = queue.is_acknowledged or is_stuck or now_s - self.last_sent_s > _SETTLED_S
         if report.sequence < sequence and is_settled and (report.next_number >= sent or not queue.is_acknowledged):
-            self._heartbeats.wanted = True  # it does not know what it has lost behind its last message
+            self._heartbeats.is_reminder_wanted = True  # it does not know what it has lost behind its last message
 
     def handle_timer(self, now_s: float) -> None:
         """Suspend silent readers, drop slow ones from the window, and give up what was suspended for too long."""
@@ -171,7 +171,7 @@ class AckNackHandler:
         for move in self._queue.moves:
             if move.is_before(report.next_number):
                 report = report._replace(next_number=move.new_number(report.next_number), next_part=0, missing=())
-                self._heartbeats.wanted = True
+                self._heartbeats.is_reminder_wanted = True
         return report
 
     def _start(self, name: bytes, report: AckNack, now_s: float) -> None:
@@ -217,4 +217,4 @@ class AckNackHandler:
         lacks_from = report.missing[0].number if report.missing and not is_new else report.next_number
         is_gone = lacks_from < oldest
         if is_gone or (window.is_suspended(name) and not report.missing):
-            self._heartbeats.wanted = True  # it requests what is gone, or does not know what it lacks
+            self._heartbeats.is_reminder_wanted = True  # it requests what is gone, or does not know what it lacks

@@ -21,6 +21,7 @@ from gdp.message.reassembly import Reassembler
 __all__ = ["AckNackSchedule"]
 
 _FIRST_BYTES: Final = 3_000
+_MISSING_MAX_S: Final = 16 * REPORT_DELAY_S  # between two requests of what is missing, while nothing comes
 
 
 class AckNackSchedule:
@@ -42,6 +43,8 @@ class AckNackSchedule:
         self._unreported_bytes = 0
         self._total_bytes = 0
         self._clean_bytes = 0  # reported since something was last missing
+        self._has_come = False  # something has, since the report before
+        self._missing_s = REPORT_DELAY_S  # until what is missing is requested again
 
     def count(self, size: int) -> None:
         """Count received bytes that no report confirms yet."""
@@ -77,13 +80,16 @@ class AckNackSchedule:
     def start_report(self) -> None:
         """Count all received bytes as reported."""
         self._clean_bytes += self._unreported_bytes
+        self._has_come = self._unreported_bytes > 0
         self._unreported_bytes = 0
 
     def handle_reported(self, now_s: float, *, is_missing: bool) -> None:
-        """Schedule the report after one that is sent now."""
+        """Schedule the report after one that is sent now: ever later while something is missing and nothing comes."""
+        is_repeated = is_missing and not self._has_come
+        self._missing_s = min(2 * self._missing_s, _MISSING_MAX_S) if is_repeated else REPORT_DELAY_S
         if is_missing:
             self._clean_bytes = 0
-        self.due_s = now_s + (REPORT_DELAY_S if is_missing else self.idle_s)
+        self.due_s = now_s + (self._missing_s if is_missing else self.idle_s)
 
     def _is_owed(self) -> bool:
         """Return whether enough bytes came for a report; the threshold grows while nothing is missing.

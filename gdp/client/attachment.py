@@ -45,6 +45,8 @@ from gdp.trust.rtcert import RtCert
 __all__ = ["Attachment", "PendingAdvertisement", "attachment_waits"]
 
 _ADVERTISEMENT_AGAIN_S: Final = 0.5  # until it is acknowledged
+_RENEWAL_AGAIN: Final = 1 / 12  # of a lease, until a renewal is acknowledged; the pause doubles, up to a third
+_RENEWALS_MAX: Final = 16  # that are counted
 # delay of other advertisements after the node's own; without a RIB they are valid on this switch only
 _OWN_FIRST_S: Final = 0.5
 _MOVED_S: Final = 5.0  # after a move, advertisements name the former switch for this time
@@ -71,6 +73,8 @@ class PendingAdvertisement:
     advertisement_at_s: float = 0.0
     is_taken: bool = False
     refused: DropReason | None = None
+    sent_sequence: int = 0  # of the newest advertisement that was sent
+    renewals: int = 0  # sent since the last acknowledgement
     join_sequence: int = -1  # of the newest join for it that came from this switch
 
     @property
@@ -134,6 +138,12 @@ class Attachment:
         """Return whether this node is refused because an older one with its identity is there."""
         own = self._own_advertisement
         return own is not None and own.refused is DropReason.IN_USE
+
+    @property
+    def is_revoked(self) -> bool:
+        """Return whether the membership of this node is revoked, as far as it has learnt."""
+        member = self._identity.member
+        return self._policy.revoked.has(member.fingerprint, member.issuer_key)
 
     @property
     def _own_advertisement(self) -> PendingAdvertisement | None:
@@ -287,10 +297,9 @@ class Attachment:
             return
         for each in self._due_advertisements():
             if each.advertisement_at_s <= now.mono_s:
-                each.advertisement_at_s = now.mono_s + (
-                    self._lease_s / 3 if each.is_acknowledged else _ADVERTISEMENT_AGAIN_S
-                )
+                each.advertisement_at_s = now.mono_s + self._repeat_s(each)
                 self._say(Kind.ADVERTISE, self._advertisement_wire(each, now))
+                each.sent_sequence = self._sequence
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
@@ -298,6 +307,17 @@ class Attachment:
         if self._switch is not None:
             times += [each.advertisement_at_s for each in self._due_advertisements()]
         return min(times) if times else None
+
+    def _repeat_s(self, each: PendingAdvertisement) -> float:
+        """Count an advertisement that is sent now; return the seconds until it is repeated, unless it is acknowledged.
+
+        A renewal has some five frames, and is lost with any of them.
+        """
+        if not each.is_acknowledged:
+            return _ADVERTISEMENT_AGAIN_S
+        pause_s = min(_ADVERTISEMENT_AGAIN_S, _RENEWAL_AGAIN * self._lease_s) * 2.0**each.renewals
+        each.renewals = min(each.renewals + 1, _RENEWALS_MAX)
+        return min(pause_s, self._lease_s / 3)
 
     def _due_advertisements(self) -> Iterable[PendingAdvertisement]:
         """Return the advertisements that may be sent: only the node's own name while another has this identity."""
@@ -402,8 +422,8 @@ class Attachment:
 
     def _apply_ack(self, each: PendingAdvertisement, ack: AdvertiseAck, now_s: float) -> None:
         if ack.refused is None:
-            if not each.is_taken:
-                each.advertisement_at_s = now_s + self._lease_s / 3
+            if not each.is_taken or ack.sequence >= each.sent_sequence:
+                each.advertisement_at_s, each.renewals = now_s + self._lease_s / 3, 0
             each.is_taken, each.refused = True, None
             if each.right is Right.ATTACH:
                 for other in self._advertisements.values():
@@ -411,7 +431,7 @@ class Attachment:
                         other.advertisement_at_s = min(other.advertisement_at_s, now_s)
             return
         self.refusals[ack.refused] += 1
-        each.is_taken = False
+        each.is_taken, each.renewals = False, 0
         if ack.refused is DropReason.STALE:
             self._sequence = self.started = max(self._sequence, ack.sequence)
             each.advertisement_at_s = now_s  # an earlier incarnation of ours was ahead: retry above its number

@@ -5,6 +5,10 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 A new reader repeats its request until a Heartbeat brings the description. Present readers cannot know of a new
 description, and no reader acknowledges a Heartbeat. So a new description is sent at once, before any message that it
 describes, and repeated several times at growing intervals.
+
+A Heartbeat that repeats what a reader seems not to know is a reminder. There is one within a round trip: the reader's
+answer to the one before cannot have come earlier. Else a slow link would fill with reminders of its own slowness
+(RFC 8085, section 3.1.3).
 """
 
 from __future__ import annotations
@@ -17,6 +21,7 @@ __all__ = ["HeartbeatSchedule"]
 
 _GAP_S: Final = 0.02  # between two
 _BYTES_PER_S: Final = 8 << 20  # ... and longer after a large one
+_REMINDER_MAX_S: Final = 1.0
 _PAUSES_S: Final = (0.05, 0.2, 0.8, 3.2)  # after each sending of a new description but the last
 _NEVER: Final = float("inf")
 
@@ -29,17 +34,18 @@ class HeartbeatSchedule:
 
     Attributes:
         wanted: a Heartbeat has to be sent.
+        is_reminder_wanted: ... once a round trip has passed since the last one.
         starts: new readers, and where they begin.
     """
 
     def __init__(self, description: bytes, number: int) -> None:
         self.number = number
-        self.wanted = False
+        self.wanted = self.is_reminder_wanted = False
         self.starts: dict[bytes, StreamStart] = {}
         self._description = description
         self._said = len(_PAUSES_S) + 1  # times that the description was sent; beyond the last it is not new
         self._again_s = _NEVER  # when the description is sent again
-        self._at_s = -_NEVER  # when the next Heartbeat may be sent
+        self._at_s = self._remind_s = -_NEVER  # when the next Heartbeat, and the next reminder, may be sent
 
     def describe(self, description: bytes) -> bool:
         """Set the description; return whether it is new."""
@@ -61,17 +67,19 @@ class HeartbeatSchedule:
     def get_timer(self) -> float | None:
         """Return the monotonic second at which a Heartbeat may be sent or will be wanted, or None."""
         at_s = self._at_s if self.wanted else self._again_s
+        at_s = min(at_s, self._remind_s) if self.is_reminder_wanted else at_s
         return None if at_s == _NEVER else at_s
 
     def is_due(self, now_s: float) -> bool:
         """Return whether a Heartbeat is wanted and may be sent."""
-        return self.wanted and now_s >= self._at_s
+        return (self.wanted and now_s >= self._at_s) or (self.is_reminder_wanted and now_s >= self._remind_s)
 
-    def poll_heartbeat(self, place: Heartbeat, now_s: float) -> bytes:
+    def poll_heartbeat(self, place: Heartbeat, now_s: float, trip_s: float = 0.0) -> bytes:
         """Return the wire form of the next one, whose number is then ``number``.
 
         Args:
             place: what is cached, sent, renumbered and gone; starts and description are added.
+            trip_s: how long a reader's answer to it may take.
         """
         is_news = self._said <= len(_PAUSES_S)
         about = self._description if self.starts or is_news else b""
@@ -80,7 +88,8 @@ class HeartbeatSchedule:
             self._said += 1
         wire = place._replace(starts=dict(self.starts), description=about).to_wire()
         self.starts.clear()
-        self.wanted = False
+        self.wanted = self.is_reminder_wanted = False
         self.number += 1
         self._at_s = now_s + max(_GAP_S, len(wire) / _BYTES_PER_S)
+        self._remind_s = max(self._at_s, now_s + min(trip_s, _REMINDER_MAX_S))
         return wire

@@ -161,6 +161,8 @@ class ParitySender:
 
     def poll_frames(self, limit: int) -> list[bytes]:
         """Remove and return at most ``limit`` parity frames, and those that leave at once."""
+        if not self._waiting:
+            return []
         frames = [self._waiting.popleft() for _ in range(min(max(limit, self._at_once), len(self._waiting)))]
         self.sent += len(frames)
         self._at_once = max(self._at_once - len(frames), 0)

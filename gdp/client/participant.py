@@ -26,6 +26,7 @@ from gdp.client.timer_queue import TimerQueue
 from gdp.client.unicast_stream import Party, PeerIncarnation
 from gdp.client.writer_proxy import WriterProxy, WriterProxyState
 from gdp.control.boundary import ErrorBoundary
+from gdp.control.diagnostics import Diagnostics, Question
 from gdp.control.join import Join
 from gdp.control.query import Response
 from gdp.control.settings import NodeSettings
@@ -45,6 +46,7 @@ from gdp.trust.right import Right
 from gdp.trust.verifier import AdvertisementVerifier
 
 _FOR_WRITER_PROXIES: Final = (int(Kind.DATA), int(Kind.HEARTBEAT), int(Kind.PARITY))
+_DIAGNOSTICS: Final = (int(Kind.DIAGNOSTIC_REQUEST), int(Kind.DIAGNOSTIC_REPLY))
 _NOTES: Final = (int(Kind.ACKNACK), int(Kind.INTRODUCTION))
 # a participant that is called later than this, although hellos are due, was not scheduled
 _STALL_S: Final = 2 * HELLO_S
@@ -83,6 +85,11 @@ class Participant:
         self._source = source
         self.attachment = Attachment(identity, policy, settings, notes.public)
         self.attachment.advertisement(identity.subject, Right.ATTACH, (), is_global=True)
+        self.diagnostics = Diagnostics(
+            identity, policy, self.attachment.fragmenter, settings.first_sequence,
+            lambda frames, _to, _now: self.attachment.send(frames),
+        )  # fmt: skip
+        self.diagnostics.register("ping", self._answer_ping, for_foreign=True)
 
     @property
     def name(self) -> Name:
@@ -98,7 +105,7 @@ class Participant:
         """Return what was dropped, by reason."""
         attachment = self.attachment
         total = self._drops + self._subscriptions.drops + attachment.drops + attachment.refusals
-        total += self._publications.drops
+        total += self._publications.drops + self.diagnostics.drops
         for writer_proxy in self.writer_proxies():
             total += writer_proxy.drops
         return total
@@ -276,6 +283,11 @@ class Participant:
         """Return the topics that are read."""
         return [subscription.topic for subscription in self._subscriptions if subscription.right is Right.READ]
 
+    def subscriptions(self) -> Iterator[tuple[Name, Right]]:
+        """Yield the names that are read, served or called here, and the right for each."""
+        for subscription in self._subscriptions:
+            yield subscription.topic.name, subscription.right
+
     def publishers(self) -> list[Publisher]:
         """Return the publishers, one for each published topic."""
         return list(self._publications)
@@ -289,6 +301,11 @@ class Participant:
         """Return the writer proxies of one topic, without unicast streams."""
         subscription = self._subscriptions.get(topic)
         return [] if subscription is None else list(subscription.writer_proxies.values())
+
+    def absent_writers(self, name: Name) -> int:
+        """Return how many publishers of a topic that is read have lost their route, and may return."""
+        subscription = self._subscriptions.get(name)
+        return 0 if subscription is None else len(subscription.absent)
 
     def losses_of(self, name: Name) -> Losses:
         """Return what was lost of a name's messages since it was subscribed."""
@@ -323,7 +340,7 @@ class Participant:
     def _hand_out(self, fed: dict[WriterProxy, Subscription], now_s: float) -> None:
         for writer_proxy, subscription in fed.items():
             self._messages += subscription.poll_messages(writer_proxy.publisher)
-            if writer_proxy.get_timer() <= now_s:
+            if writer_proxy.is_report_due(now_s):
                 self._reporting[writer_proxy] = None  # it states for how long it held back what it reports
             self._writer_proxies_due.reschedule(writer_proxy)
         fed.clear()
@@ -335,6 +352,8 @@ class Participant:
                 self._writer_proxy(header, arrival, now.mono_s, fed)
             elif header.kind in _NOTES:
                 self._take_note(header, arrival, now.mono_s)
+            elif header.kind in _DIAGNOSTICS:
+                self._take_diagnostic(header, arrival, now)
             elif header.kind >= CONTROL_FROM:
                 statement = self.attachment.receive_control(arrival, header, now)
                 if statement is not None:
@@ -355,6 +374,7 @@ class Participant:
     def handle_timer(self, now: Timestamps) -> None:
         """Process the timers that are due."""
         self.attachment.handle_timer(now)
+        self.diagnostics.handle_timer(now)
         self._look_at_clock(now.mono_s)
         self._publications.handle_timer(now.mono_s)
         for writer_proxy in self._writer_proxies_due.poll_due(now.mono_s):
@@ -387,10 +407,14 @@ class Participant:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self.attachment.get_timer()]
+        times = [self.attachment.get_timer(), self.diagnostics.get_timer()]
         if self.attachment.switch is not None:  # without a switch nothing can be sent: hellos alone are due
             times += [self._publications.next_due(), self._writer_proxies_due.next_due()]
         return min((time for time in times if time is not None), default=None)
+
+    def count_arrivals(self, frames_from: Callable[[int], int]) -> None:
+        """Learn how to count the frames that have come from a port."""
+        self.attachment.hello_protocol.count_arrivals(frames_from)
 
     def poll_neighbours(self) -> Mapping[int, frozenset[bytes]]:
         """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
@@ -484,6 +508,16 @@ class Participant:
         fed[writer_proxy] = subscription
         if header.parts > 1:
             self._under_way = writer_proxy, subscription
+
+    def _take_diagnostic(self, header: Header, arrival: ReceivedFrame, now: Timestamps) -> None:
+        if header.destination != self.name:
+            raise StatementError(DropReason.NOT_FOR_US)
+        self.diagnostics.receive(header, arrival, now)
+
+    def _answer_ping(self, question: Question, _now: Timestamps) -> Mapping[str, object]:
+        """Return the rights by which this node advertises a name."""
+        ours = [each for each in self.attachment.advertisements if each.subject.name == question.name]
+        return {"rights": [each.right.value for each in ours if each.right is not Right.ATTACH]}
 
     def _take_note(self, header: Header, arrival: ReceivedFrame, now_s: float) -> None:
         if header.destination != self.name:

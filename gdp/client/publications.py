@@ -212,7 +212,8 @@ class Publications:
             self.turns.resume()
 
     def frames_leave(self, now_s: float) -> None:
-        """Note that the frames polled last leave now."""
+        """Count the frames polled last, which left at ``now_s``."""
+        self.turns.count_sent()
         self._reader_paths.frames_leave(now_s)
 
     def attachment_changed(self, now_s: float) -> None:

@@ -47,6 +47,7 @@ __all__ = ["Publisher"]
 _Number = TypeVar("_Number", int, float)
 _ALL: Final = 1 << 30
 _NEVER: Final = float("inf")
+_ALONE_FROM_S: Final = 1.0  # after a second path: round trips enough to measure the one that remains
 _LIMIT_BURST_S: Final = 0.05  # of ``max_bits_s``: a burst of this time leaves at once
 
 
@@ -104,6 +105,7 @@ class Publisher:
         self._blocking = BlockingReaders(patience.lag_s)
         self._seen_s = 0.0
         self._under_way = SentFrames(self._reader_paths, counts_losses=paths != SPREAD)
+        self._uncounted: tuple[list[bytes], list[bytes], float, int] | None = None
         self._limit = _limit_of(options)
         self.second_path_until_s = float("-inf")
         self._striper = Striper() if paths == SPREAD else None
@@ -167,6 +169,10 @@ class Publisher:
         """Return whether a tree is installed, and ``name`` is a reader, keeping up or not."""
         return self.mtu is not None and name in self._readers
 
+    def reader_names(self) -> list[Name]:
+        """Return the readers that have introduced themselves and have not left, silent ones included."""
+        return [Name(each) for each in self._readers.names()]
+
     def is_silent(self, name: Name) -> bool:
         """Return whether ``name`` is a reader that has stopped reporting, and may return."""
         return self._readers.is_suspended(name)
@@ -200,6 +206,15 @@ class Publisher:
     def repairs(self) -> int:
         """Return how many fragments were sent again."""
         return self._window.retransmissions + self._late.retransmissions
+
+    def is_limited(self, now_s: float) -> bool:
+        """Return whether messages wait now because ``max_bits_s`` lets no frame leave."""
+        return self._limit is not None and not self._queue.is_empty and self._limit.left(now_s) <= 0
+
+    @property
+    def epoch(self) -> int:
+        """Return the key epoch that seals."""
+        return self._keys.epoch
 
     def has_space(self) -> bool:
         """Return whether a message may be published without evicting an unacknowledged one."""
@@ -280,14 +295,18 @@ class Publisher:
         """Return how many bytes of frames may leave now, as far as the paths to its readers permit; 0: none.
 
         Of a topic that sends each frame over two paths, the round trip changes with the path whose copy comes first. So
-        no path governs it while there are two.
+        no path governs it while there are two. When one ends, the other has carried every frame, but is not measured:
+        the first window would delay messages that fit it. It governs a second later.
         """
         if self._limit is not None and self._limit.left(now_s) <= 0:
             return 0
         self._seen_s, urgent = now_s, self.is_urgent
-        if self._is_doubled(now_s):
+        if self._is_doubled(now_s - _ALONE_FROM_S):
             return _ALL
-        allowances = [path.allowance(now_s, urgent=urgent) for path in self._paths()]
+        paths = self._paths()
+        if len(paths) == 1:
+            return paths[0].allowance(now_s, urgent=urgent)
+        allowances = [path.allowance(now_s, urgent=urgent) for path in paths]
         if self.confirms and len(allowances) > 1 and min(allowances) <= 0:
             self._record_blocks(now_s)
         return self._governed(allowances, _ALL)
@@ -365,7 +384,7 @@ class Publisher:
         """
         if not self.is_wanted:
             if self._queue.depth:
-                self._queue.defer(message)
+                self._queue.defer(message, now_s)
             else:
                 self.drops[DropReason.NO_READER] += 1
                 self.skip(LossReason.NO_READER)
@@ -395,6 +414,8 @@ class Publisher:
 
         Errors are counted.
         """
+        self.count_sent()
+        self._queue.drop_aged(now_s)
         is_old = header.epoch != self._keys.epoch
         try:
             secret = self._keys.secret_of(header.epoch, now_s)
@@ -415,7 +436,7 @@ class Publisher:
         if report.missing and not self.confirms:
             newest = report.newest, report.newest_part
             self._late.request(header.source, report.missing, now_s, newest=newest, rtt_s=self.path_rtt_s)
-        self._heartbeats.wanted |= is_old  # it has not received the new epoch yet
+        self._heartbeats.is_reminder_wanted |= is_old  # it has not received the new epoch yet
         return True
 
     def connect(self, name: Name, incarnation: int, exchange: bytes, now_s: float) -> None:
@@ -449,8 +470,10 @@ class Publisher:
     def poll_frames(self, now_s: float, limit_bytes: int = _ALL) -> list[bytes]:
         """Return about ``limit_bytes`` of frames; the rest is sealed when it is polled.
 
-        Heartbeats that are due leave in any case; with ``limit_bytes`` 0 nothing else does.
+        Heartbeats that are due leave in any case; with ``limit_bytes`` 0 nothing else does. ``count_sent`` follows,
+        before another publisher asks what the same paths permit.
         """
+        self.count_sent()
         self.has_more = False
         mtu = self._queue.mtu
         if mtu is None or not self._readers:
@@ -459,16 +482,15 @@ class Publisher:
             if not self._readers:
                 self._queue.drop_unread()
             return []
+        self._queue.drop_aged(now_s)
         self._queue.seal_deferred()
         if not self.confirms:
             self._queue.bytes_s = self.path_bytes_s
-            self._heartbeats.wanted |= self._queue.drop_expired(now_s)
+            self._heartbeats.is_reminder_wanted |= self._queue.drop_expired(now_s)
         has_pair = self.paths > 1 and now_s < self.second_path_until_s
         status = self._seal_status(now_s, mtu) if self._heartbeats.is_due(now_s) else []
         heartbeats, repaired = len(status), self.repairs
-        sent: list[bytes] = []
-        parity: list[bytes] = []
-        parity_after: list[bytes] = []
+        sent, parity, parity_after = list[bytes](), list[bytes](), list[bytes]()
         if limit_bytes > 0:
             limit = max(limit_bytes // (mtu * (2 if has_pair and self._striper is None else 1)), 1)
             parity = self.parity.poll_frames(limit)
@@ -479,7 +501,7 @@ class Publisher:
             self.has_more = left <= len(self.parity)
             parity_after = self.parity.poll_frames(max(left, 0))
             if not self._is_doubled(now_s):
-                self._under_way.sent(sent, self._readers, now_s, self.repairs - repaired)
+                self._uncounted = sent, list(self._readers), now_s, self.repairs - repaired
             if self._limit is not None and (leaving := sum(map(len, parity + sent + parity_after))):
                 self._limit.charge(now_s, leaving)
         frames = status + parity + sent + parity_after
@@ -487,9 +509,9 @@ class Publisher:
             self._acknowledgements.last_sent_s = now_s
         self.redundancy.handle_sent(sent, self._readers, now_s, has_pair=has_pair)
         copies = self.redundancy.poll_copies(now_s)
-        if extra_bytes := sum(map(len, copies + parity + parity_after)):
+        if extra := copies + parity + parity_after:
             for path in self._paths():
-                path.controller.charge(extra_bytes, now_s)
+                path.controller.charge(sum(map(len, extra)), now_s)
         frames += copies
         if not has_pair:
             return frames
@@ -497,6 +519,13 @@ class Publisher:
             return [*frames, *map(second_path_copy, frames)]
         doubled = heartbeats + self.repairs - repaired
         return self._striper.stripe(frames, doubled, self._readers.names())
+
+    def count_sent(self) -> None:
+        """Count the frames polled last on the paths to the readers."""
+        uncounted, self._uncounted = self._uncounted, None
+        if uncounted is not None:
+            frames, readers, polled_s, again = uncounted
+            self._under_way.sent(frames, readers, polled_s, again)
 
     def _frames_to_send(self, now_s: float, limit: int) -> list[bytes]:
         """Return at most ``limit`` frames: late repairs first."""
@@ -561,7 +590,8 @@ class Publisher:
             sent_sequence=sent_sequence,
             gone=tuple(queue.ledger.gone),
         )
-        wire = self._heartbeats.poll_heartbeat(state, now_s)
+        trip_s = max((path.patience_s(now_s) for path in self._paths()), default=0.0)
+        wire = self._heartbeats.poll_heartbeat(state, now_s, trip_s)
         return list(self._keys.status.seal(self._heartbeats.number, queue.flags, wire, mtu))
 
 

@@ -20,6 +20,9 @@ BURST_S: Final = 0.001  # frames of this time leave at once: a timer for each fr
 _TIMEOUT_LEAST_S: Final = 0.3
 _TIMEOUT_TRIPS: Final = 4.0
 _TIMEOUT_MOST_S: Final = 4.0
+_DOUBLINGS_MAX: Final = 3
+_PROBE_TRIPS, _PROBE_LEAST_S = 2.0, 0.1
+_LATE_TRIPS, _LATE_LEAST_S = 4.0, 0.1  # RFC 8985, section 6.2; reports of one topic may come so much after another's
 _SCAN_S: Final = 0.1
 _URGENT_SHARE: Final = 1.5  # of the window: urgent frames find space where the others have filled it
 _URGENT_FRAMES: Final = 8
@@ -33,35 +36,47 @@ class ReaderPath:
 
     Attributes:
         controller: its congestion controller.
+        may_probe: one frame may leave whatever the window: what a report of it shows as lost makes space.
         is_silent: nothing was confirmed for a timeout, though something is under way.
     """
 
     def __init__(self, mtu: int, now_s: float) -> None:
         self.controller = PathController(mtu)
-        self.is_silent = False
+        self.is_silent = self.may_probe = self._has_probed = False
         self._mtu = mtu
         self._number = self._left = 0
         self._hops: int | None = None
         self._confirmed_s = now_s
+        self._answered_s = now_s  # as _confirmed_s, but a timeout does not change it
+        self._trip_s = 0.0  # the last one measured; a timeout forgets the controller's
+        self._timeouts = 0  # since a round trip was measured
 
     def allowance(self, now_s: float, *, urgent: bool = False) -> int:
         """Return how many bytes may leave now; 0: none."""
         controller, mtu = self.controller, self._mtu
+        if self.may_probe:
+            return mtu
         free = int(controller.limit) - controller.inflight
         if urgent:
             extra = max((_URGENT_SHARE - 1) * controller.window, _URGENT_FRAMES * mtu)
             return max(free + int(extra), 0)
-        next_s = controller.next_send_s(min(free, mtu) if free > 0 else mtu)
-        if next_s is None or next_s > now_s + BURST_S:
+        if free <= 0 and controller.next_send_s(mtu) is None:
+            return 0
+        next_s = controller.due_s
+        if next_s > now_s + BURST_S:
+            controller.paced()
             return 0
         free = max(free, mtu)  # an empty path carries a frame, whatever its window
         pace = controller.pacing_bytes_s
         if pace >= _UNLIMITED:
             return free
-        return min(free, int((now_s + BURST_S - max(next_s, now_s - BURST_S)) * pace) + mtu)
+        since_s = max(next_s, now_s - max(controller.credit_s, BURST_S))
+        return min(free, int((now_s + BURST_S - since_s) * pace) + mtu)
 
     def next_send_s(self) -> float:
         """Return when the next frame may leave; infinity: not before something is confirmed."""
+        if self.may_probe:
+            return 0.0
         next_s = self.controller.next_send_s(self._mtu)
         return _NEVER if next_s is None else next_s
 
@@ -74,7 +89,9 @@ class ReaderPath:
         """Count frames that leave at once; return the number under which they are confirmed."""
         if not self.controller.inflight:
             self._confirmed_s = now_s
+            self._answered_s = self._answered_s if self._timeouts else now_s
         self._number += 1
+        self.may_probe = False
         self.controller.sent(self._number, size, now_s, frames)
         return self._number
 
@@ -93,13 +110,20 @@ class ReaderPath:
         before = self.controller.inflight
         self.controller.acknowledged(numbers, now_s, held_s=held_s, lost=lost)
         if self.controller.inflight < before:
-            self._confirmed_s = now_s
+            self._confirmed_s, self._has_probed = now_s, False
+            if self.controller.rtt_s is not None:  # not one of before a timeout
+                self._answered_s, self._trip_s, self._timeouts = now_s, self.controller.rtt_s, 0
 
     def handle_heard(self) -> None:
         """Note that the reader is alive; what left during a silence and is not confirmed now was lost."""
         if self.is_silent:
             self.is_silent = False
             self.controller.forget_all()
+
+    def patience_s(self, now_s: float) -> float:
+        """Return how long an answer may take: a round trip, or as long as nothing under way was confirmed."""
+        is_waiting = self._timeouts > 0 or self.controller.inflight > 0
+        return max(self._trip_s, now_s - self._answered_s if is_waiting else 0.0)
 
     def handle_hops(self, hops: int, now_s: float) -> None:
         """Note over how many hops a report came; another count means another path."""
@@ -114,13 +138,29 @@ class ReaderPath:
             self.controller.set_mtu(mtu)
 
     def handle_timer(self, now_s: float) -> None:
-        """Start again if nothing was confirmed for too long."""
+        """Start again if nothing was confirmed for too long; forget what was not, while other frames were.
+
+        Else the lost end of one topic's message would fill the window for ever: what confirms it is a later frame of
+        that topic, which may not leave, and frames of other topics keep the path from a timeout. Timeouts that follow
+        each other double (RFC 6298, section 5.5): shorter than the round trip, they would never let one be measured.
+        Before a timeout one frame may leave (RFC 8985, section 7): the last ones of a full window may be lost.
+        """
         if not self.controller.inflight:
             return
-        trip_s = self.controller.rtt_s or 0.0
-        if now_s - self._confirmed_s >= min(max(_TIMEOUT_TRIPS * trip_s, _TIMEOUT_LEAST_S), _TIMEOUT_MOST_S):
+        timeout_s = max(_TIMEOUT_TRIPS * self._trip_s, _TIMEOUT_LEAST_S) * 2 ** min(self._timeouts, _DOUBLINGS_MAX)
+        timeout_s = min(timeout_s, _TIMEOUT_MOST_S)
+        if now_s - self._confirmed_s >= timeout_s:
+            self._timeouts += 1
             self.controller.timed_out(now_s)
-            self.is_silent, self._confirmed_s = True, now_s
+            self.is_silent, self._confirmed_s, self.may_probe, self._has_probed = True, now_s, False, False
+        else:
+            if not self._has_probed and now_s - self._confirmed_s >= max(_PROBE_TRIPS * self._trip_s, _PROBE_LEAST_S):
+                self.may_probe = self._has_probed = True
+            late_s = max(self._trip_s / _LATE_TRIPS, _LATE_LEAST_S)
+            self.controller.forget_before(self.controller.confirmed_sent_s - late_s)
+            inflight = self.controller.inflight
+            self.controller.forget_before(self._confirmed_s - timeout_s)
+            self._timeouts += self.controller.inflight < inflight
 
     def is_unused(self, now_s: float) -> bool:
         """Return whether nothing was confirmed for so long that the path need not be remembered."""
@@ -160,7 +200,7 @@ class ReaderPaths:
 
     def governing(self, readers: Iterable[bytes], now_s: float) -> list[ReaderPath]:
         """Return the paths that govern what leaves for these readers: silent ones only if all are."""
-        paths = [self.path(reader, now_s) for reader in readers]
+        paths = [self._paths.get(reader) or self.path(reader, now_s) for reader in readers]
         return [path for path in paths if not path.is_silent] or paths[:1]
 
     def attachment_changed(self, now_s: float) -> None:
@@ -180,9 +220,9 @@ class ReaderPaths:
         before = sum(path.is_silent for path in self._paths.values())
         timed_out = False
         for reader, path in list(self._paths.items()):
-            was_s = path.controller.inflight
+            inflight = path.controller.inflight
             path.handle_timer(now_s)
-            timed_out |= bool(was_s) and not path.controller.inflight
+            timed_out |= path.controller.inflight < inflight or path.may_probe
             if path.is_unused(now_s):
                 del self._paths[reader]
         self._scan_s = now_s + _SCAN_S if any(path.controller.inflight for path in self._paths.values()) else None

@@ -7,10 +7,11 @@ role, and its switch announces it in its link state (``control/link_state.py``).
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from gdp.client.attachment import Attachment
 from gdp.control.channel import Channels
+from gdp.control.diagnostics import Diagnostics
 from gdp.control.fragments import ControlReassembler
 from gdp.control.settings import NodeSettings
 from gdp.crypto.identity import Identity
@@ -38,6 +39,13 @@ class RibHost:
         self._channels = Channels(identity, policy, settings.random_bytes, accepts=True)
         self.attachment = Attachment(identity, policy, settings)
         self.rib = rib
+        self.diagnostics = Diagnostics(
+            identity,
+            policy,
+            self.attachment.fragmenter,
+            settings.first_sequence,
+            lambda frames, _to, _now: self.attachment.send(frames),
+        )
 
     @property
     def name(self) -> Name:
@@ -46,7 +54,7 @@ class RibHost:
 
     def drops(self) -> Mapping[DropReason, int]:
         """Return what was dropped or refused, by reason."""
-        own = self._drops + self._reassembler.drops + self._channels.drops
+        own = self._drops + self._reassembler.drops + self._channels.drops + self.diagnostics.drops
         return own + self.attachment.drops + self.rib.refusals
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Timestamps) -> None:
@@ -77,6 +85,7 @@ class RibHost:
         """Process the timers that are due."""
         self._now_s = now.mono_s
         self.attachment.handle_timer(now)
+        self.diagnostics.handle_timer(now)
         self._record_connection(now)
         self._reassembler.drop_expired(now.mono_s)
         self.rib.handle_timer(now)
@@ -86,7 +95,12 @@ class RibHost:
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         times = [self.attachment.get_timer(), self.rib.get_timer(), self._channels.get_timer()]
+        times.append(self.diagnostics.get_timer())
         return min((time for time in times if time is not None), default=None)
+
+    def count_arrivals(self, frames_from: Callable[[int], int]) -> None:
+        """Learn how to count the frames that have come from a port."""
+        self.attachment.hello_protocol.count_arrivals(frames_from)
 
     def poll_neighbours(self) -> Mapping[int, frozenset[bytes]]:
         """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
@@ -110,6 +124,9 @@ class RibHost:
             return []
         if header.destination != self.name:
             raise FrameError(DropReason.NOT_FOR_US)
+        if header.kind in (Kind.DIAGNOSTIC_REQUEST, Kind.DIAGNOSTIC_REPLY):
+            self.diagnostics.receive(header, arrival, now)
+            return []
         if header.kind not in (Kind.RIB_REQUEST, Kind.RIB_ANSWER):
             raise FrameError(DropReason.UNKNOWN_KIND, str(header.kind))
         wire = self._reassembler.add(header, arrival.frame, now.mono_s, arrival.via)

@@ -6,22 +6,37 @@ Sans-I/O.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal, TypeAlias, get_args
 
 from gdp.errors import LocalError
+from gdp.limits import WINDOW_BYTES
 
 __all__ = [
     "DEADLINE_MAX_S",
     "DEFAULT_OPTIONS",
+    "HISTORY_BYTES_MAX",
+    "HISTORY_MESSAGES_MAX",
+    "PRIORITIES",
     "RATE_MAX_BITS_S",
     "RATE_MIN_BITS_S",
     "WEIGHT_MAX",
+    "Priority",
     "SendOptions",
     "checked",
+    "is_urgent",
 ]
+
+Priority: TypeAlias = Literal["urgent", "interactive", "high", "normal", "low", "bulk", "background"]
+PRIORITIES: Final[tuple[Priority, ...]] = get_args(Priority)  # first what leaves first
+
+# The first two have the flag URGENT on the wire and go before all others, in order. The others share what is left.
+_STRICT: Final = 2
+_WEIGHTS: Final[dict[Priority, int]] = {"high": 16, "normal": 8, "low": 4, "bulk": 2, "background": 1}
 
 DEADLINE_MAX_S: Final = 3_600.0
 WEIGHT_MAX: Final = 100
+HISTORY_MESSAGES_MAX: Final = 100_000
+HISTORY_BYTES_MAX: Final = WINDOW_BYTES
 RATE_MIN_BITS_S: Final = 1_000.0  # less would carry a frame of 1,500 bytes in more than 12 s
 RATE_MAX_BITS_S: Final = 1e12
 
@@ -34,8 +49,11 @@ class SendOptions:
         deadline_s: a best-effort message that cannot leave whole within this time is dropped (ROS 2: lifespan). None: a
             message that waits is dropped when a newer one waits, too.
         weight: share of the path, next to other topics of the same priority.
+        priority: what goes first; ``high`` to ``background`` share the path 16 : 8 : 4 : 2 : 1, times ``weight``.
         max_bits_s: most bits of frames per second; None: what the path carries.
         fec: messages are sent redundantly against loss that is measured.
+        history_bytes: most bytes that a latched topic keeps for late joiners; None: its depth alone counts.
+        history_age_s: longest time that a latched message waits for late joiners; None: its depth alone counts.
         repairs: lost parts of a best-effort message are sent again while that can be in time.
     """
 
@@ -44,6 +62,30 @@ class SendOptions:
     max_bits_s: float | None = None
     repairs: bool = True
     fec: bool = True
+    priority: Priority = "normal"
+    history_bytes: int | None = None
+    history_age_s: float | None = None
+
+    @property
+    def rank(self) -> int:
+        """Return the place of the priority; 0 leaves first."""
+        return PRIORITIES.index(self.priority)
+
+    @property
+    def share(self) -> int:
+        """Return the share of the path next to all topics that are not urgent; an urgent one shares with none."""
+        return self.weight * _WEIGHTS.get(self.priority, 1)
+
+
+def is_urgent(priority: Priority) -> bool:
+    """Return whether frames of this priority go before others wherever frames queue.
+
+    Raises:
+        LocalError: there is no such priority.
+    """
+    if priority not in PRIORITIES:
+        raise LocalError(f"priority is one of {', '.join(PRIORITIES)}, not {priority!r}")
+    return PRIORITIES.index(priority) < _STRICT
 
 
 DEFAULT_OPTIONS: Final = SendOptions()

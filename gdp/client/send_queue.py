@@ -78,12 +78,14 @@ class SendQueue:
         self.bundle_bytes = BUNDLE_BYTES
         self.moves: deque[Renumbering] = deque(maxlen=MOVES_MAX)
         self.drops: Counter[DropReason] = Counter()
-        self._deferred = deque[tuple[int, bytes]]()  # (sequence number, message)
+        self._deferred = deque[tuple[int, bytes, float | None]]()  # (sequence number, message, since when)
+        self._deferred_bytes = 0
         self._gathered = Gathered()
         self.options = options
         self.bytes_s: float | None = None
         self.has_parity = False
         self._best_effort = BestEffortQueue(options.deadline_s)
+        window.set_history_bounds(options.history_bytes, options.history_age_s)
 
     @property
     def is_empty(self) -> bool:
@@ -130,10 +132,21 @@ class SendQueue:
             sent = self.ledger.begin_of(self._window.sent[0], self.first_waiting)
         return sent, sent if oldest is None else self.ledger.begin_of(oldest, sent)
 
-    def defer(self, message: bytes) -> None:
-        """Queue a latched message for the first reader; the oldest above ``depth`` are dropped."""
-        self._deferred.append((self.ledger.next(), message))
-        self._drop_deferred(self.depth)
+    def defer(self, message: bytes, added_s: float | None = None) -> None:
+        """Queue a latched message for the first reader; the oldest beyond the history are dropped.
+
+        Args:
+            added_s: when it is published; None: it does not age.
+        """
+        self._deferred.append((self.ledger.next(), message, added_s))
+        self._deferred_bytes += len(message)
+        self._drop_deferred(self.depth, added_s)
+
+    def drop_aged(self, now_s: float) -> None:
+        """Drop what is too old for late joiners."""
+        if self.options.history_age_s is not None:
+            self._window.release_aged(now_s)
+            self._drop_deferred(self.depth, now_s)
 
     def add(self, message: bytes, *, gather_bytes: int, added_s: float | None = None) -> None:
         """Queue a message; small ones wait to be bundled, up to ``gather_bytes`` of them.
@@ -164,6 +177,7 @@ class SendQueue:
         """Change how fresh best-effort messages leave, those that wait included."""
         self.options = options
         self._best_effort.deadline_s = options.deadline_s
+        self._window.set_history_bounds(options.history_bytes, options.history_age_s)
 
     def set_depth(self, depth: int) -> None:
         """Change how many messages are latched; what is beyond that is dropped."""
@@ -175,8 +189,9 @@ class SendQueue:
     def seal_deferred(self) -> None:
         """Seal what waited for the first reader."""
         while self._deferred:
-            sequence, message = self._deferred.popleft()
-            self._seal_message(message, sequence)
+            sequence, message, added_s = self._deferred.popleft()
+            self._deferred_bytes -= len(message)
+            self._seal_message(message, sequence, added_s=added_s)
 
     def seal_gathered(self) -> None:
         """Seal what waited to be bundled."""
@@ -209,7 +224,8 @@ class SendQueue:
     def frames_to_send(self, now_s: float, limit: int) -> list[bytes]:
         """Return about ``limit`` frames that may be sent now, at least one; the rest is sealed when it is polled."""
         frames = self._best_effort.poll_frames(max(limit, 1))
-        frames += self._window.frames_to_send(now_s, max(limit - len(frames), 1))
+        if not self._gathered or self._window.has_frames:
+            frames += self._window.frames_to_send(now_s, max(limit - len(frames), 1))
         while self._gathered and len(frames) < limit and not self._has_best_effort_queue():
             self._seal_next()
             left = limit - len(frames)
@@ -280,7 +296,7 @@ class SendQueue:
                 self._lose(dropped.sequence, dropped.messages, DropReason.MEMORY_FULL, LossReason.QUEUE_OVERFLOW)
             return
         ledger.put(number, sequence, messages)
-        evicted = self._window.add(number, frames, frames.size_bytes)
+        evicted = self._window.add(number, frames, frames.size_bytes, added_s)
         self.drops[DropReason.MEMORY_FULL] += ledger.record_evicted(evicted, LossReason.WINDOW_OVERFLOW)
         ledger.forget(self.oldest)
 
@@ -295,10 +311,21 @@ class SendQueue:
         self.drops[drop_reason] += messages
         self.ledger.lose(sequence, sequence + messages - 1, reason)
 
-    def _drop_deferred(self, keep: int) -> int:
-        """Drop the oldest deferred messages above ``keep``; return how many."""
-        dropped = max(len(self._deferred) - keep, 0)
-        for _ in range(dropped):
-            sequence, _ = self._deferred.popleft()
+    def _drop_deferred(self, keep: int, now_s: float | None = None) -> int:
+        """Drop the oldest deferred messages above ``keep``, and beyond the history; return how many."""
+        dropped = 0
+        while self._deferred and (len(self._deferred) > keep or self._is_beyond_history(now_s)):
+            sequence, message, _ = self._deferred.popleft()
+            self._deferred_bytes -= len(message)
             self.ledger.lose(sequence, sequence, LossReason.NO_READER)
+            dropped += 1
         return dropped
+
+    def _is_beyond_history(self, now_s: float | None) -> bool:
+        """Return whether the oldest deferred message is one too many by bytes, or too old."""
+        options, added_s = self.options, self._deferred[0][2]
+        if options.history_bytes is not None and self._deferred_bytes > options.history_bytes:
+            return True
+        if options.history_age_s is None or added_s is None or now_s is None:
+            return False
+        return now_s - added_s >= options.history_age_s

@@ -1,9 +1,10 @@
 """Send scheduler of a participant: the order in which its publishers send, and when.
 
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Urgent publishers come first. The others share what their
-paths permit by deficit round robin, frame by frame. A publisher that had nothing to send has its first round before
-those that wait, so that no image delays a scan. Sources: Linux ``sch_prio``; M. Shreedhar and G. Varghese, Efficient
-Fair Queuing Using Deficit Round Robin, SIGCOMM 1995; RFC 8290, section 4 (new and old queues).
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Urgent publishers come first, in the order of their
+priorities. The others share what their paths permit by deficit round robin, by priority and weight. A publisher that
+had nothing to send has its first round before those that wait, so that no image delays a scan. Sources: Linux
+``sch_prio``; M. Shreedhar and G. Varghese, Efficient Fair Queuing Using Deficit Round Robin, SIGCOMM 1995; RFC 8290,
+section 4 (new and old queues).
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ from gdp.limits import MTU_MIN_BYTES
 
 __all__ = ["BYTES_AT_ONCE", "BYTES_WITH_URGENT", "SendScheduler"]
 
-BYTES_AT_ONCE: Final = 96 << 10  # of ordinary frames, before any other publisher has its turn
+BYTES_AT_ONCE: Final = 160 << 10  # of ordinary frames, before any other publisher has its turn
 BYTES_WITH_URGENT: Final = 64 << 10  # ... with an urgent topic, whose frames may have to wait for this amount
-_QUANTUM_FRAMES: Final = 2  # of a publisher of weight 1 in each round, where the path is the limit
+_QUANTUM_FRAMES: Final = 2  # of the publisher with the least share in each round, where the path is the limit
 _NEVER: Final = float("inf")
 
 
@@ -36,6 +37,8 @@ class SendScheduler:
         self._ordinary: dict[Publisher, int] = {}  # with the bytes left of its round; the one whose turn it is first
         self._at_once = BYTES_AT_ONCE
         self._held_until_s: float | None = None  # the paths hold back all that wait
+        self._uncounted: Publisher | None = None  # whose frames leave before they are counted
+        self._is_idle = False  # it had nothing more
 
     def __bool__(self) -> bool:
         return bool(self._urgent or self._new or self._ordinary) and self._held_until_s is None
@@ -62,6 +65,10 @@ class SendScheduler:
         if self._held_until_s is not None and now_s < self._held_until_s:
             return []
         self._held_until_s = None
+        self.count_sent()
+        if not self._urgent and len(self._new) + len(self._ordinary) == 1:
+            frames = self._poll_only(now_s)
+            return [frames] if frames else []
         urgent, due_s = self._poll_urgent(now_s)
         if 0 < sum(map(len, urgent)) < self._at_once // 2:
             return [urgent]  # it leaves now; the others' next chunk is sealed after that
@@ -72,11 +79,33 @@ class SendScheduler:
             self._held_until_s = min(due_s, ordinary_due_s)
         return [frames for frames in (urgent, ordinary) if frames]
 
+    def count_sent(self) -> None:
+        """Count what the only publisher sent: after its frames have left, so that they need not wait for that."""
+        publisher, self._uncounted = self._uncounted, None
+        if publisher is not None:
+            publisher.count_sent()
+            if self._is_idle:
+                publisher.note_idle()
+
+    def _poll_only(self, now_s: float) -> list[bytes]:
+        """Return frames of the only publisher that waits, an ordinary one: it shares with no other."""
+        (publisher,) = self._ordinary or self._new
+        publisher.path_share = 1.0
+        allowance = publisher.allowance(now_s)
+        frames = publisher.poll_frames(now_s, min(allowance, self._at_once))
+        self._asked(publisher)
+        self._uncounted, self._is_idle = publisher, allowance > 0 and not publisher.has_more
+        self._new.clear()
+        self._ordinary = {publisher: 0} if allowance <= 0 or publisher.has_more else {}
+        if self._ordinary and not frames:
+            self._held_until_s = _or_never(publisher.next_send_s(now_s)) if allowance <= 0 else _NEVER
+        return frames
+
     def _poll_urgent(self, now_s: float) -> tuple[list[bytes], float]:
         """Return urgent frames, and when a path permits more."""
         frames: list[bytes] = []
         due_s = _NEVER
-        for publisher in list(self._urgent):
+        for publisher in sorted(self._urgent, key=lambda each: each.options.rank):
             allowance = publisher.allowance(now_s)
             frames += self._poll(publisher, min(allowance, self._at_once), now_s)
             if allowance <= 0:
@@ -89,9 +118,10 @@ class SendScheduler:
         """Return one round of ordinary frames, and when a path permits more."""
         frames: list[bytes] = []
         due_s, left = _NEVER, self._at_once
-        weights = sum(publisher.options.weight for publisher in self._ordinary)
+        shares = [publisher.options.share for publisher in self._ordinary]
+        total, least = sum(shares), min(shares, default=1)
         for publisher, left_of_round in list(self._ordinary.items()):
-            publisher.path_share = publisher.options.weight / weights
+            publisher.path_share = publisher.options.share / total
             allowance = publisher.allowance(now_s)
             if allowance <= 0:
                 frames += self._poll(publisher, 0, now_s)
@@ -100,7 +130,7 @@ class SendScheduler:
             is_shared = allowance < left and len(self._ordinary) > 1
             deficit = left_of_round
             if is_shared and deficit <= 0:
-                deficit += _QUANTUM_FRAMES * publisher.options.weight * (publisher.mtu or MTU_MIN_BYTES)
+                deficit += _QUANTUM_FRAMES * publisher.options.share * (publisher.mtu or MTU_MIN_BYTES) // least
             polled = self._poll(publisher, min(allowance, deficit if is_shared else left), now_s)
             size = sum(map(len, polled))
             frames += polled
@@ -119,6 +149,7 @@ class SendScheduler:
 
     def _poll(self, publisher: Publisher, limit_bytes: int, now_s: float) -> list[bytes]:
         frames = publisher.poll_frames(now_s, limit_bytes)
+        publisher.count_sent()
         self._asked(publisher)
         if limit_bytes > 0 and not publisher.has_more and len(self._ordinary) + len(self._urgent) + len(self._new) == 1:
             publisher.note_idle()  # the path could carry more than there is

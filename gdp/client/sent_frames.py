@@ -21,15 +21,25 @@ from gdp.message.acknack import AckNack
 
 __all__ = ["SentFrames"]
 
-_FLIGHT_FRAMES: Final = 8
-_KEY: Final = slice(NUMBER_AT, NUMBER_AT + 12)  # message number and fragment, as in the header
-_KEYS_MAX: Final = 1 << 16
+_FLIGHT_FRAMES: Final = 16
+_MESSAGES_MAX: Final = 1 << 16
 _COUNT_MASK: Final = (1 << 32) - 1
 
 
 class _Flight(NamedTuple):
     end: int  # count of frames sent up to its last one
     number: int  # on the reader's path
+
+
+class _Run(NamedTuple):
+    first: int  # fragment of a message
+    last: int  # ... and the one up to which the others left right after it
+    place: int  # count of frames sent up to the first one
+
+    @property
+    def end(self) -> int:
+        """Count of frames sent up to the last one."""
+        return self.place + self.last - self.first
 
 
 @dataclass(slots=True)
@@ -57,14 +67,13 @@ class SentFrames:
         self._counts_losses = counts_losses
         self._readers: dict[bytes, _Reader] = {}
         self._count = 0
-        self._places: dict[bytes, int] = {}  # frame -> count of frames sent up to it; oldest first
+        self._runs: dict[int, list[_Run]] = {}  # by message number; oldest first
 
-    def sent(self, frames: Sequence[bytes], readers: Iterable[bytes], now_s: float, again: int = 0) -> None:
-        """Count frames that leave now to all readers; the first ``again`` of them were sent before.
+    def sent(self, frames: Sequence[bytes], names: Sequence[bytes], now_s: float, again: int = 0) -> None:
+        """Count frames that leave now to the readers of these names; the first ``again`` of them were sent before.
 
         Of several readers, those that have a frame already do not confirm it again. It then counts for the pace alone.
         """
-        names = list(readers)
         if len(self._readers) > len(names):
             self.keep(names)
         if again and len(names) > 1:
@@ -72,22 +81,39 @@ class SentFrames:
             for name in names:
                 self._paths.path(name, now_s).controller.charge(size, now_s)
             frames, again = frames[again:], 0
+        if len(frames) > again:
+            self._note_places(frames[again:], self._count + again + 1)
         for first in range(0, len(frames), _FLIGHT_FRAMES):
             flight = frames[first : first + _FLIGHT_FRAMES]
             size = sum(map(len, flight))
-            count = self._count
-            for frame in flight:
-                count += 1
-                if count - self._count + first > again:
-                    self._places[frame[_KEY]] = count
-            self._count = count
+            count = self._count = self._count + len(flight)
             for name in names:
                 path = self._paths.path(name, now_s)
                 reader = self._readers.get(name)
                 if reader is None:
                     reader = self._readers[name] = _Reader(resolved=count - len(flight))
                 reader.flights.append(_Flight(count, path.sent(size, len(flight), now_s)))
-        self._forget_places()
+        if not names or len(self._runs) > _MESSAGES_MAX:
+            self._forget_places()
+
+    def _note_places(self, frames: Sequence[bytes], place: int) -> None:
+        """Note the counts of frames that leave for the first time; ``place`` is the first one's."""
+        (number, part), (last_number, last_part) = (
+            NUMBER_AND_PART.unpack_from(frame, NUMBER_AT) for frame in (frames[0], frames[-1])
+        )
+        if number == last_number and last_part - part == len(frames) - 1:  # of a large message, in order
+            self._runs.setdefault(number, []).append(_Run(part, last_part, place))
+            return
+        for each, frame in enumerate(frames, place):
+            number, part = NUMBER_AND_PART.unpack_from(frame, NUMBER_AT)
+            self._runs.setdefault(number, []).append(_Run(part, part, each))
+
+    def _place_of(self, number: int, part: int) -> int:
+        """Return the count of frames sent up to one of them; 0: it is not known any more."""
+        for run in reversed(self._runs.get(number, ())):
+            if run.first <= part <= run.last:
+                return run.place + part - run.first
+        return 0
 
     def handle_hops(self, name: bytes, hops: int, now_s: float) -> None:
         """Note over how many hops a reader's report came."""
@@ -101,13 +127,14 @@ class SentFrames:
         if path is not None:
             if reader is not None and report.received:
                 self._confirm(reader, path, report, now_s, waited_s)
+                self._forget_places()
             path.handle_heard()
 
     def _confirm(self, reader: _Reader, path: ReaderPath, report: AckNack, now_s: float, waited_s: float) -> None:
         while reader.flights and not path.controller.is_under_way(reader.flights[0].number):
             reader.resolved, reader.partial = reader.flights.popleft().end, 0  # it was given up with a silence
         came = (report.received - reader.received) & _COUNT_MASK if reader.received >= 0 else 0
-        place = self._places.get(NUMBER_AND_PART.pack(report.newest, report.newest_part), 0)
+        place = self._place_of(report.newest, report.newest_part)
         if place <= reader.resolved:
             self._confirm_repairs(reader, path, came, now_s)
             if came <= _COUNT_MASK // 2:
@@ -156,11 +183,11 @@ class SentFrames:
                 path.controller.forget(flight.number for flight in reader.flights)
 
     def _forget_places(self) -> None:
-        """Forget the places of frames that every reader has confirmed, and the oldest of too many."""
+        """Forget the places in messages that every reader has confirmed, and in the oldest of too many."""
         below = min((reader.resolved for reader in self._readers.values()), default=self._count)
-        places = self._places
-        while places:
-            key = next(iter(places))
-            if places[key] > below and len(places) <= _KEYS_MAX:
+        runs = self._runs
+        while runs:
+            number = next(iter(runs))
+            if runs[number][-1].end > below and len(runs) <= _MESSAGES_MAX:
                 break
-            del places[key]
+            del runs[number]

@@ -213,6 +213,11 @@ class WriterProxy:
         return self._data.drops + self._status.drops
 
     @property
+    def is_best_effort(self) -> bool:
+        """Return whether the publisher has said that it repeats nothing for good."""
+        return self._is_reliable is False
+
+    @property
     def delivered(self) -> int:
         """Return how many messages were delivered."""
         return self._delivery.delivered
@@ -319,6 +324,10 @@ class WriterProxy:
         due_s = min(self._schedule.due_s, self._gap_until_s, held_s, self._late.get_timer())
         due_s = min(due_s, self._recovery.next_expiry())
         return min([due_s, *(expiry for expiry in expiries if expiry is not None)])
+
+    def is_report_due(self, now_s: float) -> bool:
+        """Return whether ``control_to_send`` has a report now."""
+        return now_s >= self._schedule.due_s or self._late.is_due(now_s)
 
     def control_to_send(self, now_s: float) -> list[bytes]:
         """Return the frames of the report that is due, if one is, and of an introduction if it is wanted."""

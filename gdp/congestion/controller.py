@@ -14,6 +14,8 @@ What differs from Copa:
   start of the other one takes nearly all of a long queue, and CUBIC needs a minute to win it back.
 - A queue that empties shows no departure where the FIFO is short: both flows have given way. For ``_TRIAL_S`` after a
   competition, a rate under ``_TRIAL_SHARE`` of the one before shows that the other flow is still there.
+- Next to another flow nearly half of what leaves is not lost for rounds. Where it is, the path has become thin: its
+  former capacity is forgotten.
 - The window only grows while it is used, so a camera that pauses keeps a window that was measured.
 - Reports confirm many frames at once. What has arrived and is not reported yet does not count against the window, as
   BBR does with what was acknowledged in excess (section 4.6.4.2).
@@ -25,6 +27,7 @@ What differs from Copa:
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import takewhile
 from math import sqrt
 from typing import Final
 
@@ -40,7 +43,7 @@ _FIRST_FRAMES: Final = 32  # as Google's QUIC; RFC 6928 has 10
 _FIRST_RTT_S: Final = 0.02  # until one is measured
 _LEAST_RTT_S: Final = 1e-5
 _NOISE_S: Final = 0.002
-_HOLD_WINDOW_S, _HOLD_MOST_S = 0.2, 0.03  # of reports; a reader reports at least each 20 ms while frames come
+_HOLD_WINDOW_S, _HOLD_MOST_S = 0.2, 0.01  # of reports; a reader reports at least each 20 ms while frames come
 _BASE_WINDOW_S: Final = 10.0  # Copa, section 2
 _RATE_ROUNDS: Final = 10
 _RECENT_ROUNDS: Final = 2
@@ -52,8 +55,11 @@ _QUEUE_SHARE: Final = 0.1
 _LEAST_QUEUE: Final = 2.0  # frames; Copa: 1/delta
 _SAME_DIRECTION: Final = 3  # rounds before the velocity doubles
 _PACING_STARTUP, _PACING = 2.89, 1.2  # BBR: 2/ln 2 lets the window double each round trip
+_CREDIT_SHARE, _CREDIT_MOST_S = 0.125, 0.01  # of a round trip; less than a time slice loses the pace on a busy core
 _HEAVY_LOSS, _HEAVY_FRAMES = 0.1, 20
 _AFTER_HEAVY: Final = 0.85
+_SHRUNK_LOSS, _SHRUNK_ROUNDS = 0.4, 5
+_COLLAPSED_SHARE, _COLLAPSED_ROUNDS = 0.05, 2  # a slow start behind a second of queue leaves a flow a fourteenth
 _STANDING_BASES: Final = 12  # round trips of the empty path without a nearly empty queue
 _STANDING_LEAST_S, _STANDING_MOST_S = 0.5, 3.0
 _WANTED_MOST_S: Final = 0.06  # two frames at 0.4 Mbit/s; a longer queue is another flow's
@@ -83,6 +89,10 @@ class PathController:
         state: what governs the window.
         window: bytes that may be under way.
         inflight: bytes that are.
+        limit: bytes that may be unconfirmed: those under way, and those that the reader has not reported yet.
+        confirmed_sent_s: when the newest flight left that was confirmed.
+        due_s: monotonic second of the next frame by the pace alone.
+        pacing_bytes_s: rate at which frames may leave; none is limited before the first round trip.
     """
 
     def __init__(self, mtu: int) -> None:
@@ -91,12 +101,16 @@ class PathController:
         self._rate = DeliveryRate()
         self._flights: dict[int, Flight] = {}
         self.inflight = 0
-        self._next_s = self._changed_s = self._loss = 0.0
+        self.due_s = self._changed_s = self._loss = 0.0
+        self.confirmed_sent_s = float("-inf")
+        self._is_paced = False
+        self.window = float(_FIRST_FRAMES * mtu)
         self._start()
+        self._set_limits()
 
     def _start(self) -> None:
-        """Forget the path."""
-        self.window = float(_FIRST_FRAMES * self._mtu)
+        """Forget the path; the window begins no larger than it was, because another path may be as thin."""
+        self.window = min(self.window, float(_FIRST_FRAMES * self._mtu))
         self._srtt_s: float | None = None
         self._base = WindowedExtreme(is_lowest=True)
         self._standing = WindowedExtreme(is_lowest=True)
@@ -107,14 +121,14 @@ class PathController:
         self._full_rate, self._flat_rounds = 0.0, 0
         self._velocity, self._direction, self._same, self._round_window = 1.0, 0, 0, self.window
         self._was_used = False
-        self._lost_frames = self._round_frames = 0
+        self._lost_frames = self._round_frames = self._reported_lost = 0
         self._round_delivered = self._rate.delivered
         self._empty_s = self._entered_s = 0.0
         self._last_rate = self._capacity = 0.0
         self._recent = WindowedExtreme(is_lowest=False)
         self._peaks = WindowedExtreme(is_lowest=False)
         self._capacities = WindowedExtreme(is_lowest=False)
-        self._full_rounds = 0
+        self._full_rounds = self._lossy_rounds = 0
         self._probe_from_s = 0.0
         self._cubic: Cubic | None = None
         self._lost_until_s = 0.0
@@ -154,17 +168,15 @@ class PathController:
         return self._loss
 
     @property
-    def limit(self) -> float:
-        """Return how many bytes may be unconfirmed: those under way, and those that the reader has not reported yet."""
-        return self.window + self.bytes_s * self._hold.value(0.0)
+    def credit_s(self) -> float:
+        """Return how much time of the pace a sender that was scheduled late may catch up with."""
+        return min(_CREDIT_SHARE * (self._srtt_s or 0.0), _CREDIT_MOST_S) if self._is_paced else 0.0
 
-    @property
-    def pacing_bytes_s(self) -> float:
-        """Return the rate at which frames may leave; none is limited before the first round trip."""
-        if self._srtt_s is None:
-            return float("inf")
+    def _set_limits(self) -> None:
+        """Compute what each sender asks for: after every event, because frames are more frequent."""
+        self.limit = self.window + self.bytes_s * self._hold.value(0.0)
         gain = _PACING_STARTUP if self.state is State.STARTUP else _PACING
-        return gain * self.window / self._standing_s
+        self.pacing_bytes_s = float("inf") if self._srtt_s is None else gain * self.window / self._standing_s
 
     @property
     def _standing_s(self) -> float:
@@ -178,8 +190,9 @@ class PathController:
     def next_send_s(self, size: int) -> float | None:
         """Return when a frame of so many bytes may leave; None: not before something is confirmed or lost."""
         if self.inflight and self.inflight + size > self.limit:
+            self._is_paced = False
             return None
-        return self._next_s
+        return self.due_s
 
     def sent(self, number: int, size: int, now_s: float, frames: int = 1) -> None:
         """Count a flight of so many bytes and frames, which leaves now."""
@@ -196,11 +209,16 @@ class PathController:
 
     def charge(self, size: int, now_s: float) -> None:
         """Delay what follows by the time that so many bytes take."""
-        self._next_s = max(self._next_s, now_s) + size / self.pacing_bytes_s
+        self.due_s = max(self.due_s, now_s - self.credit_s) + size / self.pacing_bytes_s
+
+    def paced(self) -> None:
+        """Report that a frame waits only for the pace, until ``next_send_s``: a late sender may catch up."""
+        self._is_paced = True
 
     def app_limited(self) -> None:
         """Report that nothing waits, though a frame might leave."""
         self._rate.app_limited(self.inflight)
+        self._is_paced = False
 
     def acknowledged(self, numbers: Iterable[int], now_s: float, *, held_s: float | None = 0.0, lost: int = 0) -> None:
         """Take an acknowledgement of one flight or many, in any order; unknown numbers are ignored.
@@ -209,23 +227,31 @@ class PathController:
             held_s: how long the reader held it back; None: it gives no round trip.
             lost: how many of the frames did not arrive.
         """
-        flights = [flight for number in numbers if (flight := self._flights.pop(number, None)) is not None]
-        if not flights:
+        newest, first_s, size, frames = None, now_s, 0, 0
+        for number in numbers:
+            flight = self._flights.pop(number, None)
+            if flight is None:
+                continue
+            size, frames, first_s = size + flight.size, frames + flight.frames, min(first_s, flight.sent_s)
+            if newest is None or flight.sent_s > newest.sent_s:
+                newest = flight
+        if newest is None:
             return
-        size = sum(flight.size for flight in flights)
         self.inflight -= size
-        newest = max(flights, key=lambda flight: flight.sent_s)
+        self.confirmed_sent_s = max(self.confirmed_sent_s, newest.sent_s)
         if newest.sent_s < self._changed_s:  # it says nothing about this path
             self._rate.acknowledged(newest, size, now_s, 0.0)
             self._round_end = self._rate.delivered
             return
         if held_s is not None:
-            hold_s = newest.sent_s - min(flight.sent_s for flight in flights) + held_s
+            hold_s = newest.sent_s - first_s + held_s
             self._hold.add(now_s, min(hold_s, _HOLD_MOST_S), now_s - _HOLD_WINDOW_S)
             self._measure_rtt(max(now_s - newest.sent_s - held_s, _LEAST_RTT_S), now_s)
         sample = self._rate.acknowledged(newest, size, now_s, self.base_rtt_s)
-        frames = sum(flight.frames for flight in flights)
+        if self._srtt_s is None:  # it may be of what was given up before: nothing is known of the path yet
+            return
         self._round_frames += frames
+        self._reported_lost += lost
         self._note_loss(frames, lost)
         is_new_round = newest.delivered >= self._round_end
         if is_new_round:
@@ -244,6 +270,7 @@ class PathController:
             self._record_lost(lost, newest.sent_s, now_s)
         if is_new_round:
             self._end_round(sample, now_s)
+        self._set_limits()
 
     def lost(self, numbers: Iterable[int], now_s: float) -> None:
         """Take frames that are taken for lost; unknown numbers are ignored."""
@@ -252,8 +279,10 @@ class PathController:
             return
         self.inflight -= sum(flight.size for flight in flights)
         frames = sum(flight.frames for flight in flights)
+        self._round_frames += frames
         self._note_loss(frames, frames)
         self._record_lost(frames, max(flight.sent_s for flight in flights), now_s)
+        self._set_limits()
 
     def forget(self, numbers: Iterable[int]) -> None:
         """Take flights off the account whose fate will not be known."""
@@ -261,6 +290,11 @@ class PathController:
             flight = self._flights.pop(number, None)
             if flight is not None:
                 self.inflight -= flight.size
+
+    def forget_before(self, sent_s: float) -> None:
+        """Take flights off the account that left before ``sent_s``; numbers ascend, so the oldest are first."""
+        old = takewhile(lambda each: each[1].sent_s < sent_s, self._flights.items())
+        self.forget([number for number, _ in old])
 
     def is_under_way(self, number: int) -> bool:
         """Return whether a flight is on the account."""
@@ -276,6 +310,7 @@ class PathController:
         self.forget_all()
         self._signal(Signal.PATH_CHANGED, now_s)
         self.window = float(_LEAST_FRAMES * self._mtu)
+        self._set_limits()
 
     def _note_loss(self, frames: int, lost: int) -> None:
         """Average the share of lost frames over about ``_LOSS_FRAMES``."""
@@ -295,11 +330,13 @@ class PathController:
     def path_changed(self, now_s: float) -> None:
         """Start again: frames now take another path; what is under way stays counted."""
         self._signal(Signal.PATH_CHANGED, now_s)
+        self._set_limits()
 
     def set_mtu(self, mtu: int) -> None:
         """Set the bytes of a full frame; the window in bytes stays."""
         self._mtu = mtu
         self.window = max(self.window, float(_LEAST_FRAMES * mtu))
+        self._set_limits()
 
     def _measure_rtt(self, rtt_s: float, now_s: float) -> None:
         self._srtt_s = rtt_s if self._srtt_s is None else self._srtt_s + (rtt_s - self._srtt_s) / 8
@@ -333,6 +370,7 @@ class PathController:
                 self._signal(Signal.PATH_FULL, now_s)
         elif self.state is State.DELAY:
             self._follow_delay(size, may_grow=may_grow)
+            self._drain()
         elif self.state is State.COMPETITIVE and self._cubic is not None:
             if may_grow:
                 self._cubic.acknowledged(size / self._mtu, now_s, self._srtt_s or _FIRST_RTT_S)
@@ -366,7 +404,9 @@ class PathController:
     def _end_round(self, sample: RateSample | None, now_s: float) -> None:
         """Decide what is decided once each round trip."""
         delivered = self._rate.delivered - self._round_delivered
-        frames = self._lost_frames + self._round_frames
+        frames = self._round_frames
+        is_lossy = frames >= _HEAVY_FRAMES and self._lost_frames > _SHRUNK_LOSS * frames
+        self._lossy_rounds = self._lossy_rounds + 1 if is_lossy and self.state is State.COMPETITIVE else 0
         if frames >= _HEAVY_FRAMES and self._lost_frames > _HEAVY_LOSS * frames and self.state is not State.COMPETITIVE:
             self._signal(Signal.PATH_FULL, now_s)
             self.window = max(min(self.window, _AFTER_HEAVY * delivered), float(_LEAST_FRAMES * self._mtu))
@@ -375,7 +415,6 @@ class PathController:
             self._note_growth(sample, now_s)
         elif self.state is State.DELAY:
             self._turn_velocity()
-            self._drain()
             patience_s = min(max(_STANDING_BASES * self.base_rtt_s, _STANDING_LEAST_S), _STANDING_MOST_S)
             if self.queue_s < _FALLING_SHARE * (self._highest.value(0.0) - self.base_rtt_s):
                 self._empty_s = max(self._empty_s, now_s - patience_s / 2)  # it falls: its end may be near
@@ -383,6 +422,8 @@ class PathController:
                 self._signal(Signal.QUEUE_STANDS, now_s)
             elif self._cubic is not None:
                 self._try_alone(sample, now_s)
+        elif self._lossy_rounds >= (_COLLAPSED_ROUNDS if self._has_collapsed() else _SHRUNK_ROUNDS):
+            self._shrink(delivered * self._arrived, now_s)
         elif self.state is State.COMPETITIVE:
             is_full = self._was_alone and self._last_rate > _FULL_SHARE * self._capacity
             self._full_rounds = self._full_rounds + 1 if is_full else 0
@@ -390,7 +431,25 @@ class PathController:
                 self._full_rounds = 0
                 self._signal(Signal.PROBE_DUE, now_s)
         self._round_delivered, self._lost_frames, self._round_frames = self._rate.delivered, 0, 0
+        self._reported_lost = 0
         self._round_window, self._was_used = self.window, False
+
+    @property
+    def _arrived(self) -> float:
+        """Return which share of the frames that the reports of this round resolved did arrive, 0 to 1."""
+        return max(1 - self._reported_lost / max(self._round_frames, 1), 0.0)
+
+    def _has_collapsed(self) -> bool:
+        """Return whether next to nothing of the capacity is left."""
+        return self._recent.value(0.0) * self._arrived < _COLLAPSED_SHARE * self._capacity
+
+    def _shrink(self, delivered: float, now_s: float) -> None:
+        """Forget the former capacity; ``delivered``: bytes that passed in the last round."""
+        self._signal(Signal.PATH_SHRANK, now_s)
+        for rates in self._rates, self._recent, self._peaks, self._capacities:
+            rates.clear()
+        self._cubic, self._lossy_rounds = None, 0
+        self.window = max(_AFTER_HEAVY * delivered, float(_LEAST_FRAMES * self._mtu))
 
     def _try_alone(self, sample: RateSample | None, now_s: float) -> None:
         """Find out after a competition whether the other flow takes what this one has given up."""

@@ -32,6 +32,7 @@ class Signal(Enum):
     QUEUE_EMPTY = "queue empty"
     PROBE_DUE = "probe due"
     PROBE_OVER = "probe over"
+    PATH_SHRANK = "path shrank"  # most of what leaves is lost, round after round
     PATH_CHANGED = "path changed"
 
 
@@ -43,24 +44,28 @@ TRANSITIONS: Final[Mapping[tuple[State, Signal], State]] = MappingProxyType(
         (_S.STARTUP, _I.QUEUE_EMPTY): _S.STARTUP,
         (_S.STARTUP, _I.PROBE_DUE): _S.STARTUP,
         (_S.STARTUP, _I.PROBE_OVER): _S.STARTUP,
+        (_S.STARTUP, _I.PATH_SHRANK): _S.STARTUP,
         (_S.STARTUP, _I.PATH_CHANGED): _S.STARTUP,
         (_S.DELAY, _I.PATH_FULL): _S.DELAY,
         (_S.DELAY, _I.QUEUE_STANDS): _S.COMPETITIVE,
         (_S.DELAY, _I.QUEUE_EMPTY): _S.DELAY,
         (_S.DELAY, _I.PROBE_DUE): _S.DELAY,
         (_S.DELAY, _I.PROBE_OVER): _S.DELAY,
+        (_S.DELAY, _I.PATH_SHRANK): _S.DELAY,
         (_S.DELAY, _I.PATH_CHANGED): _S.STARTUP,
         (_S.COMPETITIVE, _I.PATH_FULL): _S.COMPETITIVE,
         (_S.COMPETITIVE, _I.QUEUE_STANDS): _S.COMPETITIVE,
         (_S.COMPETITIVE, _I.QUEUE_EMPTY): _S.DELAY,
         (_S.COMPETITIVE, _I.PROBE_DUE): _S.PROBE,
         (_S.COMPETITIVE, _I.PROBE_OVER): _S.COMPETITIVE,
+        (_S.COMPETITIVE, _I.PATH_SHRANK): _S.DELAY,
         (_S.COMPETITIVE, _I.PATH_CHANGED): _S.STARTUP,
         (_S.PROBE, _I.PATH_FULL): _S.PROBE,
         (_S.PROBE, _I.QUEUE_STANDS): _S.PROBE,
         (_S.PROBE, _I.QUEUE_EMPTY): _S.DELAY,
         (_S.PROBE, _I.PROBE_DUE): _S.PROBE,
         (_S.PROBE, _I.PROBE_OVER): _S.COMPETITIVE,
+        (_S.PROBE, _I.PATH_SHRANK): _S.DELAY,
         (_S.PROBE, _I.PATH_CHANGED): _S.STARTUP,
     }
 )

@@ -33,7 +33,15 @@ from gdp.frame.kinds import Flag, Kind
 from gdp.limits import HOPS_MAX
 from gdp.names import ZERO
 
-__all__ = ["PAYLOAD_BYTES", "KeepaliveFlag", "KeepaliveSession", "Slowness", "open_keepalive", "seal_keepalive"]
+__all__ = [
+    "PAYLOAD_BYTES",
+    "QUEUED_S",
+    "KeepaliveFlag",
+    "KeepaliveSession",
+    "Slowness",
+    "open_keepalive",
+    "seal_keepalive",
+]
 
 _TAG_BYTES: Final = 16
 _DIGEST_AT: Final = HEADER_BYTES + 2
@@ -47,6 +55,7 @@ _DIGEST: Final = "sha256"
 _PURPOSE: Final = b"gdp-keepalive-1"
 _SUSPECT_AFTER: Final = 1.25  # intervals without a frame, after which the neighbour is polled
 _POLLS_PER_INTERVAL: Final = 4
+QUEUED_S: Final = 3.0  # longest time in which a neighbour whose other frames come may be silent
 _FORGET_S: Final = 10.0
 _JITTER: Final = 0.1 / 255  # of an interval, for each value of a byte; RFC 5880, 6.8.7 requires up to 0.25
 
@@ -127,6 +136,8 @@ class KeepaliveSession:
         hears_us: the neighbour reports that it receives ours.
         is_poll_due: an answer is wanted although the neighbour is not silent.
         probe: of the link, while the neighbour does not answer.
+        arrivals: frames that had come from the port when last counted; None: not since the last keepalive.
+        arrived_s: when last counted, and there were more than the time before.
         quality: measurements of the link.
         has_new_cost: the keepalive opened last changed the cost that follows from them.
     """
@@ -144,6 +155,8 @@ class KeepaliveSession:
     hears_us: bool = False
     is_poll_due: bool = False
     probe: LinkProbe | None = None
+    arrivals: int | None = None
+    arrived_s: float = float("-inf")
     quality: LinkQuality = field(default_factory=LinkQuality)
     has_new_cost: bool = False
 
@@ -208,7 +221,8 @@ class KeepaliveSession:
         header = Header(Kind.KEEPALIVE, Flag.LAST, HOPS_MAX, 0, PAYLOAD_BYTES, sequence, 0, 1, incarnation, ZERO, name)
         frame = seal_keepalive(self.out_key, header, flags, multiplier, digest, self.quality.report_to_send(now_s))
         self.send_at_s = now_s + self.out_interval_s * (1 - frame[-1] * _JITTER)
-        self.poll_at_s = now_s + self.in_interval_s / _POLLS_PER_INTERVAL
+        is_queued = self.arrivals is not None and now_s - self.arrived_s < self.detect_s
+        self.poll_at_s = now_s + self.in_interval_s / (1 if is_queued else _POLLS_PER_INTERVAL)
         return frame
 
     def open(self, header: Header, frame: bytes, now_s: float, waited_s: float = 0.0) -> bytes:
@@ -225,7 +239,7 @@ class KeepaliveSession:
         flags, multiplier, digest, report = open_keepalive(self.in_key, frame)
         self.has_new_cost = self.quality.receive(report, now_s - waited_s)
         self.detect_s = self.in_interval_s * max(multiplier, 1)
-        self.received, self.is_alive = header.number, True
+        self.received, self.is_alive, self.arrivals = header.number, True, None
         self.hears_us = bool(flags & _HEARD)
         if self.probe is not None and self.probe.is_answered(self.quality.confirmed_s):
             self.probe = None
@@ -248,6 +262,23 @@ class KeepaliveSession:
         if self.probe is None:
             self.probe = LinkProbe(since_s=now_s)
         self.probe.polls += 1
+
+    def note_arrivals(self, frames: int, now_s: float) -> None:
+        """Note how many frames have come from the port of a silent neighbour, which is its only one."""
+        if self.arrivals is not None and frames != self.arrivals:
+            self.arrived_s = now_s
+        self.arrivals = frames
+
+    def silent_at_s(self, heard_s: float) -> float:
+        """Return when a neighbour last heard at ``heard_s`` is lost.
+
+        While other frames come, its keepalives wait in a full queue or are dropped there: it has ``QUEUED_S`` more.
+        """
+        return max(heard_s, min(self.arrived_s, heard_s + QUEUED_S)) + self.detect_s
+
+    def is_silent(self, heard_s: float, now_s: float) -> bool:
+        """Return whether a neighbour last heard at ``heard_s`` has left out a keepalive."""
+        return now_s >= heard_s + _SUSPECT_AFTER * self.in_interval_s
 
     def suspect_at_s(self, heard_s: float) -> float:
         """Return when a neighbour last heard at ``heard_s`` is polled next; never before its first keepalive."""

@@ -90,6 +90,7 @@ class HelloProtocol:
     Args:
         digest_for: returns the digest of our link state for the far end of a port.
         incarnation_elsewhere: returns the mark of a named node that is alive, but at none of our ports; or None.
+        is_only_way: returns whether only our link leads to a named neighbour; None: if no other link is up.
         rtcert_for: of a RIB, its RtCert for a switch; None of any other node.
 
     Attributes:
@@ -107,6 +108,7 @@ class HelloProtocol:
         *,
         digest_for: Callable[[HelloPort], bytes] = lambda _: bytes(DIGEST_BYTES),
         incarnation_elsewhere: Callable[[Name], bytes | None] = lambda _: None,
+        is_only_way: Callable[[Name], bool] | None = None,
         rtcert_for: Callable[[Name], bytes] | None = None,
     ) -> None:
         self._identity = identity
@@ -129,8 +131,10 @@ class HelloProtocol:
         self._digest_for = digest_for
         self._incarnation_id = settings.incarnation_id
         self._incarnation_elsewhere = incarnation_elsewhere
+        self._is_only_way = is_only_way
         self._rtcert_for = rtcert_for
         self._rtcerts = RtCertCache(_RTCERTS_REMEMBERED)
+        self._frames_from: Callable[[int], int] = lambda _: 0
         self.conflicts = IdentityConflicts()
         self._cookies = Cookies(settings.random_bytes)
         self._replies: list[OutgoingFrames] = []
@@ -144,6 +148,10 @@ class HelloProtocol:
         self.clash_reporter: Name | None = None
         self._clash_since_s = self._clash_s = float("-inf")
         self.ports: dict[int, HelloPort] = {}
+
+    def count_arrivals(self, frames_from: Callable[[int], int]) -> None:
+        """Learn how to count the frames that have come from a port; frames without keepalives show a full queue."""
+        self._frames_from = frames_from
 
     def set_timing(self, index: int, timing: Timing) -> None:
         """Request another keepalive timing on one port, from its next session on."""
@@ -648,6 +656,8 @@ class HelloProtocol:
                 if is_suspect or session.send_at_s <= now_s + session.out_interval_s * _TOGETHER:
                     if is_suspect:
                         session.note_poll(now_s)
+                    if session.is_silent(neighbour.heard_s, now_s) and self._is_needed(neighbour):
+                        session.note_arrivals(self._frames_from(port.index), now_s)
                     port.keepalive_sequence += 1
                     timing = self._timings.get(port.index, self._timing)
                     frame = session.seal(
@@ -660,6 +670,15 @@ class HelloProtocol:
                     )
                     out.append(OutgoingFrames(port.index, neighbour.mac, [frame]))
         return out
+
+    def _is_needed(self, neighbour: Neighbour) -> bool:
+        """Return whether a neighbour is the only one on its port, and no other way leads to it."""
+        if len(self.ports[neighbour.port].neighbours) > 1:  # whose frames come is not known
+            return False
+        others = [each for each in self.all_up() if each.port != neighbour.port]
+        if self._is_only_way is None:
+            return not others
+        return all(each.name != neighbour.name for each in others) and self._is_only_way(neighbour.name)
 
     def _request_polls(self, now_s: float) -> None:
         """Poll the links that can show that only the link of a silent neighbour fails."""
@@ -714,7 +733,7 @@ class HelloProtocol:
             return neighbour.heard_s + self._dead_s + late_s
         flooded_until_s = self.ports[neighbour.port].admission.flooded_until_s  # its hellos may be among those refused
         hellos_end_s = max(neighbour.greeted_s, flooded_until_s) + _HELLOS_MISSED * HELLO_IDLE * self._hello_s
-        return min(neighbour.heard_s + session.detect_s, hellos_end_s, self._failed_at_s(neighbour, session)) + late_s
+        return min(session.silent_at_s(neighbour.heard_s), hellos_end_s, self._failed_at_s(neighbour, session)) + late_s
 
     def _note_failed(self, port: HelloPort, lost: list[Neighbour], now_s: float) -> None:
         """Note that an uplink has failed, if it no longer reaches a node that another link reaches."""

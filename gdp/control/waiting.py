@@ -15,11 +15,12 @@ from gdp.control.hello_port import HelloPort
 from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.neighbour import NeighbourState
 from gdp.crypto.certificates import Role
+from gdp.diagnosis.facts import WaitFact
 from gdp.errors import DropReason
 from gdp.limits import WAIT_REPORT_S
 from gdp.names import Name
 
-__all__ = ["Wait", "WaitLog", "WaitReason", "port_waits", "stranger_waits"]
+__all__ = ["Wait", "WaitLog", "WaitReason", "port_waits", "stranger_waits", "wait_fact"]
 
 _SETTLE_S: Final = 1.0  # a change of the reason is reported after it has lasted this long
 _STRANGER_S: Final = 2.0  # a refused neighbour that was silent for longer is gone
@@ -34,6 +35,7 @@ class WaitReason(Enum):
     ONE_WAY = "not-heard"  # a neighbour whose hellos we receive does not receive ours, or refuses us
     NO_SWITCH = "no-switch"  # neighbours, but none is a switch
     NO_RIB = "no-rib"
+    NO_UPPER_RIB = "no-upper-rib"  # no RIB of the tier above responds to this one
     REFUSED = "advertisement-refused"
     IN_USE = "identity-in-use"
     THROUGH_LEAF = "through-leaf"  # switches of the domain that only a leaf connects to this one
@@ -46,7 +48,7 @@ class Wait:
     Args:
         port: index of the port concerned, if any.
         domain: label of a stranger's domain; unproven, maybe empty.
-        name: of the neighbour, of the advertisement that was refused, or of one switch that is cut off.
+        name: of the neighbour, of the refused advertisement, of one switch that is cut off, or of the RIB above.
         refused: why a hello or an advertisement was refused.
     """
 
@@ -63,6 +65,8 @@ class Wait:
             return "stranger", self.port, self.domain
         if self.reason is WaitReason.REFUSED:
             return "advertisement", self.name
+        if self.reason is WaitReason.NO_UPPER_RIB:
+            return "tier above", None
         if self.reason is WaitReason.THROUGH_LEAF:
             return "leaf", None
         return "port", self.port
@@ -92,6 +96,12 @@ def stranger_waits(hello_protocol: HelloProtocol, now_s: float) -> Iterator[Wait
     for port in hello_protocol.ports.values():
         for each in port.strangers.since(now_s - _STRANGER_S):
             yield Wait(WaitReason.STRANGER, port.index, each.domain, refused=each.reason)
+
+
+def wait_fact(wait: Wait, device: str) -> WaitFact:
+    """Return a wait as a fact of a diagnosis; ``device``: of its port, empty without one."""
+    refused = "" if wait.refused is None else wait.refused.label
+    return WaitFact(reason=wait.reason.value, device=device, domain=wait.domain, refused=refused)
 
 
 @dataclass(slots=True)

@@ -1,14 +1,15 @@
 """Certificate authority of a domain: it creates the root and issues memberships on request.
 
-Sans-I/O except for the randomness of serial numbers and signatures. Source: RFC 5280 (certificates), RFC 2986
-(requests). ``openssl x509`` and ``openssl verify`` read what this module writes. ``certificates`` reads what ``openssl
-x509 -req -copy_extensions copy`` issues from such a request.
+Sans-I/O except for the randomness of serial numbers. Source: RFC 5280 (certificates), RFC 2986 (requests). ``openssl
+x509`` and ``openssl verify`` read what this module writes. ``certificates`` reads what ``openssl x509 -req
+-copy_extensions copy`` issues from such a request.
 """
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from typing import Final
 
@@ -36,17 +37,28 @@ _KEY_ID_BYTES: Final = 20
 
 @dataclass(frozen=True, slots=True)
 class CertificateAuthority:
-    """A trust domain's root with its private key: the holder of it decides which nodes belong."""
+    """A trust domain's root with its private key: the holder of it decides which nodes belong.
+
+    Attributes:
+        next_serial: gives the serial number of each certificate; a simulation has its own, so that a run repeats.
+    """
 
     key: SigningKey
     root: Root
+    next_serial: Callable[[], int] = field(default=x509.random_serial_number, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if self.key.public != self.root.key:
             raise LocalError("this private key is not that of the domain's root")
 
     @classmethod
-    def create(cls, label: str, key: SigningKey, validity: Validity) -> CertificateAuthority:
+    def create(
+        cls,
+        label: str,
+        key: SigningKey,
+        validity: Validity,
+        next_serial: Callable[[], int] = x509.random_serial_number,
+    ) -> CertificateAuthority:
         """Return a new domain; kind, label and key give its id, which is a name.
 
         Raises:
@@ -55,12 +67,12 @@ class CertificateAuthority:
         subject = Subject.of(Metadata({"kind": DOMAIN_UNIT, "name": label}), key.public.compressed)
         distinguished = distinguished_name(DOMAIN_UNIT, label)
         builder = (
-            _builder(distinguished, distinguished, subject, key.public, validity)
+            _builder(next_serial(), distinguished, distinguished, subject, key.public, validity)
             .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
             .add_extension(_key_usage(is_authority=True), critical=True)
             .add_extension(x509.SubjectKeyIdentifier(subject.name[:_KEY_ID_BYTES]), critical=False)
         )
-        return cls(key, Root.from_wire(signed_certificate(builder, key)))
+        return cls(key, Root.from_wire(signed_certificate(builder, key)), next_serial)
 
     def succeed(self, key: SigningKey, validity: Validity, retires_unix_s: int) -> CertificateAuthority:
         """Return the domain under another root key, which this one vouches for; the domain keeps its name.
@@ -75,13 +87,15 @@ class CertificateAuthority:
             raise LocalError("a successor has another key")
         name = x509.load_der_x509_certificate(self.root.wire).subject
         builder = (
-            _builder(name, name, self.root.subject, key.public, validity, retires_unix_s)
+            _builder(self.next_serial(), name, name, self.root.subject, key.public, validity, retires_unix_s)
             .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
             .add_extension(_key_usage(is_authority=True), critical=True)
             .add_extension(x509.SubjectKeyIdentifier(_key_id(key.public)), critical=False)
             .add_extension(x509.AuthorityKeyIdentifier(self.root.key_id, None, None), critical=False)
         )
-        return CertificateAuthority(key, self.root.succeeded_by(signed_certificate(builder, self.key)))
+        return CertificateAuthority(
+            key, self.root.succeeded_by(signed_certificate(builder, self.key)), self.next_serial
+        )
 
     def renew(self, member: Membership, validity: Validity) -> Membership:
         """Issue a membership again, with the same key, role and label.
@@ -126,7 +140,7 @@ class CertificateAuthority:
         subject = distinguished_name(holder.unit, holder.label)
         key_id = x509.AuthorityKeyIdentifier(self.root.key_id or None, None, None)
         builder = (
-            _builder(issuer, subject, holder.subject, holder.key, validity)
+            _builder(self.next_serial(), issuer, subject, holder.subject, holder.key, validity)
             .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
             .add_extension(_key_usage(is_authority=False), critical=True)
             .add_extension(x509.SubjectKeyIdentifier(holder.subject.name[:_KEY_ID_BYTES]), critical=False)
@@ -150,6 +164,7 @@ def request_membership(key: SigningKey, role: Role, label: str, digest: bytes) -
 
 
 def _builder(
+    serial: int,
     issuer: x509.Name,
     holder: x509.Name,
     subject: Subject,
@@ -159,7 +174,7 @@ def _builder(
 ) -> x509.CertificateBuilder:
     return (
         x509.CertificateBuilder()
-        .serial_number(x509.random_serial_number())
+        .serial_number(serial)
         .issuer_name(issuer)
         .subject_name(holder)
         .public_key(key.point)

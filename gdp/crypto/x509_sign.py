@@ -1,8 +1,8 @@
 """X.509 signing with any key, also one in a token.
 
-Sans-I/O except for the randomness of signatures. Source: RFC 5280, section 4.1; RFC 2986, section 4. The library signs
-with its own keys only. For another key, a temporary key signs first; the part to be signed is taken from its result and
-gets the real key's signature.
+Sans-I/O except for the randomness of a token. Source: RFC 5280, section 4.1; RFC 2986, section 4; RFC 6979 for the
+signatures of this process. The library signs with its own keys only. For another key, a temporary key signs first; the
+part to be signed is taken from its result and gets the real key's signature.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _ECDSA_SHA256: Final = bytes.fromhex("300a06082a8648ce3d040302")  # RFC 5758, se
 def signed_certificate(builder: x509.CertificateBuilder, key: SigningKey) -> bytes:
     """Return a certificate, DER."""
     if isinstance(key, SoftwareKey):
-        return builder.sign(key.private, hashes.SHA256()).public_bytes(Encoding.DER)
+        return builder.sign(key.private, hashes.SHA256(), ecdsa_deterministic=True).public_bytes(Encoding.DER)
     draft = builder.sign(SigningKey.generate().private, hashes.SHA256())
     return _completed(draft.tbs_certificate_bytes, key)
 
@@ -34,7 +34,7 @@ def signed_certificate(builder: x509.CertificateBuilder, key: SigningKey) -> byt
 def signed_request(builder: x509.CertificateSigningRequestBuilder, key: SigningKey) -> bytes:
     """Return a certificate request, PEM."""
     if isinstance(key, SoftwareKey):
-        return builder.sign(key.private, hashes.SHA256()).public_bytes(Encoding.PEM)
+        return builder.sign(key.private, hashes.SHA256(), ecdsa_deterministic=True).public_bytes(Encoding.PEM)
     drawn = SigningKey.generate()
     draft = builder.sign(drawn.private, hashes.SHA256()).tbs_certrequest_bytes
     # Both are P-256 keys, so that the temporary one has the same length.

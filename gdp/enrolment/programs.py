@@ -15,7 +15,7 @@ from typing import Final
 from gdp.enrolment.member_files import MemberFiles
 from gdp.enrolment.member_setup import RELAY_FILE
 
-__all__ = ["MachineProgram", "missing_ros", "programs_of"]
+__all__ = ["MachineProgram", "missing_ros", "node_program", "programs_of"]
 
 _NET: Final = ("CAP_NET_RAW", "CAP_NET_ADMIN")
 _AWAIT_S: Final = "60"
@@ -23,6 +23,20 @@ _ROS_VARIABLES: Final = (
     "PYTHONPATH", "LD_LIBRARY_PATH", "AMENT_PREFIX_PATH", "ROS_DISTRO", "ROS_DOMAIN_ID", "RMW_IMPLEMENTATION",
     "ROS_LOCALHOST_ONLY", "ROS_AUTOMATIC_DISCOVERY_RANGE", "CYCLONEDDS_URI",
 )  # fmt: skip
+_MODULES: Final = {
+    "switch": "gdp.cli.switch",
+    "relay": "gdp.cli.relay",
+    "rib": "gdp.cli.rib",
+    "proxy": "proxy.cli.proxy",
+    "fog": "fog.cli.app",
+}
+_TITLES: Final = {
+    "switch": "GDP switch: forwards frames by 256-bit names",
+    "relay": "GDP relay: carries frames through TLS where UDP is blocked",
+    "rib": "GDP RIB: stores where names are",
+    "proxy": "GDP proxy: carries ROS over the overlay",
+    "fog": "GDP fog supervisor: replaces machines of clusters that are lost",
+}
 _ROS: Final = ("rclpy", "cyclonedds")
 
 
@@ -35,6 +49,7 @@ class MachineProgram:
         argv: the command.
         capabilities: those that it needs at its start.
         environment: variables that a unit has to set: those of ROS, as ``setup.bash`` exports them.
+        config: file of a node that was configured by hand.
     """
 
     name: str
@@ -42,6 +57,7 @@ class MachineProgram:
     argv: tuple[str, ...]
     capabilities: tuple[str, ...] = ()
     environment: tuple[tuple[str, str], ...] = ()
+    config: Path | None = None
 
 
 def programs_of(files: MemberFiles) -> list[MachineProgram]:
@@ -50,7 +66,7 @@ def programs_of(files: MemberFiles) -> list[MachineProgram]:
     found = [
         MachineProgram(
             name="switch",
-            title="GDP switch: forwards frames by 256-bit names",
+            title=_TITLES["switch"],
             argv=_module("gdp.cli.switch", "--config", directory / "switch.yaml"),
             capabilities=(*_NET, "CAP_BPF", "CAP_PERFMON"),
         )
@@ -58,25 +74,24 @@ def programs_of(files: MemberFiles) -> list[MachineProgram]:
     if (directory / RELAY_FILE).exists():
         argv = _module("gdp.cli.relay", "--config", directory / RELAY_FILE)
         needed = ("CAP_NET_ADMIN", "CAP_NET_RAW", "CAP_NET_BIND_SERVICE")
-        title = "GDP relay: carries frames through TLS where UDP is blocked"
+        title = _TITLES["relay"]
         found.append(MachineProgram(name="relay", title=title, argv=argv, capabilities=needed))
     if files.config.rib is not None:
         argv = _module("gdp.cli.rib", "--config", directory / "rib.yaml", "--await-iface", _AWAIT_S)
-        found.append(MachineProgram(name="rib", title="GDP RIB: stores where names are", argv=argv, capabilities=_NET))
+        found.append(MachineProgram(name="rib", title=_TITLES["rib"], argv=argv, capabilities=_NET))
     if files.is_border:
         argv = _module("gdp.cli.gdp", "domain", "serve", directory)
         title, bind = "GDP enrolment server of a domain", ("CAP_NET_BIND_SERVICE",)
         found.append(MachineProgram(name="enrolment", title=title, argv=argv, capabilities=bind))
     if files.config.proxy is not None and not missing_ros():
         argv = _module("proxy.cli.proxy", "--config", directory / "proxy.yaml", "--await-iface", _AWAIT_S)
-        ros = tuple((key, os.environ[key]) for key in _ROS_VARIABLES if os.environ.get(key))
         found.append(
             MachineProgram(
                 name="proxy",
-                title="GDP proxy: carries ROS over the overlay",
+                title=_TITLES["proxy"],
                 argv=argv,
                 capabilities=_NET,
-                environment=ros,
+                environment=_ros_environment(),
             )
         )
     found.append(
@@ -89,6 +104,19 @@ def programs_of(files: MemberFiles) -> list[MachineProgram]:
     return found
 
 
+def node_program(name: str, config: Path) -> MachineProgram:
+    """Return the program of a node that a file configures: a section of ``machine.yaml``, or ``fog``."""
+    awaits = ("--await-iface", _AWAIT_S) if name in ("rib", "proxy") else ()
+    argv = _command(name, *(("supervise", "--stay", "--site") if name == "fog" else ("--config",)), config, *awaits)
+    return MachineProgram(
+        name=name,
+        title=_TITLES[name],
+        argv=argv,
+        environment=_ros_environment() if name == "proxy" else (),
+        config=config,
+    )
+
+
 def missing_ros() -> str:
     """Return why no proxy can run here; empty: one can."""
     if importlib.util.find_spec("proxy") is None:
@@ -96,6 +124,16 @@ def missing_ros() -> str:
     if all(importlib.util.find_spec(each) is None for each in _ROS):
         return "neither rclpy nor cyclonedds is installed: pip install 'gdp-ros[dds]', then run gdp up again"
     return ""
+
+
+def _ros_environment() -> tuple[tuple[str, str], ...]:
+    return tuple((key, os.environ[key]) for key in _ROS_VARIABLES if os.environ.get(key))
+
+
+def _command(name: str, *words: str | Path) -> tuple[str, ...]:
+    """Return a node's command line: its script next to the interpreter, or its module where no script is installed."""
+    script = Path(sys.executable).with_name(name if name == "fog" else f"gdp-{name}")
+    return (str(script), *map(str, words)) if script.is_file() else _module(_MODULES[name], *words)
 
 
 def _module(module: str, *words: str | Path) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from gdp.crypto.server_certificate import channel_binding, issue_server_certific
 from gdp.crypto.validity import Validity
 from gdp.crypto.x509_profile import to_pem
 from gdp.errors import LocalError
+from gdp.stores.checkout import ignore_folder
 from gdp.stores.files import private, write_all
 from gdp.stores.issue import DAY_S
 from gdp.stores.keyring import load_domain
@@ -43,6 +44,7 @@ def make_server_tls(domain: Path, state: Path, unix_s: float) -> ServerTls:
         raise LocalError("the root of the domain has expired")
     certificate = issue_server_certificate(authority, key.public, Validity(int(unix_s), int(end)))
     write_all(state, {_FILE: private(key.to_pem() + to_pem(certificate))}, force=True)
+    ignore_folder(state)
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     context.num_tickets = 0  # no resumption: each connection shows the certificate

@@ -1,7 +1,8 @@
 """Foreground supervisor of a machine's programs, where no systemd runs: it restarts what ends, with growing pauses.
 
-I/O. Each program has a session of its own, so that Ctrl-C reaches only this process; it ends the programs in the
-reverse order of their start. If this process is killed, the kernel ends them, too (``PR_SET_PDEATHSIG``).
+I/O. What the programs write becomes one log on standard error, where each line begins with its program's name. Each
+program has a session of its own, so that Ctrl-C reaches only this process; it ends the programs in the reverse order of
+their start. If this process is killed, the kernel ends them, too (``PR_SET_PDEATHSIG``).
 """
 
 from __future__ import annotations
@@ -15,12 +16,13 @@ import signal
 import subprocess
 import sys
 from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Final
 
 from gdp.enrolment.programs import MachineProgram
 from gdp.errors import LocalError
 
-__all__ = ["supervise"]
+__all__ = ["Failures", "supervise"]
 
 log = logging.getLogger(__name__)
 
@@ -28,22 +30,37 @@ _PAUSE_MIN_S: Final = 0.2
 _PAUSE_MAX_S: Final = 15.0
 _STEADY_S: Final = 30.0  # a program that ran this long is restarted after the shortest pause
 _END_S: Final = 8.0
+_LINE_MAX: Final = 1 << 16
 
 
-async def supervise(programs: Sequence[MachineProgram], started: Callable[[], Awaitable[None]] | None = None) -> None:
+@dataclass(slots=True)
+class Failures:
+    """Programs that have failed: they ended by themselves less than 30 s ago, or did not end when asked."""
+
+    names: set[str] = field(default_factory=set)
+
+
+async def supervise(
+    programs: Sequence[MachineProgram],
+    started: Callable[[], Awaitable[None]] | None = None,
+    failures: Failures | None = None,
+) -> None:
     """Run the programs until cancelled; then end them.
 
     Args:
         started: called once, when each program was started.
+        failures: filled with the programs that have failed.
 
     Raises:
         LocalError: a program cannot be started at all.
     """
     tasks = list[asyncio.Task[None]]()
+    failures = Failures() if failures is None else failures
+    width = max(len(each.name) for each in programs)
     try:
         for each in programs:
             first = asyncio.Event()
-            tasks.append(asyncio.ensure_future(_keep_running(each, first)))
+            tasks.append(asyncio.ensure_future(_keep_running(each, first, f"{each.name:<{width}} | ", failures)))
             begun = asyncio.ensure_future(first.wait())
             await asyncio.wait([begun, tasks[-1]], return_when=asyncio.FIRST_COMPLETED)
             begun.cancel()
@@ -51,7 +68,10 @@ async def supervise(programs: Sequence[MachineProgram], started: Callable[[], Aw
                 await tasks[-1]
         if started is not None:
             tasks.append(asyncio.ensure_future(_once(started)))
-        await asyncio.gather(*tasks)
+        # Unlike gather(), wait() cancels nothing when it is cancelled: the programs end one after the other, below.
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
+        for task in done:
+            await task
     finally:
         for task in reversed(tasks):
             task.cancel()
@@ -62,23 +82,46 @@ async def _once(work: Callable[[], Awaitable[None]]) -> None:
     await work()
 
 
-async def _keep_running(program: MachineProgram, first: asyncio.Event) -> None:
+async def _keep_running(program: MachineProgram, first: asyncio.Event, prefix: str, failures: Failures) -> None:
     pause_s, loop = _PAUSE_MIN_S, asyncio.get_running_loop()
     while True:
         begun_s = loop.time()
         process = await _start(program)
         first.set()
         log.info("program started program=%s pid=%d", program.name, process.pid)
+        logging_output = asyncio.ensure_future(_log_output(process, prefix))
         try:
             code = await process.wait()
         except asyncio.CancelledError:
-            await _end(process)
+            if loop.time() - begun_s > _STEADY_S:
+                failures.names.discard(program.name)
+            if not await _end(process):
+                failures.names.add(program.name)
+            await asyncio.wait([logging_output], timeout=_END_S)
             raise
         if loop.time() - begun_s > _STEADY_S:
             pause_s = _PAUSE_MIN_S
+        failures.names.add(program.name)
         log.warning("program ended program=%s code=%d pause_s=%.1f", program.name, code, pause_s)
         await asyncio.sleep(pause_s)
         pause_s = min(2 * pause_s, _PAUSE_MAX_S)
+
+
+async def _log_output(process: asyncio.subprocess.Process, prefix: str) -> None:
+    """Copy a program's lines to standard error, each behind the prefix; a longer one than 64 KiB comes in parts."""
+    if process.stdout is None:
+        return
+    rest = b""
+    while data := await process.stdout.read(_LINE_MAX):
+        *lines, rest = (rest + data).split(b"\n")
+        if len(rest) >= _LINE_MAX:
+            lines, rest = [*lines, rest], b""
+        for line in lines:
+            sys.stderr.write(f"{prefix}{line.decode(errors='replace')}\n")
+        sys.stderr.flush()
+    if rest:
+        sys.stderr.write(f"{prefix}{rest.decode(errors='replace')}\n")
+        sys.stderr.flush()
 
 
 async def _start(program: MachineProgram) -> asyncio.subprocess.Process:
@@ -88,7 +131,8 @@ async def _start(program: MachineProgram) -> asyncio.subprocess.Process:
             *leash,
             *program.argv,
             stdin=subprocess.DEVNULL,
-            stdout=sys.stderr,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
             cwd="/",  # Python imports from the working directory, which others may be able to write to
             env=_environment(),
             start_new_session=True,
@@ -103,13 +147,15 @@ def _environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": os.pathsep.join(folders)} if folders else dict(os.environ)
 
 
-async def _end(process: asyncio.subprocess.Process) -> None:
-    """Interrupt a program, and kill it if it does not end."""
+async def _end(process: asyncio.subprocess.Process) -> bool:
+    """Interrupt a program, and kill it if it does not end; return whether it ended by itself."""
     with contextlib.suppress(ProcessLookupError):
         process.send_signal(signal.SIGINT)
     waiting = asyncio.ensure_future(process.wait())
     await asyncio.wait([waiting], timeout=_END_S)
-    if not waiting.done():
-        with contextlib.suppress(ProcessLookupError):
-            process.kill()
-        await waiting
+    if waiting.done():
+        return True
+    with contextlib.suppress(ProcessLookupError):
+        process.kill()
+    await waiting
+    return False

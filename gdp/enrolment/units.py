@@ -5,6 +5,7 @@ I/O. The units are named after the machine's directory, so that one host can bel
 
 from __future__ import annotations
 
+import contextlib
 import re
 import subprocess
 from collections.abc import Callable, Mapping, Sequence
@@ -15,11 +16,23 @@ from gdp.enrolment.programs import MachineProgram
 from gdp.errors import LocalError
 from gdp.stores.files import public, write_all
 
-__all__ = ["UNIT_FOLDER", "has_systemd", "install_units", "remove_units", "unit_texts"]
+__all__ = [
+    "MARK",
+    "UNIT_FOLDER",
+    "has_systemd",
+    "install_units",
+    "installed_units",
+    "quoted",
+    "remove_units",
+    "systemctl",
+    "unit_names",
+    "unit_texts",
+]
 
+MARK: Final = "# gdp service: "  # begins the first line of each unit that is written here; then the machine's folder
 UNIT_FOLDER: Final = Path("/etc/systemd/system")
 _RUNNING: Final = Path("/run/systemd/system")  # sd_booted(3)
-_TIMEOUT_S: Final = 60.0
+_TIMEOUT_S: Final = 120.0  # a node has 90 s to report that it is up
 _OF_DEVICES: Final = frozenset({"CAP_NET_ADMIN", "CAP_NET_RAW"})
 _FENCES: Final = """\
 PrivateDevices=yes
@@ -32,6 +45,8 @@ SystemCallArchitectures=native
 SystemCallErrorNumber=EPERM
 SystemCallFilter=@system-service
 """  # of programs that any host may connect to, and that touch no device
+_RUNTIME: Final = Path("/run")
+_RUNTIME_LINE: Final = re.compile(r"^RuntimeDirectory=(.*)$", re.MULTILINE)
 _UNSAFE: Final = re.compile(r"[^A-Za-z0-9_.-]")
 
 
@@ -42,44 +57,84 @@ def has_systemd() -> bool:
 
 def unit_texts(directory: Path, programs: Sequence[MachineProgram]) -> dict[str, str]:
     """Return the units of a machine by file name, in the order in which they start."""
-    names = [f"gdp-{_UNSAFE.sub('-', directory.name)}-{each.name}.service" for each in programs]
-    return {
-        name: _unit(directory, each, None if each is programs[0] else names[0])
-        for name, each in zip(names, programs, strict=True)
-    }
+    names = unit_names(directory, programs)
+    first = names[programs[0].name]
+    return {names[each.name]: _unit(directory, each, None if each is programs[0] else first) for each in programs}
+
+
+def unit_names(directory: Path | None, programs: Sequence[MachineProgram]) -> dict[str, str]:
+    """Return the file name of each program's unit; None: of the machine whose configuration is in ``/etc/gdp``."""
+    machine = "" if directory is None else f"{_UNSAFE.sub('-', directory.name)}-"
+    return {each.name: f"gdp-{machine}{each.name}.service" for each in programs}
+
+
+def installed_units(directory: Path | None = None, folder: Path = UNIT_FOLDER) -> list[str]:
+    """Return the file names of units that were written here, in the order in which they start.
+
+    Args:
+        directory: the machine's folder; None: of all machines.
+    """
+    found = list[tuple[int, str]]()
+    for path in folder.glob("gdp-*.service"):
+        if path.is_symlink() or not path.is_file():
+            continue
+        first = path.read_text(encoding="utf-8", errors="replace").partition("\n")[0]
+        if first.startswith(MARK) and (directory is None or first.removeprefix(MARK) == str(directory.absolute())):
+            found.append((path.stat().st_mtime_ns, path.name))
+    return [name for _, name in sorted(found)]
 
 
 def install_units(
-    units: Mapping[str, str], folder: Path = UNIT_FOLDER, run: Callable[[Sequence[str]], None] | None = None
+    units: Mapping[str, str], folder: Path = UNIT_FOLDER, run: Callable[[Sequence[str]], object] | None = None
 ) -> None:
     """Write units, and start them now and at each boot.
 
     Raises:
         LocalError: the folder cannot be written, or systemd refuses.
     """
-    call = run or _systemctl
+    call = run or systemctl
     write_all(folder, {name: public(text.encode()) for name, text in units.items()}, force=True)
     call(["daemon-reload"])
     call(["enable", "--now", *units])
 
 
 def remove_units(
-    units: Sequence[str], folder: Path = UNIT_FOLDER, run: Callable[[Sequence[str]], None] | None = None
+    units: Sequence[str], folder: Path = UNIT_FOLDER, run: Callable[[Sequence[str]], object] | None = None
 ) -> None:
     """Stop units and remove their files. Raises ``LocalError``: systemd refuses."""
-    call = run or _systemctl
+    call = run or systemctl
     call(["disable", "--now", *units])
+    folders = {name for each in units for name in _runtime_folders(folder / each)}
     for each in units:
         (folder / each).unlink(missing_ok=True)
     call(["daemon-reload"])
+    for name in folders:
+        _remove_empty(_RUNTIME / name)
+
+
+def _runtime_folders(unit: Path) -> list[str]:
+    """Return the folders below /run that a unit preserves for the others."""
+    line = _RUNTIME_LINE.search(unit.read_text(encoding="utf-8")) if unit.exists() else None
+    return line[1].split() if line else []
+
+
+def _remove_empty(path: Path) -> None:
+    """Remove a folder of locks that no node uses any more; of a dynamic user, ``path`` is a link to it."""
+    target = path.resolve()
+    for each in (target / "gdp-locks", target):
+        with contextlib.suppress(OSError):  # missing, or other nodes use it
+            each.rmdir()
+    if path.is_symlink() and not target.exists():
+        path.unlink()
 
 
 def _unit(directory: Path, program: MachineProgram, after: str | None) -> str:
-    words = " ".join(_quoted(each) for each in program.argv)
+    words = " ".join(quoted(each) for each in program.argv)
     order = "After=network-online.target\nWants=network-online.target\n"
     order += f"After={after}\nWants={after}\n" if after is not None else ""
-    environment = "".join(f"Environment={_quoted(f'{key}={value}')}\n" for key, value in program.environment)
+    environment = "".join(f"Environment={quoted(f'{key}={value}')}\n" for key, value in program.environment)
     return f"""\
+{MARK}{directory.absolute()}
 [Unit]
 Description={program.title}
 {order}StartLimitIntervalSec=0
@@ -110,16 +165,18 @@ WantedBy=multi-user.target
 """
 
 
-def _quoted(word: str) -> str:
+def quoted(word: str) -> str:
     """Return a word of a command line; systemd.service(5), section COMMAND LINES."""
     escaped = word.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$")
     return f'"{escaped}"' if re.search(r"[\s'\"\\;]", word) else escaped
 
 
-def _systemctl(words: Sequence[str]) -> None:
+def systemctl(words: Sequence[str]) -> str:
+    """Run ``systemctl`` and return what it prints. Raises ``LocalError``: it is missing or refuses."""
     try:
         done = subprocess.run(["systemctl", *words], capture_output=True, text=True, timeout=_TIMEOUT_S, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:
         raise LocalError(f"systemctl {words[0]}: {error}") from error
     if done.returncode != 0:
         raise LocalError(f"systemctl {words[0]}: {done.stderr.strip() or done.returncode}")
+    return done.stdout

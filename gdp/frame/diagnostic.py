@@ -13,9 +13,9 @@ from typing import Final
 
 from gdp.limits import CBOR_DEPTH_MAX, CONTROL_MAX_BYTES
 
-__all__ = ["byte_string", "diagnose"]
+__all__ = ["SHOWN_BYTES", "byte_string", "diagnose"]
 
-_SHOWN_BYTES: Final = 32  # a name is shown completely, a longer string by its beginning and its size
+SHOWN_BYTES: Final = 32  # a name is shown completely, a longer string by its beginning and its size
 _SIMPLE: Final = {20: "false", 21: "true", 22: "null"}
 _FLOATS: Final = {2: struct.Struct("!e"), 4: struct.Struct("!f"), 8: struct.Struct("!d")}
 _UINT, _NEGATIVE, _BYTES, _TEXT, _ARRAY, _MAP, _TAG, _OTHER = range(8)
@@ -110,6 +110,6 @@ def _bytes(piece: bytes, depth: int) -> str:
             end = -1
         if end == len(piece):
             return f"<<{text}>>"
-    if len(piece) <= _SHOWN_BYTES:
+    if len(piece) <= SHOWN_BYTES:
         return f"h'{piece.hex()}'"
     return f"h'{piece[:8].hex()}…' ({len(piece)} bytes)"

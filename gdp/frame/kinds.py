@@ -29,6 +29,8 @@ class Kind(IntEnum):
     RELOCATE = 0x12  # a statement of a node's new switch to its former one
     ECHO_REQUEST = 0x20
     ECHO_REPLY = 0x21
+    DIAGNOSTIC_REQUEST = 0x22  # a statement to a member, or to the switch where its hops end
+    DIAGNOSTIC_REPLY = 0x23  # a statement from there to the member that asked
     HELLO = 0x80  # to the neighbour: identity of the sender
     LINK_STATE = 0x81
     JOIN = 0x82  # to the neighbour: request for a tree

@@ -24,6 +24,7 @@ from scapy.fields import (
     XByteField,
     XLongField,
     XShortField,
+    XStrField,
     XStrFixedLenField,
 )
 from scapy.layers.l2 import Ether
@@ -37,19 +38,49 @@ from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, VERSION, Flag, Kind
 from gdp.limits import HOPS_MAX
 from gdp.names import NAME_BYTES, ZERO, Name
 
-__all__ = ["GDP", "Cookie", "Keepalive", "Statement", "layout"]
+__all__ = [
+    "FLAG_NAMES",
+    "GDP",
+    "KIND_NAMES",
+    "PAYLOADS",
+    "STATEMENTS",
+    "CborBytesField",
+    "Cookie",
+    "HopsField",
+    "Keepalive",
+    "LastPart",
+    "NameField",
+    "Note",
+    "ParityFrame",
+    "Part",
+    "RestField",
+    "Statement",
+    "layout",
+    "least_bytes",
+]
 
 KIND_NAMES: Final = {int(kind): kind.name.lower().replace("_", "-") for kind in Kind}
 FLAG_NAMES: Final = [next((f.name.lower() for f in Flag if f.name and f == 1 << bit), f"bit{bit}") for bit in range(8)]
 _NO_STATEMENTS: Final = frozenset({Kind.KEEPALIVE, Kind.COOKIE})  # of the kinds for the neighbour itself
-_STATEMENTS: Final = frozenset(
-    {Kind.RIB_REQUEST, Kind.RIB_ANSWER, *(kind for kind in Kind if kind >= CONTROL_FROM and kind not in _NO_STATEMENTS)}
+STATEMENTS: Final = frozenset(
+    {
+        Kind.RIB_REQUEST,
+        Kind.RIB_ANSWER,
+        Kind.RELOCATE,
+        Kind.DIAGNOSTIC_REQUEST,
+        Kind.DIAGNOSTIC_REPLY,
+        *(kind for kind in Kind if kind >= CONTROL_FROM and kind not in _NO_STATEMENTS),
+    }
 )
-_ANSWER_TO: Final = {Kind.RIB_ANSWER: Kind.RIB_REQUEST, Kind.ECHO_REPLY: Kind.ECHO_REQUEST}
+_ANSWER_TO: Final = {
+    Kind.RIB_ANSWER: Kind.RIB_REQUEST,
+    Kind.ECHO_REPLY: Kind.ECHO_REQUEST,
+    Kind.DIAGNOSTIC_REPLY: Kind.DIAGNOSTIC_REQUEST,
+}
 _COSE_SIGN1: Final = 0xD284  # tag 18, an array of four
 _LENGTH_AT: Final = 6
-_KEEPALIVE_BYTES: Final = 47
-_COOKIE_BYTES: Final = 32
+_SALT_BYTES: Final = 8
+_TAG_BYTES: Final = 16
 
 
 class NameField(XStrFixedLenField):
@@ -106,6 +137,27 @@ class CborBytesField(StrField):
         return diagnose(x) or f"h'{x.hex()}'"
 
 
+class RestField(XStrField):
+    """All bytes up to the fields behind it.
+
+    Args:
+        behind: bytes of the fields behind it.
+        least: fewest bytes of its own.
+    """
+
+    __slots__ = ("behind", "least")
+
+    def __init__(self, name: str, *, behind: int = 0, least: int = 0) -> None:
+        super().__init__(name, b"")
+        self.behind = behind
+        self.least = least
+
+    def getfield(self, _pkt: Packet, s: bytes) -> tuple[bytes, bytes]:
+        """Return the bytes behind the field, and its own."""
+        end = len(s) - self.behind
+        return s[end:], s[:end]
+
+
 class GDP(Packet):
     """The 96-byte header; ``length`` is filled in, and bytes behind the payload are Ethernet padding."""
 
@@ -142,13 +194,12 @@ class GDP(Packet):
 
     def guess_payload_class(self, payload: bytes) -> type[Packet]:
         """Return the layer of the payload; raw bytes where it is malformed or of another kind."""
-        if self.version == VERSION and self.kind in _STATEMENTS and self.parts == 1 and _is_statement(payload):
-            return Statement
-        if self.version == VERSION and self.kind == Kind.KEEPALIVE and len(payload) >= _KEEPALIVE_BYTES:
-            return Keepalive
-        if self.version == VERSION and self.kind == Kind.COOKIE and len(payload) >= _COOKIE_BYTES:
-            return Cookie
-        return conf.raw_layer
+        if self.version != VERSION:
+            return conf.raw_layer
+        if self.kind in STATEMENTS:
+            return Statement if self.parts == 1 and _is_statement(payload) else conf.raw_layer
+        layer = PAYLOADS[self.kind][bool(self.flags & Flag.LAST)] if self.kind in PAYLOADS else None
+        return layer if layer is not None and len(payload) >= least_bytes(layer) else conf.raw_layer
 
     def hashret(self) -> bytes:
         """Return the key that a query and its response share; that of an echo includes its number."""
@@ -203,6 +254,51 @@ class Cookie(Packet):
     ]
 
 
+class Part(Packet):
+    """The payload of a part of a sealed message that is not its last (``crypto/envelope.py``)."""
+
+    name = "GDP sealed part"
+    fields_desc = [  # noqa: RUF012
+        XStrFixedLenField("salt", bytes(_SALT_BYTES), length=_SALT_BYTES),
+        RestField("ciphertext", behind=_TAG_BYTES),
+        XStrFixedLenField("tag", bytes(_TAG_BYTES), length=_TAG_BYTES),
+    ]
+
+
+class LastPart(Packet):
+    """The payload of the last part: ciphertext, tag, and the signature unless the stream has a session secret.
+
+    Only the ends of a stream know whether it is signed.
+    """
+
+    name = "GDP last sealed part"
+    fields_desc = [  # noqa: RUF012
+        XStrFixedLenField("salt", bytes(_SALT_BYTES), length=_SALT_BYTES),
+        RestField("sealed", least=_TAG_BYTES),
+    ]
+
+
+class Note(Packet):
+    """Payload of an AckNack or introduction: the topic in plain, and the rest sealed (``crypto/control_seal.py``)."""
+
+    name = "GDP note"
+    fields_desc = [  # noqa: RUF012
+        NameField("topic"),
+        RestField("ciphertext", behind=_TAG_BYTES),
+        XStrFixedLenField("tag", bytes(_TAG_BYTES), length=_TAG_BYTES),
+    ]
+
+
+class ParityFrame(Packet):
+    """The payload of a parity frame, which is sealed as a whole (``crypto/parity_seal.py``)."""
+
+    name = "GDP parity"
+    fields_desc = [  # noqa: RUF012
+        RestField("ciphertext", behind=_TAG_BYTES),
+        XStrFixedLenField("tag", bytes(_TAG_BYTES), length=_TAG_BYTES),
+    ]
+
+
 class Statement(Packet):
     """A COSE_Sign1 statement of one fragment; each fragment of a longer one is shown raw."""
 
@@ -214,6 +310,23 @@ class Statement(Packet):
         CborBytesField("body", b""),
         CborBytesField("signature", b""),
     ]
+
+
+# by kind: layer of a payload without the flag *last*, and with it
+PAYLOADS: Final[dict[int, tuple[type[Packet], type[Packet]]]] = {
+    Kind.DATA: (Part, LastPart),
+    Kind.HEARTBEAT: (Part, LastPart),
+    Kind.ACKNACK: (Note, Note),
+    Kind.INTRODUCTION: (Note, Note),
+    Kind.PARITY: (ParityFrame, ParityFrame),
+    Kind.KEEPALIVE: (Keepalive, Keepalive),
+    Kind.COOKIE: (Cookie, Cookie),
+}
+
+
+def least_bytes(layer: type[Packet]) -> int:
+    """Return the bytes of the shortest payload that a layer of ``PAYLOADS`` shows."""
+    return len(layer()) + sum(field.least for field in layer.fields_desc if isinstance(field, RestField))
 
 
 def _is_statement(payload: bytes) -> bool:

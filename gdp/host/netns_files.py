@@ -8,6 +8,7 @@ closed. Then the file lies in the run's own directory, and ``nsenter --net=FILE`
 
 from __future__ import annotations
 
+import errno
 import os
 import threading
 from collections.abc import Callable, Collection
@@ -18,6 +19,7 @@ from typing import Final, TypeVar
 from gdp.errors import LocalError
 from gdp.host.mounts import unmount
 from gdp.host.processes import Process
+from gdp.ports.sockets import AS_ROOT
 
 __all__ = ["IP_NETNS_DIRECTORY", "create", "disable_ipv6", "inside", "processes_inside", "release"]
 
@@ -35,7 +37,9 @@ def create(path: Path) -> None:
     try:
         netns.create(str(path))
     except OSError as error:
-        raise LocalError(f"network namespace {path.name} cannot be made: {error}") from error
+        is_refused = error.errno in (errno.EPERM, errno.EACCES)
+        why = f"not permitted; {AS_ROOT}" if is_refused else str(error)
+        raise LocalError(f"network namespace {path.name} cannot be made: {why}") from error
 
 
 def inside(path: Path, work: Callable[[], T]) -> T:

@@ -30,6 +30,7 @@ __all__ = ["Record", "Run", "RunRegistry", "in_first_user_namespace", "outer_uid
 log = logging.getLogger(__name__)
 
 _ID_BYTES: Final = 3
+_WRITE: Final = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
 _FRESH: Final = ".new"  # of a record that is being written
 _WRITTEN_S: Final = 60.0  # a longer write counts as abandoned
 _ALL_IDS: Final = 4_294_967_295  # length of the first user namespace's map; user_namespaces(7)
@@ -157,7 +158,11 @@ class Run:
 
     def _save(self) -> None:
         fresh = self._path.with_suffix(_FRESH)
-        descriptor = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+        try:
+            descriptor = os.open(fresh, _WRITE, 0o600)
+        except FileNotFoundError:  # another run ended, and took the empty directory with it
+            _make_directory(fresh.parent)
+            descriptor = os.open(fresh, _WRITE, 0o600)
         with os.fdopen(descriptor, "w", encoding="utf-8") as file:
             file.write(self._record.to_text())
         fresh.replace(self._path)
@@ -175,8 +180,7 @@ class RunRegistry:
 
     def __init__(self, directory: Path | None = None) -> None:
         self._directory = directory or _default_directory()
-        self._directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-        refuse_foreign_folder(self._directory, "it names what will be deleted")
+        _make_directory(self._directory)
 
     def start(self) -> Run:
         """Begin a run with a new id and an empty scratch directory (in the directory for temporary files)."""
@@ -228,6 +232,11 @@ class RunRegistry:
         return found
 
 
+def _make_directory(path: Path) -> None:
+    path.mkdir(mode=0o700, parents=True, exist_ok=True)
+    refuse_foreign_folder(path, "it names what will be deleted")
+
+
 def _default_directory() -> Path:
     if in_first_user_namespace() and os.getuid() == 0:
         return Path("/run/gdp")
@@ -261,4 +270,7 @@ def _take_down(record: Record, path: Path) -> bool:
             target.unlink(missing_ok=True)
     path.with_suffix(_FRESH).unlink(missing_ok=True)
     path.unlink(missing_ok=True)
+    if path.parent.parent == Path(tempfile.gettempdir()):
+        with suppress(OSError):  # another run has a record there
+            path.parent.rmdir()
     return True

@@ -20,6 +20,7 @@ class CachedMessage(NamedTuple):
     frames: Sequence[bytes]
     begin_at: int
     size: int
+    added_s: float = 0.0  # monotonic
 
     @property
     def end_at(self) -> int:
@@ -42,12 +43,16 @@ class HistoryCache:
         depth: messages that stay for late joiners after every reader has acknowledged them.
 
     Attributes:
+        depth_bytes: frames of so many bytes stay at most; None: the depth alone counts.
+        age_s: a message stays for so many seconds at most; None: the depth alone counts.
         held_bytes: size of all frames.
         end_at: position behind the newest message.
     """
 
     def __init__(self, depth: int) -> None:
         self.depth = depth
+        self.depth_bytes: int | None = None
+        self.age_s: float | None = None
         self.held_bytes = 0
         self.end_at = 0
         self.messages: OrderedDict[int, CachedMessage] = OrderedDict()
@@ -60,9 +65,9 @@ class HistoryCache:
         """Return the lowest number, or None."""
         return next(iter(self.messages), None)
 
-    def add(self, number: int, frames: Sequence[bytes], size: int) -> None:
+    def add(self, number: int, frames: Sequence[bytes], size: int, added_s: float = 0.0) -> None:
         """Add the newest message, of ``size`` bytes."""
-        self.messages[number] = CachedMessage(frames, self.end_at, size)
+        self.messages[number] = CachedMessage(frames, self.end_at, size, added_s)
         self.held_bytes += size
         self.end_at += size
 
@@ -72,9 +77,21 @@ class HistoryCache:
         self.held_bytes -= message.size
         return message
 
-    def beyond_depth(self) -> list[int]:
+    def beyond_depth(self, now_s: float = 0.0) -> list[int]:
         """Return the numbers that no late joiner needs, oldest first."""
-        return list(islice(self.messages, max(len(self.messages) - self.depth, 0)))
+        beyond = max(len(self.messages) - self.depth, 0)
+        if self.depth_bytes is None and self.age_s is None:
+            return list(islice(self.messages, beyond))
+        numbers: list[int] = []
+        held_bytes = self.held_bytes
+        for number, message in self.messages.items():
+            is_aged = self.age_s is not None and now_s - message.added_s >= self.age_s
+            is_above = self.depth_bytes is not None and held_bytes > self.depth_bytes
+            if len(numbers) >= beyond and not is_aged and not is_above:
+                break
+            numbers.append(number)
+            held_bytes -= message.size
+        return numbers
 
     def begin_of(self, number: int) -> int:
         """Return the position at which a message begins, or would begin if it were cached."""

@@ -61,6 +61,7 @@ class SendWindow:
         self._best_effort_queue = deque[tuple[int, int]]()  # (number, first fragment not sent), oldest first
         self._newest = first_number - 1
         self._sent_at = 0
+        self._now_s = 0.0  # of the latest event
         self._sent_before = 0  # messages before this one were sent, if under an old number
         self.evicted = 0
 
@@ -128,8 +129,22 @@ class SendWindow:
         self._newest = max(self._newest, next_number - 1)
         self._release_acknowledged()
 
-    def add(self, number: int, frames: Sequence[bytes], size: int) -> list[int]:
+    def set_history_bounds(self, depth_bytes: int | None, age_s: float | None) -> None:
+        """Change how many bytes stay for late joiners, and for how many seconds; None: the depth alone counts."""
+        self._cache.depth_bytes, self._cache.age_s = depth_bytes, age_s
+        self._release_acknowledged()
+
+    def release_aged(self, now_s: float) -> None:
+        """Release what is too old for late joiners."""
+        self._now_s = now_s
+        if self._cache.age_s is not None:
+            self._release_acknowledged()
+
+    def add(self, number: int, frames: Sequence[bytes], size: int, added_s: float | None = None) -> list[int]:
         """Queue a message of ``size`` bytes of frames, which may be sealed when they are read; numbers rise.
+
+        Args:
+            added_s: from when it ages; None: from the latest event.
 
         Returns:
             the numbers of messages that were evicted for it before every reader had them.
@@ -144,7 +159,7 @@ class SendWindow:
             self._release(oldest)
         self.evicted += len(evicted)
         self._newest = number
-        self._cache.add(number, frames, size)
+        self._cache.add(number, frames, size, self._now_s if added_s is None else added_s)
         self._best_effort_queue.append((number, 0))
         return evicted
 
@@ -159,12 +174,13 @@ class SendWindow:
             frames: number, frames and their size; as in ``add``.
         """
         self._sent_before = move.new_number(max(self._sent_before, self.sent[0]))
+        ages_s = {move.new_number(number): each.added_s for number, each in self._cache.messages.items()}
         for number in list(self._cache.messages):
             self._release(number)
         self._repairs.clear()
         self._flow.round_trip.discard_sample()
         for number, each, size in frames:
-            self.add(number, each, size)
+            self.add(number, each, size, ages_s.get(number))
         positions = self._readers.all()
         for position in positions:
             position.next_number = move.new_number(position.next_number)
@@ -202,6 +218,7 @@ class SendWindow:
 
     def handle_acknack(self, reader: bytes, report: AckNack, now_s: float) -> None:
         """Process the report of a known reader: release what all have, and queue repairs."""
+        self._now_s = now_s
         message = self._cache.messages.get(report.next_number)
         position = message.position(report.next_part) if message else self._cache.begin_of(report.next_number)
         suspended = self._readers.suspended.get(reader)
@@ -223,8 +240,14 @@ class SendWindow:
         self._request_repairs(reader, report, now_s)
         self._release_acknowledged()
 
+    @property
+    def has_frames(self) -> bool:
+        """Return whether something waits to be sent, or sent again; or no reader waits for it."""
+        return bool(self._best_effort_queue or self._repairs) or not self._readers.active
+
     def frames_to_send(self, now_s: float, limit: int = 1 << 30) -> list[bytes]:
         """Return at most ``limit`` frames: repairs first, then new ones as far as the readers can hold them."""
+        self._now_s = now_s
         frames: list[bytes] = []
         if self._repairs and (frames := self._repairs.frames_to_send(self._cache.messages, limit, now_s)):
             self._flow.round_trip.discard_sample()
@@ -306,7 +329,7 @@ class SendWindow:
 
     def _release_acknowledged(self) -> None:
         least = self._readers.least()
-        for number in self._cache.beyond_depth():
+        for number in self._cache.beyond_depth(self._now_s):
             is_best_effort_queue = self._readers.active and self._cache.messages[number].end_at > self._sent_at
             if number >= least or is_best_effort_queue:
                 break

@@ -39,6 +39,7 @@ from gdp.limits import (
     RELAY_RATE_MIN,
     RIB_NAMES_PER_SENDER,
     RIB_WATCHES_MAX,
+    SCAPY_KEEPALIVE_MS,
     TABLE_MAX,
 )
 from gdp.nodes.schema import (
@@ -66,6 +67,7 @@ __all__ = [
     "Quotas",
     "RibConfig",
     "SwitchConfig",
+    "UplinkPlane",
 ]
 
 
@@ -79,6 +81,7 @@ def _endpoint(text: str) -> str:
 EndpointText = Annotated[str, AfterValidator(_endpoint)]
 ServerText = Annotated[str, AfterValidator(checked_host_port)]
 DataPlane = Literal["auto", "kernel", "raw", "scapy"]
+UplinkPlane = Literal["raw", "scapy"]  # of a RIB or proxy
 
 LISTEN_DEFAULT: Final = 51_820  # UDP; the usual port of WireGuard
 _KEEPALIVE_MIN_MS: Final = 10
@@ -176,26 +179,39 @@ class SwitchConfig(Section):
     hello_s: float = Field(default=HELLO_S, ge=0.01, le=60.0)
     dead_s: float = Field(default=DEAD_S, ge=0.02, le=600.0)
     lease_s: LeaseSeconds = ADVERTISEMENT_LEASE_S
-    keepalive_ms: KeepaliveMs = KEEPALIVE_MS
+    keepalive_ms: KeepaliveMs | None = None
     detect_multiplier: DetectMultiplier = DETECT_MULTIPLIER
     control_socket: NewFile | None = None
     sandbox: bool = True
 
+    @property
+    def keepalive_or_default_ms(self) -> int:
+        """Return the milliseconds between keepalives, which depend on the data plane where they are not set."""
+        if self.keepalive_ms is not None:
+            return self.keepalive_ms
+        return SCAPY_KEEPALIVE_MS if self.data_plane == "scapy" else KEEPALIVE_MS
+
     def timing_of(self, port: PortConfig) -> Timing:
         """Return the keepalive settings of a port."""
-        every_ms = self.keepalive_ms if port.keepalive_ms is None else port.keepalive_ms
+        every_ms = self.keepalive_or_default_ms if port.keepalive_ms is None else port.keepalive_ms
         return Timing(every_ms, every_ms, port.detect_multiplier or self.detect_multiplier)
 
     @classmethod
     def load(cls, path: Path) -> SwitchConfig:
-        """Read ``switch.yaml``."""
-        return load(cls, path)
+        """Read ``switch.yaml``, or the section ``switch`` of ``machine.yaml``."""
+        return load(cls, path, section="switch")
 
     def with_ifaces(self, ifaces: Iterable[str]) -> SwitchConfig:
         """Return this configuration with a port of default cost for each device that has no port."""
         known = {port.iface for port in self.ports}
         added = tuple(PortConfig(iface=iface) for iface in dict.fromkeys(ifaces) if iface not in known)
         return self.model_copy(update={"ports": self.ports + added})
+
+    def only_ifaces(self, ifaces: Iterable[str]) -> SwitchConfig:
+        """Return this configuration with these ports alone, each as it is here if it is."""
+        known = {port.iface: port for port in self.ports}
+        ports = tuple(known.get(iface, PortConfig(iface=iface)) for iface in dict.fromkeys(ifaces))
+        return self.model_copy(update={"ports": ports})
 
     @field_validator("ports")
     @classmethod
@@ -272,8 +288,8 @@ def _as_names(value: object) -> object:
 class RibConfig(Section):
     """``rib.yaml``.
 
-    ``upper`` names the RIB of the tier above, or several of which any may be used; ``null``: none. ``peers`` names
-    other RIBs of this domain, which hold the same routes.
+    ``upper`` names the RIB of the tier above, or several of which the first that answers is used; ``null``: none. Those
+    of the tier above that may follow. ``peers`` names other RIBs of this domain, which hold the same routes.
     """
 
     identity: Directory
@@ -285,6 +301,7 @@ class RibConfig(Section):
     lease_s: LeaseSeconds = ADVERTISEMENT_LEASE_S
     store: Literal["memory"] | SharedStore = "memory"
     snapshot: NewFile | None = None
+    data_plane: UplinkPlane = "raw"
     state: Directory | None = None
     quotas: Quotas = Quotas()
     metrics: Metrics | None = None
@@ -301,5 +318,5 @@ class RibConfig(Section):
 
     @classmethod
     def load(cls, path: Path) -> RibConfig:
-        """Read ``rib.yaml``."""
-        return load(cls, path)
+        """Read ``rib.yaml``, or the section ``rib`` of ``machine.yaml``."""
+        return load(cls, path, section="rib")

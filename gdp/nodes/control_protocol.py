@@ -7,8 +7,15 @@ Sans-I/O. A request is one line of at most ``LINE_MAX_BYTES``, each response is 
     --> {"command": "drain"}
     <-- {"ok": true, "result": {"state": "draining"}}
     <-- {"ok": true, "result": {"state": "drained", "complete": true}}
+    --> {"command": "show", "what": "neighbors", "from": 0}
+    <-- {"ok": true, "result": {"rows": [...], "next": null}}
+    --> {"command": "ask", "id": 7, "ask": "ping", "target": "75e0...", "timeout_s": 0.5}
+    <-- {"ok": true, "result": {"id": 7, "state": "answered", "rtt_ms": 0.8, ...}}
     --> {"command": "dance"}
-    <-- {"ok": false, "error": "unknown command 'dance'; expected drain, reload, status"}
+    <-- {"ok": false, "error": "unknown command 'dance'; expected ask, drain, lookup, reload, ..."}
+
+A lookup names a 256-bit name as well: ``{"command": "lookup", "name": "75e1..."}``. The response to ``ask`` comes when
+the reply has come, so that responses may overtake each other.
 """
 
 from __future__ import annotations
@@ -20,6 +27,7 @@ from enum import Enum
 from typing import Final
 
 from gdp.errors import GdpError, LocalError
+from gdp.names import Name
 
 __all__ = [
     "LINE_MAX_BYTES",
@@ -27,6 +35,7 @@ __all__ = [
     "Command",
     "ControlRequestError",
     "LineBuffer",
+    "Request",
     "Response",
     "decode_request",
     "decode_response",
@@ -49,6 +58,33 @@ class Command(Enum):
     RELOAD = "reload"
     STATUS = "status"
     DRAIN = "drain"
+    TOPICS = "topics"
+    LOOKUP = "lookup"
+    ASK = "ask"  # send a diagnostic request as the member that the node is
+    SHOW = "show"  # one page of a table
+    SNAPSHOT = "snapshot"  # see ``snapshot``: what a live view shows
+    TOPOLOGY = "topology"
+
+
+_WITH_ARGUMENTS: Final = (Command.ASK, Command.LOOKUP, Command.SHOW)
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """Request of a client.
+
+    Args:
+        arguments: JSON fields; only ``ask``, ``lookup`` and ``show`` have any.
+    """
+
+    command: Command
+    arguments: Mapping[str, object] = field(default_factory=dict)
+
+    @property
+    def name(self) -> Name | None:
+        """Return the name of a lookup."""
+        name = self.arguments.get("name")
+        return Name.from_text(name) if self.command is Command.LOOKUP and isinstance(name, str) else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,26 +128,44 @@ class LineBuffer:
         return lines
 
 
-def encode_request(command: Command) -> bytes:
-    """Return a request as one line."""
-    return json.dumps({"command": command.value}).encode() + b"\n"
+def encode_request(request: Request) -> bytes:
+    """Return a request as one line. Raises ``LocalError``: it is larger than a node accepts."""
+    line = json.dumps({"command": request.command.value, **request.arguments}).encode() + b"\n"
+    if len(line) > LINE_MAX_BYTES:
+        raise LocalError(f"the request has {len(line)} bytes; at most {LINE_MAX_BYTES} are accepted")
+    return line
 
 
-def decode_request(line: bytes) -> Command:
-    """Return the command of a request.
+def decode_request(line: bytes) -> Request:
+    """Return the request that a line holds.
 
     Raises:
         ControlRequestError: the line is not a request; the text gives the reason.
     """
     fields = _decode_object(line)
-    if set(fields) != {"command"} or not isinstance(fields["command"], str):
-        raise ControlRequestError('expected one key, such as {"command": "status"}')
-    word = fields["command"]
+    word = fields.pop("command", None)
+    if not isinstance(word, str):
+        raise ControlRequestError('expected a command, such as {"command": "status"}')
     try:
-        return Command(word)
+        command = Command(word)
     except ValueError as error:
         known = ", ".join(sorted(each.value for each in Command))
         raise ControlRequestError(f"unknown command {word[:_QUOTED_CHARS]!r}; expected {known}") from error
+    if fields and command not in _WITH_ARGUMENTS:
+        raise ControlRequestError(f'expected no other key: {{"command": "{word}"}}')
+    request = Request(command, fields)
+    if command is Command.LOOKUP:
+        _check_lookup(request)
+    return request
+
+
+def _check_lookup(request: Request) -> None:
+    try:
+        is_right = set(request.arguments) == {"name"} and request.name is not None
+    except LocalError as error:
+        raise ControlRequestError(f"name: expected 64 hex digits: {error}") from error
+    if not is_right:
+        raise ControlRequestError('expected a command and a name: {"command": "lookup", "name": "75e1..."}')
 
 
 def encode_response(response: Response) -> bytes:

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import GdpError, LocalError
+from gdp.names import Name
 from gdp.nodes.control_protocol import (
     LINE_MAX_BYTES,
     Command,
@@ -33,7 +34,14 @@ from gdp.nodes.control_protocol import (
     encode_response,
 )
 
-__all__ = ["CONTROL_SOCKET", "ControlHandlers", "ControlServer", "connect_control", "serve_control_in_thread"]
+__all__ = [
+    "CONTROL_SOCKET",
+    "ControlHandlers",
+    "ControlServer",
+    "Respond",
+    "connect_control",
+    "serve_control_in_thread",
+]
 
 log = logging.getLogger(__name__)
 
@@ -47,6 +55,17 @@ _PROBE_S: Final = 0.5
 _TIMEVAL: Final = struct.Struct("@ll")
 
 
+Respond = Callable[[Response], None]
+
+
+def _ask_nothing(_arguments: Mapping[str, object], _respond: Respond) -> None:
+    raise LocalError("this process is no member and sends no diagnostic requests")
+
+
+def _show_nothing(_arguments: Mapping[str, object]) -> Mapping[str, object]:
+    raise LocalError("this process keeps no tables")
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlHandlers:
     """Actions of a node on request.
@@ -55,13 +74,24 @@ class ControlHandlers:
         reload: read the configuration again; raises ``GdpError`` if the old one stays in use.
         status: return JSON fields about the node.
         drain: begin to drain; the node ends when it has drained, and then closes the server.
+        snapshot: return what a live view shows of the node; ``topology``: the network as it knows it.
         is_drained: whether all work that the drain waited for was finished; called once, at the end.
+        topics: return JSON fields about the names that the node carries; None: it carries none.
+        lookup: return JSON fields about a name, as far as known now; None: the node asks no RIB and is none.
+        ask: send a diagnostic request, and call back once, at once or later; raises ``GdpError`` if it is not sent.
+        show: return a page of a table; raises ``GdpError`` if there is no such table.
     """
 
     reload: Callable[[], None]
     status: Callable[[], Mapping[str, object]]
     drain: Callable[[], None]
     is_drained: Callable[[], bool] = lambda: True
+    topics: Callable[[], Mapping[str, object]] | None = None
+    lookup: Callable[[Name], Mapping[str, object]] | None = None
+    ask: Callable[[Mapping[str, object], Respond], None] = _ask_nothing
+    show: Callable[[Mapping[str, object]], Mapping[str, object]] = _show_nothing
+    snapshot: Callable[[], Mapping[str, object]] = dict
+    topology: Callable[[], Mapping[str, object]] = dict
 
 
 @dataclass(slots=True)
@@ -154,20 +184,42 @@ class ControlServer:
             self._respond(client, Response(error=str(error)))
             self._end(client)
             return
+        client.since_s = time.monotonic()
         for line in lines:
-            self._respond(client, self._handle(client, line))
+            response = self._handle(client, line)
+            if response is not None:
+                self._respond(client, response)
 
-    def _handle(self, client: _Client, line: bytes) -> Response:
+    def _handle(self, client: _Client, line: bytes) -> Response | None:
+        """Return the response to a request; None: it comes later."""
         try:
-            command = decode_request(line)
-            level = logging.DEBUG if command is Command.STATUS else logging.INFO  # the relay asks twice a second
+            request = decode_request(line)
+            command = request.command
+            level = logging.INFO if command in (Command.RELOAD, Command.DRAIN) else logging.DEBUG
             log.log(level, "control command=%s", command.value)
+            if command is Command.ASK:
+                self._handlers.ask(request.arguments, lambda response: self._respond(client, response))
+                return None
+            if command is Command.SHOW:
+                return Response(self._handlers.show(request.arguments))
             if command is Command.RELOAD:
                 self._handlers.reload()
                 return Response({"state": "reloaded"})
             if command is Command.STATUS:
                 state = "draining" if self._is_draining else "running"
                 return Response({"state": state, "pid": os.getpid(), **self._handlers.status()})
+            if command is Command.TOPICS:
+                if self._handlers.topics is None:
+                    raise LocalError("this node carries no names; ask a switch or a proxy")
+                return Response(self._handlers.topics())
+            if command is Command.LOOKUP and request.name is not None:
+                if self._handlers.lookup is None:
+                    raise LocalError("this node asks no RIB; ask a switch or a RIB")
+                return Response(self._handlers.lookup(request.name))
+            if command is Command.SNAPSHOT:
+                return Response({"pid": os.getpid(), **self._handlers.snapshot()})
+            if command is Command.TOPOLOGY:
+                return Response(self._handlers.topology())
             client.awaits_drain = True
             if not self._is_draining:
                 self._is_draining = True

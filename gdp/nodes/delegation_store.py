@@ -12,7 +12,7 @@ from pathlib import Path
 
 from gdp.client.participant import Topic
 from gdp.crypto.identity import Identity
-from gdp.errors import GdpError, LocalError
+from gdp.errors import GdpError, LocalError, RemoteError
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.stores.keyring import load_delegations
@@ -30,6 +30,9 @@ class DelegationStore:
     Args:
         directory: of delegation files; an invalid delegation is logged and left out.
 
+    Attributes:
+        left_out: why delegations were left out, by name: the label of a ``DropReason``, or a text.
+
     Raises:
         LocalError: a file is malformed, or readable for others.
     """
@@ -37,11 +40,13 @@ class DelegationStore:
     def __init__(self, directory: Path, identity: Identity) -> None:
         self.directory = directory
         self._topics: dict[Name, Topic] = {}
+        self.left_out: dict[Name, str] = {}
         for delegation in load_delegations(directory):
             try:
                 self._topics[delegation.name] = open_delegation(delegation, identity)
             except GdpError as error:
                 meant = delegation.metadata["name"] if delegation.metadata else delegation.name.short
+                self.left_out[delegation.name] = error.reason.label if isinstance(error, RemoteError) else str(error)
                 log.warning("delegation left out of=%s reason=%s", meant, error)
 
     def __iter__(self) -> Iterator[Topic]:

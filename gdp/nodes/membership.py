@@ -53,17 +53,17 @@ def load_policy(domain: Domain) -> Policy:
     """Return the policy that states which domains the members of a domain trust.
 
     Raises:
-        LocalError: a root certificate is not valid, or transit names a domain that is not trusted.
+        LocalError: a root certificate is not valid, or transit or diagnostics names a domain that is not trusted.
     """
     own = load_root(domain.root)
     trusted = [load_root(path) for path in domain.trusts]
-    if domain.transit is None:
-        return Policy(own, trusted)
     labels = {root.label: root.domain for root in [own, *trusted]}
-    unknown = sorted(set(domain.transit) - labels.keys())
-    if unknown:
-        raise LocalError(f"transit: not a trusted domain: {', '.join(unknown)}")
-    return Policy(own, trusted, [labels[label] for label in domain.transit])
+    for key, named in (("transit", domain.transit or ()), ("diagnostics", domain.diagnostics)):
+        unknown = sorted(set(named) - labels.keys())
+        if unknown:
+            raise LocalError(f"{key}: not a trusted domain: {', '.join(unknown)}")
+    transit = None if domain.transit is None else [labels[label] for label in domain.transit]
+    return Policy(own, trusted, transit, diagnostics=[labels[label] for label in domain.diagnostics])
 
 
 def fresh_bytes(size: int) -> bytes:

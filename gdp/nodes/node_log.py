@@ -11,11 +11,13 @@ from typing import Final
 
 from gdp.control.boundary import ErrorBoundary
 from gdp.control.neighbor_discovery import HelloProtocol
-from gdp.control.waiting import Wait, WaitLog, WaitReason
+from gdp.control.waiting import Wait, WaitLog, WaitReason, wait_fact
+from gdp.diagnosis.facts import WaitFact
 from gdp.errors import DropReason
 from gdp.names import Name
 from gdp.ports.plane import MAC_BYTES, Plane
 from gdp.sansio import Timestamps
+from gdp.telemetry.health import Health
 from gdp.trust.audit import Action
 from gdp.trust.domain import Policy
 
@@ -71,6 +73,7 @@ class NodeLog:
         self._on_wait = on_wait
         self._neighbours: set[tuple[int, Name]] = set()
         self._wait_log = WaitLog()
+        self._health = Health()
 
     def log_changes(self, now: Timestamps) -> None:
         """Log what changed since the last call."""
@@ -89,7 +92,9 @@ class NodeLog:
         if reporter is not None and reporter != self._known_clash:
             self._known_clash = reporter
             log.error("another node with this identity is alive, says switch %s; the older one stays", reporter.short)
-        for wait in self._wait_log.update(self._waits(now.mono_s), now.mono_s):
+        waits = self._waits(now.mono_s)
+        self._health = Health(now.mono_s, tuple(map(self._text, waits)))
+        for wait in self._wait_log.update(waits, now.mono_s):
             text = self._text(wait)
             log.log(logging.ERROR if wait.reason is WaitReason.IN_USE else logging.WARNING, "waiting: %s", text)
             if self._on_wait is not None:
@@ -98,6 +103,15 @@ class NodeLog:
     def waiting_for(self, now_s: float) -> list[str]:
         """Return what the node waits for now, each as a sentence; empty if it waits for nothing."""
         return [self._text(wait) for wait in self._waits(now_s)]
+
+    def wait_facts(self, now_s: float) -> tuple[WaitFact, ...]:
+        """Return what the node waits for now, as facts of a diagnosis."""
+        waits = self._waits(now_s)
+        return tuple(wait_fact(wait, "" if wait.port is None else self._ifname(wait.port)) for wait in waits)
+
+    def health(self) -> Health:
+        """Return the state as of the last look; any thread may ask."""
+        return self._health
 
     def metrics(self) -> Mapping[str, int]:
         """Return for each reason whether the node waits for it, 1 or 0."""
@@ -140,6 +154,10 @@ class NodeLog:
                 return f"no switch on {ifname}: its neighbours are RIBs or proxies"
             case WaitReason.NO_RIB:
                 return "no RIB of this domain can be reached" if self._rib is not None else "no RIB answers the switch"
+            case WaitReason.NO_UPPER_RIB:
+                return (
+                    f"RIB {name} above does not answer: what it gave is kept, new names of other domains are not found"
+                )
             case WaitReason.REFUSED:
                 reason = "" if wait.refused is None else wait.refused.label
                 return f"advertisement of {'?' if wait.name is None else self._local_name(wait.name)} refused: {reason}"

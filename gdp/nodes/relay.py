@@ -17,6 +17,7 @@ from pathlib import Path
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import DROP_COUNTERS, DropReason
+from gdp.host.service_notifier import service_notifier
 from gdp.names import Name
 from gdp.nodes.control_client import control_path
 from gdp.nodes.control_socket import ControlHandlers, ControlServer
@@ -38,6 +39,7 @@ from gdp.nodes.switch_watch import SwitchWatch
 from gdp.ports.address_monitor import AddressMonitor
 from gdp.ports.tap import TapDevice, tap_name
 from gdp.relay.connection import ConnectionCounters
+from gdp.telemetry.health import Health
 from gdp.telemetry.sources import Sources
 
 __all__ = ["Relay", "relay_control_path", "run_relay"]
@@ -62,6 +64,7 @@ def run_relay(config: RelayConfig, ready: Callable[[Identity, Relay], None]) -> 
     identity, policy = load_member(config.identity, config.domain, Role.SWITCH)
     with contextlib.ExitStack() as stack:
         stack.enter_context(run_alone("relay", _instance(identity.name)))
+        notifier = stack.enter_context(service_notifier())
         loop = RelayLoop()
         stack.callback(loop.close)
         context = RelayContext(config=config, identity=identity, policy=policy, loop=loop)
@@ -75,6 +78,7 @@ def run_relay(config: RelayConfig, ready: Callable[[Identity, Relay], None]) -> 
             relay.check_members()
 
         stack.enter_context(loop.signals(reload))
+        notifier.follow(loop.every)
         path = relay_control_path(config, identity.name)
         handlers = ControlHandlers(reload=reload, status=relay.status, drain=loop.stop)
         stack.enter_context(_control(loop, path, handlers))
@@ -102,6 +106,7 @@ class Relay:
         self._loop = context.loop
         self._begun_s = time.monotonic()
         self._looks: list[Callable[[], None]] = [self.check_members]
+        self._health = Health()
         self._is_closed = False
         context.load_revocations(now())
         context.tls(is_server=False)
@@ -141,6 +146,7 @@ class Relay:
         if self._watch is not None:
             for dialer in self.dialers:
                 dialer.follow_tunnel(now_s, is_up=dialer.peer.to_text() in self._watch.up)
+        self._health = Health(now_s, tuple(filter(None, (dialer.waiting for dialer in self.dialers))))
         return now_s + LOOK_S
 
     def check_members(self) -> None:
@@ -182,7 +188,7 @@ class Relay:
             total = self.counters()
             return {"in": total.frames_in, "out": total.frames_out}
 
-        return Sources(frames=frames, drops=[self._drops])
+        return Sources(frames=frames, drops=[self._drops], health=lambda: self._health)
 
     def status(self) -> dict[str, object]:
         """Return the JSON fields of this relay."""

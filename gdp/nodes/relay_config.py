@@ -83,7 +83,7 @@ class RelayConfig(Section):
     @classmethod
     def load(cls, path: Path) -> RelayConfig:
         """Read ``relay.yaml``."""
-        return load(cls, path)
+        return load(cls, path, section="relay")
 
     @field_validator("borders")
     @classmethod

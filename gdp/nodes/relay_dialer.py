@@ -178,6 +178,13 @@ class BorderDialer:
             total.add(self.port.link.connection.counters)
         return total
 
+    @property
+    def waiting(self) -> str:
+        """What the connection waits for, as a sentence; empty: it is up, or on standby."""
+        if self.is_up or not self._is_wanted:
+            return ""
+        return f"no connection to border {self._border.peer.short}: {self.reason or 'connecting'}"
+
     def status(self, now_s: float) -> dict[str, object]:
         """Return JSON fields about the connection."""
         return {

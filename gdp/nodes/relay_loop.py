@@ -32,6 +32,22 @@ class Timed(Protocol):
         """Do what is due at a monotonic second; return the second of the next call."""
 
 
+class _Periodic:
+    """Function that is called once in a period, however often the timers are."""
+
+    def __init__(self, period_s: float, look: Callable[[float], None]) -> None:
+        self._period_s = period_s
+        self._look = look
+        self._due_s = float("-inf")
+
+    def handle_timer(self, now_s: float) -> float:
+        """Call the function if it is due; return the second of the next call."""
+        if now_s >= self._due_s:
+            self._due_s = now_s + self._period_s
+            self._look(now_s)
+        return self._due_s
+
+
 class RelayLoop:
     """The loop; ``close`` releases its descriptors."""
 
@@ -64,6 +80,10 @@ class RelayLoop:
         """Call a part's timers from now on, the first time at once."""
         self._timed.append(part)
         self._due_s = 0.0
+
+    def every(self, period_s: float, look: Callable[[float], None]) -> None:
+        """Call ``look`` with the monotonic second each ``period_s``, the first time at once."""
+        self.add_timed(_Periodic(period_s, look))
 
     def remove_timed(self, part: Timed) -> None:
         """Call a part's timers no more."""

@@ -13,6 +13,7 @@ from gdp.client.attachment import attachment_waits
 from gdp.client.rib_host import RibHost
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
+from gdp.host.service_notifier import service_notifier
 from gdp.names import Name
 from gdp.nodes.audit import audit_folder, keep_audit
 from gdp.nodes.config import RibConfig
@@ -20,14 +21,22 @@ from gdp.nodes.control_client import control_path
 from gdp.nodes.control_socket import ControlHandlers
 from gdp.nodes.control_status import node_status
 from gdp.nodes.credentials import Credentials
+from gdp.nodes.decision_log import log_decisions
+from gdp.nodes.diagnostic_control import DiagnosticCommands
+from gdp.nodes.link_rows import LinkRows
+from gdp.nodes.member_tables import rib_tables
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
+from gdp.nodes.name_lookup import rib_lookup
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
+from gdp.nodes.port_rows import port_rows
 from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.nodes.rib_upkeep import MemoryUpkeep, Upkeep
 from gdp.nodes.rights import confine_rib
 from gdp.nodes.runtime import DRAIN_MAX_S, Runtime, now
 from gdp.nodes.single_instance import run_alone
-from gdp.nodes.uplink import open_uplink
+from gdp.nodes.snapshot import node_snapshot, rib_snapshot
+from gdp.nodes.state_answers import answer_for_rib
+from gdp.nodes.uplink import load_plane, open_uplink
 from gdp.ports.plane import Plane
 from gdp.rib.core import RibCore, RibSettings
 from gdp.stores.audit_log import AuditLog
@@ -64,10 +73,12 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
     )
     with contextlib.ExitStack() as stack:
         stack.enter_context(run_alone("RIB", identity.name))
+        notifier = stack.enter_context(service_notifier())
         folder = audit_folder(config.audit)
         if config.sandbox:
             if folder is not None:
                 AuditLog(folder)  # makes the folder
+            load_plane(config.data_plane)
             confine_rib(config)  # before the thread of the store starts; the device can still be opened
         revocations = load_revocations(config.state, policy.revoked, stack)
         upkeep = _upkeep(config, policy)
@@ -75,7 +86,7 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
         rib = RibCore(identity, policy, upkeep.store, settings)
         host = RibHost(identity, policy, rib, attachment)
         upkeep.begin(rib, now())
-        plane = stack.enter_context(open_uplink(config.iface))
+        plane = stack.enter_context(open_uplink(config.iface, config.data_plane))
         runtime = Runtime(host, plane)
         runtime.every(upkeep.every_s, upkeep.work)
         revocations.start(runtime)
@@ -85,21 +96,39 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
             policy,
             plane,
             rib.boundary,
-            lambda now_s: attachment_waits(host.attachment, now_s),
+            lambda now_s: [*attachment_waits(host.attachment, now_s), *rib.waits(now_s)],
             on_wait=on_wait,
         )
         runtime.every(LOOK_S, node_log.log_changes)
         credentials = Credentials(config.identity, config.domain, identity, policy)
         runtime.every(LOOK_S, credentials.reload_changed)
         stack.enter_context(runtime.signals(lambda: credentials.reload_changed(now())))
-        sources, begun_s = _sources(host, plane, node_log), now().mono_s
+        notifier.follow(runtime.every)
+        sources, begun_s = _sources(host, plane, node_log, runtime), now().mono_s
+        log_decisions(runtime, plane.ports, sources.drops)
+        answer_for_rib(host, policy, node_log.wait_facts)
+        commands = DiagnosticCommands(
+            diagnostics=host.diagnostics,
+            policy=policy,
+            own_switch=lambda: host.attachment.switch.name if host.attachment.switch is not None else None,
+            now=now,
+            tables=rib_tables(host, upkeep.store, plane, policy, sources.drops),
+            role="RIB",
+        )
         handlers = ControlHandlers(
             reload=lambda: credentials.reload_changed(now()),
             status=lambda: node_status(
                 identity, sources, uptime_s=now().mono_s - begun_s, attached=host.attachment.switch is not None
             ),
+            snapshot=lambda: {
+                **node_snapshot(identity, sources, uptime_s=now().mono_s - begun_s),
+                **rib_snapshot(rib, None if host.attachment.switch is None else host.attachment.switch.name),
+            },
             drain=lambda: runtime.drain(lambda: True, DRAIN_MAX_S),
             is_drained=lambda: runtime.has_drained,
+            lookup=lambda name: rib_lookup(rib, identity.name, name, now()),
+            ask=commands.ask,
+            show=commands.show,
         )
         stack.enter_context(runtime.control(config.control_socket or control_path(identity.name), handlers))
         for source in upkeep.sources():
@@ -110,7 +139,7 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
             metrics = Metrics(sources)
             metrics.serve(config.metrics.port)
             stack.callback(metrics.close)
-        log.info("rib up name=%s iface=%s", identity.name.short, config.iface)
+        log.info("rib up name=%s iface=%s plane=%s", identity.name.short, config.iface, config.data_plane)
         if runtime.run(lambda: host.attachment.switch is not None):
             ready(identity.name)
         runtime.run()
@@ -124,8 +153,10 @@ def _upkeep(config: RibConfig, policy: Policy) -> Upkeep:
     return ClusterUpkeep(config.store.cluster.address(), policy, allow_unowned=config.allow_unowned)
 
 
-def _sources(host: RibHost, plane: Plane, node_log: NodeLog) -> Sources:
+def _sources(host: RibHost, plane: Plane, node_log: NodeLog, runtime: Runtime) -> Sources:
     counters, rib = plane.counters, host.rib
+    links = LinkRows(host.attachment.hello_protocol, plane.ports)
+    runtime.every(LOOK_S, links.refresh)
     return Sources(
         frames=lambda: {"in": counters.frames_in, "out": counters.frames_out, "punted": counters.punted},
         drops=[lambda: counters.drops, lambda: count_list(host.drops())],
@@ -137,5 +168,8 @@ def _sources(host: RibHost, plane: Plane, node_log: NodeLog) -> Sources:
         },
         rib_refusals=lambda: {reason.label: count for reason, count in list(rib.refusals.items())},
         waiting=node_log.metrics,
+        links=lambda: links.rows,
+        ports=lambda: port_rows(plane.ports),
+        health=node_log.health,
         clashes=lambda: rib.identities.clashes + host.attachment.hello_protocol.clashes,
     )

@@ -69,6 +69,7 @@ class Runtime:
         self._drain_until_s: float | None = None
         self._is_finished: Callable[[], bool] = lambda: True
         self.has_drained = False
+        machine.count_arrivals(plane.frames_from)
         moment = now()
         for port in list(plane.ports.values()):
             self._add(port.index, moment)
@@ -234,11 +235,13 @@ class Runtime:
         for index, macs in self._machine.poll_neighbours().items():
             self._plane.set_neighbours(index, macs)
         transmits = self._machine.frames_to_send(time.monotonic())
-        if transmits:
-            self._machine.frames_leave(time.monotonic())
+        if not transmits:
+            return False
+        left_s = time.monotonic()
         for port, mac, frames in transmits:
             self._plane.transmit(port, mac, frames)
-        return bool(transmits)
+        self._machine.frames_leave(left_s)
+        return True
 
     @contextlib.contextmanager
     def signals(self, reload: Callable[[], None] | None = None) -> Iterator[None]:

@@ -15,6 +15,7 @@ from pydantic_core import ErrorDetails
 
 from gdp.errors import ConfigError, LocalError
 from gdp.names import Name
+from gdp.nodes.machine_file import section_source
 from gdp.nodes.yaml_source import ConfigFileError, KeyPath, YamlSource, read_yaml
 
 __all__ = [
@@ -134,6 +135,9 @@ class Domain(Section):
     root: ExistingFile
     trusts: Annotated[tuple[ExistingFile, ...], Unique] = ()
     transit: Annotated[tuple[str, ...] | None, Field(default=None)]  # labels; None: every trusted domain
+    diagnostics: tuple[str, ...] = Field(
+        default=(), description="Labels of the trusted domains whose members get whole diagnostic replies."
+    )
 
 
 class Metrics(Section):
@@ -146,19 +150,21 @@ def load(
     model: type[M],
     path: Path,
     *,
+    section: str = "",
     more: Mapping[str, object] | None = None,
     locate: Callable[[YamlSource, KeyPath], tuple[YamlSource, KeyPath]] | None = None,
 ) -> M:
     """Read a YAML file as this model.
 
     Args:
+        section: the model's section if the file is a ``machine.yaml``.
         more: further context of the model's validators.
         locate: the file, and its key, that a key of the model comes from; None: the same key of this file.
 
     Raises:
         ConfigError: the file cannot be read, or holds anything outside the model; then the error lists every finding.
     """
-    source = read_yaml(path)
+    source = section_source(read_yaml(path), section)
     context = {"base": path.parent, **(more or {})}
     try:
         return model.model_validate_json(orjson.dumps(source.data), strict=True, context=context)

@@ -14,6 +14,7 @@ from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import LocalError, StatementError
+from gdp.host.service_notifier import service_notifier
 from gdp.nodes.audit import keep_audit
 from gdp.nodes.config import SwitchConfig
 from gdp.nodes.control_client import control_path
@@ -21,16 +22,26 @@ from gdp.nodes.control_socket import ControlHandlers
 from gdp.nodes.control_status import node_status
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.data_plane import Chosen, choose_plane
+from gdp.nodes.decision_log import log_decisions
+from gdp.nodes.diagnostic_control import DiagnosticCommands
 from gdp.nodes.link_rows import LinkRows, link_status
 from gdp.nodes.links import LINKS_LOOK_S, TunnelLinks
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.metrics import serve_metrics
+from gdp.nodes.name_lookup import SwitchLookups
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
+from gdp.nodes.port_counters import PortCounters
+from gdp.nodes.port_rows import port_rows
 from gdp.nodes.relay_ports import RELAY_LOOK_S, RelayPorts
 from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.nodes.rights import confine_switch
 from gdp.nodes.runtime import DRAIN_MAX_S, Runtime, now
 from gdp.nodes.single_instance import own_devices, run_alone
+from gdp.nodes.snapshot import node_snapshot, switch_snapshot, topology_snapshot
+from gdp.nodes.state_answers import answer_for_switch
+from gdp.nodes.switch_tables import SwitchTables
+from gdp.nodes.switch_topics import switch_rows
+from gdp.nodes.topic_rows import rows_to_fields
 from gdp.nodes.tunnels import open_underlays
 from gdp.nodes.uplink import refuse_loopback
 from gdp.nodes.veth import attach_pairs, switch_end
@@ -74,12 +85,13 @@ def run_switch(
         hello_s=config.hello_s,
         dead_s=config.dead_s,
         lease_s=config.lease_s,
-        keepalive_ms=config.keepalive_ms,
+        keepalive_ms=config.keepalive_or_default_ms,
         detect_multiplier=config.detect_multiplier,
     )
     switch = SwitchCore(identity, policy, table, settings)
     with contextlib.ExitStack() as stack:
         stack.enter_context(run_alone("switch", identity.name))
+        notifier = stack.enter_context(service_notifier())
         revocations = load_revocations(config.state, policy.revoked, stack)
         stack.enter_context(own_devices(ifaces))
         stack.enter_context(attach_pairs(config.attach, identity.name, _widest(ifaces)))
@@ -114,8 +126,10 @@ def run_switch(
             _revoke(switch, config.revocations)
 
         stack.enter_context(runtime.signals(reload))
+        notifier.follow(runtime.every)
         sources = _sources(switch, chosen, node_log, runtime)
-        handlers = _control_handlers(identity, switch, chosen, runtime, reload, sources, links, relay)
+        commands = _diagnostic_commands(identity, policy, switch, plane, sources, links, node_log)
+        handlers = _control_handlers(identity, switch, chosen, runtime, reload, sources, links, relay, commands, stack)
         stack.enter_context(runtime.control(config.control_socket or control_path(identity.name), handlers))
         _revoke(switch, config.revocations)
         keep_audit(config.audit, policy.audit, switch.drops, runtime, stack)
@@ -125,16 +139,16 @@ def run_switch(
         _start_links(links, runtime, stack)
         if config.metrics is not None:
             stack.callback(serve_metrics(sources, config.metrics.port))
-        _log_start(identity, chosen)
-        ready(identity, chosen.name, chosen.reason)
+        _report_start(identity, chosen, ready)
         runtime.run()
 
 
-def _log_start(identity: Identity, chosen: Chosen) -> None:
+def _report_start(identity: Identity, chosen: Chosen, ready: Callable[[Identity, str, str], None]) -> None:
     said = identity.name.short, identity.role.value, chosen.name, len(chosen.plane.ports)
     log.info("switch up name=%s role=%s plane=%s ports=%d", *said)
     if chosen.reason:
         log.warning("not the best data plane plane=%s reason=%s", chosen.name, chosen.reason)
+    ready(identity, chosen.name, chosen.reason)
 
 
 def _add_ports(config: SwitchConfig, plane: Plane, switch: SwitchCore) -> None:
@@ -186,6 +200,33 @@ def _open_links(
     )
 
 
+def _diagnostic_commands(
+    identity: Identity,
+    policy: Policy,
+    switch: SwitchCore,
+    plane: Plane,
+    sources: Sources,
+    links: TunnelLinks | None,
+    node_log: NodeLog,
+) -> DiagnosticCommands:
+    """Return the handlers of diagnostic requests and tables.
+
+    From now on the switch tells the devices of its ports, and what it waits for.
+    """
+    tunnels = None if links is None else links.status
+    answer_for_switch(switch, policy, node_log.wait_facts, now().mono_s, tunnels)
+    ports = plane.ports
+    switch.diagnostic_answers.port_name = lambda index: ports[index].ifname if index in ports else ""
+    return DiagnosticCommands(
+        diagnostics=switch.diagnostics,
+        policy=policy,
+        own_switch=lambda: identity.name,
+        now=now,
+        tables=SwitchTables(switch, plane, policy, sources.drops, tunnels).sources,
+        role="switch",
+    )
+
+
 def _control_handlers(
     identity: Identity,
     switch: SwitchCore,
@@ -195,8 +236,12 @@ def _control_handlers(
     sources: Sources,
     links: TunnelLinks | None,
     relay: RelayPorts | None,
+    commands: DiagnosticCommands,
+    stack: contextlib.ExitStack,
 ) -> ControlHandlers:
-    begun_s = now().mono_s
+    begun_s, counters = now().mono_s, PortCounters()
+    stack.callback(counters.close)
+    lookups = SwitchLookups(switch)
 
     def status() -> dict[str, object]:
         """Return the JSON fields of this switch."""
@@ -213,11 +258,23 @@ def _control_handlers(
             more["relay"] = relay.status()
         return node_status(identity, sources, uptime_s=now().mono_s - begun_s, **more)
 
+    def snapshot() -> dict[str, object]:
+        """Return the fields of a live view."""
+        rows = sources.links() if sources.links is not None else ()
+        fields = node_snapshot(identity, sources, uptime_s=now().mono_s - begun_s)
+        return fields | switch_snapshot(switch, rows, counters.read())
+
     return ControlHandlers(
         reload=reload,
         status=status,
+        snapshot=snapshot,
+        topology=lambda: topology_snapshot(switch),
         drain=lambda: runtime.drain(lambda: not switch.resolver.pending_frames, DRAIN_MAX_S),
         is_drained=lambda: runtime.has_drained,
+        topics=lambda: rows_to_fields(switch_rows(switch.attached.all(), sources.entries), now().mono_s),
+        lookup=lambda name: lookups.lookup(name, now()),
+        ask=commands.ask,
+        show=commands.show,
     )
 
 
@@ -260,7 +317,7 @@ def _sources(switch: SwitchCore, chosen: Chosen, node_log: NodeLog, runtime: Run
         now = plane.counters
         return {"in": now.frames_in, "out": now.frames_out, "forwarded": now.forwarded, "punted": now.punted}
 
-    return Sources(
+    sources = Sources(
         frames=frames,
         drops=[lambda: plane.counters.drops, lambda: count_list(switch.drops())],
         table_entries=lambda: len(switch.table),
@@ -268,6 +325,10 @@ def _sources(switch: SwitchCore, chosen: Chosen, node_log: NodeLog, runtime: Run
         pending_frames=lambda: switch.resolver.pending_frames,
         waiting=node_log.metrics,
         links=lambda: links.rows,
+        ports=lambda: port_rows(plane.ports),
+        health=node_log.health,
         two_paths=lambda: two_paths,
         clashes=lambda: switch.hello_protocol.clashes,
     )
+    log_decisions(runtime, plane.ports, sources.drops, switch.table)
+    return sources

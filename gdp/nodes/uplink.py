@@ -12,27 +12,30 @@ import time
 from collections.abc import Iterable, Iterator
 
 from gdp.errors import LocalError
+from gdp.extras import require_extra
+from gdp.nodes.config import UplinkPlane
 from gdp.nodes.single_instance import own_devices
-from gdp.ports.netdev import NoDeviceError
+from gdp.ports.netdev import NetdevPlane, NoDeviceError
 from gdp.ports.raw import RawPlane
 from gdp.ports.rtnetlink import LinkMonitor
 
-__all__ = ["open_uplink", "refuse_loopback", "wait_for_device"]
+__all__ = ["load_plane", "open_uplink", "refuse_loopback", "wait_for_device"]
 
 log = logging.getLogger(__name__)
 
 
 @contextlib.contextmanager
-def open_uplink(ifname: str) -> Iterator[RawPlane]:
+def open_uplink(ifname: str, data_plane: UplinkPlane = "raw") -> Iterator[NetdevPlane]:
     """Open a node's device; close it on leaving.
 
     Raises:
+        MissingExtraError: Scapy is requested and not installed.
         LocalError: the device does not exist, another node uses it, or the process may not open raw sockets.
     """
     refuse_loopback([ifname])
     with own_devices([ifname]):
         try:
-            plane = RawPlane([ifname])
+            plane = load_plane(data_plane)([ifname])
         except NoDeviceError as error:
             raise LocalError(
                 f"{ifname}: no such device; start gdp-switch with attach: [{ifname}] first, or wait for it with"
@@ -42,6 +45,20 @@ def open_uplink(ifname: str) -> Iterator[RawPlane]:
             yield plane
         finally:
             plane.close()
+
+
+def load_plane(data_plane: UplinkPlane) -> type[RawPlane] | type[NetdevPlane]:
+    """Return the class of a data plane. A confined process calls this before, because Scapy reads files when loaded.
+
+    Raises:
+        MissingExtraError: Scapy is requested and not installed.
+    """
+    if data_plane == "raw":
+        return RawPlane
+    require_extra("scapy", ("scapy",), "data plane scapy")
+    from gdp.ports.scapy_plane import ScapyPlane
+
+    return ScapyPlane
 
 
 def refuse_loopback(ifnames: Iterable[str]) -> None:

@@ -17,6 +17,7 @@ import logging
 import select
 import time
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Final
@@ -61,6 +62,7 @@ class NetdevPlane(ABC):
         self._unopened: dict[int, str] = {}  # port index to why its device cannot be opened
         self._open_again_s = 0.0
         self._counters = Counters()
+        self._came: Counter[int] = Counter()  # frames, by port
         self._polls = 0
         self._audited_at = -1  # frames that had come by the last audit
         self._next_index = 0
@@ -187,11 +189,16 @@ class NetdevPlane(ABC):
             self._unopened.pop(index, None)
             self._close_device(index)
             self._mtus.pop(index, None)
+            self._came.pop(index, None)
             self._devices = {ifindex: port for ifindex, port in self._devices.items() if port != index}
 
     def port_state(self, index: int) -> bool:
         """Return whether the port exists, is up and has a carrier."""
         return index in self._mtus
+
+    def frames_from(self, port: int) -> int:
+        """Return how many frames have come from a port, as ``Plane.frames_from``."""
+        return self._came[port]
 
     def on_link(self, callback: LinkCallback) -> None:
         """Call ``callback(port, up)`` when a port goes up or down, as ``Plane.on_link``."""

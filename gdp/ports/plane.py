@@ -119,6 +119,9 @@ class Plane(Protocol):
     def port_state(self, index: int) -> bool:
         """Return whether the port exists, is up and has a carrier."""
 
+    def frames_from(self, port: int) -> int:
+        """Return how many frames have come from a port since its creation, forwarded and dropped ones too."""
+
     def on_link(self, callback: LinkCallback) -> None:
         """Call ``callback(port, up)`` from within ``poll`` each time a port goes up or down.
 

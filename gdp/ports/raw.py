@@ -221,6 +221,7 @@ class RawPlane(NetdevPlane):
         batch = self._batch
         sizes = batch.receive(source)
         self._counters.frames_in += len(sizes)
+        self._came[port] += len(sizes)
         pool, arrivals, waited = batch.pool, self._arrivals, waited_s(source) if sizes else 0.0
         for slot, size in zip(range(0, len(pool), batch.slot_bytes), sizes, strict=False):
             mac, frame = _shape(size).unpack_from(pool, slot)
@@ -242,6 +243,7 @@ class RawPlane(NetdevPlane):
         pool, step, glance = batch.pool, batch.slot_bytes, _GLANCE.unpack_from
         sizes = batch.receive(source)
         self._counters.frames_in += len(sizes)
+        self._came[port] += len(sizes)
         run_key, run_hops, run_start, fits = b"", NOWHERE, 0, 0
         for at, size in zip(range(ETHER_BYTES, len(pool), step), sizes, strict=False):
             first, hops_left, length, key = glance(pool, at)

@@ -117,6 +117,7 @@ class ScapyPlane(NetdevPlane):
         """Decide on one frame, and act on the decision."""
         counters, frame = self._counters, bytes(packet)
         counters.frames_in += 1
+        self._came[index] += 1
         if self._entries is None:
             self._punt(index, frame)
             return

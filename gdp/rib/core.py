@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
@@ -22,10 +23,12 @@ from gdp.control.presence import IdentityChecks, Presence
 from gdp.control.query import Query, Response
 from gdp.control.relay import Relay
 from gdp.control.replica import Digest, Entry, Fetch, Inventory, Key, Replicas
+from gdp.control.waiting import Wait, WaitReason
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.fields import Fields, check_sequence
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, parse
+from gdp.diagnosis.facts import RibFacts, RouteFact
 from gdp.errors import DropReason, RemoteError, StatementError, StoreError
 from gdp.frame.kinds import Kind
 from gdp.limits import (
@@ -41,12 +44,13 @@ from gdp.limits import (
 from gdp.names import Name
 from gdp.rib.digest_tree import DigestTree
 from gdp.rib.endpoints import RibEndpoints
+from gdp.rib.former import FormerAdvertisers
 from gdp.rib.replication import Message, Replication
 from gdp.rib.revocations import RibRevocations
 from gdp.rib.route import Route, Withdrawn
 from gdp.rib.store import Store
 from gdp.rib.upstream_advertisements import PROBE_S, Passed, UpstreamAdvertisements
-from gdp.rib.upstream_queries import UpstreamQueries
+from gdp.rib.upstream_queries import WATCH_AGAIN_S, UpstreamQueries
 from gdp.rib.watches import Asker, Watches
 from gdp.sansio import Timestamps
 from gdp.token_bucket import TokenBuckets
@@ -60,10 +64,12 @@ from gdp.trust.verifier import AdvertisementVerifier
 __all__ = ["OutgoingStatement", "RibCore", "RibSettings"]
 
 _ADVISED_S: Final = 30.0  # how long members that received a response also receive moves
+_ROUTES_SHOWN: Final = 32  # of a name, in a diagnosis
 _UNREPORTED_S: Final = 1.0  # ... where there are too many for that
 _NAMES_OF_ISSUER_MAX: Final = 256  # names whose watchers receive a revocation by an issuer that is not the names' owner
 _QUESTION_BYTES: Final = 1_024  # cost of a query, forwarded upstream or answered in the negative
 _ANSWER_BYTES: Final = 1_024  # cost of a response without the advertisement in it
+_STALE_MARGIN_S: Final = 1.0  # for the notice of a longer lease to arrive before the former one ends
 _DOUBT_S: Final = 0.1  # a RIB above that is silent for so long receives a probe with the next query
 _PEER_MESSAGES: Final[dict[StatementType, type[Message]]] = {
     StatementType.DIGEST: Digest,
@@ -87,7 +93,8 @@ class RibSettings:
     """Options of an operator.
 
     Args:
-        upper: RIBs of the tier above, any of which may be used; empty at the top.
+        upper: RIBs of the tier above, any of which may be used, the preferred one first; after them RIBs of the tier
+            above that, which are used while none of the former responds. Empty at the top.
         peers: other RIBs of this domain, with which this one replicates.
     """
 
@@ -123,6 +130,7 @@ class RibCore:
         self._outgoing_statements: list[OutgoingStatement] = []
         self.boundary = ErrorBoundary()
         self.identities = IdentityChecks()
+        self._former = FormerAdvertisers()
         self.refusals: Counter[DropReason] = Counter()
         self.accepted = 0
         self.answers = 0
@@ -137,6 +145,19 @@ class RibCore:
     def watching(self) -> int:
         """Return the number of watches."""
         return len(self._watches)
+
+    def routes_of(self, name: Name, now: Timestamps) -> list[tuple[Route, Advertisement]]:
+        """Return the routes of a name with their advertisements, each verified; invalid ones by now are left out.
+
+        Raises:
+            StoreError: the store does not answer.
+        """
+        self._store.prefetch([name], now)
+        found = list[tuple[Route, Advertisement]]()
+        for route in self._store.routes(name):
+            with suppress(StatementError):
+                found.append((route, self._verifier.verify_statement(parse(route.advertisement), now.unix_s)))
+        return found
 
     def receive(self, wire: bytes, sender: Name, now: Timestamps) -> None:
         """Handle a statement from ``sender`` (from the frame header; unproven). Each invalid statement is counted."""
@@ -170,6 +191,36 @@ class RibCore:
         except Exception as error:  # one statement must not stop the RIB
             self.boundary.record(error)
             self.refusals[DropReason.INTERNAL] += 1
+
+    def name_facts(self, name: Name, now: Timestamps) -> RibFacts:
+        """Return what this RIB knows about a name, for a diagnosis. Raises ``StoreError``: the store is away."""
+        routes = [route for route in self._store.routes(name) if route.expires_s > now.mono_s]
+        return RibFacts(
+            name=self._identity.name.to_text(),
+            domain=self._identity.member.domain.to_text(),
+            unix_s=now.unix_s,
+            routes=tuple(
+                RouteFact(
+                    advertiser=route.advertiser.to_text(),
+                    right=UnverifiedAdvertisement.from_statement(parse(route.advertisement)).right.value,
+                    switch=route.switch.to_text(),
+                    domain=route.domain.to_text(),
+                    lease_s=round(route.expires_s - now.mono_s, 1),
+                )
+                for route in routes[:_ROUTES_SHOWN]
+            ),
+            gone=self._former.gone(name),
+            refused=self._former.refused(name),
+        )
+
+    def waits(self, now_s: float) -> list[Wait]:
+        """Return what this RIB waits for."""
+        return [Wait(WaitReason.NO_UPPER_RIB, name=self._upstream.rib)] if self._upstream.is_silent(now_s) else []
+
+    def parties(self, name: Name, now_s: float) -> set[Name]:
+        """Return the nodes that advertise a name, and the switches and RIBs that watch it."""
+        watchers = {asker.name for asker in self._watches.watchers(name, now_s)}
+        return watchers | {route.advertiser for route in self._store.routes(name)}
 
     def receive_all(self, wires: Sequence[tuple[bytes, Name]], now: Timestamps) -> None:
         """Handle statements, each with its sender; the entries that they concern are read from the store in one go."""
@@ -224,6 +275,7 @@ class RibCore:
     def handle_timer(self, now: Timestamps) -> None:
         """Expire routes and notify their watchers; repeat open queries upstream."""
         for route in self._store.expire(now.mono_s, now.unix_s):
+            self._former.note_gone(route, is_lapsed=True)
             self._tell_gone(route, now.mono_s)
         self._now_s = now.mono_s
         self._watches.expire(now.mono_s)
@@ -231,7 +283,7 @@ class RibCore:
         if self._replication is not None:
             self._replication.handle_timer(now.mono_s)
         self._endpoints.handle_timer(now)
-        self._ask_what_is_due(now.mono_s)
+        self._ask_what_is_due(now)
         for passed in self._upstream.due(now.mono_s):
             self._send_up(passed)
 
@@ -305,6 +357,7 @@ class RibCore:
         if relay.domain is not None and member.role is Role.RIB:
             route = replace(route, domain=relay.domain)
         self._store.put(route)
+        self._former.note_accepted(route)
         self.accepted += 1
         if not isinstance(known, Route):
             self._audit.record(Action.ACCEPTED, "name", who=route.advertiser.to_text(), about=route.name.to_text())
@@ -405,6 +458,7 @@ class RibCore:
     def _withdraw(self, route: Route, sequence: int, proof: bytes, membership: bytes) -> None:
         gone = Withdrawn(route.sender, max(sequence, route.sequence), route.valid_until_unix_s, proof, membership)
         self._store.withdraw(route.name, route.advertiser, gone)
+        self._former.note_gone(route, is_lapsed=False)
 
     def _forward_upstream(self, route: Route, statement: bytes, sequence: int, now_s: float) -> None:
         if self._upstream.rib is not None:
@@ -435,6 +489,7 @@ class RibCore:
             name = UnverifiedAdvertisement.from_statement(passed_on).subject.name
         except StatementError:
             return  # not even an advertisement: a response could name nothing; the caller counts it
+        self._former.note_refused(name, error.reason)
         who, reason = passed_on.signer.to_text(), error.reason.label
         self._audit.record(Action.REFUSED, "name", who=who, about=name.to_text(), reason=reason)
         known = self._store.get(name, passed_on.signer)
@@ -582,31 +637,53 @@ class RibCore:
 
     # -- the tier above
 
-    def _ask_what_is_due(self, now_s: float) -> None:
+    def _ask_what_is_due(self, now: Timestamps) -> None:
         """Repeat queries to the tier above; of several RIBs there, replace a silent one."""
+        now_s = now.mono_s
         if self._upstream.turn_over(now_s):
             self._upstream_queries.ask_again(now_s)
-        ask, given_up = self._upstream_queries.due(now_s)
-        for name, watch_s in ask:
-            self._ask_upstream(name, watch_s)
+        ask, given_up = self._upstream_queries.due(now_s, is_silent=self._upstream.is_silent(now_s))
+        for query in ask:
+            if query.is_unanswered:
+                self._serve_stale(query.name, query.again_s, now)
+            self._ask_upstream(query.name, query.watch_s)
         for name, askers in given_up:
             for asker in askers:
                 self._answer_negative(name, asker.name)
+        for rib in self._upstream.preferred(now_s):
+            self._query_upstream(rib, rib, 0.0)
         self._probe(now_s, PROBE_S)
+
+    def _serve_stale(self, name: Name, until_s: float, now: Timestamps) -> None:
+        """Keep the routes that the tier above gave until it is asked next, as it does not respond (as in RFC 8767).
+
+        The proofs of an advertisement still end it.
+        """
+        try:
+            routes = self._store.routes(name)
+        except StoreError:
+            self.refusals[DropReason.UNAVAILABLE] += 1  # a shared store that is away, too, keeps its routes itself
+            return
+        for route in routes:
+            is_lapsing = route.expires_s < until_s + _STALE_MARGIN_S
+            if route.is_from_upstream and is_lapsing and now.unix_s < route.valid_until_unix_s:
+                stale = replace(route, expires_s=max(until_s, now.mono_s + WATCH_AGAIN_S) + _STALE_MARGIN_S)
+                self._store.put(stale)
+                self._tell(stale, route, now.mono_s)
 
     def _probe(self, now_s: float, quiet_s: float) -> None:
         """Send one of several RIBs above a probe if it gave no sign of life for ``quiet_s``."""
         if self._upstream.probe(now_s, quiet_s):
-            self._query_upstream(self._upstream.rib, 0.0)
+            self._query_upstream(self._upstream.rib, self._upstream.rib, 0.0)
 
     def _ask_upstream(self, name: Name, watch_s: float) -> None:
-        self._query_upstream(name, watch_s)
+        self._query_upstream(self._upstream.rib, name, watch_s)
         self._probe(self._now_s, _DOUBT_S)
 
-    def _query_upstream(self, name: Name | None, watch_s: float) -> None:
-        upper = self._upstream.rib
+    def _query_upstream(self, upper: Name | None, name: Name | None, watch_s: float) -> None:
         assert upper is not None
         assert name is not None
+        self._upstream.record_asked(self._now_s)
         query = Query(name, watch_s, self._policy.revoked.digest_about(name) if watch_s > 0 else None)
         wire = query.to_wire(self._identity.name, self._identity.key, self._identity.membership)
         self._outgoing_statements.append(OutgoingStatement(upper, Kind.RIB_REQUEST, wire))
@@ -617,7 +694,8 @@ class RibCore:
         if not self._upstream.has(member.name) or member.role is not Role.RIB:
             raise StatementError(DropReason.WRONG_DOMAIN, "not from the tier above")
         statement.verify(member.key)
-        self._upstream.record_alive(member.name, now.mono_s)
+        if self._upstream.record_alive(member.name, now.mono_s):
+            self._upstream_queries.ask_again(now.mono_s)
         return member
 
     def _take_ack_from_above(self, statement: Statement, now: Timestamps) -> None:
@@ -677,7 +755,8 @@ class RibCore:
         self._store.put(route)
         if isinstance(known, Route) and not known.is_from_upstream:
             self._replicate(route.name, route.advertiser)  # a peer has the old location
-        self._tell(route, known, now.mono_s, self._upstream_queries.answered(answer.name, now.mono_s))
+        askers = self._upstream_queries.answered(answer.name, now.mono_s, answer.lease_s)
+        self._tell(route, known, now.mono_s, askers)
 
     # -- revocations
 

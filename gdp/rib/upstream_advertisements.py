@@ -1,7 +1,8 @@
 """Advertisements for the tier above: each is repeated until one of its RIBs has acknowledged it.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Of several RIBs above one is used; where it does not respond,
-the next one is. While none responds, pending advertisements are kept to the end of their leases, within a bound.
+the next one is, until a preferred one responds again. While none responds, pending advertisements are kept to the end
+of their leases, within a bound.
 """
 
 from __future__ import annotations
@@ -20,8 +21,10 @@ RETRY_MAX_S: Final = 5.0
 SILENT_MIN_S: Final = 0.12  # a RIB above that leaves a probe unanswered for so long, or three round trips more ...
 SILENT_MAX_S: Final = 1.0  # ... but no longer than this, is replaced by the next one
 PROBE_S: Final = 1.0  # with several RIBs above, the one in use receives a query or a probe at least this often
+RETURN_S: Final = 5.0  # between probes of the RIBs that are preferred to the one in use
 SEND_MAX: Final = 256  # at once, so that AdvertiseAcks are received in between
 GONE_S: Final = 1.0  # a tier above that is silent for so long is sent one advertisement at a time
+QUIET_S: Final = 2.0  # a RIB above may wait itself for the tier above it
 WAITING_MAX: Final = 65_536
 
 
@@ -57,7 +60,10 @@ class UpstreamAdvertisements:
         self._waiting: dict[Key, _Waiting] = {}
         self._due: list[tuple[float, Key]] = []
         self._asked_s: float | None = None  # since when a message is unanswered
+        self._unheard_s: float | None = None  # when the first message left since one of them was heard
         self._heard_s = float("-inf")
+        self._return_at_s = float("inf")  # when to probe the preferred RIBs
+        self._probed_s: float | None = None  # when they were probed last, since another one is in use
         self._round_trip_s = 0.0  # smoothed, as in RFC 6298
         self.given_up = 0
 
@@ -97,23 +103,47 @@ class UpstreamAdvertisements:
         self._asked_s = now_s
         return True
 
-    def record_alive(self, rib: Name, now_s: float) -> None:
-        """Record a sign of life of the RIB in use; after a long silence all pending advertisements are due."""
+    def preferred(self, now_s: float) -> tuple[Name, ...]:
+        """Return the RIBs to probe now, because they are preferred to the one in use."""
+        if now_s < self._return_at_s:
+            return ()
+        self._probed_s, self._return_at_s = now_s, now_s + RETURN_S
+        return self._ribs[: self._at]
+
+    def record_alive(self, rib: Name, now_s: float) -> bool:
+        """Record a sign of life of a RIB above; return whether all queries are to be sent again.
+
+        That is after a silence, and where another RIB is used from now on: one that is preferred and was probed. A late
+        response to an earlier query does not count. All pending advertisements are due then, too.
+        """
+        was_silent, self._unheard_s = self.is_silent(now_s), None
+        if self._probed_s is not None and rib in self._ribs[: self._at]:
+            self._round_trip_s += (now_s - self._probed_s - self._round_trip_s) / 8
+            self._use(self._ribs.index(rib), now_s)
+            return True
         if rib != self.rib:
-            return
+            return was_silent
         if self._asked_s is not None:
             if self._is_gone(now_s):
                 self._all_due(now_s)
             self._round_trip_s += (now_s - self._asked_s - self._round_trip_s) / 8
         self._asked_s, self._heard_s = None, now_s
+        return was_silent
+
+    def record_asked(self, now_s: float) -> None:
+        """Record that something was sent to the tier above, to which it responds."""
+        if self._unheard_s is None:
+            self._unheard_s = now_s
+
+    def is_silent(self, now_s: float) -> bool:
+        """Return whether no RIB of the tier above has responded for ``QUIET_S``, though it should have."""
+        return self._unheard_s is not None and now_s - self._unheard_s >= QUIET_S
 
     def turn_over(self, now_s: float) -> bool:
         """Select the next RIB above if the one in use is silent; return whether that is so."""
         if len(self._ribs) < 2 or self._asked_s is None or now_s - self._asked_s < self._silent_s():
             return False
-        self._at = (self._at + 1) % len(self._ribs)
-        self._asked_s = None
-        self._all_due(now_s)
+        self._use((self._at + 1) % len(self._ribs), now_s)
         return True
 
     def due(self, now_s: float) -> list[Passed]:
@@ -133,8 +163,10 @@ class UpstreamAdvertisements:
             heapq.heappush(self._due, (waiting.again_s, key))
             if len(found) < most:
                 found.append(waiting.passed)
-        if found and self._asked_s is None:
-            self._asked_s = now_s
+        if found:
+            self.record_asked(now_s)
+            if self._asked_s is None:
+                self._asked_s = now_s
         return found
 
     def next_due(self) -> float | None:
@@ -142,7 +174,13 @@ class UpstreamAdvertisements:
         times = [self._due[0][0]] if self._due else []
         if len(self._ribs) > 1:
             times.append(self._heard_s + PROBE_S if self._asked_s is None else self._asked_s + self._silent_s())
+            times.append(self._return_at_s)
         return min(times, default=None)
+
+    def _use(self, at: int, now_s: float) -> None:
+        self._at, self._asked_s, self._probed_s = at, None, None
+        self._return_at_s = now_s + RETURN_S if at else float("inf")
+        self._all_due(now_s)
 
     def _silent_s(self) -> float:
         return min(SILENT_MIN_S + 3 * self._round_trip_s, SILENT_MAX_S)

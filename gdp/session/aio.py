@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import TypeVar
 
 from gdp.client.participant import Topic
-from gdp.client.send_options import SendOptions
+from gdp.client.send_options import Priority, SendOptions, is_urgent
 from gdp.errors import LocalError
 from gdp.service.replication import Replication
 from gdp.session.core import QUEUE_MESSAGES
@@ -31,10 +31,8 @@ from gdp.session.session import (
     GOODBYE_S,
     LINGER_S,
     Paths,
-    Priority,
     Sign,
     checked_response,
-    is_urgent,
 )
 from gdp.session.settings import SessionConfig, settings_of
 from gdp.session.wire import message_to_wire
@@ -237,7 +235,9 @@ class AsyncSession(BaseSession[LoopDriver]):
             is_global=is_global,
             description=description,
             paths=paths_value(paths),
-            options=SendOptions(deadline_s=deadline_s, weight=weight, max_bits_s=max_bits_s, repairs=repairs),
+            options=SendOptions(
+                deadline_s=deadline_s, weight=weight, max_bits_s=max_bits_s, repairs=repairs, priority=priority
+            ),
         )
         publisher = AsyncPublisher(self, topic, made, reliable=reliable)
         self._opened.append(publisher)
@@ -286,6 +286,7 @@ class AsyncSession(BaseSession[LoopDriver]):
             at_once=workers,
             is_global=is_global,
             urgent=is_urgent(priority),
+            options=SendOptions(priority=priority),
             paths=paths_value(paths),
             is_session=session_value(sign),
         )

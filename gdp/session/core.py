@@ -208,6 +208,7 @@ class SessionCore:
         at_once: int | None,
         is_global: bool,
         urgent: bool,
+        options: SendOptions = DEFAULT_OPTIONS,
         paths: int = 1,
         is_session: bool = False,
     ) -> ServerCore:
@@ -223,6 +224,7 @@ class SessionCore:
             at_once=at_once,
             is_global=is_global,
             urgent=urgent,
+            options=options,
             paths=paths,
             is_session=is_session,
         )

@@ -27,7 +27,7 @@ from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.nodes.runtime import Runtime
 from gdp.nodes.single_instance import run_alone
 from gdp.nodes.uplink import open_uplink
-from gdp.ports.raw import RawPlane
+from gdp.ports.netdev import NetdevPlane
 from gdp.session.core import SessionCore
 from gdp.session.errors import SessionError
 from gdp.session.settings import SessionConfig
@@ -46,7 +46,7 @@ class SessionNode:
     identity: Identity
     member: Participant
     runtime: Runtime
-    plane: RawPlane
+    plane: NetdevPlane
     node_log: NodeLog
     core: SessionCore
     _stack: ExitStack

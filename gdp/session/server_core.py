@@ -10,6 +10,7 @@ from collections import deque
 from typing import Final
 
 from gdp.client.participant import Message, Participant, Topic
+from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.service.serving import Asked, Serving, Turn
@@ -49,6 +50,7 @@ class ServerCore:
         at_once: int | None,
         is_global: bool,
         urgent: bool,
+        options: SendOptions = DEFAULT_OPTIONS,
         paths: int = 1,
         is_session: bool = False,
     ) -> None:
@@ -56,7 +58,7 @@ class ServerCore:
         self._name = topic.name
         self._serving: Serving[bytes] = Serving(start, at_once)
         self._publisher = member.serve(
-            topic, SERVING, is_global=is_global, urgent=urgent, paths=paths, is_session=is_session
+            topic, SERVING, is_global=is_global, urgent=urgent, options=options, paths=paths, is_session=is_session
         )
         self._seen_s: dict[Name, float] = {}  # when the clients of active calls were last alive
         self._check_at_s: float | None = None  # when clients are checked next; None: no call is active

@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Final, Literal, TypeVar
 
 from gdp.client.participant import Topic
-from gdp.client.send_options import SendOptions
+from gdp.client.send_options import Priority, SendOptions, is_urgent
 from gdp.errors import LocalError
 from gdp.service.replication import Replication
 from gdp.session.core import QUEUE_MESSAGES
@@ -39,7 +39,6 @@ ATTACH_TIMEOUT_S: Final = 10.0
 CALL_TIMEOUT_S: Final = 10.0
 LINGER_S: Final = 1.0
 GOODBYE_S: Final = 0.2  # how long a leaving node continues, so that its goodbye is sent
-Priority = Literal["normal", "urgent"]
 Paths = Literal[1, 2, "spread"]
 Sign = Literal["always", "session"]
 
@@ -242,7 +241,7 @@ class Session(BaseSession[Driver]):
         Args:
             name: ``name`` of its metadata, such as ``"camera"``; 64 hex digits; a ``Name``; or the ``Metadata``.
             reliable: whether readers get every message, in order; otherwise lost messages stay lost.
-            priority: ``"urgent"`` messages precede others in every queue.
+            priority: one of seven, ``"urgent"`` to ``"background"``; ``"urgent"`` precedes others in every queue.
             latched: how many of the last messages late readers get.
             is_global: whether other domains can find the name.
             description: information that readers need to decode the messages; it travels sealed.
@@ -269,7 +268,9 @@ class Session(BaseSession[Driver]):
                 is_global=is_global,
                 description=description,
                 paths=paths_value(paths),
-                options=SendOptions(deadline_s=deadline_s, weight=weight, max_bits_s=max_bits_s, repairs=repairs),
+                options=SendOptions(
+                    deadline_s=deadline_s, weight=weight, max_bits_s=max_bits_s, repairs=repairs, priority=priority
+                ),
             )
         )
         publisher = Publisher(self, topic, made, reliable=reliable)
@@ -345,13 +346,14 @@ class Session(BaseSession[Driver]):
         if workers < 1:
             raise LocalError(f"workers is at least 1, not {workers}")
         topic = self.core.resolve(name, Right.SERVE)
-        urgent = is_urgent(priority)
+        urgent, options = is_urgent(priority), SendOptions(priority=priority)
         core = self.driver.run(
             lambda: self.core.serve(
                 topic,
                 at_once=workers,
                 is_global=is_global,
                 urgent=urgent,
+                options=options,
                 paths=paths_value(paths),
                 is_session=session_value(sign),
             )
@@ -520,17 +522,6 @@ def checked_response(response: object) -> bytes | str:
     if isinstance(response, bytes | bytearray | memoryview):
         return bytes(response)
     return f"the handler returned {type(response).__name__}, not bytes"
-
-
-def is_urgent(priority: Priority) -> bool:
-    """Return whether a priority is ``urgent``.
-
-    Raises:
-        LocalError: it is neither ``normal`` nor ``urgent``.
-    """
-    if priority not in ("normal", "urgent"):
-        raise LocalError(f"priority is 'normal' or 'urgent', not {priority!r}")
-    return priority == "urgent"
 
 
 def _deadline_s(driver: Driver, timeout_s: float | None) -> float | None:

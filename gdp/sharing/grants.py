@@ -90,7 +90,7 @@ class Grants:
                     metadata = described(each.kind, each.name, each.type_name)
                     names[metadata.digest()] = metadata
             for lacking in found:
-                metadata = described(lacking.kind, lacking.local, lacking.type_name)
+                metadata = described(lacking.kind, lacking.shared, lacking.type_name)
                 if lacking.side == "expose" and metadata.name(key) == lacking.name:
                     names[metadata.digest()] = metadata
             for issued in store:

@@ -54,12 +54,14 @@ class Undelegated:
 
     Args:
         local: its name in the graph.
+        shared: the ROS name that all sides know, with the prefix of the machine.
         name: the 256-bit name that the rule gives to it.
     """
 
     side: str
     kind: str
     local: str
+    shared: str
     type_name: str
     name: Name
 
@@ -72,6 +74,7 @@ class ProxyFiles:
         root: root certificate of the proxy's domain.
         control_socket: None: at the default place.
         rules: of ``proxy.yaml`` and of the drop-ins of other programs.
+        prefix: namespace of this machine on the overlay; empty: none.
     """
 
     path: Path
@@ -80,6 +83,7 @@ class ProxyFiles:
     delegations: Path
     control_socket: Path | None
     rules: Sequence[StatedRule]
+    prefix: str = ""
 
     @classmethod
     def read(cls, path: Path) -> ProxyFiles:
@@ -92,6 +96,7 @@ class ProxyFiles:
         data = source.data if isinstance(source.data, dict) else {}
         domain = data.get("domain")
         socket = data.get("control_socket")
+        prefix = str(data.get("prefix") or "")
         files = [path, *sorted(each for each in drop_in_directory(path).glob("[!.]*.yaml") if each.name != DROP_IN)]
         return cls(
             path=path,
@@ -99,13 +104,26 @@ class ProxyFiles:
             root=_path(source, "domain", domain.get("root") if isinstance(domain, dict) else None),
             delegations=_path(source, "delegations", data.get("delegations")),
             control_socket=None if socket is None else _path(source, "control_socket", socket),
-            rules=tuple(rule for file in files for rule in _rules(read_yaml(file))),
+            rules=tuple(rule for file in files for rule in _rules(read_yaml(file), prefix)),
+            prefix=prefix,
         )
 
     @property
     def drop_in(self) -> Path:
         """Return the file of this program's rules."""
         return drop_in_directory(self.path) / DROP_IN
+
+    def shared_name(self, local: str) -> str:
+        """Return the ROS name that all sides know for a name, or a pattern of names, of this machine."""
+        return _prefixed(self.prefix, local)
+
+    def name_keys(self, shared: str) -> dict[str, str]:
+        """Return the keys of a rule of this machine for a name that all sides know, or a pattern of such."""
+        if not self.prefix:
+            return {"name": shared}
+        if shared.startswith(f"/{self.prefix}/"):
+            return {"name": shared.removeprefix(f"/{self.prefix}")}
+        return {"name": shared, "prefix": ""}
 
     def find(self, side: Side, kind: str, name: str) -> StatedRule | None:
         """Return the rule that states exactly this name or pattern."""
@@ -168,10 +186,18 @@ def fits(pattern: str, name: str) -> bool:
     return pattern == name or matches(pattern, name)
 
 
+def _prefixed(prefix: str, local: str) -> str:
+    return f"/{prefix}{local}" if prefix else local
+
+
 def _undelegated(fields: object) -> Undelegated:
     match fields:
-        case {"side": str(side), "kind": str(kind), "local": str(local), "type": str(type_name), "name": str(name)}:
-            return Undelegated(side=side, kind=kind, local=local, type_name=type_name, name=Name.from_text(name))
+        case {
+            "side": str(side), "kind": str(kind), "local": str(local), "shared": str(shared), "type": str(type_name),
+            "name": str(name),
+        }:  # fmt: skip
+            found = Name.from_text(name)
+            return Undelegated(side=side, kind=kind, local=local, shared=shared, type_name=type_name, name=found)
     raise LocalError("the proxy reports its names in another format; restart it with this version")
 
 
@@ -184,7 +210,7 @@ def _path(source: YamlSource, key: str, value: Plain) -> Path:
         raise ConfigError(str(source.path), key, str(error)) from error
 
 
-def _rules(source: YamlSource) -> Iterator[StatedRule]:
+def _rules(source: YamlSource, prefix: str) -> Iterator[StatedRule]:
     """Yield the rules of a file, without validation: the proxy itself validates them."""
     sides: tuple[Side, Side] = ("expose", "import")
     for side in sides:
@@ -192,12 +218,12 @@ def _rules(source: YamlSource) -> Iterator[StatedRule]:
         for index, rule in enumerate(listed if isinstance(listed, list) else []):
             if isinstance(rule, dict) and isinstance(name := rule.get("name"), str):
                 line, column = source.values[side, index]
-                more = rule.get("metadata")
+                more, own = rule.get("metadata"), rule.get("prefix")
                 items = more.items() if isinstance(more, dict) else ()
                 yield StatedRule(
                     side=side,
                     kind=str(rule.get("kind", "topic")),
-                    name=name,
+                    name=_prefixed(prefix if own is None else str(own), name),
                     type_name=str(rule.get("type") or "") if is_name(name) else "",
                     metadata={key: value for key, value in items if isinstance(value, str | int)},
                     is_salted=rule.get("salt_file") is not None,

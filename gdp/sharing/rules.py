@@ -126,7 +126,7 @@ def _line(
     more: dict[str, object],
 ) -> str:
     path: Path = folder.owner_file(owner)
-    rule = {"kind": kind, "name": name, **({"type": type_name} if type_name else {}), **more}
+    rule = {"kind": kind, **files.name_keys(name), **({"type": type_name} if type_name else {}), **more}
     return f"- {json.dumps({**rule, 'owner': os.path.relpath(path, files.drop_in.parent)})}\n"
 
 

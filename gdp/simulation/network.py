@@ -38,7 +38,8 @@ class SimLink:
         jitter_s: largest random addition to the delay; frames may then overtake each other.
         loss: share of frames that are lost, 0 to 1.
         burst_frames: mean length of a run of lost frames in one direction (Gilbert's model); 1: they are independent.
-        bytes_s: rate of each direction; frames beyond it wait in a queue without end.
+        bytes_s: rate of each direction; frames beyond it wait in a FIFO.
+        fifo_s: longest wait in that FIFO; a frame that would wait longer is lost.
     """
 
     delay_s: float = 0.0005
@@ -48,6 +49,7 @@ class SimLink:
     is_up: bool = True
     bytes_s: float = float("inf")
     burst_frames: float = 1.0
+    fifo_s: float = float("inf")
     free_s: dict[bytes, float] = field(default_factory=dict)  # by receiver: when the last frame has left
     in_burst: set[bytes] = field(default_factory=set)  # receivers whose last frame was lost
 
@@ -60,6 +62,10 @@ class SimLink:
         is_lost = chance < into
         (self.in_burst.add if is_lost else self.in_burst.discard)(to)
         return is_lost
+
+    def is_full(self, to: bytes, now_s: float) -> bool:
+        """Return whether the FIFO towards a receiver takes no further frame."""
+        return self.free_s.get(to, now_s) - now_s > self.fifo_s
 
     def leaves_s(self, to: bytes, size: int, now_s: float) -> float:
         """Queue a frame of ``size`` bytes towards a receiver; return when its last byte has left."""
@@ -84,6 +90,7 @@ class _Node:
     fired_s: float = float("-inf")
     fired: int = 0  # number of timers in the instant ``fired_s``
     is_alive: bool = True
+    came: Counter[int] = field(default_factory=Counter)  # frames, by port
     stalled: list[tuple[_End, bytes]] | None = None  # frames that arrived while it was frozen
 
 
@@ -119,7 +126,8 @@ class SimNetwork:
 
     def add(self, name: str, machine: ProtocolCore, table: Table | None = None) -> None:
         """Add a node; with a table it forwards what the table decides."""
-        self._nodes[name] = _Node(machine=machine, table=table)
+        node = self._nodes[name] = _Node(machine=machine, table=table)
+        machine.count_arrivals(node.came.__getitem__)
 
     def connect(self, a: str, b: str, sim_link: SimLink | None = None, cost: int = 10) -> SimLink:
         """Join two nodes by a link; return the link, which may be changed while time runs."""
@@ -172,6 +180,7 @@ class SimNetwork:
         """Restart a node without any state, on the same links."""
         before = self._nodes[name]
         node = self._nodes[name] = _Node(machine=machine, table=table, ports=before.ports, costs=before.costs)
+        machine.count_arrivals(node.came.__getitem__)
         for port, (sim_link, own, _) in node.ports.items():
             machine.add_port(port, own.mac, sim_link.mtu, node.costs[port], self.now)
             if not sim_link.is_up:
@@ -276,7 +285,9 @@ class SimNetwork:
             tap(self._now_s, own.node, far.node, frame)
         if not sim_link.is_up or len(frame) - ETHER_BYTES > sim_link.mtu:
             self.drops[DropReason.PORT_DOWN if not sim_link.is_up else DropReason.TOO_BIG] += 1
-        elif sim_link.loss and sim_link.loses(far.mac, self._random.random()):
+        elif sim_link.is_full(far.mac, self._now_s) or (
+            sim_link.loss and sim_link.loses(far.mac, self._random.random())
+        ):
             self.lost += 1
         else:
             delay_s = sim_link.delay_s + (self._random.random() * sim_link.jitter_s if sim_link.jitter_s else 0.0)
@@ -295,6 +306,7 @@ class SimNetwork:
             if len(node.stalled) < _STALLED_MAX:
                 node.stalled.append((end, frame))
             return
+        node.came[end.port] += 1
         if node.table is not None:
             mtus = {port: sim_link.mtu for port, (sim_link, _, _) in node.ports.items() if sim_link.is_up}
             decision = decide(frame, node.table.entries, mtus, node.table.sides, end.port)

@@ -5,8 +5,12 @@ No I/O. ``namespaces`` realises the same topology with kernel namespaces and rea
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from typing import Final
+
+from cryptography.hazmat.primitives.asymmetric import ec
 
 from gdp.client.participant import Participant, Topic
 from gdp.client.rib_host import RibHost
@@ -14,7 +18,7 @@ from gdp.control.settings import NodeSettings
 from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
-from gdp.crypto.keys import SigningKey
+from gdp.crypto.keys import SoftwareKey
 from gdp.crypto.validity import Validity
 from gdp.limits import ADVERTISEMENT_LEASE_S, DEAD_S, HELLO_S
 from gdp.metadata import Metadata
@@ -33,6 +37,7 @@ from gdp.trust.right import Right
 __all__ = ["Simulation"]
 
 _YEAR_S = 365 * 86_400
+_ORDER: Final = 0xFFFFFFFF00000000FFFFFFFFFFFFFFFFBCE6FAADA7179E84F3B9CAC2FC632551  # of P-256
 
 
 @dataclass(slots=True, kw_only=True)
@@ -72,15 +77,17 @@ class Simulation:
     owner: Owner = field(init=False)
     settled_s: float = field(init=False)  # when ``run_until_attached`` last ended; at first, when it began
     _incarnation: int = 0
+    _keys: int = 0
+    _serials: int = 1 << 64
 
     def __post_init__(self) -> None:
         self.network = SimNetwork(self.seed)
         self.settled_s = self.network.now.mono_s
-        self.owner = Owner(SigningKey.generate(), bytes(range(32)))
+        self.owner = Owner(self._key(), bytes(range(32)))
         self.validity = Validity(int(EPOCH_UNIX_S) - _YEAR_S, int(EPOCH_UNIX_S) + _YEAR_S)
         for domain in self.topology.domains:
             self.authorities[domain.label] = CertificateAuthority.create(
-                domain.label, SigningKey.generate(), self.validity
+                domain.label, self._key(), self.validity, self._serial
             )
         for node in self.topology.nodes:
             self._add_switch(node, self.topology.domain_of(node).label)
@@ -101,7 +108,7 @@ class Simulation:
         """Return the identity of a node, made at the first call."""
         known = self.identities.get(label)
         if known is None:
-            keys = NodeKeys.generate(role, label.replace("/", "-"))
+            keys = NodeKeys.generate(role, label.replace("/", "-"), key=self._key())
             known = self.identities[label] = keys.join(self.authorities[domain], self.validity)
         return known
 
@@ -174,6 +181,17 @@ class Simulation:
         self.settled_s = self.network.now.mono_s
         return settled
 
+    def _key(self) -> SoftwareKey:
+        """Return a key that follows from the seed, so that names, and all that is sorted by them, repeat."""
+        self._keys += 1
+        digest = hashlib.sha256(b"%d %d" % (self.seed, self._keys)).digest()
+        return SoftwareKey.of(ec.derive_private_key(int.from_bytes(digest, "big") % (_ORDER - 1) + 1, ec.SECP256R1()))
+
+    def _serial(self) -> int:
+        """Return the next serial number of a certificate; all have the same length."""
+        self._serials += 1
+        return self._serials
+
     def _add_switch(self, name: str, domain: str) -> None:
         self.identity(Role.LEAF if name in self.leaves else Role.SWITCH, name, domain)
         self.network.add(name, *self._switch(name, domain))
@@ -192,9 +210,16 @@ class Simulation:
                 places[domain.label if number == 1 else f"{domain.label}#{number}"] = at
         return places
 
-    def _rib_names(self, domain: str | None) -> tuple[Name, ...]:
+    def _rib_names(self, domain: str) -> tuple[Name, ...]:
         labels = [label for label in self._rib_places() if label.split("#", maxsplit=1)[0] == domain]
         return tuple(self.identities[f"rib:{label}"].name for label in labels)
+
+    def _upper_names(self, domain: str | None) -> tuple[Name, ...]:
+        """Return the RIBs of a domain, and after them those of the tiers above it."""
+        if domain is None:
+            return ()
+        above = next(each.upper for each in self.topology.domains if each.label == domain)
+        return self._rib_names(domain) + self._upper_names(above)
 
     def _add_rib(self, label: str, at: Attachment) -> None:
         node = self.rib_node(label)
@@ -203,7 +228,7 @@ class Simulation:
 
     def _rib(self, label: str) -> RibHost:
         domain = next(each for each in self.topology.domains if each.label == label.split("#", maxsplit=1)[0])
-        upper, peers = self._rib_names(domain.upper), self._rib_names(domain.label)
+        upper, peers = self._upper_names(domain.upper), self._rib_names(domain.label)
         identity = self.identities[f"rib:{label}"]
         policy = self.policy(domain.label)
         rib = RibCore(identity, policy, MemoryStore(), RibSettings(upper=upper, peers=peers))

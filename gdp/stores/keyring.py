@@ -19,7 +19,7 @@ system refuses.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final, TypeVar
 
@@ -31,6 +31,7 @@ from gdp.crypto.keys import PublicKey
 from gdp.crypto.x509_profile import to_pem
 from gdp.errors import GdpError, LocalError
 from gdp.metadata import Metadata
+from gdp.stores.checkout import ignore_folder, refuse_work_tree
 from gdp.stores.files import NewFile, private, public, read_private, read_public, write_all
 from gdp.stores.private_keys import Storage, key_file, read_secret, read_signing_key, secret_file, storage_of
 from gdp.trust.delegation import Delegation
@@ -122,7 +123,7 @@ def save_domain(
         ROOT_KEY: key_file(authority.key, passphrase),
         ROOT_CERTIFICATE: public(authority.root.to_pem()),
     }
-    write_all(directory, files, force=force)
+    _write_keys(directory, files, force=force)
 
 
 def load_domain(directory: Path) -> CertificateAuthority:
@@ -139,7 +140,7 @@ def save_owner(directory: Path, owner: Owner, *, passphrase: bytes | None = None
         OWNER_MASTER: secret_file(owner.master, passphrase),
         OWNER_PUBLIC: public(owner.public.to_pem()),
     }
-    write_all(directory, files, force=force)
+    _write_keys(directory, files, force=force)
 
 
 def load_owner(directory: Path) -> Owner:
@@ -170,7 +171,7 @@ def save_node_keys(
         NODE_METADATA: public(text.encode()),
         REQUEST: public(keys.request()),
     }
-    write_all(directory, files, force=force)
+    _write_keys(directory, files, force=force)
 
 
 def load_node_keys(directory: Path) -> NodeKeys:
@@ -189,7 +190,7 @@ def save_identity(directory: Path, identity: Identity, *, force: bool = False) -
         NODE_CERTIFICATE: public(to_pem(identity.membership)),
         CARD: public(NodeDescriptor.make(identity)),
     }
-    write_all(directory, files, force=force)
+    _write_keys(directory, files, force=force)
 
 
 def save_membership(directory: Path, member: Membership, root: Root) -> None:
@@ -218,7 +219,7 @@ def save_delegation(directory: Path, delegation: Delegation, *, force: bool = Fa
         directory: a node's ``delegations``, or another directory from which it is copied there.
     """
     name = delegation.name.to_text() + _DELEGATION_SUFFIX
-    write_all(directory, {name: private(delegation.to_wire())}, force=force)
+    _write_keys(directory, {name: private(delegation.to_wire())}, force=force)
     return directory / name
 
 
@@ -263,6 +264,13 @@ def store_again(directory: Path, passphrase: bytes | None) -> dict[Path, Storage
             files[path.name] = key_file(read_signing_key(path), passphrase)
     write_all(directory, files, force=True)
     return storage(directory)
+
+
+def _write_keys(directory: Path, files: Mapping[str, NewFile], *, force: bool) -> None:
+    """Write files as ``write_all`` does, into a folder that git ignores."""
+    refuse_work_tree(directory)
+    write_all(directory, files, force=force)
+    ignore_folder(directory)
 
 
 def _node_metadata(data: bytes) -> tuple[Role, str, bytes]:

@@ -12,16 +12,18 @@ The path of a punted frame::
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Final
 
 from gdp.control.boundary import ErrorBoundary
 from gdp.control.channel import Channels, Opened
+from gdp.control.diagnostics import Diagnostics
 from gdp.control.endpoint_record import EndpointRecord
 from gdp.control.endpoints import Endpoint
 from gdp.control.fragments import ControlFragmenter, ControlReassembler
 from gdp.control.hello_port import HelloPort
 from gdp.control.join import Join
+from gdp.control.link_state import LinkState, Scope
 from gdp.control.neighbor_discovery import Change, HelloProtocol
 from gdp.control.neighbour import Neighbour, NeighbourState
 from gdp.control.revocation_sync import RevocationSync
@@ -30,14 +32,16 @@ from gdp.control.waiting import Wait, WaitReason, port_waits, stranger_waits
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, parse
+from gdp.diagnosis.facts import SwitchFacts, WaitFact
 from gdp.errors import DropReason, FrameError, RemoteError, StatementError
-from gdp.frame.codec import HEADER_BYTES, SECOND_PATH, Header, decode, encode
+from gdp.frame.codec import HEADER_BYTES, HOPS_MASK, SECOND_PATH, Header, decode, encode
 from gdp.frame.kinds import CONTROL_FROM, Kind
 from gdp.limits import ADVERTISEMENTS_BURST, ADVERTISEMENTS_PER_S, HOPS_MAX, JOINS_BURST, JOINS_PER_S
 from gdp.names import Name
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
 from gdp.switch.advertisements import AdvertisementHandler
 from gdp.switch.dependents import Dependents
+from gdp.switch.diagnostic_answers import DiagnosticAnswers
 from gdp.switch.direct_tunnels import Action, DirectTunnels
 from gdp.switch.endpoint_exchange import EndpointExchange, Refusal
 from gdp.switch.evidence import Evidence
@@ -45,9 +49,11 @@ from gdp.switch.flooding import Flooding
 from gdp.switch.local_advertisements import LocalAdvertisements
 from gdp.switch.location_updates import LocationUpdates
 from gdp.switch.multicast import MulticastTrees
+from gdp.switch.name_facts import location_facts, reached_switches, trees_facts
 from gdp.switch.name_resolver import NameResolver
 from gdp.switch.outbox import Outbox
 from gdp.switch.path_updates import PathUpdates
+from gdp.switch.paths import Paths
 from gdp.switch.presence import PresenceAnswers
 from gdp.switch.relocation import Relocations
 from gdp.switch.revocations import RevocationHandler
@@ -75,6 +81,7 @@ class SwitchCore:
         self.hello_protocol = HelloProtocol(
             identity, policy, self._fragmenter, settings,
             digest_for=self._digest_for, incarnation_elsewhere=self._incarnation_elsewhere,
+            is_only_way=self._is_only_way,
         )  # fmt: skip
         self._outbox = Outbox(self.hello_protocol, self._fragmenter)
         self._flooding = Flooding(
@@ -133,6 +140,15 @@ class SwitchCore:
             multicast=self.multicast, unicast=self.unicast, rib_client=self.rib_client, locations=self._locations,
             relocations=self.relocations, held=self._held, outbox=self._outbox,
         )  # fmt: skip
+        self.diagnostics = Diagnostics(
+            identity, policy, self._fragmenter, settings.first_sequence,
+            lambda frames, to, now: self.unicast.originate(frames, to, identity.name, now.mono_s),
+        )  # fmt: skip
+        self.diagnostic_answers = DiagnosticAnswers(
+            me=identity.name, hello_protocol=self.hello_protocol, table=table, multicast=self.multicast,
+            attached=self.attached, resolver=self.resolver, paths=self._paths, wake=self._wake,
+            diagnostics=self.diagnostics,
+        )  # fmt: skip
         self.boundary = ErrorBoundary()
         self._join_paces = TokenBuckets(JOINS_PER_S, JOINS_BURST)
         self._advertisement_paces = TokenBuckets(ADVERTISEMENTS_PER_S, ADVERTISEMENTS_BURST)
@@ -151,6 +167,11 @@ class SwitchCore:
         return self.rib_client.rib
 
     @property
+    def paths(self) -> Paths:
+        """Return the paths to the switches that link states name."""
+        return self._paths
+
+    @property
     def severed(self) -> frozenset[Name]:
         """Return the switches of the domain that only leaves connect to this one, so that no path leads to them."""
         return self._paths.severed()
@@ -164,6 +185,10 @@ class SwitchCore:
     def link_states(self) -> int:
         """Return how many link states are known."""
         return len(self._flooding.link_states)
+
+    def known_link_states(self, scope: Scope) -> list[LinkState]:
+        """Return the newest link state of each switch, in one scope."""
+        return self._flooding.link_states.states(scope)
 
     def waits(self, attachments: Collection[int], now_s: float) -> list[Wait]:
         """Return the conditions that are missing before this switch can serve; empty when none is.
@@ -184,9 +209,39 @@ class SwitchCore:
             waits.append(Wait(WaitReason.NO_RIB))
         return waits
 
+    def name_facts(self, name: Name, now: Timestamps, waits: tuple[WaitFact, ...] = ()) -> SwitchFacts:
+        """Return what this switch knows about a name, for a diagnosis."""
+        member = self._identity.member
+        readers, branches, is_joined = trees_facts(self.multicast, name)
+        return SwitchFacts(
+            name=self.name.to_text(),
+            domain=member.domain.to_text(),
+            unix_s=now.unix_s,
+            valid_from_unix_s=float(member.not_before_unix_s),
+            valid_until_unix_s=float(member.not_after_unix_s),
+            rib="" if self.rib is None else self.rib.to_text(),
+            is_rib_silent=self.resolver.cache.serves_stale,
+            waits=waits,
+            neighbours=tuple(each.name.to_text() for each in self.hello_protocol.all_up()),
+            proxies=tuple(each.name.to_text() for each in self.hello_protocol.all_up() if each.role is Role.PROXY),
+            reaches=reached_switches(self._paths, self._policy, self.name),
+            attached=tuple(
+                f"{each.advertisement.node.to_text()} {each.advertisement.right.value}"
+                for each in self.attached.named(name)
+            ),
+            locations=location_facts(self.resolver.cache, self._paths, self._policy, self.name, name, now.mono_s),
+            is_negative=self.resolver.cache.is_negative(name, now.mono_s),
+            readers=readers,
+            branches=branches,
+            is_joined=is_joined,
+            drops={reason.label: count for reason, count in self.drops().items() if count},
+            pending=self.resolver.pending_frames,
+        )
+
     def drops(self) -> Mapping[DropReason, int]:
         """Return what the control plane dropped, by reason."""
         own = self._drops + self._reassembler.drops + self.hello_protocol.drops + self._channels.drops
+        own += self.diagnostics.drops
         return own + self._flooding.drops + self.resolver.drops + self.multicast.drops + self.unicast.drops
 
     def add_port(self, index: int, mac: bytes, mtu: int, cost: int, now: Timestamps) -> None:
@@ -231,6 +286,7 @@ class SwitchCore:
         if has_others:
             self._rest_due_s = None
             self._presence.answer(now.mono_s)
+            self.diagnostics.answer_waiting(now)
             self._flooding.tell_of_conflicts(now.mono_s)
             self._path_updates.plan(now.mono_s)
 
@@ -243,6 +299,7 @@ class SwitchCore:
             self._neighbour_changed(change, now_s)
         for hello in self.hello_protocol.hellos_to_send(now_s):
             self._outbox.put(hello)
+        self.diagnostics.handle_timer(now)
         if not lost and self._rest_due_s is not None and now_s < self._rest_due_s:
             return  # most due timers are keepalives
         self._rest_due_s = None
@@ -261,13 +318,14 @@ class SwitchCore:
         self._sync.handle_timer(now_s)
         self._tell_rib_of_revocations(now_s)
         self._presence.answer(now_s)
+        self.diagnostics.answer_waiting(now)
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         if self._rest_due_s is None:
             self._rest_due_s = self._next_of_rest()
-        hello_protocol_s = self.hello_protocol.get_timer()
-        return self._rest_due_s if hello_protocol_s is None else min(hello_protocol_s, self._rest_due_s)
+        times = (self._rest_due_s, self.hello_protocol.get_timer(), self.diagnostics.get_timer())
+        return min(time for time in times if time is not None)
 
     def _next_of_rest(self) -> float:
         """Return the monotonic second of the next timer outside neighbour discovery."""
@@ -287,6 +345,20 @@ class SwitchCore:
             times.append(self.attached.next_expiry())
         return min(time for time in times if time is not None)
 
+    def query_name(self, name: Name, now_s: float) -> None:
+        """Query a name at the RIB at once, known or not, for a tool of this machine."""
+        self.resolver.request_again(name, now_s)
+        self.rib_client.send_due(now_s)
+        self._rest_due_s = None
+
+    def _is_only_way(self, name: Name) -> bool:
+        """Return whether only our own link leads to a neighbour."""
+        return self._paths.is_only_way(name)
+
+    def count_arrivals(self, frames_from: Callable[[int], int]) -> None:
+        """Learn how to count the frames that have come from a port."""
+        self.hello_protocol.count_arrivals(frames_from)
+
     def poll_neighbours(self) -> Mapping[int, frozenset[bytes]]:
         """Return, once, the addresses of neighbours, former ones too, at each port where they have changed."""
         return self.hello_protocol.poll_addresses()
@@ -298,6 +370,10 @@ class SwitchCore:
 
     def frames_leave(self, now_s: float) -> None:
         """Do nothing: no path is measured here."""
+
+    def _wake(self) -> None:
+        """Note that a timer outside neighbour discovery has changed."""
+        self._rest_due_s = None
 
     def _unwatch(self, orphaned: Iterable[Name]) -> None:
         for topic in orphaned:
@@ -414,7 +490,11 @@ class SwitchCore:
                     self._take_control(arrival, header.kind, statement, now)
             return
         neighbour = self._sender(arrival)  # their frames cause no response and no query
-        if header.destination == self.name:
+        if header.kind == Kind.DIAGNOSTIC_REQUEST and header.hops_left & HOPS_MASK <= 1:
+            if self.multicast.trees.of_topic(Name(header.destination)):
+                raise FrameError(DropReason.NOT_FOR_US, "a request that a tree has copied")
+            self.diagnostics.receive(header, arrival, now, neighbour.name)
+        elif header.destination == self.name:
             self._take_own(header, arrival, now)
         elif header.hops_left & SECOND_PATH:
             raise FrameError(DropReason.NO_SECOND_PATH)  # nothing is asked for it: the first copy travels anyway
@@ -497,6 +577,8 @@ class SwitchCore:
             )  # fmt: skip
             reply = encode(back) + arrival.frame[HEADER_BYTES : HEADER_BYTES + header.length]
             self.unicast.send([reply], Name(header.source), self.name, now.mono_s)
+        elif header.kind in (Kind.DIAGNOSTIC_REQUEST, Kind.DIAGNOSTIC_REPLY):
+            self.diagnostics.receive(header, arrival, now, self._sender(arrival).name)
         else:
             raise FrameError(DropReason.NOT_FOR_US, str(header.kind))
 

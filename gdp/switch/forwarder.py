@@ -5,7 +5,8 @@ sections 3 and 7. The order of the checks:
 
 1. shorter than an Ethernet and a GDP header: drop, truncated; another EtherType or version: drop;
 2. a kind from 0x80 on is for the neighbour itself: punt;
-3. hops left 0 or 1: drop, for it may not leave again; a payload longer than the received bytes: drop, truncated;
+3. hops left 0 or 1: drop, for it may not leave again, but punt a diagnostic request; a payload longer than the received
+   bytes: drop, truncated;
 4. look up destination and source, then destination alone; a miss: punt; an entry whose frames come from other sides:
    drop, wrong side; an entry without hops: drop, no route. A copy for the second path has a key of its own, the
    destination with its last bit inverted; a miss is a drop, because the first copy travels anyway;
@@ -30,7 +31,7 @@ from gdp.frame.codec import (
     SECOND_PATH,
     second_path_key,
 )
-from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, VERSION
+from gdp.frame.kinds import CONTROL_FROM, ETHERTYPE, VERSION, Kind
 from gdp.names import NAME_BYTES
 from gdp.switch.table import MACS_BYTES, Hop, Hops, is_side
 
@@ -38,6 +39,7 @@ __all__ = ["PUNT", "Decision", "Drop", "Forward", "Punt", "decide", "rewrite"]
 
 _NO_SIDES: Final[Mapping[bytes, int]] = {}
 _ETHERTYPE: Final = ETHERTYPE.to_bytes(2, "big")
+_KIND: Final = ETHER_BYTES + KIND_AT
 _HOPS: Final = ETHER_BYTES + HOPS_AT
 _LENGTH: Final = ETHER_BYTES + 6
 _DESTINATION: Final = ETHER_BYTES + DESTINATION_AT
@@ -85,10 +87,12 @@ def decide(
         return Drop(DropReason.BAD_ETHERTYPE)
     if frame[ETHER_BYTES] != VERSION:
         return Drop(DropReason.BAD_VERSION)
-    if frame[ETHER_BYTES + KIND_AT] >= CONTROL_FROM:
+    if frame[_KIND] >= CONTROL_FROM:
         return PUNT
     if frame[_HOPS] & HOPS_MASK <= 1:
-        return Drop(DropReason.HOPS_EXPIRED)
+        # this switch answers it; a second copy would make a second answer
+        is_for_us = frame[_KIND] == Kind.DIAGNOSTIC_REQUEST and not frame[_HOPS] & SECOND_PATH
+        return PUNT if is_for_us else Drop(DropReason.HOPS_EXPIRED)
     if len(frame) < OVERHEAD_BYTES + int.from_bytes(frame[_LENGTH : _LENGTH + 2], "big"):
         return Drop(DropReason.TRUNCATED)
     key = bytes(frame[_DESTINATION : ETHER_BYTES + HEADER_BYTES])

@@ -18,7 +18,9 @@ from gdp.trust.right import Right
 
 __all__ = ["LocalAdvertisement", "LocalAdvertisements"]
 
-RELAY_AGAIN_S: Final = 0.4
+RELAY_AGAIN_S: Final = 0.4  # many attempts in a lease: a relay over a lossy path often fails
+_RELAY_MAX_S: Final = 3.2  # over a slow link
+_ROUND_TRIPS: Final = 2.0
 RELAY_TRIES: Final = 20
 
 
@@ -32,6 +34,7 @@ class LocalAdvertisement:
     expires_s: float
     relay_at_s: float
     tries: int = 0
+    is_slow: bool = False  # it was last relayed over a slow link
     is_settled: bool = False  # the RIB has sent an AdvertiseAck
 
 
@@ -54,6 +57,10 @@ class LocalAdvertisements:
         """Return an advertisement, or None."""
         return self._by_name.get(name, {}).get(advertiser)
 
+    def named(self, name: Name) -> list[LocalAdvertisement]:
+        """Return the advertisements of one name."""
+        return list(self._by_name.get(name, {}).values())
+
     def at(self, name: Name) -> LocalAdvertisement | None:
         """Return an advertisement that takes unicast frames for a name, or None."""
         for attachment in self._by_name.get(name, {}).values():
@@ -64,6 +71,8 @@ class LocalAdvertisements:
     def put(self, advertisement: Advertisement, port: int, mac: bytes, now_s: float) -> LocalAdvertisement:
         """Store a verified advertisement; it is due to be relayed at once.
 
+        In place of one that waits behind a slow link it is relayed when that one was due: nodes repeat themselves, too.
+
         Raises:
             StatementError: QUOTA, the node has too many.
         """
@@ -72,8 +81,11 @@ class LocalAdvertisements:
         attachment = LocalAdvertisement(
             advertisement=advertisement, port=port, mac=mac, expires_s=now_s + advertisement.lease_s, relay_at_s=now_s
         )
+        before = self.get(advertisement.name, advertisement.node)
+        if before is not None and before.is_slow and not before.is_settled and (before.port, before.mac) == (port, mac):
+            attachment.relay_at_s, attachment.is_slow = max(before.relay_at_s, now_s), True
         self._by_name.setdefault(advertisement.name, {})[advertisement.node] = attachment
-        self._push(self._relays, now_s, attachment)
+        self._push(self._relays, attachment.relay_at_s, attachment)
         self._push(self._ends, attachment.expires_s, attachment)
         return attachment
 
@@ -113,13 +125,21 @@ class LocalAdvertisements:
             attachment.is_settled, attachment.relay_at_s, attachment.tries = False, now_s, 0
             self._push(self._relays, now_s, attachment)
 
-    def due(self, now_s: float) -> list[LocalAdvertisement]:
-        """Return the advertisements to relay now."""
-        due = []
+    def is_relay_due(self, now_s: float) -> bool:
+        """Return whether an advertisement is to be relayed now."""
+        return self._next_relay() <= now_s
+
+    def due(self, now_s: float, trip_s: float) -> list[LocalAdvertisement]:
+        """Return the advertisements to relay now.
+
+        Args:
+            trip_s: round trip of the link towards the RIB; relays do not fill a slow one.
+        """
+        due, interval_s = [], min(max(RELAY_AGAIN_S, _ROUND_TRIPS * trip_s), _RELAY_MAX_S)
         while self._next_relay() <= now_s:
             each = heapq.heappop(self._relays)[2]
             each.tries += 1
-            each.relay_at_s = now_s + RELAY_AGAIN_S
+            each.relay_at_s, each.is_slow = now_s + interval_s, interval_s > RELAY_AGAIN_S
             self._push(self._relays, each.relay_at_s, each)
             due.append(each)
         return due

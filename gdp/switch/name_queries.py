@@ -3,8 +3,9 @@
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
 A query is repeated until a response comes. A name that attached readers want, or that frames are sent to, is watched:
-its query is sent again before the watch ends, so that a RIB that restarted learns of the watch. Queries for new names
-pass the query window (``query_window.py``).
+its query is sent again before the watch ends, so that a RIB that restarted learns of the watch. A link that loses
+frames loses both this renewal and the RIB's updates, so the renewal is repeated, too. Queries for new names pass the
+query window (``query_window.py``).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ __all__ = ["BATCH_MAX", "QUERIES_MAX", "RETRY_S", "TRIES_MAX", "USED_NAMES_MAX",
 
 RETRY_S: Final = 0.25
 TRIES_MAX: Final = 8
+_RENEWAL_TRIES_MAX: Final = 4  # the pause doubles after each; then the next renewal
 QUERIES_MAX: Final = 4_096  # open at once, watches of readers not counted; each costs a signature at every try
 BATCH_MAX: Final = 64  # queries in one call, some 10 ms: a switch has other work
 USED_NAMES_MAX: Final = 8_192  # names watched because frames are sent to them
@@ -36,6 +38,7 @@ class _Query:
     is_watch: bool = False  # an attached reader needs all advertisers of the name
     used_until_s: float = 0.0  # frames are sent to the name
     is_answered: bool = False
+    renewals: int = 0  # of the watch, sent since the last response
 
 
 class NameQueries:
@@ -76,8 +79,13 @@ class NameQueries:
                 self._queries[name] = _Query(due_s=_NEVER_S, since_s=now_s, owner=owner)
                 self._window.put(owner, name)
         elif query.is_answered:
-            query.is_answered, query.tries, query.due_s = False, 0, now_s
+            query.is_answered, query.tries, query.renewals, query.due_s = False, 0, 0, now_s
             self._due_s = min(self._due_s, now_s)
+
+    def is_open(self, name: Name) -> bool:
+        """Return whether a query for a name has no response yet."""
+        query = self._queries.get(name)
+        return query is not None and not query.is_answered
 
     def watch(self, name: Name, now_s: float) -> None:
         """Query a name at once and watch it for attached readers, who proved their right: no bound applies."""
@@ -124,14 +132,14 @@ class NameQueries:
             self._remove(name)
             return
         self._window.answered(name)
-        if not query.is_answered:  # a later update renews no watch
-            query.is_answered = True
+        if not query.is_answered or query.renewals:  # another update renews no watch
+            query.is_answered, query.renewals = True, 0
             query.due_s = now_s + self._renewal_s(query)
 
     def repeat_all(self, now_s: float) -> None:
         """Send every open query and every watch again at once: there is a new RIB."""
         for query in self._queries.values():
-            query.tries = 0
+            query.tries = query.renewals = 0
             if query.due_s != _NEVER_S:
                 query.due_s = now_s
         self._due_s = min(self._due_s, now_s)
@@ -182,10 +190,20 @@ class NameQueries:
         """Record one try of a query; return for how many seconds the RIB shall watch its name."""
         query.tries += 1
         if query.is_answered:
-            query.due_s = now_s + self._renewal_s(query)
+            query.due_s = now_s + self._repeat_s(query)
         else:
             query.due_s = now_s + RETRY_S * min(2 ** (query.tries // TRIES_MAX), 8)
         return self.watch_s if query.is_watch else self._use_watch_s if query.used_until_s > now_s else 0.0
+
+    def _repeat_s(self, query: _Query) -> float:
+        """Count a renewal; return the seconds until it is repeated, unless its response comes."""
+        renewal_s = self._renewal_s(query)
+        again_s = RETRY_S * 2.0**query.renewals
+        query.renewals += 1
+        if query.renewals < _RENEWAL_TRIES_MAX and again_s < renewal_s:
+            return again_s
+        query.renewals = 0
+        return renewal_s
 
     def _renewal_s(self, query: _Query) -> float:
         return self._watch_again_s if query.is_watch else self._use_again_s

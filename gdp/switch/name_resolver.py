@@ -132,11 +132,24 @@ class NameResolver:
         self._request(name, now_s, owner)
         return None
 
+    def find(self, name: Name, now_s: float) -> list[Location] | None:
+        """Return every known advertiser of a name, whatever its right, or None after a query to the RIB."""
+        found = self.resolve_source(name, now_s)
+        return None if found is None else found.locations
+
     def _request(self, name: Name, now_s: float, owner: bytes) -> None:
         """Open a query within the rate of its owner."""
         rate = self._rates.get(owner[:1])
         if rate is None or name in self._queries or rate.spend(owner, now_s):
             self._queries.request(name, now_s, owner)
+
+    def request_again(self, name: Name, now_s: float) -> None:
+        """Query a name for this switch itself, known or not."""
+        self._queries.request(name, now_s)
+
+    def is_asking(self, name: Name) -> bool:
+        """Return whether a query for a name has no response yet."""
+        return self._queries.is_open(name)
 
     def watch(self, name: Name, now_s: float) -> None:
         """Query a name and watch it for attached readers."""

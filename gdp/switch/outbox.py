@@ -72,6 +72,12 @@ class Outbox:
         session = None if neighbour is None else neighbour.keepalives
         return 0.0 if session is None else session.quality.loss_out
 
+    def rtt_to(self, name: Name) -> float:
+        """Return the smoothed round trip of the link to a neighbour in seconds; 0: not measured, or it is not up."""
+        neighbour = self.neighbour(name)
+        session = None if neighbour is None else neighbour.keepalives
+        return 0.0 if session is None else session.quality.rtt.srtt_s or 0.0
+
     def hop(self, neighbour: Neighbour) -> Hop:
         """Return the table's hop to a neighbour."""
         return neighbour.port, neighbour.mac + self._hello_protocol.ports[neighbour.port].mac

@@ -112,6 +112,15 @@ class Paths:
                 found.append((edge["weight"] + onwards, neighbour))
         return min(found, default=(0, None))[1]
 
+    def is_only_way(self, neighbour: Name) -> bool:
+        """Return whether the link between them alone joins this switch and a neighbour, as far as is known."""
+        self._refresh()
+        if self._graph is None or neighbour not in self._graph:
+            return True
+        from networkx import has_path, restricted_view
+
+        return not has_path(restricted_view(self._graph, (), ((self._me, neighbour),)), self._me, neighbour)
+
     def distance_from(self, start: Name, switch: Name, domain: Name, allowed: frozenset[Name]) -> int | None:
         """Return the distance of a switch from another one than this; None where there is no path."""
         self._refresh()

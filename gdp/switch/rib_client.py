@@ -130,14 +130,20 @@ class RibClient:
             self.links_changed(now_s)
         if self._owed_s is not None and now_s - self._owed_s >= SILENT_S:
             self._leave_silent_rib(now_s)
-        for attachment in self._attached.due(now_s):
-            self.relay(attachment.advertisement.wire, now_s)
+        if self._attached.is_relay_due(now_s):
+            for attachment in self._attached.due(now_s, self._trip_s(self.rib)):
+                self.relay(attachment.advertisement.wire, now_s)
         for statement in self._endpoints.statements_to_send(now_s):
             self._to_rib(statement, now_s)
         for name, watch_s in self._resolver.queries_to_send(now_s):
             is_heard = bool(self._multicast.readers(name))
             query = Query(name, watch_s, self._policy.revoked.digest_about(name) if is_heard else None)
             self._to_rib(query.to_wire(self._identity.name, self._identity.key, self._identity.membership), now_s)
+
+    def _trip_s(self, rib: Name) -> float:
+        """Return the round trip of the link towards a RIB, in seconds; 0: not measured, or the RIB is here."""
+        way, _ = self._paths.to_rib(rib, self._policy.transit)
+        return 0.0 if way is None else self._outbox.rtt_to(way.first)
 
     def _leave_silent_rib(self, now_s: float) -> None:
         """Switch to another RIB; where there is none, serve known locations."""

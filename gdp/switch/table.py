@@ -98,6 +98,10 @@ class Table:
     def __len__(self) -> int:
         return len(self.entries)
 
+    def end_of(self, key: bytes) -> float | None:
+        """Return the monotonic second at which the lease of an entry ends, or None."""
+        return self._ends.get(key)
+
     def observe(self, observer: Observer | None) -> None:
         """Send one observer all present entries, and from now on each change; None: no observer."""
         self._observer = observer

@@ -14,6 +14,7 @@ that routes of different readers form no loop.
 from __future__ import annotations
 
 import heapq
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -218,6 +219,11 @@ class Trees:
     def all(self) -> list[Tree]:
         """Return every tree."""
         return [tree for topic in list(self._by_topic) for tree in self.of_topic(topic)]
+
+    def present(self) -> Iterator[Tree]:
+        """Yield every tree, to be read only: its timers are not read again."""
+        for trees in self._by_topic.values():
+            yield from trees.values()
 
     def of_topic(self, topic: Name) -> list[Tree]:
         """Return a topic's trees."""

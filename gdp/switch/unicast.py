@@ -9,6 +9,7 @@ leaves it: then only domains that the policies of both ends trust may carry the 
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
@@ -87,6 +88,16 @@ class Unicast:
                 self.drops[self._reason(destination, source)] += len(frames)
             else:
                 self._outbox.frames(hop[0], hop[1][:6], frames)
+
+    def originate(self, frames: Iterable[bytes], destination: Name, source: Name, now_s: float) -> None:
+        """Send frames of our own to a name as ``send`` does, but keep them while its location is queried.
+
+        Args:
+            frames: each with the hops that are left when it has left this switch.
+        """
+        for frame in frames:
+            leaving = frame[:HOPS_AT] + bytes([frame[HOPS_AT] + 1]) + frame[HOPS_AT + 1 :]
+            self._find(destination, source, leaving, b"", now_s)
 
     def release(self, name: Name, now_s: float) -> None:
         """Retry the frames that wait for a name."""

@@ -18,7 +18,16 @@ from prometheus_client.registry import Collector
 from gdp.errors import DropReason, LocalError
 from gdp.names import NAME_BYTES, Name
 from gdp.telemetry.scraping import ScrapeServer
-from gdp.telemetry.sources import Counts, EntryCounts, Gauge, Histogram, LinkRow, Sources
+from gdp.telemetry.sources import (
+    Counts,
+    EntryCounts,
+    Gauge,
+    Histogram,
+    LinkRow,
+    PortRow,
+    Sources,
+    TopicCounts,
+)
 
 __all__ = ["Metrics"]
 
@@ -60,6 +69,10 @@ class Metrics(Collector):
         yield from _gauges("gdp_waiting", "1: the node makes no progress for this reason", "reason", of.waiting)
         if of.links is not None:
             yield from _links(of.links())
+        if of.ports is not None:
+            yield from _ports(of.ports())
+        if of.topics is not None:
+            yield from _topics(of.topics())
         yield from _gauges("gdp_two_paths", "Flows that want two paths, by what they have", "paths", of.two_paths)
         if of.clashes is not None:
             yield CounterMetricFamily(
@@ -85,7 +98,7 @@ class Metrics(Collector):
         if self._server is not None:
             raise LocalError("metrics are served already")
         try:
-            self._server = ScrapeServer(port, lambda: generate_latest(self._registry))
+            self._server = ScrapeServer(port, lambda: generate_latest(self._registry), self._sources.health)
         except OSError as error:
             raise LocalError(f"metrics port {port}: {error.strerror}") from error
         return self._server.port
@@ -140,6 +153,45 @@ def _links(rows: Sequence[LinkRow]) -> Iterator[Metric]:
     yield costs
     yield rtts
     yield losses
+
+
+def _ports(rows: Sequence[PortRow]) -> Iterator[Metric]:
+    is_up = GaugeMetricFamily("gdp_port_up", "1: the device is on and has a carrier", labels=["port"])
+    mtus = GaugeMetricFamily("gdp_port_mtu_bytes", "Bytes of a frame after the Ethernet header", labels=["port"])
+    labels = ["port", "direction"]
+    frames = CounterMetricFamily("gdp_port_frames", "Frames at the device, of all protocols", labels=labels)
+    sizes = CounterMetricFamily("gdp_port_bytes", "Their bytes", labels=labels)
+    errors = CounterMetricFamily("gdp_port_errors", "Frames with errors at the device", labels=labels)
+    drops = CounterMetricFamily("gdp_port_drops", "Frames that the device or its queue dropped", labels=labels)
+    for row in rows:
+        is_up.add_metric([row.port], int(row.is_up))
+        mtus.add_metric([row.port], row.mtu)
+        if (counts := row.counts) is None:
+            continue
+        for family, (come, gone) in (
+            (frames, (counts.frames_in, counts.frames_out)),
+            (sizes, (counts.bytes_in, counts.bytes_out)),
+            (errors, (counts.errors_in, counts.errors_out)),
+            (drops, (counts.drops_in, counts.drops_out)),
+        ):
+            family.add_metric([row.port, "in"], come)
+            family.add_metric([row.port, "out"], gone)
+    yield from (is_up, mtus, frames, sizes, errors, drops)
+
+
+def _topics(rows: Sequence[TopicCounts]) -> Iterator[Metric]:
+    labels = ["topic", "direction"]
+    messages = CounterMetricFamily("gdp_topic_messages", "Messages of a topic that is carried now", labels=labels)
+    sizes = CounterMetricFamily("gdp_topic_bytes", "Their bytes in ROS's wire form", labels=labels)
+    lost = CounterMetricFamily("gdp_topic_lost_messages", "Messages of it that were lost", labels=labels)
+    readers = GaugeMetricFamily("gdp_topic_readers", "Its readers on the overlay", labels=["topic"])
+    for row in rows:
+        messages.add_metric([row.topic, row.direction], row.messages)
+        lost.add_metric([row.topic, row.direction], row.lost)
+        sizes.add_metric([row.topic, row.direction], row.size)
+        if row.readers is not None:
+            readers.add_metric([row.topic], row.readers)
+    yield from (messages, sizes, lost, readers)
 
 
 def _gauge(name: str, text: str, source: Gauge | None) -> Iterator[Metric]:

@@ -1,4 +1,4 @@
-"""HTTP server for scrapes, on the loopback address, in one thread.
+"""HTTP server for scrapes and probes, on the loopback address, in one thread.
 
 I/O. Every local user may connect, so everything is bounded: concurrent connections, bytes of a request, seconds of a
 connection, and connections and responses per second. A connection beyond a bound closes at once. One thread serves all,
@@ -18,6 +18,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
+from gdp.telemetry.health import PROBES, Health, probe
 from gdp.token_bucket import TokenBucket
 
 __all__ = ["CONNECTIONS_MAX", "CONNECTION_S", "REQUEST_MAX_BYTES", "ScrapeServer"]
@@ -32,6 +33,7 @@ _BACKLOG: Final = 128
 _ACCEPTS_PER_S: Final = 500.0  # about 20 us each
 _ANSWERS_PER_S: Final = 20.0  # a few ms each; a scraper polls every few seconds
 _TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
+_JSON: Final = "application/json"
 _END: Final = (b"\r\n\r\n", b"\n\n")
 
 
@@ -46,18 +48,20 @@ class _Connection:
 
 
 class ScrapeServer:
-    """Server of GET on any path with the present text.
+    """Server of GET with the present text; the paths of ``PROBES`` give the state of the node instead.
 
     Args:
         port: of 127.0.0.1; 0: the system chooses.
         text: called in the server's thread, once for each response.
+        health: called for each probe; None: the node has no probes, and they get 404.
 
     Raises:
         OSError: the port is in use.
     """
 
-    def __init__(self, port: int, text: Callable[[], bytes]) -> None:
+    def __init__(self, port: int, text: Callable[[], bytes], health: Callable[[], Health] | None = None) -> None:
         self._text = text
+        self._health = health
         self._accepts, self._answers = (TokenBucket(each, each) for each in (_ACCEPTS_PER_S, _ANSWERS_PER_S))
         self._connections: dict[int, _Connection] = {}
         self._resume_s: float | None = None  # when the server accepts connections again
@@ -160,17 +164,25 @@ class ScrapeServer:
             self._end(connection)
 
     def _answer_to(self, request: bytes) -> bytes:
-        method = request.partition(b" ")[0]
+        method, _, rest = request.partition(b" ")
+        path = rest.split(maxsplit=1)[0].partition(b"?")[0].decode(errors="replace") if rest.split() else ""
         if method not in (b"GET", b"HEAD"):
             return _answer("405 Method Not Allowed", b"")
         if not self._answers.spend(time.monotonic()):
             return _answer("503 Service Unavailable", b"")
+        is_head = method == b"HEAD"
+        if path in PROBES:
+            if self._health is None:
+                return _answer("404 Not Found", b"")
+            is_good, state = probe(path, self._health(), time.monotonic())
+            status = "200 OK" if is_good else "503 Service Unavailable"
+            return _answer(status, state, is_head=is_head, content_type=_JSON)
         try:
             body = self._text()
         except Exception:  # a source of the node failed; the node itself continues
             log.exception("scrape failed")
             return _answer("500 Internal Server Error", b"")
-        return _answer("200 OK", body, is_head=method == b"HEAD")
+        return _answer("200 OK", body, is_head=is_head)
 
     def _end(self, connection: _Connection) -> None:
         del self._connections[connection.peer.fileno()]
@@ -178,6 +190,8 @@ class ScrapeServer:
         connection.peer.close()
 
 
-def _answer(status: str, body: bytes, *, is_head: bool = False) -> bytes:
-    head = f"HTTP/1.1 {status}\r\nContent-Type: {_TYPE}\r\nContent-Length: {len(body)}\r\nConnection: close\r\n\r\n"
+def _answer(status: str, body: bytes, *, is_head: bool = False, content_type: str = _TYPE) -> bytes:
+    head = (
+        f"HTTP/1.1 {status}\r\nContent-Type: {content_type}\r\nContent-Length: {len(body)}\r\nConnection: close\r\n\r\n"
+    )
     return head.encode() + (b"" if is_head else body)

@@ -11,8 +11,21 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from gdp.errors import DropReason
+from gdp.telemetry.health import Health
 
-__all__ = ["LATENCY_BOUNDS_S", "Counts", "EntryCounts", "Gauge", "Histogram", "LinkRow", "Sources", "count_list"]
+__all__ = [
+    "LATENCY_BOUNDS_S",
+    "Counts",
+    "DeviceCounts",
+    "EntryCounts",
+    "Gauge",
+    "Histogram",
+    "LinkRow",
+    "PortRow",
+    "Sources",
+    "TopicCounts",
+    "count_list",
+]
 
 LATENCY_BOUNDS_S: Final = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 
@@ -65,6 +78,54 @@ class LinkRow(NamedTuple):
     cost: int
 
 
+class DeviceCounts(NamedTuple):
+    """What the kernel counted at a device since it was made: all protocols together."""
+
+    frames_in: int
+    frames_out: int
+    bytes_in: int
+    bytes_out: int
+    errors_in: int
+    errors_out: int
+    drops_in: int
+    drops_out: int
+
+
+class PortRow(NamedTuple):
+    """One port.
+
+    Attributes:
+        port: device name.
+        mtu: bytes after the Ethernet header.
+        counts: None while there is no such device.
+    """
+
+    port: str
+    is_up: bool
+    mtu: int
+    counts: DeviceCounts | None
+
+
+class TopicCounts(NamedTuple):
+    """One topic that a proxy carries now, in one direction.
+
+    Attributes:
+        topic: short overlay name, or the local ROS name where the configuration allows it.
+        direction: in or out.
+        messages: since the flow began.
+        size: their bytes in ROS's wire form.
+        lost: messages that did not arrive, or that did not leave.
+        readers: of an outgoing topic, on the overlay; None for an incoming one.
+    """
+
+    topic: str
+    direction: str
+    messages: int
+    size: int
+    lost: int
+    readers: int | None
+
+
 EntryCounts = Callable[[], Mapping[bytes, tuple[int, int]]]  # table key to frames and bytes
 
 
@@ -89,6 +150,9 @@ class Sources:
         calls: events of services with several servers: late and unexpected responses, hedged requests.
         waiting: 1 for each reason for which the node makes no progress, 0 for the others.
         links: to neighbours that are up.
+        ports: with the kernel's counts of their devices.
+        topics: that a proxy carries now.
+        health: of the loop, for probes.
         two_paths: flows that want two paths, by what they have: disjoint, shared, single.
         clashes: signs of another node with this identity.
         latency: one-way, from the source's stamp to delivery.
@@ -110,6 +174,9 @@ class Sources:
     calls: Counts | None = None
     waiting: Counts | None = None
     links: Callable[[], Sequence[LinkRow]] | None = None
+    ports: Callable[[], Sequence[PortRow]] | None = None
+    topics: Callable[[], Sequence[TopicCounts]] | None = None
+    health: Callable[[], Health] | None = None
     two_paths: Counts | None = None
     clashes: Gauge | None = None
     latency: Callable[[], Histogram] | None = None

@@ -30,10 +30,11 @@ class Policy:
         own: the root of the domain that this node belongs to.
         trusted: roots of other domains whose members may advertise, attach and carry traffic here.
         transit: domains through which this domain lets its traffic pass; all trusted ones if not given.
+        diagnostics: domains whose members get whole diagnostic replies; others but our own get latency only.
         remembered: how many verified memberships to cache.
 
     Raises:
-        LocalError: ``transit`` names a domain that is not trusted.
+        LocalError: ``transit`` or ``diagnostics`` names a domain that is not trusted.
     """
 
     def __init__(
@@ -42,6 +43,7 @@ class Policy:
         trusted: Iterable[Root] = (),
         transit: Iterable[Name] | None = None,
         *,
+        diagnostics: Iterable[Name] = (),
         remembered: int = MEMBERS_REMEMBERED,
     ) -> None:
         roots = {root.domain: root for root in (own, *trusted)}
@@ -51,6 +53,9 @@ class Policy:
         self.transit: Final = frozenset(roots if transit is None else {own.domain, *transit})
         if not self.transit <= roots.keys():
             raise LocalError("transit goes through trusted domains only")
+        self.diagnostics: Final = frozenset({own.domain, *diagnostics})
+        if not self.diagnostics <= roots.keys():
+            raise LocalError("diagnostics are for members of trusted domains only")
         self.revoked: Final = Revocations(_keys_of(roots.values()))
         self._by_issuer = _by_issuer(roots.values())
         self._members: Lru[Membership] = Lru(remembered)

@@ -23,7 +23,7 @@ __all__ = ["BootedMachine"]
 
 _BOOT: Final = Path(__file__).with_name("boot.sh")
 _SPACES: Final = ("--mount", "--pid", "--uts", "--ipc", "--cgroup", "--fork", "--kill-child")
-_PATIENCE_S: Final = 20.0
+_PATIENCE_S: Final = 120.0
 
 
 class BootedMachine:
@@ -41,7 +41,7 @@ class BootedMachine:
         run.plan_cgroup(self._group.name)
         self._group.make()
         network = self.root / "etc/cloud/cloud.cfg.d/91_network.cfg"
-        network.parent.mkdir(parents=True)
+        network.parent.mkdir(parents=True, exist_ok=True)  # a machine that boots again has it
         network.write_text(lease.network_config, encoding="ascii")
         self._master, slave = os.openpty()
         argv = ["unshare", *_SPACES, str(_BOOT), str(run.directory / name), str(image), os.ttyname(slave)]

@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import secrets
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Final, NamedTuple, Protocol, TypeAlias
 
 from gdp.client.participant import Message, Topic
@@ -21,23 +21,28 @@ from gdp.nodes.delegation_store import DelegationStore
 from gdp.trust.right import Right
 from proxy.bridge.bridge_election import SIGN, BridgeElection, presence_of, sign
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.desired_flows import ConfigProblem, FlowSpec, exposed, imported
+from proxy.bridge.desired_flows import ConfigProblem, DeniedName, FlowSpec, denied, exposed, imported
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.exposed_service import ExposedService
 from proxy.bridge.exposed_topic import ExposedTopic
 from proxy.bridge.faults import Fault
 from proxy.bridge.imported_service import ImportedService
 from proxy.bridge.imported_topic import ImportedTopic
+from proxy.bridge.liveliness import NameLiveliness
+from proxy.bridge.readiness import ReadinessProbe
 from proxy.bridge.sent_stats import SentStats
+from proxy.bridge.status_topic import StatusTopic, open_status_topics
 from proxy.bridge.topic_stats import TopicStats
 from proxy.config.rule import Rule
+from proxy.config.status_topic import StatusTopicConfig
 from proxy.endpoints.endpoint import Endpoint, EndpointError, Event, Graph, GraphEntity, Role, proxy_node_name
 
-__all__ = ["Bridge", "BridgeRules"]
+__all__ = ["Bridge", "BridgeRules", "FlowChange"]
 
 log = logging.getLogger(__name__)
 
 _ENDED_MAX: Final = 256
+_CHANGES_MAX: Final = 512  # of unread flow changes; a bridge of a recording never reads them
 TICK_S: Final = 0.05  # interval at which services check their peers, and pending flows are checked
 
 Flow: TypeAlias = ExposedTopic | ImportedTopic | ExposedService | ImportedService
@@ -56,6 +61,13 @@ class BridgeRules(Protocol):
 
     def endpoint_of(self, rule: Rule) -> int:
         """Return the number of the endpoint to which a rule applies."""
+
+
+class FlowChange(NamedTuple):
+    """A flow that began, or that ended."""
+
+    flow_spec: FlowSpec
+    is_begun: bool
 
 
 class _Key(NamedTuple):
@@ -97,6 +109,7 @@ class Bridge:
 
     Args:
         endpoints: numbered as in the rules, in the order of the configuration's ``ros`` section.
+        status_topic: where local nodes read the parties of names; None: nowhere.
         look_s: seconds of observation before any flow begins: graphs need them to show the other proxies.
     """
 
@@ -108,6 +121,7 @@ class Bridge:
         held: DelegationStore,
         *,
         look_s: float = 0.0,
+        status_topic: StatusTopicConfig | None = None,
     ) -> None:
         self._site = site
         self._config = config
@@ -117,17 +131,22 @@ class Bridge:
         self._flows: dict[_Key, tuple[FlowSpec, Flow]] = {}
         self._inbound: dict[Name, Flow] = {}  # the flow that receives the overlay's messages of a name
         self._timed: list[ExposedService | ImportedService] = []
+        self._probes: dict[_Key, ReadinessProbe] = {}  # of local servers, whether their flow has begun or not
         self._since: dict[_Key, float] = {}  # desired flows that wait for other proxies to begin
+        self._flow_begun_s: dict[_Key, float] = {}
         self._failed: dict[_Key, ConfigProblem] = {}  # flows that this graph does not allow at present
         self._undelegated: dict[_Key, FlowSpec] = {}  # failed flows that wait for a delegation
         self._complaints: set[ConfigProblem] = set()
         self._ended = deque[TopicStats](maxlen=_ENDED_MAX)
+        self._changes = deque[FlowChange](maxlen=_CHANGES_MAX)
         self._is_stale = True
         self._look_s = look_s
         self._begun_s: float | None = None  # time of the first refresh
         self._tick_at_s = 0.0
         self._now_s = 0.0
         self.unknown_names = 0
+        live = [seat for seat in self._seats if seat.endpoint.is_live and status_topic is not None]
+        self._status_topics: list[StatusTopic] = [] if status_topic is None else open_status_topics(live, status_topic)
         for seat in self._seats:
             if not seat.endpoint.is_live:
                 continue  # no other proxy takes part in a recording
@@ -140,6 +159,32 @@ class Bridge:
     def flows(self) -> list[tuple[FlowSpec, Flow]]:
         """Return the present flows."""
         return list(self._flows.values())
+
+    @property
+    def rules(self) -> BridgeRules:
+        """Return the present rules."""
+        return self._config
+
+    @property
+    def held(self) -> DelegationStore:
+        """Return the delegations in use."""
+        return self._held
+
+    @property
+    def problems(self) -> Collection[ConfigProblem]:
+        """Return why names that rules name are not carried at present."""
+        return self._complaints
+
+    def graphs(self) -> list[Graph]:
+        """Return the entities of each graph, in the order of the configuration."""
+        return [seat.endpoint.graph() for seat in self._seats]
+
+    def flow_of(self, rule: Rule, local: str, name: Name) -> tuple[Flow, float] | None:
+        """Return the flow of a local name under a rule, and when it began, monotonic seconds; None: there is none."""
+        for key, (flow_spec, flow) in self._flows.items():
+            if (flow_spec.rule, flow_spec.local, flow_spec.name) == (rule, local, name):
+                return flow, self._flow_begun_s[key]
+        return None
 
     @property
     def labels(self) -> list[str]:
@@ -160,10 +205,49 @@ class Bridge:
         exposed = [(spec.local, flow.publisher) for spec, flow in self.flows if isinstance(flow, ExposedTopic)]
         return [SentStats.of(local, each) for local, each in exposed if each is not None and not each.confirms]
 
+    def answered_by(self, name: Name) -> Name | None:
+        """Return the server whose response ended the latest call of a service; None: there was no response."""
+        flow = self._inbound.get(name)
+        return flow.answered_by if isinstance(flow, ImportedService) else None
+
+    def publishers_of(self, name: Name) -> list[Name]:
+        """Return the remote publishers of a topic that is read here, as far as they have introduced themselves."""
+        return [each.publisher for each in self._site.member.writer_proxies_of(name)]
+
     @property
     def undelegated(self) -> list[FlowSpec]:
         """Return the flows that only lack a delegation."""
         return [flow_spec for key, flow_spec in self._undelegated.items() if key in self._failed]
+
+    @property
+    def denied(self) -> list[DeniedName]:
+        """Return the local names that rules are about, and that ``deny`` keeps local."""
+        found = list[DeniedName]()
+        for at, seat in enumerate(self._seats):
+            graph = seat.endpoint.graph()
+            for rules, is_exposed in ((self._config.expose, True), (self._config.imports, False)):
+                here = [rule for rule in rules if self._config.endpoint_of(rule) == at]
+                found += denied(here, graph, is_exposed=is_exposed)
+        return found
+
+    def liveliness(self, now_s: float) -> list[NameLiveliness]:
+        """Return the parties of every name that is carried."""
+        return [
+            NameLiveliness(
+                kind=spec.rule.kind,
+                local=spec.local,
+                shared=spec.rule.global_name_of(spec.local),
+                is_exposed=spec.is_exposed,
+                is_joined=not isinstance(flow, ImportedTopic) or flow.is_joined,
+                parties=flow.parties(now_s),
+            )
+            for spec, flow in self.flows
+        ]
+
+    @property
+    def unready(self) -> list[tuple[str, str]]:
+        """Return the local servers whose probe does not pass, each with the reason."""
+        return [(key.local, probe.reason) for key, probe in self._probes.items() if not probe.is_ready]
 
     @property
     def is_settled(self) -> bool:
@@ -179,6 +263,11 @@ class Bridge:
                 self._failed.clear()
         for message in self._site.member.poll_messages():
             self._receive(message, now_s)
+        for key, probe in self._probes.items():
+            probe.handle_timer(now_s)
+            if probe.poll_changed():
+                self._is_stale = True
+                log.info("server ready=%s kind=%s reason=%s", probe.is_ready, key.kind, probe.reason or "probe passed")
         if self._is_stale or (self._since and now_s >= self._tick_at_s):
             self._refresh(now_s)
         for seat in self._seats:
@@ -190,17 +279,26 @@ class Bridge:
                 flow.tick(now_s)
             elif due_s is not None and due_s <= now_s:
                 flow.handle_timer(now_s)
+        for topic in self._status_topics:
+            if topic.is_due(now_s):
+                topic.update(self.liveliness(now_s), now_s)
         if is_tick:
             self._tick_at_s = now_s + TICK_S
             self._site.traffic.dropped = sum(seat.endpoint.dropped for seat in self._seats)
+
+    def poll_changes(self) -> list[FlowChange]:
+        """Return the flows that began or ended since the last call, in order; the oldest are forgotten first."""
+        changes = list(self._changes)
+        self._changes.clear()
+        return changes
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         if self._is_stale:
             return 0.0
-        if not self._timed:
+        if not self._timed and not self._probes:
             return self._tick_at_s if self._since else None
-        times = [flow.get_timer() for flow in self._timed]
+        times = [each.get_timer() for each in (*self._timed, *self._probes.values())]
         return min([self._tick_at_s, *(time for time in times if time is not None)])
 
     def reload(self, config: BridgeRules, held: DelegationStore) -> None:
@@ -229,6 +327,12 @@ class Bridge:
         """End every flow; endpoints stay open."""
         for key in list(self._flows):
             self._end(key)
+        for probe in self._probes.values():
+            probe.close()
+        self._probes.clear()
+        for topic in self._status_topics:
+            topic.close()
+        self._status_topics = []
 
     def _receive(self, message: Message, now_s: float) -> None:
         flow = self._inbound.get(message.topic)
@@ -255,6 +359,12 @@ class Bridge:
                 wished.add(key)
                 if key in self._flows and self._flows[key][0].rule != flow_spec.rule:
                     self._end(key)
+                if not self._is_ready(key, flow_spec, now_s):
+                    if key in self._flows:
+                        self._end(key)
+                    self._since.pop(key, None)
+                    complaints += [self._failed[key]] if key in self._failed else []
+                    continue
                 if key not in self._flows and key not in self._failed and self._is_our_turn(key, view, now_s):
                     self._begin(key, flow_spec, view)
                 try:
@@ -265,9 +375,28 @@ class Bridge:
                 complaints += [self._failed[key]] if key in self._failed else []
         for key in [key for key in self._flows if key not in wished]:
             self._end(key)
+        for key in [key for key in self._probes if key not in wished]:
+            self._probes.pop(key).close()
         self._since = {key: since for key, since in self._since.items() if key in wished}
         self._undelegated = {key: each for key, each in self._undelegated.items() if key in wished}
         self._tell(complaints)
+
+    def _is_ready(self, key: _Key, flow_spec: FlowSpec, now_s: float) -> bool:
+        """Return whether the local server's probe passes; one without a probe is ready."""
+        settings = flow_spec.rule.readiness
+        probe = self._probes.get(key)
+        if probe is not None and probe.settings != settings:
+            self._probes.pop(key).close()
+            probe = None
+        if settings is None or not flow_spec.is_exposed:
+            return True
+        if probe is None:
+            try:
+                probe = self._probes[key] = ReadinessProbe(self._seats[key.seat], settings, now_s)
+            except LocalError as error:
+                self._failed[key] = ConfigProblem(flow_spec.local, Fault.UNKNOWN_TYPE, f"readiness: {error}")
+                return False
+        return probe.is_ready
 
     def _is_our_turn(self, key: _Key, view: _View, now_s: float) -> bool:
         """Return whether higher-ranked proxies of this graph had time to show themselves and to begin."""
@@ -308,10 +437,12 @@ class Bridge:
             self._failed[key] = ConfigProblem(flow_spec.local, Fault.UNKNOWN_TYPE, str(error))
             return
         self._flows[key] = flow_spec, flow
+        self._flow_begun_s[key] = self._now_s
         if not isinstance(flow, ExposedTopic):
             self._inbound[flow_spec.name] = flow
         if isinstance(flow, ExposedService | ImportedService):
             self._timed.append(flow)
+        self._changes.append(FlowChange(flow_spec, is_begun=True))
         log.debug("flow begun name=%s exposed=%s", flow_spec.name.short, flow_spec.is_exposed)
 
     def _make(self, seat: EndpointDispatcher, flow_spec: FlowSpec, topic: Topic, view: _View) -> Flow:
@@ -325,6 +456,7 @@ class Bridge:
 
     def _end(self, key: _Key) -> None:
         flow_spec, flow = self._flows.pop(key)
+        del self._flow_begun_s[key]
         if self._inbound.get(flow_spec.name) is flow:
             del self._inbound[flow_spec.name]
         if isinstance(flow, ExposedService | ImportedService):
@@ -332,14 +464,14 @@ class Bridge:
         if isinstance(flow, ImportedTopic):
             self._ended.append(flow.stats)
         flow.close(self._now_s)
+        self._changes.append(FlowChange(flow_spec, is_begun=False))
         log.debug("flow ended name=%s exposed=%s", flow_spec.name.short, flow_spec.is_exposed)
 
     def _how_to_delegate(self, flow_spec: FlowSpec) -> str:
-        right, kind = _right(flow_spec).value, flow_spec.rule.kind
         return (
-            f"no delegation for {flow_spec.name.to_text()} in {self._held.directory}; the owner makes one with"
-            f" 'gdp delegate name --right {right} --kind {kind} --name {flow_spec.rule.global_name_of(flow_spec.local)}"
-            f" --type {flow_spec.type_name} ...'"
+            f"no delegation to {_right(flow_spec).value} [{flow_spec.type_name}] as {flow_spec.name.to_text()} in"
+            f" {self._held.directory}; the owner makes all that this proxy needs with"
+            " 'gdp delegate --owner OWNER --live FILE' (FILE: its proxy.yaml)"
         )
 
     def _tell(self, complaints: Sequence[ConfigProblem]) -> None:

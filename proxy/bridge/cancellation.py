@@ -15,12 +15,12 @@ from proxy.bridge.goal_calls import GoalCalls
 from proxy.endpoints.endpoint import Endpoint
 from proxy.wire.service import Stop
 
-__all__ = ["TRIGGER", "Cancellation"]
+__all__ = ["NO_FIELDS", "TRIGGER", "Cancellation"]
 
 TRIGGER: Final = "std_srvs/srv/Trigger"
 
-# empty request of the stop service; ROS 2 fills a message without fields with one byte
-_NO_FIELDS: Final = {1: b"", 2: b"\0\1\0\0\0"}
+# empty request of a Trigger; ROS 2 fills a message without fields with one byte
+NO_FIELDS: Final = {1: b"", 2: b"\0\1\0\0\0"}
 
 
 class Cancellation:
@@ -95,4 +95,4 @@ class Cancellation:
         if self._stopper is not None:
             self._endpoint.drop(self._stopper, self._stops)  # the response to the last one is not used
             self._stops += 1
-            self._endpoint.call(self._stopper, self._stops, _NO_FIELDS[self._endpoint.ros])
+            self._endpoint.call(self._stopper, self._stops, NO_FIELDS[self._endpoint.ros])

@@ -24,6 +24,8 @@ class Traffic:
         late: responses of servers that were not the first.
         unexpected: responses of servers that had no request.
         hedged: second copies of requests.
+        answered: by the overlay name of a service, 64 hex digits: the answered calls of local clients, and what they
+            took together, in milliseconds.
         latency: one-way, from the remote proxy's stamp until delivery to the endpoint here.
     """
 
@@ -37,6 +39,7 @@ class Traffic:
     late: int = 0
     unexpected: int = 0
     hedged: int = 0
+    answered: dict[str, tuple[int, float]] = field(default_factory=dict)
     latency: Histogram = field(default_factory=Histogram)
 
     def sent(self, size: int) -> None:
@@ -48,6 +51,11 @@ class Traffic:
         """Count an incoming message of this many bytes."""
         self.messages_in += 1
         self.bytes_in += size
+
+    def call_ended(self, service: str, took_s: float) -> None:
+        """Count an answered call of a local client."""
+        ended, total_ms = self.answered.get(service, (0, 0.0))
+        self.answered[service] = ended + 1, total_ms + 1_000 * took_s
 
     def messages(self) -> Mapping[str, int]:
         """Return the counts of messages by outcome."""

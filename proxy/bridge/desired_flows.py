@@ -18,7 +18,7 @@ from proxy.config.matching import choose
 from proxy.config.rule import Rule
 from proxy.endpoints.endpoint import Graph, GraphEntity, Role
 
-__all__ = ["ConfigProblem", "FlowSpec", "exposed", "imported"]
+__all__ = ["ConfigProblem", "DeniedName", "FlowSpec", "denied", "exposed", "imported"]
 
 _SHOWS: Final[dict[Kind, Role]] = {"topic": Role.PUBLISHES, "service": Role.SERVES, "action": Role.SERVES}
 _WANTS: Final[dict[Kind, Role]] = {"topic": Role.SUBSCRIBES, "service": Role.CALLS, "action": Role.CALLS}
@@ -42,6 +42,25 @@ class ConfigProblem(NamedTuple):
     local: str
     fault: Fault
     detail: str
+
+
+class DeniedName(NamedTuple):
+    """Local name that a rule is about, and the pattern under ``deny`` because of which it stays local."""
+
+    is_exposed: bool
+    local: str
+    pattern: str
+
+
+def denied(rules: Sequence[Rule], graph: Graph, *, is_exposed: bool) -> Iterator[DeniedName]:
+    """Yield the denied names of one direction: those of the graph, and those that a rule states."""
+    shown = {(rule.kind, rule.local) for rule in rules if rule.is_denied}
+    shown |= _shown(graph, _SHOWS if is_exposed else _WANTS).keys()
+    for kind, local in sorted(shown):
+        meant = (rule.denied_by(local) for rule in rules if rule.kind == kind and rule.means(local))
+        pattern = next((each for each in meant if each is not None), None)
+        if pattern is not None:
+            yield DeniedName(is_exposed, local, pattern)
 
 
 def exposed(rules: Sequence[Rule], graph: Graph, complaints: list[ConfigProblem]) -> Iterator[FlowSpec]:
@@ -87,7 +106,7 @@ def _imported(
     rules: Sequence[Rule], wanted: Mapping[tuple[Kind, str], set[str]], held: Iterable[tuple[Metadata, Name]]
 ) -> Iterator[FlowSpec]:
     for rule in rules:
-        if not rule.is_pattern and rule.type_name:
+        if not rule.is_pattern and rule.type_name and not rule.is_denied:
             yield FlowSpec(False, rule.local, rule.type_name, rule.overlay_name, rule)
     for metadata, name in held:
         found = matching.imported(rules, name, metadata)

@@ -17,6 +17,7 @@ from dataclasses import replace
 from typing import Final
 
 from gdp.client.participant import Message, Topic
+from gdp.client.send_options import is_urgent
 from gdp.errors import LocalError, RemoteError
 from gdp.names import Name
 from gdp.service.follower import Refuse
@@ -25,6 +26,7 @@ from gdp.service.serving import Asked, Serving
 from gdp.trust.advertisement import paths_value, session_value
 from proxy.bridge.action_interface import CANCEL, GOAL, PROFILES, RESULT, ActionInterface
 from proxy.bridge.bridge_election import presence_of, sign
+from proxy.bridge.call_tracer import CallKey
 from proxy.bridge.cancellation import TRIGGER, Cancellation
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.desired_flows import FlowSpec
@@ -32,6 +34,7 @@ from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault
 from proxy.bridge.goal_calls import GoalCalls
 from proxy.bridge.goals import cancel_of, goal_of
+from proxy.bridge.liveliness import Party
 from proxy.bridge.ordered_server import OrderedServer
 from proxy.bridge.remote_clients import ClientLiveness, RemoteClients
 from proxy.bridge.response_sender import ResponseSender
@@ -61,6 +64,10 @@ _NOTICE_S: Final = 1.0
 class ExposedService:
     """Lets remote clients call one local server.
 
+    Attributes:
+        requests: how many were accepted from remote clients.
+        request_bytes: their bytes on the overlay, before sealing.
+
     Raises:
         LocalError: this machine does not know a type.
     """
@@ -74,6 +81,8 @@ class ExposedService:
         self._topic = topic
         self._serving: Serving[bytes] = Serving(random_start, flow_spec.rule.at_once)
         self._goals = GoalCalls()
+        self.requests = 0
+        self.request_bytes = 0
         self._cancels = 0  # number of the last cancel request of the proxy itself
         self._refuses_from_s: float | None = None
         self._liveness = ClientLiveness()
@@ -93,7 +102,7 @@ class ExposedService:
             topic,
             self._exchange.to_wire(),
             is_global=rule.is_global,
-            urgent=rule.priority == "urgent",
+            urgent=is_urgent(rule.priority),
             paths=paths_value(rule.paths),
             options=rule.send_options(),
             is_session=session_value(rule.sign),
@@ -185,6 +194,14 @@ class ExposedService:
                 self._responses.fail(asked, Fault.TIMED_OUT, "the server did not answer in time")
         self._give()
 
+    def parties(self, now_s: float) -> list[Party]:
+        """Return the clients that are known now."""
+        del now_s
+        member, name = self._site.member, self._topic.name
+        silent = set(member.silent_peers(name))
+        names = dict.fromkeys([*member.connected_peers(name), *silent])
+        return [Party("client", each.to_text(), is_silent=each in silent) for each in names]
+
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         return self._serving.get_timer()
@@ -247,9 +264,13 @@ class ExposedService:
             if before:
                 self._responses.send_wire(asked.client, before)
             return
+        key = CallKey(self._topic.name, asked.client, asked.part, asked.call)
+        self._site.tracer.serving(key, self._flow_spec.local)
         if self._kept is None and self._refuses_from_s is not None and now_s >= self._refuses_from_s:
             self._responses.refuse(asked, "the server is leaving")
             return
+        self.requests += 1
+        self.request_bytes += len(delivered.message)
         try:
             raw = self._remote_clients.incoming(delivered.publisher, message.description, asked.part).decode(
                 request.body

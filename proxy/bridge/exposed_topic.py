@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 from gdp.client.participant import Topic
 from gdp.client.publisher import Publisher
+from gdp.client.send_options import is_urgent
 from gdp.errors import LocalError
 from gdp.message.loss import LossReason
 from gdp.trust.advertisement import paths_value
@@ -19,6 +20,7 @@ from proxy.bridge.desired_flows import FlowSpec
 from proxy.bridge.encoder import MessageEncoder, compressor_of, description_of
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault
+from proxy.bridge.liveliness import Party
 from proxy.bridge.rate_limit import RateLimiter
 from proxy.bridge.stream_qos import Change, LiveQos, RecordedQos, StreamQos
 from proxy.endpoints.endpoint import EndpointError, Event, GraphEntity, MessageReceived, TypeResolved
@@ -36,6 +38,9 @@ class ExposedTopic:
         publisher: the overlay's publisher of the topic; None until the endpoint has described it.
         published: messages published, by channel, including those without a reader.
         published_bytes: their bytes in ROS's wire form.
+        local_publishers: how many there are on this machine.
+        taken: local messages received; ``thinned``: of these, what the rule's rate left out.
+        last_s: monotonic second of the newest; None: there was none.
 
     Raises:
         LocalError: this machine does not know the type.
@@ -57,8 +62,12 @@ class ExposedTopic:
         self.publisher: Publisher | None = None
         self.published = Counter[int]()
         self.published_bytes = Counter[int]()
+        self.taken = 0
+        self.thinned = 0
+        self.last_s: float | None = None
         self._channels: tuple[Channel, ...] = ()  # as the endpoint describes them
         self._encoders: list[MessageEncoder] = []
+        self.local_publishers = len(ends)
         self._compressor = compressor_of(flow_spec.rule)
         self._pace = RateLimiter(flow_spec.rule.max_hz)
         self._adaptation = adaptation_of(flow_spec.rule)
@@ -71,6 +80,7 @@ class ExposedTopic:
 
     def follow(self, ends: Sequence[GraphEntity]) -> None:
         """Update the local publishers."""
+        self.local_publishers = len(ends)
         change = self._qos.receive_publishers(ends)
         if change is Change.NONE:
             return
@@ -99,6 +109,20 @@ class ExposedTopic:
         if self.publisher is not None:
             self._site.member.flush(now_s)  # the last messages must not wait: they would be dropped with their stream
             self._site.member.withdraw(self._topic.name)
+
+    def parties(self, now_s: float) -> list[Party]:
+        """Return the readers that are known now."""
+        del now_s
+        publisher = self.publisher
+        if publisher is None:
+            return []
+        names = publisher.reader_names()
+        return [Party("reader", name.to_text(), is_silent=publisher.is_silent(name)) for name in names]
+
+    @property
+    def depth(self) -> int:
+        """Return how many messages late joiners get."""
+        return self._qos.depth
 
     def renew(self, topic: Topic) -> None:
         """Replace the delegation."""
@@ -132,7 +156,7 @@ class ExposedTopic:
             reliable=self._qos.is_reliable,
             depth=self._qos.depth,
             is_global=rule.is_global,
-            urgent=rule.priority == "urgent",
+            urgent=is_urgent(rule.priority),
             paths=paths_value(rule.paths),
             options=self._qos.options,
         )
@@ -141,8 +165,11 @@ class ExposedTopic:
         rule, publisher, traffic = self._flow_spec.rule, self.publisher, self._site.traffic
         if publisher is None:
             return  # the description always comes first: an earlier message belongs to a subscription that was replaced
+        self.taken += 1
+        self.last_s = now_s
         if not self._pace.may_pass(now_s):
             traffic.thinned += 1
+            self.thinned += 1
             return
         if len(event.raw) > rule.max_bytes:
             detail = f"a message of {len(event.raw)} bytes; the rule's max_bytes is {rule.max_bytes}"

@@ -47,13 +47,15 @@ class Faults:
     def __init__(self) -> None:
         self._counts: Counter[Fault] = Counter()
         self._reported: dict[tuple[str, Fault], int] = {}
+        self._details: dict[tuple[str, Fault], str] = {}  # the newest, of what was reported
 
     def report(self, what: str, fault: Fault, detail: str) -> None:
         """Count a fault; warn of the first of its kind about ``what``, a local name."""
         self._counts[fault] += 1
         count = self._reported[what, fault] = self._reported.get((what, fault), 0) + 1
+        self._details[what, fault] = printable(detail)
         if len(self._reported) > _COUNTS_MAX:
-            del self._reported[next(iter(self._reported))]
+            self._forget(next(iter(self._reported)))
         if count == 1:
             log.warning("%s: %s: %s", printable(what), fault.value, printable(detail))
         elif count >= _COUNT_LOGGED and str(count).strip("0") == "1":
@@ -61,7 +63,16 @@ class Faults:
 
     def clear(self, what: str, fault: Fault) -> None:
         """Record that a fault is over: the next one is logged again."""
-        self._reported.pop((what, fault), None)
+        self._forget((what, fault))
+
+    def of(self, what: str) -> dict[str, tuple[int, str]]:
+        """Return the faults of a local name that are not over: by label, how often each came, and its newest detail."""
+        found = ((fault, count) for (name, fault), count in self._reported.items() if name == what)
+        return {fault.value: (count, self._details[what, fault]) for fault, count in found}
+
+    def _forget(self, key: tuple[str, Fault]) -> None:
+        self._reported.pop(key, None)
+        self._details.pop(key, None)
 
     @property
     def counts(self) -> Mapping[str, int]:

@@ -11,11 +11,13 @@ It combines ``server_discovery.py`` (the servers) and ``request_sender.py`` (the
 from __future__ import annotations
 
 import secrets
+from collections import Counter
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
 
 from gdp.client.participant import Message, Topic
+from gdp.client.send_options import is_urgent
 from gdp.errors import LocalError, RemoteError
 from gdp.names import Name
 from gdp.service.dispatch import Dispatch, Failure
@@ -24,11 +26,13 @@ from gdp.service.replication_messages import INCARNATION_BITS
 from gdp.service.sequencer import Sequencer
 from gdp.trust.advertisement import paths_value, session_value
 from proxy.bridge.action_interface import CANCEL, GOAL, PROFILES, RESULT, ActionInterface
+from proxy.bridge.call_tracer import CallKey
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.desired_flows import FlowSpec
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault
 from proxy.bridge.goals import Goals, goal_of, says_yes
+from proxy.bridge.liveliness import Party
 from proxy.bridge.request_sender import RequestSender
 from proxy.bridge.server_discovery import Response, ServerCalls, ServerDiscovery
 from proxy.endpoints.endpoint import EndpointError, Event, RequestReceived
@@ -53,11 +57,19 @@ class _Waiting:
     part: int
     ticket: int
     goal: bytes
+    begun_s: float
     call: int = 0
 
 
 class ImportedService:
-    """Lets local clients call one remote service or action."""
+    """Lets local clients call one remote service or action.
+
+    Attributes:
+        requests: how many local clients made.
+        request_bytes: their bytes in ROS's wire form.
+        failed: requests that ended without a response.
+        answered_by: the server whose response ended the latest call; None: none did yet.
+    """
 
     def __init__(
         self, site: BridgeContext, seat: EndpointDispatcher, flow_spec: FlowSpec, topic: Topic, random_start: int
@@ -83,6 +95,12 @@ class ImportedService:
             )
             for part in range(len(self._parts.services))
         )
+        self._now_s = 0.0  # of the last message of a server
+        self.requests = 0
+        self.request_bytes = 0
+        self.failed = 0
+        self.answered_by: Name | None = None
+        self.first_answers = Counter[Name]()  # by server, of the calls that a first response ended
         self._counted: tuple[int, ...] = (0, 0, 0)  # late, unexpected and hedged, as reported last
         self._requests: tuple[Serializer, ...] = ()
         self._no_answers: tuple[NoAnswer | None, ...] = ()  # None: the dialect has errors
@@ -92,7 +110,7 @@ class ImportedService:
             topic,
             self._description(),
             is_global=flow_spec.rule.is_global,
-            urgent=flow_spec.rule.priority == "urgent",
+            urgent=is_urgent(flow_spec.rule.priority),
             paths=paths_value(flow_spec.rule.paths),
             options=flow_spec.rule.send_options(),
             is_session=session_value(flow_spec.rule.sign),
@@ -112,9 +130,20 @@ class ImportedService:
             closed=self._shut,
         )
 
+    @property
+    def servers(self) -> list[Name]:
+        """Return the servers that can be asked now."""
+        return list(self._calls[0].servers)
+
+    @property
+    def late(self) -> int:
+        """Return how many responses were not the first."""
+        return sum(each.late for each in self._calls)
+
     def receive(self, message: Message, now_s: float) -> None:
         """Process a remote server's response, or a message of its action's topics."""
         self._site.traffic.received(len(message.delivered.message))
+        self._now_s = now_s
         try:
             if message.private and self._sequencer is not None and is_word(message.delivered.message):
                 word, name = follower_message(message.delivered.message), Name(message.delivered.publisher)
@@ -152,6 +181,14 @@ class ImportedService:
         for dispatch in self._calls:
             dispatch.handle_timer(now_s)
         self._sender.flush(now_s)
+
+    def parties(self, now_s: float) -> list[Party]:
+        """Return the servers that are known now."""
+        del now_s
+        member, name = self._site.member, self._topic.name
+        silent = set(member.silent_peers(name))
+        names = dict.fromkeys([*member.connected_peers(name), *silent])
+        return [Party("server", each.to_text(), is_silent=each in silent) for each in names]
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
@@ -212,7 +249,9 @@ class ImportedService:
 
     def _ask(self, event: RequestReceived, now_s: float) -> None:
         part, rule = self._handles.index(event.handle), self._flow_spec.rule
-        waiting = _Waiting(part, event.ticket, b"")
+        waiting = _Waiting(part, event.ticket, b"", now_s)
+        self.requests += 1
+        self.request_bytes += len(event.raw)
         body = self._requests[part].encode(event.raw)
         if reason := too_large("a request", len(event.raw), rule.max_bytes, len(body)):
             self._refuse(waiting, Fault.TOO_LARGE, reason)
@@ -237,6 +276,7 @@ class ImportedService:
         patience_ms = 0 if timeout_s is None else min(max(int(timeout_s * 1e3), 1), PATIENCE_MAX_MS)
         wire = Request(waiting.part, call, patience_ms, body).to_wire()
         waiting.call = call
+        self._site.tracer.begun(self._key(waiting.part, call), self._flow_spec.local)
         if self._goals is not None:
             self._sender.note_goal(waiting.part, call, waiting.goal)
             if waiting.part == GOAL:
@@ -258,16 +298,19 @@ class ImportedService:
         server = self._discovery.find(name, now_s)
         if server is None or answer.part >= len(server.answers):
             return  # of a server that left, or that has no valid description here: that was reported
-        dispatch = self._calls[answer.part]
+        dispatch, key = self._calls[answer.part], self._key(answer.part, answer.call)
         if answer.outcome is Outcome.FAILED:
+            self._site.tracer.responded(key, name, answer.reason)
             dispatch.refused(answer.call, name, answer.reason, now_s)
             return
         try:
             raw = server.answers[answer.part].decode(answer.body)
         except RemoteError as error:
             self._site.faults.report(self._flow_spec.local, Fault.MALFORMED, str(error))
+            self._site.tracer.responded(key, name, str(error))
             dispatch.refused(answer.call, name, str(error), now_s)
             return
+        self._site.tracer.responded(key, name)
         if self._goals is None or says_yes(answer.part, raw):
             dispatch.answered(answer.call, name, (name, raw), now_s)
         else:
@@ -275,7 +318,12 @@ class ImportedService:
 
     def _answered(self, waiting: _Waiting, response: Response) -> None:
         server, raw = response
+        self.answered_by = server
         self._forget(waiting)
+        if waiting.part == 0:  # of an action the answer to its goal; results take as long as they want
+            self._site.traffic.call_ended(self._topic.name.to_text(), max(self._now_s - waiting.begun_s, 0.0))
+        self.first_answers[server] += 1
+        self._site.tracer.answered(self._key(waiting.part, waiting.call), server)
         self._seat.endpoint.answer(self._handles[waiting.part], waiting.ticket, raw)
         if self._goals is None or not says_yes(waiting.part, raw):
             return
@@ -286,6 +334,8 @@ class ImportedService:
 
     def _failed(self, waiting: _Waiting, failure: Failure, reason: str) -> None:
         self._forget(waiting)
+        self.failed += 1
+        self._site.tracer.failed(self._key(waiting.part, waiting.call), reason or failure.value)
         if failure is not Failure.TIMED_OUT:
             self._refuse(waiting, _FAULTS[failure], reason)
             return
@@ -296,6 +346,9 @@ class ImportedService:
             return
         self._site.faults.report(self._flow_spec.local, Fault.TIMED_OUT, reason)
         self._seat.endpoint.answer(self._handles[waiting.part], waiting.ticket, no_answer.to_raw(reason))
+
+    def _key(self, part: int, call: int) -> CallKey:
+        return CallKey(self._topic.name, self._site.member.name, part, call)
 
     def _forget(self, waiting: _Waiting) -> None:
         is_cancelled = self._sequencer is None  # entries of a log go to all servers in any case

@@ -22,6 +22,7 @@ from proxy.bridge.desired_flows import FlowSpec
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.expander import MessageExpander
 from proxy.bridge.faults import Fault
+from proxy.bridge.liveliness import Party
 from proxy.bridge.local_output import ChannelPublishers, LocalOutput, MergedPublisher
 from proxy.bridge.rate_limit import RateLimiter
 from proxy.bridge.topic_stats import SAMPLES_MAX, TopicStats
@@ -33,6 +34,7 @@ from proxy.wire.message import RosMessage, TopicDescription
 
 __all__ = ["ImportedTopic"]
 
+_HEARD_MAX = 1_024  # publishers
 _SAMPLES_MAX = 4_096  # latencies kept of a live topic
 
 
@@ -47,6 +49,11 @@ class _Decoded(NamedTuple):
 class ImportedTopic:
     """Carries one remote topic to the local graph.
 
+    Attributes:
+        local_readers: how many there are on this machine.
+        thinned: messages that the rule's rate left out.
+        last_s: monotonic second of the newest message that arrived; None: there was none.
+
     Raises:
         LocalError: this graph does not accept a publisher of it.
     """
@@ -58,17 +65,22 @@ class ImportedTopic:
         self._unmatched: Set[str] = frozenset()  # keys of readers whose QoS cannot be met
         self._sources = DecoderCache[tuple[_Decoded, ...]]()
         self._is_joined = False
+        self.local_readers = 0
         self._past_losses = Losses()  # losses of earlier subscriptions
         self._pace = RateLimiter(flow_spec.rule.max_hz)
+        self.thinned = 0
+        self.last_s: float | None = None
         samples = _SAMPLES_MAX if seat.endpoint.is_live else SAMPLES_MAX
         self.stats = TopicStats(
             topic=flow_spec.local, type_name=flow_spec.type_name, latencies_ms=deque(maxlen=samples)
         )
         kind = MergedPublisher if seat.endpoint.is_live else ChannelPublishers
+        self._heard_s: dict[bytes, float] = {}  # when each publisher's last message came, the latest last
         self._output: LocalOutput = kind(seat, self, flow_spec)
 
     def follow(self, ends: Sequence[GraphEntity]) -> None:
         """Update the local readers."""
+        self.local_readers = len(ends)
         self._tell_unmatched(ends)
         if ends and not self._is_joined:
             self._is_joined = True
@@ -81,6 +93,10 @@ class ImportedTopic:
 
     def receive(self, message: Message, now_s: float) -> None:
         """Process a message of the overlay."""
+        self._heard_s.pop(message.delivered.publisher, None)
+        self._heard_s[message.delivered.publisher] = now_s
+        if len(self._heard_s) > _HEARD_MAX:
+            del self._heard_s[next(iter(self._heard_s))]
         try:
             self._receive(message, now_s)
         except RemoteError as error:
@@ -95,6 +111,18 @@ class ImportedTopic:
         del now_s
         if isinstance(event, EndpointError):
             self._site.report_error(self._flow_spec.local, event, Fault.QOS)
+
+    @property
+    def is_joined(self) -> bool:
+        """Return whether it is subscribed: a local node reads it."""
+        return self._is_joined
+
+    def parties(self, now_s: float) -> list[Party]:
+        """Return the publishers that are known now."""
+        names = [each.publisher for each in self._site.member.writer_proxies_of(self._topic.name)]
+        self._heard_s = {name: self._heard_s[name] for name in names if name in self._heard_s}
+        ago_s = {name: now_s - heard_s for name, heard_s in self._heard_s.items()}
+        return [Party("publisher", name.to_text(), ago_s.get(name)) for name in names]
 
     def close(self, now_s: float) -> None:
         """Close the subscription and the local publisher."""
@@ -147,8 +175,10 @@ class ImportedTopic:
         if channels is None or not self._output.is_open:
             self.stats.refused += 1
             return
+        self.last_s = now_s
         if not self._pace.may_pass(now_s):
             traffic.thinned += 1
+            self.thinned += 1
             return
         ros_message = RosMessage.from_wire(delivered.message)
         if ros_message.channel >= len(channels):
@@ -163,7 +193,7 @@ class ImportedTopic:
         self._output.publish(handle, raw)
         latency_ms = (time.time_ns() - ros_message.stamp_ns) / 1e6
         self.stats.count_number(delivered.publisher, delivered.incarnation, delivered.number, delivered.place)
-        self.stats.add(latency_ms, delivered.parts, delivered.hops)
+        self.stats.add(latency_ms, delivered.parts, delivered.hops, len(raw))
         traffic.latency.observe(latency_ms / 1e3)
         traffic.received(len(delivered.message))
 

@@ -14,6 +14,7 @@ from gdp.service.dispatch import Ask
 from gdp.service.replication_messages import ReplicaCommand
 from proxy.bridge.action_interface import CANCEL, RESULT
 from proxy.bridge.broadcast_queue import BroadcastQueue, Effect, wire_of
+from proxy.bridge.call_tracer import CallKey
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.goals import Goals
 from proxy.bridge.server_discovery import ServerCalls
@@ -87,6 +88,7 @@ class RequestSender:
             wire = wire_of(part, effect)
             self._publisher.publish(wire)
             self._site.traffic.sent(len(wire))
+            self._trace(part, effect, servers)
         except LocalError as error:
             self._refuse(part, effect, servers, str(error), now_s)
 
@@ -101,8 +103,13 @@ class RequestSender:
             for wire in (*([] if again is None else [again]), wire_of(part, effect)):
                 self._site.member.send_request(self._service, server, wire)
                 self._site.traffic.sent(len(wire))
+            self._trace(part, effect, [server])
         except LocalError as error:
             self._refuse(part, effect, [server], str(error), now_s)
+
+    def _trace(self, part: int, effect: Effect, servers: list[Name]) -> None:
+        if isinstance(effect, Ask):
+            self._site.tracer.asked(CallKey(self._service, self._site.member.name, part, effect.call), servers)
 
     def _refuse(self, part: int, effect: Effect, servers: list[Name], reason: str, now_s: float) -> None:
         self._site.traffic.unread += 1

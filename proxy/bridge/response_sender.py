@@ -10,6 +10,7 @@ from gdp.errors import LocalError
 from gdp.message.loss import LossReason
 from gdp.names import Name
 from gdp.service.serving import Asked, Serving
+from proxy.bridge.call_tracer import CallKey
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.desired_flows import FlowSpec
 from proxy.bridge.faults import Fault
@@ -101,3 +102,5 @@ class ResponseSender:
         wire = answer.to_wire()
         self._serving.remember(asked, wire)
         self.send_wire(asked.client, wire)
+        error = answer.reason if answer.outcome is Outcome.FAILED else ""
+        self._site.tracer.served(CallKey(self._service, asked.client, asked.part, asked.call), error)

@@ -80,6 +80,8 @@ class LiveQos:
     @property
     def depth(self) -> int:
         """Return the number of messages for late joiners."""
+        if self._rule.history is not None:
+            return self._rule.history.messages
         if self._rule.wants_latched is False:
             return 0
         if self._rule.latched or self._is_latched:
@@ -110,7 +112,7 @@ class LiveQos:
         offers = (request(self._offers),) if self._offers else channel.qos
         if offers or latched:
             profile = offers[0] if offers else default(latched=True)
-            offers = (replace(profile, depth=self.depth or profile.depth),)
+            offers = (replace(profile, depth=min(self.depth, DEPTH_MAX) or profile.depth),)
         return (replace(channel, topic=topic, latched=latched, qos=offers),)
 
 
@@ -135,6 +137,8 @@ class RecordedQos:
     @property
     def depth(self) -> int:
         """Return the largest recorded depth of a latched channel, and at least 1 where the rule latches."""
+        if self._rule.history is not None:
+            return self._rule.history.messages
         return max(self._recorded_depth, int(self._rule.latched))
 
     @property

@@ -23,6 +23,7 @@ class TopicStats:
     topic: str
     type_name: str
     received: int = 0
+    received_bytes: int = 0  # in the endpoint's wire form
     losses: Losses = field(default_factory=Losses)  # on the overlay
     duplicated: int = 0
     refused: int = 0  # arrived, but could not be passed to the endpoint
@@ -44,9 +45,10 @@ class TopicStats:
         self.duplicated += at <= newest
         self.newest[incarnation_id] = max(at, newest)
 
-    def add(self, latency_ms: float, parts: int, hops: int) -> None:
-        """Count one message."""
+    def add(self, latency_ms: float, parts: int, hops: int, size: int = 0) -> None:
+        """Count one message of this many bytes."""
         self.received += 1
+        self.received_bytes += size
         self.latencies_ms.append(latency_ms)
         self.parts = max(self.parts, parts)
         self.hops[hops] += 1

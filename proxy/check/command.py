@@ -6,9 +6,9 @@ I/O.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
-from rich.console import Console
-
+from gdp.cli.console import console
 from gdp.cli.node import emit
 from gdp.crypto.certificates import Role
 from gdp.names import Name
@@ -27,8 +27,11 @@ from proxy.node.node import open_topics
 __all__ = ["check_proxy"]
 
 
-def check_proxy(settings: ProxyConfig, *, json: bool) -> None:
-    """Print the meaning of each rule.
+def check_proxy(path: Path, settings: ProxyConfig, *, json: bool) -> int:
+    """Print the meaning of each rule; return how many names here lack a delegation.
+
+    Args:
+        path: of the configuration, for the advice.
 
     Raises:
         LocalError: without a live graph, a rule has no delegation; with one, a graph cannot be queried.
@@ -36,16 +39,30 @@ def check_proxy(settings: ProxyConfig, *, json: bool) -> None:
     identity, _ = load_member(settings.identity, settings.domain, Role.PROXY)
     held = DelegationStore(settings.delegations, identity)
     delegations = {topic.name: topic.delegation for topic in held}
+    lacking = 0
     if settings.ros:
         for at, (label, graph) in enumerate(read_graphs(settings.ros, identity.name.to_text(), "check")):
-            _tell(label, _findings(settings, at, graph, delegations), json=json)
+            findings = _findings(settings, at, graph, delegations)
+            lacking += _lacking(findings)
+            _tell(label, findings, json=json)
     else:
         open_topics(settings, held)
         _tell("", explain(settings.expose, settings.imports, None, delegations), json=json)
     if json:
-        emit("checked", name=identity.name.to_text())
+        emit("checked", name=identity.name.to_text(), undelegated=lacking)
+    elif lacking:
+        names = "1 name lacks a delegation" if lacking == 1 else f"{lacking} names lack a delegation"
+        console().print(
+            f"configuration valid: proxy {identity.name.short}, but {names};"
+            f" the owner makes it with: gdp delegate --owner OWNER --live {path}"
+        )
     else:
-        Console().print(f"configuration good: proxy {identity.name.short}", highlight=False)
+        console().print(f"configuration good: proxy {identity.name.short}")
+    return lacking
+
+
+def _lacking(findings: Sequence[Finding]) -> int:
+    return sum(each.overlay is not None and not each.is_held for finding in findings for each in finding.matches)
 
 
 def _findings(settings: ProxyConfig, at: int, graph: Graph, delegations: Mapping[Name, Delegation]) -> list[Finding]:
@@ -60,7 +77,7 @@ def _tell(label: str, findings: Sequence[Finding], *, json: bool) -> None:
         for finding in findings:
             emit("rule", graph=label, **finding.to_fields())
         return
-    console = Console()
+    shown = console()
     if label:
-        console.print(label, style="bold", highlight=False)
-    console.print(table(findings))
+        shown.print(label, style="bold")
+    shown.print(table(findings))

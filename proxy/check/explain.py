@@ -24,6 +24,7 @@ __all__ = ["Delegated", "explain"]
 
 _GOAL: Final = "/_action/send_goal"  # https://design.ros2.org/articles/actions.html
 _GOAL_TYPE: Final = "_SendGoal"
+_DENIED_SHOWN: Final = 10
 _OPTIONS: Final = ("author", "maintainer", "description")  # metadata for which ``gdp delegate`` has an option
 
 
@@ -88,19 +89,34 @@ class _Look:
         self._is_live = graph is not None
         self._side = _SIDES[direction, rule.kind == "topic"]
         kin = _of_kind(graph or (), rule.kind)
-        ends = [end for end in kin if end.role is self._side.role and rule.matches(end.name)]
+        meant = [end for end in kin if end.role is self._side.role and rule.means(end.name)]
+        ends = [end for end in meant if rule.denied_by(end.name) is None]
+        self._denied = dict(self._find_denied([end.name for end in meant]))
         self._ends = [end for end in ends if not end.is_proxy]
         self._proxied = sorted({end.name for end in ends if end.is_proxy} - {end.name for end in self._ends})
 
     def finding(self) -> Finding:
         matches = tuple(self._match(*each) for each in sorted(self._candidates()))
-        return Finding(self._direction, self._rule.kind, self._rule.name, matches, tuple(self._notes(matches)))
+        denied = tuple(sorted(self._denied.items()))
+        return Finding(self._direction, self._rule.kind, self._rule.name, matches, tuple(self._notes(matches)), denied)
+
+    def _find_denied(self, names: Sequence[str]) -> Iterator[tuple[str, str]]:
+        """Yield what the rule is about and ``deny`` keeps local: of the graph, of the rule, of held delegations."""
+        rule, allowing = self._rule, self._rule.within(None, ())
+        stated = [] if rule.is_pattern else [rule.local]
+        held = [
+            allowing.local_of(each.metadata) for each in self._held.values() if each.metadata and self._has_right(each)
+        ]
+        for local in [*stated, *names, *(each for each in held if each is not None)]:
+            pattern = rule.denied_by(local)
+            if pattern is not None:
+                yield local, pattern
 
     def _candidates(self) -> set[tuple[str, str]]:
         """Return local names and types: from the rule, from delegations, and from the live graph."""
         rule = self._rule
         found = set()
-        if not rule.is_pattern and rule.type_name:
+        if not rule.is_pattern and rule.type_name and not rule.is_denied:
             found.add((rule.local, rule.type_name))
         for name, delegation in self._held.items():
             if delegation.metadata is None or not self._has_right(delegation):
@@ -176,7 +192,10 @@ class _Look:
                     yield f"{end.node} offers best effort: what is lost before the proxy stays lost"
 
     def _notes(self, matches: Sequence[Match]) -> Iterator[str]:
-        if not matches:
+        if self._denied:
+            shown = ", ".join(f"{local} ({pattern})" for local, pattern in sorted(self._denied.items())[:_DENIED_SHOWN])
+            yield f"denied, hence left alone: {len(self._denied)}: {shown}"
+        elif not matches:
             foreign = sorted({end.type_name for end in self._ends if not self._rule.fits_type(end.type_name)})
             if foreign:
                 yield f"what matches here is {', '.join(foreign)}, not {self._rule.type_name}"

@@ -55,13 +55,18 @@ class Match:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One rule: its matches, and the faults that concern no single name of it."""
+    """One rule: its matches, and the faults that concern no single name of it.
+
+    Args:
+        denied: local names that the rule is about and that never cross, each with its pattern under ``deny``.
+    """
 
     direction: Direction
     kind: Kind
     name: str
     matches: tuple[Match, ...]
     notes: tuple[str, ...]
+    denied: tuple[tuple[str, str], ...] = ()
 
     def to_fields(self) -> dict[str, object]:
         """Return the JSON form."""
@@ -70,5 +75,6 @@ class Finding:
             "kind": self.kind,
             "rule": self.name,
             "matches": [match.to_fields() for match in self.matches],
+            "denied": [{"local": local, "pattern": pattern} for local, pattern in self.denied],
             "notes": list(self.notes),
         }

@@ -99,7 +99,7 @@ def _asked(machine: Machine, owner: PublicKey) -> dict[Name, Metadata]:
 
 def _stated(rules: Iterable[Rule], owner: PublicKey) -> Iterator[tuple[Name, Metadata]]:
     for rule in _of(rules, owner):
-        if not rule.is_pattern and rule.type_name:
+        if not rule.is_pattern and rule.type_name and not rule.is_denied:
             yield rule.overlay_name, rule.overlay_metadata
 
 

@@ -22,7 +22,7 @@ def table(findings: Sequence[Finding]) -> Group:
     for heading in ("rule", "here", "type", "nodes", "QoS"):
         drawn.add_column(heading, overflow="fold")
     for heading in ("name", "allowed"):
-        drawn.add_column(heading, no_wrap=True)
+        drawn.add_column(heading, overflow="fold")
     for finding in findings:
         rule = Text(f"{finding.direction} {finding.kind} {finding.name}")
         if not finding.matches:

@@ -1,6 +1,6 @@
-"""Command ``gdp-delegate``: an owner gives proxies the delegations that the rules of their files need.
+"""Command ``gdp delegate rules``: an owner gives proxies the delegations that the rules of their files need.
 
-I/O.
+I/O; ``gdp`` starts it, since the package ``gdp`` does not know ``proxy``. ``gdp-delegate`` is ``gdp delegate``.
 """
 
 from __future__ import annotations
@@ -12,8 +12,10 @@ from typing import Annotated
 
 import typer
 
+from gdp.cli import delegate as group
+from gdp.cli.completion import allow_completion
 from gdp.cli.node import Json, emit, failing_clearly
-from gdp.cli.version import Version
+from gdp.cli.version import HELP, Version
 from gdp.crypto.keys import PublicKey
 from gdp.errors import LocalError, StatementError
 from gdp.limits import CHAIN_MAX
@@ -40,7 +42,11 @@ Renew = Annotated[bool, typer.Option("--renew", help="make those again that are 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 
-@app.command(epilog="Example: gdp-delegate --owner owner --live robot/proxy.yaml server/proxy.yaml")
+@app.command(
+    context_settings=HELP,
+    epilog="Examples: gdp delegate rules --owner owner --live robot/proxy.yaml;"
+    " gdp delegate --owner owner robot/proxy.yaml",
+)
 def delegate_what_is_needed(
     files: Files,
     owner: OwnerDir,
@@ -72,9 +78,13 @@ def delegate_what_is_needed(
                 typer.echo(f"{file}: {rule.name}: nothing is known yet that it means; try --live", err=True)
 
 
-def main() -> None:
-    """Run the command."""
-    app(prog_name="gdp-delegate")
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command with arguments; without, run ``gdp delegate`` with those of this process as ``gdp-delegate``."""
+    if arguments is None:
+        allow_completion("gdp-delegate")
+        group.main()
+    else:
+        app(args=list(arguments), prog_name="gdp delegate rules")
 
 
 def _refuse_other_owners(owner: Path, key: PublicKey, files: Sequence[Path], configs: Sequence[ProxyConfig]) -> None:
@@ -92,10 +102,11 @@ def _refuse_other_owners(owner: Path, key: PublicKey, files: Sequence[Path], con
 
 def _owners_named(file: Path) -> str:
     """Return the owners that a file's rules name, as the file writes them."""
-    data = read_yaml(file).data
-    sides = [data.get(side) for side in ("expose", "import")] if isinstance(data, dict) else []
+    read = read_yaml(file).data
+    data = read if isinstance(read, dict) else {}
+    sides = [data.get(side) for side in ("expose", "import")]
     rules = [rule for side in sides if isinstance(side, list) for rule in side if isinstance(rule, dict)]
-    named = dict.fromkeys(str(rule.get("owner")) for rule in rules)
+    named = dict.fromkeys(str(rule.get("owner") or data.get("owner")) for rule in rules)
     return f"they name {', '.join(str(file.parent / each) for each in named)}" if named else "it has no rules"
 
 

@@ -10,8 +10,24 @@ from typing import Annotated
 
 import typer
 
-from gdp.cli.node import AwaitIface, Check, Config, Json, Verbose, failing_clearly, set_up_logging
-from gdp.cli.version import Version
+from gdp.cli.completion import allow_completion
+from gdp.cli.console import Columns
+from gdp.cli.node import (
+    AwaitIface,
+    Check,
+    Config,
+    Format,
+    Json,
+    Level,
+    LogFormat,
+    LogLevel,
+    MemberPlane,
+    Verbose,
+    failing_clearly,
+    member_plane,
+    set_up_logging,
+)
+from gdp.cli.version import HELP, Version
 from gdp.nodes.uplink import wait_for_device
 from proxy.config.config import ProxyConfig
 
@@ -42,13 +58,17 @@ Schema = Annotated[
 ]
 
 
-@app.command(epilog="Example: gdp-proxy --config proxy.yaml --check")
+@app.command(context_settings=HELP, epilog="Example: gdp-proxy --config proxy.yaml --check")
 def proxy(
     config: Config,
     await_iface: AwaitIface = 0.0,
+    data_plane: MemberPlane = None,
     check: Check = False,
+    columns: Columns = None,
     json: Json = False,
     verbose: Verbose = False,
+    log_level: LogLevel = Level.INFO,
+    log_format: LogFormat = Format.TEXT,
     schema: Schema = False,
     version: Version = False,
 ) -> None:
@@ -56,10 +76,12 @@ def proxy(
 
     With a ros section it takes part in that graph; without one it records what it imports.
     """
-    del schema, version  # their callbacks end the command
-    set_up_logging(verbose=verbose)
+    del columns, schema, version  # their callbacks have done all
+    set_up_logging(verbose=verbose, level=log_level, form=log_format)
     with failing_clearly():
         settings = ProxyConfig.load(config)
+        if data_plane is not None:
+            settings = settings.model_copy(update={"data_plane": member_plane(data_plane)})
         if check:
             from proxy.check.command import check_proxy
 
@@ -67,8 +89,7 @@ def proxy(
                 from proxy.node.recorder import refuse_existing_file
 
                 refuse_existing_file(settings)
-            check_proxy(settings, json=json)
-            return
+            raise typer.Exit(1 if check_proxy(config, settings, json=json) else 0)
         if settings.ros:
             from proxy.node.bridge_node import run
 
@@ -83,6 +104,7 @@ def proxy(
 
 def main() -> None:
     """Run the command."""
+    allow_completion("gdp-proxy")
     app(prog_name="gdp-proxy")
 
 

@@ -15,8 +15,25 @@ from typing import Annotated, Final
 
 import typer
 
-from gdp.cli.node import Check, Config, Json, Verbose, emit, emit_wait, failing_clearly, set_up_logging
-from gdp.cli.version import Version
+from gdp.cli.completion import allow_completion
+from gdp.cli.console import Columns
+from gdp.cli.node import (
+    Check,
+    Config,
+    Format,
+    Json,
+    Level,
+    LogFormat,
+    LogLevel,
+    MemberPlane,
+    Verbose,
+    emit,
+    emit_wait,
+    failing_clearly,
+    member_plane,
+    set_up_logging,
+)
+from gdp.cli.version import HELP, Version
 from gdp.errors import LocalError
 from proxy.check.command import check_proxy
 from proxy.config.config import ProxyConfig
@@ -34,11 +51,12 @@ __all__ = ["main"]
 log = logging.getLogger(__name__)
 
 ATTACH_PATIENCE_S: Final = 30.0
+PROGRESS_S: Final = 5.0  # between log lines of a replay
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 
-@app.command(epilog="Example: gdp-replay drive.mcap --config proxy.yaml --rate 2")
+@app.command(context_settings=HELP, epilog="Example: gdp-replay drive.mcap --config proxy.yaml --rate 2")
 def replay(
     bag: Annotated[Path, typer.Argument(help="A ROS 1 bag, an MCAP file, a .db3 file or a rosbag2 folder.")],
     config: Config,
@@ -52,9 +70,13 @@ def replay(
         float | None,
         typer.Option(min=1.0, metavar="SECONDS", help="Processor time to decode it; 30 s and 2 s for each MiB."),
     ] = None,
+    data_plane: MemberPlane = None,
     check: Check = False,
+    columns: Columns = None,
     json: Json = False,
     verbose: Verbose = False,
+    log_level: LogLevel = Level.INFO,
+    log_format: LogFormat = Format.TEXT,
     version: Version = False,
 ) -> None:
     """Replay a recording's exposed topics onto the overlay with the recorded timing.
@@ -63,15 +85,16 @@ def replay(
     includes latched topics. Also if the overlay refused a topic, or the recording exceeds its memory or time. Best
     effort is sent without confirmation; what was dropped here, and what a reader lost, is stated at the end.
     """
-    del version  # its callback ends the command
-    set_up_logging(verbose=verbose)
+    del columns, version  # their callbacks have done all
+    set_up_logging(verbose=verbose, level=log_level, form=log_format)
     limits = BagLimits(None if memory is None else memory << 20, cpu)
     with failing_clearly(), _failing_decoder():
         settings = ProxyConfig.load(config)
+        if data_plane is not None:
+            settings = settings.model_copy(update={"data_plane": member_plane(data_plane)})
         with BagReader(bag, limits) as reader:
             if check:
-                check_proxy(settings, json=json)
-                return
+                raise typer.Exit(1 if check_proxy(config, settings, json=json) else 0)
             with run_node(settings, emit_wait if json else None) as node:
                 is_complete = _replay(node, reader, settings, rate, wait_readers, json=json)
     raise typer.Exit(0 if is_complete else 1)
@@ -94,10 +117,15 @@ def _replay(
     endpoint = ReplayEndpoint(reader)
     rules = RecordedRules.of(expose=settings.expose)
     with open_recording_bridge(node, settings, rules, endpoint) as bridge:
+        said_s = time.monotonic()
 
         def report() -> None:
+            nonlocal said_s
             if json:
                 _report_progress(replay, total)
+            elif (now_s := time.monotonic()) >= said_s + PROGRESS_S:
+                said_s = now_s
+                log.info("progress sent=%d of=%s confirmed=%d", replay.sent, total or "?", replay.confirmed)
 
         replay = Replay(node, bridge, endpoint, rate, report)
         total = _exposed_total(reader, endpoint)
@@ -187,6 +215,7 @@ def _topic_fields(replay: Replay) -> list[dict[str, object]]:
 
 def main() -> None:
     """Run the command."""
+    allow_completion("gdp-replay")
     app(prog_name="gdp-replay")
 
 

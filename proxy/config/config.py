@@ -24,12 +24,13 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from gdp.errors import LocalError
 from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.nodes.busy_poll import SPIN_MAX_US, SPIN_US
-from gdp.nodes.config import LeaseSeconds
+from gdp.nodes.config import LeaseSeconds, UplinkPlane
 from gdp.nodes.schema import Directory, Domain, Ifname, Metrics, NewFile, Section, load
-from proxy.config.drop_ins import DROP_INS, DropIns, add_drop_in_rules
+from proxy.config.drop_ins import DROP_INS, DropIns, add_drop_in_patterns, add_drop_in_rules
 from proxy.config.graph import RosGraphConfig
 from proxy.config.matching import Fault, clashes
-from proxy.config.rule import REDUCTIONS, Rule
+from proxy.config.rule import REDUCTIONS, NamePatterns, NamePrefix, Owner, Rule, keep_owner
+from proxy.config.status_topic import StatusTopicConfig
 from proxy.serial.serializer import Encoding
 
 __all__ = ["DIALECT", "Encoding", "ProxyConfig", "Record", "RosGraphConfig", "Rule"]
@@ -42,7 +43,7 @@ _SHARED: Final = {  # keys of every node's file; docs/reference/configuration.md
     ("Domain", "root"): "Root certificate of the node's own trust domain.",
     ("Domain", "trusts"): "Root certificates of other domains whose members are believed.",
     ("Domain", "transit"): "Labels of the domains through which traffic may pass. `null`: every trusted one.",
-    ("Metrics", "port"): "TCP port on 127.0.0.1.",
+    ("ProxyMetrics", "port"): "TCP port on 127.0.0.1.",
 }
 
 
@@ -66,6 +67,27 @@ class Record(Section):
     format: Literal["mcap", "ros1"] = Field(default="mcap", description="`mcap` or `ros1` (a bag).")
 
 
+class ProxyMetrics(Metrics):
+    """Prometheus text of a proxy."""
+
+    topic_names: bool = Field(
+        default=False,
+        description="Label topics with local ROS names, which every user of this host may then read.",
+    )
+
+
+class Traces(Section):
+    """Where OpenTelemetry spans of service calls go."""
+
+    endpoint: str = Field(
+        pattern=r"^https?://\S+$", description="OTLP over HTTP, such as `http://127.0.0.1:4318/v1/traces`."
+    )
+    ratio: float = Field(
+        default=1.0, ge=0.0, le=1.0, description="Share of the calls that are traced; use the same one at both ends."
+    )
+    timeout_s: float = Field(default=2.0, gt=0.0, le=60.0, description="Longest time that one request may take.")
+
+
 class ProxyConfig(Section):
     """``proxy.yaml``. ``expose`` lists what leaves this machine, ``import`` what is wanted from elsewhere."""
 
@@ -80,6 +102,20 @@ class ProxyConfig(Section):
         description="The ROS graph, or a list of graphs, to take part in. Without it there are only recordings.",
         json_schema_extra=_or_one,
     )
+    owner: Annotated[Owner | None, AfterValidator(keep_owner)] = Field(
+        default=None, description="Public key file of the owner of all names whose rules state none."
+    )
+    prefix: NamePrefix = Field(
+        default=None,
+        description="Namespace of this machine on the overlay, such as robot1: /scan here is /robot1/scan elsewhere."
+        " `null`: none.",
+    )
+    deny: Annotated[NamePatterns, AfterValidator(add_drop_in_patterns)] = Field(
+        default=(),
+        validate_default=True,
+        description="Names, and patterns of such, that never cross, whatever the rules say: names of this machine, or"
+        " with their prefix. Hidden segments match, too.",
+    )
     expose: Annotated[tuple[Rule, ...], AfterValidator(add_drop_in_rules)] = Field(
         default=(), validate_default=True, description="Rules for what leaves this machine."
     )
@@ -87,10 +123,21 @@ class ProxyConfig(Section):
         default=(), alias="import", validate_default=True, description="Rules for what comes from elsewhere."
     )
     record: Record | None = Field(default=None, description="Write what arrives into a file.")
+    status: StatusTopicConfig | None = Field(
+        default=None,
+        description="A latched local topic (std_msgs/msg/String, JSON) with who publishes, reads, serves and calls the"
+        " names of this proxy. `null`: none.",
+    )
     state: Directory | None = Field(
         default=None, description="Directory that keeps revocations across restarts, for this user alone."
     )
-    metrics: Metrics | None = Field(default=None, description="Serve Prometheus text on 127.0.0.1.")
+    metrics: ProxyMetrics | None = Field(default=None, description="Serve Prometheus text on 127.0.0.1.")
+    traces: Traces | None = Field(
+        default=None, description="Send OpenTelemetry spans of service calls to a collector; needs the extra `otel`."
+    )
+    data_plane: UplinkPlane = Field(
+        default="raw", description="How frames are sent and received: `raw`, or by Scapy, which is slow."
+    )
     lease_s: LeaseSeconds = Field(
         default=ADVERTISEMENT_LEASE_S,
         description="Lease of this node's advertisements, in seconds; each is renewed after a third of it.",
@@ -111,18 +158,20 @@ class ProxyConfig(Section):
 
     @classmethod
     def load(cls, path: Path) -> ProxyConfig:
-        """Read ``proxy.yaml`` and the rules of its drop-in directory ``proxy.yaml.d``.
+        """Read ``proxy.yaml``, or the section ``proxy`` of ``machine.yaml``, and the rules of the drop-ins next to it.
 
         Raises:
             ConfigError: every error of a file, each with line and column.
         """
         drop_ins = DropIns.load(path)
-        return load(cls, path, more={DROP_INS: drop_ins}, locate=drop_ins.locate)
+        return load(cls, path, section="proxy", more={DROP_INS: drop_ins}, locate=drop_ins.locate)
 
     @classmethod
     def json_schema(cls) -> JsonSchema:
         """Return the JSON schema of the file, for editors."""
-        return editor_schema(cls, "proxy.yaml")
+        stated: JsonSchema = {"items": {"required": ["owner"]}}
+        either = [{"required": ["owner"]}, {"properties": {"expose": stated, "import": stated}}]
+        return {**editor_schema(cls, "proxy.yaml"), "anyOf": either}
 
     def endpoint_of(self, rule: Rule) -> int:
         """Return the index in ``ros`` of a rule's graph; in a loaded file with any ``ros`` every rule has exactly one.
@@ -151,7 +200,11 @@ class ProxyConfig(Section):
         """Yield the keys that have no meaning on their side."""
         for side, rules, only in (
             ("expose", self.expose, {"replication": "import"}),
-            ("import", self.imports, dict.fromkeys(("stop", "at_once", "state_node", *REDUCTIONS), "expose")),
+            (
+                "import",
+                self.imports,
+                dict.fromkeys(("history", "readiness", "stop", "at_once", "state_node", *REDUCTIONS), "expose"),
+            ),
         ):
             for index, rule in enumerate(rules):
                 for key in only.keys() & rule.model_fields_set:

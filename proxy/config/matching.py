@@ -81,7 +81,7 @@ class _Seen:
         return None
 
     def _keys(self, rule: Rule) -> Iterator[tuple[Hashable, str]]:
-        overlay = (rule.kind, rule.name, tuple(sorted(rule.extra.items())), rule.owner.compressed)
+        overlay = (rule.kind, rule.global_name_of(rule.name), tuple(sorted(rule.extra.items())), rule.owner.compressed)
         yield overlay, f"gives the same name: {rule.name}"
         if not rule.is_pattern or self._side == "expose":  # patterns of several owners may be imported into one graph
             local = (rule.kind, rule.local, self._place_of(rule))

@@ -5,6 +5,7 @@ Section of a configuration file. Validation reads the owner's public key and cha
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -13,13 +14,15 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    PrivateAttr,
     ValidationInfo,
     WithJsonSchema,
     field_validator,
 )
 from pydantic.config import JsonDict, JsonValue
+from pydantic_core import PydanticCustomError
 
-from gdp.client.send_options import DEADLINE_MAX_S, RATE_MAX_BITS_S, RATE_MIN_BITS_S, WEIGHT_MAX, SendOptions
+from gdp.client.send_options import DEADLINE_MAX_S, RATE_MAX_BITS_S, RATE_MIN_BITS_S, WEIGHT_MAX, Priority, SendOptions
 from gdp.crypto.keys import PublicKey
 from gdp.errors import GdpError, LocalError
 from gdp.limits import MESSAGE_MAX_BYTES
@@ -30,8 +33,10 @@ from gdp.ros_names import (
     NAME_FORM,
     NAME_MAX_CHARS,
     PATTERN_FORM,
+    PREFIX_FORM,
     TYPE_FORMS,
     Kind,
+    covers,
     fits_kind,
     is_name,
     is_pattern,
@@ -39,14 +44,17 @@ from gdp.ros_names import (
 )
 from gdp.service.replication import Mode, Replication
 from gdp.stores.files import read_private
+from proxy.config.history import SomeHistory
+from proxy.config.readiness import Readiness
 from proxy.config.reduction import Region, SomeAdapt, SomeCompress
 from proxy.reduce.cloud import CLOUD
 from proxy.reduce.image import IMAGE
 from proxy.reduce.picture import QUALITY, PictureFormat
 from proxy.serial.serializer import Encoding
 
-__all__ = ["DOMAIN_MAX", "REDUCTIONS", "SALT", "Rule"]
+__all__ = ["DOMAIN_MAX", "REDUCTIONS", "SALT", "NamePatterns", "NamePrefix", "Owner", "Rule", "keep_owner"]
 
+_OWNER: Final = "owner"  # key of the validation context
 CALL_S: Final = 5.0
 CALL_MAX_S: Final = 86_400.0
 COPIES_MAX: Final = 1_024
@@ -58,8 +66,8 @@ DOMAIN_MAX: Final = 232  # ports of a higher domain would exceed 65535; DDSI-RTP
 SALT: Final = "salt"  # the key of the unguessable part
 REDUCTIONS: Final = ("compress", "image", "quality", "voxel_m", "region", "adapt")  # keys about sending less
 _OWN_KEYS: Final = ("kind", "name", "type")
-_OF_TOPICS: Final = ("reliable", "latched", "max_hz", "deadline_ms", "repair", *REDUCTIONS)
-_OF_CALLS: Final = ("timeout_s", "on_timeout", "replication", "sign")
+_OF_TOPICS: Final = ("reliable", "latched", "history", "max_hz", "deadline_ms", "repair", *REDUCTIONS)
+_OF_CALLS: Final = ("timeout_s", "on_timeout", "replication", "readiness", "sign")
 _OF_SERVICES: Final = ("stop", "at_once", "state", "state_node")
 _FOREIGN: Final[dict[Kind, tuple[str, ...]]] = {
     "topic": (*_OF_CALLS, *_OF_SERVICES),
@@ -79,7 +87,15 @@ def _extra_metadata(items: dict[str, str | int]) -> dict[str, str | int]:
 
 
 def _owner_key(value: object, info: ValidationInfo) -> object:
-    """Read the public key file that ``owner`` names; a value that is not text is passed on and refused as such."""
+    """Read the public key file that ``owner`` names; a value that is not text is passed on and refused as such.
+
+    A rule without ``owner`` has that of its file, which ``keep_owner`` stored.
+    """
+    if value is None:
+        of_file = info.context.get(_OWNER) if isinstance(info.context, dict) else None
+        if of_file is None:
+            raise PydanticCustomError("missing", "Field required")
+        return of_file
     if not isinstance(value, str):
         return value
     path = relative(Path(value), info)
@@ -89,6 +105,17 @@ def _owner_key(value: object, info: ValidationInfo) -> object:
         raise ValueError(f"expected an owner's public key file: {path}: {error.strerror}") from error
     except GdpError as error:
         raise ValueError(f"expected an owner's public key file: {path}: {error}") from error
+
+
+def keep_owner(owner: PublicKey | None, info: ValidationInfo) -> PublicKey | None:
+    """Store the owner of a file for its rules, which are validated after it with the same context."""
+    if isinstance(info.context, dict):
+        info.context[_OWNER] = owner
+    return owner
+
+
+def _without_default(schema: JsonDict) -> None:
+    schema.pop("default", None)
 
 
 def _salt(value: object, info: ValidationInfo) -> object:
@@ -107,6 +134,30 @@ def _salt(value: object, info: ValidationInfo) -> object:
     return salt
 
 
+def _prefix(text: str | None) -> str | None:
+    """Return a namespace prefix; ``ValueError``: it is none."""
+    if text is not None and (len(text) > NAME_MAX_CHARS or re.fullmatch(PREFIX_FORM, text) is None):
+        raise ValueError("expected a namespace without its first slash, such as robot1 or fleet/robot1")
+    return text
+
+
+def _name_pattern(text: str) -> str:
+    if not is_name(text) and not is_pattern(text):
+        raise ValueError("expected a full ROS name, such as /camera/image, or a pattern: /camera/* or /camera/**")
+    return text
+
+
+NamePattern = Annotated[
+    str,
+    AfterValidator(_name_pattern),
+    Field(json_schema_extra={"pattern": f"^{PATTERN_FORM}$", "maxLength": NAME_MAX_CHARS}),
+]
+NamePatterns = tuple[NamePattern, ...]
+NamePrefix = Annotated[
+    str | None,
+    AfterValidator(_prefix),
+    Field(json_schema_extra={"pattern": f"^{PREFIX_FORM}$", "maxLength": NAME_MAX_CHARS}),
+]
 Owner = Annotated[PublicKey, BeforeValidator(_owner_key), WithJsonSchema({"type": "string", "minLength": 1})]
 Salt = Annotated[str | None, BeforeValidator(_salt), Field(max_length=4_096, repr=False)]
 ExtraMetadata = Annotated[dict[str, str | int], AfterValidator(_extra_metadata)]
@@ -143,10 +194,9 @@ class Rule(Section):
     model_config = ConfigDict(json_schema_extra={"allOf": [_by_kind("topic"), _by_kind("service"), _by_kind("action")]})
 
     kind: Kind = Field(default="topic", description="What it is about: `topic`, `service` or `action` (ROS 2).")
-    name: str = Field(
+    name: NamePattern = Field(
         description="The name that all sides know: a full ROS name such as /camera/image, or a pattern of such: `*` is"
-        " any part of one segment, `**` one or more segments. Hidden segments (`_action`) are written out.",
-        json_schema_extra={"pattern": f"^{PATTERN_FORM}$", "maxLength": NAME_MAX_CHARS},
+        " any part of one segment, `**` one or more segments. Hidden segments (`_action`) are written out."
     )
     type_name: str = Field(
         default="",
@@ -159,6 +209,10 @@ class Rule(Section):
         description="What this machine calls it, where that differs from `name`; not with a pattern.",
         json_schema_extra={"pattern": f"^{NAME_FORM}$", "maxLength": NAME_MAX_CHARS},
     )
+    prefix: NamePrefix = Field(
+        default=None,
+        description="Namespace in front of `name` on the overlay, such as robot1; empty: none. `null`: the file's.",
+    )
     metadata: ExtraMetadata = Field(
         default_factory=dict,
         description="Whatever else the 256-bit name digests: text or whole numbers.",
@@ -169,7 +223,12 @@ class Rule(Section):
         alias="salt_file",
         description="A private file (mode 0600) with the unguessable part of the 256-bit name: `salt` of its metadata.",
     )
-    owner: Owner = Field(description="Public key file of the name's owner (`owner.pub`).")
+    owner: Owner = Field(
+        default=None,
+        validate_default=True,
+        description="Public key file of the name's owner (`owner.pub`). Default: the file's `owner`.",
+        json_schema_extra=_without_default,
+    )
     encoding: Encoding = Field(
         default="json", description="How messages travel: `json`, `cbor`, or `cdr` (the bytes as ROS wrote them)."
     )
@@ -182,6 +241,11 @@ class Rule(Section):
         default=None,
         alias="latched",
         description="Topics: whether late joiners get the last message. `null`: as the publisher's QoS says.",
+    )
+    history: SomeHistory = Field(
+        default=None,
+        description="Topics, under `expose`: the messages that this machine keeps for late joiners. `null`: as many as"
+        " the publishers' QoS says, at most 64.",
     )
     max_hz: float | None = Field(
         default=None,
@@ -262,6 +326,11 @@ class Rule(Section):
         default_factory=Spread,
         description="Services and actions, under `import`: which of several servers get each request.",
     )
+    readiness: Readiness | None = Field(
+        default=None,
+        description="Services and actions, under `expose`: a probe of the local server. Remote clients find the server"
+        " only while it passes. `null`: whenever it is there.",
+    )
     stop: str | None = Field(
         default=None,
         description="Services, under `expose`: a local `std_srvs/srv/Trigger` that is called when no caller waits"
@@ -286,8 +355,10 @@ class Rule(Section):
         " array, is the server's state. `null`: it tells none.",
         json_schema_extra={"pattern": f"^{NAME_FORM}$", "maxLength": NAME_MAX_CHARS},
     )
-    priority: Literal["normal", "urgent"] = Field(
-        default="normal", description="`urgent`: goes before everything `normal`, wherever frames queue."
+    priority: Priority = Field(
+        default="normal",
+        description="`urgent`, then `interactive`: go before all others, wherever frames queue. The others share a full"
+        " path of this machine: `high` 16, `normal` 8, `low` 4, `bulk` 2, `background` 1, times `weight`.",
     )
     paths: Literal[1, 2, "spread"] = Field(
         default=1,
@@ -321,6 +392,19 @@ class Rule(Section):
         alias="global",
         description="Whether the name climbs to the tier above, so that other domains can find it.",
     )
+
+    _denied: tuple[str, ...] = PrivateAttr(default=())
+
+    def within(self, prefix: str | None, denied: tuple[str, ...]) -> Rule:
+        """Return the rule as it applies in a file.
+
+        Args:
+            prefix: the file's namespace; it applies where the rule has none of its own.
+            denied: patterns of names that never cross.
+        """
+        rule = self.model_copy(update={"prefix": prefix or ""} if self.prefix is None else {})
+        rule._denied = denied
+        return rule
 
     @property
     def extra(self) -> dict[str, str | int]:
@@ -383,14 +467,31 @@ class Rule(Section):
         return SendOptions(
             deadline_s=deadline_s if self.deadline_ms is None else self.deadline_ms / 1_000,
             weight=self.weight,
+            priority=self.priority,
             max_bits_s=self.max_bits_s,
             repairs=self.repair == "in-time",
             fec=self.fec == "auto",
+            history_bytes=None if self.history is None else self.history.max_bytes,
+            history_age_s=None if self.history is None else self.history.age_s,
         )
+
+    def means(self, local_name: str) -> bool:
+        """Return whether the rule is about a local name, denied or not."""
+        return matches(self.name, local_name) if self.is_pattern else local_name == self.local
+
+    def denied_by(self, local_name: str) -> str | None:
+        """Return the pattern under ``deny`` that covers a local name or its name on the overlay; None: none does."""
+        names = (local_name, self.global_name_of(local_name))
+        return next((pattern for pattern in self._denied if any(covers(pattern, name) for name in names)), None)
+
+    @property
+    def is_denied(self) -> bool:
+        """Return whether the rule is about one name, and that never crosses."""
+        return not self.is_pattern and self.denied_by(self.local) is not None
 
     def matches(self, local_name: str) -> bool:
         """Return whether the rule applies to a local name."""
-        return matches(self.name, local_name) if self.is_pattern else local_name == self.local
+        return self.means(local_name) and self.denied_by(local_name) is None
 
     def fits_type(self, type_name: str) -> bool:
         """Return whether the rule accepts this type; an empty type on either side is unknown and fits."""
@@ -398,7 +499,8 @@ class Rule(Section):
 
     def global_name_of(self, local_name: str) -> str:
         """Return the name that all sides use for a local name that ``matches``."""
-        return local_name if self.is_pattern else self.name
+        name = local_name if self.is_pattern else self.name
+        return f"/{self.prefix}{name}" if self.prefix else name
 
     def metadata_of(self, local_name: str, type_name: str) -> Metadata:
         """Return the metadata that the overlay name of a matching local name digests."""
@@ -421,16 +523,15 @@ class Rule(Section):
             return None
         if not fits_kind(type_name, self.kind) or not self.fits_type(type_name):
             return None
+        if self.prefix:
+            if not name.startswith(f"/{self.prefix}/"):
+                return None
+            name = name.removeprefix(f"/{self.prefix}")
         if self.is_pattern:
-            return name if matches(self.name, name) else None
-        return self.local if name == self.name else None
-
-    @field_validator("name")
-    @classmethod
-    def _name(cls, text: str) -> str:
-        if not is_name(text) and not is_pattern(text):
-            raise ValueError("expected a full ROS name, such as /camera/image, or a pattern: /camera/* or /camera/**")
-        return text
+            local = name if matches(self.name, name) else None
+        else:
+            local = self.local if name == self.name else None
+        return None if local is None or self.denied_by(local) is not None else local
 
     @field_validator("type_name")
     @classmethod
@@ -452,11 +553,18 @@ class Rule(Section):
             raise ValueError("a pattern cannot be remapped; write a rule for each name")
         return text
 
-    @field_validator("wants_reliable", "wants_latched", "max_hz", "deadline_ms", "repair", *REDUCTIONS)
+    @field_validator("wants_reliable", "wants_latched", "history", "max_hz", "deadline_ms", "repair", *REDUCTIONS)
     @classmethod
     def _is_of_topics(cls, value: object, info: ValidationInfo) -> object:
         if info.data.get("kind", "topic") != "topic":
             raise ValueError("only topics have this")
+        return value
+
+    @field_validator("history")
+    @classmethod
+    def _is_latched(cls, value: object, info: ValidationInfo) -> object:
+        if value is not None and info.data.get("wants_latched") is False:
+            raise ValueError("this keeps messages for late joiners; leave out 'latched: false'")
         return value
 
     @field_validator("image", "voxel_m", "region")
@@ -475,7 +583,7 @@ class Rule(Section):
             raise ValueError("this needs 'image: jpeg'")
         return value
 
-    @field_validator("timeout_s", "on_timeout", "replication", "sign")
+    @field_validator("timeout_s", "on_timeout", "replication", "readiness", "sign")
     @classmethod
     def _is_of_calls(cls, value: object, info: ValidationInfo) -> object:
         if info.data.get("kind", "service") == "topic":

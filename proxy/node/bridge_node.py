@@ -15,15 +15,21 @@ import typer
 
 from gdp.cli.node import emit, emit_wait
 from gdp.errors import LocalError
+from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
-from proxy.bridge.bridge import Bridge
+from proxy.bridge.bridge import Bridge, FlowChange
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.desired_flows import FlowSpec
+from proxy.bridge.flow_fields import flow_fields
+from proxy.bridge.topic_counts import topic_counts
+from proxy.bridge.topic_rows import flow_rows
 from proxy.bridge.topic_stats import percentile
 from proxy.config.config import ProxyConfig
 from proxy.endpoints.endpoint import proxy_node_name
 from proxy.endpoints.live import open_endpoints
 from proxy.node.node import GOODBYE_S, ProxyNode, run_node
+from proxy.node.otel_tracer import open_tracer
+from proxy.node.state_answer import answer_for_proxy
 
 __all__ = ["run"]
 
@@ -49,14 +55,28 @@ def run(path: Path, settings: ProxyConfig, *, json: bool) -> None:
         name = proxy_node_name(node.identity.name.to_text())
         with open_endpoints(settings.ros, name) as endpoints:
             held = DelegationStore(settings.delegations, node.identity)
+            tracer = open_tracer(settings.traces, node.identity.name, node.identity.label)
             look_s = 0.0 if all(end.exclusive for end in settings.ros) else _LOOK_S
-            bridge = Bridge(
-                BridgeContext(node.member, node.traffic, node.faults), settings, endpoints, held, look_s=look_s
-            )
+            site = BridgeContext(node.member, node.traffic, node.faults, tracer)
+            bridge = Bridge(site, settings, endpoints, held, look_s=look_s, status_topic=settings.status)
+            domains = tuple(end.domain_id for end in settings.ros if end.endpoint != "ros1")
+            answer_for_proxy(bridge, site, node.identity, node.policy, node.node_log.wait_facts, domains)
             node.drains = True
             node.on_reload = lambda: _reload(path, settings, node, bridge)
+            has_names = settings.metrics is not None and settings.metrics.topic_names
+            node.topic_counts = lambda: topic_counts(bridge.flows, has_names=has_names)
             node.best_effort = lambda: bridge.best_effort
+            node.topics = lambda: flow_rows(bridge.flows, bridge.held, node.member)
+            local_name = node.local_name
+            node.local_name = lambda name: _local_names(bridge).get(name) or local_name(name)
+            node.flows = lambda: [flow_fields(*each) for each in bridge.flows]
             node.undelegated = lambda: [_described(each) for each in bridge.undelegated]
+            node.liveliness = lambda: [each.to_fields() for each in bridge.liveliness(time.monotonic())]
+            node.unready = lambda: [{"local": local, "reason": reason} for local, reason in bridge.unready]
+            node.denied = lambda: [
+                {"side": "expose" if each.is_exposed else "import", "local": each.local, "pattern": each.pattern}
+                for each in bridge.denied
+            ]
             for endpoint in endpoints:
                 node.runtime.watch(endpoint)
             try:
@@ -64,6 +84,7 @@ def run(path: Path, settings: ProxyConfig, *, json: bool) -> None:
             finally:
                 for endpoint in endpoints:
                     node.runtime.unwatch(endpoint)
+                tracer.close()
             best_effort = bridge.best_effort
             bridge.close()
             node.member.leave()
@@ -109,19 +130,40 @@ def _work(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:
             is_ready = True
             node.tell_refusals()
             _tell_ready(node, bridge, json=json)
+        if is_ready:
+            for change in bridge.poll_changes():
+                _tell_change(change, json=json)
         if now_s >= tick_at_s:
             tick_at_s = now_s + TICK_S
             if json and is_ready:
                 _tell_progress(node, bridge)
 
 
+def _local_names(bridge: Bridge) -> dict[Name, str]:
+    return {flow_spec.name: flow_spec.local for flow_spec, _ in bridge.flows}
+
+
+def _tell_change(change: FlowChange, *, json: bool) -> None:
+    """Say that a flow began or ended after the start: a node came or went, or the rules were read again."""
+    if json:
+        emit("flow", change="begun" if change.is_begun else "ended", **_described(change.flow_spec))
+    else:
+        typer.echo(f"  {'+' if change.is_begun else '-'} {_line(change.flow_spec)}")
+
+
+def _line(flow_spec: FlowSpec) -> str:
+    kind = "" if flow_spec.rule.kind == "topic" else f"{flow_spec.rule.kind} "
+    return f"{'expose' if flow_spec.is_exposed else 'import'} {kind}{flow_spec.local} [{flow_spec.type_name}]"
+
+
 def _tell_ready(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:
+    bridge.poll_changes()  # those before are in the list
     if json:
         emit("ready", name=node.member.name.to_text())
         return
     typer.echo(f"proxy {node.member.name.short} is attached, in {', '.join(bridge.labels)}; Ctrl-C ends it")
     for flow_spec, _ in bridge.flows:
-        typer.echo(f"  {'expose' if flow_spec.is_exposed else 'import'} {flow_spec.local} [{flow_spec.type_name}]")
+        typer.echo(f"  {_line(flow_spec)}")
 
 
 def _tell_progress(node: ProxyNode, bridge: Bridge) -> None:
@@ -153,6 +195,7 @@ def _described(flow_spec: FlowSpec) -> dict[str, str]:
         "side": "expose" if flow_spec.is_exposed else "import",
         "kind": flow_spec.rule.kind,
         "local": flow_spec.local,
+        "shared": flow_spec.rule.global_name_of(flow_spec.local),
         "type": flow_spec.type_name,
         "name": flow_spec.name.to_text(),
     }
@@ -162,7 +205,7 @@ def _reload(path: Path, first: ProxyConfig, node: ProxyNode, bridge: Bridge) -> 
     """Read the configuration and the delegations again; flows with an unchanged rule continue."""
     settings = ProxyConfig.load(path)
     held = DelegationStore(settings.delegations, node.identity)
-    for key in ("identity", "domain", "iface", "ros", "metrics", "sandbox", "state", "control_socket"):
+    for key in ("identity", "domain", "iface", "ros", "metrics", "sandbox", "state", "status", "control_socket"):
         if getattr(settings, key) != getattr(first, key):
             raise LocalError(f"{path}: {key} changed; restart the proxy to change it")
     bridge.reload(settings, held)

@@ -13,9 +13,11 @@ from collections.abc import Iterator
 from gdp.nodes.delegation_store import DelegationStore
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.context import BridgeContext
+from proxy.bridge.topic_rows import flow_rows
 from proxy.config.config import ProxyConfig
 from proxy.config.recorded import RecordedRules
 from proxy.node.node import ProxyNode, open_topics
+from proxy.node.state_answer import answer_for_proxy
 from proxy.recordings.endpoint import RecordingEndpoint, ReplayEndpoint
 
 __all__ = ["open_recording_bridge", "work"]
@@ -34,7 +36,10 @@ def open_recording_bridge(
     """
     held = DelegationStore(settings.delegations, node.identity)
     open_topics(settings, held)
-    bridge = Bridge(BridgeContext(node.member, node.traffic, node.faults), rules, [endpoint], held)
+    site = BridgeContext(node.member, node.traffic, node.faults)
+    bridge = Bridge(site, rules, [endpoint], held)
+    answer_for_proxy(bridge, site, node.identity, node.policy, node.node_log.wait_facts)
+    node.topics = lambda: flow_rows(bridge.flows, bridge.held, node.member)
     node.on_reload = lambda: _renew(node, settings, rules, bridge)
     node.runtime.watch(endpoint)
     try:

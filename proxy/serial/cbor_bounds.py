@@ -1,6 +1,9 @@
-"""Bounds of a CBOR text before a library builds its values: items, depth, and lengths that the bytes cannot hold.
+"""Bounds of a CBOR text before a library builds its values: items, depth, tags, and lengths the bytes cannot hold.
 
-Sans-I/O. Source: RFC 8949, section 3. The check takes time proportional to the items and stops at the bound.
+Sans-I/O. The check takes time proportional to the items and stops at the bound. Tags other than those of typed arrays
+are refused: with shared values (tags 28 and 29) a few bytes stand for any number of items, and others make the library
+compile or compute something.
+Source: RFC 8949, section 3; RFC 8746, section 2.
 """
 
 from __future__ import annotations
@@ -11,6 +14,7 @@ __all__ = ["check_bounds"]
 
 _DEPTH_MAX: Final = 64
 _BREAK: Final = 0xFF
+_TYPED_ARRAYS: Final = range(64, 88)  # tags
 
 
 def check_bounds(wire: bytes, items_max: int) -> None:
@@ -20,7 +24,7 @@ def check_bounds(wire: bytes, items_max: int) -> None:
         items_max: numbers, texts, arrays, maps and tags in all.
 
     Raises:
-        ValueError: too many items, too deep, or lengths beyond the end.
+        ValueError: too many items, too deep, another tag than those of typed arrays, or lengths beyond the end.
     """
     open_counts: list[int] = [1]  # items that follow at each level; -1: until a break
     at, left, end = 0, items_max, len(wire)
@@ -54,6 +58,8 @@ def check_bounds(wire: bytes, items_max: int) -> None:
         elif major in (4, 5):
             open_counts.append(value * (major - 3))
         elif major == 6:
+            if value not in _TYPED_ARRAYS:
+                raise ValueError(f"tag {value}, which is of no typed array")
             open_counts.append(1)
         if at > end or (major in (4, 5) and info != 31 and value > end - at):
             raise ValueError("a length beyond the end")

@@ -176,7 +176,7 @@ def _measured(options: argparse.Namespace) -> Iterator[Row]:
         for times in _RATES
     ]
     jobs += [(speaker, "", 0) for speaker in options.speakers]
-    with prepared(options.seed), _smaller_grants():
+    with prepared(), _smaller_grants():
         _stage = Stage(options.seed)
         _record = _recorded(_stage)
         with multiprocessing.get_context("fork").Pool(options.processes, maxtasksperchild=1) as pool:

@@ -69,7 +69,6 @@ from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
 from tests.insiders.oracle import signing_oracle
 from tests.journeys.flows import Flow, advertise
-from tests.journeys.networks import reproducible_keys
 from tests.journeys.services import Party
 
 __all__ = ["add_arguments", "run"]
@@ -583,7 +582,7 @@ def run(options: argparse.Namespace, before: dict[str, Any]) -> tuple[dict[str, 
         stack.enter_context(mock.patch("gdp.simulation.simulation.SimNetwork", RecordingNetwork))
         stack.enter_context(signing_oracle())
         while counts.total() < options.tries and time.monotonic() - begun_s < options.seconds:
-            with reproducible_keys(seed), _without(options.control):
+            with _without(options.control):
                 found += _episode(Domain(seed), options.tries - counts.total(), counts, restarts)
             progress(f"network {seed}: {counts.total()} tries, {len(found)} accepted")
             seed += 1

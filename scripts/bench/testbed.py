@@ -28,6 +28,7 @@ from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE
 from gdp.trust.right import Right
 from ring.credentials import OverlayCredentials
+from ring.plan import METRICS_PORTS
 
 T = TypeVar("T")
 
@@ -98,19 +99,28 @@ class OverlayNodes:
         switches: nodes with one, in the order in which they start.
         plane: as ``gdp-switch --data-plane``; any but ``auto`` must be the one that the switch takes.
         label: of the folder with keys; one lab may have several in turn.
+        metrics: every node serves them, at the ports of the ring.
 
     Raises:
         FailedError: a process did not come up.
     """
 
     def __init__(
-        self, lab: Lab, switches: Sequence[str], *, plane: str, ready_s: float = 20.0, label: str = "keys"
+        self,
+        lab: Lab,
+        switches: Sequence[str],
+        *,
+        plane: str,
+        ready_s: float = 20.0,
+        label: str = "keys",
+        metrics: bool = False,
     ) -> None:
         self.lab = lab
         number = sum(1 for _ in lab.directory.glob(f"{label}-*"))
         self.files = lab.directory / f"{label}-{number}"
         self.files.mkdir(mode=0o700)
-        credentials = OverlayCredentials(lab.topology, self.files, metrics=False)
+        credentials = OverlayCredentials(lab.topology, self.files, metrics=metrics)
+        self._switch_nodes = tuple(switches)
         self.planes: set[str] = set()
         self.undo = ExitStack()
         with ExitStack() as undo:
@@ -129,6 +139,12 @@ class OverlayNodes:
             rib = ["-m", "gdp.cli.rib", "--json", "--config", str(credentials.rib(at))]
             undo.enter_context(lab.start(at.switch, "rib", rib)).read(ready_s)
             self.undo = undo.pop_all()
+
+    def metrics_urls(self) -> dict[str, list[str]]:
+        """Return the addresses of the nodes' metrics by machine; to be read from within the machine."""
+        (at,) = self.lab.topology.attached("rib")
+        roles = {node: ["switch", *(["rib"] if node == at.switch else [])] for node in self._switch_nodes}
+        return {node: [f"http://127.0.0.1:{METRICS_PORTS[role]}" for role in each] for node, each in roles.items()}
 
     def close(self) -> None:
         """End all processes, the last one first."""

@@ -131,7 +131,7 @@ def main() -> None:
         while not (most and stats.calls >= most and not waiting):
             rclpy.spin_once(node)
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # both end the node normally
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal and its launch both send one: the second cuts nothing
     report(done=True)
     node.destroy_node()
     rclpy.try_shutdown()

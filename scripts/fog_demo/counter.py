@@ -6,6 +6,7 @@ I/O; needs rclpy. A request with ``data: true`` adds one; the response's message
 
 from __future__ import annotations
 
+import signal
 import struct
 from collections.abc import Sequence
 from typing import Final
@@ -38,7 +39,7 @@ def main() -> None:
     try:
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # both end the node normally
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal and its launch both send one: the second cuts nothing
     finally:
         node.destroy_node()
         rclpy.try_shutdown()

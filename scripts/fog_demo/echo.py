@@ -7,6 +7,7 @@ I/O; needs rclpy. The response is {success: value of the request, message: the m
 from __future__ import annotations
 
 import os
+import signal
 import time
 
 import rclpy
@@ -35,7 +36,7 @@ def main() -> None:
     try:
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # both end the node normally
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal and its launch both send one: the second cuts nothing
     finally:
         node.destroy_node()
         rclpy.try_shutdown()

@@ -138,13 +138,13 @@ def _receive(source: socket.socket, side: int, line: DelayLine, delay: _Delay) -
 
 def main() -> None:
     """Run the relay of the command line."""
-    logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(levelname)s %(name)s %(message)s")
+    logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(levelname)s internet.line %(message)s")
     ctypes.CDLL(None).prctl(_TIMER_SLACK, 1, 0, 0, 0)  # the default adds 50 us to each pause
     line = DelayLine(0)
     with _open(sys.argv[1]) as one, _open(sys.argv[2]) as other:
         _relay((one, other), line)
-    if line.dropped:
-        log.warning("frames dropped count=%d", line.dropped)
+    if line.dropped:  # expected where an uplink was cut with frames under way
+        log.warning("delay line %s-%s lost frames, device down or queue full count=%d", *sys.argv[1:3], line.dropped)
 
 
 if __name__ == "__main__":

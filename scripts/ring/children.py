@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import sys
-from collections.abc import Coroutine, Iterable, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 from typing import Final, TypeVar
 
 from gdp.host.run_registry import Run
@@ -28,9 +28,11 @@ class Children:
     Args:
         run: records each of them, so that the clean-up of the run ends it.
         kept: they outlive this process; otherwise the kernel kills them when it ends for any reason.
+        started: called with machine and process id of each process that runs in a namespace.
     """
 
-    def __init__(self, run: Run, *, kept: bool) -> None:
+    def __init__(self, run: Run, *, kept: bool, started: Callable[[str, int], None] | None = None) -> None:
+        self._started = started
         self._run = run
         self._kept = kept
         self._all: list[Child] = []
@@ -57,7 +59,10 @@ class Children:
         """Start Python with these arguments in the namespace of a switch; ``environment`` extends the present one."""
         prefix = ["env", *(f"{name}={value}" for name, value in environment.items())] if environment else []
         argv = namespaces.command(node, [*prefix, sys.executable, *arguments], dies_with_us=not self._kept)
-        return self.start(f"{role} {node}", argv, heard=heard)
+        child = self.start(f"{role} {node}", argv, heard=heard)
+        if self._started is not None:
+            self._started(node, child.pid)
+        return child
 
     async def ready(self, children: Sequence[Child]) -> list[Event]:
         """Wait until each has reported ``ready``, and return these events; from then on they are required."""

@@ -28,6 +28,7 @@ from ring.child import ChildError
 from ring.faults import Cut, Kill, Roam
 from ring.hints import hints, live_hints
 from ring.live_run import LiveRing
+from ring.nodes.content import CAMERA_HZ
 from ring.options import LIVE_S, Live, Options, RingPlane
 from ring.progress import ProgressReporter
 from ring.result import Result
@@ -56,6 +57,8 @@ Examples:
   scripts/ring_topology.sh --roam robot:nuc3@5       the robot drives on to another switch
   scripts/ring_topology.sh --kill rib:school@5       a RIB dies
   scripts/ring_topology.sh --live --seconds 70 --cut nuc1-nuc2@5 --kill switch:nuc3@20-30 --roam server:nuc4@40
+  scripts/ring_topology.sh --data-plane scapy        every frame built by Scapy
+  scripts/ring_topology.sh --cores                   a robot of two cores, edge servers of four
   scripts/ring_topology.sh --keep                    leave it up to look around
   scripts/ring_topology.sh --down                    and take it down
 """
@@ -74,10 +77,13 @@ def ring(
     seconds: Annotated[
         float | None, typer.Option(help=f"Of traffic; a recording is stretched. Live: {LIVE_S:g} where not said.")
     ] = None,
+    camera_hz: Annotated[float, typer.Option(help="Images a second of the live camera.")] = CAMERA_HZ,
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the result as JSON.")] = None,
     rate: Annotated[float, typer.Option(help="Pace of the replay; 0: as fast as it goes.")] = 1.0,
     encoding: Annotated[str, typer.Option(help=f"Of messages: {', '.join(ENCODINGS)}.")] = "json",
-    data_plane: Annotated[str, typer.Option(help=f"Of the switches: {', '.join(PLANES)}.")] = "auto",
+    data_plane: Annotated[
+        str, typer.Option(help=f"Of the switches: {', '.join(PLANES)}; scapy: of RIBs and proxies, too.")
+    ] = "auto",
     mtu: Annotated[int, typer.Option(help="Of the links, in bytes.")] = MTU_BYTES,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep the received recording here.")] = None,
     pcap: Annotated[Path | None, typer.Option(metavar="FILE", help="Write what an eavesdropper on nuc3 sees.")] = None,
@@ -94,6 +100,9 @@ def ring(
     lease: Annotated[
         float, typer.Option(help="Of names, in seconds: what is not renewed is forgotten.")
     ] = ADVERTISEMENT_LEASE_S,
+    cores: Annotated[
+        bool, typer.Option("--cores", help="Two cores' worth for the robot, four for each edge server, by cgroups.")
+    ] = False,
     keep: Annotated[bool, typer.Option("--keep", help="Leave the ring up, and say what to try.")] = False,
     down: Annotated[bool, typer.Option("--down", help="Take down every ring that was kept, and end.")] = False,
 ) -> None:
@@ -125,8 +134,10 @@ def ring(
             kills=tuple(Kill.from_text(text) for text in kill or ()),
             lease_s=lease,
             keep=keep,
+            cores=cores,
             live=None if live is None else _one_of("live", live, LIVES),
             seconds=seconds,
+            camera_hz=camera_hz,
         )
         for swept in runs.sweep():
             errors.print(f"took down what run {swept} had left behind", highlight=False)

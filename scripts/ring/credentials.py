@@ -20,6 +20,7 @@ from gdp.crypto.certificates import Role
 from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.metadata import Metadata
 from gdp.names import Name
+from gdp.nodes.config import UplinkPlane
 from gdp.simulation.topology import Attachment, Topology
 from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
 from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE
@@ -39,6 +40,7 @@ class OverlayCredentials:
 
     Args:
         roamers: proxies that will also be attached to other switches.
+        data_plane: of RIBs and proxies.
     """
 
     def __init__(
@@ -49,7 +51,9 @@ class OverlayCredentials:
         metrics: bool,
         roamers: Collection[Attachment] = (),
         lease_s: float = ADVERTISEMENT_LEASE_S,
+        data_plane: UplinkPlane = "raw",
     ) -> None:
+        self._data_plane = data_plane
         self._roamers = roamers
         self._lease_s = lease_s
         self._topology = topology
@@ -84,7 +88,12 @@ class OverlayCredentials:
         upstream = upper_rib(self._topology, self._topology.domain_of(at.switch))
         upper = self._names[_title(Role.RIB, upstream.switch)] if upstream is not None else None
         content = rib_yaml(
-            at, self._credentials(Role.RIB, at.switch), upper, metrics=self._metrics, lease_s=self._lease_s
+            at,
+            self._credentials(Role.RIB, at.switch),
+            upper,
+            metrics=self._metrics,
+            data_plane=self._data_plane,
+            lease_s=self._lease_s,
         )
         return self._write(Role.RIB, at.switch, content)
 
@@ -106,7 +115,15 @@ class OverlayCredentials:
         rules: dict[str, Sequence[Yaml]] = {side: [each.rule(self._owner / OWNER_PUBLIC, encoding) for each in carried]}
         credentials = self._credentials(Role.PROXY, at.switch)
         content = proxy_yaml(
-            at, credentials, node / DELEGATIONS, 2, rules, None, metrics=self._metrics, lease_s=self._lease_s
+            at,
+            credentials,
+            node / DELEGATIONS,
+            2,
+            rules,
+            None,
+            metrics=self._metrics,
+            data_plane=self._data_plane,
+            lease_s=self._lease_s,
         )
         return self._write(Role.PROXY, at.switch, {**content, "ros": graph})
 
@@ -135,7 +152,15 @@ class OverlayCredentials:
         }
         credentials = self._credentials(Role.PROXY, at.switch)
         content = proxy_yaml(
-            at, credentials, node / DELEGATIONS, ros, rules, record, metrics=self._metrics, lease_s=self._lease_s
+            at,
+            credentials,
+            node / DELEGATIONS,
+            ros,
+            rules,
+            record,
+            metrics=self._metrics,
+            data_plane=self._data_plane,
+            lease_s=self._lease_s,
         )
         return self._write(Role.PROXY, at.switch, content)
 

@@ -142,9 +142,14 @@ def graphs_of(live: Live, run: str) -> tuple[Graph, Graph]:
     return Graph(robot, domain), Graph(server, domain % _DOMAINS + 1)
 
 
-def messages_in(seconds: float) -> dict[str, int]:
-    """Return the number of messages that each talker publishes."""
-    return {talk.node: max(round(talk.hz * seconds), 1) for talk in TALKS}
+def paces(camera_hz: float) -> dict[str, float]:
+    """Return the messages a second of each talker."""
+    return {talk.node: talk.hz for talk in TALKS} | {"camera": camera_hz}
+
+
+def messages_in(seconds: float, hz: float) -> int:
+    """Return the number of messages that a talker publishes."""
+    return max(round(hz * seconds), 1)
 
 
 def calls_in(seconds: float) -> int:

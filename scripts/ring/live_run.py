@@ -19,7 +19,7 @@ from proxy.endpoints.ros1.install import rospy_folder
 from ring.child import Child
 from ring.events import Event
 from ring.injection import Injection
-from ring.live_plan import CARRIED, FAST_DDS_PROFILES, MASTER_PORT, Graph, Side, calls_in, graphs_of, messages_in
+from ring.live_plan import CARRIED, FAST_DDS_PROFILES, MASTER_PORT, Graph, Side, calls_in, graphs_of, messages_in, paces
 from ring.live_result import Heard, rows
 from ring.live_session import ENDING_S, LiveNodes, LiveSession
 from ring.options import Live, Options
@@ -96,10 +96,14 @@ class LiveRing:
     async def _live_nodes(self) -> LiveNodes:
         """Start the nodes; return when all are ready."""
         (robot, at_robot, _), (server, at_server, _) = self._ends
-        talking, calls = messages_in(self._options.live_s), calls_in(self._options.live_s)
+        seconds, talking = self._options.live_s, paces(self._options.camera_hz)
+        calls = calls_in(seconds)
         self._reporter.step(f"starting nodes at {robot.switch}, ROS {at_robot.ros}: {', '.join(talking)}, lamp")
         self._reporter.step(f"starting nodes at {server.switch}, ROS {at_server.ros}: listener, caller")
-        talkers = {self._start_node(robot, at_robot, name, count): count for name, count in talking.items()}
+        talkers = dict[Child, int]()
+        for name, hz in talking.items():
+            count = messages_in(seconds, hz)
+            talkers[self._start_node(robot, at_robot, name, count, hz)] = count
         lamp = self._start_node(robot, at_robot, "lamp", 0)
         listener = self._start_node(server, at_server, "listener", 0)
         caller = self._start_node(server, at_server, "caller", calls)
@@ -131,8 +135,9 @@ class LiveRing:
         argv = ["-m", "proxy.cli.proxy", "--config", str(config), *(["--json"] if heard else [])]
         return self._start(at, graph, "proxy", argv, heard=heard)
 
-    def _start_node(self, at: Attachment, graph: Graph, name: str, count: int) -> Child:
-        return self._start(at, graph, name, ["-m", "ring.nodes", str(graph.ros), name, str(count)])
+    def _start_node(self, at: Attachment, graph: Graph, name: str, count: int, hz: float | None = None) -> Child:
+        pace = [] if hz is None else [str(hz)]
+        return self._start(at, graph, name, ["-m", "ring.nodes", str(graph.ros), name, str(count), *pace])
 
     def _start(self, at: Attachment, graph: Graph, role: str, argv: list[str], *, heard: bool = True) -> Child:
         return self.overlay.start(at.switch, role, argv, heard=heard, environment=self.environment(graph))

@@ -15,6 +15,7 @@ from gdp.limits import ADVERTISEMENT_LEASE_S, LEASE_MAX_S, LEASE_MIN_S
 from gdp.simulation.topology import MTU_BYTES, Topology, ring5
 from proxy.config.config import Encoding
 from ring.faults import Cut, Fault, Kill, Roam, check_faults
+from ring.nodes.content import CAMERA_HZ
 
 __all__ = ["LIVE_S", "Live", "Options", "RingPlane"]
 
@@ -23,6 +24,7 @@ Live = Literal["ros2", "ros1", "mixed"]
 
 LIVE_S: Final = 10.0
 _LIVE_MAX_S: Final = 3_600.0
+_CAMERA_HZ: Final = 0.1, 120.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,9 +35,11 @@ class Options:
         bag: the recording; None: a generated robot drive.
         rate: 1 is the recorded pace, 0 as fast as possible.
         out: directory, created if necessary, for the received recording; None: it is deleted with the run.
+        cores: bound and weight the processor time of each machine.
         live: real nodes instead of a recording; their ROS version. ``mixed``: ROS 1 at the robot, ROS 2 at the server.
         seconds: of traffic; a recording is replayed slower or faster to last this long, a generated one is created with
             this length. None: ``LIVE_S`` live, else the recording's own time.
+        camera_hz: images a second of the live camera.
 
     Raises:
         LocalError: an invalid rate, a fault that cannot be injected, a directory that is missing, a recording for a
@@ -54,13 +58,19 @@ class Options:
     roams: tuple[Roam, ...] = ()
     kills: tuple[Kill, ...] = ()
     keep: bool = False
+    cores: bool = False
     live: Live | None = None
     seconds: float | None = None
+    camera_hz: float = CAMERA_HZ
     lease_s: float = ADVERTISEMENT_LEASE_S
 
     def __post_init__(self) -> None:
         if self.live is not None and (self.bag is not None or self.rate != 1 or self.out is not None):
             raise LocalError("--live is without a recording: neither BAG nor --rate nor --out goes with it")
+        if self.live is None and self.camera_hz != CAMERA_HZ:
+            raise LocalError("--camera-hz is for --live: a recording has its own pace")
+        if not _CAMERA_HZ[0] <= self.camera_hz <= _CAMERA_HZ[1]:
+            raise LocalError(f"--camera-hz is {_CAMERA_HZ[0]:g} to {_CAMERA_HZ[1]:g}, not {self.camera_hz:g}")
         if self.seconds is not None and self.rate != 1:
             raise LocalError("--seconds and --rate both say how fast: give one of them")
         if self.seconds is not None and not 1 <= self.seconds <= _LIVE_MAX_S:
@@ -102,10 +112,11 @@ class Options:
         """Return the options for the JSON result."""
         recorded = {"recording": str(self.bag) if self.bag else "demo", "rate": self.rate, "seconds": self.seconds}
         return {
-            **({"live": self.live, "seconds": self.live_s} if self.live else recorded),
+            **({"live": self.live, "seconds": self.live_s, "camera_hz": self.camera_hz} if self.live else recorded),
             "encoding": self.encoding,
             "data_plane": self.data_plane,
             "mtu": self.mtu,
+            "cores": self.cores,
             "lease_s": self.lease_s,
             "cuts": [str(cut) for cut in self.cuts],
             "roams": [str(roam) for roam in self.roams],

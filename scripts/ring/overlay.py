@@ -11,10 +11,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
+from gdp.errors import LocalError
 from gdp.host.run_registry import Run
 from gdp.simulation.namespaces import Namespaces
 from ring.child import Child
 from ring.children import READY_S, Children
+from ring.cores import EDGE_CORES, ROBOT_CORES, MachineCores
 from ring.credentials import OverlayCredentials
 from ring.faults import Cut, Kill, Roam, roamers
 from ring.options import Options
@@ -48,9 +50,15 @@ class Overlay:
         for at in roaming:
             self.namespaces.connect_device(at.switch, at.ifname, at.switch)
         self.materials = OverlayCredentials(
-            self.topology, run.directory, metrics=options.keep, roamers=roaming, lease_s=options.lease_s
+            self.topology,
+            run.directory,
+            metrics=options.keep,
+            roamers=roaming,
+            lease_s=options.lease_s,
+            data_plane="scapy" if options.data_plane == "scapy" else "raw",
         )
-        self.children = Children(run, kept=options.keep)
+        self._cores = self._make_cores(run) if options.cores else None
+        self.children = Children(run, kept=options.keep, started=None if self._cores is None else self._cores.add)
         self.switches: dict[str, Child] = {}
         self._ribs: dict[str, Child] = {}
         self._restarts = 0
@@ -58,8 +66,9 @@ class Overlay:
 
     @property
     def settings(self) -> dict[str, object]:
-        """Return the options for the JSON result, with the selected data plane."""
-        return {**self.options.settings(), "data_plane": ", ".join(self._planes)}
+        """Return the options for the JSON result, with the selected data plane and the cores of each machine."""
+        cores = None if self._cores is None else self._cores.cores
+        return {**self.options.settings(), "data_plane": ", ".join(self._planes), "cores": cores}
 
     async def stand_up(self) -> None:
         """Start switches and RIBs; return when all are ready."""
@@ -120,6 +129,17 @@ class Overlay:
         home = roam.proxy(self.topology).switch
         await asyncio.to_thread(self.namespaces.unplug, home, roam.who)
         await asyncio.to_thread(self.namespaces.connect_device, home, roam.who, roam.to)
+
+    def _make_cores(self, run: Run) -> MachineCores | None:
+        cores = {node: ROBOT_CORES if node == self.robot.switch else EDGE_CORES for node in self.topology.nodes}
+        try:
+            made = MachineCores(run, cores)
+        except LocalError as error:
+            self.reporter.step(f"--cores has no effect: no control groups can be made here ({error})")
+            return None
+        text = f"the robot {ROBOT_CORES}, each edge server {EDGE_CORES}"
+        self.reporter.step(f"cores by control groups: {text}")
+        return made
 
     def _start_switch(self, node: str, config: Path, prefix: str = "") -> Child:
         return self.start(node, f"{prefix}switch", ["-m", "gdp.cli.switch", "--config", str(config), "--json"])

@@ -12,6 +12,7 @@ from typing import Final, TypeAlias
 
 from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.names import Name
+from gdp.nodes.config import UplinkPlane
 from gdp.simulation.topology import Attachment, DomainPlan, Topology
 from proxy.config.config import Encoding
 from proxy.serial.channel import Channel
@@ -107,6 +108,7 @@ def rib_yaml(
     upper: Name | None,
     *,
     metrics: bool,
+    data_plane: UplinkPlane = "raw",
     lease_s: float = ADVERTISEMENT_LEASE_S,
 ) -> Yaml:
     """Return ``rib.yaml`` of one domain's RIB."""
@@ -114,6 +116,7 @@ def rib_yaml(
         **credentials.to_yaml(),
         "iface": at.ifname,
         "upper": upper.to_text() if upper is not None else None,
+        "data_plane": data_plane,
         "lease_s": lease_s,
         **_metrics("rib", wanted=metrics),
     }
@@ -143,6 +146,7 @@ def proxy_yaml(
     record: Path | None,
     *,
     metrics: bool,
+    data_plane: UplinkPlane = "raw",
     lease_s: float = ADVERTISEMENT_LEASE_S,
 ) -> Yaml:
     """Return ``proxy.yaml`` of one proxy.
@@ -156,6 +160,7 @@ def proxy_yaml(
         **credentials.to_yaml(),
         "iface": at.ifname,
         "delegations": str(delegations),
+        "data_plane": data_plane,
         "lease_s": lease_s,
         **{side: list(each) for side, each in rules.items()},
         **({"record": {"path": str(record), "format": form}} if record is not None else {}),

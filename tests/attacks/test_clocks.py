@@ -58,7 +58,7 @@ def restart_rib(world: Simulation, label: str, by_s: float) -> None:
     settings = replace(settings, first_sequence=settings.first_sequence + int(by_s * 1_000))
     identity, policy = world.identities[f"rib:{label}"], world.policy(label)
     (domain,) = (each for each in world.topology.domains if each.label == label)
-    places = RibSettings(upper=world._rib_names(domain.upper), peers=world._rib_names(label))
+    places = RibSettings(upper=world._upper_names(domain.upper), peers=world._rib_names(label))
     host = world.ribs[label] = off(
         RibHost(identity, policy, RibCore(identity, policy, MemoryStore(), places), settings), by_s
     )

@@ -129,8 +129,8 @@ def test_a15_a_nodes_advertisements_are_bounded_and_cost_the_same_however_many_t
     rtcert = RtCert.make(GATEWAY, SWITCH.name, DAY)
     others = advertisement(node=GATEWAY, subject=_subject("/others", GATEWAY), chain=[], rtcert=rtcert)
     attached.put(verifier().verify(others, NOW), 1, b"n", 0.0)
-    assert len(attached.due(0.0)) == ATTACHED_MAX // 2 + 1
-    assert attached.due(0.1) == []
+    assert len(attached.due(0.0, 0.0)) == ATTACHED_MAX // 2 + 1
+    assert attached.due(0.1, 0.0) == []
 
 
 def test_a15_advertisements_and_withdrawals_beyond_a_neighbours_pace_draw_nothing(

@@ -30,12 +30,13 @@ from gdp.enrolment.units import unit_texts
 from tests.fog.enrolment.desk import made_desk
 from tests.pages import ROOT
 
-UNITS = sorted((ROOT / "scripts" / "systemd").glob("*.service"))
+UNITS = sorted((ROOT / "gdp" / "enrolment" / "service").glob("*.service"))
 EXPOSURE_MAX = {  # tenths; 96 without fences
     "gdp-switch": 27,
     "gdp-relay": 27,
-    "gdp-rib": 27,
-    "gdp-proxy": 32,
+    "gdp-rib": 23,
+    "gdp-proxy": 23,
+    "gdp-fog": 23,
     "fog-machine": 50,
 }
 FENCES = (
@@ -70,7 +71,7 @@ def unit(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     """Unit file with an existing program."""
     text = machine_unit() if request.param is None else request.param.read_text()
     path = tmp_path / ("fog-machine.service" if request.param is None else request.param.name)
-    path.write_text(re.sub(r"(?m)^(Exec\w+=\+?)/(?:opt|usr/local)/\S+", r"\1/bin/true", text))
+    path.write_text(re.sub(r"(?m)^(Exec\w+=\+?)/(?:opt|usr/local|usr/lib/gdp-ros)/\S+", r"\1/bin/true", text))
     return path
 
 
@@ -99,10 +100,11 @@ def test_a53_systemd_finds_the_unit_fenced(unit: Path) -> None:
 def test_a53_the_unit_has_every_fence(unit: Path) -> None:
     lines = unit.read_text().splitlines()
     lacking = [fence for fence in FENCES if not any(line.startswith(fence) for line in lines)]
-    assert lacking == (["PrivateTmp=yes"] if unit.stem == "gdp-proxy" else [])  # where ROS nodes of the host meet it
+    assert lacking == []
     kept = set(re.findall(r"CAP_\w+", " ".join(line for line in lines if line.startswith("CapabilityBoundingSet="))))
     assert not kept & {"CAP_SYS_ADMIN", "CAP_SYS_PTRACE", "CAP_SYS_MODULE", "CAP_DAC_READ_SEARCH", "CAP_SYS_RAWIO"}
-    assert "User=gdp" in lines or unit.stem == "fog-machine"
+    assert unit.stem == "fog-machine" or {"DynamicUser=yes", "Type=notify", "NotifyAccess=main"} <= set(lines)
+    assert unit.stem == "fog-machine" or any(line.startswith("WatchdogSec=") for line in lines)
 
 
 @needs_systemd

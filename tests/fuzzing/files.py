@@ -159,7 +159,15 @@ DECODERS: Final = (
     Decoder("bag-stream", _frames, (_FRAMES,), (LocalError, RemoteError)),
     Decoder("qos", _qos, (_QOS,), (LocalError,), _YAML, size_max=_TEXT_MAX),
     Decoder("yaml", _in_file("a.yaml", read_yaml), (_CONFIG,), _REFUSED, _YAML, size_max=_TEXT_MAX),
-    Decoder("proxy-config", _in_file("p.yaml", ProxyConfig.load), (_CONFIG,), _REFUSED, _YAML, size_max=_TEXT_MAX),
+    Decoder(
+        "proxy-config",
+        _in_file("p.yaml", ProxyConfig.load),
+        (_CONFIG,),
+        _REFUSED,
+        _YAML,
+        size_max=_TEXT_MAX,
+        memory_max=8.0,  # a rule of five bytes gets an error for each key that it lacks
+    ),
     Decoder("switch-config", _in_file("s.yaml", SwitchConfig.load), (_CONFIG,), _REFUSED, _YAML, size_max=_TEXT_MAX),
     Decoder(
         "parameters",

@@ -50,6 +50,7 @@ _U64: Final = (1 << 64) - 1
 _INTEGERS: Final = (0, 1, 2, 255, 256, 65_535, 65_536, (1 << 24), (1 << 31) - 1, 1 << 32, (1 << 63), _U64 - 1, _U64)
 _NUMBERS: Final = (0.0, -0.0, -1.0, 1e-9, 0.5, 1.0, 24.0, 3_599.5, 3_600.0, 3_600.5, 1e300, float("inf"), float("nan"))
 _TEXTS: Final = ("", "publish", "serve", "call", "read", "attach", "domain", "border", "x" * 300)
+_ASKS: Final = ("ping", "trace", "resolve", "state", "dance", "", "x" * 17)
 _SIZES: Final = (900, 1_024, 1_025, 6_400, 6_500, 6_501, 12_000, 16_000, 16_300)
 _MAXIMA: Final = {
     "h": HEARD_MAX, "u": CONFLICTS_MAX, "y": COOKIES_MAX,
@@ -606,6 +607,27 @@ class Forge:
             "c": identity.membership,
         }
 
+    def _diagnostic_request(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        return {
+            "a": rng.choice(_ASKS), "n": rng.choice((ZERO, *self._topics, self._name(rng))),
+            "to": rng.choice((*self._nodes, self._switch_at(rng, place))), "s": self._sequence(rng),
+            "b": rng.choice(({}, {"x": rng.choice(_SIZES)}, {"n": [self._name(rng)] * 40})), "k": rng.random() < 0.5,
+            "c": identity.membership, "z": bytes(rng.choice((0, 1, 360, 1_040, *_SIZES))),
+        }  # fmt: skip
+
+    def _diagnostic_reply(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
+        return {
+            "a": rng.choice(_ASKS), "s": self._sequence(rng), "r": rng.choice(self._nodes),
+            "b": rng.choice(({}, {"l": [self._name(rng)] * rng.choice((1, 100))}, {"state": _TEXTS[-1]})),
+            "e": rng.choice(("", "", "refused", "x" * 33)), "w": rng.random() < 0.5, "m": rng.random() < 0.5,
+            "h": rng.choice((0, 1, HOPS_MAX, 63)), "c": identity.membership,
+        }  # fmt: skip
+
+    def _sequence(self, rng: random.Random) -> int:
+        """Return a sequence number: one that follows from the wall clock, as honest nodes start with, or another."""
+        unix_ms = int(self._stage.world.network.now.unix_s * 1_000)
+        return rng.choice((unix_ms + next(self._counters), unix_ms, *self._far_numbers(), *_INTEGERS))
+
     def _adcert(self, rng: random.Random, identity: Identity, place: Place) -> _Body:
         return dict(parse(AdCert.make(
             identity.key, identity.name, identity.subject, rng.choice(self._identities()).subject,
@@ -632,6 +654,8 @@ class Forge:
         if rng.random() < 0.03:
             return rng.choice(tuple(Kind)), rng.choice((ZERO, self._name(rng)))
         kind = rng.choice(_KINDS[type_])
+        if type_ in (StatementType.DIAGNOSTIC_REQUEST, StatementType.DIAGNOSTIC_REPLY):
+            return kind, rng.choice((*self._nodes, *(each.name for each in self._stage.world.switches.values())))
         if kind >= Kind.HELLO:
             return kind, ZERO
         world = self._stage.world
@@ -785,6 +809,7 @@ _BODIES: Final[dict[StatementType, _Make]] = {
     _T.ADCERT: Forge._adcert, _T.RTCERT: Forge._rtcert, _T.CARD: Forge._card, _T.GRANT: Forge._grant,
     _T.ENDPOINTS: Forge._endpoints, _T.ENDPOINTS_QUERY: Forge._endpoints_query,
     _T.ENDPOINTS_ANSWER: Forge._endpoints_answer, _T.MAIL: Forge._mail,
+    _T.DIAGNOSTIC_REQUEST: Forge._diagnostic_request, _T.DIAGNOSTIC_REPLY: Forge._diagnostic_reply,
 }  # fmt: skip
 _K = Kind
 _KINDS: Final[dict[StatementType, tuple[Kind, ...]]] = {
@@ -799,7 +824,8 @@ _KINDS: Final[dict[StatementType, tuple[Kind, ...]]] = {
     _T.GRANT: (_K.ADVERTISE_ACK,), _T.OPEN: (_K.RIB_REQUEST,), _T.ACCEPT: (_K.RIB_ANSWER,),
     _T.REVOKED: (_K.REVOKED,), _T.LACKING: (_K.REVOKED,), _T.ENDPOINTS: (_K.RIB_REQUEST,),
     _T.ENDPOINTS_QUERY: (_K.RIB_REQUEST,), _T.ENDPOINTS_ANSWER: (_K.RIB_ANSWER, _K.RIB_REQUEST),
-    _T.MAIL: (_K.RIB_REQUEST, _K.RIB_ANSWER),
+    _T.MAIL: (_K.RIB_REQUEST, _K.RIB_ANSWER), _T.DIAGNOSTIC_REQUEST: (_K.DIAGNOSTIC_REQUEST,),
+    _T.DIAGNOSTIC_REPLY: (_K.DIAGNOSTIC_REPLY, _K.DIAGNOSTIC_REPLY, _K.DIAGNOSTIC_REQUEST),
 }  # fmt: skip
 _RARE: Final = {_T.ADCERT, _T.RTCERT, _T.CARD, _T.GRANT}
 _SPOKEN: Final = tuple(each for each in _BODIES for _ in range(1 if each in _RARE else 6))

@@ -77,7 +77,7 @@ def plan_of(seed: int, words: int = WORDS) -> Plan:
 def run_plan(plan: Plan) -> tuple[Figures, Found | None]:
     """Run one plan; return the counts and the failure, if any."""
     ErrorBoundary.reraises = True
-    with prepared(plan.seed):
+    with prepared():
         trial = Trial(plan)
         try:
             trial.run()

@@ -24,7 +24,6 @@ from tests.insiders.network import Echo, TracingNetwork
 from tests.insiders.oracle import signing_oracle
 from tests.insiders.stage import GOOD, PARTS, PERSONAS, PROMISE_S, Stage
 from tests.insiders.tables import GENERAL_MAX, LIMITS, sizes
-from tests.journeys.networks import reproducible_keys
 
 __all__ = ["BrokenError", "Figures", "Plan", "Trial", "prepared", "shrunk"]
 
@@ -111,10 +110,9 @@ class _Said:
 
 
 @contextmanager
-def prepared(seed: int) -> Iterator[None]:
-    """Prepare a stage with keys by a seed, the signing oracle and a tracing network."""
+def prepared() -> Iterator[None]:
+    """Prepare a stage with the signing oracle and a tracing network."""
     with ExitStack() as stack:
-        stack.enter_context(reproducible_keys(seed))
         stack.enter_context(signing_oracle())
         stack.enter_context(mock.patch("gdp.simulation.simulation.SimNetwork", TracingNetwork))
         yield

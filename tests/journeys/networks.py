@@ -16,10 +16,8 @@ from typing import Final
 from unittest import mock
 
 import networkx as nx
-from cryptography.hazmat.primitives.asymmetric import ec
 from hypothesis import strategies as st
 
-from gdp.crypto.keys import SigningKey, SoftwareKey
 from gdp.limits import DEAD_S, HELLO_S, JOIN_LEASE_S
 from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
@@ -33,7 +31,6 @@ PERIOD_S: Final = 0.5  # between messages of each publisher
 SETTLE_S: Final = 40.0
 _FAST_SWITCHES: Final = 8  # timers of larger networks are slower in proportion, to save time
 _FAULT_S: Final = 2.0  # the first fault, from the first message on
-_P256_ORDER: Final = 0xFFFFFFFF00000000FFFFFFFFFFFFFFFFBCE6FAADA7179E84F3B9CAC2FC632551
 
 
 class Fate(Enum):
@@ -161,30 +158,13 @@ def plans(draw: st.DrawFn, faults_max: int = 2) -> Plan:
 
 
 @contextmanager
-def reproducible_keys(seed: int) -> Iterator[None]:
-    """Make keys, and so names, the same for the same seed."""
-    made = iter(range(1, 1 << 32))
-
-    def generate() -> SigningKey:
-        digest = hashlib.sha256(b"%d %d" % (seed, next(made))).digest()
-        return SoftwareKey.of(ec.derive_private_key(int.from_bytes(digest, "big") % (_P256_ORDER - 1) + 1, _CURVE))
-
-    with mock.patch.object(SigningKey, "generate", generate):
-        yield
-
-
-@contextmanager
-def reproducible(seed: int) -> Iterator[None]:
-    """Make keys the same for the same seed, and no lease longer than ``LEASE_S``."""
+def short_leases() -> Iterator[None]:
+    """Make no lease longer than ``LEASE_S``."""
     with (
-        reproducible_keys(seed),
         mock.patch("gdp.switch.lsdb.LINK_STATE_LEASE_S", LEASE_S),
         mock.patch("gdp.switch.flooding.LINK_STATE_REFRESH_S", LEASE_S / 3),
     ):
         yield
-
-
-_CURVE: Final = ec.SECP256R1()
 
 
 @dataclass

@@ -209,6 +209,20 @@ def test_best_effort_over_loss_goes_on_without_what_is_lost() -> None:
     flow.outlive()
 
 
+@pytest.mark.parametrize("seed", [1, 3])
+def test_names_of_live_nodes_do_not_lapse_though_every_link_loses_statements(seed: int) -> None:
+    """A statement has some five frames, so 8 % of lost frames are a third of the statements on each link."""
+    flow = flowing(ring(seed, lease_s=6.0), reliable=False)
+    world = flow.world
+    knowing = [host.rib for host in world.ribs.values() if host.rib.routes_of(flow.topic.name, world.network.now)]
+    assert len(knowing) == 3
+    for sim_link in world.cables.values():
+        sim_link.loss = 0.08
+    for _ in range(120):
+        world.network.run(0.25)
+        assert all(rib.routes_of(flow.topic.name, world.network.now) for rib in knowing), world.network.now
+
+
 def test_both_directions_flow_at_once() -> None:
     world = ring()
     there = flowing(world, "/there")

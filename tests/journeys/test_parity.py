@@ -129,7 +129,7 @@ def test_raw_images_come_within_one_way_and_10_ms(loss: float, with_parity: floa
         made.cable.loss = loss
         made.stream(20, 0.4, IMAGE_BYTES)
         shares.append(made.in_time(5))
-    assert shares[0] <= 0.1
+    assert shares[0] <= 0.2  # those that lost nothing in their last 40 ms: repairs of the rest come before their end
     assert shares[1] >= with_parity
 
 

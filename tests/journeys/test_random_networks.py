@@ -7,7 +7,7 @@ import os
 import pytest
 from hypothesis import HealthCheck, Phase, example, given, settings
 
-from tests.journeys.networks import Fault, Plan, Trial, plans, reproducible
+from tests.journeys.networks import Fault, Plan, Trial, plans, short_leases
 
 TRIALS = int(os.environ.get("GDP_RANDOM_NETWORKS", "8"))
 # The path within a domain was longer than one through its neighbour, which sent back the frames that left.
@@ -18,6 +18,11 @@ LOOPED_AT_A_BORDER = Plan(
 THREE_TIERS = Plan(
     (1, 7, 3, 6, 2, 4), (0, 1, 1, 0, 0), (), ((9, 13, 20, 26), (31, 36, 31, 39)), (6, 4, 4, 4, 3, 8), (22, 28, 12),
     frozenset({3}), (Fault(False, 141, 2.1),), seed=304,
+)  # fmt: skip
+# The only RIB of a middle tier dies with its switch; what its tier knew of the others ended with their leases.
+MIDDLE_TIER_DIES = Plan(
+    (2, 4, 1, 9, 2), (0, 1, 1, 0), (), (), (2, 5, 6, 7, 3), (29, 28, 2), frozenset(),
+    (Fault(True, 44, 2.0), Fault(True, 75, 2.0)), seed=175,
 )  # fmt: skip
 IS_LONG = "GDP_RANDOM_NETWORKS" in os.environ
 
@@ -34,6 +39,7 @@ IS_LONG = "GDP_RANDOM_NETWORKS" in os.environ
 @given(plans())
 @example(LOOPED_AT_A_BORDER)
 @example(THREE_TIERS)
+@example(MIDDLE_TIER_DIES)
 def test_all_arrives_that_graph_and_policy_allow(plan: Plan) -> None:
-    with reproducible(plan.seed):
+    with short_leases():
         Trial(plan).run()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 import pytest
@@ -65,6 +65,9 @@ class Behind:
         if not self._queue or not self.frames_s:
             return due_s
         return self._at_s if due_s is None else min(due_s, self._at_s)
+
+    def count_arrivals(self, frames_from: Callable[[int], int]) -> None:
+        self._member.count_arrivals(frames_from)
 
     def poll_neighbours(self) -> Mapping[int, frozenset[bytes]]:
         return self._member.poll_neighbours()

@@ -6,8 +6,10 @@ from functools import partial
 
 import pytest
 
+from gdp.control.waiting import WaitReason
 from gdp.frame.kinds import Kind
 from gdp.limits import ADVERTISEMENT_LEASE_S
+from gdp.rib.upstream_advertisements import RETURN_S
 from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
@@ -15,6 +17,7 @@ from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
 LONG_S = 3 * ADVERTISEMENT_LEASE_S + 8
 LEASE_S = 6.0  # of names, where the real one would only cost time: that of readers is as long
 SHORT_S = 3 * LEASE_S + 8
+KEEPALIVE_MS = 300  # where no link fails in silence, the real ones would only cost time, too
 
 
 def complete(flow: Flow, label: str, count: int, within_s: float) -> None:
@@ -68,7 +71,7 @@ A, C = "a1/robot", "c2/server"
 
 def sites(lease_s: float = LEASE_S) -> Simulation:
     """Return the sites, settled."""
-    world = Simulation(topology=three_sites(), lease_s=lease_s)
+    world = Simulation(topology=three_sites(), lease_s=lease_s, keepalive_ms=KEEPALIVE_MS)
     assert world.run_until_attached()
     return world
 
@@ -137,6 +140,83 @@ def test_ribs_that_were_dead_for_long_come_back_without_a_flow_noticing() -> Non
         world.network.call(2.0, partial(world.kill_rib, label))
         world.network.call(46.0, partial(restart_rib, world, label))
     complete(flow, C, 1_000, 110)
+
+
+@pytest.mark.parametrize(
+    "dead", [("top",), ("a",), ("c",), ("a", "top"), ("c", "top"), ("a", "c"), ("a", "b", "c")], ids=" ".join
+)
+def test_flows_outlive_the_death_and_the_return_of_any_ribs(dead: tuple[str, ...]) -> None:
+    world = sites()
+    there, back = flowing(world, source=A, readers=(C,)), flowing(world, "/answers", C, (A,))
+    count = int((SHORT_S + 12) / 0.5)
+    there.stream(count, 0.5, size=100)
+    back.stream(count, 0.5, size=100)
+    for label in dead:
+        world.network.call(2.0, partial(world.kill_rib, label))
+        world.network.call(SHORT_S, partial(restart_rib, world, label))
+    complete(there, C, count, SHORT_S + 15)
+    complete(back, A, count, 1)
+
+
+def test_the_death_of_the_top_rib_ends_no_flow_with_real_leases() -> None:
+    world = ring(lease_s=ADVERTISEMENT_LEASE_S)
+    flow = flowing(world)
+    world.kill_rib("backbone")
+    flow.stream(int(LONG_S), 1.0, size=100)
+    complete(flow, SERVER, int(LONG_S), LONG_S + 10)
+    below = world.ribs["cloud"].rib
+    assert [each.reason for each in below.waits(world.network.now.mono_s)] == [WaitReason.NO_UPPER_RIB]
+    restart_rib(world, "backbone")
+    assert world.network.run(10, lambda: below.waits(world.network.now.mono_s) == [])
+
+
+def test_a_publisher_that_dies_while_the_tier_above_is_dead_is_gone_once_that_is_back() -> None:
+    world = ring(lease_s=LEASE_S)
+    flow = flowing(world)
+    world.kill_rib("backbone")
+    world.network.run(SHORT_S)
+    cloud = world.ribs["cloud"].rib
+    world.network.stop(ROBOT)
+    world.network.run(SHORT_S)
+    assert cloud.routes_of(flow.topic.name, world.network.now), "it cannot be known that it is gone"
+    restart_rib(world, "backbone")
+    world.network.run(SHORT_S)
+    assert not cloud.routes_of(flow.topic.name, world.network.now)
+
+
+def three_tiers() -> Topology:
+    """Return domains in three tiers, a below m below top, and b below top, each a switch with its RIB."""
+    uppers = {"a": "m", "m": "top", "b": "top", "top": None}
+    return Topology(
+        (Link("a1", "m1"), Link("m1", "t1"), Link("b1", "t1")),
+        tuple(DomainPlan(label, (f"{label[0]}1",), upper=upper) for label, upper in uppers.items()),
+        (
+            *(Attachment(f"{label[0]}1", "rib", "rib") for label in uppers),
+            *(Attachment(at, "proxy", "member") for at in ("a1", "m1", "b1")),
+        ),
+    )
+
+
+@pytest.mark.parametrize("reader", ["m1/member", "b1/member"])
+def test_the_tier_above_the_dead_one_takes_its_place_until_it_returns(reader: str) -> None:
+    world = Simulation(topology=three_tiers(), lease_s=LEASE_S, keepalive_ms=KEEPALIVE_MS)
+    assert world.run_until_attached()
+    there = flowing(world, source="a1/member", readers=(reader,))
+    back = flowing(world, "/answers", reader, ("a1/member",))
+    count = int((SHORT_S + 30) / 0.25)
+    there.stream(count, 0.25, size=100)
+    back.stream(count, 0.25, size=100)
+    world.network.run(2)
+    world.kill_rib("m")
+    world.network.run(SHORT_S)
+    flowing(world, "/new", "a1/member", (reader,))  # ... and new names are found by way of the top
+    upstream = world.ribs["a"].rib._upstream
+    assert upstream.rib == world.identities["rib:top"].name
+    restart_rib(world, "m")
+    # The first probe tells that its channel ended with the RIB, and the second one comes through the next channel.
+    assert world.network.run(2 * RETURN_S + 1, lambda: upstream.rib == world.identities["rib:m"].name)
+    complete(there, reader, count, 40)
+    complete(back, "a1/member", count, 1)
 
 
 def test_a_transit_domain_needs_no_rib_of_its_own() -> None:

@@ -86,3 +86,13 @@ def test_an_existing_file_is_not_replaced(bag: Path) -> None:
 
 def test_help_has_an_example() -> None:
     assert "example:" in make("--help").stdout
+
+
+def test_without_images_everything_else_is_there(tmp_path: Path) -> None:
+    path = tmp_path / "small.mcap"
+    made = make("--seconds", "0.1", "--without-images", "-o", str(path))
+    assert made.returncode == 0, made.stderr
+    with BagReader(path) as bag:
+        topics = {channel.topic for channel in bag.channels}
+    assert topics == {"/tf_static", "/map", "/scan", "/imu", "/odom", "/tf"}
+    assert path.stat().st_size < 100_000

@@ -405,3 +405,29 @@ def test_a_commit_is_built_to_the_same_bytes_each_time_without_what_is_not_commi
         assert {(each.uid, each.uname, each.mode & 0o022) for each in sdist.getmembers()} == {(0, "", 0)}
     with pytest.raises(release.ReleaseError, match="not empty"):
         release.build(tmp_path / "one", root)
+
+
+@needs_toml
+@needs_backend
+def test_the_release_of_this_commit_is_reproducible_pure_and_passes_twine(tmp_path: Path) -> None:
+    twine = pytest.importorskip("twine.commands.check", reason="twine of the extra `dev` is not installed")
+    if subprocess.run(["git", "-C", str(ROOT), "rev-parse", "HEAD"], capture_output=True, check=False).returncode:
+        pytest.skip("this is no clone: a release is built from a commit")
+    for out in ("one", "two"):
+        release.build(tmp_path / out)
+    files = sorted((tmp_path / "one").iterdir())
+    for path in files:
+        assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes(), path.name
+    (wheel,), (sdist,) = (tmp_path / "one").glob("*.whl"), (tmp_path / "one").glob("*.tar.gz")
+    assert twine.check([str(wheel), str(sdist)], strict=True) is False
+    assert wheel.name.endswith("-py3-none-any.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        (about,) = (name for name in archive.namelist() if name.endswith(".dist-info/WHEEL"))
+        assert "Root-Is-Purelib: true" in archive.read(about).decode().splitlines()
+        assert not [name for name in archive.namelist() if name.endswith((".so", ".pyd", ".dll"))]
+        units = {name for name in archive.namelist() if name.endswith(".service")}
+        assert units >= {f"gdp/enrolment/service/gdp-{each}.service" for each in ("switch", "rib", "proxy", "fog")}
+    document = json.loads((tmp_path / "one/sbom.cdx.json").read_text())
+    assert (document["bomFormat"], document["specVersion"]) == ("CycloneDX", "1.6")
+    stated = {line.split("  ")[1] for line in (tmp_path / "one/SHA256SUMS").read_text().splitlines()}
+    assert stated == {path.name for path in files} - {"SHA256SUMS"}

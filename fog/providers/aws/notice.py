@@ -27,6 +27,7 @@ import typer
 
 from fog.host.preemption_notice import write_notice
 from fog.providers.aws.instances import DRAIN
+from gdp.cli.version import HELP
 
 __all__ = ["Metadata", "Watch", "main"]
 
@@ -117,7 +118,7 @@ class Watch:
         return False
 
 
-@app.command(epilog="Example: python -m fog.providers.aws.notice --home /var/lib/fog")
+@app.command(context_settings=HELP, epilog="Example: python -m fog.providers.aws.notice --home /var/lib/fog")
 def watch(
     home: Annotated[Path, typer.Option(help="The machine's folder.")],
     url: Annotated[str, typer.Option(help="Where the metadata service is.")] = METADATA_URL,

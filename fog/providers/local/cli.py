@@ -20,6 +20,7 @@ __all__ = ["local_app"]
 Machine = Annotated[str, typer.Argument(help="its id, or its name where only one is called so")]
 Seconds = Annotated[float, typer.Option("--seconds", min=0.0, help="until it is taken")]
 Off = Annotated[bool, typer.Option("--off", help="let it go on")]
+Back = Annotated[bool, typer.Option("--off", help="have them again")]
 Share = Annotated[float, typer.Option("--share", min=0.0, help="of one processor; 0: what its hardware has")]
 Ms = Annotated[float, typer.Option("--ms", min=0.0, help="each way; 0: none")]
 
@@ -53,6 +54,12 @@ def local_app(directory: Callable[[], Path]) -> typer.Typer:
         """Let the machine have a share of one processor."""
         with failing_clearly():
             fault_injection.slow(RunRegistry(directory()), machine, share or None)
+
+    @app.command(name="sold-out")
+    def sold_out(off: Back = False) -> None:
+        """Refuse every new spot machine, as a cloud without capacity does; those there are go on."""
+        with failing_clearly():
+            (fault_injection.restock if off else fault_injection.sell_out)(directory())
 
     @app.command()
     def delay(machine: Machine, ms: Ms = 100.0) -> None:

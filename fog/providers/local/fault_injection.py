@@ -1,7 +1,7 @@
-"""Fault injection on local machines: preemption notice, kill, freeze, slow processor and delayed link.
+"""Fault injection on local machines: preemption notice, kill, freeze, slow processor, delayed link, and no capacity.
 
-I/O; for tests, demonstrations and experiments. Each function takes the site's records and a machine's id or unique
-name, and raises ``LocalError`` if there is no such machine.
+I/O; for tests, demonstrations and experiments. Functions about a machine take the site's records and its id or unique
+name, and raise ``LocalError`` if there is no such machine.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
+from typing import Final
 
 from fog.host.preemption_notice import write_notice
 from fog.host.status import Status
@@ -22,7 +24,9 @@ from gdp.errors import LocalError
 from gdp.host.processes import end_all
 from gdp.host.run_registry import RunRegistry
 
-__all__ = ["delay", "freeze", "hold", "kill", "notice", "slow", "thaw"]
+__all__ = ["delay", "freeze", "hold", "is_sold_out", "kill", "notice", "restock", "sell_out", "slow", "thaw"]
+
+_SOLD_OUT: Final = "spot-sold-out"
 
 
 def notice(runs: RunRegistry, machine: str, seconds: float) -> None:
@@ -91,6 +95,22 @@ def delay(runs: RunRegistry, machine: str, ms: float) -> None:
         delete(found.gateway, found.relay_out)
         plug(found.gateway, found.gateway_device)
     end_all(before)
+
+
+def sell_out(directory: Path) -> None:
+    """Let the provider of this folder of records have no further spot machine."""
+    directory.mkdir(parents=True, mode=0o700, exist_ok=True)
+    (directory / _SOLD_OUT).touch()
+
+
+def restock(directory: Path) -> None:
+    """Let the provider of this folder of records have spot machines again."""
+    (directory / _SOLD_OUT).unlink(missing_ok=True)
+
+
+def is_sold_out(directory: Path) -> bool:
+    """Return whether the provider of this folder of records has no spot machine now."""
+    return (directory / _SOLD_OUT).exists()
 
 
 def hold(machine: LocalMachine, *, held: bool) -> None:

@@ -25,7 +25,7 @@ from fog.host.bounded_log import last_lines
 from fog.host.bundle import install
 from fog.machine import Machine, MachineBundle, MachineSpec, MachineState
 from fog.offer import Offer
-from fog.providers.local.fault_injection import hold, kill
+from fog.providers.local.fault_injection import hold, is_sold_out, kill
 from fog.providers.local.machine_file import MachineFile
 from fog.providers.local.machine_handle import LocalMachine, find, list_machines
 from fog.providers.local.netlinks import MACHINE_DEVICE, UP, UPLINK_BRIDGE, delete, exists, join, make_space, plug
@@ -109,13 +109,20 @@ class LocalProvider:
         return sorted(fitting, key=lambda each: each.usd_per_hour)
 
     def create(self, spec: MachineSpec, boot: MachineBundle) -> str:
-        """Create a machine on this host and start its programs; return its id."""
+        """Create a machine on this host and start its programs; return its id.
+
+        Raises:
+            LocalError: the name is none.
+            StoreError: spot machines are sold out, or the kernel refuses.
+        """
         if not _NAME.fullmatch(spec.name):
             raise LocalError(f"machine {spec.name!r}: a name has letters, digits, '-' and '_'")
         with self._alone():
             for each in list_machines(self.runs, spec.cluster):
                 if each.file.spec.name == spec.name:
                     return each.id  # a repeated request: the requester was killed before it stored the id
+            if spec.offer.is_spot and is_sold_out(self._directory):
+                raise StoreError(f"machine {spec.name}: no spot machine is to be had there now")
             gateway = self._network.gateway(spec.offer.region)
             run = self.runs.start()
             file = MachineFile(spec, time.time(), str(gateway))

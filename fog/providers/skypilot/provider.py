@@ -56,6 +56,8 @@ class SkyPilotProvider:
             self._sky = sky or import_module("sky")
         except ModuleNotFoundError as missing:
             raise LocalError("provider skypilot needs SkyPilot: pip install 'gdp-ros[skypilot]'") from missing
+        if sky is None:  # this process is a client; in a server SkyPilot prints progress as lines of a protocol
+            import_module("sky.utils.annotations").client_api(lambda: None)()
 
     def offers(self, hardware: Hardware, *, spot: bool) -> list[Offer]:
         """Return the best fits in each place by SkyPilot's catalogue: a few types, not all."""

@@ -9,7 +9,8 @@ Sans-I/O; numbers only. Numbers are in host byte order; names and addresses are 
     group    number of branches (4)  unused (4)
              64 times: port (4)  addresses (12)  alternate port or NOWHERE (4)  its addresses (12)
     count    frames (8)  bytes (8), on each CPU
-    totals   drops by reason (8 each), then the rest of ``Total`` (8 each), on each CPU
+    totals   drops by reason (8 each), the rest of ``Total`` (8 each), frames by side but the shared one (8 each), on
+             each CPU
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from typing import Final
 
 from gdp.errors import DROP_COUNTERS
 from gdp.names import NAME_BYTES
-from gdp.switch.table import MACS_BYTES, Hops
+from gdp.switch.table import MACS_BYTES, SHARED_SIDE, Hops
 
 __all__ = [
     "BRANCHES_MAX",
@@ -92,6 +93,7 @@ class Total(IntEnum):
     TAKEN = DROP_COUNTERS  # frames that were not punted
     COPIES = TAKEN + 1  # forwarded
     BYTES = TAKEN + 2  # of those copies, Ethernet header included
+    FROM = TAKEN + 3  # frames taken from the port of a side; one counter for each side, in order
 
 
 _HEAD: Final = struct.Struct(f"=I{MACS_BYTES}sI{MACS_BYTES}sI")
@@ -107,7 +109,7 @@ GROUP_HEAD_BYTES: Final = _GROUP_HEAD.size
 BRANCH_BYTES: Final = _BRANCH.size
 GROUP_BYTES: Final = GROUP_HEAD_BYTES + BRANCHES_MAX * BRANCH_BYTES
 COUNT_BYTES: Final = 16
-TOTALS_BYTES: Final = 8 * (max(Total) + 1)
+TOTALS_BYTES: Final = 8 * (Total.FROM + SHARED_SIDE)
 
 
 def entry_head(

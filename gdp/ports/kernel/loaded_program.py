@@ -120,11 +120,22 @@ class LoadedProgram:
         """Return the counts of the program up to its release. Safe in any thread."""
         if not self._programs:
             return self._last
-        words = memoryview(self.totals.get(_FIRST) or b"").cast("Q")
-        width = len(words) // possible_cpus()
+        words, width = self._words()
         totals = [sum(words[at::width]) for at in range(width)]
         copies = totals[Total.COPIES]
         return Counters(totals[Total.TAKEN], copies, copies, 0, totals[:DROP_COUNTERS])
+
+    def frames_from(self, port: int) -> int:
+        """Return how many frames the program has taken from a port; 0 for a port that shares its side with others."""
+        if not self._programs or port >= SHARED_SIDE:
+            return 0
+        words, width = self._words()
+        return sum(words[Total.FROM + port :: width])
+
+    def _words(self) -> tuple[memoryview[int], int]:
+        """Return the counters of all CPUs, and how many each has."""
+        words = memoryview(self.totals.get(_FIRST) or b"").cast("Q")
+        return words, len(words) // possible_cpus()
 
     def _make(self, kind: MapKind, key_bytes: int, value_bytes: int, max_entries: int, name: str) -> KernelMap:
         made = KernelMap(kind, key_bytes, value_bytes, max_entries, name)

@@ -94,6 +94,13 @@ class KernelPlane(RawPlane):
             drops,
         )
 
+    def frames_from(self, port: int) -> int:
+        """Return how many frames have come from a port, as ``Plane.frames_from``.
+
+        Of a port above the 63rd only the punted ones are counted.
+        """
+        return super().frames_from(port) + self._loaded.frames_from(port)
+
     @property
     def left_out(self) -> int:
         """Number of the table's entries that Python alone forwards by."""

@@ -40,7 +40,7 @@ from gdp.ports.kernel.abi import (
     Total,
 )
 from gdp.ports.kernel.assembler import Assembler, Reg
-from gdp.switch.table import MACS_BYTES
+from gdp.switch.table import MACS_BYTES, SHARED_SIDE
 
 __all__ = ["DROP", "LICENCE", "REDIRECT", "UP", "Descriptors", "forwarder"]
 
@@ -213,7 +213,7 @@ class ForwarderProgram(Assembler):
         self.move(Reg.R3, 1)
         self.shift_left(Reg.R3, self._side)
         self.jump_if(Reg.R2, "&", Reg.R3, "from its side")
-        self._count(Total.TAKEN)
+        self._count_taken()
         self._count(DropReason.WRONG_SIDE)
         self.jump("drop")
         self.label("from its side")
@@ -254,7 +254,7 @@ class ForwarderProgram(Assembler):
             self.load(Reg.R2, Reg.R4, EntryAt.MACS + at, 4)
             self.store(_FRAME, at, Reg.R2, 4)
         self.move(_PORT, Reg.R0)  # the frame is not read after this
-        self._count(Total.TAKEN)
+        self._count_taken()
         self._count_copy()
         self._count_entry("one hop")
         self.load(Reg.R1, _PORT, PortAt.IFINDEX, 4)
@@ -275,7 +275,7 @@ class ForwarderProgram(Assembler):
         self.jump_if(Reg.R0, "==", 0, "up")
         self.store(Reg.R10, _GROUP, Reg.R0, 8)
         self._one_hop_fewer()
-        self._count(Total.TAKEN)
+        self._count_taken()
         self._count_entry("group")
         self.move(_TURN, 0)
         self.label("branch")
@@ -337,11 +337,11 @@ class ForwarderProgram(Assembler):
 
     def _ends(self) -> None:
         self.label("nowhere")
-        self._count(Total.TAKEN)
+        self._count_taken()
         self._count(DropReason.NO_ROUTE)
         self.jump("drop")
         self.label("down")
-        self._count(Total.TAKEN)
+        self._count_taken()
         self._count(DropReason.PORT_DOWN)
         # falls into "drop"; a group, which has already counted, also ends there
         self.label("drop")
@@ -385,6 +385,11 @@ class ForwarderProgram(Assembler):
         self.load(Reg.R1, _TOTALS, 8 * index, 8)
         self.add(Reg.R1, amount)
         self.store(_TOTALS, 8 * index, Reg.R1, 8)
+
+    def _count_taken(self) -> None:
+        self._count(Total.TAKEN)
+        if self._side < SHARED_SIDE:
+            self._count(Total.FROM + self._side)
 
     def _count_copy(self) -> None:
         self._count(Total.COPIES)

@@ -6,6 +6,7 @@ Source: rmw_dds_common for the announcement of nodes; the binding's own samples 
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from typing import Final, NamedTuple
@@ -19,6 +20,7 @@ from cyclonedds.sub import DataReader, Subscriber
 
 from gdp.errors import LocalError
 from proxy.endpoints.dds import library
+from proxy.endpoints.dds.discovery_range import with_discovery_range
 from proxy.endpoints.dds.graph_cache import GraphCache
 from proxy.endpoints.dds.naming import user_data
 from proxy.endpoints.dds.node_info import GID_BYTES, INFO_HASH, INFO_TOPIC, INFO_TYPE, write_info
@@ -114,6 +116,8 @@ class Node:
 
     def __init__(self, domain: int, name: str) -> None:
         self._name = name
+        if (uri := with_discovery_range(os.environ)) is not None:
+            os.environ["CYCLONEDDS_URI"] = uri  # the library reads it when the first participant begins
         try:
             self.participant = DomainParticipant(domain, qos=DdsQos(Policy.Userdata(b"enclave=/;")))
         except DDSException as error:

@@ -69,7 +69,7 @@ class Gdp:
 
     name = "gdp"
 
-    def __init__(self, plane: str = "raw") -> None:
+    def __init__(self, plane: str = "kernel") -> None:
         self._plane = plane
 
     @contextmanager

@@ -1,4 +1,6 @@
-"""Module entry ``python -m ring.nodes ROS NODE COUNT``: ROS is 1 or 2; COUNT messages or calls, where the node has any.
+"""Module entry ``python -m ring.nodes ROS NODE COUNT [HZ]``: ROS is 1 or 2; COUNT messages or calls, if it has any.
+
+HZ: a talker's messages a second, if not its usual ones.
 
 I/O.
 """
@@ -6,6 +8,7 @@ I/O.
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 
 from ring.nodes import roles
 from ring.nodes.content import TALKS
@@ -38,7 +41,8 @@ def main() -> None:
     elif name == "caller":
         roles.call(node, orders, count)
     else:
-        roles.talk(node, orders, next(talk for talk in TALKS if talk.node == name), count)
+        talk = next(talk for talk in TALKS if talk.node == name)
+        roles.talk(node, orders, replace(talk, hz=float(sys.argv[4])) if len(sys.argv) > 4 else talk, count)
 
 
 if __name__ == "__main__":

@@ -15,10 +15,23 @@ from functools import cache
 from hashlib import sha256, shake_128
 from typing import Final, NamedTuple, TypeAlias
 
-__all__ = ["LAMP", "LAMP_HZ", "LAMP_TYPE", "TALKS", "Fit", "Mark", "Talk", "digest", "lamp_says", "talk_of"]
+__all__ = [
+    "CAMERA_HZ",
+    "LAMP",
+    "LAMP_HZ",
+    "LAMP_TYPE",
+    "TALKS",
+    "Fit",
+    "Mark",
+    "Talk",
+    "digest",
+    "lamp_says",
+    "talk_of",
+]
 
 Fit: TypeAlias = Callable[["array[int]"], object]  # converts an array to the form of a ROS version
 
+CAMERA_HZ: Final = 15.0  # unless a run asks for another pace
 LAMP: Final = "/lamp"
 LAMP_TYPE: Final = "std_srvs/srv/SetBool"
 LAMP_HZ: Final = 5.0
@@ -135,7 +148,7 @@ def _look_at_map(message: object) -> Mark:
 
 TALKS: Final = (
     Talk("talker", "/chatter", "std_msgs/msg/String", 10.0, fill=_say, read=_listen),
-    Talk("camera", "/camera/image", "sensor_msgs/msg/Image", 15.0, fill=_take_picture, read=_look_at_picture),
+    Talk("camera", "/camera/image", "sensor_msgs/msg/Image", CAMERA_HZ, fill=_take_picture, read=_look_at_picture),
     Talk("mapper", "/map", "nav_msgs/msg/OccupancyGrid", 1.0, fill=_draw_map, read=_look_at_map, latched=True),
 )
 

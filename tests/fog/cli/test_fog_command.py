@@ -8,11 +8,12 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from typer.testing import CliRunner, Result
 
-from fog.cli import options
+from fog.cli import logs, options, status
 from fog.cli.app import app
 from fog.cli.views import stage
 from fog.cluster import ClusterPlan
@@ -161,6 +162,57 @@ def test_the_final_log_lines_of_a_machine_that_is_gone_are_shown(fog: Run, journ
     assert "m3 is gone" in fog("ssh", "m3").output
 
 
+def test_a_log_is_followed_until_its_machine_is_gone(
+    fog: Run, journal: Journal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    up(journal)
+    windows = [["one", "two"], ["one", "two", "three"], ["three", "four"]]
+
+    def log(machine: str, program: str, lines: int) -> str:
+        window = windows.pop(0)
+        if not windows:
+            gone = serving("m1").ended(Outcome.RELEASED, "fog down", time.time())
+            journal.put(gone, time.time(), "released", "fog down")
+        return "\n".join(window)
+
+    provider = SimpleNamespace(poll_s=0.0, log=log, close=lambda: None)
+    monkeypatch.setattr(logs, "open_provider", lambda site: provider)
+    monkeypatch.setattr(logs, "_LOOK_S", 0.0)
+    result = fog("logs", "m1", "node", "--follow", "-n", "1", "--json")
+    said = [json.loads(line) for line in result.stdout.splitlines()]
+    assert said == [{"machine": "m1", "program": "node", "line": each} for each in ("two", "three", "four")]
+    assert "m1 is gone" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("known", "now", "new"),
+    [
+        ([], ["a"], ["a"]),
+        (["a"], ["a"], []),
+        (["a", "b"], ["b", "c"], ["c"]),
+        (["a", "a"], ["a", "a", "a"], ["a"]),
+        (["a", "b"], ["c", "d"], ["c", "d"]),
+    ],
+)
+def test_of_a_log_only_what_is_new_is_shown(known: list[str], now: list[str], new: list[str]) -> None:
+    assert logs.new_lines(known, now) == new
+
+
+def test_states_and_events_are_followed_as_lines_of_json_in_a_pipe(
+    fog: Run, journal: Journal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    up(journal)
+
+    def happen(seconds: float) -> None:
+        if any(each.what == "draining" for each in journal.events("c")):
+            raise KeyboardInterrupt
+        journal.put(replace(serving("m1"), drained_unix_s=time.time()), time.time(), "draining", "asked")
+
+    monkeypatch.setattr(status, "time", SimpleNamespace(time=time.time, sleep=happen))
+    events = [json.loads(line) for line in fog("status", "--events", "--follow", "--json").stdout.splitlines()]
+    assert events[-1]["what"] == "draining"
+
+
 def test_a_regions_latency_is_shown(fog: Run, journal: Journal, tmp_path: Path) -> None:
     up(journal)
     site = open_site(None)
@@ -250,6 +302,14 @@ def test_tables_in_a_pipe_lose_nothing(fog: Run) -> None:
     shown = fog("prices", "--hardware", "T4", "--all").output
     assert "eu-central-1" in shown
     assert "…" not in shown
+
+
+def test_the_width_of_tables_can_be_chosen_and_then_no_word_is_lost_either(fog: Run, journal: Journal) -> None:
+    up(journal)
+    narrow = fog("status", "--columns", "40").output
+    assert max(map(len, narrow.splitlines()[:6])) <= 40
+    assert "…" not in narrow
+    assert max(map(len, fog("status").output.splitlines())) > 60
 
 
 @pytest.mark.parametrize(("verb", "missing"), [("plan", "--target"), ("logs", "MACHINE"), ("launch", "FILE")])

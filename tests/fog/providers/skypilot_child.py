@@ -7,6 +7,7 @@ Prints one line of JSON with the result of each step.
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import sys
 from collections.abc import Callable
@@ -14,6 +15,7 @@ from dataclasses import asdict, replace
 
 import sky
 from sky import check, core, execution
+from sky.utils import rich_utils
 
 from fog.cluster import CloudNode, ClusterPlan, ExportedInterface, MachineRequest
 from fog.enrolment.bootstrap import joining_boot
@@ -65,6 +67,13 @@ def outcome(step: Callable[[], object]) -> str:
         return f"{type(error).__name__}: {error}"
 
 
+def printed_progress() -> str:
+    """Return what SkyPilot prints about a step that takes a while."""
+    with contextlib.redirect_stdout(io.StringIO()) as printed, rich_utils.safe_status("looking up prices"):
+        pass
+    return printed.getvalue()
+
+
 def main() -> None:
     enabled = check.check_capability(sky.clouds.CloudCapability.COMPUTE, quiet=True, clouds=["aws"])
     unserved = Unserved()
@@ -90,6 +99,9 @@ def main() -> None:
     read = sky.Task.from_yaml_config(unserved.tasks[0])  # SkyPilot's own parser, with its schema
     types = [each.instance_type for each in read.resources]
     reported["task"] = {"setup": read.setup, "run": read.run, "types": types}
+    reported["printed by a server"] = printed_progress()
+    SkyPilotProvider()
+    reported["printed by a client"] = printed_progress()
     sys.__stdout__.write(f"\n{json.dumps(reported)}\n")  # type: ignore[union-attr]
 
 

@@ -299,6 +299,8 @@ def test_the_real_package_takes_our_tasks_in_a_dry_run(home: Path) -> None:
     assert task["types"] == ["m6i.4xlarge"]
     assert "systemctl enable --now --no-block fog-machine" in task["setup"]
     assert task["run"].startswith("sudo journalctl --follow --unit fog-machine")
+    assert "sky-payload" in reported["printed by a server"], "the stand-in is none: SkyPilot prints such lines"
+    assert reported["printed by a client"] == ""
 
 
 @pytest.mark.parametrize("place", ["kubernetes", "k8s/kind-skypilot", "Kubernetes/lab", "ssh/pool"])

@@ -66,8 +66,58 @@ def test_a_machine_gets_every_file_and_pins_every_wheel(supply: Supply, tmp_path
     assert (tmp_path / "got" / "wheels" / WHEEL).read_bytes() == b"a wheel"
     (line,) = (tmp_path / "got" / "requirements.txt").read_text().splitlines()
     assert line.startswith(f"{tmp_path / 'got' / 'wheels' / WHEEL} --hash=sha256:")
-    with tarfile.open(tmp_path / "got" / WORKSPACE) as archive:
-        assert archive.getnames() == ["lib", "lib/link", "local_setup.bash"]
+    assert contents(tmp_path / "got") == {
+        "d-lib.tar.gz": ["lib", "lib/link"],
+        "top.tar.gz": ["local_setup.bash"],
+    }
+
+
+def contents(got: Path) -> dict[str, list[str]]:
+    """Return what is in each archive of a workspace."""
+    found = {}
+    for path in sorted((got / WORKSPACE).iterdir()):
+        with tarfile.open(path) as archive:
+            found[path.name] = archive.getnames()
+    return found
+
+
+def test_only_the_package_that_changed_is_packed_and_fetched_again(supply: Supply, tmp_path: Path) -> None:
+    assert supply.fetch(supply.server.bundle_file(60.0), tmp_path / "got").returncode == 0
+    before = {path.name: path.stat().st_ino for path in (tmp_path / "got" / WORKSPACE).iterdir()}
+    (tmp_path / "install" / "local_setup.bash").write_text("export A=3\n")
+    assert supply.fetch(supply.server.bundle_file(60.0), tmp_path / "got").returncode == 0
+    after = {path.name: path.stat().st_ino for path in (tmp_path / "got" / WORKSPACE).iterdir()}
+    assert [name for name in after if after[name] != before[name]] == ["top.tar.gz"]
+    assert len(list((tmp_path / "keys" / WORKSPACE).iterdir())) == 3
+
+
+def test_a_package_that_was_removed_is_removed_on_the_machine(supply: Supply, tmp_path: Path) -> None:
+    assert supply.fetch(supply.server.bundle_file(60.0), tmp_path / "got").returncode == 0
+    (tmp_path / "install" / "lib" / "link").unlink()
+    (tmp_path / "install" / "lib").rmdir()
+    assert supply.fetch(supply.server.bundle_file(60.0), tmp_path / "got").returncode == 0
+    assert list(contents(tmp_path / "got")) == ["top.tar.gz"]
+
+
+def test_a_damaged_file_on_the_machine_is_fetched_again(supply: Supply, tmp_path: Path) -> None:
+    assert supply.fetch(supply.server.bundle_file(60.0), tmp_path / "got").returncode == 0
+    (tmp_path / "got" / "wheels" / WHEEL).write_bytes(b"damaged")
+    assert supply.fetch(supply.server.bundle_file(60.0), tmp_path / "got").returncode == 0
+    assert (tmp_path / "got" / "wheels" / WHEEL).read_bytes() == b"a wheel"
+
+
+def test_what_a_pattern_ignores_is_not_sent(supply: Supply, tmp_path: Path) -> None:
+    workspace = tmp_path / "install"
+    for path in ("lib/__pycache__/a.pyc", "lib/b.log", "docs/c.txt", "lib/docs/d.txt"):
+        (workspace / path).parent.mkdir(parents=True, exist_ok=True)
+        (workspace / path).write_text(path)
+    (workspace / ".fogignore").write_text("# logs\n*.log\n/docs/*\n")
+    assert supply.fetch(supply.server.bundle_file(60.0), tmp_path / "got").returncode == 0
+    assert contents(tmp_path / "got") == {
+        "d-docs.tar.gz": ["docs"],
+        "d-lib.tar.gz": ["lib", "lib/docs", "lib/docs/d.txt", "lib/link"],
+        "top.tar.gz": ["local_setup.bash"],
+    }
 
 
 def test_a_file_that_was_changed_on_its_way_is_not_used(supply: Supply, tmp_path: Path) -> None:

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import typer
+from typer.core import TyperGroup
 from typer.main import get_command
 
 from gdp.cli.gdp import app, main
@@ -189,8 +191,11 @@ def test_a_card_of_another_domain_is_refused_where_a_root_is_given(gdp: Run, key
 
 
 def leaves(command: object, path: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
-    inner = getattr(command, "commands", None)
-    return [path] if inner is None else [leaf for name, sub in inner.items() for leaf in leaves(sub, (*path, name))]
+    if not isinstance(command, TyperGroup):
+        return [path]
+    context = typer.Context(command)
+    inner = [(name, command.get_command(context, name)) for name in command.list_commands(context)]
+    return [leaf for name, sub in inner for leaf in leaves(sub, (*path, name))]
 
 
 @pytest.mark.parametrize("path", leaves(get_command(app)), ids=" ".join)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from gdp.cli.gdp import main
 from gdp.cli.switch import app as switch
@@ -51,6 +52,28 @@ def test_a_machine_that_comes_later_is_of_the_same_domain_and_has_no_rib() -> No
     assert Path("arm/switch/root.crt").read_bytes() == Path("robot/switch/root.crt").read_bytes()
     assert Path("arm/owner.pub").read_bytes() == Path("robot/owner.pub").read_bytes()
     assert not Path("arm/rib.yaml").exists()
+
+
+def test_a_switch_finds_what_the_lab_left_and_takes_the_ports_of_its_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert _lab("robot --iface eth0") == 0
+    found: list[SwitchConfig] = []
+    monkeypatch.setattr("gdp.cli.switch.run_switch", lambda settings, *_: found.append(settings))
+    for line in ("--iface lan0", ""):
+        assert CliRunner().invoke(switch, line.split()).exit_code == 0
+    assert [[port.iface for port in each.ports] for each in found] == [["lan0"], ["eth0"]]
+    assert {each.attach for each in found} == {("rib0", "proxy0")}
+
+
+def test_the_command_that_a_switch_without_identity_names_makes_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(Path.cwd()))
+    monkeypatch.setattr("gdp.cli.switch._machine_folders", list)
+    monkeypatch.setattr("socket.gethostname", lambda: "robot")
+    ended = CliRunner().invoke(switch, ["--iface", "eth0"])
+    assert ended.exit_code == 2
+    assert _lab(ended.output.rsplit("gdp lab ", 1)[1].strip()) == 0
+    assert CliRunner().invoke(switch, ["--iface", "eth0", "--check"]).exit_code == 0
 
 
 @pytest.mark.parametrize("line", ["server robot", "server server"])

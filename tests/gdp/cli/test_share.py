@@ -167,3 +167,34 @@ def listed(done: tuple[int, str, str]) -> dict[str, Any]:
     assert (code, errors) == (0, "")
     result: dict[str, Any] = json.loads(text)
     return result
+
+
+def test_a_robot_with_a_prefix_shares_its_names_under_it(site: Site, server: Machine, run: Run) -> None:
+    robot = site.add("robot", "prefix: robot1\n")
+    FolderExchange(site.folder / "common", load_card(robot.folder / "proxy" / CARD))
+    robot.graph.append(("topic", "/camera/image", IMAGE))
+    with ExitStack() as stack:
+        robot.start(stack)
+        server.start(stack)
+        code, text, error = run("expose", "robot", "/camera/**", "--to", "server")
+        assert (code, error) == (0, "")
+        assert f"/robot1/camera/image [{IMAGE}] to server" in text
+        run("import", "server", "/robot1/camera/image")
+    assert robot.rules("expose") == [("/camera/**", "")]
+    assert server.rules("import") == [("/robot1/camera/image", IMAGE)]
+
+
+def test_a_robot_with_a_prefix_takes_names_with_it_and_others_as_they_are(
+    site: Site, server: Machine, run: Run
+) -> None:
+    robot = site.add("robot", "prefix: robot1\n")
+    FolderExchange(site.folder / "common", load_card(robot.folder / "proxy" / CARD))
+    with ExitStack() as stack:
+        robot.start(stack)
+        server.start(stack)
+        for name in ("/robot1/cmd", "/fleet/goal"):
+            run("expose", "server", name, "--type", STRING, "--to", "robot")
+            run("import", "robot", name)
+    assert robot.config is not None
+    rules = [(rule.local, rule.overlay_metadata["name"]) for rule in robot.config.imports]
+    assert rules == [("/cmd", "/robot1/cmd"), ("/fleet/goal", "/fleet/goal")]

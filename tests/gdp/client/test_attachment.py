@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 
 from gdp.client.attachment import PendingAdvertisement
@@ -59,6 +61,27 @@ def test_advertisements_are_renewed_before_their_lease_ends() -> None:
     world.network.run(3 * ADVERTISEMENT_LEASE_S)
     assert world.switches["nuc1"].attached.get(world.members[ROBOT].name, world.members[ROBOT].name) is not None
     assert world.ribs["school"].rib.names == 1
+
+
+def test_a_renewal_is_repeated_with_longer_pauses_until_it_is_acknowledged() -> None:
+    world = ring(lease_s=12.0)
+    world.network.run(1)
+    tap = Tap(ROBOT, "nuc1")
+    sent_s: list[float] = []
+
+    def note(at_s: float, a: str, b: str, frame: bytes) -> None:
+        count = tap.count(Kind.ADVERTISE)
+        tap(at_s, a, b, frame)
+        if tap.count(Kind.ADVERTISE) > count and (not sent_s or at_s > sent_s[-1] + 0.1):
+            sent_s.append(at_s)
+
+    world.network.taps.append(note)
+    world.network.stop("nuc2/rib")  # no other RIB is reached from there: nothing acknowledges it
+    for domain in ("nuc3/rib", "nuc4/rib"):
+        world.network.stop(domain)
+    world.network.run(world.lease_s)
+    pauses_s = [later - earlier for earlier, later in pairwise(sent_s)]
+    assert pauses_s == pytest.approx([0.5, 1.0, 2.0, 4.0], abs=0.05)
 
 
 def test_a_node_whose_clock_went_back_finds_its_way_past_its_earlier_life() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from gdp.client.publisher import Publisher
-from gdp.client.send_options import SendOptions
+from gdp.client.send_options import PRIORITIES, Priority, SendOptions, is_urgent
 from gdp.client.send_scheduler import SendScheduler
 from gdp.frame.codec import decode
 from gdp.names import Name
@@ -21,10 +21,12 @@ def read_by_one() -> Publisher:
 class Flood(Publisher):
     """A publisher that always has frames, on a path that permits some bytes of all publishers together."""
 
-    def __init__(self, path: list[int], *, weight: int = 1, waiting: int = 1 << 30, urgent: bool = False) -> None:
+    def __init__(
+        self, path: list[int], *, weight: int = 1, waiting: int = 1 << 30, priority: Priority = "normal"
+    ) -> None:
         self.path = path
-        self.options = SendOptions(weight=weight)
-        self.is_urgent = urgent
+        self.options = SendOptions(weight=weight, priority=priority)
+        self.is_urgent = is_urgent(priority)
         self.waiting = waiting
         self.frames_out = 0
         self.has_more = True
@@ -46,6 +48,9 @@ class Flood(Publisher):
         self.waiting -= count
         self.has_more = self.waiting > 0
         return [bytes(1_500)] * count
+
+    def count_sent(self) -> None:
+        pass  # these paths take what the test says
 
     def note_idle(self) -> None:
         pass
@@ -89,10 +94,43 @@ def test_a_small_message_waits_for_two_frames_of_a_flood_at_most() -> None:
 
 def test_an_urgent_flood_leaves_before_an_ordinary_one() -> None:
     path = [15_000]
-    ordinary, urgent = Flood(path), Flood(path, urgent=True, waiting=4)
+    ordinary, urgent = Flood(path), Flood(path, priority="urgent", waiting=4)
     turns = scheduled(ordinary, urgent)
     turns.poll_turn(0.0)
     assert (urgent.frames_out, ordinary.frames_out) == (4, 0)
+
+
+def test_urgent_frames_leave_before_interactive_ones_whichever_came_first() -> None:
+    path = [6_000]
+    interactive, urgent = Flood(path, priority="interactive"), Flood(path, priority="urgent", waiting=4)
+    scheduled(interactive, urgent).poll_turn(0.0)
+    assert (urgent.frames_out, interactive.frames_out) == (4, 0)
+
+
+def test_five_priorities_share_a_thin_path_by_their_weights() -> None:
+    path = [0]
+    floods = {priority: Flood(path, priority=priority) for priority in reversed(PRIORITIES[2:])}
+    turns = scheduled(*floods.values())
+    for _ in range(3_100):
+        path[0] = 1_500
+        turns.resume()
+        turns.poll_turn(0.0)
+    assert [round(floods[each].frames_out / 100) for each in PRIORITIES[2:]] == [16, 8, 4, 2, 1]
+
+
+def test_weights_share_what_a_priority_has() -> None:
+    path = [0]
+    low, heavy = Flood(path, priority="normal"), Flood(path, priority="low", weight=4)
+    turns = scheduled(low, heavy)
+    for _ in range(300):
+        path[0] = 1_500
+        turns.resume()
+        turns.poll_turn(0.0)
+    assert abs(heavy.frames_out - 2 * low.frames_out) <= 8
+
+
+def test_only_two_priorities_have_the_flag_that_switches_know() -> None:
+    assert [each for each in PRIORITIES if is_urgent(each)] == ["urgent", "interactive"]
 
 
 def test_what_the_path_holds_back_is_due_when_the_path_says_so() -> None:

@@ -108,6 +108,26 @@ def test_a_path_that_becomes_slower_is_drained_within_two_seconds() -> None:
     assert flow.share(7, 12, 5e6) >= 0.9
 
 
+@pytest.mark.parametrize("collapsed_bits_s", [3e5, 1e6, 5e6])
+def test_a_path_that_collapses_behind_a_short_fifo_is_drained_and_used(collapsed_bits_s: float) -> None:
+    link, flow = SimulatedPath(bits_s=200e6, rtt_s=0.01, fifo_bytes=64_000), own()
+    link.add(flow)
+    link.at(5, lambda: link.set_rate(collapsed_bits_s))
+    link.run(30)
+    assert link.queue_quantile(20, 0.99) <= max(0.1, 8 * MTU * 8 / collapsed_bits_s)
+    assert flow.share(20, 30, collapsed_bits_s) >= 0.85
+
+
+def test_without_a_round_trip_a_confirmation_makes_the_window_no_larger() -> None:
+    controller = PathController(MTU)
+    controller.timed_out(1.0)
+    before = controller.window
+    for number in range(100):
+        controller.sent(number, MTU, 1.0 + number)
+        controller.acknowledged([number], 1.1 + number, held_s=None)
+    assert (controller.window, controller.inflight) == (before, 0)
+
+
 def test_a_path_that_becomes_faster_is_used_within_two_seconds() -> None:
     link, flow = path(5, fifo_s=SECOND), own()
     link.add(flow)

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gdp.control.advertise_ack import AdvertiseAck
+from gdp.control.diagnostic_bodies import DiagnosticReply, DiagnosticRequest, cut_to_fit
 from gdp.control.endpoint_query import EndpointQuery, EndpointResponse
 from gdp.control.endpoints import Endpoint
 from gdp.control.hello import Hello
@@ -47,6 +48,10 @@ ANSWER = Response(name=A, advertiser=B, advertisement=b"claim", domain=C, transi
 REVOKED = Revoked(b"s" * 16, 7, ((A, 3, b"d" * 8), (B, 0, bytes(8))))
 BUCKETS = Revoked(b"s" * 16, 8, (), A, tuple(bytes([at]) * 8 for at in range(256)))
 LACKING = Lacking(b"s" * 16, 9, A, (1, 200), (b"i" * 8, b"j" * 8))
+ASKED = DiagnosticRequest(ask="trace", name=A, target=B, sequence=7, body={"p": bytes(C)}, membership=b"cert")
+REPLIED = DiagnosticReply(
+    ask="trace", sequence=7, asker=A, result={"branches": [{"port": "eth0"}]}, is_cut=True, hops_left=3
+)
 
 Read = Callable[[Fields], object]
 BODIES: dict[str, tuple[bytes, object, Read]] = {
@@ -64,6 +69,12 @@ BODIES: dict[str, tuple[bytes, object, Read]] = {
         EndpointResponse(records=(b"record",), kept_sequence=3, refused=DropReason.STALE),
         EndpointResponse.from_fields,
     ),
+    "diagnostic request": (
+        ASKED.to_wire(NODE.name, NODE.key, 1_000),
+        ASKED,
+        DiagnosticRequest.from_fields,
+    ),
+    "diagnostic reply": (REPLIED.to_wire(NODE.name, NODE.key), REPLIED, DiagnosticReply.from_fields),
     "join": (JOIN.to_wire(NODE.name, NODE.key), JOIN, Join.from_fields),
     "link state": (STATE.to_wire(NODE.key, b"cert"), STATE, lambda fields: LinkState.from_fields(fields, NODE.name, A)),
     "query": (Query(A, 20.0).to_wire(NODE.name, NODE.key, b"cert"), Query(A, 20.0), Query.from_fields),
@@ -134,3 +145,21 @@ def test_what_is_taken_has_no_reason() -> None:
 def test_a_response_that_names_the_name_itself_without_an_advertisement_is_negative() -> None:
     assert Response(name=A, advertiser=A, advertisement=b"", domain=C, transit=(), lease_s=2.0).is_negative
     assert not Response(name=A, advertiser=B, advertisement=b"", domain=C, transit=(), lease_s=0.0).is_negative
+
+
+@given(st.integers(0, 8_000), st.integers(0, 300), st.booleans())
+def test_a_reply_is_cut_to_the_length_of_its_request(max_bytes: int, count: int, knows: bool) -> None:
+    result = {"branches": [{"n": bytes(A)}] * count, "in": {"port": "eth0"}}
+    reply = replace(REPLIED, result=result, is_cut=False, membership=b"" if knows else b"c" * 600)
+    cut = cut_to_fit(reply, max_bytes)
+    if cut is not None:
+        assert len(cut.to_wire(NODE.name, NODE.key)) <= max_bytes
+        assert cut.is_cut or cut == reply
+    else:
+        assert max_bytes < 1_000
+
+
+@pytest.mark.parametrize("length", [0, 500, 2_000, 8_000])
+def test_a_request_is_as_long_as_the_reply_that_it_accepts(length: int) -> None:
+    wire = ASKED.to_wire(NODE.name, NODE.key, length)
+    assert len(wire) in range(max(length, 1_000), max(length, 1_000) + 80)

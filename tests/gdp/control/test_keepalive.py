@@ -9,7 +9,7 @@ import pytest
 
 from gdp.control.fragments import ControlFragmenter
 from gdp.control.hello import Hello, Timing
-from gdp.control.keepalive import KeepaliveFlag, Slowness, open_keepalive
+from gdp.control.keepalive import QUEUED_S, KeepaliveFlag, Slowness, open_keepalive
 from gdp.control.link_quality import LinkQuality
 from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.neighbour import NeighbourState
@@ -171,6 +171,58 @@ def test_a_neighbour_comes_back_in_the_same_session() -> None:
     assert pair.is_up("a")
     assert pair.is_up("b")
     assert set(pair.refused) <= {DropReason.UNKNOWN_SENDER}  # until the other has received our echo
+
+
+class Frames:
+    """Count of frames that come from a port while a condition holds."""
+
+    def __init__(self, pair: Pair, until_s: float) -> None:
+        self._pair, self._until_s = pair, until_s
+
+    def __call__(self, _port: int) -> int:
+        return int(1_000 * min(self._pair.now_s, self._until_s))
+
+
+def test_while_other_frames_come_a_neighbour_may_be_silent_for_three_seconds_more() -> None:
+    pair = up(Pair())
+    cut_s = pair.now_s
+    pair.ends["a"].count_arrivals(Frames(pair, float("inf")))
+    pair.passes = lambda sender, _frame: sender == "a"
+    pair.run(QUEUED_S)
+    assert pair.is_up("a")
+    assert pair.is_up("b")
+    pair.run(2 * DETECT_S)
+    assert pair.gone_s["a"] - cut_s == pytest.approx(QUEUED_S + DETECT_S, abs=0.1)
+
+
+def test_a_neighbour_whose_frames_stop_is_lost_a_detection_time_later() -> None:
+    pair = up(Pair())
+    cut_s = pair.now_s
+    pair.ends["a"].count_arrivals(Frames(pair, cut_s + 1))
+    pair.passes = lambda sender, _frame: sender == "a"
+    pair.run(2)
+    assert pair.gone_s["a"] - cut_s == pytest.approx(1 + DETECT_S, abs=0.1)
+
+
+def test_frames_of_before_the_silence_give_no_time() -> None:
+    pair = up(Pair())
+    cut_s = pair.now_s
+    pair.ends["a"].count_arrivals(Frames(pair, cut_s))
+    pair.passes = lambda _sender, _frame: False
+    pair.run(0.3)
+    assert pair.gone_s["a"] - cut_s <= DETECT_S + 2 * STEP_S
+
+
+def test_where_several_nodes_are_on_a_port_its_frames_give_no_time() -> None:
+    pair = up(Pair())
+    for transmit in Pair.hello_protocol(node("c"), 3, FAST).hellos_to_send(0.0):
+        for frame in transmit.frames:
+            pair.hear("a", frame)
+    cut_s = pair.now_s
+    pair.ends["a"].count_arrivals(Frames(pair, float("inf")))
+    pair.passes = lambda sender, _frame: sender == "a"
+    pair.run(0.3)
+    assert pair.gone_s["a"] - cut_s <= DETECT_S + 2 * STEP_S
 
 
 def test_two_keepalives_lost_in_a_row_lose_no_neighbour_and_are_followed_by_polls() -> None:

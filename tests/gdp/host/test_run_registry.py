@@ -47,7 +47,18 @@ def test_the_end_of_a_run_leaves_nothing(runs: RunRegistry, tmp_path: Path) -> N
     (run.directory / "keys").mkdir()
     (run.directory / "keys" / "a").write_text("secret")
     run.end()
-    assert list(tmp_path.rglob("*")) == [tmp_path / "runs"]
+    assert list(tmp_path.rglob("*")) == []
+
+
+def test_a_directory_for_records_that_another_run_removed_is_made_again(runs: RunRegistry, tmp_path: Path) -> None:
+    first = runs.start()
+    first.end()
+    with_record = runs.start()
+    assert len(list((tmp_path / "runs").iterdir())) == 1
+    with_record.end()
+    assert not (tmp_path / "runs").exists()
+    assert not runs.all()
+    assert not runs.sweep()
 
 
 def test_only_this_user_sees_a_run(runs: RunRegistry, tmp_path: Path) -> None:

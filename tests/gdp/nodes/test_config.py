@@ -79,7 +79,7 @@ def test_every_error_of_a_file_is_listed_in_its_order(place: Path) -> None:
     text = "identity: nowhere\ndomain:\n  root: root.crt\n  trust: []\nports:\n  - {iface: a, cost: dear}\nspeed: 1\n"
     assert refusals(place, text) == [
         f"switch.yaml:1:11: identity: no such directory: {place}/nowhere",
-        "switch.yaml:4:3: domain.trust: unknown key; expected one of root, trusts, transit",
+        "switch.yaml:4:3: domain.trust: unknown key; expected one of root, trusts, transit, diagnostics",
         "switch.yaml:6:22: ports[0].cost: expected a whole number, not 'dear'",
         f"switch.yaml:7:1: speed: unknown key; expected one of {', '.join(SwitchConfig.model_fields)}",
     ]

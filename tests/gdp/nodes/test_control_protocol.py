@@ -10,12 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gdp.errors import LocalError
+from gdp.names import Name
 from gdp.nodes.control_protocol import (
     LINE_MAX_BYTES,
     RESPONSE_MAX_BYTES,
     Command,
     ControlRequestError,
     LineBuffer,
+    Request,
     Response,
     decode_request,
     decode_response,
@@ -23,10 +25,29 @@ from gdp.nodes.control_protocol import (
     encode_response,
 )
 
+NAMED = {"name": Name(bytes(range(32))).to_text()}
+REQUESTS = [Request(each, NAMED if each is Command.LOOKUP else {}) for each in Command]
 
-@pytest.mark.parametrize("command", list(Command))
-def test_a_request_survives_encoding(command: Command) -> None:
-    assert decode_request(encode_request(command).rstrip(b"\n")) is command
+
+@pytest.mark.parametrize("request_", REQUESTS)
+def test_a_request_survives_encoding(request_: Request) -> None:
+    assert decode_request(encode_request(request_).rstrip(b"\n")) == request_
+
+
+@pytest.mark.parametrize("name", [None, 1, "", "75e", "g" * 64])
+def test_a_lookup_without_a_name_is_refused(name: object) -> None:
+    with pytest.raises(ControlRequestError, match="name"):
+        decode_request(json.dumps({"command": "lookup", "name": name}).encode())
+
+
+def test_the_arguments_of_a_request_survive_encoding() -> None:
+    request = Request(Command.ASK, {"id": 7, "ask": "ping", "target": None})
+    assert decode_request(encode_request(request).rstrip(b"\n")) == request
+
+
+def test_a_request_above_the_limit_is_not_sent() -> None:
+    with pytest.raises(LocalError, match="at most 4096"):
+        encode_request(Request(Command.ASK, {"body": "x" * LINE_MAX_BYTES}))
 
 
 @pytest.mark.parametrize("response", [Response({"state": "running", "pid": 7}), Response(error="no")])
@@ -44,7 +65,8 @@ def test_a_line_that_is_no_request_is_refused(line: bytes) -> None:
 
 
 def test_an_unknown_command_is_answered_with_the_known_ones() -> None:
-    with pytest.raises(ControlRequestError, match="unknown command 'dance'; expected drain, reload, status"):
+    known = "ask, drain, lookup, reload, show, snapshot, status, topics, topology"
+    with pytest.raises(ControlRequestError, match=f"unknown command 'dance'; expected {known}"):
         decode_request(json.dumps({"command": "dance"}).encode())
 
 

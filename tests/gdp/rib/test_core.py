@@ -13,11 +13,12 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.statements import StatementType, parse, sign
 from gdp.crypto.subject import Subject
-from gdp.errors import DropReason
+from gdp.errors import DropReason, StoreError
 from gdp.limits import NEGATIVE_LEASE_S
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.rib.core import OutgoingStatement, RibCore, RibSettings
+from gdp.rib.route import Route
 from gdp.rib.store import MemoryStore
 from gdp.sansio import Timestamps
 from gdp.trust.advertisement import UnverifiedAdvertisement, sign_advertisement
@@ -583,3 +584,29 @@ def test_a_tier_above_that_is_behind_does_not_undo_what_is_newer_here() -> None:
     answer_from_upstream(at_rib, advertisement(sequence=4))
     assert at_rib.refusals == {DropReason.STALE: 1}
     assert answers(ask(at_rib))[0].domain == SCHOOL.root.domain
+
+
+class AwayStore(MemoryStore):
+    """A shared store that may be away."""
+
+    is_away = False
+
+    def routes(self, name: Name) -> list[Route]:
+        if self.is_away:
+            raise StoreError("away")
+        return super().routes(name)
+
+
+def test_a_rib_outlives_a_shared_store_and_a_tier_above_that_are_both_away() -> None:
+    store = AwayStore()
+    policy = Policy(SCHOOL.root, [CLOUD.root])
+    at_rib = RibCore(RIB, policy, store, RibSettings(upper=(UPPER.name,)))
+    ask(at_rib, watch_s=100.0)
+    answer_from_upstream(at_rib, advertisement())
+    store.is_away = True
+    for step in range(30):
+        at_rib.handle_timer(at(step / 2))
+        at_rib.statements_to_send()
+    assert at_rib.refusals[DropReason.UNAVAILABLE] > 0
+    store.is_away = False
+    assert store.get(NAME, ROBOT.name) is not None

@@ -204,8 +204,8 @@ def test_a_closed_publisher_refuses_messages(pair: Simulated) -> None:
 
 
 def test_an_unknown_priority_is_refused(pair: Simulated) -> None:
-    with pytest.raises(LocalError, match="'normal' or 'urgent'"):
-        pair.sessions["robot"].publisher("camera", priority="high")  # type: ignore[arg-type]
+    with pytest.raises(LocalError, match="priority is one of urgent, interactive"):
+        pair.sessions["robot"].publisher("camera", priority="higher")  # type: ignore[arg-type]
 
 
 def test_an_impossible_number_of_paths_is_refused(pair: Simulated) -> None:

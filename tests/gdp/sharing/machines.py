@@ -151,7 +151,8 @@ class Machine:
             rule = choose(rules, kind, local, type_name)  # type: ignore[arg-type]
             name = None if rule is None else rule.overlay_name_of(local, type_name)
             if name is not None and name not in held:
-                fields = {"side": "expose", "kind": kind, "local": local, "type": type_name}
+                shared = local if rule is None else rule.global_name_of(local)
+                fields = {"side": "expose", "kind": kind, "local": local, "shared": shared, "type": type_name}
                 listed.append({**fields, "name": name.to_text()})
         return {"undelegated": listed}
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import pytest
 
@@ -38,6 +38,9 @@ class Talker:
 
     def get_timer(self) -> float | None:
         return self.due_s
+
+    def count_arrivals(self, frames_from: Callable[[int], int]) -> None:
+        pass
 
     def poll_neighbours(self) -> Mapping[int, frozenset[bytes]]:
         return {}

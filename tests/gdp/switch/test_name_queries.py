@@ -145,3 +145,19 @@ def test_a_watch_is_renewed_in_time_however_often_the_rib_sends_updates() -> Non
     assert sent_s[0] == 0
     assert all(b - a <= ADVERTISEMENT_LEASE_S / 4 for a, b in pairwise(sent_s))
     assert len(sent_s) >= 60 / (ADVERTISEMENT_LEASE_S / 4)
+
+
+def test_a_renewal_of_a_watch_is_repeated_until_a_response_comes() -> None:
+    queries = NameQueries()
+    queries.watch(TOPIC, 0.0)
+    polled(queries, 0.0)
+    queries.receive_answer(TOPIC, 0.0)
+    renewed_s = ADVERTISEMENT_LEASE_S / 4
+    again_s = [renewed_s, renewed_s + RETRY_S, renewed_s + 3 * RETRY_S, renewed_s + 7 * RETRY_S]
+    for due_s in again_s:
+        assert not polled(queries, due_s - 0.02)
+        assert polled(queries, due_s) == [(TOPIC, ADVERTISEMENT_LEASE_S)]
+    assert not polled(queries, again_s[-1] + renewed_s - 0.02)
+    assert polled(queries, again_s[-1] + renewed_s) == [(TOPIC, ADVERTISEMENT_LEASE_S)]
+    queries.receive_answer(TOPIC, again_s[-1] + renewed_s)
+    assert not polled(queries, again_s[-1] + 2 * renewed_s - 0.02)

@@ -45,6 +45,13 @@ def three_domains() -> Paths:
     )
 
 
+def test_a_link_is_the_only_way_unless_another_one_leads_to_the_neighbour() -> None:
+    row = paths("a", state("a", link("b")), state("b", link("a"), link("c")), state("c", link("b")))
+    assert row.is_only_way(name("b"))
+    assert not three_domains().is_only_way(name("x"))
+    assert row.is_only_way(name("a member, which is no switch"))
+
+
 def test_a_domain_that_is_not_allowed_is_gone_around() -> None:
     found = three_domains()
     assert found.to_switch(name("x"), AWAY, ALL) == Path(name("t"), 10)

@@ -11,7 +11,7 @@ import pytest
 from gdp.errors import DROP_COUNTERS, DropReason, LocalError
 from gdp.names import Name
 from gdp.telemetry.metrics import Metrics
-from gdp.telemetry.sources import Histogram, LinkRow, Sources
+from gdp.telemetry.sources import DeviceCounts, Histogram, LinkRow, PortRow, Sources, TopicCounts
 
 
 def drops(**counts: int) -> list[int]:
@@ -151,3 +151,33 @@ def test_each_link_shows_its_cost_its_round_trip_time_and_its_loss() -> None:
     ):
         assert line in text.splitlines()
     assert text.count("gdp_link_rtt_seconds{") == 1
+
+
+def test_each_port_shows_its_state_and_what_its_device_counted() -> None:
+    counts = DeviceCounts(5, 6, 500, 600, 0, 1, 2, 0)
+    ports = [PortRow("eth0", is_up=True, mtu=1500, counts=counts), PortRow("eth1", is_up=False, mtu=0, counts=None)]
+    lines = Metrics(Sources(ports=lambda: ports)).text().splitlines()
+    for line in (
+        'gdp_port_up{port="eth0"} 1.0',
+        'gdp_port_up{port="eth1"} 0.0',
+        'gdp_port_mtu_bytes{port="eth0"} 1500.0',
+        'gdp_port_frames_total{direction="in",port="eth0"} 5.0',
+        'gdp_port_bytes_total{direction="out",port="eth0"} 600.0',
+        'gdp_port_errors_total{direction="out",port="eth0"} 1.0',
+        'gdp_port_drops_total{direction="in",port="eth0"} 2.0',
+    ):
+        assert line in lines
+    assert not [line for line in lines if line.startswith("gdp_port_frames") and "eth1" in line]
+
+
+def test_each_topic_shows_its_messages_losses_and_readers() -> None:
+    topics = [TopicCounts("/scan", "out", 10, 800, 1, 2), TopicCounts("/scan", "in", 4, 320, 0, None)]
+    lines = Metrics(Sources(topics=lambda: topics)).text().splitlines()
+    for line in (
+        'gdp_topic_messages_total{direction="out",topic="/scan"} 10.0',
+        'gdp_topic_messages_total{direction="in",topic="/scan"} 4.0',
+        'gdp_topic_bytes_total{direction="out",topic="/scan"} 800.0',
+        'gdp_topic_lost_messages_total{direction="out",topic="/scan"} 1.0',
+        'gdp_topic_readers{topic="/scan"} 2.0',
+    ):
+        assert line in lines

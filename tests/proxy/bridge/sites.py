@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Final, cast
+from typing import Any, Final, cast
 
 from gdp.client.participant import Participant, Topic
 from gdp.client.publisher import Publisher
@@ -20,7 +20,7 @@ from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.ros_names import Kind
 from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import ring5
+from gdp.simulation.topology import Topology, ring5
 from gdp.trust.owner import Owner
 from gdp.trust.right import Right
 from proxy.bridge.bridge import Bridge, BridgeRules
@@ -54,6 +54,7 @@ class Granted(DelegationStore):
 
     def __init__(self, directory: Path, topics: Sequence[Topic]) -> None:
         self.directory = directory
+        self.left_out = {}
         self._topics = {topic.name: topic for topic in topics}
 
 
@@ -128,10 +129,12 @@ class Sites:
 
     Args:
         folder: an empty one, for the files that rules name.
+        topology: None: the ring of five.
+        options: further ones of ``Simulation``.
     """
 
-    def __init__(self, folder: Path, seed: int = 1) -> None:
-        self.world = Simulation(topology=ring5(), seed=seed, keepalive_ms=500)
+    def __init__(self, folder: Path, seed: int = 1, topology: Topology | None = None, **options: Any) -> None:
+        self.world = Simulation(topology=topology or ring5(), seed=seed, keepalive_ms=500, **options)
         self.world.owner = Owner(OWNER, bytes(range(32)))
         self.machines: list[Machine] = []
         self._folder = folder

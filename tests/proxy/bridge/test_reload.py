@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from gdp.client.participant import Topic
+from proxy.bridge.topic_counts import topic_counts
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, STRING, string, switch, switched
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Granted, Machine, Sites, named
@@ -42,6 +43,28 @@ def test_a_rule_that_is_added_carries_and_the_untouched_one_loses_nothing(sites:
     sites.run(3)
     assert other.texts == ["hello"]
     assert ear.texts == [str(number) for number in range(600)]
+
+
+def test_flows_that_begin_and_end_later_are_reported_each_once(sites: Sites) -> None:
+    robot, _, _, _ = flowing(sites)
+    assert [(each.flow_spec.local, each.is_begun) for each in robot.bridge.poll_changes()] == [("/chatter", True)]
+    sites.reload(robot, expose=[OTHER])
+    robot.graph.publish("/talker", "/other", STRING)
+    assert sites.run(1, lambda: robot.carried == {("/other", True)})
+    changes = {(each.flow_spec.local, each.is_begun) for each in robot.bridge.poll_changes()}
+    assert changes == {("/chatter", False), ("/other", True)}
+    assert robot.bridge.poll_changes() == []
+
+
+def test_metrics_have_a_row_for_each_topic_and_no_name_unless_it_is_allowed(sites: Sites) -> None:
+    robot, server, talker, ear = flowing(sites)
+    talker.publish(string("hello"))
+    assert sites.run(1, lambda: ear.texts == ["hello"])
+    (out,), (into,) = (topic_counts(each.bridge.flows, has_names=True) for each in (robot, server))
+    assert (out.topic, out.direction, out.messages, out.lost, out.readers) == ("/chatter", "out", 1, 0, 1)
+    assert (into.topic, into.direction, into.messages, into.size) == ("/chatter", "in", 1, out.size)
+    (secret,) = topic_counts(robot.bridge.flows, has_names=False)
+    assert secret.topic == robot.bridge.flows[0][0].name.short
 
 
 def test_a_rule_that_is_removed_carries_no_more_and_the_untouched_one_loses_nothing(sites: Sites) -> None:

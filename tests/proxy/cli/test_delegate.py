@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
+from gdp.cli.delegate import main as alias
 from gdp.cli.gdp import main
 from gdp.stores.issue import delegate
 from gdp.stores.keyring import load_delegations, save_delegation
@@ -111,6 +113,47 @@ def test_an_owner_whom_no_rule_names_is_refused_with_those_that_they_name() -> N
     assert done.exit_code == 2
     assert "no rule of robot/proxy.yaml names this owner (other/owner.pub)" in done.output
     assert "they name robot/owner.pub" in done.output
+
+
+@pytest.mark.parametrize("program", ["gdp delegate", "gdp delegate rules", "gdp-delegate"])
+def test_all_three_spellings_do_the_same(program: str, capsys: pytest.CaptureFixture[str]) -> None:
+    _, *words = program.split()
+    with pytest.raises(SystemExit) as leaving:
+        (main if words else alias)([*words, *_BOTH])
+    assert not leaving.value.code
+    assert "robot/proxy.yaml: + publish topic /map" in capsys.readouterr().out
+
+
+def test_delegations_of_a_node_are_listed_by_what_they_are_about(capsys: pytest.CaptureFixture[str]) -> None:
+    _run(*_BOTH)
+    with pytest.raises(SystemExit):
+        alias(["ls", "robot/proxy"])
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith("valid ")
+    assert "publish  topic /map  [nav_msgs/msg/OccupancyGrid]" in line
+    with pytest.raises(SystemExit):
+        alias(["show", line.split()[-1], "--json"])
+    said = json.loads(capsys.readouterr().out)
+    assert (said["ros_name"], said["rights"], len(said["links"])) == ("/map", ["publish"], 1)
+
+
+def test_an_expired_delegation_is_listed_as_such(capsys: pytest.CaptureFixture[str]) -> None:
+    rule = ProxyConfig.load(Path("robot/proxy.yaml")).expose[0]
+    old = delegate(
+        Path("owner"), Path("robot/proxy/node.card"), rule.overlay_metadata, [Right.READ], days=1, unix_s=1e9
+    )
+    save_delegation(Path("robot/proxy/delegations"), old)
+    with pytest.raises(SystemExit):
+        alias(["ls", "robot/proxy"])
+    assert capsys.readouterr().out.startswith("expired ")
+
+
+def test_a_directory_without_delegations_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    for directory, code, said in (("robot/proxy", 0, "no delegation is in"), ("nowhere", 2, "no such directory")):
+        with pytest.raises(SystemExit) as leaving:
+            alias(["ls", directory])
+        output = capsys.readouterr()
+        assert (leaving.value.code or 0, said in output.out + output.err) == (code, True)
 
 
 def test_a_recording_that_exists_is_refused_by_the_check_too() -> None:

@@ -9,7 +9,7 @@ import pytest
 from gdp.errors import LocalError
 from gdp.limits import MESSAGE_MAX_BYTES
 from gdp.metadata import Metadata
-from tests.proxy.rule_files import OWNER, furnish, proxy, refusals, rules
+from tests.proxy.rule_files import OTHER, OWNER, furnish, proxy, refusals, rules
 
 RULE = "  - {name: /camera/image, type: sensor_msgs/msg/Image, metadata: {author: lab}, owner: owner.pub}\n"
 
@@ -41,6 +41,14 @@ def test_the_overlay_name_follows_from_metadata_and_owner(place: Path) -> None:
     (rule,) = proxy(place, "import:\n" + RULE).imports
     metadata = {"kind": "topic", "name": "/camera/image", "type": "sensor_msgs/msg/Image", "author": "lab"}
     assert rule.overlay_name == Metadata(metadata).name(OWNER.public.compressed)
+
+
+def test_the_file_may_state_the_owner_of_all_its_names(place: Path) -> None:
+    own = RULE.replace("owner.pub", "other.pub")
+    config = proxy(place, f"owner: owner.pub\nexpose:\n  - {{name: /a}}\n{own}import:\n  - {{name: /b}}\n")
+    assert [rule.owner for rule in (*config.expose, *config.imports)] == [OWNER.public, OTHER.public, OWNER.public]
+    assert refusal(place, "expose:\n  - {name: /a}\n").endswith(": expose[0].owner: required, but not there")
+    assert "owner: expected an owner's public key file" in refusal(place, "owner: missing.pub\n")
 
 
 def test_a_graph_may_be_said_to_have_no_other_proxy(place: Path) -> None:

@@ -60,7 +60,7 @@ def test_a_key_that_belongs_into_the_main_file_is_refused_where_it_stands(path: 
     file = drop(path, "a.yaml", "import:\n" + RULE % ("/in", OWNER_FROM_DROP_IN) + "iface: eth0\n")
     with pytest.raises(ConfigError) as refused:
         ProxyConfig.load(path)
-    assert str(refused.value) == f"{file}:3:1: iface: unknown key; expected one of expose, import"
+    assert str(refused.value) == f"{file}:3:1: iface: unknown key; expected one of expose, import, deny"
 
 
 def test_an_error_in_a_drop_in_has_its_file_line_and_key(path: Path) -> None:

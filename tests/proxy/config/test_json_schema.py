@@ -88,6 +88,12 @@ def test_an_editor_takes_the_good_rules_and_underlines_the_bad() -> None:
     assert [text for text, _ in BAD if _accepts(_with_rule(text))] == of_two_keys
 
 
+def test_an_editor_knows_that_the_file_may_state_the_owner_for_its_rules() -> None:
+    ownerless = "ros: {endpoint: ros2}\nexpose:\n  - {name: /a}\n"
+    assert _accepts(f"owner: owner.pub\n{ownerless}")
+    assert not _accepts(ownerless)
+
+
 def test_an_editor_knows_the_other_keys_too() -> None:
     good = ["", "ros: [{endpoint: ros2, domain: 1}, {endpoint: ros1, master: 'http://a:1'}]", "ros: {endpoint: dds}"]
     bad = ["ros: 2", "ros: {endpoint: zenoh}", "record: {path: x, format: bag}", "metrics: {}", "exposes: []"]

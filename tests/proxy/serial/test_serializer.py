@@ -403,6 +403,18 @@ def test_a_typed_array_of_another_kind_or_length_is_refused() -> None:
         assert refusal(about, cbor2.dumps({"a": cbor2.CBORTag(tag, raw)}), "cbor") is DropReason.MALFORMED
 
 
+def test_shared_values_that_stand_for_millions_of_items_are_refused() -> None:
+    """Six kilobytes of references: a thousand times the same list, which has a thousand times the same text."""
+    about = channel(f"Row[] rows\n{RULE}MSG: a/Row\nstring[] cells\n")
+
+    def many(first: bytes, number: int) -> bytes:
+        return b"\x99\x04\x00" + b"\xd8\x1c" + first + (b"\xd8\x1d" + bytes([number])) * 1_023
+
+    cells = b"\xa1" + cbor2.dumps("cells") + many(cbor2.dumps("x" * 100), 1)
+    body = b"\xa1" + cbor2.dumps("rows") + many(cells, 0)
+    assert refusal(about, body, "cbor") is DropReason.MALFORMED
+
+
 def test_a_few_bytes_that_announce_many_records_without_fields_are_not_read() -> None:
     channel = known.custom("a/msg/Nothings", f"a/Nothing[] nothings\n{RULE}MSG: a/Nothing\n", 1)
     serializer = Serializer(channel, "json")

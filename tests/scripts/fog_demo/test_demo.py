@@ -42,6 +42,24 @@ def test_the_robot_is_answered_by_the_machine_and_both_end_cleanly() -> None:
     assert left == 0
 
 
+def test_a_second_ctrl_c_cuts_nothing() -> None:
+    environment = {
+        **os.environ,
+        "ROS_DOMAIN_ID": str(free_domain()),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    }
+    words = [sys.executable, "-m", "fog_demo.caller", "--ros-args", "-p", "report_s:=0.2"]
+    caller = subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert caller.stdout is not None
+    caller.stdout.readline()
+    caller.send_signal(signal.SIGINT)
+    while not json.loads(caller.stdout.readline())["done"]:
+        pass  # a line that came before the signal
+    caller.send_signal(signal.SIGINT)
+    _, complaints = caller.communicate(timeout=20)
+    assert (caller.returncode, complaints) == (0, "")
+
+
 def test_a_wrong_answer_is_counted() -> None:
     stats = Tally(calls=2)
     stats.answered(True, Tallied(success=False, message="a"), 0.001, 5.0)

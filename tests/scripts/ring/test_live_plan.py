@@ -12,7 +12,7 @@ from gdp.trust.right import Right
 from proxy.config.config import ProxyConfig
 from proxy.config.rule import DOMAIN_MAX
 from ring.credentials import OverlayCredentials
-from ring.live_plan import CARRIED, Graph, graphs_of, messages_in
+from ring.live_plan import CARRIED, Graph, graphs_of, messages_in, paces
 from ring.nodes.content import TALKS
 from ring.options import Live
 
@@ -34,8 +34,12 @@ def test_the_domain_of_a_run_is_one_whose_ports_no_other_domain_uses(run: str) -
 
 
 def test_every_talker_says_at_least_something() -> None:
-    assert messages_in(0.01) == {talk.node: 1 for talk in TALKS}
-    assert messages_in(10.0)["camera"] == 150
+    assert {messages_in(0.01, talk.hz) for talk in TALKS} == {1}
+    assert messages_in(10.0, 15.0) == 150
+
+
+def test_only_the_camera_follows_the_pace_that_was_asked_for() -> None:
+    assert paces(5.0) == {talk.node: talk.hz for talk in TALKS} | {"camera": 5.0}
 
 
 @pytest.mark.parametrize("ros", [1, 2])

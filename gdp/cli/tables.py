@@ -1,0 +1,62 @@
+"""Tables on the standard output: aligned columns that never lose data outside a terminal.
+
+I/O. Outside a terminal no cell is shortened and no line is wrapped.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Mapping, Sequence
+
+import typer
+
+from gdp.errors import LocalError
+from gdp.names import NAME_BYTES, Name
+
+__all__ = ["cell", "print_table", "select_columns"]
+
+_HEX_DIGITS = 2 * NAME_BYTES
+_LAST = "…"
+
+
+def select_columns(rows: Sequence[Mapping[str, object]], columns: str | None) -> list[str]:
+    """Return the columns to print: those of an option, or all.
+
+    Raises:
+        LocalError: the option names one that the table does not have.
+    """
+    known = list(dict.fromkeys(key for row in rows for key in row))
+    if columns is None:
+        return known
+    wanted = [each.strip() for each in columns.split(",")]
+    unknown = [each for each in wanted if each not in known]
+    if unknown and rows:
+        raise LocalError(f"--columns: no column {unknown[0]!r}; the table has {', '.join(known)}")
+    return wanted
+
+
+def print_table(rows: Sequence[Mapping[str, object]], columns: Sequence[str]) -> None:
+    """Print rows under their column names.
+
+    On a terminal, names are short and lines end at its width; elsewhere everything is whole.
+    """
+    is_terminal = sys.stdout.isatty()
+    cells = [[cell(row.get(column), is_short=is_terminal) for column in columns] for row in rows]
+    widths = [max(map(len, (column, *(line[at] for line in cells)))) for at, column in enumerate(columns)]
+    width = shutil.get_terminal_size().columns if is_terminal else 0
+    for line in [[column.upper() for column in columns], *cells]:
+        text = "  ".join(word.ljust(size) for word, size in zip(line, widths, strict=True)).rstrip()
+        typer.echo(text if not width or len(text) <= width else text[: width - 1] + _LAST)
+
+
+def cell(value: object, *, is_short: bool) -> str:
+    """Return a value as text; ``is_short``: names in their form for people."""
+    if value is None or value == "":
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    text = str(value)
+    if is_short and len(text) == _HEX_DIGITS and set(text) <= set("0123456789abcdef"):
+        return Name.from_text(text).short
+    return text

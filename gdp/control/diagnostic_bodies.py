@@ -1,0 +1,174 @@
+"""Bodies of diagnostic requests and replies (``diagnostics.py``).
+
+Sans-I/O. A request is padded to the longest reply that it accepts, so that no reply is longer than its request.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+from gdp.crypto.cbor import encode
+from gdp.crypto.fields import Fields
+from gdp.crypto.keys import SigningKey
+from gdp.crypto.statements import StatementType, assemble, sign
+from gdp.errors import DropReason, LocalError, StatementError
+from gdp.frame.codec import HOPS_MASK
+from gdp.limits import DIAGNOSTIC_REPLY_MAX_BYTES
+from gdp.names import ZERO, Name
+
+__all__ = ["ASK_MAX_CHARS", "DiagnosticReply", "DiagnosticRequest", "cut_to_fit"]
+
+ASK_MAX_CHARS: Final = 16
+_ERROR_MAX_CHARS: Final = 32
+_SHORT_REPLY_BYTES: Final = 360  # an empty result, and a few counters
+_CERTIFICATE_BYTES: Final = 680  # of the member that replies, if we lack it: label and domain of some 60 letters
+_PAD_HEAD_BYTES: Final = 5  # key and head of the padding
+_NO_SIGNATURE: Final = bytes(64)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DiagnosticRequest:
+    """Request of one member to another.
+
+    Args:
+        name: asked about; ``ZERO``: none.
+        body: more about the question; its keys depend on ``ask``.
+        knows_target: the asker has the certificate of the target, so the reply may omit it.
+        membership: DER; empty: the target has it.
+    """
+
+    ask: str
+    name: Name
+    target: Name
+    sequence: int
+    body: Mapping[str, object] = field(default_factory=dict)
+    knows_target: bool = False
+    membership: bytes = b""
+
+    def to_wire(self, signer: Name, key: SigningKey, reply_bytes: int = 0) -> bytes:
+        """Return the signed statement, as long as the longest reply that it accepts.
+
+        Raises:
+            LocalError: ``reply_bytes`` is above the limit, or the body is too large.
+        """
+        if not 0 < len(self.ask) <= ASK_MAX_CHARS or reply_bytes > DIAGNOSTIC_REPLY_MAX_BYTES:
+            raise LocalError(
+                f"an ask has 1 to {ASK_MAX_CHARS} letters, its reply at most {DIAGNOSTIC_REPLY_MAX_BYTES} bytes"
+            )
+        body: dict[str, object] = {
+            "a": self.ask,
+            "n": self.name,
+            "to": self.target,
+            "s": self.sequence,
+            "b": dict(self.body),
+            "k": self.knows_target,
+        }
+        if self.membership:
+            body["c"] = self.membership
+        least = _SHORT_REPLY_BYTES + (0 if self.knows_target else _CERTIFICATE_BYTES)
+        size = len(assemble(StatementType.DIAGNOSTIC_REQUEST, body, signer, _NO_SIGNATURE))
+        body["z"] = bytes(max(max(reply_bytes, least) - size - _PAD_HEAD_BYTES, 0))
+        return sign(StatementType.DIAGNOSTIC_REQUEST, body, signer, key)
+
+    @classmethod
+    def from_fields(cls, fields: Fields) -> DiagnosticRequest:
+        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
+        ask = fields.text("a", ASK_MAX_CHARS)
+        if not ask.isprintable() or not ask:
+            raise StatementError(DropReason.MALFORMED, "what is asked is not printable")
+        return cls(
+            ask=ask,
+            name=fields.optional_name("n"),
+            target=fields.name("to"),
+            sequence=fields.uint("s"),
+            body=fields.map_("b"),
+            knows_target=fields.flag("k"),
+            membership=fields.bytes_("c") if "c" in fields else b"",
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DiagnosticReply:
+    """Reply to one request.
+
+    Args:
+        asker: whose request had this sequence number.
+        error: why there is no result; empty: there is.
+        is_withheld: the asker's domain gets less than ours.
+        is_cut: lists in the result lack their last items.
+        hops_left: that the request had when it came.
+        membership: DER; empty: the asker has it.
+    """
+
+    ask: str
+    sequence: int
+    asker: Name
+    result: Mapping[str, object] = field(default_factory=dict)
+    error: str = ""
+    is_withheld: bool = False
+    is_cut: bool = False
+    hops_left: int = 0
+    membership: bytes = b""
+
+    @property
+    def body(self) -> dict[str, object]:
+        """Return the body of the statement."""
+        body: dict[str, object] = {
+            "a": self.ask,
+            "s": self.sequence,
+            "r": self.asker,
+            "b": dict(self.result),
+            "e": self.error,
+            "w": self.is_withheld,
+            "m": self.is_cut,
+            "h": self.hops_left,
+        }
+        if self.membership:
+            body["c"] = self.membership
+        return body
+
+    def to_wire(self, signer: Name, key: SigningKey) -> bytes:
+        """Return the signed statement."""
+        return sign(StatementType.DIAGNOSTIC_REPLY, self.body, signer, key)
+
+    @classmethod
+    def from_fields(cls, fields: Fields) -> DiagnosticReply:
+        """Read a parsed statement's body; a malformed one raises ``StatementError``."""
+        return cls(
+            ask=fields.text("a", ASK_MAX_CHARS),
+            sequence=fields.uint("s"),
+            asker=fields.name("r"),
+            result=fields.map_("b"),
+            error=fields.text("e", _ERROR_MAX_CHARS),
+            is_withheld=fields.flag("w"),
+            is_cut=fields.flag("m"),
+            hops_left=fields.uint("h", HOPS_MASK),
+            membership=fields.bytes_("c") if "c" in fields else b"",
+        )
+
+
+def cut_to_fit(reply: DiagnosticReply, max_bytes: int) -> DiagnosticReply | None:
+    """Return the reply with as many list items as fit, or without its result; None: not even that fits.
+
+    Args:
+        max_bytes: of the signed statement.
+    """
+    while _size(reply) > max_bytes:
+        lists = {key: value for key, value in reply.result.items() if isinstance(value, list | tuple) and value}
+        if lists:
+            key = max(lists, key=lambda each: len(encode(lists[each])))
+            excess, each_bytes = _size(reply) - max_bytes, len(encode(lists[key])) / len(lists[key])
+            kept = len(lists[key]) - max(int(excess / each_bytes), 1)
+            result = {**reply.result, key: lists[key][: max(kept, 0)]}
+        elif reply.result:
+            result = {}
+        else:
+            return None
+        reply = replace(reply, result=result, is_cut=True)
+    return reply
+
+
+def _size(reply: DiagnosticReply) -> int:
+    return len(assemble(StatementType.DIAGNOSTIC_REPLY, reply.body, ZERO, _NO_SIGNATURE))

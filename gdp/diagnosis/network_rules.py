@@ -1,0 +1,255 @@
+"""Rules about nodes and the network between them.
+
+Sans-I/O. Each rule returns sentence and command where its cause holds, else None.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from gdp.diagnosis.facts import ProxyFacts, RibFacts
+from gdp.diagnosis.view import Node, View, short
+from gdp.limits import CLOCK_SKEW_S
+
+__all__ = [
+    "Found",
+    "clock",
+    "ethertype_filtered",
+    "far_proxy_down",
+    "identity_in_use",
+    "interface_down",
+    "link_silent",
+    "membership_expired",
+    "membership_revoked",
+    "nat_closed",
+    "no_proxy_here",
+    "no_route",
+    "rib_down",
+    "rib_silent",
+    "switch_down",
+    "tunnel_down",
+    "untrusted_domain",
+]
+
+Found = tuple[str, str] | None
+
+_STRANGER: Final = "neighbour-refused"
+_SILENT: Final = ("no-neighbour", "not-heard")
+
+
+def no_proxy_here(view: View) -> Found:
+    """No proxy of the asker answers."""
+    if view.near is not None:
+        return None
+    down = next((each for each in view.facts.unreachable if each.role == "proxy"), None)
+    where = "this machine" if down is None else down.where
+    return f"No proxy runs on {where}, so nothing crosses.", "gdp-proxy --config proxy.yaml"
+
+
+def clock(view: View) -> Found:
+    """A clock differs by more than certificates allow."""
+    near = view.near
+    if near is None:
+        return None
+    for node in view.nodes:
+        apart_s = node.unix_s - near.unix_s
+        if node.unix_s and near.unix_s and abs(apart_s) > CLOCK_SKEW_S:
+            which = f"The clock of {view.place_of(node)} differs from this machine's by {_span(apart_s)}"
+            return f"{which}, so one of them refuses the certificates of the other.", "timedatectl set-ntp true"
+    for each in view.members:
+        if each.unix_s and each.unix_s < each.valid_from_unix_s - CLOCK_SKEW_S:
+            early = _span(each.valid_from_unix_s - each.unix_s)
+            text = f"The clock of {view.place_of(each)} is {early} before its own certificate begins."
+            return text, "timedatectl set-ntp true"
+    return None
+
+
+def identity_in_use(view: View) -> Found:
+    """Another node has the same keys."""
+    for node, _ in view.waits("identity-in-use"):
+        text = f"Another node with the keys of {view.place_of(node)} is attached, and the older one stays."
+        return text, "gdp keygen node keys/new --role proxy --label LABEL"
+    return None
+
+
+def membership_revoked(view: View) -> Found:
+    """A membership is revoked: a proxy knows it of its own, or refuses a neighbour for it."""
+    for proxy in view.facts.proxies:
+        if proxy.is_revoked:
+            text = f"The membership of {view.place_of(proxy)} is revoked, so its neighbours refuse it."
+            return text, "gdp cert issue --domain DOMAIN --request node.csr --role proxy --label LABEL"
+    for node, wait in view.waits(_STRANGER):
+        if wait.refused == "revoked":
+            text = f"{_of(view, node)} refuses its neighbour on {wait.device}: that membership is revoked."
+            return text, "gdp cert issue --domain DOMAIN --request node.csr --role proxy --label LABEL"
+    return None
+
+
+def membership_expired(view: View) -> Found:
+    """A membership has ended."""
+    for each in view.members:
+        if each.valid_until_unix_s and each.unix_s > each.valid_until_unix_s:
+            late = _span(each.unix_s - each.valid_until_unix_s)
+            if view.is_torn:
+                return f"The membership of {view.place_of(each)} expired {late} ago.", "gdp cert renew --help"
+    for node, wait in view.waits(_STRANGER):
+        if wait.refused == "expired":
+            text = f"{_of(view, node)} refuses its neighbour on {wait.device}: that membership has expired"
+            return f"{text}, or a clock is wrong.", "gdp cert renew --help"
+    return None
+
+
+def untrusted_domain(view: View) -> Found:
+    """A neighbour, or the domain of an advertiser, is not trusted."""
+    for node, wait in view.waits(_STRANGER):
+        if wait.refused in ("wrong-domain", "bad-certificate"):
+            domain = wait.domain or "another domain"
+            text = f"{_of(view, node)} does not trust {domain}, the domain of its neighbour on {wait.device}."
+            return text, "gdp domain --help"
+    for switch in view.facts.switches:
+        for place in switch.locations:
+            if not place.is_trusted:
+                text = f"{_of(view, switch)} does not trust domain {short(place.domain)}, where the name is."
+                return text, "gdp domain --help"
+    return None
+
+
+def interface_down(view: View) -> Found:
+    """A link is down, and the network is not whole."""
+    for node, wait in view.waits("link-down") if view.is_torn else ():
+        text = f"Device {wait.device} of {view.place_of(node)} is down or absent."
+        return text, f"ip link set {wait.device or 'DEVICE'} up"
+    return None
+
+
+def switch_down(view: View) -> Found:
+    """A switch that the asker named does not run."""
+    for each in view.facts.unreachable:
+        if each.role == "switch" and each.is_down:
+            return f"The switch {each.where} does not run.", f"gdp-switch --config {each.where}.yaml"
+    return None
+
+
+def ethertype_filtered(view: View) -> Found:
+    """Two switches run, their link is up, and neither hears the other."""
+    if not view.is_torn:
+        return None
+    silent = [(node, wait) for node, wait in view.waits(*_SILENT) if not isinstance(node, RibFacts | ProxyFacts)]
+    names = {node.name for node, _ in silent}
+    if len(names) > 1 and not any(each.is_down for each in view.facts.unreachable):
+        node, wait = silent[0]
+        text = f"The link at {wait.device} of {view.place_of(node)} is up and both ends run, but no hello passes"
+        return f"{text}: something in between filters EtherType 0x88B5.", (
+            f"tcpdump -eni {wait.device or 'DEVICE'} ether proto 0x88b5"
+        )
+    return None
+
+
+def link_silent(view: View) -> Found:
+    """No node answers on a link that the name needs."""
+    for node, wait in view.waits(*_SILENT, "no-switch") if view.is_torn else ():
+        if wait.reason == "not-heard":
+            text = f"The neighbour of {view.place_of(node)} on {wait.device} does not hear it, or does not trust it."
+            return text, "gdp status NODE_DIR"
+        text = f"No switch answers on {wait.device} of {view.place_of(node)}"
+        return f"{text}: it does not run, or something filters EtherType 0x88B5.", "gdp-switch --config switch.yaml"
+    return None
+
+
+def nat_closed(view: View) -> Found:
+    """A tunnel never had a handshake, and the name is behind it."""
+    if not _is_cut_off(view):
+        return None
+    for switch in view.facts.switches:
+        for tunnel in switch.tunnels:
+            if not tunnel.is_up and tunnel.handshake_age_s is None and tunnel.endpoint:
+                text = f"No handshake ever came back from {tunnel.endpoint}, the far end of tunnel {tunnel.device}"
+                return f"{text}: its NAT or firewall is closed for UDP.", "gdp status SWITCH_DIR"
+    return None
+
+
+def tunnel_down(view: View) -> Found:
+    """A tunnel is down, and the name is behind it."""
+    if not _is_cut_off(view):
+        return None
+    for switch in view.facts.switches:
+        for tunnel in switch.tunnels:
+            if not tunnel.is_up:
+                age = tunnel.handshake_age_s
+                since = "it has no endpoint yet" if age is None else f"its last handshake was {_span(age)} ago"
+                text = f"Tunnel {tunnel.device} of {view.place_of(switch)} to {tunnel.peer} is down; {since}."
+                return text, "gdp status SWITCH_DIR"
+    return None
+
+
+def rib_down(view: View) -> Found:
+    """No RIB answers."""
+    for each in view.facts.unreachable:
+        if each.role == "rib" and each.is_down:
+            return f"The RIB {each.where} does not run, so no switch learns where names are.", (
+                f"gdp-rib --config {each.where}.yaml"
+            )
+    cut = {node.name for node, _ in view.waits(*_SILENT, "link-down")}
+    if any(each.rib for each in view.facts.switches):
+        return None
+    for switch in view.facts.switches:
+        if switch.name not in cut:
+            return f"{_of(view, switch)} reaches no RIB, so names are not found.", "gdp-rib --config rib.yaml"
+    for node, _ in view.waits("no-rib") if not view.facts.switches else ():
+        return f"No RIB answers {view.place_of(node)}, so names are not found.", "gdp-rib --config rib.yaml"
+    return None
+
+
+def rib_silent(view: View) -> Found:
+    """The RIB in use does not answer."""
+    for switch in view.facts.switches:
+        if switch.is_rib_silent and not view.advertisers:
+            text = f"{_of(view, switch)} gets no answer from RIB {short(switch.rib)}, so the name is not found."
+            return text, "gdp-rib --config rib.yaml"
+    return None
+
+
+def far_proxy_down(view: View) -> Found:
+    """The other end's proxy is away: the asker knows that it does not run, or its lease ended."""
+    for each in view.facts.unreachable:
+        if each.role == "proxy" and each.is_down and view.near is not None:
+            return f"The proxy {each.where} does not run.", f"gdp-proxy --config {each.where}.yaml"
+    lapsed = [each for each in view.lapsed if view.reaches(each.switch, each.domain)]
+    if lapsed:
+        text = f"Proxy {short(lapsed[-1].advertiser)} advertised the name until its lease ended"
+        return f"{text}: it stopped without a goodbye, or its machine is cut off.", "gdp-proxy --config proxy.yaml"
+    is_known = view.exporters or view.facts.ribs
+    if not is_known and not view.advertisers and any(each.flow.absent for each in view.importers):
+        return "The proxy that published the name is gone.", "gdp-proxy --config proxy.yaml"
+    return None
+
+
+def no_route(view: View) -> Found:
+    """The advertiser's switch is known, and no path leads there."""
+    for switch in view.facts.switches:
+        for place in switch.locations:
+            if not place.is_reachable:
+                text = f"{_of(view, switch)} knows that the name is at switch {short(place.switch)}"
+                return f"{text}, but no path that the policies allow leads there.", "gdp show routes"
+    for node, _ in view.waits("through-leaf"):
+        return f"Only leaves, which carry no transit, connect {view.place_of(node)} to other switches.", (
+            "gdp show links"
+        )
+    return None
+
+
+def _is_cut_off(view: View) -> bool:
+    return view.is_torn or (not view.advertisers and any(each.tunnels for each in view.facts.switches))
+
+
+def _of(view: View, node: Node) -> str:
+    text = view.place_of(node)
+    return text[0].upper() + text[1:]
+
+
+def _span(seconds: float) -> str:
+    seconds = abs(seconds)
+    for size, unit in ((86_400, "days"), (3_600, "h"), (60, "min")):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{seconds:.3g} s"

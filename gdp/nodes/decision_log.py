@@ -1,0 +1,90 @@
+"""Log of a node's decisions for ``-v``: routes that it set and removed, and what it dropped, by reason.
+
+I/O; it compares twice a second, and only while debug lines are logged: the core itself decides without a log. A look
+writes a bounded number of lines. Names appear in their short form, ports as device names.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final
+
+from gdp.errors import DropReason
+from gdp.names import NAME_BYTES, Name
+from gdp.nodes.node_log import LOOK_S
+from gdp.nodes.runtime import Runtime
+from gdp.ports.plane import Port
+from gdp.sansio import Timestamps
+from gdp.switch.table import Hops, Table
+
+__all__ = ["DecisionLog", "log_decisions"]
+
+log = logging.getLogger(__name__)
+
+_LINES_MAX: Final = 64  # of each kind in one look
+_ANY: Final = "any"
+
+
+def log_decisions(
+    runtime: Runtime,
+    ports: Mapping[int, Port],
+    drops: Sequence[Callable[[], Sequence[int]]],
+    table: Table | None = None,
+) -> None:
+    """Log decisions from within the loop if debug lines are wanted."""
+    if log.isEnabledFor(logging.DEBUG):
+        runtime.every(LOOK_S, DecisionLog(ports, drops, table).look)
+
+
+class DecisionLog:
+    """What a node decided since the last look.
+
+    Args:
+        drops: lists of counts by ``DropReason``, which are added up.
+        table: of a switch.
+    """
+
+    def __init__(
+        self, ports: Mapping[int, Port], drops: Sequence[Callable[[], Sequence[int]]], table: Table | None = None
+    ) -> None:
+        self._ports = ports
+        self._drops = drops
+        self._table = table
+        self._routes: dict[bytes, str] = {}
+        self._dropped: dict[DropReason, int] = {}
+
+    def look(self, _now: Timestamps) -> None:
+        """Log what changed since the last call."""
+        if self._table is not None:
+            self._look_at_routes(self._table.entries)
+        lists = [source() for source in self._drops]
+        for reason in DropReason:
+            count = sum(counts[reason] for counts in lists)
+            if (more := count - self._dropped.get(reason, 0)) > 0:
+                log.debug("dropped reason=%s frames=%d total=%d", reason.label, more, count)
+                self._dropped[reason] = count
+
+    def _look_at_routes(self, entries: Mapping[bytes, Hops]) -> None:
+        now = {key: self._where(hops) for key, hops in entries.items()}
+        changed = [key for key, where in now.items() if self._routes.get(key) != where]
+        gone = [key for key in self._routes if key not in now]
+        for key in changed[:_LINES_MAX]:
+            log.debug("route set destination=%s source=%s to=%s", *_ends(key), now[key])
+        for key in gone[:_LINES_MAX]:
+            log.debug("route removed destination=%s source=%s", *_ends(key))
+        left = max(len(changed) - _LINES_MAX, 0) + max(len(gone) - _LINES_MAX, 0)
+        if left:
+            log.debug("further routes changed count=%d", left)
+        self._routes = now
+
+    def _where(self, hops: Hops) -> str:
+        return ",".join(self._ifname(hop[0]) for hop in hops) or "nowhere"
+
+    def _ifname(self, index: int) -> str:
+        port = self._ports.get(index)
+        return "?" if port is None else port.ifname
+
+
+def _ends(key: bytes) -> tuple[str, str]:
+    return Name(key[:NAME_BYTES]).short, Name(key[NAME_BYTES:]).short if len(key) > NAME_BYTES else _ANY

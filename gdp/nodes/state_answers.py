@@ -1,0 +1,101 @@
+"""Answers to the diagnostic request ``state``: what a switch or a RIB knows about one name.
+
+Sans-I/O. Members of the own domain, and of domains that the policy names, get the facts. Another member gets them if it
+holds a right on the name: it advertises, serves, calls or reads that name, as far as this node knows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
+from typing import Final
+
+from gdp.client.rib_host import RibHost
+from gdp.control.diagnostics import Diagnostics, Question
+from gdp.diagnosis.facts import RibFacts, SwitchFacts, TunnelFact, WaitFact
+from gdp.diagnosis.fields import to_fields
+from gdp.errors import StoreError
+from gdp.names import Name
+from gdp.sansio import Timestamps
+from gdp.switch.core import SwitchCore
+from gdp.trust.domain import Policy
+
+__all__ = ["ASK", "answer_for_rib", "answer_for_switch", "answer_state"]
+
+ASK: Final = "state"
+_TUNNELS_MAX: Final = 32
+
+Waits = Callable[[float], tuple[WaitFact, ...]]
+
+
+def answer_state(
+    diagnostics: Diagnostics,
+    policy: Policy,
+    gather: Callable[[Question, Timestamps], object],
+    holders: Callable[[Name, float], Collection[Name]],
+) -> None:
+    """Answer ``state`` from now on.
+
+    Args:
+        gather: returns the facts, a dataclass of ``gdp/diagnosis/facts.py``.
+        holders: returns the nodes that hold a right on a name, as far as known, at a monotonic second.
+    """
+
+    def answer(question: Question, now: Timestamps) -> Mapping[str, object]:
+        """Return the facts for who may know them; else nothing."""
+        asker = question.asker
+        if asker.domain not in policy.diagnostics and asker.name not in holders(question.name, now.mono_s):
+            return {}
+        try:
+            return to_fields(gather(question, now))
+        except StoreError:
+            return {}
+
+    diagnostics.register(ASK, answer, for_foreign=True)
+
+
+def answer_for_switch(
+    switch: SwitchCore,
+    policy: Policy,
+    waits: Waits,
+    begun_s: float,
+    tunnels: Callable[[Timestamps], Sequence[Mapping[str, object]]] | None = None,
+) -> None:
+    """Answer ``state`` for a switch.
+
+    Args:
+        begun_s: monotonic second of its start.
+        tunnels: returns a row for each tunnel, as ``TunnelLinks.status``; None: the switch has none.
+    """
+
+    def gather(question: Question, now: Timestamps) -> SwitchFacts:
+        known = switch.name_facts(question.name, now, waits(now.mono_s))
+        rows = () if tunnels is None else tunnels(now)
+        return replace(known, uptime_s=round(now.mono_s - begun_s, 1), tunnels=tuple(map(_tunnel, rows[:_TUNNELS_MAX])))
+
+    def holders(name: Name, now_s: float) -> set[Name]:
+        attached = {each.advertisement.node for each in switch.attached.named(name)}
+        return attached | {place.advertiser for place in switch.resolver.cache.of(name, now_s)}
+
+    answer_state(switch.diagnostics, policy, gather, holders)
+
+
+def answer_for_rib(host: RibHost, policy: Policy, waits: Waits) -> None:
+    """Answer ``state`` for a RIB."""
+
+    def gather(question: Question, now: Timestamps) -> RibFacts:
+        known = host.rib.name_facts(question.name, now)
+        return replace(known, waits=waits(now.mono_s), is_attached=host.attachment.switch is not None)
+
+    answer_state(host.diagnostics, policy, gather, host.rib.parties)
+
+
+def _tunnel(row: Mapping[str, object]) -> TunnelFact:
+    age_s = row.get("handshake_age_s")
+    return TunnelFact(
+        peer=str(row.get("label") or row.get("peer")),
+        device=str(row.get("device")),
+        is_up=row.get("up") is True,
+        handshake_age_s=float(age_s) if isinstance(age_s, int | float) else None,
+        endpoint=str(row.get("endpoint") or ""),
+    )

@@ -1,0 +1,61 @@
+"""Former advertisers and refusals of names, kept for diagnoses.
+
+Sans-I/O; bounded: of too many, those that were noted or asked for longest ago are forgotten.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from gdp.diagnosis.facts import GoneFact
+from gdp.errors import DropReason
+from gdp.names import Name
+from gdp.rib.route import Route
+from gdp.trust.lru import Lru
+
+__all__ = ["FormerAdvertisers"]
+
+_NAMES_MAX: Final = 4_096
+_ADVERTISERS_MAX: Final = 16  # of one name
+_LAPSED: Final = "lapsed"
+_WITHDREW: Final = "withdrew"
+
+
+class FormerAdvertisers:
+    """How advertisers of names left, and why an advertisement was refused last."""
+
+    def __init__(self) -> None:
+        self._gone: Lru[dict[Name, GoneFact]] = Lru(_NAMES_MAX)
+        self._refused: Lru[str] = Lru(_NAMES_MAX)
+
+    def note_gone(self, route: Route, *, is_lapsed: bool) -> None:
+        """Note that an advertiser withdrew a name, or that its lease ended."""
+        known = self._gone.get(route.name) or {}
+        known.pop(route.advertiser, None)
+        known[route.advertiser] = GoneFact(
+            advertiser=route.advertiser.to_text(),
+            how=_LAPSED if is_lapsed else _WITHDREW,
+            switch=route.switch.to_text(),
+            domain=route.domain.to_text(),
+        )
+        if len(known) > _ADVERTISERS_MAX:
+            del known[next(iter(known))]
+        self._gone.put(route.name, known)
+
+    def note_accepted(self, route: Route) -> None:
+        """Forget that an advertiser left, or was refused: it is back."""
+        known = self._gone.get(route.name)
+        if known is not None:
+            known.pop(route.advertiser, None)
+
+    def note_refused(self, name: Name, reason: DropReason) -> None:
+        """Note why an advertisement of a name was refused."""
+        self._refused.put(name, reason.label)
+
+    def gone(self, name: Name) -> tuple[GoneFact, ...]:
+        """Return the advertisers of a name that left."""
+        return tuple((self._gone.get(name) or {}).values())
+
+    def refused(self, name: Name) -> str:
+        """Return the label of the newest refusal of a name, or an empty text."""
+        return self._refused.get(name) or ""

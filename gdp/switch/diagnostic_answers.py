@@ -1,0 +1,130 @@
+"""Answers of a switch to diagnostic requests: the path and the trees of a name here, and where the name is advertised.
+
+Sans-I/O.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from gdp.control.diagnostics import Diagnostics, Question
+from gdp.control.neighbor_discovery import HelloProtocol
+from gdp.control.neighbour import Neighbour
+from gdp.names import NAME_BYTES, ZERO, Name
+from gdp.sansio import Timestamps
+from gdp.switch.local_advertisements import LocalAdvertisements
+from gdp.switch.multicast import MulticastTrees
+from gdp.switch.name_resolver import NameResolver
+from gdp.switch.paths import Paths
+from gdp.switch.table import Table
+from gdp.trust.right import Right
+
+__all__ = ["DiagnosticAnswers"]
+
+_MAC_BYTES: Final = 6
+
+
+class DiagnosticAnswers:
+    """The answers of one switch.
+
+    Args:
+        wake: called when a query to the RIB is due.
+
+    Attributes:
+        port_name: returns the device of a port; the I/O layer sets it.
+    """
+
+    def __init__(
+        self,
+        *,
+        me: Name,
+        hello_protocol: HelloProtocol,
+        table: Table,
+        multicast: MulticastTrees,
+        attached: LocalAdvertisements,
+        resolver: NameResolver,
+        paths: Paths,
+        wake: Callable[[], None],
+        diagnostics: Diagnostics,
+    ) -> None:
+        self._me = me
+        self._hello_protocol = hello_protocol
+        self._table = table
+        self._multicast = multicast
+        self._attached = attached
+        self._resolver = resolver
+        self._paths = paths
+        self._wake = wake
+        self.port_name: Callable[[int], str] = str
+        diagnostics.register("trace", self.trace)
+        diagnostics.register("resolve", self.resolve)
+
+    def trace(self, question: Question, _now: Timestamps) -> Mapping[str, object]:
+        """Return the link that the request came by, the next one towards its target, and the tree branches of its name.
+
+        The body may name one publisher (``p``); without it the branches of all publishers come. It may also name the
+        end of the path (``t``), where that is not the member that was asked.
+        """
+        result: dict[str, object] = {}
+        if question.port is not None:
+            result["in"] = self._link(question.port, question.mac)
+        end = Name(question.body.bytes_("t", NAME_BYTES)) if "t" in question.body else question.target
+        hops = self._table.entries.get(end + question.asker.name) or self._table.entries.get(end)
+        if end != self._me and hops:
+            result["out"] = self._link(hops[0][0], hops[0][1][:_MAC_BYTES])
+        wanted = Name(question.body.bytes_("p", NAME_BYTES)) if "p" in question.body else ZERO
+        result["branches"] = [
+            {"p": tree.publisher, **self._link(port, mac)}
+            for tree in self._multicast.trees.of_topic(question.name)
+            if wanted in (ZERO, tree.publisher) and tree.path == 1
+            for (port, mac), branch in sorted(tree.branches.items())
+            if branch.is_active and (port, mac) != tree.upstream
+        ]
+        return result
+
+    def resolve(self, question: Question, now: Timestamps) -> Mapping[str, object] | None:
+        """Return who advertises a name, for a node that is attached here; None: the RIB is being queried."""
+        if not question.is_neighbour:
+            return {"places": []}
+        places: dict[Name, Mapping[str, object]] = {
+            each.advertisement.node: {
+                "node": each.advertisement.node,
+                "right": each.advertisement.right.value,
+                "switch": self._me,
+            }
+            for each in self._attached.named(question.name)
+        }
+        if self._paths.is_switch(question.name) or self._paths.is_rib(question.name) or question.name == self._me:
+            places[question.name] = {"node": question.name, "right": Right.ATTACH.value}  # link states name it
+        found = self._resolver.find(question.name, now.mono_s)
+        if found is None:
+            self._wake()
+            if not places:
+                return None
+        for place in found or ():
+            known = {
+                "node": place.advertiser,
+                "right": place.right.value,
+                "switch": place.switch,
+                "domain": place.domain,
+            }
+            places.setdefault(place.advertiser, known)
+        return {"places": [places[node] for node in sorted(places)]}
+
+    def _link(self, port: int, mac: bytes) -> dict[str, object]:
+        """Return the link to a neighbour: its device, and who is at the other end, as far as known."""
+        link: dict[str, object] = {"port": self.port_name(port)}
+        neighbour = self._neighbour(port, mac)
+        if neighbour is not None:
+            rtt_s = self._hello_protocol.ports[port].quality_of(neighbour.name).rtt.srtt_s
+            link |= {"to": neighbour.name, "role": neighbour.role.value, "cost": neighbour.cost}
+            if neighbour.member is not None:
+                link["label"] = neighbour.member.label
+            if rtt_s is not None:
+                link["rtt_us"] = round(1e6 * rtt_s)
+        return link
+
+    def _neighbour(self, port: int, mac: bytes) -> Neighbour | None:
+        known = self._hello_protocol.ports.get(port)
+        return next((each for each in known.neighbours.values() if each.mac == mac), None) if known else None

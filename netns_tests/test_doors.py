@@ -1,0 +1,142 @@
+"""Doors on real devices: a replayed recording reaches WebSocket clients through a switch, and nothing else does."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import pytest
+import yaml
+
+from gdp.trust.right import Right
+from netns_tests.session_lab import SessionLab, lines_of, session_lab
+from tests.pages import ROOT
+
+if shutil.which("nsenter") is None or shutil.which("setpriv") is None:
+    pytest.skip("nsenter or setpriv is not installed (util-linux)", allow_module_level=True)
+pytest.importorskip("websockets")
+
+pytestmark = pytest.mark.netns
+
+TYPES = {"/camera/image": "sensor_msgs/msg/Image", "/odom": "nav_msgs/msg/Odometry", "/tf": "tf2_msgs/msg/TFMessage"}
+RIGHTS = {
+    "robot": {name: [Right.PUBLISH] for name in TYPES},
+    "viewer": {"/camera/image": [Right.READ], "/odom": [Right.READ]},
+}
+CLIENT = """
+import json, struct, sys
+from websockets.sync.client import connect
+with connect("ws://127.0.0.1:8765", subprotocols=["foxglove.websocket.v1"], max_size=None) as socket:
+    print(json.loads(socket.recv())["op"], flush=True)
+    channels = {}
+    while len(channels) < 2:
+        message = json.loads(socket.recv())
+        if message["op"] == "advertise":
+            channels |= {each["topic"]: each for each in message["channels"]}
+    print(json.dumps({topic: [each["schemaName"], each["schemaEncoding"], len(each["schema"]) > 100]
+                      for topic, each in sorted(channels.items())}), flush=True)
+    names = {}
+    for number, (topic, each) in enumerate(sorted(channels.items())):
+        names[number] = topic
+        socket.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": number, "channelId": each["id"]}]}))
+    socket.send(json.dumps({"op": "advertise", "channels": [
+        {"id": 9, "topic": "/cmd_vel", "encoding": "cdr", "schemaName": "geometry_msgs/msg/Twist"}]}))
+    counts, sizes = {topic: 0 for topic in names.values()}, {topic: 0 for topic in names.values()}
+    while counts["/camera/image"] < 20 or counts["/odom"] < 40:
+        message = socket.recv(timeout=20)
+        if isinstance(message, str):
+            print(message, flush=True)
+            continue
+        opcode, number, stamp = struct.unpack_from("<BIQ", message)
+        assert opcode == 1 and message[13:17] == b"\\0\\1\\0\\0" and stamp > 10**18
+        counts[names[number]] += 1
+        sizes[names[number]] += len(message) - 13
+    print(json.dumps([counts, sizes]), flush=True)
+"""
+
+
+@pytest.fixture(scope="module")
+def lab() -> Iterator[SessionLab]:
+    with session_lab(RIGHTS, TYPES) as lab:
+        bag = lab.folder / "drive.mcap"
+        subprocess.run(
+            [sys.executable, str(ROOT / "scripts/make_demo_bag.py"), "--seconds", "2", "-o", str(bag)], check=True
+        )
+        _configure(lab, "all", "/camera/image", "/odom")
+        _configure(lab, "odom", "/odom")
+        yield lab
+
+
+def _configure(lab: SessionLab, label: str, *names: str) -> None:
+    """Write the configuration of a replay of these topics."""
+    config = {
+        "identity": "robot",
+        "domain": {"root": "domain/root.crt"},
+        "iface": "robot0",
+        "delegations": "robot/delegations",
+        "expose": [{"name": name, "type": TYPES[name], "owner": "owner/owner.pub", "reliable": True} for name in names],
+    }
+    (lab.folder / f"{label}.yaml").write_text(yaml.safe_dump(config))
+
+
+def test_a_replayed_recording_reaches_a_foxglove_client_whole(lab: SessionLab) -> None:
+    door = lab.start("-m", "gdp.cli.gdp", "foxglove", "viewer", "--json")
+    ready = json.loads(lines_of(door, 1)[0])
+    assert (ready["event"], sorted(ready["reads"])) == ("ready", ["/camera/image", "/odom"])
+    client = lab.start("-c", CLIENT)
+    info, channels = lines_of(client, 2)
+    assert info == "serverInfo"
+    assert json.loads(channels) == {
+        name: [TYPES[name], "ros2msg", True] for name in RIGHTS["viewer"]
+    }  # and not /tf, for which the door has no delegation
+    (status,) = lines_of(client, 1)
+    assert "gdp delegate name --right publish --kind topic --name /cmd_vel" in json.loads(status)["message"]
+    replay = lab.start("-m", "proxy.cli.replay", "drive.mcap", "--config", "all.yaml")
+    lab.output(replay)
+    counts, sizes = json.loads(lab.output(client).splitlines()[-1])
+    assert counts == {"/camera/image": 20, "/odom": 40}
+    assert sizes["/camera/image"] > 20 * 640 * 480
+    door.send_signal(signal.SIGINT)
+    assert json.loads(lab.output(door).splitlines()[-1])["dropped"] == 0
+
+
+ROSLIBPY = """
+import json, threading, roslibpy
+ros = roslibpy.Ros("127.0.0.1", 9090)
+ros.run(20)
+waiting = threading.Semaphore(0)
+got = []
+def hear(message):
+    got.append(message)
+    waiting.release()
+topic = roslibpy.Topic(ros, "/odom", "nav_msgs/Odometry")
+topic.subscribe(hear)
+print("ready", flush=True)
+for _ in range(40):
+    assert waiting.acquire(timeout=25)
+print(json.dumps([len(got), got[0]["header"]["frame_id"], ros.get_topics(), ros.get_topic_type("/odom")]), flush=True)
+try:
+    roslibpy.Service(ros, "/reset", "std_srvs/Trigger").call(roslibpy.ServiceRequest())
+except Exception as error:
+    print(error, flush=True)
+ros.terminate()
+"""
+
+
+def test_a_replayed_recording_reaches_roslibpy(lab: SessionLab) -> None:
+    pytest.importorskip("roslibpy")
+    door = lab.start("-m", "gdp.cli.gdp", "rosbridge", "viewer", "--json")
+    assert '"ready"' in lines_of(door, 1)[0]
+    client = lab.start("-c", ROSLIBPY)
+    assert lines_of(client, 1) == ["ready"]
+    replay = lab.start("-m", "proxy.cli.replay", "drive.mcap", "--config", "odom.yaml")
+    lab.output(replay)
+    heard, error = lab.output(client).splitlines()
+    count, frame, topics, type_name = json.loads(heard)
+    assert (count, frame, type_name) == (40, "odom", TYPES["/odom"])
+    assert sorted(topics) == ["/camera/image", "/odom"]
+    assert "gdp delegate name --right call --kind service --name /reset" in error

@@ -1,0 +1,78 @@
+"""A robot with a namespace, between real ROS 2 graphs on two machines; its rules change by command while it runs."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+
+import pytest
+
+from gdp.metadata import Metadata
+from netns_tests.live_pair import Crossing, Pair, pair_of, until
+from tests.proxy.endpoints.ros2_net import Peer, needs
+
+needs("std_msgs")
+if shutil.which("nsenter") is None or shutil.which("setpriv") is None:
+    pytest.skip("nsenter or setpriv is not installed (util-linux)", allow_module_level=True)
+
+pytestmark = pytest.mark.netns
+
+STRING = "std_msgs/msg/String"
+PREFIX = "robot1"
+_NODE = """
+from std_msgs.msg import String
+heard = {}
+def read(topic):
+    found = heard[topic] = []
+    return node.create_subscription(String, topic, lambda m: found.append(m.data), 10)
+"""
+
+
+class PrefixedCrossing(Crossing):
+    """Topic of the robot; the other machine takes the prefix away by the same rule."""
+
+    @property
+    def metadata(self) -> Metadata:
+        return Metadata({"kind": self.kind, "name": f"/{PREFIX}{self.name}", "type": self.type_name})
+
+
+@pytest.fixture(scope="module")
+def pair() -> Iterator[Pair]:
+    with pair_of(PrefixedCrossing("/chat", STRING, "a", "b", options={"prefix": PREFIX})) as made:
+        yield made
+
+
+def gdp(pair: Pair, label: str, *words: str) -> list[Mapping[str, object]]:
+    """Return what a command about a running proxy prints as JSON, a line each."""
+    argv = [sys.executable, "-m", "gdp.cli.gdp", *words, "--config", str(pair.folder / f"proxy-{label}.yaml"), "--json"]
+    done = subprocess.run(argv, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def started(pair: Pair, graph: str) -> Peer:
+    node = pair.node(graph)
+    node.tell("!" + _NODE)
+    return node
+
+
+def test_a_prefixed_topic_crosses_is_watched_and_is_denied_by_command(pair: Pair) -> None:
+    robot, station = started(pair, "a"), started(pair, "b")
+    station.tell("!reading = read('/chat')")
+    robot.tell("!chat = node.create_publisher(String, '/chat', 10)")
+
+    def arrives() -> object:
+        robot.tell("chat.publish(String(data='hello'))")
+        return station.tell("len(heard['/chat'])")
+
+    until(arrives, "/chat at the station")
+    (event,) = gdp(pair, "b", "watch", f"/{PREFIX}/*", "--count", "1")
+    assert (event["event"], event["role"], event["name"]) == ("appears", "publisher", f"/{PREFIX}/chat")
+    assert gdp(pair, "a", "rule", "add", "deny", "/chat")[0]["applied"] == "now"
+    until(lambda: not gdp(pair, "b", "watch", "/chat", "--for", "0"), "the publisher goes")
+    assert gdp(pair, "a", "rule", "remove", "deny", "/chat")[0]["applied"] == "now"
+    station.tell("!heard['/chat'].clear()")
+    until(arrives, "/chat at the station again")

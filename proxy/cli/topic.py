@@ -1,0 +1,313 @@
+"""Commands ``gdp topic hz``, ``gdp topic bw`` and ``gdp topic echo``: what a topic carries, read as a member.
+
+I/O; ``gdp`` loads them, since the package ``gdp`` does not know ``proxy``.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from gdp.cli.node import AwaitIface, Json, Verbose, failing_clearly, set_up_logging
+from gdp.errors import RemoteError
+from gdp.trust.right import Right
+from proxy.cli.node_options import Delegations, Iface
+from proxy.cli.tool_options import (
+    Node,
+    TypeName,
+    complete_readable,
+    ending_quietly,
+    print_json,
+    print_text,
+)
+
+if TYPE_CHECKING:
+    from proxy.bridge.bridge import Bridge
+    from proxy.serial.channel import Channel
+    from proxy.tools.member import Access, Tick
+    from proxy.tools.message_text import MessageText
+    from proxy.tools.rates import BandwidthReport, FrequencyReport
+
+__all__ = ["app"]
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, no_args_is_help=True)
+
+_REPORT_S: Final = 1.0
+_SILENT_S: Final = 5.0  # after this time without a message, why is said once
+
+Name = Annotated[
+    str,
+    typer.Argument(
+        metavar="NAME",
+        autocompletion=complete_readable,
+        help="ROS name such as /scan, the 256-bit name in hex, or its short form such as 75e…0fc.",
+    ),
+]
+Duration = Annotated[
+    float | None, typer.Option("--duration", min=0.1, metavar="SECONDS", help="End after this time. Default: Ctrl-C.")
+]
+
+
+@app.command(
+    no_args_is_help=True,
+    epilog="Examples: gdp topic hz /scan --node keys/viewer; gdp topic hz /scan --node keys/viewer --duration 5 --json",
+)
+def hz(
+    name: Name,
+    node: Node,
+    type_name: TypeName = "",
+    window: Annotated[int, typer.Option("--window", "-w", min=2, help="Messages in the average.")] = 10_000,
+    duration: Duration = None,
+    iface: Iface = None,
+    delegations: Delegations = None,
+    await_iface: AwaitIface = 0.0,
+    json: Json = False,
+    verbose: Verbose = False,
+) -> None:
+    """Print once a second at which rate messages of a topic arrive here, as 'ros2 topic hz' does.
+
+    It reads the topic through the overlay as the node NODE, whose delegations must give the right to read it. With
+    --duration the exit code is 1 if no rate could be measured.
+    """
+    set_up_logging(verbose=verbose, quiet=True)
+    with failing_clearly(), ending_quietly():
+        access = _readable(node, iface, delegations, name, type_name, await_iface)
+        from proxy.tools.rates import Frequency
+
+        measured = Frequency(window)
+
+        def report(now_s: float) -> bool:
+            """Print the rate; return whether there was one."""
+            del now_s
+            found: FrequencyReport | None = measured.poll_report()
+            if found is None:
+                return False
+            if json:
+                rate = None if math.isinf(found.rate_hz) else found.rate_hz
+                print_json({"topic": access.rule.name, **found._asdict(), "rate_hz": rate})
+            else:
+                print_text(found.words())
+            return True
+
+        _measure(access, lambda _channel, _raw, now_s: measured.add(now_s), report, duration)
+
+
+@app.command(
+    no_args_is_help=True,
+    epilog="Examples: gdp topic bw /camera/image --node keys/viewer; gdp topic bw /scan --node keys/viewer --json",
+)
+def bw(
+    name: Name,
+    node: Node,
+    type_name: TypeName = "",
+    window: Annotated[int, typer.Option("--window", "-w", min=2, help="Messages in the average.")] = 100,
+    duration: Duration = None,
+    iface: Iface = None,
+    delegations: Delegations = None,
+    await_iface: AwaitIface = 0.0,
+    json: Json = False,
+    verbose: Verbose = False,
+) -> None:
+    """Print once a second how many bytes of a topic arrive here, as 'ros2 topic bw' does.
+
+    Bytes are those of the messages in ROS's wire form, before sealing and compression. The node NODE needs the right to
+    read the topic. With --duration the exit code is 1 if nothing could be measured.
+    """
+    set_up_logging(verbose=verbose, quiet=True)
+    with failing_clearly(), ending_quietly():
+        access = _readable(node, iface, delegations, name, type_name, await_iface)
+        from proxy.tools.rates import Bandwidth
+
+        measured = Bandwidth(window)
+
+        def report(now_s: float) -> bool:
+            """Print the bandwidth; return whether there was one."""
+            found: BandwidthReport | None = measured.poll_report(now_s)
+            if found is None:
+                return False
+            if json:
+                print_json({"topic": access.rule.name, **found._asdict()})
+            else:
+                print_text(found.words())
+            return True
+
+        _measure(access, lambda _channel, raw, now_s: measured.add(now_s, len(raw)), report, duration)
+
+
+@app.command(
+    no_args_is_help=True,
+    epilog="Examples: gdp topic echo /odom --node keys/viewer --once;"
+    " gdp topic echo /odom --node keys/viewer --json -n 5",
+)
+def echo(
+    name: Name,
+    node: Node,
+    type_name: TypeName = "",
+    count: Annotated[int | None, typer.Option("-n", "--count", min=1, help="End after so many messages.")] = None,
+    once: Annotated[bool, typer.Option("--once", help="End after one message.")] = False,
+    timeout: Annotated[
+        float | None,
+        typer.Option("--timeout", min=0.1, metavar="SECONDS", help="End with exit code 1 after so long in silence."),
+    ] = None,
+    truncate: Annotated[
+        int, typer.Option("--truncate-length", "-l", min=1, help="Longest array and string of the YAML form.")
+    ] = 128,
+    full: Annotated[bool, typer.Option("--full-length", "-f", help="Whole arrays and strings.")] = False,
+    iface: Iface = None,
+    delegations: Delegations = None,
+    await_iface: AwaitIface = 0.0,
+    json: Json = False,
+    verbose: Verbose = False,
+) -> None:
+    """Print the messages of a topic, as 'ros2 topic echo' does, until Ctrl-C.
+
+    It reads the topic through the overlay as the node NODE, whose delegations must give the right to read it. Without
+    that right the exit code is 2, and the text says what the owner types. --json prints whole messages as lines.
+    """
+    set_up_logging(verbose=verbose, quiet=True)
+    with failing_clearly(), ending_quietly():
+        access = _readable(node, iface, delegations, name, type_name, await_iface)
+        printer = _Printer(1 if once else count, None if full else truncate, is_json=json)
+        _read(access, printer.print, printer.tick(access, timeout))
+        if printer.is_silent:
+            print(f"error: {name}: no message within {timeout:g} s", file=sys.stderr)  # noqa: T201
+            raise typer.Exit(1)
+
+
+class _Printer:
+    """Prints messages until there were enough of them."""
+
+    def __init__(self, count: int | None, truncate: int | None, *, is_json: bool) -> None:
+        self._left = count
+        self._truncate = truncate
+        self._is_json = is_json
+        self._heard_s: float | None = None
+        self._texts: dict[int, tuple[Channel, MessageText]] = {}
+        self.is_silent = False
+
+    def print(self, channel: Channel, raw: bytes, now_s: float) -> None:
+        """Print a message; one that does not fit its definition is reported instead."""
+        if self._left == 0:
+            return
+        self._heard_s = now_s
+        try:
+            self._print(channel, raw)
+        except RemoteError as error:
+            print(f"error: {channel.topic}: {error.detail}", file=sys.stderr)  # noqa: T201
+            return
+        if self._left is not None:
+            self._left -= 1
+
+    def _print(self, channel: Channel, raw: bytes) -> None:
+        from proxy.tools.message_text import MessageText
+
+        known = self._texts.get(id(channel))
+        if known is None or known[0] is not channel:
+            known = self._texts[id(channel)] = channel, MessageText(channel, self._truncate)
+        if self._is_json:
+            fields = {"topic": channel.topic, "type": channel.type_name, "received_ns": time.time_ns()}
+            print_json({**fields, "bytes": len(raw), "message": known[1].to_json(raw)})
+        else:
+            print_text(f"{known[1].to_yaml(raw)}---")
+
+    def tick(self, access: Access, timeout_s: float | None) -> Tick:
+        """Return the function that decides when to end."""
+        hint = _Hint(access)
+
+        def tick(bridge: Bridge, now_s: float) -> float | None:
+            """Return the moment of the next call; None: enough messages, or too long in silence."""
+            if self._left == 0:
+                return None
+            if self._heard_s is None:
+                hint.tick(bridge, now_s)
+            since_s = max(self._heard_s or 0.0, hint.begun_s)
+            if timeout_s is not None and now_s >= since_s + timeout_s:
+                self.is_silent = True
+                return None
+            return now_s + _REPORT_S if timeout_s is None else min(now_s + _REPORT_S, since_s + timeout_s)
+
+        return tick
+
+
+class _Hint:
+    """Says once, on standard error, what is known where no message comes."""
+
+    def __init__(self, access: Access) -> None:
+        self._access = access
+        self._is_said = False
+        self.begun_s = math.inf
+
+    def tick(self, bridge: Bridge, now_s: float) -> None:
+        """Look at the publishers after a while without a message."""
+        self.begun_s = min(self.begun_s, now_s)
+        if self._is_said or now_s < self.begun_s + _SILENT_S:
+            return
+        self._is_said = True
+        publishers = len(bridge.publishers_of(self._access.name))
+        seen = f"{publishers} publishers, none of them sends" if publishers else "no publisher is known"
+        text = f"{self._access.rule.name}: no message within {_SILENT_S:g} s; {seen}; still waiting"
+        print(text, file=sys.stderr)  # noqa: T201
+
+
+def _readable(
+    node: Path, iface: str | None, delegations: Path | None, name: str, type_name: str, await_s: float
+) -> Access:
+    from gdp.nodes.uplink import wait_for_device
+    from proxy.tools.member import Wanted, find_access
+
+    access = find_access(node, iface, delegations, Wanted(name, type_name, Right.READ))
+    wait_for_device(access.config.iface, await_s)
+    return access
+
+
+def _read(access: Access, take: Callable[[Channel, bytes, float], None], tick: Tick) -> None:
+    from proxy.endpoints.probe import Probe
+    from proxy.tools.member import run_probe
+
+    rule = access.rule
+    run_probe(access, Probe((rule.local, rule.type_name), take), tick)
+
+
+def _measure(
+    access: Access,
+    take: Callable[[Channel, bytes, float], None],
+    report: Callable[[float], bool],
+    duration_s: float | None,
+) -> None:
+    """Report once a second; exit 1 if a bounded time brought no report."""
+    hint = _Hint(access)
+    is_measured = False
+    report_at_s = math.inf
+
+    def tick(bridge: Bridge, now_s: float) -> float | None:
+        """Report when it is time; return when that is next."""
+        nonlocal is_measured, report_at_s
+        if report_at_s == math.inf:
+            report_at_s = now_s + _REPORT_S
+        if not is_measured:
+            hint.tick(bridge, now_s)
+        end_s = math.inf if duration_s is None else hint.begun_s + duration_s
+        if now_s >= min(report_at_s, end_s):
+            is_measured |= report(now_s)
+            report_at_s = now_s + _REPORT_S
+        return None if now_s >= end_s else min(report_at_s, end_s)
+
+    _read(access, take, tick)
+    if duration_s is not None and not is_measured:
+        print(f"error: {access.rule.name}: fewer than two messages within {duration_s:g} s", file=sys.stderr)  # noqa: T201
+        raise typer.Exit(1)
+
+
+def main() -> None:
+    """Run the commands."""
+    app(prog_name="gdp topic")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,49 @@
+"""History of a rule: what a publisher keeps for late joiners, by messages, bytes and age.
+
+Section of a configuration file.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Final
+
+from pydantic import BeforeValidator, Field
+from pydantic.config import JsonDict
+
+from gdp.client.send_options import HISTORY_BYTES_MAX, HISTORY_MESSAGES_MAX
+from gdp.nodes.schema import Section
+
+__all__ = ["History", "SomeHistory"]
+
+AGE_MAX_S: Final = 86_400.0
+
+
+class History(Section):
+    """Bounds of what is kept; the first that is reached counts."""
+
+    messages: int = Field(
+        default=HISTORY_MESSAGES_MAX, ge=1, le=HISTORY_MESSAGES_MAX, description="Most messages that are kept."
+    )
+    max_bytes: int = Field(
+        default=8 << 20,
+        alias="bytes",
+        ge=1,
+        le=HISTORY_BYTES_MAX,
+        description="Most bytes that are kept, as they travel.",
+    )
+    age_s: float | None = Field(
+        default=None, gt=0, le=AGE_MAX_S, description="Longest time that a message is kept, in seconds. `null`: any."
+    )
+
+
+def _history(value: object) -> object:
+    return {"messages": value} if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+def _or_count(schema: JsonDict) -> None:
+    forms = schema.get("anyOf")
+    if isinstance(forms, list):
+        schema["anyOf"] = [{"type": "integer", "minimum": 1, "maximum": HISTORY_MESSAGES_MAX}, *forms]
+
+
+SomeHistory = Annotated[History | None, BeforeValidator(_history), Field(json_schema_extra=_or_count)]

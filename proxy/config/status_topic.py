@@ -1,0 +1,40 @@
+"""Status topic of a proxy: where local nodes read which parties its names have.
+
+Section of a configuration file.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from pydantic import Field, field_validator
+
+from gdp.nodes.schema import Section
+from gdp.ros_names import NAME_FORM, NAME_MAX_CHARS, is_name
+
+__all__ = ["StatusTopicConfig"]
+
+DEADLINE_MAX_S: Final = 86_400.0
+
+
+class StatusTopicConfig(Section):
+    """A latched ``std_msgs/msg/String`` in each graph."""
+
+    topic: str = Field(
+        default="/gdp_status",
+        description="Its local name.",
+        json_schema_extra={"pattern": f"^{NAME_FORM}$", "maxLength": NAME_MAX_CHARS},
+    )
+    deadline_s: float | None = Field(
+        default=None,
+        gt=0,
+        le=DEADLINE_MAX_S,
+        description="A publisher that sends nothing for so many seconds is silent. `null`: only who stopped reporting.",
+    )
+
+    @field_validator("topic")
+    @classmethod
+    def _topic(cls, text: str) -> str:
+        if not is_name(text):
+            raise ValueError("expected a full ROS name, such as /gdp_status")
+        return text

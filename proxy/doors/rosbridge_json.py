@@ -1,0 +1,138 @@
+"""Messages as rosbridge writes them in JSON: octets as base64, and null for a float that JSON cannot express.
+
+Sans-I/O. Source: the rosbridge v2 protocol, section 3 (data encoding), and the conventions of rosbridge_library.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Final
+
+import cbor2
+import orjson
+
+from gdp.errors import DropReason, RemoteError
+from proxy.serial.channel import Channel
+from proxy.serial.dialect import MisfitError
+from proxy.serial.json_dialect import JsonDialect
+from proxy.serial.schema import Array, Number, Record, Sequence, Text, Type, parse
+from proxy.serial.serializer import Codec, native_codec
+
+__all__ = ["RosbridgeCodec", "cbor_raw"]
+
+_NAN: Final = {"f": 0x7FC00000, "d": 0x7FF8000000000000}
+_DUMMY: Final = "structure_needs_at_least_one_member"  # rosidl's field of an empty type
+
+
+class _Dialect(JsonDialect):
+    """JSON of rosbridge: plain integers of any size, null for NaN and infinities, octets also as a list."""
+
+    guarded = ""
+
+    def number(self, code: str, value: float, bits: int) -> object:
+        """Return a number, or None for an infinity or NaN."""
+        written = super().number(code, value, bits)
+        return (None if code in _NAN else value) if isinstance(written, str) else written
+
+    def bits(self, code: str, value: object) -> int | bool:
+        """Return the value to pack; None is a NaN."""
+        if value is None and code in _NAN:
+            return _NAN[code]
+        if code == "?" and value in (0, 1):
+            return bool(value)
+        return super().bits(code, value)
+
+    def array(self, item: Number, raw: memoryview) -> object:
+        """Return base64 for octets, else a list."""
+        written = super().array(item, raw)
+        if not isinstance(written, list) or item.code == "?":
+            return written
+        if item.code in _NAN:
+            return [None if isinstance(each, str) else each for each in written]
+        return [int(each) if isinstance(each, str) else each for each in written]
+
+    def unarray(self, item: Number, value: object) -> bytes | memoryview:
+        """Return the bytes of a list or of base64; None in a list of floats is a NaN."""
+        if item.octet and isinstance(value, list):
+            return bytes(value)
+        if isinstance(value, list) and None in value and item.code in _NAN:
+            nan = float("nan")
+            value = [nan if each is None else each for each in value]
+        return super().unarray(item, value)
+
+
+class RosbridgeCodec:
+    """Converter between a channel's CDR and rosbridge's JSON.
+
+    Raises:
+        DefinitionError: the channel has no usable definition.
+    """
+
+    def __init__(self, channel: Channel) -> None:
+        self._name = channel.type_name
+        self._record = parse(channel.type_name, channel.definition, channel.definition_format, 2)
+        self._codec = Codec(self._record, 2, _Dialect(), native_codec(channel))
+
+    @property
+    def field_names(self) -> list[str]:
+        """Return the fields in order."""
+        return [name for name, _ in self._record.fields if name != _DUMMY]
+
+    def to_json(self, raw: bytes) -> bytes:
+        """Return the message as JSON.
+
+        Raises:
+            RemoteError: it does not fit the definition.
+        """
+        tree = self._codec.to_tree(raw)
+        if tree is None:
+            raise RemoteError(DropReason.MALFORMED, f"a message that does not fit {self._name}")
+        if isinstance(tree, dict):
+            tree.pop(_DUMMY, None)
+        return orjson.dumps(tree, option=orjson.OPT_SERIALIZE_NUMPY)
+
+    def to_raw(self, tree: object) -> bytes:
+        """Return the CDR of a client's message; fields that it leaves out are zero, empty or false.
+
+        Raises:
+            RemoteError: it does not fit the definition.
+        """
+        try:
+            return self._codec.to_raw(_filled(self._record, tree, self._name))
+        except (ArithmeticError, LookupError, TypeError, ValueError, struct.error, RecursionError) as error:
+            raise RemoteError(DropReason.MALFORMED, f"{self._name}: {error}"[:300]) from error
+
+
+def cbor_raw(topic: str, stamp_ns: int, raw: bytes) -> bytes:
+    """Return a message of a subscription with the compression ``cbor-raw``: the bytes as ROS wrote them."""
+    secs, nsecs = divmod(stamp_ns, 1_000_000_000)
+    return cbor2.dumps({"op": "publish", "topic": topic, "msg": {"secs": secs, "nsecs": nsecs, "bytes": raw}})
+
+
+def _filled(kind: Type, value: object, where: str) -> object:
+    """Return a client's value with every field that it left out."""
+    if isinstance(kind, Record):
+        if not isinstance(value, dict):
+            raise MisfitError(f"{where}: an object was expected")
+        names = [name for name, _ in kind.fields]
+        if unknown := sorted(str(key) for key in value.keys() - set(names)):
+            raise MisfitError(f"{where}: there is no field {unknown[0]}; it has {', '.join(names)}")
+        return {
+            name: _filled(field, value[name], f"{where}.{name}") if name in value else _zero(field)
+            for name, field in kind.fields
+        }
+    if isinstance(kind, Array | Sequence) and isinstance(kind.item, Record) and isinstance(value, list):
+        return [_filled(kind.item, each, f"{where}[{index}]") for index, each in enumerate(value)]
+    return value
+
+
+def _zero(kind: Type) -> object:
+    if isinstance(kind, Record):
+        return {name: _zero(field) for name, field in kind.fields}
+    if isinstance(kind, Text):
+        return ""
+    if isinstance(kind, Number):
+        return False if kind.code == "?" else 0
+    if isinstance(kind, Array):
+        return [_zero(kind.item)] * kind.count
+    return []

@@ -1,0 +1,383 @@
+"""Session of one rosbridge client: JSON messages of the rosbridge v2 protocol.
+
+Sans-I/O. Types may be written as in ROS 1 (``std_msgs/String``) or ROS 2 (``std_msgs/msg/String``). Of rosapi it
+answers what lists names and types.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+import orjson
+
+from gdp.errors import DropReason, GdpError, LocalError, RemoteError
+from proxy.doors.client_queue import ClientQueue, Pending
+from proxy.doors.hub import Hub, Publication, TopicType
+from proxy.doors.rosbridge_json import RosbridgeCodec, cbor_raw
+from proxy.doors.throttle import Throttle
+from proxy.serial.bounded_cache import BoundedCache, digest_of
+from proxy.serial.channel import Channel
+from proxy.serial.service import Service
+
+__all__ = ["RosbridgeSession"]
+
+SUBSCRIPTIONS_MAX: Final = 4_096
+CALLS_MAX: Final = 1_024
+_TEXT_MAX: Final = 1_024
+_QUEUE_MAX: Final = 1_024
+_PERIOD_MAX_MS: Final = 3_600_000
+_LEVELS: Final = ("none", "error", "warning", "info")
+_COMPRESSIONS: Final = ("none", "cbor-raw")
+_ROSAPI: Final = "/rosapi/"
+
+
+@dataclass(slots=True)
+class _Subscription:
+    """What a client wants of one topic, by one or several ``subscribe`` with different ids."""
+
+    key: int
+    type_name: str  # empty: whatever is offered
+    wishes: dict[str, tuple[float, int, str]] = field(default_factory=dict)  # by id: period, queue length, compression
+    throttle: Throttle = field(default_factory=lambda: Throttle(0.0, 0))
+
+    def merge(self) -> None:
+        """Follow the least restrictive period and, as rosbridge does, the shortest queue."""
+        self.throttle = Throttle(self.period_s, self.queue_length)
+
+    @property
+    def period_s(self) -> float:
+        return min(each[0] for each in self.wishes.values())
+
+    @property
+    def queue_length(self) -> int:
+        return min(each[1] for each in self.wishes.values())
+
+    @property
+    def is_raw(self) -> bool:
+        return all(each[2] == "cbor-raw" for each in self.wishes.values())
+
+
+@dataclass(frozen=True, slots=True)
+class _Call:
+    service: Service
+    number: object  # the client's id, whatever it is
+
+
+class RosbridgeSession:
+    """State of one connection."""
+
+    def __init__(self, hub: Hub, number: int, queue: ClientQueue, now_s: Callable[[], float]) -> None:
+        self._hub = hub
+        self.number = number
+        self.queue = queue
+        self._now_s = now_s
+        self._level = _LEVELS.index("error")
+        self._offered: dict[str, Publication] = {}  # by topic
+        self._subscriptions: dict[str, _Subscription] = {}  # by topic
+        self._topics: dict[int, str] = {}  # of keys
+        self._published: dict[str, tuple[str, set[str]]] = {}  # topic to type and ids
+        self._keys = 0
+        self._calls = 0
+        self._operations: Mapping[str, Callable[[dict[str, object]], None]] = {
+            "subscribe": self._subscribe,
+            "unsubscribe": self._unsubscribe,
+            "advertise": self._advertise,
+            "unadvertise": self._unadvertise,
+            "publish": self._publish,
+            "call_service": self._call,
+            "set_level": self._set_level,
+            "status": self._set_level,
+        }
+
+    def handle_message(self, data: str | bytes, now_ns: int) -> None:
+        """Process a message of the client. Raises ``GdpError``: it is wrong, and was ignored."""
+        self._received_ns = now_ns
+        try:
+            fields = orjson.loads(data)
+        except orjson.JSONDecodeError as error:
+            raise _wrong("a message that is not JSON") from error
+        if not isinstance(fields, dict):
+            raise _wrong("a message is a JSON object")
+        operation = self._operations.get(str(fields.get("op")))
+        if operation is None:
+            known = ", ".join(self._operations)
+            raise _wrong(f"operation {fields.get('op')!r} is not supported; supported are {known}"[:300])
+        try:
+            operation(fields)
+        except GdpError as error:
+            self._tell("error", str(error), fields.get("id"))
+
+    def tell_wrong(self, reason: str) -> None:
+        """Report an error."""
+        self._tell("error", reason, None)
+
+    def tell_dropped(self, total: int) -> None:
+        """Report dropped messages as a warning."""
+        text = f"this client reads too slowly: {total} messages were dropped for it; other clients lose nothing"
+        self._tell("warning", text, None)
+
+    def encode(self, pending: Pending) -> str | bytes:
+        """Return ``publish`` with a message of a subscription; clients share the JSON of the latest message."""
+        topic = self._topics.get(pending.key, "")
+        subscription, publication = self._subscriptions.get(topic), self._offered.get(topic)
+        if subscription is not None and subscription.is_raw:
+            return cbor_raw(topic, pending.stamp_ns, pending.raw)
+        if publication is None:
+            return _text(op="status", level="warning", msg=f"{topic}: withdrawn; a message was left out")
+        try:
+            body = publication.encoded(pending.raw, lambda raw: _codec(publication.channel).to_json(raw))
+        except GdpError as error:
+            return _text(op="status", level="error", msg=f"{topic}: {error}")
+        return f'{{"op":"publish","topic":{orjson.dumps(topic).decode()},"msg":{body.decode()}}}'
+
+    def get_timer(self) -> float | None:
+        """Return when a throttled message is due."""
+        times = (each.throttle.get_timer() for each in self._subscriptions.values())
+        return min((time for time in times if time is not None), default=None)
+
+    def handle_timer(self, now_s: float) -> None:
+        """Queue the throttled messages whose turn has come."""
+        for each in self._subscriptions.values():
+            if (message := each.throttle.poll(now_s)) is not None:
+                self.queue.put(each.key, *message, depth=each.queue_length)
+
+    def reads(self) -> Iterable[TopicType]:
+        """Return the topics of the subscriptions whose type is known."""
+        for topic, each in self._subscriptions.items():
+            offered = self._offered.get(topic)
+            type_name = each.type_name or (offered.channel.type_name if offered is not None else "")
+            if type_name:
+                yield topic, type_name
+
+    def publishes(self) -> Iterable[TopicType]:
+        """Return the topics that the client advertised."""
+        return [(topic, type_name) for topic, (type_name, _) in self._published.items()]
+
+    def schema_of(self, topic: str, type_name: str) -> Channel | None:
+        """Return None: clients of rosbridge describe no types. What the door reads itself is a description, too."""
+        offered = self._offered.get(topic)
+        return offered.channel if offered is not None and offered.channel.type_name == type_name else None
+
+    def add_publication(self, publication: Publication) -> None:
+        """Note a topic; a subscription to it begins now."""
+        topic = publication.channel.topic
+        self._offered[topic] = publication
+        if topic in self._subscriptions:
+            self._hub.update_graph()
+
+    def remove_publication(self, publication: Publication) -> None:
+        """Forget a topic; subscriptions to it wait for its return."""
+        if self._offered.get(publication.channel.topic) is publication:
+            del self._offered[publication.channel.topic]
+
+    def queue_message(self, publication: Publication, stamp_ns: int, raw: bytes) -> None:
+        """Queue a message for the client's subscription."""
+        each = self._subscriptions.get(publication.channel.topic)
+        if each is not None and each.throttle.offer(stamp_ns, raw, self._now_s()):
+            self.queue.put(each.key, stamp_ns, raw, depth=each.queue_length)
+
+    def add_service(self, handle: int, service: Service) -> None:
+        """Do nothing: clients name services when they call them."""
+
+    def remove_service(self, handle: int, service: Service) -> None:
+        """Do nothing: see ``add_service``."""
+
+    def pass_answer(self, context: object, raw: bytes) -> None:
+        """Send a response."""
+        if isinstance(context, _Call):
+            self._calls -= 1
+            try:
+                body = _codec(context.service.response).to_json(raw)
+            except GdpError as error:
+                self._respond(context.service.name, context.number, str(error), result=False)
+                return
+            self._respond(context.service.name, context.number, orjson.Fragment(body), result=True)
+
+    def pass_refusal(self, context: object, reason: str) -> None:
+        """Send the reason of a failed call."""
+        if isinstance(context, _Call):
+            self._calls -= 1
+            self._respond(context.service.name, context.number, reason, result=False)
+
+    def _subscribe(self, fields: dict[str, object]) -> None:
+        topic, number = _word(fields, "topic"), str(fields.get("id", ""))
+        type_name = _type(_word(fields, "type", is_optional=True), "msg")
+        period_s = _number(fields, "throttle_rate", _PERIOD_MAX_MS) / 1e3
+        queue_length = _number(fields, "queue_length", _QUEUE_MAX)
+        compression = _word(fields, "compression", is_optional=True) or "none"
+        if compression not in _COMPRESSIONS:
+            raise LocalError(f"subscribe {topic}: compression {compression} is not supported; use none or cbor-raw")
+        if reason := self._hub.rights().may_read(topic, type_name):
+            raise LocalError(f"subscribe {topic}: {reason}")
+        each = self._subscriptions.get(topic)
+        if each is None:
+            if len(self._subscriptions) >= SUBSCRIPTIONS_MAX:
+                raise LocalError(f"subscribe {topic}: more than {SUBSCRIPTIONS_MAX} topics")
+            self._keys += 1
+            each = self._subscriptions[topic] = _Subscription(self._keys, type_name)
+            self._topics[each.key] = topic
+        is_new = not each.wishes
+        if len(each.wishes) >= SUBSCRIPTIONS_MAX:
+            raise LocalError(f"subscribe {topic}: more than {SUBSCRIPTIONS_MAX} ids")
+        each.wishes[number] = (period_s, queue_length, compression)
+        each.merge()
+        if is_new and (offered := self._offered.get(topic)) is not None:
+            for stamp_ns, raw in offered.kept:
+                self.queue.put(each.key, stamp_ns, raw)
+        self._hub.update_graph()
+
+    def _unsubscribe(self, fields: dict[str, object]) -> None:
+        topic = _word(fields, "topic")
+        each = self._subscriptions.get(topic)
+        if each is None:
+            raise LocalError(f"unsubscribe {topic}: it is not subscribed")
+        if "id" in fields:
+            each.wishes.pop(str(fields["id"]), None)
+        else:
+            each.wishes.clear()
+        if each.wishes:
+            each.merge()
+            return
+        del self._subscriptions[topic], self._topics[each.key]
+        self.queue.forget(each.key)
+        self._hub.update_graph()
+
+    def _advertise(self, fields: dict[str, object]) -> None:
+        topic, type_name = _word(fields, "topic"), _type(_word(fields, "type"), "msg")
+        if reason := self._hub.rights().may_publish(topic, type_name):
+            raise LocalError(f"advertise {topic}: {reason}")
+        if len(self._published) >= SUBSCRIPTIONS_MAX:
+            raise LocalError(f"advertise {topic}: more than {SUBSCRIPTIONS_MAX} topics")
+        _, numbers = self._published.setdefault(topic, (type_name, set()))
+        numbers.add(str(fields.get("id", "")))
+        self._hub.update_graph()
+
+    def _unadvertise(self, fields: dict[str, object]) -> None:
+        topic = _word(fields, "topic")
+        if topic not in self._published:
+            raise LocalError(f"unadvertise {topic}: it is not advertised")
+        numbers = self._published[topic][1]
+        numbers.discard(str(fields.get("id", "")))
+        if not numbers or "id" not in fields:
+            del self._published[topic]
+            self._hub.update_graph()
+
+    def _publish(self, fields: dict[str, object]) -> None:
+        topic = _word(fields, "topic")
+        if topic not in self._published:
+            type_name = _type(_word(fields, "type", is_optional=True), "msg") or self._hub.rights().type_of(topic)
+            self._advertise({"topic": topic, "type": type_name or "unknown"})
+        type_name = self._published[topic][0]
+        channel = self._hub.channel_of(topic, type_name)
+        if channel is None:
+            raise LocalError(f"publish {topic}: the definition of {type_name} is not known here")
+        raw = _codec(channel).to_raw(fields.get("msg", {}))
+        self._hub.input(topic, type_name, self._received_ns, raw)
+
+    def _call(self, fields: dict[str, object]) -> None:
+        name, number = _word(fields, "service"), fields.get("id")
+        args = fields.get("args", {})
+        if name.startswith(_ROSAPI):
+            self._rosapi(name.removeprefix(_ROSAPI), number, args if isinstance(args, dict) else {})
+            return
+        handle = next((handle for handle, each in self._hub.services.items() if each.name == name), None)
+        if handle is None or self._calls >= CALLS_MAX:
+            reason = self._hub.rights().may_call(name) or f"{name}: no server is reachable"
+            reason = reason if handle is None else f"{name}: more than {CALLS_MAX} calls are under way"
+            self._respond(name, number, reason, result=False)
+            return
+        service = self._hub.services[handle]
+        try:
+            raw = _codec(service.request).to_raw(_named_arguments(service.request, args))
+        except GdpError as error:
+            self._respond(name, number, str(error), result=False)
+            return
+        self._calls += 1
+        self._hub.request(self, handle, _Call(service, number), raw)
+
+    def _rosapi(self, name: str, number: object, args: dict[str, object]) -> None:
+        """Answer what lists names and types."""
+        topics = {topic: each.channel.type_name for topic, each in self._offered.items()}
+        services = {each.name: each.type_name for each in self._hub.services.values()}
+        wanted = str(args.get("type", ""))
+        answers: Mapping[str, Mapping[str, object]] = {
+            "topics": {"topics": [*topics], "types": [*topics.values()]},
+            "topic_type": {"type": topics.get(str(args.get("topic")), "")},
+            "topics_for_type": {"topics": [topic for topic, each in topics.items() if each == _type(wanted, "msg")]},
+            "services": {"services": [*services]},
+            "service_type": {"type": services.get(str(args.get("service")), "")},
+            "services_for_type": {
+                "services": [each for each, kind in services.items() if kind == _type(wanted, "srv")]
+            },
+        }
+        values = answers.get(name)
+        if values is None:
+            self._respond(f"{_ROSAPI}{name}", number, f"{_ROSAPI}{name} is not offered by this door", result=False)
+        else:
+            self._respond(f"{_ROSAPI}{name}", number, values, result=True)
+
+    def _set_level(self, fields: dict[str, object]) -> None:
+        level = _word(fields, "level")
+        if level not in _LEVELS:
+            raise LocalError(f"set_level: the level is one of {', '.join(_LEVELS)}")
+        self._level = _LEVELS.index(level)
+
+    def _tell(self, level: str, text: str, number: object) -> None:
+        if _LEVELS.index(level) <= self._level:
+            named = {} if number is None else {"id": number}
+            self.queue.put_control(_text(op="status", level=level, msg=text, **named))
+
+    def _respond(self, service: str, number: object, values: object, *, result: bool) -> None:
+        named = {} if number is None else {"id": number}
+        self.queue.put_control(_text(op="service_response", service=service, values=values, result=result, **named))
+
+
+_codecs: Final = BoundedCache[RosbridgeCodec](256, LocalError)
+
+
+def _codec(channel: Channel) -> RosbridgeCodec:
+    """Return the converter of a type; raises ``LocalError``: it has no usable definition."""
+    key = digest_of("rosbridge", channel.type_name, channel.definition, channel.definition_format, 2)
+    return _codecs.get(key, lambda: RosbridgeCodec(channel))
+
+
+def _named_arguments(request: Channel, args: object) -> object:
+    """Return arguments by name; rosbridge allows a list in the order of the fields."""
+    if not isinstance(args, list):
+        return {} if args is None else args
+    names = RosbridgeCodec(request).field_names
+    if len(args) > len(names):
+        raise _wrong(f"{len(args)} arguments; {request.type_name} has {len(names)}")
+    return dict(zip(names, args, strict=False))
+
+
+def _type(text: str, part: str) -> str:
+    """Return a type as ROS 2 writes it."""
+    package, slash, name = text.partition("/")
+    return f"{package}/{part}/{name}" if slash and "/" not in name else text
+
+
+def _text(**fields: object) -> str:
+    return orjson.dumps(fields).decode()
+
+
+def _word(fields: dict[str, object], key: str, *, is_optional: bool = False) -> str:
+    value = fields.get(key)
+    if value is None and is_optional:
+        return ""
+    if not isinstance(value, str) or len(value) > _TEXT_MAX:
+        raise _wrong(f"{key}: a text of at most {_TEXT_MAX} characters was expected")
+    return value
+
+
+def _number(fields: dict[str, object], key: str, limit: int) -> int:
+    value = fields.get(key, 0)
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= limit:
+        raise _wrong(f"{key}: a whole number from 0 to {limit} was expected")
+    return value
+
+
+def _wrong(detail: str) -> RemoteError:
+    return RemoteError(DropReason.MALFORMED, detail)

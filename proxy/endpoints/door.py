@@ -1,0 +1,377 @@
+"""Door endpoint: a graph of WebSocket clients, for the bridge.
+
+I/O. A thread runs the WebSocket server (the library ``websockets``) and the hub; the bridge's thread passes commands to
+it and takes events from it. Each client has a task that sends what its queue holds, so a slow client delays its own
+messages only. Browsers state the origin of the page that connects: only listed origins may.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import count
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+from gdp.errors import GdpError, LocalError
+from gdp.extras import require_extra
+from gdp.host_port import split_host_port
+from gdp.ports.listening import listen_tcp
+from proxy.doors.client_queue import DATA_MAX_BYTES, DATA_MAX_MESSAGES, ClientQueue, Pending
+from proxy.doors.hub import Hub, Rights, Session
+from proxy.doors.types import known_channel
+from proxy.endpoints.endpoint import Event, Graph, MessageReceived
+from proxy.serial.channel import Channel, Qos, RosVersion
+from proxy.serial.service import Service
+
+if TYPE_CHECKING:
+    from websockets.asyncio.server import ServerConnection
+
+__all__ = ["DoorEndpoint", "DoorSettings", "NewSession"]
+
+log = logging.getLogger(__name__)
+
+NewSession: TypeAlias = "Callable[[Hub, int, ClientQueue], Session]"
+
+INPUT_MAX_BYTES: Final = 64 << 20  # messages of clients that wait for the bridge
+OUTPUT_MAX_BYTES: Final = 64 << 20  # messages of the bridge that wait for the server's thread
+MESSAGE_MAX_BYTES: Final = 32 << 20  # of one message of a client
+_REPORT_S: Final = 1.0  # at most one report of dropped messages a second
+_SILENT_S: Final = 60.0  # a client that answers no ping for so long is disconnected
+_TRY_AGAIN: Final = 1013  # close code of the IANA registry
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DoorSettings:
+    """How a door listens, and its bounds.
+
+    Args:
+        listen: ``host:port``.
+        origins: values of the header Origin that are accepted; a client without the header is no browser, and accepted.
+        subprotocols: WebSocket subprotocols, one of which a client must speak; none: it needs no subprotocol.
+    """
+
+    label: str
+    listen: str
+    origins: tuple[str, ...] = ()
+    subprotocols: tuple[str, ...] = ()
+    clients_max: int = 64
+    queue_max_bytes: int = DATA_MAX_BYTES
+    queue_max_messages: int = DATA_MAX_MESSAGES
+
+
+@dataclass(slots=True)
+class _Client:
+    session: Session
+    wake: asyncio.Event = field(default_factory=asyncio.Event)
+    reported: int = 0  # dropped messages that the client knows of
+    reported_at_s: float = 0.0
+
+    @property
+    def queue(self) -> ClientQueue:
+        """Return what waits for the client."""
+        return self.session.queue
+
+
+class DoorEndpoint:
+    """Endpoint whose nodes are the clients of a WebSocket server.
+
+    Raises:
+        LocalError: the address cannot be listened on, or ``websockets`` is not installed.
+    """
+
+    def __init__(self, settings: DoorSettings, new_session: NewSession, rights: Callable[[], Rights]) -> None:
+        require_extra("doors", ["websockets"], settings.label)
+        self._settings = settings
+        self._new_session = new_session
+        self._events: deque[Event] = deque()
+        self._input_bytes = 0  # written by the server's thread
+        self._taken_bytes = 0  # written by the bridge's thread
+        self._output_bytes = 0  # written by the bridge's thread
+        self._passed_bytes = 0  # written by the server's thread
+        self._lost = 0  # messages that either bound has dropped
+        self._handles = count(1)
+        self._sessions = count(1)
+        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._hub = Hub(self._emit, rights, _known_or_none)
+        self._clients: dict[int, _Client] = {}
+        self._timer: asyncio.TimerHandle | None = None
+        self._due_s = 0.0
+        try:
+            self._socket = listen_tcp(*split_host_port(settings.listen))
+        except OSError as error:
+            os.close(self._wake)
+            raise LocalError(
+                f"cannot listen on {settings.listen}: {error.strerror}; choose another address with --listen"
+            ) from error
+        self._loop = asyncio.new_event_loop()
+        self._stop = asyncio.Event()
+        self._failed: BaseException | None = None
+        started = threading.Event()
+        self._thread = threading.Thread(target=self._run, args=(started,), name=settings.label, daemon=True)
+        self._thread.start()
+        started.wait()
+        if self._failed is not None:
+            self.shut_down()
+            raise LocalError(f"{settings.label} did not start: {self._failed}")
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """Return host and port."""
+        host, port = self._socket.getsockname()[:2]
+        return host, port
+
+    @property
+    def ros(self) -> RosVersion:
+        """Return the dialect of its messages: CDR."""
+        return 2
+
+    @property
+    def label(self) -> str:
+        """Return the display name."""
+        host, port = self.address
+        return f"{self._settings.label} ws://{f'[{host}]' if ':' in host else host}:{port}"
+
+    @property
+    def is_live(self) -> bool:
+        """Return True: clients come and go."""
+        return True
+
+    @property
+    def dropped(self) -> int:
+        """Return the messages dropped because a queue was full."""
+        return self._hub.dropped + self._lost
+
+    @property
+    def clients(self) -> int:
+        """Return the number of connections."""
+        return len(self._clients)
+
+    def fileno(self) -> int:
+        """Return a descriptor that is readable while there are events."""
+        return self._wake
+
+    def poll_events(self) -> Sequence[Event]:
+        """Remove and return the pending events."""
+        with contextlib.suppress(BlockingIOError):
+            os.eventfd_read(self._wake)
+        events = list[Event]()
+        while self._events:
+            event = self._events.popleft()
+            if isinstance(event, MessageReceived):
+                self._taken_bytes += len(event.raw)
+            events.append(event)
+        return events
+
+    def graph(self) -> Graph:
+        """Return what the clients read and publish."""
+        return self._hub.graph
+
+    def channel(self, topic: str, type_name: str) -> Channel:
+        """Return a standard type; any other is read from a publisher. Raises ``LocalError``: it is none."""
+        try:
+            return known_channel(topic, type_name)
+        except LocalError:
+            self._do(self._hub.want_definition, topic, type_name)
+            raise
+
+    def service(self, name: str, type_name: str) -> Service:
+        """Raise ``LocalError``: the definition of a server is used."""
+        raise LocalError(f"{name}: a door has no definition of {type_name}; that of its server is used")
+
+    def subscribe(self, topic: str, type_name: str, qos: Qos | None) -> int:
+        """Take what clients publish under a name."""
+        del qos
+        handle = next(self._handles)
+        self._do(self._hub.take_topic, handle, topic, type_name)
+        return handle
+
+    def advertise(self, channel: Channel) -> int:
+        """Offer a topic to the clients."""
+        handle = next(self._handles)
+        self._do(self._hub.offer_topic, handle, channel)
+        return handle
+
+    def publish(self, handle: int, raw: bytes) -> None:
+        """Pass a message on; it is dropped and counted where the server's thread does not keep up at all."""
+        if self._output_bytes - self._passed_bytes > OUTPUT_MAX_BYTES:
+            self._lost += 1
+            return
+        self._output_bytes += len(raw)
+        self._do(self._publish, handle, time.time_ns(), raw)
+
+    def serve(self, service: Service) -> int:
+        """Offer a service to the clients."""
+        handle = next(self._handles)
+        self._do(self._hub.offer_service, handle, service)
+        return handle
+
+    def answer(self, handle: int, ticket: int, raw: bytes) -> None:
+        """Answer a client's request."""
+        del handle
+        self._do(self._hub.pass_answer, ticket, raw)
+
+    def refuse(self, handle: int, ticket: int, reason: str) -> None:
+        """Fail a client's request."""
+        del handle
+        self._do(self._hub.pass_refusal, ticket, reason)
+
+    def create_client(self, name: str, type_name: str) -> int:
+        """Raise ``LocalError``: clients of a door serve nothing."""
+        raise LocalError(f"{name}: clients of a door cannot serve {type_name}")
+
+    def call(self, handle: int, call: int, raw: bytes) -> None:
+        """Raise ``LocalError``: see ``create_client``."""
+        del call, raw
+        raise LocalError(f"handle {handle} is no client")
+
+    def drop(self, handle: int, call: int) -> None:
+        """Do nothing: no call was begun."""
+
+    def close(self, handle: int) -> None:
+        """Close a subscription, publisher or server."""
+        self._do(self._hub.close, handle, time.monotonic())
+
+    def shut_down(self) -> None:
+        """Disconnect the clients and end the thread."""
+        if self._thread.is_alive():
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                self._loop.call_soon_threadsafe(self._stop.set)
+            self._thread.join()
+        self._socket.close()
+        os.close(self._wake)
+
+    # the server's thread
+
+    def _do(self, act: Callable[..., None], *arguments: object) -> None:
+        self._loop.call_soon_threadsafe(self._act, act, arguments)
+
+    def _act(self, act: Callable[..., None], arguments: tuple[object, ...]) -> None:
+        act(*arguments)
+        self._settle()
+
+    def _settle(self) -> None:
+        """Wake the tasks that send, and set the timer."""
+        self._wake_clients()
+        due_s = self._hub.get_timer()
+        if due_s is None or (self._timer is not None and self._due_s <= due_s):
+            return
+        if self._timer is not None:
+            self._timer.cancel()
+        self._due_s = due_s
+        self._timer = self._loop.call_later(max(due_s - time.monotonic(), 0.0), self._handle_timer)
+
+    def _handle_timer(self) -> None:
+        self._timer = None
+        self._hub.handle_timer(time.monotonic())
+        self._settle()
+
+    def _publish(self, handle: int, stamp_ns: int, raw: bytes) -> None:
+        self._passed_bytes += len(raw)
+        self._hub.pass_message(handle, stamp_ns, raw)
+
+    def _wake_clients(self) -> None:
+        for client in self._clients.values():
+            client.wake.set()
+
+    def _emit(self, event: Event) -> None:
+        if isinstance(event, MessageReceived):
+            if self._input_bytes - self._taken_bytes > INPUT_MAX_BYTES:
+                self._lost += 1
+                return
+            self._input_bytes += len(event.raw)
+        self._events.append(event)
+        os.eventfd_write(self._wake, 1)
+
+    def _run(self, started: threading.Event) -> None:
+        try:
+            self._loop.run_until_complete(self._serve(started))
+        except Exception as error:
+            log.exception("the server of a door failed")
+            self._failed = error
+        finally:
+            self._loop.close()
+            started.set()
+
+    async def _serve(self, started: threading.Event) -> None:
+        from websockets.asyncio.server import serve
+        from websockets.typing import Origin, Subprotocol
+
+        server = await serve(
+            self._attend,
+            sock=self._socket,
+            origins=[None, *map(Origin, self._settings.origins)],
+            subprotocols=[Subprotocol(each) for each in self._settings.subprotocols] or None,
+            compression=None,
+            max_size=MESSAGE_MAX_BYTES,
+            ping_timeout=_SILENT_S,
+        )
+        started.set()
+        try:
+            await self._stop.wait()
+        finally:
+            server.close()
+            await server.wait_closed()
+
+    async def _attend(self, connection: ServerConnection) -> None:
+        from websockets.exceptions import ConnectionClosed
+
+        if len(self._clients) >= self._settings.clients_max:
+            await connection.close(_TRY_AGAIN, f"this door has {len(self._clients)} clients already")
+            return
+        queue = ClientQueue(self._settings.queue_max_bytes, self._settings.queue_max_messages)
+        client = _Client(self._new_session(self._hub, next(self._sessions), queue))
+        self._clients[client.session.number] = client
+        self._hub.open(client.session)
+        sender = asyncio.create_task(self._send(connection, client))
+        try:
+            async for data in connection:
+                try:
+                    client.session.handle_message(data, time.time_ns())
+                except GdpError as error:
+                    client.session.tell_wrong(str(error))
+                self._settle()
+        except ConnectionClosed as error:
+            log.debug("client gone session=%d reason=%s", client.session.number, error)
+        finally:
+            sender.cancel()
+            await asyncio.gather(sender, return_exceptions=True)
+            del self._clients[client.session.number]
+            self._hub.end(client.session)
+            self._settle()
+
+    async def _send(self, connection: ServerConnection, client: _Client) -> None:
+        """Send what waits for a client, as fast as its connection takes it."""
+        from websockets.exceptions import ConnectionClosed
+
+        queue, session = client.queue, client.session
+        try:
+            while True:
+                now_s = time.monotonic()
+                if queue.dropped > client.reported and now_s >= client.reported_at_s + _REPORT_S:
+                    client.reported, client.reported_at_s = queue.dropped, now_s
+                    session.tell_dropped(queue.dropped)
+                if queue.is_overrun:
+                    await connection.close(_TRY_AGAIN, "this client does not read")
+                    return
+                item = queue.pop()
+                if item is None:
+                    client.wake.clear()
+                    await client.wake.wait()
+                else:
+                    await connection.send(session.encode(item) if isinstance(item, Pending) else item)
+        except ConnectionClosed:
+            log.debug("client gone while sending session=%d", session.number)
+
+
+def _known_or_none(topic: str, type_name: str) -> Channel | None:
+    try:
+        return known_channel(topic, type_name)
+    except LocalError:
+        return None

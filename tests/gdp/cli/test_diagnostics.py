@@ -1,0 +1,247 @@
+"""``gdp ping``, ``gdp trace`` and ``gdp show``: their output, and how they find nodes and names."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gdp.cli import tables
+from gdp.cli.gdp import main
+from gdp.cli.path_view import path_lines
+from gdp.cli.ping_statistics import PingStatistics, quantile
+from gdp.nodes import running_nodes
+from gdp.nodes.control_protocol import Response
+from gdp.nodes.control_socket import ControlHandlers, Respond, serve_control_in_thread
+
+SCAN, OTHER, ROBOT = "0b" * 32, "0c" * 32, "aa" * 32
+LONG = "x" * 300
+
+
+class Node:
+    """A node that answers as a proxy whose publisher is the robot."""
+
+    def __init__(self, label: str, role: str = "proxy") -> None:
+        self.label = label
+        self.role = role
+        self.places: list[dict[str, str]] = [{"node": ROBOT, "right": "publish"}, {"node": OTHER, "right": "read"}]
+        self.is_silent = False
+        self.asked: list[Mapping[str, object]] = []
+        self.target_role = "proxy"
+
+    def handlers(self) -> ControlHandlers:
+        return ControlHandlers(
+            reload=lambda: None,
+            status=lambda: {"role": self.role, "label": self.label, "name": OTHER},
+            drain=lambda: None,
+            ask=self._ask,
+            show=self._show,
+        )
+
+    def _show(self, arguments: Mapping[str, object]) -> Mapping[str, object]:
+        rows: list[dict[str, object]] = [{"local": "/scan", "name": SCAN, "note": LONG}]
+        rows += [{"local": "/twice", "name": digit * 64, "note": ""} for digit in "12"]
+        return {"rows": rows if arguments["what"] == "names" else [], "next": None}
+
+    def _ask(self, arguments: Mapping[str, object], respond: Respond) -> None:
+        fields: dict[str, object] = {"id": arguments["id"], "rtt_ms": 1.5}
+        self.asked.append(arguments)
+        if arguments["ask"] == "resolve":
+            respond(Response({**fields, "state": "answered", "result": {"places": self.places}}))
+        elif self.is_silent:
+            respond(Response({**fields, "state": "silent"}))
+        else:
+            role = {} if arguments["ask"] == "trace" else {"role": self.target_role}
+            respond(Response({**fields, **answered(arguments), **role}))
+
+
+def answered(arguments: Mapping[str, object]) -> dict[str, object]:
+    """Return a reply: of the robot, two switches away; or of one of these."""
+    hops = arguments.get("hops")
+    is_trace = arguments["ask"] == "trace"
+    result = {"in": {"port": "eth0", "to": OTHER}, "branches": [{"port": "eth1", "to": ROBOT, "role": "proxy"}]}
+    return {
+        "state": "answered",
+        "node": f"{hops:064d}" if is_trace else ROBOT,
+        "label": f"nuc{hops}" if is_trace else "robot",
+        "role": "switch" if is_trace else "proxy",
+        "domain": SCAN,
+        "domain_label": "school",
+        "switches": 2,
+        "result": {} if hops == 2 or not is_trace else result,
+        "withheld": is_trace and hops == 2,
+        "cut": False,
+        "error": "",
+    }
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the folder in which the nodes of this machine have their sockets."""
+    monkeypatch.setattr(running_nodes, "control_sockets", lambda: sorted(tmp_path.glob("*.sock")))
+    return tmp_path
+
+
+@pytest.fixture
+def node(folder: Path) -> Iterator[Node]:
+    made = Node("robot-proxy")
+    with serve_control_in_thread(folder / "one.sock", made.handlers()):
+        yield made
+
+
+def gdp(*words: str) -> int:
+    """Run a command; return its exit code."""
+    try:
+        main(words)
+    except SystemExit as ended:
+        return int(ended.code or 0)
+    return 0
+
+
+@pytest.mark.usefixtures("node")
+def test_a_ping_prints_a_line_for_each_reply_and_a_summary(capsys: pytest.CaptureFixture[str]) -> None:
+    assert gdp("ping", "/scan", "-c", "2", "-i", "0.05") == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "reply 1 from robot (proxy, school): 1.50 ms",
+        "reply 2 from robot (proxy, school): 1.50 ms",
+        "--- /scan ---",
+        "robot (proxy, school): 2 sent, 2 received, 0 % lost, min/median/p99/max 1.50/1.50/1.50/1.50 ms",
+    ]
+
+
+def test_a_ping_without_replies_exits_with_1(node: Node, capsys: pytest.CaptureFixture[str]) -> None:
+    node.is_silent = True
+    assert gdp("ping", SCAN, "-c", "1", "--json") == 1
+    line, summary = map(json.loads, capsys.readouterr().out.splitlines())
+    assert line == {"number": 1, "node": ROBOT, "rtt_ms": None}
+    assert summary["members"][0]["loss"] == 1.0
+
+
+def test_a_name_that_no_member_advertises_is_an_error(node: Node, capsys: pytest.CaptureFixture[str]) -> None:
+    node.places = []
+    assert gdp("ping", "/scan", "-c", "1") == 2
+    assert "no RIB that answers knows a member that advertises it" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("node")
+@pytest.mark.parametrize(("name", "words"), [("/none", "gdp show names"), ("/twice", "several names")])
+def test_a_name_that_is_unknown_or_not_unique_is_refused(
+    name: str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert gdp("trace", name) == 2
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("node")
+def test_a_trace_prints_the_switches_and_their_branches(capsys: pytest.CaptureFixture[str]) -> None:
+    assert gdp("trace", "/scan") == 0
+    *lines, last = capsys.readouterr().out.splitlines()
+    assert lines == [
+        "/scan, published by robot (proxy of school): 2 switches, 1.50 ms",
+        "  1  nuc1  switch of school  1.50 ms  in eth0 0c0…c0c",
+        "       tree -> eth1 aaa…aaa",
+        "  2  a switch of school  1.50 ms  (tells our domain no more)",
+    ]
+    assert last.startswith("traced in ")
+
+
+def test_a_trace_to_a_silent_member_exits_with_1(node: Node, capsys: pytest.CaptureFixture[str]) -> None:
+    node.is_silent = True
+    assert gdp("trace", "/scan", "--json") == 1
+    (path,) = json.loads(capsys.readouterr().out)["paths"]
+    assert (path["answered"], path["hops"]) == (False, [])
+
+
+def test_a_trace_to_a_switch_ends_with_that_switch(node: Node) -> None:
+    node.places, node.target_role = [{"node": ROBOT, "right": "attach"}], "switch"
+    assert gdp("trace", ROBOT) == 0
+    assert [each["hops"] for each in node.asked if "hops" in each] == [1, 2, 3]
+
+
+def test_a_switch_that_withholds_its_name_has_none_in_the_output(
+    node: Node, capsys: pytest.CaptureFixture[str]
+) -> None:
+    del node
+    gdp("trace", "/scan", "--json")
+    (path,) = json.loads(capsys.readouterr().out)["paths"]
+    assert (path["hops"][1]["withheld"], path["hops"][1]["node"], path["hops"][1]["label"]) == (True, None, None)
+
+
+def test_several_nodes_need_a_choice(folder: Path, node: Node, capsys: pytest.CaptureFixture[str]) -> None:
+    del node
+    with serve_control_in_thread(folder / "two.sock", Node("arm-proxy").handlers()):
+        assert gdp("ping", "/scan", "-c", "1") == 2
+        assert "choose one with --node LABEL: arm-proxy (proxy), robot-proxy (proxy)" in capsys.readouterr().err
+        for choice in ("arm-proxy", str(folder / "two.sock")):
+            assert gdp("ping", "/scan", "-c", "1", "--node", choice) == 0
+        assert gdp("ping", "/scan", "-c", "1", "--node", "nuc9") == 2
+        assert "nuc9" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("folder")
+def test_without_a_node_the_error_says_what_to_do(capsys: pytest.CaptureFixture[str]) -> None:
+    assert gdp("show", "names") == 2
+    assert "--node DIR" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("node")
+def test_a_table_in_a_pipe_loses_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    assert gdp("show", "names") == 0
+    header, first, *_ = capsys.readouterr().out.splitlines()
+    assert header.split() == ["NODE", "LOCAL", "NAME", "NOTE"]
+    assert first.split() == ["robot-proxy", "/scan", SCAN, LONG]
+
+
+@pytest.mark.usefixtures("node")
+def test_columns_are_selected_and_unknown_ones_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert gdp("show", "names", "--columns", "name,local", "--node", "robot-proxy") == 0
+    assert capsys.readouterr().out.splitlines()[1].split() == [SCAN, "/scan"]
+    assert gdp("show", "names", "--columns", "color") == 2
+    assert "the table has node, local, name, note" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("node")
+def test_a_table_is_one_json_object(capsys: pytest.CaptureFixture[str]) -> None:
+    assert gdp("show", "names", "--json") == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["table"] == "names"
+    assert shown["rows"][0] == {"node": "robot-proxy", "local": "/scan", "name": SCAN, "note": LONG}
+
+
+def test_on_a_terminal_names_are_short_and_lines_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    out = Terminal()
+    monkeypatch.setattr("sys.stdout", out)
+    monkeypatch.setenv("COLUMNS", "40")
+    tables.print_table([{"name": SCAN, "note": LONG}], ["name", "note"])
+    lines = out.getvalue().splitlines()
+    assert lines[1].startswith("0b0…b0b")
+    assert max(map(len, lines)) <= 40
+
+
+def test_quantiles_are_values_that_were_measured() -> None:
+    times = [float(each) for each in range(1, 101)]
+    assert (quantile(times, 0.5), quantile(times, 0.99), quantile([], 0.5)) == (50.0, 99.0, None)
+
+
+def test_statistics_of_silence_have_no_times() -> None:
+    assert PingStatistics(sent=2).to_text() == "2 sent, 0 received, 100 % lost"
+
+
+def test_branches_below_are_indented() -> None:
+    below: dict[str, Any] = {"state": "answered", "branches": [{"port": "p", "label": "robot"}]}
+    hop = {"hop": 1, "state": "silent", "branches": [{"port": "q", "label": "nuc2", "rtt_us": 250, "below": below}]}
+    path = {"right": "serve", "node": ROBOT, "answered": False, "hops": [hop]}
+    assert list(path_lines("/echo", path)) == [
+        "/echo, served by aaa…aaa, which does not answer",
+        "  1  no answer",
+        "       tree -> q nuc2 0.25 ms",
+        "           tree -> p robot",
+    ]

@@ -1,0 +1,82 @@
+"""Answers from facts alone: what is said where little is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from gdp.diagnosis.answer import Cause, Verdict
+from gdp.diagnosis.diagnosis import RULES, diagnose
+from gdp.diagnosis.facts import Facts, FlowFact, ProxyFacts, RibFacts, SwitchFacts, Unreachable
+from gdp.diagnosis.survey import ROLES, Survey
+
+NEAR, SWITCH, RIB, FAR = "1" * 64, "2" * 64, "3" * 64, "4" * 64
+FLOW = FlowFact(
+    side="import", kind="topic", local="/a", type_name="x/msg/X", overlay="5" * 64, is_carried=True, nodes=1,
+    delegated="yes", advertised="accepted", writers=1, live=1, age_s=60.0,
+)  # fmt: skip
+PROXY = ProxyFacts(name=NEAR, is_near=True, switch=SWITCH, is_attached=True, uptime_s=60.0, entities=3, flows=(FLOW,))
+
+
+def facts(*, flow: FlowFact = FLOW, **more: object) -> Facts:
+    return Facts(asked="/a", proxies=(replace(PROXY, flows=(flow,)),), window_s=1.0, **more)  # type: ignore[arg-type]
+
+
+def test_without_far_facts_an_unheard_topic_is_not_called_a_fault() -> None:
+    answer = diagnose(facts())
+    assert (answer.cause, answer.cause.verdict) == (Cause.UNKNOWN, Verdict.UNKNOWN)
+    assert "no far proxy" in answer.sentence
+
+
+def test_a_node_that_did_not_answer_is_listed() -> None:
+    silent = Unreachable(role="switch", where="abc…def", why="no answer", is_down=False)
+    assert diagnose(facts(unreachable=(silent,))).unknown == ("switch abc…def: no answer",)
+
+
+def test_what_flows_is_never_a_fault() -> None:
+    flow = replace(FLOW, received=10, idle_s=0.03, faults={"too-large": 3}, refused="quota")
+    switch = SwitchFacts(name=SWITCH, is_near=True, drops={"too-big": 9})
+    assert diagnose(facts(flow=flow, switches=(switch,))).cause is Cause.ARRIVES
+
+
+def test_a_message_a_while_ago_is_idle() -> None:
+    assert diagnose(facts(flow=replace(FLOW, idle_s=300.0))).cause is Cause.IDLE
+
+
+def test_what_is_young_is_not_called_a_fault() -> None:
+    young = replace(PROXY, uptime_s=1.0, is_attached=False)
+    switch = SwitchFacts(name=SWITCH, is_near=True)
+    assert diagnose(Facts(asked="/a", proxies=(young,), switches=(switch,))).cause is Cause.STARTING
+
+
+def test_a_known_lack_is_a_fault_from_the_first_second() -> None:
+    young = replace(PROXY, uptime_s=1.0, flows=(replace(FLOW, delegated="no", is_carried=False, live=0),))
+    answer = diagnose(Facts(asked="/a", proxies=(young,)))
+    assert answer.cause is Cause.DELEGATION_MISSING
+    assert answer.command.startswith("gdp delegate name ")
+
+
+@pytest.mark.parametrize(("cause", "rule"), RULES, ids=lambda each: getattr(each, "value", ""))
+def test_no_rule_fails_on_empty_facts(cause: Cause, rule: object) -> None:
+    del rule
+    answer = diagnose(Facts(asked="/a"))
+    assert answer.cause is Cause.NO_PROXY_HERE
+    assert cause.value
+
+
+def test_the_json_form_names_all_parts() -> None:
+    assert diagnose(Facts(asked="/a")).to_fields().keys() == {"verdict", "cause", "sentence", "command", "unknown"}
+
+
+def test_a_survey_asks_each_node_once() -> None:
+    survey = Survey("/a")
+    survey.add("proxy", {"name": NEAR, "switch": SWITCH}, is_near=True)
+    assert survey.targets(0) == [SWITCH]
+    survey.add("switch", {"name": SWITCH, "rib": RIB, "reaches": [SWITCH], "proxies": [NEAR, FAR]}, is_near=True)
+    assert [survey.targets(each) for each in range(len(ROLES))] == [[], [RIB], [], [FAR]]
+    survey.add("rib", {"name": RIB, "routes": [{"advertiser": FAR, "right": "publish", "switch": "6" * 64}]})
+    assert survey.targets(2) == ["6" * 64]
+    survey.add("proxy", {"name": 7})
+    assert "form" in survey.facts().unreachable[0].why
+    assert survey.facts().ribs == (RibFacts(name=RIB, routes=survey.facts().ribs[0].routes),)
