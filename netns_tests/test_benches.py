@@ -14,6 +14,7 @@ from tests.pages import ROOT
 pytestmark = pytest.mark.netns
 
 _PATIENCE_S = 300.0
+soak = pytest.mark.soak
 needs_ros2 = pytest.mark.skipif(find_spec("rclpy") is None, reason="rclpy is not installed: scripts/setup.sh --ros2")
 needs_wireguard = pytest.mark.skipif(
     which("wireguard-go") is None or which("wg") is None, reason="wireguard-go or wireguard-tools is not installed"
@@ -24,21 +25,21 @@ needs_wireguard = pytest.mark.skipif(
     "command",
     [
         ["forwarding.py", "--quick", "--no-save"],
-        ["scale.py", "--quick", "--no-save"],
-        ["messages.py", "--quick", "--mtu", "9000", "--offloads", "off"],
+        pytest.param(["scale.py", "--quick", "--no-save"], marks=soak),
+        pytest.param(["messages.py", "--quick", "--mtu", "9000", "--offloads", "off"], marks=soak),
         ["library.py", "--rounds", "1", "--count", "5"],
         ["thread_offload.py", "--rounds", "1", "--count", "5"],
         ["packet_rings.py", "--rounds", "1", "--count", "128"],
         ["segments.py", "--rounds", "1", "--count", "1"],
-        ["priority.py", "--quick", "--no-save"],
-        ["bundles.py", "--quick", "--no-save"],
-        pytest.param(["tunnel.py", "--quick", "--no-save", "--only", "kernel"], marks=needs_wireguard),
-        pytest.param(["first_topic.py", "--rounds", "1", "--no-save"], marks=[needs_ros2, needs_wireguard]),
+        pytest.param(["priority.py", "--quick", "--no-save"], marks=soak),
+        pytest.param(["bundles.py", "--quick", "--no-save"], marks=soak),
+        pytest.param(["tunnel.py", "--quick", "--no-save", "--only", "kernel"], marks=[soak, needs_wireguard]),
+        pytest.param(["first_topic.py", "--rounds", "1", "--no-save"], marks=[soak, needs_ros2, needs_wireguard]),
         ["uplink.py", "--quick", "--no-save", "--no-tcp", "--fifo", "bdp", "--only", "line", "gdp"],
-        pytest.param(["ros.py", "--quick", "--no-save", "--mtu", "9000"], marks=needs_ros2),
-        pytest.param(["services.py", "--quick", "--no-save"], marks=needs_ros2),
-        pytest.param(["fogros.py", "--quick", "--no-save", "--mtu", "9000"], marks=needs_ros2),
-        ["survive.py", "--only", "cut", "--rounds", "1", "--no-save"],
+        pytest.param(["ros.py", "--quick", "--no-save", "--mtu", "9000"], marks=[soak, needs_ros2]),
+        pytest.param(["services.py", "--quick", "--no-save"], marks=[soak, needs_ros2]),
+        pytest.param(["fogros.py", "--quick", "--no-save", "--mtu", "9000"], marks=[soak, needs_ros2]),
+        pytest.param(["survive.py", "--only", "cut", "--rounds", "1", "--no-save"], marks=soak),
         ["serial.py", "--help"],
         ["advertisement_verify.py", "--advertisements", "100"],
     ],

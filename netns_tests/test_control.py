@@ -66,23 +66,35 @@ def nodes(space: Space, commands: Commands) -> Nodes:
     return Nodes(commands)
 
 
-@pytest.mark.parametrize("name", ["switch", "rib", "proxy"])
-def test_a_running_node_shows_its_status(nodes: Nodes, name: str) -> None:
-    code, text = nodes.gdp("status", name, "--json")
-    shown = json.loads(text)
-    assert code == 0
-    assert (shown["state"], shown["role"]) == ("running", name)
-    assert shown["counters"]["frames"]["in"] > 0
+def reload_reads_what_sighup_reads(nodes: Nodes) -> None:
+    (nodes.commands.home / "revoked" / "x").write_bytes(b"no statement")
+    assert nodes.gdp("reload", "switch")[0] == 0
+    nodes.switch.until("revocation not taken")
+    assert nodes.gdp("reload", "rib")[0] == 0
 
 
-def test_a_switch_shows_each_link_with_its_measured_quality(nodes: Nodes) -> None:
-    _, text = nodes.gdp("status", "switch", "--json")
-    shown = json.loads(text)
+def a_refused_reload_says_why(nodes: Nodes) -> None:
+    for file in (nodes.commands.home / "proxy" / "delegations").iterdir():
+        file.unlink()
+    code, text = nodes.gdp("reload", "proxy")
+    assert code == 1
+    assert "no delegation for" in text
+
+
+def test_running_nodes_show_their_status_and_links_and_reload_what_they_accept(nodes: Nodes) -> None:
+    for name in ("rib", "proxy", "switch"):
+        code, text = nodes.gdp("status", name, "--json")
+        shown = json.loads(text)
+        assert code == 0
+        assert (shown["state"], shown["role"]) == ("running", name)
+        assert shown["counters"]["frames"]["in"] > 0
     assert len(shown["link_quality"]) == shown["neighbours"] > 0
     assert {key for row in shown["link_quality"] for key in row} == {
         "port", "neighbour", "rtt_ms", "rtt_var_ms", "loss_in", "loss_out", "cost",
     }  # fmt: skip
     assert {row["cost"] for row in shown["link_quality"]} == {10}
+    reload_reads_what_sighup_reads(nodes)
+    a_refused_reload_says_why(nodes)
 
 
 def test_nodes_that_drain_end_and_leave_no_socket(nodes: Nodes) -> None:
@@ -94,21 +106,6 @@ def test_nodes_that_drain_end_and_leave_no_socket(nodes: Nodes) -> None:
         assert node.process.wait(PATIENCE_S) == 0
     assert not any(path.exists() for path in sockets)
     assert {path.name for path in (nodes.commands.home / "kept").iterdir()} == {"received.mcap", "routes"}
-
-
-def test_a_reload_reads_what_sighup_reads(nodes: Nodes) -> None:
-    (nodes.commands.home / "revoked" / "x").write_bytes(b"no statement")
-    assert nodes.gdp("reload", "switch")[0] == 0
-    nodes.switch.until("revocation not taken")
-    assert nodes.gdp("reload", "rib")[0] == 0
-
-
-def test_a_reload_that_a_node_refuses_says_why(nodes: Nodes) -> None:
-    for file in (nodes.commands.home / "proxy" / "delegations").iterdir():
-        file.unlink()
-    code, text = nodes.gdp("reload", "proxy")
-    assert code == 1
-    assert "no delegation for" in text
 
 
 def test_the_socket_of_a_killed_node_is_replaced(nodes: Nodes) -> None:

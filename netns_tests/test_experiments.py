@@ -47,7 +47,9 @@ def run(name: str, out: Path) -> dict[str, Any]:
     return reported
 
 
-@pytest.mark.parametrize("name", ["fig5", "fig6", "fig7", "fig9"])
+@pytest.mark.parametrize(
+    "name", ["fig5", *(pytest.param(each, marks=pytest.mark.soak) for each in ("fig6", "fig7", "fig9"))]
+)
 def test_an_experiment_runs_to_its_page_without_a_failed_request(name: str, tmp_path: Path) -> None:
     if name == "fig5" and not (ROOT.parent / "shared" / "data" / "planning").is_dir():
         pytest.skip("no ../shared/data/planning here")

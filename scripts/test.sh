@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
-# Static checks and all tests, those with real namespaces included.
+# Static checks and the tests, those with real namespaces included.
 #
-#   sudo scripts/test.sh
+#   sudo scripts/test.sh                           all but those marked soak; what CI runs
+#   sudo scripts/test.sh --soak                    those marked soak: long ones, of which shorter tests cover most
 #   scripts/test.sh -k certificate                 arguments go to pytest
 #
 # Without root the namespace tests run in a user namespace; where that is not allowed they are skipped with that reason.
@@ -28,6 +29,7 @@ run() {
     fi
 }
 
+[[ ${1:-} != --soak ]] || set -- -m soak "${@:2}"
 if [[ $# -gt 0 ]]; then
     run "$@"
     exit
@@ -38,7 +40,7 @@ clusters=(netns_tests/test_{bench_replicas,experiments,fog,fog_demo,leaving,loca
 declare -A lanes=(["clusters"]="tests ${clusters[*]}" ["spaces"]="netns_tests ${clusters[*]/#/--ignore=}")
 # lane <name> <report> <argument>...: runs the tests of a lane and writes a JUnit file
 # shellcheck disable=SC2086  # words
-lane() { run -o "cache_dir=.pytest_cache/$1" --junit-xml "$scratch/$1.$2.xml" ${lanes[$1]} "${@:3}"; }
+lane() { run -m "not soak" -o "cache_dir=.pytest_cache/$1" --junit-xml "$scratch/$1.$2.xml" ${lanes[$1]} "${@:3}"; }
 lane clusters first >"$scratch/clusters.log" 2>&1 &
 others=$!
 trap 'kill "$others" 2>/dev/null || true; exit 130' INT TERM

@@ -136,9 +136,9 @@ def origins(world: Simulation, label: str) -> set[bytes]:
 
 
 @pytest.mark.momentary("nothing flows")
-@pytest.mark.parametrize("later_s", [0.0, 600.0])
+@pytest.mark.parametrize("later_s", [0.0, pytest.param(600.0, marks=pytest.mark.soak)])
 def test_a38_a_recorded_link_state_of_a_dead_switch_is_refused(later_s: float) -> None:
-    world = ring()
+    world = ring(keepalive_ms=2_000)
     world.network.run(1)
     wires = buried(world, "nuc3")
     world.network.run(later_s)
@@ -151,7 +151,7 @@ def test_a38_a_recorded_link_state_of_a_dead_switch_is_refused(later_s: float) -
 
 @pytest.mark.momentary("nothing flows")
 def test_a38_a_switch_that_has_restarted_since_refuses_it_by_its_time() -> None:
-    world = ring()
+    world = ring(keepalive_ms=2_000)
     world.network.run(1)
     wires = buried(world, "nuc3")
     restart_switch(world, "nuc1", LINK_STATE_AGE_MAX_S)  # much later

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from gdp.crypto.statements import StatementType
 from tests.insiders.trial import Plan, Trial, prepared
 
-TRIALS = int(os.environ.get("GDP_INSIDERS", "3"))
+TRIALS = int(os.environ.get("GDP_INSIDERS", "2"))
 IS_LONG = "GDP_INSIDERS" in os.environ
 WORDS = 150
 

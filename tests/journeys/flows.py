@@ -11,6 +11,7 @@ from gdp.client.delivery import Delivered
 from gdp.client.participant import Participant, Topic
 from gdp.client.publisher import Publisher
 from gdp.frame.codec import ETHER_BYTES, Header, decode
+from gdp.limits import SCAPY_KEEPALIVE_MS
 from gdp.names import Name
 from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import ring5
@@ -122,10 +123,14 @@ class Tap:
 
 
 def ring(
-    seed: int = 1, transits: Mapping[str, tuple[str, ...]] | None = None, *, lease_s: float = LEASE_S
+    seed: int = 1,
+    transits: Mapping[str, tuple[str, ...]] | None = None,
+    *,
+    lease_s: float = LEASE_S,
+    keepalive_ms: int | None = SCAPY_KEEPALIVE_MS,
 ) -> Simulation:
     """Return the ring of five, with every member attached."""
-    world = Simulation(topology=ring5(), seed=seed, transits=transits, lease_s=lease_s)
+    world = Simulation(topology=ring5(), seed=seed, transits=transits, lease_s=lease_s, keepalive_ms=keepalive_ms)
     assert world.run_until_attached()
     return world
 

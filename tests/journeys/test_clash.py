@@ -101,7 +101,7 @@ def test_when_the_older_node_dies_the_younger_is_taken() -> None:
 
 
 def test_a_node_that_is_killed_and_started_at_another_switch_is_taken_when_its_neighbour_is_known_to_be_dead() -> None:
-    world = ring()
+    world = ring(keepalive_ms=None)
     world.network.stop(ROBOT)
     converter = add_converter(world, ELSEWHERE)
     assert world.network.run(DEAD_S + 0.6, lambda: converter.attachment.is_attached)

@@ -42,7 +42,7 @@ class Collapse:
             (DomainPlan("home", ("s0", "s1", "s2")),),
             (Attachment("s1", "rib", "rib"), Attachment("s0", "proxy", "robot"), Attachment("s2", "proxy", "reader")),
         )
-        self.world = world = Simulation(topology=topology)
+        self.world = world = Simulation(topology=topology, keepalive_ms=None)
         assert world.run_until_attached()
         self.flows = {
             name: advertise(world, name, ROBOT, reliable=reliable, urgent=urgent)

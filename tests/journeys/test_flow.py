@@ -35,7 +35,7 @@ def test_a_cut_in_mid_flow_turns_the_traffic_and_loses_nothing() -> None:
 
 
 def test_a_link_that_dies_without_a_word_is_noticed_by_its_silence() -> None:
-    flow = flowing(ring())
+    flow = flowing(ring(keepalive_ms=None))
     flow.stream(100, 0.02)
     flow.world.network.call(1.0, lambda: setattr(flow.world.cables[LONG], "loss", 1.0))
     assert flow.world.network.run(10, lambda: flow.has(SERVER, 100))
@@ -189,7 +189,7 @@ def test_the_network_settles_with_loss_from_the_beginning() -> None:
 
 @pytest.mark.momentary("hellos have no lease of a name")
 def test_a_dead_neighbour_is_let_go_after_its_silence() -> None:
-    world = ring()
+    world = ring(keepalive_ms=None)
     world.network.stop("nuc3")
     world.network.run(DEAD_S + 0.5)
     assert all(n.name != world.identities["nuc3"].name for n in world.switches["nuc2"].hello_protocol.all_up())

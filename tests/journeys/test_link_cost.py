@@ -32,6 +32,7 @@ def diamond(seed: int = 1, left_s: float = 0.01, right_s: float = 0.01) -> Simul
             (Attachment("s4", "rib", "rib"), Attachment("s1", "proxy", "robot")),
         ),
         seed=seed,
+        keepalive_ms=None,
     )
     for a, b in CABLES:
         cable = world.cables[frozenset((a, b))]

@@ -1,23 +1,28 @@
-"""Two hundred switches in eight domains: they discover each other, and a message reaches its reader."""
+"""Many switches in eight domains: they discover each other, and a message reaches its reader."""
 
 from __future__ import annotations
 
 import random
 
+import pytest
+
 from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from tests.journeys.flows import flowing
 
-DOMAINS, SWITCHES = 8, 25
+DOMAINS = 8
 
 
-def wide(seed: int = 1) -> Topology:
+def wide(switches: int, seed: int = 1) -> Topology:
     """Return domains that are each a random tree with some more links, joined to the first and to some others.
+
+    Args:
+        switches: of each domain.
 
     The first is the tier above all the others; each has its RIB at its first switch, and a proxy at its last.
     """
     chance = random.Random(seed)
-    domains = [[f"d{domain}s{number}" for number in range(SWITCHES)] for domain in range(DOMAINS)]
+    domains = [[f"d{domain}s{number}" for number in range(switches)] for domain in range(DOMAINS)]
     joined: dict[frozenset[str], Link] = {}
 
     def join(a: str, b: str) -> None:
@@ -25,9 +30,9 @@ def wide(seed: int = 1) -> Topology:
             joined.setdefault(frozenset((a, b)), Link(a, b, chance.randint(5, 20)))
 
     for nodes in domains:
-        for number in range(1, SWITCHES):
+        for number in range(1, switches):
             join(nodes[number], nodes[chance.randrange(number)])
-        for _ in range(SWITCHES // 2):
+        for _ in range(switches // 2):
             join(chance.choice(nodes), chance.choice(nodes))
     for number in range(1, DOMAINS):
         for other in (0, chance.randrange(number)):
@@ -40,13 +45,14 @@ def wide(seed: int = 1) -> Topology:
     )
 
 
-def test_two_hundred_switches_settle_and_deliver() -> None:
-    world = Simulation(topology=wide(), hello_s=5.0, dead_s=18.0, lease_s=5.0)
-    assert len(world.switches) == 200
+@pytest.mark.parametrize("switches", [8, pytest.param(25, marks=pytest.mark.soak)])
+def test_up_to_two_hundred_switches_settle_and_deliver(switches: int) -> None:
+    world = Simulation(topology=wide(switches), hello_s=5.0, dead_s=18.0, lease_s=5.0, keepalive_ms=4_000)
+    assert len(world.switches) == DOMAINS * switches
     assert world.run_until_attached(30)
-    label = f"d{DOMAINS - 1}s{SWITCHES - 1}/proxy"
-    flow = flowing(world, source="d1s24/proxy", readers=(label, "d4s24/proxy"))
+    source, label, other = (f"d{domain}s{switches - 1}/proxy" for domain in (1, DOMAINS - 1, 4))
+    flow = flowing(world, source=source, readers=(label, other))
     flow.stream(20, 0.01)
-    assert world.network.run(10, lambda: flow.has(label, 20) and flow.has("d4s24/proxy", 20))
+    assert world.network.run(10, lambda: flow.has(label, 20) and flow.has(other, 20))
     assert flow.numbers(label) == list(range(20))
     flow.outlive()

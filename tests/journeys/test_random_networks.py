@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, Phase, example, given, settings
 
 from tests.journeys.networks import Fault, Plan, Trial, plans, short_leases
 
-TRIALS = int(os.environ.get("GDP_RANDOM_NETWORKS", "8"))
+TRIALS = int(os.environ.get("GDP_RANDOM_NETWORKS", "3"))
 # The path within a domain was longer than one through its neighbour, which sent back the frames that left.
 LOOPED_AT_A_BORDER = Plan(
     (9, 6, 6, 4), (0, 1, 1), (), (), (2, 3, 0, 0), (3, 0), frozenset({2}), (Fault(False, 0, 2.0),), seed=1

@@ -109,9 +109,10 @@ def radio(*, loss: float, reliable: bool = False, seed: int = 1, fec: bool = Tru
     return made
 
 
-def test_urgent_messages_survive_5_percent_of_loss_without_a_round_trip() -> None:
+@pytest.mark.parametrize("count", [4_000, pytest.param(20_000, marks=pytest.mark.soak)])
+def test_urgent_messages_survive_5_percent_of_loss_without_a_round_trip(count: int) -> None:
     made = radio(loss=0.05)
-    made.publish(20_000, 0.02)
+    made.publish(count, 0.02)
     assert len(made.late) <= 0.001 * made.sent
     assert len(set(made.came)) == len(made.came) >= 0.999 * made.sent
     assert made.came == sorted(made.came)

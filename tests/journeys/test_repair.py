@@ -24,7 +24,7 @@ DETECT_S = 0.21
 
 def square() -> Simulation:
     """Return four switches in a ring, with their alternates."""
-    world = Simulation(topology=SQUARE, lease_s=LEASE_S)
+    world = Simulation(topology=SQUARE, lease_s=LEASE_S, keepalive_ms=None)
     world.network.run(3.0)
     return world
 
