@@ -31,12 +31,12 @@ PROJECT: Final = Path(__file__).parents[1]
 SHARED: Final = PROJECT.parent / "shared" / "data" / "bags"
 RECORDINGS: Final = (
     "tilt_laser.bag",
-    "rosbag2_test",
-    "ros_numpy_test.bag",
-    "event_camera.bag",
+    pytest.param("rosbag2_test", marks=pytest.mark.soak),
+    pytest.param("ros_numpy_test.bag", marks=pytest.mark.soak),
+    pytest.param("event_camera.bag", marks=pytest.mark.soak),
     "ninety_four_types.mcap",
-    "turtlesim.bag",
-    "aruco_compressed.bag",
+    pytest.param("turtlesim.bag", marks=pytest.mark.soak),
+    pytest.param("aruco_compressed.bag", marks=pytest.mark.soak),
 )
 PATIENCE_S: Final = 240
 LASTING: Final = ("--seconds", 7, "--lease", LEASE_S)  # past three leases
@@ -193,7 +193,9 @@ def test_a_recording_of_a_real_robot_crosses(recording: str, tmp_path: Path) -> 
 
 
 @pytest.mark.momentary(FAST)
-@pytest.mark.parametrize("recording", ["ninety_four_types.mcap", "tilt_laser.bag"])
+@pytest.mark.parametrize(
+    "recording", ["ninety_four_types.mcap", pytest.param("tilt_laser.bag", marks=pytest.mark.soak)]
+)
 def test_with_cdr_the_very_bytes_cross(recording: str, tmp_path: Path) -> None:
     if not (SHARED / recording).exists():
         pytest.skip(f"{SHARED} is not there")

@@ -29,7 +29,12 @@ run() {
     fi
 }
 
-[[ ${1:-} != --soak ]] || set -- -m soak "${@:2}"
+if [[ ${1:-} == --soak ]]; then
+    GDP_RANDOM_NETWORKS=8 GDP_RANDOM_LINKS=4 GDP_INSIDERS=3 \
+        run tests/journeys/test_random_{networks,links}.py tests/insiders/test_insiders.py "${@:2}"
+    run -m soak "${@:2}"
+    exit
+fi
 if [[ $# -gt 0 ]]; then
     run "$@"
     exit

@@ -6,6 +6,9 @@ A query is repeated until a response comes. A name that attached readers want, o
 its query is sent again before the watch ends, so that a RIB that restarted learns of the watch. A link that loses
 frames loses both this renewal and the RIB's updates, so the renewal is repeated, too. Queries for new names pass the
 query window (``query_window.py``).
+
+An answer may leave the frames of a name where they are: its node was attached here, is silent, and the RIB does not
+know yet. They ask again, so a query follows the one before after ``RETRY_S`` at the soonest, answered or not.
 """
 
 from __future__ import annotations
@@ -34,6 +37,7 @@ class _Query:
     due_s: float  # ``_NEVER_S`` while it waits for the window
     since_s: float
     owner: bytes = b""  # the neighbour whose share it uses
+    sent_s: float = -_NEVER_S
     tries: int = 0
     is_watch: bool = False  # an attached reader needs all advertisers of the name
     used_until_s: float = 0.0  # frames are sent to the name
@@ -66,7 +70,7 @@ class NameQueries:
         return name in self._queries
 
     def request(self, name: Name, now_s: float, owner: bytes = b"") -> None:
-        """Query a name unless a query is open; a query with a response is sent again at once.
+        """Query a name unless a query is open; a query with a response is sent again, ``RETRY_S`` after the last time.
 
         Nothing happens where ``QUERIES_MAX`` are open: ``name in queries`` stays False.
 
@@ -79,8 +83,9 @@ class NameQueries:
                 self._queries[name] = _Query(due_s=_NEVER_S, since_s=now_s, owner=owner)
                 self._window.put(owner, name)
         elif query.is_answered:
-            query.is_answered, query.tries, query.renewals, query.due_s = False, 0, 0, now_s
-            self._due_s = min(self._due_s, now_s)
+            query.is_answered, query.tries, query.renewals = False, 0, 0
+            query.due_s = max(now_s, query.sent_s + RETRY_S)
+            self._due_s = min(self._due_s, query.due_s)
 
     def is_open(self, name: Name) -> bool:
         """Return whether a query for a name has no response yet."""
@@ -188,7 +193,7 @@ class NameQueries:
 
     def _sent(self, query: _Query, now_s: float) -> float:
         """Record one try of a query; return for how many seconds the RIB shall watch its name."""
-        query.tries += 1
+        query.tries, query.sent_s = query.tries + 1, now_s
         if query.is_answered:
             query.due_s = now_s + self._repeat_s(query)
         else:

@@ -84,8 +84,8 @@ MOVES = {
 }
 
 
-@pytest.mark.parametrize("who", [A, C])
 @pytest.mark.parametrize("moves", MOVES.values(), ids=MOVES)
+@pytest.mark.parametrize("who", [A, pytest.param(C, marks=pytest.mark.soak)])
 def test_a_node_that_moves_keeps_every_flow(who: str, moves: list[str]) -> None:
     world = sites()
     there, back = flowing(world, source=A, readers=(C,)), flowing(world, "/answers", C, (A,))

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import pytest
 
 import gdp
 from gdp.errors import LocalError
+from gdp.frame.codec import ETHER_BYTES, decode
+from gdp.frame.kinds import Kind
 from gdp.names import Name
 from gdp.service.replication import ALL, Mode
 from gdp.session.client_core import Call
@@ -60,8 +64,11 @@ def test_a_running_call_outlives_a_silence_of_its_only_server(replicas: Simulate
     assert replicas.run(5.0, lambda: bool(server.turns))
     lead = replicas.world.leads["s/edge"]
     lead.loss = 1.0
+    kinds = Counter[int]()
+    replicas.world.network.taps.append(lambda _, __, ___, frame: kinds.update((decode(frame[ETHER_BYTES:]).kind,)))
     replicas.run(outage_s)
     assert not call.is_done
+    assert kinds[Kind.RIB_REQUEST] <= 20 * outage_s
     lead.loss = 0.0
     respond(replicas, server, "edge", b"y")
     assert replicas.run(10.0, lambda: call.is_done)

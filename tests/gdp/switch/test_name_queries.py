@@ -68,6 +68,17 @@ def test_a_request_repeats_a_query_that_was_answered() -> None:
     assert polled(queries, 1.0) == [(TOPIC, queries.watch_s)]
 
 
+def test_requests_that_no_answer_satisfies_make_one_query_in_each_pause() -> None:
+    queries, now_s, sent = NameQueries(), 0.0, 0
+    queries.watch(TOPIC, now_s)
+    while now_s < 40 * RETRY_S:
+        sent += len(polled(queries, now_s))
+        queries.receive_answer(TOPIC, now_s)
+        queries.request(TOPIC, now_s)
+        now_s += RETRY_S / 100
+    assert 38 <= sent <= 41
+
+
 def test_a_used_name_is_watched_for_a_while_and_then_queried_no_more() -> None:
     queries = NameQueries()
     queries.use(TOPIC, 0.0)
