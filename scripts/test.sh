@@ -41,19 +41,18 @@ if [[ $# -gt 0 ]]; then
 fi
 # Tests with namespaces mostly wait for processes, so two lanes of equal length run in parallel. A failed test runs once
 # more alone, to distinguish an unsteady test from a broken one. Both fail the run, unless tests/quarantine.yaml lists the test.
-clusters=(netns_tests/test_{bench_replicas,experiments,fog,fog_demo,leaving,local_provider,replica_gateway}.py)
-declare -A lanes=(["clusters"]="tests ${clusters[*]}" ["spaces"]="netns_tests ${clusters[*]/#/--ignore=}")
+declare -A lanes=(["logic"]="tests" ["spaces"]="netns_tests")
 # lane <name> <report> <argument>...: runs the tests of a lane and writes a JUnit file
 # shellcheck disable=SC2086  # words
 lane() { run -m "not soak" -o "cache_dir=.pytest_cache/$1" --junit-xml "$scratch/$1.$2.xml" ${lanes[$1]} "${@:3}"; }
-lane clusters first >"$scratch/clusters.log" 2>&1 &
+lane logic first >"$scratch/logic.log" 2>&1 &
 others=$!
 trap 'kill "$others" 2>/dev/null || true; exit 130' INT TERM
 failed=()
 declare -A ended=()
 lane spaces first || { ended[spaces]=$?; failed+=(spaces); }
-wait "$others" || { ended[clusters]=$?; failed+=(clusters); }
-cat "$scratch/clusters.log"
+wait "$others" || { ended[logic]=$?; failed+=(logic); }
+cat "$scratch/logic.log"
 status=0
 for which in "${failed[@]}"; do
     if [[ ${ended[$which]} -ne 1 ]]; then

@@ -7,8 +7,8 @@ its query is sent again before the watch ends, so that a RIB that restarted lear
 frames loses both this renewal and the RIB's updates, so the renewal is repeated, too. Queries for new names pass the
 query window (``query_window.py``).
 
-An answer may leave the frames of a name where they are: its node was attached here, is silent, and the RIB does not
-know yet. They ask again, so a query follows the one before after ``RETRY_S`` at the soonest, answered or not.
+An answer may not help the frames that wait: the node was attached here and is silent, which the RIB does not know yet.
+They ask again. So a query follows the one before after ``RETRY_S`` at the soonest, answered or not.
 """
 
 from __future__ import annotations
