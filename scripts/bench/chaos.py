@@ -317,10 +317,13 @@ def run_seed(runs: RunRegistry, seed: int, options: Options) -> list[str]:
     kinds = [SHORT[name] for name in options.only] if options.only else None
     in_store = _in_store(plan, seed, is_wanted=options.cluster)
     faults = make_schedule(plan, seed, options.seconds, pace_s=options.pace_s, kinds=kinds, has_store=bool(in_store))
+    more = {"switch": {"keepalive_ms": options.keepalive_ms}} if options.keepalive_ms else {}
     begun_s = time.monotonic()
     with (
         new_run(runs) as run,
-        Overlay(run, plan, plane=options.plane, has_clocks=True, has_disk=True, in_store=in_store) as overlay,
+        Overlay(
+            run, plan, plane=options.plane, has_clocks=True, has_disk=True, in_store=in_store, more=more
+        ) as overlay,
     ):
         overlay.start_all()
         progress(f"seed {seed}: {len(plan.switches)} switches, {len(plan.ribs)} RIBs, {len(plan.members)} members up")
@@ -424,6 +427,11 @@ def main() -> None:
     )
     parser.add_argument("--one-rib", action="store_true", help="one RIB in each domain")
     parser.add_argument("--plane", default="auto", help="as gdp-switch --data-plane (default: %(default)s)")
+    parser.add_argument(
+        "--keepalive-ms",
+        type=int,
+        help="of switches; longer ones leave a slow machine more time (default: that of gdp-switch)",
+    )
     parser.add_argument("--logs", type=Path, help="a folder to copy the logs of a failed run to")
     options = parser.parse_args()
     broken: list[int] = []
