@@ -295,7 +295,7 @@ def with_door(sites: Sites, *, expose: Sequence[str], imports: Sequence[str]) ->
 
 
 def received(sites: Sites, client: ClientConnection) -> str | bytes:
-    """Return the next message of a client, while virtual time goes on."""
+    """Return the next message of a client, while virtual time passes."""
     end_s = time.monotonic() + PATIENCE_S
     while True:
         try:
