@@ -30,11 +30,10 @@ run() {
 }
 
 if [[ ${1:-} == --soak ]]; then
-    status=0
     GDP_RANDOM_NETWORKS=8 GDP_RANDOM_LINKS=4 GDP_INSIDERS=3 \
         run tests/journeys/test_random_{networks,links}.py tests/insiders/test_insiders.py "${@:2}" || status=1
     run -m soak "${@:2}" || status=1
-    exit "$status"
+    exit "${status:-0}"
 fi
 if [[ $# -gt 0 ]]; then
     run "$@"
