@@ -16,9 +16,8 @@ import gdp
 from gdp.cli.machine import say
 from gdp.errors import LocalError
 
-__all__ = ["ANY_ARGUMENTS", "demo"]
+__all__ = ["demo"]
 
-ANY_ARGUMENTS: Final = {"ignore_unknown_options": True, "allow_extra_args": True}
 _SECONDS: Final = 5.0
 _PICTURE: Final = """\
    domain school                                 domain cloud

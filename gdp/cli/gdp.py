@@ -7,37 +7,68 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar, Final
 
 import typer
 
-from gdp.cli import audit, cert, control, delegate, domain, doors, extension, key, keygen, rib_lookup, service, topic
-from gdp.cli.completion import allow_completion, completion
-from gdp.cli.dashboard import dashboard
-from gdp.cli.decrypt_pcap import decrypt_pcap
-from gdp.cli.demo import ANY_ARGUMENTS, demo
-from gdp.cli.endpoints import endpoints
-from gdp.cli.explain import explain
+from gdp.cli import extension
+from gdp.cli.completion import allow_completion
 from gdp.cli.extension import ExtendedGroup
-from gdp.cli.join import agent, join, up
-from gdp.cli.lab import lab
-from gdp.cli.name import name
-from gdp.cli.ping import ping
-from gdp.cli.share import expose, import_names, share
-from gdp.cli.show_tables import show_table
-from gdp.cli.top import top
-from gdp.cli.trace import trace
+from gdp.cli.lazy_commands import LazyCommand, LazyCommands
 from gdp.cli.version import HELP, Version, versioned
-from gdp.cli.wireshark import wireshark
 from gdp.errors import GdpError
 
 __all__ = ["app", "main"]
+
+
+_DEMO: Final = {"ignore_unknown_options": True, "allow_extra_args": True}
+_KNOWN: Final = {
+    "name": LazyCommand("gdp.cli.name:name"),
+    "lab": LazyCommand("gdp.cli.lab:lab"),
+    "endpoints": LazyCommand("gdp.cli.endpoints:endpoints"),
+    "join": LazyCommand("gdp.cli.join:join"),
+    "up": LazyCommand("gdp.cli.join:up"),
+    "agent": LazyCommand("gdp.cli.join:agent"),
+    "expose": LazyCommand("gdp.cli.share:expose"),
+    "import": LazyCommand("gdp.cli.share:import_names"),
+    "share": LazyCommand("gdp.cli.share:share"),
+    "reload": LazyCommand("gdp.cli.control:reload"),
+    "status": LazyCommand("gdp.cli.control:status"),
+    "drain": LazyCommand("gdp.cli.control:drain"),
+    "explain": LazyCommand("gdp.cli.explain:explain"),
+    **{
+        door: LazyCommand(f"gdp.cli.doors:{door}", no_args_is_help=False, settings=extension.ANY_ARGUMENTS)
+        for door in ("foxglove", "rosbridge", "rule", "watch")
+    },
+    "ping": LazyCommand("gdp.cli.ping:ping"),
+    "trace": LazyCommand("gdp.cli.trace:trace"),
+    "show": LazyCommand("gdp.cli.show_tables:show_table"),
+    "dashboard": LazyCommand("gdp.cli.dashboard:dashboard", no_args_is_help=False),
+    "wireshark": LazyCommand("gdp.cli.wireshark:wireshark", no_args_is_help=False),
+    "demo": LazyCommand("gdp.cli.demo:demo", no_args_is_help=False, settings=_DEMO),
+    "decrypt-pcap": LazyCommand("gdp.cli.decrypt_pcap:decrypt_pcap"),
+    "top": LazyCommand("gdp.cli.top:top", no_args_is_help=False),
+    "completion": LazyCommand("gdp.cli.completion:completion"),
+    "keygen": LazyCommand("gdp.cli.keygen:app"),
+    "key": LazyCommand("gdp.cli.key:app"),
+    "domain": LazyCommand("gdp.cli.domain:app"),
+    "cert": LazyCommand("gdp.cli.cert:app"),
+    "delegate": LazyCommand("gdp.cli.delegate:app"),
+    "audit": LazyCommand("gdp.cli.audit:app"),
+    "topic": LazyCommand("gdp.cli.topic:app"),
+    "service": LazyCommand("gdp.cli.service:app"),
+    "rib": LazyCommand("gdp.cli.rib_lookup:app"),
+}
 
 
 class _Commands(ExtendedGroup):
     extensions: ClassVar[Mapping[str, str]] = {
         each: f"proxy.cli.{each}" for each in ("foxglove", "rosbridge", "rule", "watch")
     }
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.commands = LazyCommands(_KNOWN)
 
 
 app = typer.Typer(
@@ -54,39 +85,6 @@ app = typer.Typer(
 @app.callback()
 def _gdp(version: Version = False) -> None:
     del version  # the option's callback ends the command
-
-
-app.command("name", no_args_is_help=True)(name)
-app.command("lab", no_args_is_help=True)(lab)
-app.command("endpoints", no_args_is_help=True)(endpoints)
-for member_command in (join, up, agent):
-    app.command(member_command.__name__, no_args_is_help=True)(member_command)
-app.command("expose", no_args_is_help=True)(expose)
-app.command("import", no_args_is_help=True)(import_names)
-app.command("share", no_args_is_help=True)(share)
-for command in (control.reload, control.status, control.drain):
-    app.command(command.__name__, no_args_is_help=True)(command)
-app.command("explain", no_args_is_help=True)(explain)
-for door in (doors.foxglove, doors.rosbridge, doors.rule, doors.watch):
-    app.command(door.__name__, context_settings=extension.ANY_ARGUMENTS)(door)
-app.command("ping", no_args_is_help=True)(ping)
-app.command("trace", no_args_is_help=True)(trace)
-app.command("show", no_args_is_help=True)(show_table)
-app.command("dashboard")(dashboard)
-app.command("wireshark")(wireshark)
-app.command("demo", context_settings=ANY_ARGUMENTS)(demo)
-app.command("decrypt-pcap", no_args_is_help=True)(decrypt_pcap)
-app.add_typer(keygen.app, name="keygen")
-app.add_typer(key.app, name="key")
-app.add_typer(domain.app, name="domain")
-app.add_typer(cert.app, name="cert")
-app.add_typer(delegate.app, name="delegate")
-app.add_typer(audit.app, name="audit")
-app.add_typer(topic.app, name="topic")
-app.add_typer(service.app, name="service")
-app.add_typer(rib_lookup.app, name="rib")
-app.command("top")(top)
-app.command("completion", no_args_is_help=True)(completion)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -13,7 +13,7 @@ from typer.main import get_command
 
 import gdp
 
-__all__ = ["HELP", "Version", "versioned"]
+__all__ = ["HELP", "Version", "versioned", "with_version"]
 
 HELP: Final = {"help_option_names": ["-h", "--help"]}  # context settings; sub-commands inherit them
 
@@ -29,9 +29,14 @@ Version = Annotated[
 ]
 
 
-def versioned(app: typer.Typer) -> Callable[..., object]:
+def versioned(app: typer.Typer) -> Callable[..., Any]:
     """Return the command of an application, with the option ``--version`` on every sub-command."""
-    command, option = get_command(app), _option()
+    return with_version(get_command(app))
+
+
+def with_version(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a command with the option ``--version`` on it and on all below it that are loaded."""
+    option = _option()
     for each in _all_of(command):
         if not any("--version" in param.opts for param in each.params):
             each.params.append(option)
@@ -53,5 +58,6 @@ def _option() -> Any:
 
 def _all_of(command: Any) -> Iterator[Any]:
     yield command
-    for each in getattr(command, "commands", {}).values():
+    commands = getattr(command, "commands", {})
+    for each in getattr(commands, "loaded", commands).values():  # lazy ones get the option when they are loaded
         yield from _all_of(each)

@@ -115,8 +115,8 @@ class Paths:
     def is_only_way(self, neighbour: Name) -> bool:
         """Return whether the link between them alone joins this switch and a neighbour, as far as is known."""
         self._refresh()
-        if self._graph is None or neighbour not in self._graph:
-            return True
+        if self._graph is None or self._me not in self._graph or neighbour not in self._graph:
+            return True  # a switch that has just started knows others before its own first link is in the graph
         from networkx import has_path, restricted_view
 
         return not has_path(restricted_view(self._graph, (), ((self._me, neighbour),)), self._me, neighbour)

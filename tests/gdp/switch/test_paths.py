@@ -52,6 +52,16 @@ def test_a_link_is_the_only_way_unless_another_one_leads_to_the_neighbour() -> N
     assert row.is_only_way(name("a member, which is no switch"))
 
 
+def test_a_border_that_has_just_started_knows_of_no_other_way() -> None:
+    """Links of other domains are known, and of its own there is none that both ends list."""
+    beyond = (
+        state("x", link("a", 50, HOME), link("t", 5, THIRD), domain=AWAY, scope=Scope.BORDER),
+        state("t", link("x", 5, AWAY), domain=THIRD, scope=Scope.BORDER),
+    )
+    assert paths("a", *beyond).is_only_way(name("x"))
+    assert paths("a", state("a"), *beyond).is_only_way(name("x"))
+
+
 def test_a_domain_that_is_not_allowed_is_gone_around() -> None:
     found = three_domains()
     assert found.to_switch(name("x"), AWAY, ALL) == Path(name("t"), 10)

@@ -1,0 +1,96 @@
+"""Commands whose modules are imported when they are used: a program that has forty starts as fast as one that has one.
+
+I/O: imports modules. Source: click's documentation, "Lazily loading subcommands".
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator, Mapping, MutableMapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import typer
+from typer.main import get_command, get_group
+
+from gdp.cli.version import with_version
+
+__all__ = ["LazyCommand", "LazyCommands"]
+
+
+@dataclass(frozen=True, slots=True)
+class LazyCommand:
+    """Where a command is.
+
+    Attributes:
+        target: ``module:attribute``; the attribute is a function, or an application with commands of its own.
+        no_args_is_help: whether a function without arguments prints its help.
+        settings: of the context of a function.
+    """
+
+    target: str
+    no_args_is_help: bool = True
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def import_as(self, name: str) -> Any:
+        """Return the command, named ``name``, with the option ``--version`` on it and on all below it."""
+        module, _, attribute = self.target.partition(":")
+        found = getattr(importlib.import_module(module), attribute)
+        command: Any
+        if isinstance(found, typer.Typer):
+            command = get_group(found)
+        else:
+            only = typer.Typer(add_completion=False)
+            only.command(name, no_args_is_help=self.no_args_is_help, context_settings=dict(self.settings))(found)
+            command = get_command(only)
+        command.name = name
+        return with_version(command)
+
+
+class LazyCommands(MutableMapping[str, Any]):
+    """Commands of a group by name, in the order of its help; each is loaded when it is first read.
+
+    Args:
+        known: where each is.
+
+    Attributes:
+        loaded: those that were read.
+    """
+
+    def __init__(self, known: Mapping[str, LazyCommand]) -> None:
+        self._known = dict(known)
+        self.loaded: dict[str, Any] = {}
+
+    def __getitem__(self, name: str) -> Any:
+        """Return a command.
+
+        Raises:
+            KeyError: there is none of that name.
+        """
+        if name not in self.loaded:
+            self.loaded[name] = self._known[name].import_as(name)
+        return self.loaded[name]
+
+    def __setitem__(self, name: str, command: Any) -> None:
+        """Add or replace a command."""
+        self.loaded[name] = command
+
+    def __delitem__(self, name: str) -> None:
+        """Remove a command."""
+        if name not in self:
+            raise KeyError(name)
+        self._known.pop(name, None)
+        self.loaded.pop(name, None)
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether there is such a command, without a load."""
+        return name in self._known or name in self.loaded
+
+    def __iter__(self) -> Iterator[str]:
+        """Yield the names."""
+        yield from self._known
+        yield from (each for each in self.loaded if each not in self._known)
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return sum(1 for _ in self)
