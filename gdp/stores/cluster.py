@@ -2,8 +2,9 @@
 
 I/O; blocking, with short time limits (``cluster_link.py``). One round trip for each primary fetches the routes that the
 core needs for one turn, and one more sends what it wrote. A function on the server decides whether an advertisement is
-newer, so RIBs that write at the same time agree. Leases are the expiry of keys; a change is published on the channel of
-its slot. Data from the cluster is verified like data from a peer: the store must be available, but is not trusted.
+newer, so RIBs that write at the same time agree. Leases are the expiry of keys by the servers' clock, so the clock of
+one RIB ends none. A change is published on the channel of its slot. Data from the cluster is verified like data from a
+peer: the store must be available, but is not trusted.
 """
 
 from __future__ import annotations
@@ -100,10 +101,12 @@ class ClusterStore:
         """
         self._now = now
         wanted = [name for name in dict.fromkeys(names) if name not in self._cache]
-        replies = self._link.execute([(tag_of(name), (b"GET", _routes_key(name))) for name in wanted])
+        replies = self._link.execute(
+            [(tag_of(name), (b"FCALL", b"gdp_rib_get", 1, _routes_key(name))) for name in wanted]
+        )
         for name, reply in zip(wanted, replies, strict=True):
-            if not isinstance(reply, StoreError | LocalError):
-                self._keep(name, self._decoded(name, reply if isinstance(reply, bytes) else b""))
+            if isinstance(reply, list) and (present_ms := _code(reply)) is not None and isinstance(reply[1], bytes):
+                self._keep(name, self._decoded(name, reply[1], present_ms))
 
     def routes(self, name: Name) -> list[Route]:
         """Return a name's routes."""
@@ -266,24 +269,24 @@ class ClusterStore:
         context_id = blake2b(context, digest_size=_ID_BYTES).digest()
         squeeze = zlib.compressobj(6, zlib.DEFLATED, -15, zdict=context)
         data = context_id + squeeze.compress(route.advertisement) + squeeze.flush()
-        end_ms = int((self._now.unix_s + route.expires_s - self._now.mono_s) * 1_000)
+        left_ms = max(int((route.expires_s - self._now.mono_s) * 1_000), 0)
         keys = (_routes_key(route.name), _sequence_key(route.name, route.advertiser), _context_key(tag, context_id))
         sequence = min(route.sequence, _SEQUENCE_MAX).to_bytes(8, "big")
         command: Command = (
-            *(b"FCALL", b"gdp_rib_put", 3, *keys, bytes(route.advertiser), sequence, end_ms, data),
+            *(b"FCALL", b"gdp_rib_put", 3, *keys, bytes(route.advertiser), sequence, left_ms, data),
             *(route.valid_until_unix_s * 1_000, b"", tag, self._me + route.name),
         )
         return _Write((route.name, route.advertiser), route.sequence, tag, command, context)
 
-    def _decoded(self, name: Name, value: bytes) -> dict[Name, Route]:
-        """Return the valid routes in a value; invalid ones are counted."""
+    def _decoded(self, name: Name, value: bytes, present_ms: int) -> dict[Name, Route]:
+        """Return the valid routes in a value, read at a time of the server's clock; invalid ones are counted."""
         routes: dict[Name, Route] = {}
         at = 0
         while at + _RECORD_BYTES <= len(value):
             end_ms = int.from_bytes(value[at + 40 : at + 48], "big")
             stop = at + _RECORD_BYTES + int.from_bytes(value[at + 48 : at + _RECORD_BYTES], "big")
             try:
-                route = self._route(name, value[at + _RECORD_BYTES : stop], end_ms / 1_000)
+                route = self._route(name, value[at + _RECORD_BYTES : stop], (end_ms - present_ms) / 1_000)
                 if route.expires_s > self._now.mono_s:
                     routes[route.advertiser] = route
             except RemoteError as error:
@@ -291,7 +294,7 @@ class ClusterStore:
             at = stop
         return routes
 
-    def _route(self, name: Name, data: bytes, end_unix_s: float) -> Route:
+    def _route(self, name: Name, data: bytes, left_s: float) -> Route:
         context = self._context(tag_of(name), data[:_ID_BYTES])
         try:
             advertisement_wire = zlib.decompressobj(-15, zdict=context).decompress(data[_ID_BYTES:], 1 << 16)
@@ -310,7 +313,7 @@ class ClusterStore:
             domain=fields.name("d"),
             via=fields.name("v"),
             transit=tuple(fields.names("x", 64)),
-            expires_s=self._now.mono_s + min(end_unix_s - self._now.unix_s, advertisement.lease_s),
+            expires_s=self._now.mono_s + min(left_s, advertisement.lease_s),
         )
 
     def _context(self, tag: bytes, context_id: bytes) -> bytes:

@@ -41,11 +41,18 @@ local function store(key, records, latest)
   end
 end
 
+-- KEYS: routes of the name. Returns {present (ms), records}: what is left of a lease does not depend on the clock of a RIB.
+local function get(keys)
+  return {now_ms(), redis.call('GET', keys[1]) or ''}
+end
+
 -- KEYS: routes of the name, highest sequence, shared context.
--- ARGV: advertiser, sequence, end of lease (ms), data, end of evidence (ms), context or empty, channel, message
+-- ARGV: advertiser, sequence, lease from now on (ms), data, end of evidence (ms), context or empty, channel, message
 -- Returns {1, sequence} if stored, {0, sequence} if the stored route is newer, {2, sequence} if the context is missing.
 local function put(keys, argv)
-  local advertiser, sequence, ends, data, until_ms = argv[1], argv[2], tonumber(argv[3]), argv[4], argv[5]
+  local advertiser, sequence, data, until_ms = argv[1], argv[2], argv[4], argv[5]
+  local now = now_ms()
+  local ends = now + tonumber(argv[3])
   local held = redis.call('GET', keys[2])
   if held and is_below(sequence, held) then
     return {0, held}
@@ -57,7 +64,7 @@ local function put(keys, argv)
   else
     redis.call('PEXPIREAT', keys[3], until_ms, 'GT')
   end
-  local records, latest, own, own_ends = others(redis.call('GET', keys[1]), advertiser, now_ms())
+  local records, latest, own, own_ends = others(redis.call('GET', keys[1]), advertiser, now)
   if held == sequence then
     if own ~= data then
       return {0, held}
@@ -85,5 +92,6 @@ local function withdraw(keys, argv)
   return {1, argv[2]}
 end
 
+redis.register_function{function_name = 'gdp_rib_get', callback = get, flags = {'no-writes'}}
 redis.register_function('gdp_rib_put', put)
 redis.register_function('gdp_rib_withdraw', withdraw)

@@ -109,13 +109,14 @@ class TestEveryStore:
         assert [each.refused for each in acks(pair.give(pair.two, pair.site.relay("/a", 1)))] != [None]
 
     def test_a_lease_ends_at_both(self, pair: Pair) -> None:
-        pair.give(pair.one, pair.site.relay("/a", 1, lease_s=5.0))
+        pair.give(pair.one, pair.site.relay("/a", 1, lease_s=2.0))
         pair.sync()
-        assert len(answers(pair.give(pair.two, pair.site.query("/a"), 4.0))) == 1
+        assert len(answers(pair.give(pair.two, pair.site.query("/a"), 1.0))) == 1
+        pair.wait_until(3.1)
         for rib in (pair.one, pair.two):
-            rib.handle_timer(pair.site.now(5.1))
+            rib.handle_timer(pair.site.now(3.1))
             pair.take(rib)
-        assert [each.is_negative for each in answers(pair.give(pair.two, pair.site.query("/a"), 5.1))] == [True]
+        assert [each.is_negative for each in answers(pair.give(pair.two, pair.site.query("/a"), 3.1))] == [True]
 
 
 def test_peers_forget_a_withdrawal_when_the_advertisement_can_be_proven_no_more() -> None:
@@ -159,6 +160,27 @@ def test_a_snapshot_keeps_no_withdrawal_for_longer_than_the_rib(tmp_path: Path) 
         with contextlib.closing(sqlite3.connect(path)) as database:
             rows.append(database.execute("SELECT count(*) FROM entries").fetchone()[0])
     assert rows == [3, 0]
+
+
+@pytest.mark.parametrize("ahead_s", [300.0, -300.0])
+def test_the_clock_of_one_rib_ends_no_lease_and_prolongs_none(servers: Path, ahead_s: float) -> None:
+    pair = ClusterPair(Site(), config_of(servers))
+    site = pair.site
+
+    def ask(rib: RibCore, wire: bytes, at: Timestamps) -> list[bool]:
+        rib.receive_all([(wire, site.switch.name)], at)
+        return [each.is_negative for each in answers(pair.take(rib))]
+
+    wrong = Timestamps(site.now().mono_s, site.unix_s + ahead_s)
+    pair.give(pair.one, site.relay("/read", 1))
+    assert ask(pair.two, site.query("/read"), wrong) == [False]
+    pair.two.receive_all([(site.relay("/written", 1, lease_s=2.0), site.switch.name)], wrong)
+    assert [each.refused for each in acks(pair.take(pair.two))] == [None]
+    assert ask(pair.one, site.query("/written"), site.now()) == [False]
+    pair.wait_until(3.0)
+    pair.stores[0]._cache.clear()
+    assert ask(pair.one, site.query("/written"), site.now(3.0)) == [True]
+    pair.close()
 
 
 def test_of_two_writes_at_once_the_newer_wins_and_the_other_is_not_confirmed(servers: Path) -> None:
