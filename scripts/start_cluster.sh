@@ -76,7 +76,8 @@ make_users() {
     local user
     for user in rib replica admin; do openssl rand -hex 24 >"$dir/$user.password"; done
     {
-        echo "user default off"
+        # With these rights, which no connection gets, a server reads back what functions wrote (valkey issue 3983).
+        echo "user default off ~* -@all +@write"
         echo "user rib on >$(<"$dir/rib.password") ~* &* -@all +@read +@write +@pubsub +@connection +@transaction" \
             "+fcall +function|load +cluster|slots +time -@dangerous"
         echo "user replica on >$(<"$dir/replica.password") +psync +replconf +ping"
