@@ -30,6 +30,8 @@ pytestmark = [
 TOPIC, SERVICE = "flow", "plan"
 PATIENCE_S = 60.0
 OUTAGE_S = 10.0  # longer than the timers of neighbours, trees and readers
+RATE = 100  # messages a second
+UNREAD = round(4 * OUTAGE_S * RATE)  # the test does not read during the outage
 
 
 @dataclass(slots=True)
@@ -54,8 +56,8 @@ class Field:
         return request.payload
 
     def publish(self) -> None:
-        """Publish numbers, a hundred a second, until the end."""
-        while not self.over.wait(0.01):
+        """Publish numbers at a rate until the end."""
+        while not self.over.wait(1 / RATE):
             self.publisher.put(self.published.to_bytes(8, "big"))
             self.published += 1
 
@@ -86,7 +88,7 @@ def roamer(laboratory: Laboratory) -> Iterator[Field]:
         rights = {TOPIC: [Right.PUBLISH], SERVICE: [Right.CALL]}, {TOPIC: [Right.READ], SERVICE: [Right.SERVE]}
         nodes = [overlay.add_node(host, given) for host, given in zip((robot, server), rights, strict=True)]
         with overlay.open_session(robot, nodes[0]) as caller, overlay.open_session(server, nodes[1]) as callee:
-            subscription = callee.subscribe(TOPIC)
+            subscription = callee.subscribe(TOPIC, queue=UNREAD)
             made = Field(laboratory, robot, caller, caller.publisher(TOPIC), subscription)
             callee.serve(SERVICE, made.serve)
             made.publisher.wait_for_readers(timeout_s=PATIENCE_S)
@@ -118,6 +120,7 @@ def test_a_running_call_and_a_topic_outlive_changes_of_the_address_and_a_dead_ac
         assert call.result(PATIENCE_S).payload == b"a long plan"
     roamer.over.set()
     roamer.read_until(roamer.published - 1)
+    assert (roamer.subscription.lost, roamer.subscription.dropped) == (0, 0)
     assert roamer.read == list(range(len(roamer.read)))  # nothing lost, nothing twice
     assert roamer.requests == [b"a long plan"]
 
