@@ -70,6 +70,11 @@ class ClusterUpkeep:
     def work(self, now: Timestamps) -> None:
         """Report the changes of other RIBs, and maintain the connections."""
         self._link.keep_alive(now.mono_s)
+        if self._cluster.lacks_functions:
+            self._cluster.lacks_functions = False
+            if self.is_complete:
+                log.warning("cluster incomplete; a primary lacks the RIB's functions")
+            self.is_complete = False
         if not self.is_complete and now.mono_s >= self._load_at_s:
             self._complete(now.mono_s)
         if self._rib is not None:

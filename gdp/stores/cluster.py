@@ -40,6 +40,7 @@ _ID_BYTES: Final = 16
 _RECORD_BYTES: Final = NAME_BYTES + 8 + 8 + 4
 _SEQUENCE_MAX: Final = (1 << 64) - 1
 _KEPT, _NEWER, _NO_CONTEXT = 1, 0, 2
+_NO_FUNCTION: Final = "Function not found"
 
 
 def load_functions(link: ClusterLink) -> bool:
@@ -75,6 +76,9 @@ class ClusterStore:
 
     Args:
         verifier: of the RIB: every route is verified when it is read, before it is used.
+
+    Attributes:
+        lacks_functions: a primary said that it has no functions; ``load_functions`` brings them.
     """
 
     def __init__(self, link: ClusterLink, verifier: AdvertisementVerifier) -> None:
@@ -90,6 +94,7 @@ class ClusterStore:
         self._owners: dict[Name, dict[int, float]] = {}  # ends of leases, by sender and by advertiser
         self.refusals: Counter[DropReason] = Counter()  # invalid records that were read, by reason
         self.digests = None
+        self.lacks_functions = False
 
     def __len__(self) -> int:
         return sum(map(len, self._cache.values()))
@@ -107,6 +112,8 @@ class ClusterStore:
         for name, reply in zip(wanted, replies, strict=True):
             if isinstance(reply, list) and (present_ms := _code(reply)) is not None and isinstance(reply[1], bytes):
                 self._keep(name, self._decoded(name, reply[1], present_ms))
+            else:
+                self._note_failure(reply)
 
     def routes(self, name: Name) -> list[Route]:
         """Return a name's routes."""
@@ -168,6 +175,7 @@ class ClusterStore:
                 self._set_minimum(write.key, Withdrawn(write.key[1], held, int(self._now.unix_s) + 1))
             else:
                 self.refusals[DropReason.UNAVAILABLE] += 1
+                self._note_failure(reply)
         return refused
 
     def expire(self, now_s: float, unix_s: float) -> list[Route]:
@@ -229,6 +237,9 @@ class ClusterStore:
             if routes is None:
                 raise StoreError("the cluster did not answer")
         return routes
+
+    def _note_failure(self, reply: object) -> None:
+        self.lacks_functions |= isinstance(reply, LocalError) and _NO_FUNCTION in str(reply)
 
     def _keep(self, name: Name, routes: dict[Name, Route]) -> None:
         self._cache[name] = routes

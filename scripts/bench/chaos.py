@@ -10,6 +10,7 @@ policy leave connected (``faults/oracle.py``) must continue. Promises:
     reliable flows          are complete from the first message that came, or the reader got a report of each loss
     requests                each has one answer, or one error
     snapshots               a RIB logs once that its disk is full, and when it writes again; it still starts
+    the cluster             no server logs that it lost data
 
     sudo .venv/bin/python scripts/bench/chaos.py --seed 7                    # one minute
     sudo .venv/bin/python scripts/bench/chaos.py --seed 7 --seconds 300 --switches 20
@@ -57,6 +58,7 @@ REVOKED_S: Final = 3.0
 SETTLE_S: Final = 60.0
 LOOK_S: Final = 0.1
 REPORTED_S: Final = 0.25  # shorter silences are not reported
+SPARSE: Final = 1.5  # nor those of a flow that are shorter than so many of its periods
 CALL_S: Final = 5.0
 LOG_LINES: Final = 12
 _CLUSTER_EVERY: Final = 3  # one in so many seeds gets a cluster
@@ -144,6 +146,8 @@ class Chaos:
         )
         if failed := self.books.failed_since(well_ns):
             found.append(f"after the last fault: {failed} calls failed")
+        if self._overlay.store is not None:
+            found += self._overlay.store.complaints()
         return [*found, *self._after_revocation(), *self._of_snapshots()]
 
     def noticed(self) -> int:
@@ -155,6 +159,8 @@ class Chaos:
         """Return the silences of the run, each with the last event before it."""
         found = []
         for silence in self._all_silences(self.begun_ns, time.monotonic_ns(), REPORTED_S):
+            if silence.seconds < SPARSE / self._plan.flows[silence.channel].hz:
+                continue
             before = [each for each in self.moments if each[0] <= silence.begin_ns + round(1e9)]
             _, fault, begins = before[-1] if before else (0, None, True)
             over = "" if begins else ", over"

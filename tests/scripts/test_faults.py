@@ -15,6 +15,7 @@ from faults.plan import Churn, Flow, Plan, Service
 from faults.records import Kind, Record, RecordReader, RecordWriter
 from faults.schedule import STRUCTURAL, Fault, FaultKind, broken_by, make_schedule
 from faults.slope import growth_of
+from faults.store import critical_lines
 from topologies import make_topology
 
 from gdp.message.loss import LossReason
@@ -110,6 +111,14 @@ _FULL, _AGAIN = "snapshot not written path=a reason=full\n", "snapshot written a
 )
 def test_a_rib_says_once_that_its_snapshot_is_not_written_and_when_it_is_again(log: str, faults: int) -> None:
     assert len(list(snapshot_faults("rib s1", log, is_alive=True))) == faults
+
+
+def test_a_server_of_the_cluster_that_lost_data_is_reported_once(tmp_path: Path) -> None:
+    for number, lines in (("1", ["* Ready to accept connections"]), ("2", ["# == CRITICAL == -NOPERM a", "* b"] * 3)):
+        (tmp_path / number).mkdir()
+        (tmp_path / number / "server.log").write_text("\n".join(lines))
+    (complaint,) = critical_lines(tmp_path)
+    assert complaint == "server 2 of the store, 3 times: -NOPERM a"
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ from gdp.host import netns_files
 from gdp.host.run_registry import Run
 from gdp.simulation.namespaces import Namespaces
 
-__all__ = ["StoreCluster", "has_server"]
+__all__ = ["StoreCluster", "critical_lines", "has_server"]
 
 _START_CLUSTER: Final = Path(__file__).resolve().parents[2] / "start_cluster.sh"
 _KINDS: Final = ("valkey", "redis")  # in the order of start_cluster.sh
@@ -41,6 +41,7 @@ _START_S: Final = 120.0
 _ANSWER_S: Final = 0.3
 _WHOLE_S: Final = 20.0
 _LOOK_S: Final = 0.05
+_CRITICAL: Final = "== CRITICAL =="  # of a server that lost data, and goes on
 
 
 def has_server() -> bool:
@@ -125,6 +126,10 @@ class StoreCluster:
         with suppress(ProcessLookupError):
             os.kill(self._pid(self._away.pop(fault)), signal.SIGCONT)
 
+    def complaints(self) -> list[str]:
+        """Return which servers said in their log that they lost data."""
+        return critical_lines(self._folder)
+
     def close(self) -> None:
         """End the servers; the run removes their data."""
         for number in self._servers:
@@ -166,6 +171,18 @@ class StoreCluster:
             os.close(there)
         netns_files.inside(rib, partial(add_address, _IFNAME, address))
         netns_files.inside(rib, partial(set_up, _IFNAME))
+
+
+def critical_lines(folder: Path) -> list[str]:
+    """Return the first critical line of each server's log, in the folder of a cluster."""
+    found = []
+    for log in sorted(folder.glob("*/server.log")):
+        lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if _CRITICAL in line]
+        if lines:
+            found.append(
+                f"server {log.parent.name} of the store, {len(lines)} times: {lines[0].partition(_CRITICAL)[2].strip()}"
+            )
+    return found
 
 
 def _program() -> str | None:
