@@ -20,7 +20,7 @@ from gdp.errors import GdpError
 
 __all__ = ["app", "main"]
 
-
+_DOORS: Final = ("foxglove", "rosbridge", "rule", "watch")  # of the package proxy
 _DEMO: Final = {"ignore_unknown_options": True, "allow_extra_args": True}
 _KNOWN: Final = {
     "name": LazyCommand("gdp.cli.name:name"),
@@ -38,7 +38,7 @@ _KNOWN: Final = {
     "explain": LazyCommand("gdp.cli.explain:explain"),
     **{
         door: LazyCommand(f"gdp.cli.doors:{door}", no_args_is_help=False, settings=extension.ANY_ARGUMENTS)
-        for door in ("foxglove", "rosbridge", "rule", "watch")
+        for door in _DOORS
     },
     "ping": LazyCommand("gdp.cli.ping:ping"),
     "trace": LazyCommand("gdp.cli.trace:trace"),
@@ -62,9 +62,7 @@ _KNOWN: Final = {
 
 
 class _Commands(ExtendedGroup):
-    extensions: ClassVar[Mapping[str, str]] = {
-        each: f"proxy.cli.{each}" for each in ("foxglove", "rosbridge", "rule", "watch")
-    }
+    extensions: ClassVar[Mapping[str, str]] = {each: f"proxy.cli.{each}" for each in _DOORS}
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)

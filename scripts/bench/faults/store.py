@@ -41,7 +41,7 @@ _START_S: Final = 120.0
 _ANSWER_S: Final = 0.3
 _WHOLE_S: Final = 20.0
 _LOOK_S: Final = 0.05
-_CRITICAL: Final = "== CRITICAL =="  # of a server that lost data, and goes on
+_CRITICAL: Final = "== CRITICAL =="  # of a server that lost data and continues
 
 
 def has_server() -> bool:
