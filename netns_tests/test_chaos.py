@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
-from faults.disk import NOT_WRITTEN, snapshot_faults
+from faults.disk import NOT_WRITTEN, Disk, snapshot_faults
 from faults.link_faults import FrameFaults
 from faults.overlay import Overlay
 from faults.plan import Flow, Plan
@@ -91,6 +91,12 @@ def test_the_disk_and_the_servers_of_a_killed_run_are_gone_after_the_next_sweep(
     assert not any(path.exists() for path in [*spaces, folder])
 
 
+def has_written(disk: Disk, node: str) -> bool:
+    """Return whether the RIB at a switch wrote a slice: the log of its database, which it keeps locked, has content."""
+    log = Path(f"{disk.snapshot(node)}-wal")
+    return log.exists() and log.stat().st_size > 0
+
+
 def rib_log(overlay: Overlay) -> str:
     return list(overlay.logs("rib s1"))[-1][1]
 
@@ -101,10 +107,12 @@ def test_a_rib_comes_through_a_full_disk_and_starts_on_one() -> None:
     run = RunRegistry().start()
     try:
         with Overlay(run, plan, has_disk=True, more={"rib": {"lease_s": 2.0}}) as overlay:
-            assert overlay.disk is not None
+            disk = overlay.disk
+            assert disk is not None
             overlay.start_all()
             until(lambda: numbers(overlay, "R"), "a message")
-            overlay.disk.fill()
+            until(lambda: has_written(disk, "s1"), "a slice in the snapshot")
+            disk.fill()
             until(lambda: NOT_WRITTEN in rib_log(overlay), "a word about the full disk")
             overlay.kill("rib s1")
             overlay.restart("rib s1")
@@ -112,14 +120,14 @@ def test_a_rib_comes_through_a_full_disk_and_starts_on_one() -> None:
             assert "snapshot read live=0" not in rib_log(overlay)
             assert "snapshot read live=" in rib_log(overlay)
             until(lambda: NOT_WRITTEN in rib_log(overlay), "a word about the full disk, after the restart")
-            overlay.disk.free()
+            disk.free()
             until(lambda: "snapshot written again" in rib_log(overlay), "a word that it is written again")
             faults = [
                 fault
                 for incarnation_id, log in overlay.logs("rib s1")
                 for fault in snapshot_faults(f"life {incarnation_id}", log, is_alive=incarnation_id == 2)
             ]
-            assert (faults, overlay.disk.broken()) == ([], [])
+            assert (faults, disk.broken()) == ([], [])
     finally:
         run.end()
     assert not run.directory.exists()
