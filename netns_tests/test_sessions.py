@@ -37,7 +37,7 @@ def test_threads_that_publish_and_receive_at_once_lose_nothing(lab: SessionLab) 
     code = """
 with gdp.open("robot") as robot, gdp.open("server") as server:
     publishers = [robot.publisher(name) for name in "ab"]
-    subscriptions = [server.subscribe(name) for name in "ab"]
+    subscriptions = [server.subscribe(name, queue=2000) for name in "ab"]  # a receiving thread may start late
     for publisher in publishers:
         publisher.wait_for_readers(timeout_s=10)
     got = [[], []]
