@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ import pytest
 from websockets.sync.client import ClientConnection, connect
 
 from gdp.nodes.control_client import find_control_socket
+from netns_tests.live_pair import until
 from netns_tests.spaces import Space
 from netns_tests.test_rights import PATIENCE_S, Commands, Node, commands
 from tests.pages import ROOT
@@ -122,18 +122,18 @@ def test_the_socket_of_a_killed_node_is_replaced(nodes: Nodes) -> None:
     assert nodes.gdp("status", "proxy")[0] == 0
 
 
-def structure_of_measured_links(page: ClientConnection) -> dict[str, Any]:
-    """Return the newest structure of a page, once it shows the round trips of both links, and traffic."""
-    structure: dict[str, Any] = {}
-    end_s = time.monotonic() + PATIENCE_S
-    while True:
-        shown = json.loads(page.recv(end_s - time.monotonic()))
-        if shown["kind"] == "structure":
-            structure = shown
-            continue
-        are_measured = [rtt_ms is not None for _, _, rtt_ms, _ in shown["links"]] == [True, True]
-        if are_measured and any(there + back > 0 for there, back, _, _ in shown["links"]):
-            return structure
+def measured_links(page: ClientConnection) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the newest structure and figures of a page, once the figures show round trips and traffic."""
+    shown: dict[str, dict[str, Any]] = {}
+
+    def is_measured() -> bool:
+        message = json.loads(page.recv(PATIENCE_S))
+        shown[message["kind"]] = message
+        links = message.get("links", ()) if message["kind"] == "figures" else ()
+        return all(rtt_ms is not None for _, _, rtt_ms, _ in links) and any(there + back for there, back, _, _ in links)
+
+    until(is_measured, "the round trips of a live view", PATIENCE_S)
+    return shown["structure"], shown["figures"]
 
 
 def test_the_live_view_shows_running_nodes_that_dropped_their_rights(space: Space, nodes: Nodes) -> None:
@@ -148,10 +148,12 @@ def test_the_live_view_shows_running_nodes_that_dropped_their_rights(space: Spac
             assert view.stdout is not None
             ready = json.loads(view.stdout.readline())
             with connect(ready["url"].replace("http", "ws") + "live") as page:
-                structure = structure_of_measured_links(page)
+                structure, figures = measured_links(page)
         finally:
             view.terminate()
         assert view.wait(PATIENCE_S) == 0
     assert sorted(role for _, role, _, _, is_near in structure["nodes"] if is_near) == ["proxy", "rib", "switch"]
     assert len(structure["links"]) == 2
+    assert all(rtt_ms is not None for _, _, rtt_ms, _ in figures["links"])
+    assert any(there + back > 0 for there, back, _, _ in figures["links"])
     assert structure["names"]
