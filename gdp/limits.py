@@ -97,7 +97,10 @@ LINK_STATE_LEASE_S: Final = 100.0
 LINK_STATE_AGE_MAX_S: Final = CLOCKS_APART_S + LINK_STATE_LEASE_S  # by two clocks
 JOIN_REFRESH_S: Final = 2.0
 JOIN_LEASE_S: Final = 7.0
-# A join has some five frames, and is lost with any of them. So it is repeated more often over a link that loses frames.
+JOIN_PROOF_S: Final = 60.0  # a join whose terms do not change is sent whole at least this often, else by its number
+JOIN_PROOF_LEASE_S: Final = 3 * JOIN_PROOF_S  # no refresh lets a branch outlive its last whole join by more
+JOINS_AGAIN_MAX: Final = 16  # whole joins that one reply about unknown ones causes
+# Refreshes are sent more often over a link that loses frames: they find the joins that were lost.
 JOINS_LOST_FROM: Final = 0.01  # share of frames
 JOIN_REFRESH_LOSSY_S: Final = 0.5
 

@@ -184,6 +184,8 @@ class AckNackHandler:
             if reader.start is None or is_gone or not queue.is_acknowledged:
                 number = self._first_of(report)
                 begin = queue.ledger.begin_of(number, queue.first_waiting)
+                if reader.start is not None:  # it is a reader since then: what it did not get since is lost
+                    begin = min(reader.start.sequence, begin)
                 reader.start = StreamStart(reader.incarnation, number, begin, reader.confirmed)
                 reader.sequence = min(report.sequence, queue.ledger.last + 1) or begin
                 if queue.is_acknowledged and now_s >= reader.out_until_s:

@@ -12,12 +12,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.fragments import ControlFragmenter, ControlReassembler
 from gdp.control.join import Join
+from gdp.control.join_refresh import JoinRefresh
 from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.neighbour import Neighbour
 from gdp.control.presence import Presence
@@ -76,6 +77,7 @@ class PendingAdvertisement:
     sent_sequence: int = 0  # of the newest advertisement that was sent
     renewals: int = 0  # sent since the last acknowledgement
     join_sequence: int = -1  # of the newest join for it that came from this switch
+    joins: dict[int, Join] = field(default_factory=dict)  # the newest from this switch, by path
 
     @property
     def is_acknowledged(self) -> bool:
@@ -252,6 +254,10 @@ class Attachment:
             self.hello_protocol.ports[switch.port].receive_join(join, switch)
             self._note_newest(join)
             return statement
+        if header.kind == Kind.JOIN_REFRESH:
+            statement.expect(StatementType.JOIN_REFRESH)
+            statement.verify(switch.key)
+            return statement
         if header.kind == Kind.REVOKE:
             return statement  # it proves itself
         if header.kind == Kind.REVOKED:
@@ -279,6 +285,30 @@ class Attachment:
         if revocation is not None:
             self.hello_protocol.recheck(revocation.fingerprint, now)
         return revocation
+
+    def refreshed_joins(self, statement: Statement) -> list[Join]:
+        """Return the joins that a verified refresh of our switch renews; the switch hears which are unknown.
+
+        Raises:
+            StatementError: MALFORMED, or REPLAYED.
+        """
+        switch, refresh = self._switch, JoinRefresh.from_fields(statement.fields)
+        if switch is None:
+            return []
+        port = self.hello_protocol.ports[switch.port]
+        port.receive_join(refresh, switch)
+        known = {join.sequence: join for each in self._advertisements.values() for join in each.joins.values()}
+        unknown = tuple(number for number in refresh.numbers if number not in known)
+        if unknown:
+            reply = JoinRefresh(
+                numbers=unknown,
+                session=switch.echo,
+                sender_session=port.nonce,
+                sequence=self._next_sequence(),
+                is_reply=True,
+            )
+            self._say(Kind.JOIN_REFRESH, reply.to_wire(self._identity.name, self._identity.key))
+        return [known[number] for number in refresh.numbers if number in known]
 
     def port_changed(self, port: int, up: bool, now: Timestamps) -> None:
         """Update the state of a port's link."""
@@ -353,6 +383,7 @@ class Attachment:
                 # first.
                 at_s = advertisement_at_s if each.right is Right.ATTACH else advertisement_at_s + _OWN_FIRST_S
                 each.advertisement_at_s, each.is_taken, each.refused, each.join_sequence = at_s, False, None, -1
+                each.joins.clear()
 
     def _advertisement_wire(self, each: PendingAdvertisement, now: Timestamps) -> bytes:
         assert self._switch is not None
@@ -397,6 +428,10 @@ class Attachment:
             if join.sequence < pending_advertisement.join_sequence:
                 raise StatementError(DropReason.REPLAYED, "a newer join overtook it")
             pending_advertisement.join_sequence = join.sequence
+            if join.lease_s > 0:
+                pending_advertisement.joins[join.path] = join
+            else:
+                pending_advertisement.joins.pop(join.path, None)
 
     def _handle_ack(self, statement: Statement, switch: Neighbour, now: Timestamps) -> Statement | None:
         """Process the acknowledgement of an advertisement, or return a statement about a publisher's location."""

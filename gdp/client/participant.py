@@ -540,6 +540,9 @@ class Participant:
     def _take_statement(self, statement: Statement, now: Timestamps) -> None:
         if statement.type is StatementType.JOIN:
             self._publications.receive_join(Join.from_fields(statement.fields), now.mono_s)
+        elif statement.type is StatementType.JOIN_REFRESH:
+            for join in self.attachment.refreshed_joins(statement):
+                self._publications.receive_join(join, now.mono_s)
         elif statement.type is StatementType.REVOKE:
             self._revoke(statement, now)
         elif statement.type is StatementType.ANSWER:

@@ -207,7 +207,9 @@ class ReaderProxies:
     def admit(self, name: bytes, incarnation: int, now_s: float) -> ReaderProxy:
         """Make a known node a reader, in place of a former incarnation of it."""
         former = self._readers.get(name) or self._suspended.pop(name, None)
-        incarnation_id, confirmed = self._incarnation_ids[name, incarnation], former.sequence if former else 0
+        incarnation_id, confirmed = self._incarnation_ids[name, incarnation], 0
+        if former is not None:  # one that never began has reported nothing of what an earlier one lacks
+            confirmed = former.sequence if former.start is None else former.confirmed or former.sequence
         reading = self._readers[name] = ReaderProxy(
             incarnation=incarnation, incarnation_id=incarnation_id, heard_s=now_s, confirmed=confirmed
         )

@@ -12,6 +12,7 @@ from gdp.control.admission import Admission
 from gdp.control.endpoints import Endpoint
 from gdp.control.hello import echo_of
 from gdp.control.join import Join
+from gdp.control.join_refresh import JoinRefresh
 from gdp.control.link_quality import LinkQuality
 from gdp.control.link_state import link_key
 from gdp.control.neighbour import Neighbour, NeighbourState
@@ -154,8 +155,8 @@ class HelloPort:
             if len(self.ended) > _ENDED_MAX:
                 del self.ended[next(iter(self.ended))]
 
-    def receive_join(self, join: Join, neighbour: Neighbour) -> None:
-        """Note a verified join or leave of a neighbour.
+    def receive_join(self, join: Join | JoinRefresh, neighbour: Neighbour) -> None:
+        """Note a verified join, leave or refresh of a neighbour.
 
         Raises:
             StatementError: REPLAYED: it is of another session of either end, came before, or is below the replay

@@ -35,6 +35,8 @@ class StatementType(str, Enum):
     QUERY = "query"
     ANSWER = "answer"
     JOIN = "join"
+    JOIN_REFRESH = "join-refresh"  # to a neighbour: these joins stand
+    JOIN_UNKNOWN = "join-unknown"  # ... and back: these of them are not known
     LINK_STATE = "link-state"
     HELLO = "hello"
     ADCERT = "adcert"  # owner to node: the node has these rights on the name

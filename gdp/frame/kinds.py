@@ -45,6 +45,7 @@ class Kind(IntEnum):
     # answer to a hello under load: the sender must prove this before its signature is verified; no statement
     COOKIE = 0x8B
     REVOKED = 0x8C  # between neighbours: which revocations each keeps, and those that the other lacks
+    JOIN_REFRESH = 0x8D  # to the neighbour: which joins stand, and back: which of them are unknown
 
 
 class Flag(IntFlag):

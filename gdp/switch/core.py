@@ -23,6 +23,7 @@ from gdp.control.endpoints import Endpoint
 from gdp.control.fragments import ControlFragmenter, ControlReassembler
 from gdp.control.hello_port import HelloPort
 from gdp.control.join import Join
+from gdp.control.join_refresh import JoinRefresh
 from gdp.control.link_state import LinkState, Scope
 from gdp.control.neighbor_discovery import Change, HelloProtocol
 from gdp.control.neighbour import Neighbour, NeighbourState
@@ -66,6 +67,7 @@ from gdp.trust.verifier import AdvertisementVerifier
 
 __all__ = ["SwitchCore"]
 
+_REFRESH_TOKENS: Final = 4.0  # of joins: it renews up to 128 of them, and may cost a reply
 _CONTROL: Final = frozenset(kind.value for kind in Kind if kind >= CONTROL_FROM)
 
 
@@ -529,6 +531,8 @@ class SwitchCore:
             take(neighbour, statement, now)
         elif kind in (Kind.JOIN, Kind.LEAVE):
             self._take_join(neighbour, statement, now)
+        elif kind == Kind.JOIN_REFRESH:
+            self._take_join_refresh(neighbour, statement, now.mono_s)
         elif kind == Kind.REVOKE:
             self._unwatch(self._revoker.receive_revocation(statement, neighbour, now))
         elif kind == Kind.REVOKED:
@@ -642,3 +646,18 @@ class SwitchCore:
             self._held.note_branch(join.topic, join.publisher, (neighbour.port, neighbour.mac), advertisement)
         if self.multicast.join(join, neighbour, now.mono_s):
             self.relocations.redirect_join(join.topic, join.publisher, neighbour, now.mono_s)
+
+    def _take_join_refresh(self, neighbour: Neighbour, statement: Statement, now_s: float) -> None:
+        is_reply = statement.type is StatementType.JOIN_UNKNOWN
+        expected = StatementType.JOIN_UNKNOWN if is_reply else StatementType.JOIN_REFRESH
+        refresh = JoinRefresh.from_fields(statement.expect(expected), is_reply=is_reply)
+        if statement.signer != neighbour.name or not (is_reply or neighbour.role.is_switch):
+            raise StatementError(DropReason.UNKNOWN_SENDER, "a refresh is from a neighbouring switch")
+        if not self._join_paces.spend(neighbour.name, now_s, _REFRESH_TOKENS):
+            raise StatementError(DropReason.QUOTA, "joins of one neighbour")
+        statement.verify(neighbour.key)
+        self.hello_protocol.ports[neighbour.port].receive_join(refresh, neighbour)
+        if is_reply:
+            self.multicast.join_unknown(refresh, neighbour, now_s)
+        else:
+            self.multicast.refresh(refresh, neighbour, now_s)

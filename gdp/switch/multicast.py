@@ -3,10 +3,13 @@
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: after PIM-SM (RFC 7761).
 
 A reader's advertisement and each known publisher of its topic make a tree. So do a server with each client, and a
-client with each server; here they are called reader and publisher. While a branch stands, a switch repeats its join to
-the next switch towards the publisher. It joins another one at once when the path changes. A join is repeated several
+client with each server; here they are called reader and publisher. While a branch stands, a switch renews its join to
+the next switch towards the publisher. It joins another one at once when the path changes. A join is renewed several
 times at first, since one may be lost. A join carries the smallest MTU downstream, so it is sent again at once when that
 changes: a reader came or left, or a link became narrower or wider.
+
+Where nothing in a join has changed, its number renews it, together with those of other trees (``joins.py``). A
+neighbour that does not know a number asks for the whole join.
 
 Make before break: where the upstream neighbour changes because of a better path, the former one is left only after
 ``_OVERLAP_S``; readers drop duplicates. Where the publisher has moved, the former one is left at once, for it may now
@@ -22,37 +25,52 @@ later. The backup then counts as a branch for ``_ACTIVE_S``, in which the downst
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
 from gdp.control.join import Join, Route
+from gdp.control.join_refresh import JoinRefresh
 from gdp.control.neighbour import Neighbour
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import DropReason, StatementError
 from gdp.frame.codec import second_path_key
-from gdp.frame.kinds import Kind
-from gdp.limits import JOIN_LEASE_S, JOIN_REFRESH_LOSSY_S, JOIN_REFRESH_S, JOINS_LOST_FROM, READERS_MAX, TREES_MAX
+from gdp.limits import (
+    JOIN_LEASE_S,
+    JOIN_PROOF_LEASE_S,
+    JOIN_PROOF_S,
+    JOIN_REFRESH_LOSSY_S,
+    JOIN_REFRESH_S,
+    JOINS_AGAIN_MAX,
+    JOINS_LOST_FROM,
+    READERS_MAX,
+    TREES_MAX,
+)
 from gdp.message.shares import Shares
 from gdp.names import ZERO, Name
 from gdp.switch.backups import Backups
+from gdp.switch.joins import JoinSender, ReceivedJoins
 from gdp.switch.local_advertisements import LocalAdvertisements
 from gdp.switch.name_cache import Location
 from gdp.switch.outbox import Outbox
 from gdp.switch.path_pairs import PathPairs
 from gdp.switch.paths import Paths
 from gdp.switch.table import Table
-from gdp.switch.trees import Branch, Downstream, Tree, Trees
+from gdp.switch.trees import Branch, Downstream, JoinTerms, Tree, Trees
 from gdp.trust.advertisement import Advertisement
 from gdp.trust.domain import Policy
 from gdp.trust.right import HEARS, Right
 
 __all__ = ["MulticastTrees"]
 
-_JOIN_AGAIN_S: Final = (0.1, 0.3)  # a new join is repeated after so long, then every JOIN_REFRESH_S
+_JOIN_AGAIN_S: Final = (0.1, 0.2, 0.4, 0.8)  # a new join is renewed after so long, then every JOIN_REFRESH_S
+_SETTLED_JOINS: Final = 2  # renewals after which a tree has settled
+_TICK_EARLY: Final = 0.25  # of an interval: the first renewal at a tick comes at least 0.75 intervals after the last
 _OVERLAP_S: Final = 0.3  # the former upstream neighbour is left so long after the join to the new one
+_UNKNOWN_MAX: Final = 8  # replies about one tree after which their pause grows no further
 _ACTIVE_S: Final = 1.0  # for which a backup replaces a branch that was lost
 
 
@@ -82,7 +100,6 @@ class MulticastTrees:
         outbox: Outbox,
         first_sequence: int,
     ) -> None:
-        self._sequence = first_sequence
         self._identity = identity
         self._is_leaf = identity.role is Role.LEAF
         self._policy = policy
@@ -99,6 +116,9 @@ class MulticastTrees:
         self._paired: set[tuple[Name, Name]] = set()  # topics and publishers that readers here want over two paths
         self._second: dict[Name, dict[Name, Tree]] = {}  # trees of second copies, by publisher and topic
         self.trees = Trees()
+        self._joins = JoinSender(identity, outbox, self.trees, first_sequence)
+        self._received = ReceivedJoins()
+        self._phase = identity.name[0] / 256  # of renewals, so that not all switches send theirs at once
         self.drops: Counter[DropReason] = Counter()
 
     def readers(self, topic: Name) -> list[tuple[Downstream, Right]]:
@@ -159,8 +179,7 @@ class MulticastTrees:
                 continue
             self._route_pair(tree, now_s)
             self._install(tree)
-            self._follow(tree, now_s)
-            self._ask_upstream(tree, now_s)
+            self._assure(tree, now_s)
 
     def publisher_attached(self, advertisement: Advertisement, now_s: float) -> None:
         """Handle a publisher's advertisement of its topic here: trees that pass here join it directly at once."""
@@ -229,7 +248,6 @@ class MulticastTrees:
         if tree.former is not None and tree.former[0] == at and join.backup_for == ZERO:
             self._leave_former(tree)  # it takes the messages from here now
         is_behind = join.version < tree.version
-        is_same_place = (tree.switch, tree.domain) == (join.switch, join.domain) or is_behind
         if join.version >= tree.version:
             self._place_at(tree, join.switch, join.domain, join.version, join.proof)
             tree.allowed = join.allowed
@@ -241,6 +259,8 @@ class MulticastTrees:
             sequence=join.sequence,
             session=join.sender_session,
             route=join.route,
+            place=(join.switch, join.domain),
+            proven_until_s=now_s + JOIN_PROOF_LEASE_S,
         )
         branch.fit(self._outbox.mtu_of(neighbour.port))
         if join.backup_for != ZERO:
@@ -248,13 +268,47 @@ class MulticastTrees:
             branch.active_until_s = None if before is None else before.active_until_s
         if not self._put_branch(tree, at, branch):
             raise StatementError(DropReason.QUOTA, "branches of one neighbour")
+        if before is not None:
+            self._received.remove(at, before.sequence)
+        self._received.put(at, join.sequence, tree)
         self._install(tree)
-        if not self._follow(tree, now_s):
-            if (before is None and branch.is_active) or not is_same_place or tree.is_doubted:
-                self._ask_upstream(tree, now_s)
-            else:
-                self._restate(tree)
+        self._assure(tree, now_s)
         return is_behind and tree.switch != join.switch
+
+    def refresh(self, refresh: JoinRefresh, neighbour: Neighbour, now_s: float) -> None:
+        """Renew the branches of a neighbour's joins; the reply names those that are unknown here, or no longer hold."""
+        at, unknown = (neighbour.port, neighbour.mac), []
+        for number in refresh.numbers:
+            key = self._received.get(at, number)
+            tree = None if key is None else self.trees.get(*key)
+            branch = None if tree is None else tree.branches.get(at)
+            if (
+                tree is None
+                or branch is None
+                or branch.session != refresh.sender_session
+                or branch.place != (tree.switch, tree.domain)
+                or branch.proven_until_s <= now_s
+            ):
+                unknown.append(number)
+                continue
+            branch.expires_s = min(now_s + JOIN_LEASE_S, branch.proven_until_s)
+            self._install(tree)
+        if unknown:
+            self._joins.send_unknown(at, neighbour.name, tuple(unknown))
+
+    def join_unknown(self, reply: JoinRefresh, neighbour: Neighbour, now_s: float) -> None:
+        """Send whole joins of which a neighbour does not know the numbers; of many, the others come later."""
+        at = neighbour.port, neighbour.mac
+        for count, tree in enumerate(self._joins.find_unknown(at, reply.numbers)):
+            if count < JOINS_AGAIN_MAX:
+                del tree.sent[at]
+                if tree.upstream == at:
+                    self._ask_upstream(tree, now_s)
+                elif tree.backup is not None and tree.backup[0] == at:
+                    self._ask_for_backup(tree)
+            pause_s = min(_JOIN_AGAIN_S[0] * 2**tree.unknown, JOIN_REFRESH_S)
+            tree.unknown = min(tree.unknown + 1, _UNKNOWN_MAX)
+            tree.renew_at_s = min(tree.renew_at_s, now_s + pause_s)
 
     def path_counts(self) -> dict[str, int]:
         """Return how many flows to readers here want two paths, by what they have.
@@ -284,6 +338,7 @@ class MulticastTrees:
             if backup is not None:
                 tree.branches[backup].active_until_s = now_s + _ACTIVE_S
             self._cut(tree, at)
+        self._joins.neighbour_lost(at)
 
     def link_resized(self, port: int) -> None:
         """Send joins upstream for every tree whose MTU a changed link on a port affects."""
@@ -309,7 +364,7 @@ class MulticastTrees:
         for tree in self.trees.both(topic, publisher):
             branch = tree.branches.get(at)
             if branch is not None and not proves(branch.evidence):
-                branch.expires_s = min(branch.expires_s, until_s)
+                branch.expires_s = branch.proven_until_s = min(branch.expires_s, until_s)
             if not proves(tree.shown):
                 tree.is_doubted, tree.renew_at_s = True, now_s
             self._install(tree)
@@ -349,6 +404,7 @@ class MulticastTrees:
         for tree in self.trees.due(now_s):
             if self.trees.get(tree.topic, tree.publisher, tree.path) is tree:
                 self._tree_due(tree, now_s)
+        self._joins.send_refreshes()
         return orphaned
 
     def _tree_due(self, tree: Tree, now_s: float) -> None:
@@ -368,12 +424,14 @@ class MulticastTrees:
             self._install(tree)
             self._restate(tree)
         if tree.renew_at_s <= now_s:
-            self._ask_upstream(tree, now_s)
+            self._ask_upstream(tree, now_s, renews=True)
         if tree.former is not None and tree.former_until_s <= now_s:
             self._leave_former(tree)
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
+        if self._joins.is_waiting:
+            return 0.0
         tree_s = self.trees.next_event()
         times = (tree_s, self._pairs.get_timer(), self._readers_end_s)
         next_s = min(time for time in times if time is not None)
@@ -497,7 +555,8 @@ class MulticastTrees:
         return True
 
     def _cut(self, tree: Tree, at: Downstream) -> None:
-        if tree.branches.pop(at, None) is not None:
+        if (branch := tree.branches.pop(at, None)) is not None:
+            self._received.remove(at, branch.sequence)
             self._branch_shares.release(_owner(at))
             self._after_cut(tree)
 
@@ -536,9 +595,23 @@ class MulticastTrees:
         self._ask_upstream(tree, now_s)
         return True
 
-    def _ask_upstream(self, tree: Tree, now_s: float) -> None:
+    def _tick_s(self, interval_s: float, now_s: float) -> float:
+        """Return when trees are renewed that were renewed now: all at the same ticks, so that they share a refresh."""
+        return (math.floor(now_s / interval_s - self._phase + _TICK_EARLY) + 1 + self._phase) * interval_s
+
+    def _assure(self, tree: Tree, now_s: float) -> None:
+        """Make sure that the right upstream neighbour has a join with the present terms and valid evidence."""
+        if self._follow(tree, now_s):
+            return
+        if tree.upstream is None or tree.is_doubted:
+            self._ask_upstream(tree, now_s)
+        else:
+            self._restate(tree)
+
+    def _ask_upstream(self, tree: Tree, now_s: float, *, renews: bool = False) -> None:
+        """Send a join upstream; ``renews``: its number suffices if nothing in it has changed."""
         upstream = self._upstream_queries(tree)
-        tree.renew_at_s = now_s + JOIN_REFRESH_S
+        tree.renew_at_s = self._tick_s(JOIN_REFRESH_S, now_s)
         if (None if upstream is None else upstream[:2]) != tree.upstream:
             self._part_from_above(tree, now_s, keep=upstream is not None)
             if upstream is not None:
@@ -551,30 +624,32 @@ class MulticastTrees:
             self.drops[DropReason.THROUGH_LEAF] += 1
         if upstream is None or not tree.is_wanted_below:
             return
-        has_settled = tree.joins >= len(_JOIN_AGAIN_S)
-        if has_settled and self._outbox.loss_to(upstream[0], upstream[2]) >= JOINS_LOST_FROM:
-            tree.renew_at_s = now_s + JOIN_REFRESH_LOSSY_S
-        if not has_settled:
+        has_settled = tree.joins >= _SETTLED_JOINS
+        if tree.joins < len(_JOIN_AGAIN_S):
             tree.renew_at_s = now_s + _JOIN_AGAIN_S[tree.joins]
             tree.joins += 1
-        tree.asked_mtu = self._mtu_over(tree, upstream[0])
-        self._show(tree)
+        elif self._outbox.loss_between(upstream[0], upstream[2]) >= JOINS_LOST_FROM:
+            tree.renew_at_s = self._tick_s(JOIN_REFRESH_LOSSY_S, now_s)
+        is_proof_due = now_s >= tree.prove_at_s
+        if is_proof_due:  # spread, so that the whole joins of many trees do not leave together
+            tree.prove_at_s = now_s + JOIN_PROOF_S * (1 + tree.topic[0] / 255) / 2
+        renews = renews and not is_proof_due
+        self._show(tree, renews=renews)
         if has_settled and self._paths.has_alternates:
-            self._ask_for_backup(tree)
+            self._ask_for_backup(tree, renews=renews)
         if has_settled and tree.left:
             tree.left.clear()
             self._install(tree)
 
     def _restate(self, tree: Tree) -> None:
-        """Send a join upstream at once: the tree's MTU or route, or whether it is only a backup, has changed."""
+        """Send a join upstream at once if one of its terms has changed, such as the MTU."""
         if tree.upstream is None:
             return
         if tree.asked_route != self._route_onwards(tree):
             tree.joins, tree.renew_at_s = 0, 0.0  # due at once, and repeated like the first join
             return
-        mtu = self._mtu_over(tree, tree.upstream[0])
-        if (tree.asked_mtu, tree.asked_backup_for) != (mtu, tree.backup_for):
-            tree.asked_mtu = mtu
+        sent, terms = tree.sent.get(tree.upstream), self._upstream_terms(tree)
+        if terms is not None and (sent is None or sent.terms != terms):
             self._show(tree)
 
     def _mtu_over(self, tree: Tree, port: int) -> int:
@@ -582,7 +657,7 @@ class MulticastTrees:
         trees = self.trees.both(tree.topic, tree.publisher) if tree.switch == self._identity.name else (tree,)
         return min(self._outbox.mtu_of(port), *(each.mtu for each in trees if each.branches))
 
-    def _ask_for_backup(self, tree: Tree) -> None:
+    def _ask_for_backup(self, tree: Tree, *, renews: bool = False) -> None:
         """Request a backup branch from the neighbour that could replace the best one, or leave it."""
         other = self._backups.upstream(tree)
         if other != tree.backup:
@@ -591,32 +666,40 @@ class MulticastTrees:
             self._install(tree)
         evidence = self._evidence(tree)
         if other is not None and evidence:
-            (port, _), _ = other
-            mtu = min(tree.mtu, self._outbox.mtu_of(port))
-            self._say(tree, *other, mtu, JOIN_LEASE_S, evidence, backup_for=self._identity.name)
+            at, name = other
+            mtu = min(tree.mtu, self._outbox.mtu_of(at[0]))
+            terms = self._joins.terms(tree, at, name, mtu, self._identity.name)
+            if not (renews and self._joins.add_renewal(tree, at, terms)):
+                self._joins.send_join(tree, at, name, terms, evidence)
 
     def _leave_backup(self, tree: Tree) -> None:
         if tree.backup is not None:
             (at, name), tree.backup = tree.backup, None
             tree.left.add(at[0])
             if at != tree.upstream:
-                self._say(tree, at, name, 1, 0.0, b"")
+                self._joins.send_leave(tree, at, name)
 
-    def _show(self, tree: Tree) -> None:
-        """Send a join upstream, with the evidence of a downstream reader."""
-        evidence = self._evidence(tree)
+    def _show(self, tree: Tree, *, renews: bool = False) -> None:
+        """Send a join upstream, with the evidence of a downstream reader, or renew it."""
+        tree.asked_route = self._route_onwards(tree)
+        evidence, terms = self._evidence(tree), self._upstream_terms(tree)
+        may_renew = bool(evidence) and renews and not tree.is_doubted
+        if may_renew and tree.upstream is not None and self._joins.add_renewal(tree, tree.upstream, terms):
+            return
         tree.is_doubted = tree.is_doubted and evidence == tree.shown
         tree.shown = evidence
-        tree.asked_backup_for, tree.asked_route = tree.backup_for, self._route_onwards(tree)
-        if tree.upstream is None or tree.upstream_name is None or not evidence:
-            return
+        if evidence and tree.upstream is not None and tree.upstream_name is not None:
+            self._joins.send_join(tree, tree.upstream, tree.upstream_name, terms, evidence)
+
+    def _upstream_terms(self, tree: Tree) -> JoinTerms | None:
+        """Return what a join upstream asks for now; None where none may be sent."""
+        if tree.upstream is None or tree.upstream_name is None:
+            return None
         backup_for = tree.backup_for or ZERO
         if backup_for != ZERO and self._paths.domain_of(tree.upstream_name) != self._policy.own:
-            return  # backups are internal to a domain
-        self._say(
-            tree, tree.upstream, tree.upstream_name, tree.asked_mtu, JOIN_LEASE_S, evidence,
-            backup_for=backup_for, route=tree.asked_route,
-        )  # fmt: skip
+            return None  # backups are internal to a domain
+        mtu = self._mtu_over(tree, tree.upstream[0])
+        return self._joins.terms(tree, tree.upstream, tree.upstream_name, mtu, backup_for, tree.asked_route)
 
     def _route_onwards(self, tree: Tree) -> Route:
         """Return the route for the upstream neighbour: what remains after the link to it."""
@@ -655,7 +738,7 @@ class MulticastTrees:
             tree.upstream = tree.upstream_name = None
         else:
             self._leave(tree)
-        tree.joins, tree.has_moved = 0, False
+        tree.joins, tree.unknown, tree.has_moved = 0, 0, False
 
     def _is_loop_free(self, tree: Tree) -> bool:
         """Return whether the upstream neighbour, no longer the best, cannot take the messages from here itself.
@@ -678,52 +761,13 @@ class MulticastTrees:
             (at, name), tree.former = tree.former, None
             tree.left.add(at[0])
             if at != tree.upstream:
-                self._say(tree, at, name, 1, 0.0, b"")
+                self._joins.send_leave(tree, at, name)
 
     def _leave(self, tree: Tree) -> None:
         if tree.upstream is not None and tree.upstream_name is not None:
             tree.left.add(tree.upstream[0])
-            self._say(tree, tree.upstream, tree.upstream_name, 1, 0.0, b"")
+            self._joins.send_leave(tree, tree.upstream, tree.upstream_name)
         tree.upstream = tree.upstream_name = None
-
-    def _say(
-        self,
-        tree: Tree,
-        upstream: Downstream,
-        name: Name,
-        mtu: int,
-        lease_s: float,
-        evidence: bytes,
-        *,
-        backup_for: Name = ZERO,
-        route: Route = (),
-    ) -> None:
-        """Send a join, or with no lease a leave, to one upstream neighbour."""
-        sessions = self._outbox.sessions_with(upstream[0], name)
-        if sessions is None:
-            return  # it is gone, and so is its state of our joins
-        own_session, its_echo = sessions
-        self._sequence += 1
-        join = Join(
-            topic=tree.topic,
-            publisher=tree.publisher,
-            switch=tree.switch,
-            domain=tree.domain,
-            allowed=tree.allowed,
-            mtu=mtu,
-            lease_s=lease_s,
-            evidence=evidence,
-            session=its_echo,
-            sequence=self._sequence,
-            version=tree.version,
-            backup_for=backup_for,
-            sender_session=own_session,
-            proof=tree.proof if lease_s else b"",
-            path=tree.path,
-            route=route,
-        )
-        kind = Kind.JOIN if lease_s else Kind.LEAVE
-        self._outbox.say_at(*upstream, kind, join.to_wire(self._identity.name, self._identity.key))
 
 
 def _owner(at: Downstream) -> bytes:

@@ -66,11 +66,11 @@ class Outbox:
         neighbour = self._hello_protocol.neighbour(port, name)
         return None if neighbour is None else (self._hello_protocol.ports[port].nonce, neighbour.echo)
 
-    def loss_to(self, port: int, name: Name) -> float:
-        """Return the share of keepalives to a neighbour that it reports as lost, 0 to 1; 0 also if it is not up."""
+    def loss_between(self, port: int, name: Name) -> float:
+        """Return the larger loss of keepalives to and from a neighbour, 0 to 1; 0 also if it is not up."""
         neighbour = self._hello_protocol.neighbour(port, name)
         session = None if neighbour is None else neighbour.keepalives
-        return 0.0 if session is None else session.quality.loss_out
+        return 0.0 if session is None else max(session.quality.loss_in, session.quality.loss_out)
 
     def rtt_to(self, name: Name) -> float:
         """Return the smoothed round trip of the link to a neighbour in seconds; 0: not measured, or it is not up."""

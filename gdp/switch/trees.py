@@ -16,7 +16,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, NamedTuple
 
 from gdp.control.join import Route, RouteLink
 from gdp.frame.codec import second_path_key
@@ -24,10 +24,10 @@ from gdp.limits import FRAME_MAX_BYTES
 from gdp.names import Name
 from gdp.switch.table import Hop, Hops, ProtectedHop, sides_of
 
-__all__ = ["Branch", "Tree", "Trees"]
+__all__ = ["Branch", "JoinTerms", "SentJoin", "Tree", "TreeKey", "Trees"]
 
 Downstream = tuple[int, bytes]  # port, MAC of the downstream neighbour
-_Key = tuple[Name, Name, int]  # topic, publisher and path
+TreeKey = tuple[Name, Name, int]  # topic, publisher and path
 _HEAP_SLACK: Final = 1_024
 
 
@@ -45,6 +45,8 @@ class Branch:
     active_until_s: float | None = None  # a backup whose protected branch was lost gets copies until then
     route: Route = ()  # from here to the publisher's switch, as the reader's switch chose it
     wants_pair: bool = False  # a reader attached here for which this switch chooses the routes
+    place: tuple[Name, Name] | None = None  # switch and domain of the publisher, as its last join named them
+    proven_until_s: float = float("inf")  # no refresh prolongs it beyond
 
     @property
     def is_active(self) -> bool:
@@ -54,6 +56,26 @@ class Branch:
     def fit(self, link_mtu: int) -> None:
         """Apply the link MTU to the neighbour."""
         self.mtu = min(self.said_mtu, link_mtu)
+
+
+class JoinTerms(NamedTuple):
+    """What a join asks for, in the two sessions of a link: while nothing of it changes, its number renews it."""
+
+    sessions: tuple[bytes, bytes]
+    switch: Name
+    domain: Name
+    allowed: frozenset[Name]
+    mtu: int
+    backup_for: Name
+    route: Route
+
+
+class SentJoin(NamedTuple):
+    """The last join of a tree to one neighbour."""
+
+    number: int
+    name: Name  # of the neighbour
+    terms: JoinTerms
 
 
 @dataclass(slots=True, kw_only=True)
@@ -70,21 +92,27 @@ class Tree:
     upstream: Downstream | None = None  # the neighbour that received the last join
     upstream_name: Name | None = None
     renew_at_s: float = 0.0
-    asked_mtu: int = 0  # MTU in the last join
     asked_route: Route = ()  # route in the last join
     followed: Route = ()  # that the upstream neighbour was chosen by
     shown: bytes = b""  # evidence in the last join
     version: int = 0  # sequence number of ``proof``
     proof: bytes = b""  # the publisher's advertisement that ``switch`` was read from
     joins: int = 0  # sent to the upstream neighbour since it was chosen
+    sent: dict[Downstream, SentJoin] = field(default_factory=dict)  # by neighbour that has a join of ours
+    prove_at_s: float = 0.0  # from then on the next join is sent whole
+    unknown: int = 0  # replies since the upstream neighbour was chosen that it does not know our join
     has_moved: bool = False  # the publisher has moved since the upstream neighbour was chosen
     former: tuple[Downstream, Name] | None = None  # the former upstream neighbour, until ``former_until_s``
     former_until_s: float = 0.0
     is_doubted: bool = False  # the evidence is invalid
-    asked_backup_for: Name | None = None  # backup owner in the last join
     backup: tuple[Downstream, Name] | None = None  # the neighbour that received the request for a backup branch
     left: set[int] = field(default_factory=set)  # ports that copies may still come from, until the tree has settled
     protection: dict[Downstream, Downstream] = field(default_factory=dict)  # branch to the backup that replaces it
+
+    @property
+    def identity(self) -> TreeKey:
+        """Return topic, publisher and path."""
+        return self.topic, self.publisher, self.path
 
     @property
     def key(self) -> bytes:
@@ -197,9 +225,9 @@ class Trees:
     def __init__(self) -> None:
         self._by_topic: dict[Name, dict[tuple[Name, int], Tree]] = {}
         self._size = 0
-        self._touched: dict[_Key, Tree] = {}
-        self._due_s: dict[_Key, float] = {}  # deadline of the valid heap entry
-        self._heap: list[tuple[float, _Key]] = []
+        self._touched: dict[TreeKey, Tree] = {}
+        self._due_s: dict[TreeKey, float] = {}  # deadline of the valid heap entry
+        self._heap: list[tuple[float, TreeKey]] = []
 
     def __len__(self) -> int:
         return self._size
@@ -208,8 +236,12 @@ class Trees:
         """Return a tree, or None."""
         tree = self._by_topic.get(topic, {}).get((publisher, path))
         if tree is not None:
-            self._touched[topic, publisher, path] = tree
+            self._touched[tree.identity] = tree
         return tree
+
+    def peek(self, key: TreeKey) -> Tree | None:
+        """Return a tree to be read only, or None: its timers are not read again."""
+        return self._by_topic.get(key[0], {}).get(key[1:])
 
     def both(self, topic: Name, publisher: Name) -> list[Tree]:
         """Return the trees of a topic and a publisher: none, one, or that of second copies too."""
@@ -228,7 +260,7 @@ class Trees:
     def of_topic(self, topic: Name) -> list[Tree]:
         """Return a topic's trees."""
         trees = list(self._by_topic.get(topic, {}).values())
-        self._touched.update({(topic, tree.publisher, tree.path): tree for tree in trees})
+        self._touched.update({tree.identity: tree for tree in trees})
         return trees
 
     def put(self, tree: Tree) -> None:
@@ -236,7 +268,7 @@ class Trees:
         trees = self._by_topic.setdefault(tree.topic, {})
         self._size += (tree.publisher, tree.path) not in trees
         trees[tree.publisher, tree.path] = tree
-        self._touched[tree.topic, tree.publisher, tree.path] = tree
+        self._touched[tree.identity] = tree
 
     def remove(self, tree: Tree) -> None:
         """Remove a tree."""
@@ -245,8 +277,8 @@ class Trees:
             self._size -= 1
         if not trees:
             self._by_topic.pop(tree.topic, None)
-        self._touched.pop((tree.topic, tree.publisher, tree.path), None)
-        self._due_s.pop((tree.topic, tree.publisher, tree.path), None)
+        self._touched.pop(tree.identity, None)
+        self._due_s.pop(tree.identity, None)
 
     def due(self, now_s: float) -> list[Tree]:
         """Return the trees with a timer that is due; each is returned again while that is so."""
@@ -256,7 +288,7 @@ class Trees:
             at_s, key = heapq.heappop(self._heap)
             if self._due_s.get(key) == at_s:
                 del self._due_s[key]
-                tree = self._by_topic[key[0]][key[1], key[2]]
+                tree = self._by_topic[key[0]][key[1:]]
                 self._touched[key] = tree
                 due.append(tree)
         return due

@@ -15,7 +15,7 @@ from itertools import pairwise
 from typing import Final
 
 import pytest
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
 
 from gdp.simulation.network import SimLink
@@ -261,6 +261,25 @@ class Trial:
     phases=(Phase.explicit, Phase.reuse, Phase.generate, Phase.shrink) if IS_LONG else (Phase.explicit, Phase.generate),
 )
 @given(plans())
+@example(  # a reader that began late did not count what came before (decision 346)
+    Plan(
+        6,
+        (),
+        (
+            Thin(4.0, 1, 3, 1, 1_000),
+            Thin(1.0, 1, 0, 1, 60),
+            Thin(1.0, 1, 0, 1, 60),
+            Thin(1.0, 1, 1, 1, 60),
+            Thin(2.0, 1, 1, 1, 60),
+        ),
+        2,
+        (Fault("cut", 18, 1.0, 1.2), Fault("cut", 16, 1.0, 1.2), Fault("cut", 0, 1.0, 2.5)),
+        474,
+    )
+)
+@example(  # of three joins that left together the last was lost each time (decision 347)
+    Plan(6, (), (Thin(1.0, 1, 0, 1, 60),), 1, (Fault("cut", 0, 1.0, 1.2),), 1)
+)
 @pytest.mark.momentary("every trial runs for three leases after its last fault; hypothesis also draws shorter attempts")
 def test_thin_links_that_fail_and_change_starve_nothing_and_hide_no_loss(plan: Plan) -> None:
     with short_leases():

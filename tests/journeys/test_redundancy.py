@@ -180,17 +180,17 @@ def test_copies_begin_when_loss_begins() -> None:
 
 
 @pytest.mark.parametrize(("loss", "least", "most"), [(0.0, 0, 8), (0.05, 15, 25)])
-def test_joins_are_repeated_more_often_over_a_link_that_loses_frames(loss: float, least: int, most: int) -> None:
+def test_joins_are_renewed_more_often_over_a_link_that_loses_frames(loss: float, least: int, most: int) -> None:
     made = radio(loss=loss)
     network = made.flow.world.network
     network.run(20.0)  # keepalives measure the link
-    joins = set()
+    refreshes = set()
 
     def count(_at_s: float, a: str, _b: str, frame: bytes) -> None:
         header = decode(frame, ETHER_BYTES)
-        if a == "s1" and header.kind == Kind.JOIN:
-            joins.add(header.number)
+        if a == "s1" and header.kind == Kind.JOIN_REFRESH:
+            refreshes.add(header.number)
 
     network.taps.append(count)
     network.run(10.0)
-    assert least <= len(joins) <= most
+    assert least <= len(refreshes) <= most

@@ -49,7 +49,6 @@ _BATCH: Final = 32
 _NODE_S: Final = 0.002  # pause between two steps of the node itself
 _READY_S: Final = 30.0
 _MTU: Final = 1_500
-_LEASE_S: Final = 24.0
 _MESSAGE_BYTES: Final = 100_000  # size of a message of which only one part is sent
 _Frames = Iterator[bytes]
 
@@ -91,7 +90,8 @@ class HostileSwitch:
         multicast = self._switch.multicast
         tree = next(each for each in multicast.trees.all() if each.upstream is not None)
         while tree.upstream is not None and tree.upstream_name is not None:
-            multicast._say(tree, tree.upstream, tree.upstream_name, _MTU, _LEASE_S, tree.evidence)
+            terms = multicast._joins.terms(tree, tree.upstream, tree.upstream_name, _MTU)
+            multicast._joins.send_join(tree, tree.upstream, tree.upstream_name, terms, tree.evidence)
             for transmit in self._switch.frames_to_send(time.monotonic()):
                 yield from transmit.frames
 

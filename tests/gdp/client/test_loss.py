@@ -315,3 +315,35 @@ def test_what_waits_on_a_best_effort_topic_has_not_been_sent() -> None:
     before = pipe.publisher.sent, pipe.publisher.acknowledged, pipe.publisher.is_reported()
     pipe.run(0.1)
     assert (before, pipe.publisher.sent) == ((0, 0, False), 3)
+
+
+@pytest.mark.parametrize("reliable", [True, False])
+def test_a_reader_counts_what_is_lost_from_when_its_publisher_knows_it(*, reliable: bool) -> None:
+    pipe = Pipe(publisher_of(reliable=reliable))
+    end = pipe.join(b"a")
+    end.deaf = True
+    assert pipe.run(1.0, lambda: pipe.publisher.readers == 1)
+    stream(pipe, 2.0)  # no Heartbeat that says where to begin arrives
+    end.deaf = False
+    stream(pipe, 2.0)
+    pipe.run(5.0)
+    assert len(got(end)) + end.writer_proxy.lost == pipe.publisher.messages == 40
+    assert end.writer_proxy.lost in ((0,) if reliable else (20, 21))
+
+
+def test_a_reader_that_is_killed_again_before_it_began_counts_what_it_lacks_since_it_last_did() -> None:
+    pipe = Pipe(publisher_of())
+    (end,) = live(pipe, b"a")
+    stream(pipe, 1.0)
+    pipe.run(1.0)
+    silence(end, is_silent=True)
+    stream(pipe, 1.0)
+    second = pipe.join(b"a", incarnation=8)
+    second.deaf = True
+    pipe.run(0.5)
+    stream(pipe, 1.0)
+    third = pipe.join(b"a", incarnation=9)
+    stream(pipe, 1.0)
+    pipe.run(1.0)
+    assert got(end) == list(range(10))
+    assert third.writer_proxy.losses.counts == {LossReason.READER_RESTARTED: got(third)[0] - 10}

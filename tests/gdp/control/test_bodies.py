@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import pytest
 from hypothesis import given
@@ -15,12 +16,14 @@ from gdp.control.endpoint_query import EndpointQuery, EndpointResponse
 from gdp.control.endpoints import Endpoint
 from gdp.control.hello import Hello
 from gdp.control.join import Join
+from gdp.control.join_refresh import JoinRefresh
 from gdp.control.link_state import Adjacency, AttachedRib, LinkState, Scope
 from gdp.control.query import Query, Response
 from gdp.control.relay import Relay
 from gdp.control.revoked import Lacking, Revoked
 from gdp.crypto.statements import Fields, Statement, StatementType, parse, sign
 from gdp.errors import DropReason, StatementError
+from gdp.frame.codec import HEADER_BYTES
 from gdp.names import Name
 from tests.gdp.control.members import node
 
@@ -47,6 +50,8 @@ STATE = LinkState(
 ANSWER = Response(name=A, advertiser=B, advertisement=b"claim", domain=C, transit=(A, B), lease_s=30.0)
 REVOKED = Revoked(b"s" * 16, 7, ((A, 3, b"d" * 8), (B, 0, bytes(8))))
 BUCKETS = Revoked(b"s" * 16, 8, (), A, tuple(bytes([at]) * 8 for at in range(256)))
+REFRESH = JoinRefresh(numbers=(1, 1 << 63), session=b"s" * 16, sender_session=b"o" * 8, sequence=9)
+UNKNOWN = replace(REFRESH, is_reply=True)
 LACKING = Lacking(b"s" * 16, 9, A, (1, 200), (b"i" * 8, b"j" * 8))
 ASKED = DiagnosticRequest(ask="trace", name=A, target=B, sequence=7, body={"p": bytes(C)}, membership=b"cert")
 REPLIED = DiagnosticReply(
@@ -76,6 +81,8 @@ BODIES: dict[str, tuple[bytes, object, Read]] = {
     ),
     "diagnostic reply": (REPLIED.to_wire(NODE.name, NODE.key), REPLIED, DiagnosticReply.from_fields),
     "join": (JOIN.to_wire(NODE.name, NODE.key), JOIN, Join.from_fields),
+    "join refresh": (REFRESH.to_wire(NODE.name, NODE.key), REFRESH, JoinRefresh.from_fields),
+    "join unknown": (UNKNOWN.to_wire(NODE.name, NODE.key), UNKNOWN, partial(JoinRefresh.from_fields, is_reply=True)),
     "link state": (STATE.to_wire(NODE.key, b"cert"), STATE, lambda fields: LinkState.from_fields(fields, NODE.name, A)),
     "query": (Query(A, 20.0).to_wire(NODE.name, NODE.key, b"cert"), Query(A, 20.0), Query.from_fields),
     "query of a reader": (
@@ -129,6 +136,19 @@ def test_an_empty_body_is_malformed(which: str) -> None:
     with pytest.raises(StatementError) as caught:
         BODIES[which][2](parse(sign(StatementType.HELLO, {}, NODE.name, NODE.key)).fields)
     assert caught.value.reason is DropReason.MALFORMED
+
+
+@pytest.mark.parametrize("count", [0, 129])
+def test_a_refresh_has_1_to_128_numbers(count: int) -> None:
+    refresh = replace(REFRESH, numbers=tuple(range(count)))
+    with pytest.raises(StatementError) as caught:
+        JoinRefresh.from_fields(parse(refresh.to_wire(NODE.name, NODE.key)).fields)
+    assert caught.value.reason is DropReason.MALFORMED
+
+
+def test_a_full_refresh_fits_into_one_frame_of_ethernet() -> None:
+    refresh = replace(REFRESH, numbers=tuple(range(1 << 63, (1 << 63) + 128)))
+    assert len(refresh.to_wire(NODE.name, NODE.key)) <= 1_500 - HEADER_BYTES
 
 
 def test_a_reason_of_a_later_version_is_a_refusal_all_the_same() -> None:

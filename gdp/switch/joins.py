@@ -1,0 +1,171 @@
+"""Joins of a switch: sends those of its trees, renews them by number, and finds the branches that a number renews here.
+
+Sans-I/O. Source of the refreshes: RFC 2961, section 5 (``gdp/control/join_refresh.py``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from gdp.control.join import Join, Route
+from gdp.control.join_refresh import NUMBERS_MAX, JoinRefresh
+from gdp.crypto.identity import Identity
+from gdp.frame.kinds import Kind
+from gdp.limits import JOIN_LEASE_S
+from gdp.names import ZERO, Name
+from gdp.switch.outbox import Outbox
+from gdp.switch.trees import Downstream, JoinTerms, SentJoin, Tree, TreeKey, Trees
+
+__all__ = ["JoinSender", "ReceivedJoins"]
+
+
+class JoinSender:
+    """Sends the joins and leaves of a switch's trees.
+
+    Refreshes are collected until ``send_refreshes``. A reply about unknown numbers has an effect once for each refresh,
+    and on numbers of that refresh only.
+
+    Args:
+        sequence: of the last statement of an earlier incarnation, at least.
+    """
+
+    def __init__(self, identity: Identity, outbox: Outbox, trees: Trees, sequence: int) -> None:
+        self._identity = identity
+        self._outbox = outbox
+        self._trees = trees
+        self._sequence = sequence
+        self._waiting: dict[tuple[Downstream, Name], dict[int, TreeKey]] = {}
+        self._refreshed: dict[Downstream, dict[int, TreeKey]] = {}
+
+    @property
+    def is_waiting(self) -> bool:
+        """Return whether ``send_refreshes`` has something to send."""
+        return bool(self._waiting)
+
+    def terms(
+        self, tree: Tree, at: Downstream, name: Name, mtu: int, backup_for: Name = ZERO, route: Route = ()
+    ) -> JoinTerms | None:
+        """Return what a join to a neighbour would ask for, or None if that is not up."""
+        sessions = self._outbox.sessions_with(at[0], name)
+        if sessions is None:
+            return None
+        return JoinTerms(sessions, tree.switch, tree.domain, tree.allowed, mtu, backup_for, route)
+
+    def send_join(self, tree: Tree, at: Downstream, name: Name, terms: JoinTerms | None, evidence: bytes) -> None:
+        """Send a whole join to a neighbour; none to one that is not up."""
+        if terms is None:
+            tree.sent.pop(at, None)  # it is gone, and so is its state of our joins
+            return
+        self._say(tree, at, terms, JOIN_LEASE_S, evidence)
+        tree.sent[at] = SentJoin(self._sequence, name, terms)
+
+    def add_renewal(self, tree: Tree, at: Downstream, terms: JoinTerms | None) -> bool:
+        """Put the number of a join into the next refresh, if the join has these terms; return whether it has."""
+        sent = tree.sent.get(at)
+        if sent is None or sent.terms != terms:
+            return False
+        self._waiting.setdefault((at, sent.name), {})[sent.number] = tree.identity
+        return True
+
+    def send_leave(self, tree: Tree, at: Downstream, name: Name) -> None:
+        """Send a leave to a neighbour."""
+        tree.sent.pop(at, None)
+        terms = self.terms(tree, at, name, 1)
+        if terms is not None:
+            self._say(tree, at, terms, 0.0, b"")
+
+    def send_refreshes(self) -> None:
+        """Send the refreshes."""
+        waiting, self._waiting = self._waiting, {}
+        for (at, name), numbers in waiting.items():
+            known = self._refreshed.get(at, {})
+            kept = {number: key for number, key in known.items() if self._is_standing(key, at, number)}
+            self._refreshed[at] = kept | numbers
+            listed = tuple(numbers)
+            for first in range(0, len(listed), NUMBERS_MAX):
+                self._say_numbers(at, name, listed[first : first + NUMBERS_MAX], is_reply=False)
+
+    def send_unknown(self, at: Downstream, name: Name, unknown: tuple[int, ...]) -> None:
+        """Tell a neighbour which of its joins are unknown here."""
+        self._say_numbers(at, name, unknown, is_reply=True)
+
+    def find_unknown(self, at: Downstream, numbers: Iterable[int]) -> list[Tree]:
+        """Return the trees of refreshed joins that a neighbour does not know."""
+        refreshed, found = self._refreshed.get(at, {}), []
+        for number in numbers:
+            key = refreshed.pop(number, None)
+            if key is not None and self._is_standing(key, at, number):
+                tree = self._trees.get(*key)
+                assert tree is not None
+                found.append(tree)
+        return found
+
+    def neighbour_lost(self, at: Downstream) -> None:
+        """Forget the refreshes to a neighbour."""
+        self._refreshed.pop(at, None)
+
+    def _is_standing(self, key: TreeKey, at: Downstream, number: int) -> bool:
+        tree = self._trees.peek(key)
+        join = None if tree is None else tree.sent.get(at)
+        return join is not None and join.number == number
+
+    def _say(self, tree: Tree, at: Downstream, terms: JoinTerms, lease_s: float, evidence: bytes) -> None:
+        own_session, its_echo = terms.sessions
+        self._sequence += 1
+        join = Join(
+            topic=tree.topic,
+            publisher=tree.publisher,
+            switch=terms.switch,
+            domain=terms.domain,
+            allowed=terms.allowed,
+            mtu=terms.mtu,
+            lease_s=lease_s,
+            evidence=evidence,
+            session=its_echo,
+            sequence=self._sequence,
+            version=tree.version,
+            backup_for=terms.backup_for,
+            sender_session=own_session,
+            proof=tree.proof if lease_s else b"",
+            path=tree.path,
+            route=terms.route,
+        )
+        kind = Kind.JOIN if lease_s else Kind.LEAVE
+        self._outbox.say_at(*at, kind, join.to_wire(self._identity.name, self._identity.key))
+
+    def _say_numbers(self, at: Downstream, name: Name, numbers: tuple[int, ...], *, is_reply: bool) -> None:
+        sessions = self._outbox.sessions_with(at[0], name)
+        if sessions is None:
+            return
+        own_session, its_echo = sessions
+        self._sequence += 1
+        refresh = JoinRefresh(
+            numbers=numbers,
+            session=its_echo,
+            sender_session=own_session,
+            sequence=self._sequence,
+            is_reply=is_reply,
+        )
+        self._outbox.say_at(*at, Kind.JOIN_REFRESH, refresh.to_wire(self._identity.name, self._identity.key))
+
+
+class ReceivedJoins:
+    """Trees of the joins that neighbours have sent, by neighbour and number."""
+
+    def __init__(self) -> None:
+        self._trees: dict[Downstream, dict[int, TreeKey]] = {}
+
+    def put(self, at: Downstream, number: int, tree: Tree) -> None:
+        """Add a join."""
+        self._trees.setdefault(at, {})[number] = tree.identity
+
+    def remove(self, at: Downstream, number: int) -> None:
+        """Remove a join, if it is there."""
+        numbers = self._trees.get(at, {})
+        numbers.pop(number, None)
+        if not numbers:
+            self._trees.pop(at, None)
+
+    def get(self, at: Downstream, number: int) -> TreeKey | None:
+        """Return the tree of a join, or None."""
+        return self._trees.get(at, {}).get(number)

@@ -1,0 +1,173 @@
+"""Joins renewed by number: few frames, no tree lost with a lost join, and no branch without proof for long."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+
+from gdp.control.join_refresh import JoinRefresh
+from gdp.control.neighbour import Neighbour
+from gdp.crypto.identity import Identity
+from gdp.errors import DropReason
+from gdp.frame.codec import ETHER_BYTES, HEADER_BYTES, decode
+from gdp.frame.kinds import Kind
+from gdp.limits import JOIN_LEASE_S, JOIN_PROOF_S, JOIN_REFRESH_S, JOINS_AGAIN_MAX
+from gdp.simulation.simulation import Simulation
+from gdp.simulation.topology import chain
+from gdp.switch import multicast
+from tests.journeys.flows import Flow, advertise, flowing
+from tests.journeys.test_attacks import counted
+
+ROBOT, READER = "s1/left", "s2/right"
+TOPICS = 40
+
+
+class Joins:
+    """Whole joins, refreshes and the bytes of both that enter the cable, towards the publisher."""
+
+    def __init__(self, world: Simulation, a: str = "s2", b: str = "s1") -> None:
+        self.whole: set[int] = set()
+        self.refreshes: set[int] = set()
+        self.bytes = 0
+        self.frames: list[bytes] = []  # of refreshes, from the header on
+        self._ends = a, b
+        world.network.taps.append(self._note)
+
+    def _note(self, _at_s: float, a: str, b: str, frame: bytes) -> None:
+        header = decode(frame, ETHER_BYTES)
+        if (a, b) != self._ends or header.kind not in (Kind.JOIN, Kind.JOIN_REFRESH):
+            return
+        self.bytes += HEADER_BYTES + header.length
+        (self.whole if header.kind == Kind.JOIN else self.refreshes).add(header.number)
+        if header.kind == Kind.JOIN_REFRESH:
+            self.frames.append(frame[ETHER_BYTES:])
+
+
+def two_switches(topics: int = 1) -> tuple[Simulation, list[Flow]]:
+    world = Simulation(topology=chain(2))
+    assert world.run_until_attached()
+    return world, [flowing(world, f"/t{number}", ROBOT, (READER,)) for number in range(topics)]
+
+
+def neighbour(world: Simulation, at: str, label: str) -> tuple[Neighbour, Identity]:
+    """Return a switch as another one knows it, and its identity."""
+    name = world.switches[label].name
+    (found,) = (each for each in world.switches[at].hello_protocol.all_up() if each.name == name)
+    (identity,) = (each for each in world.identities.values() if each.name == name)
+    return found, identity
+
+
+def inject(world: Simulation, at: str, sender: Neighbour, wire: bytes) -> None:
+    """Let a neighbour say this to a switch."""
+    for frame in world.switches[at]._fragmenter.split(Kind.JOIN_REFRESH, wire, 1_500):
+        world.network.inject(at, sender.port, frame, sender.mac)
+
+
+def test_forty_trees_are_renewed_in_one_frame() -> None:
+    world, flows = two_switches(TOPICS)
+    world.network.run(2 * JOIN_REFRESH_S)  # all have settled
+    joins, seconds = Joins(world), 4 * JOIN_REFRESH_S
+    world.network.run(seconds)
+    assert len(joins.refreshes) == len(joins.frames) <= 5
+    assert not joins.whole
+    assert all(len(world.switches["s1"].multicast.trees.of_topic(flow.topic.name)) == 1 for flow in flows)
+    joins.bytes = 0
+    world.network.run(2 * JOIN_PROOF_S)
+    assert 2 * TOPICS <= len(joins.whole) <= 4 * TOPICS  # proofs, each tree at a time of its own
+    whole = 2 * JOIN_PROOF_S / JOIN_REFRESH_S * TOPICS * 3_400  # what the same costs with whole joins
+    assert joins.bytes < whole / 10
+    flows[0].outlive()
+
+
+def test_a_join_that_was_lost_is_sent_again_when_its_number_is_unknown() -> None:
+    world, (flow,) = two_switches()
+    world.network.run(2 * JOIN_REFRESH_S)
+    cable = world.cables[frozenset(("s1", "s2"))]
+    other, joins = advertise(world, "/other", ROBOT), Joins(world)
+
+    def lose(_at_s: float, a: str, _b: str, frame: bytes) -> None:
+        cable.loss = float(a == "s2" and decode(frame, ETHER_BYTES).kind == Kind.JOIN and len(joins.whole) <= 1)
+
+    world.network.taps.append(lose)
+    other.read_by(READER)
+    assert world.network.run(1, lambda: other.is_read_by(1))
+    assert len(joins.whole) == 2
+    other.publish(b"it is there")
+    assert world.network.run(1, lambda: other.has(READER, 1))
+    flow.outlive()
+
+
+def test_of_many_unknown_joins_some_are_sent_at_a_time() -> None:
+    world, flows = two_switches(TOPICS)
+    world.network.run(2 * JOIN_REFRESH_S)
+    upper, joins = world.switches["s1"].multicast, Joins(world)
+    upper._received._trees.clear()
+    assert world.network.run(2 * JOIN_REFRESH_S, lambda: bool(joins.whole))
+    world.network.run(0.05)
+    assert len(joins.whole) == JOINS_AGAIN_MAX
+    world.network.run(0.5)
+    assert len(joins.whole) == TOPICS
+    flows[-1].outlive()
+
+
+def test_numbers_alone_keep_no_branch_for_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(multicast, "JOIN_PROOF_S", 1e9)  # the lower switch never shows its proofs of its own accord
+    monkeypatch.setattr(multicast, "JOIN_PROOF_LEASE_S", 3 * JOIN_REFRESH_S)
+    world, (flow,) = two_switches()
+    upper, joins = world.switches["s1"].multicast, Joins(world)
+    world.network.run(12 * JOIN_REFRESH_S)
+    assert 3 <= len(joins.whole) <= 4  # it had to
+    monkeypatch.setattr(multicast, "JOINS_AGAIN_MAX", 0)  # and now it never does
+    world.network.run(3 * JOIN_REFRESH_S + JOIN_LEASE_S)
+    assert not upper.trees.of_topic(flow.topic.name)
+    monkeypatch.setattr(multicast, "JOINS_AGAIN_MAX", JOINS_AGAIN_MAX)
+    world.network.run(JOIN_REFRESH_S + 0.1)
+    flow.outlive()
+
+
+def test_x03_a_neighbour_prolongs_no_branch_of_another_and_repeats_no_refresh() -> None:
+    world = Simulation(topology=chain(3))
+    assert world.run_until_attached()
+    flow = flowing(world, "/t", ROBOT, ("s3/right",))
+    world.network.run(2 * JOIN_REFRESH_S)
+    middle = world.switches["s2"]
+    (tree,) = middle.multicast.trees.of_topic(flow.topic.name)
+    ((at, branch),) = tree.branches.items()
+    liar, identity = neighbour(world, "s2", "s1")
+    before, expires_s = counted(world), branch.expires_s
+    refresh = JoinRefresh(
+        numbers=(branch.sequence, branch.sequence + 1),
+        session=middle.hello_protocol.ports[liar.port].echo,
+        sender_session=liar.nonce,
+        sequence=1 << 60,
+    )
+    for _ in range(2):
+        inject(world, "s2", liar, refresh.to_wire(identity.name, identity.key))
+    assert {each: its.expires_s for each, its in tree.branches.items()} == {at: expires_s}
+    assert (counted(world) - before)[DropReason.REPLAYED] == 1
+    flow.outlive()
+
+
+def test_x03_a_reply_about_unknown_joins_works_once_for_each_refresh() -> None:
+    world, (flow,) = two_switches()
+    world.network.run(2 * JOIN_REFRESH_S)
+    lower, joins = world.switches["s2"], Joins(world)
+    (tree,) = lower.multicast.trees.of_topic(flow.topic.name)
+    (sent,) = tree.sent.values()
+    upper, identity = neighbour(world, "s2", "s1")
+    before = Counter(counted(world))
+    for count in range(50):
+        reply = JoinRefresh(
+            numbers=(sent.number, sent.number + 1, 7),
+            session=lower.hello_protocol.ports[upper.port].echo,
+            sender_session=upper.nonce,
+            sequence=(1 << 60) + count,
+            is_reply=True,
+        )
+        inject(world, "s2", upper, reply.to_wire(identity.name, identity.key))
+    world.network.send_pending("s2")
+    world.network.run(0.05)
+    assert len(joins.whole) == 1
+    assert counted(world) - before == Counter()
+    flow.outlive()
