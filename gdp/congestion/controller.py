@@ -348,7 +348,8 @@ class PathController:
     def _note_queue(self, now_s: float) -> None:
         """Signal an empty queue at once."""
         highest_s = self._highest.value(0.0) - self.base_rtt_s
-        wanted_s = min(self._wanted_frames() / self._frames_s(), _WANTED_MOST_S)
+        # the base may be that of a short frame: what a full one takes to leave is no queue
+        wanted_s = min(self._wanted_frames() / self._frames_s(), _WANTED_MOST_S) + 1 / self._frames_s()
         if self.queue_s <= max(_EMPTY_SHARE * highest_s, wanted_s, _STANDING_S / 2):
             self._empty_s = now_s
             self._signal(Signal.QUEUE_EMPTY, now_s)

@@ -280,6 +280,12 @@ class Trial:
 @example(  # of three joins that left together the last was lost each time (decision 347)
     Plan(6, (), (Thin(1.0, 1, 0, 1, 60),), 1, (Fault("cut", 0, 1.0, 1.2),), 1)
 )
+@example(  # the replies that joins are unknown were lost (decision 347)
+    Plan(3, (), (Thin(1.0, 1, 0, 1, 60),), 1, (Fault("thick", 0, 3.1, 3.3),), 1)
+)
+@example(  # what a full frame takes to leave was another flow's queue (decision 348)
+    Plan(5, (), (Thin(1.0, 1, 0, 1, 60),), 0, (Fault("freeze", 0, 5.0, 5.2),), 1)
+)
 @pytest.mark.momentary("every trial runs for three leases after its last fault; hypothesis also draws shorter attempts")
 def test_thin_links_that_fail_and_change_starve_nothing_and_hide_no_loss(plan: Plan) -> None:
     with short_leases():
