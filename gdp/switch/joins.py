@@ -5,7 +5,9 @@ Sans-I/O. Source of the refreshes: RFC 2961, section 5 (``gdp/control/join_refre
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable
+from typing import NamedTuple
 
 from gdp.control.join import Join, Route
 from gdp.control.join_refresh import NUMBERS_MAX, JoinRefresh
@@ -18,12 +20,26 @@ from gdp.switch.trees import Downstream, JoinTerms, SentJoin, Tree, TreeKey, Tre
 
 __all__ = ["JoinSender", "ReceivedJoins"]
 
+_PAUSE_S, _PAUSE_MOST_S = 0.004, 0.064  # 0.2 Mbit/s is a full frame in 0.06 s
+
+
+class _SpacedFrame(NamedTuple):
+    """A frame of a join that waits, and how long the next one waits after it."""
+
+    tree: TreeKey
+    number: int
+    frame: bytes
+    pause_s: float
+
 
 class JoinSender:
     """Sends the joins and leaves of a switch's trees.
 
-    Refreshes are collected until ``send_refreshes``. A reply about unknown numbers has an effect once for each refresh,
+    Refreshes are collected until ``handle_timer``. A reply about unknown numbers has an effect once for each refresh,
     and on numbers of that refresh only.
+
+    A join has three frames, which leave together. Where the queue of the link holds fewer, it would never arrive.
+    So the frames of a join that a neighbour did not know leave one by one, the next time with longer pauses.
 
     Args:
         sequence: of the last statement of an earlier incarnation, at least.
@@ -36,11 +52,19 @@ class JoinSender:
         self._sequence = sequence
         self._waiting: dict[tuple[Downstream, Name], dict[int, TreeKey]] = {}
         self._refreshed: dict[Downstream, dict[int, TreeKey]] = {}
+        self._spaced: dict[Downstream, deque[_SpacedFrame]] = {}
+        self._free_s: dict[Downstream, float] = {}  # the next spaced frame to a neighbour leaves no earlier
 
-    @property
-    def is_waiting(self) -> bool:
-        """Return whether ``send_refreshes`` has something to send."""
-        return bool(self._waiting)
+    def get_timer(self) -> float:
+        """Return the monotonic second at which something is to be sent."""
+        spaced_s = [self._free_s.get(at, 0.0) for at in self._spaced]
+        return 0.0 if self._waiting else min(spaced_s, default=float("inf"))
+
+    def handle_timer(self, now_s: float) -> None:
+        """Send the refreshes, and the frames whose time has come."""
+        self._send_refreshes()
+        for at in list(self._spaced):
+            self._send_spaced(at, now_s)
 
     def terms(
         self, tree: Tree, at: Downstream, name: Name, mtu: int, backup_for: Name = ZERO, route: Route = ()
@@ -56,14 +80,23 @@ class JoinSender:
         if terms is None:
             tree.sent.pop(at, None)  # it is gone, and so is its state of our joins
             return
-        self._say(tree, at, terms, JOIN_LEASE_S, evidence)
+        wire = self._wire(tree, terms, JOIN_LEASE_S, evidence)
         tree.sent[at] = SentJoin(self._sequence, name, terms)
+        if not tree.unknown:
+            self._outbox.say_at(*at, Kind.JOIN, wire)
+            return
+        pause_s = min(_PAUSE_S * 2**tree.unknown, _PAUSE_MOST_S)
+        frames = self._outbox.frames_of(at[0], Kind.JOIN, wire)
+        spaced = self._spaced.setdefault(at, deque())
+        spaced.extend(_SpacedFrame(tree.identity, self._sequence, frame, pause_s) for frame in frames)
 
     def add_renewal(self, tree: Tree, at: Downstream, terms: JoinTerms | None) -> bool:
         """Put the number of a join into the next refresh, if the join has these terms; return whether it has."""
         sent = tree.sent.get(at)
         if sent is None or sent.terms != terms:
             return False
+        if any(each.number == sent.number for each in self._spaced.get(at, ())):
+            return True  # it has not left yet
         self._waiting.setdefault((at, sent.name), {})[sent.number] = tree.identity
         return True
 
@@ -72,10 +105,9 @@ class JoinSender:
         tree.sent.pop(at, None)
         terms = self.terms(tree, at, name, 1)
         if terms is not None:
-            self._say(tree, at, terms, 0.0, b"")
+            self._outbox.say_at(*at, Kind.LEAVE, self._wire(tree, terms, 0.0, b""))
 
-    def send_refreshes(self) -> None:
-        """Send the refreshes."""
+    def _send_refreshes(self) -> None:
         waiting, self._waiting = self._waiting, {}
         for (at, name), numbers in waiting.items():
             known = self._refreshed.get(at, {})
@@ -101,15 +133,27 @@ class JoinSender:
         return found
 
     def neighbour_lost(self, at: Downstream) -> None:
-        """Forget the refreshes to a neighbour."""
+        """Forget the refreshes to a neighbour, and what waits for it."""
         self._refreshed.pop(at, None)
+        self._spaced.pop(at, None)
+        self._free_s.pop(at, None)
 
     def _is_standing(self, key: TreeKey, at: Downstream, number: int) -> bool:
         tree = self._trees.peek(key)
         join = None if tree is None else tree.sent.get(at)
         return join is not None and join.number == number
 
-    def _say(self, tree: Tree, at: Downstream, terms: JoinTerms, lease_s: float, evidence: bytes) -> None:
+    def _send_spaced(self, at: Downstream, now_s: float) -> None:
+        spaced = self._spaced[at]
+        while spaced and self._free_s.get(at, 0.0) <= now_s:
+            each = spaced.popleft()
+            if self._is_standing(each.tree, at, each.number):
+                self._outbox.frames(*at, [each.frame])
+                self._free_s[at] = now_s + each.pause_s
+        if not spaced:
+            del self._spaced[at]
+
+    def _wire(self, tree: Tree, terms: JoinTerms, lease_s: float, evidence: bytes) -> bytes:
         own_session, its_echo = terms.sessions
         self._sequence += 1
         join = Join(
@@ -130,8 +174,7 @@ class JoinSender:
             path=tree.path,
             route=terms.route,
         )
-        kind = Kind.JOIN if lease_s else Kind.LEAVE
-        self._outbox.say_at(*at, kind, join.to_wire(self._identity.name, self._identity.key))
+        return join.to_wire(self._identity.name, self._identity.key)
 
     def _say_numbers(self, at: Downstream, name: Name, numbers: tuple[int, ...], *, is_reply: bool) -> None:
         sessions = self._outbox.sessions_with(at[0], name)

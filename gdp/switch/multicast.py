@@ -300,14 +300,14 @@ class MulticastTrees:
         """Send whole joins of which a neighbour does not know the numbers; of many, the others come later."""
         at = neighbour.port, neighbour.mac
         for count, tree in enumerate(self._joins.find_unknown(at, reply.numbers)):
+            pause_s = min(_JOIN_AGAIN_S[0] * 2**tree.unknown, JOIN_REFRESH_S)
+            tree.unknown = min(tree.unknown + 1, _UNKNOWN_MAX)
             if count < JOINS_AGAIN_MAX:
                 del tree.sent[at]
                 if tree.upstream == at:
                     self._ask_upstream(tree, now_s)
                 elif tree.backup is not None and tree.backup[0] == at:
                     self._ask_for_backup(tree)
-            pause_s = min(_JOIN_AGAIN_S[0] * 2**tree.unknown, JOIN_REFRESH_S)
-            tree.unknown = min(tree.unknown + 1, _UNKNOWN_MAX)
             tree.renew_at_s = min(tree.renew_at_s, now_s + pause_s)
 
     def path_counts(self) -> dict[str, int]:
@@ -404,7 +404,7 @@ class MulticastTrees:
         for tree in self.trees.due(now_s):
             if self.trees.get(tree.topic, tree.publisher, tree.path) is tree:
                 self._tree_due(tree, now_s)
-        self._joins.send_refreshes()
+        self._joins.handle_timer(now_s)
         return orphaned
 
     def _tree_due(self, tree: Tree, now_s: float) -> None:
@@ -430,10 +430,8 @@ class MulticastTrees:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        if self._joins.is_waiting:
-            return 0.0
         tree_s = self.trees.next_event()
-        times = (tree_s, self._pairs.get_timer(), self._readers_end_s)
+        times = (tree_s, self._pairs.get_timer(), self._readers_end_s, self._joins.get_timer())
         next_s = min(time for time in times if time is not None)
         return None if next_s == float("inf") else next_s
 

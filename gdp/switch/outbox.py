@@ -30,8 +30,11 @@ class Outbox:
     def say_at(self, port: int, mac: bytes, kind: int, statement: bytes) -> None:
         """Send a statement to the node with this address on a port."""
         if port in self._hello_protocol.ports:
-            frames = self._fragmenter.split(kind, statement, self._hello_protocol.ports[port].mtu)
-            self._waiting.append(OutgoingFrames(port, mac, frames))
+            self.frames(port, mac, self.frames_of(port, kind, statement))
+
+    def frames_of(self, port: int, kind: int, statement: bytes) -> list[bytes]:
+        """Return the frames of a statement to a neighbour on a port."""
+        return self._fragmenter.split(kind, statement, self.mtu_of(port))
 
     def remote_frames(self, kind: int, statement: bytes, destination: Name) -> list[bytes]:
         """Return the frames of a statement that goes beyond a neighbour."""

@@ -104,11 +104,27 @@ def test_of_many_unknown_joins_some_are_sent_at_a_time() -> None:
     upper, joins = world.switches["s1"].multicast, Joins(world)
     upper._received._trees.clear()
     assert world.network.run(2 * JOIN_REFRESH_S, lambda: bool(joins.whole))
-    world.network.run(0.05)
-    assert len(joins.whole) == JOINS_AGAIN_MAX
-    world.network.run(0.5)
+    tree = next(iter(world.switches["s2"].multicast.trees.all()))
+    ((at, _),) = tree.sent.items()
+    waiting = {each.number for each in world.switches["s2"].multicast._joins._spaced[at]}
+    assert len(waiting) == JOINS_AGAIN_MAX
+    world.network.run(JOIN_REFRESH_S)
     assert len(joins.whole) == TOPICS
     flows[-1].outlive()
+
+
+@pytest.mark.parametrize("topics", [1, 12])
+def test_joins_pass_a_queue_that_is_shorter_than_one_of_them(topics: int) -> None:
+    world = Simulation(topology=chain(2), keepalive_ms=None)
+    assert world.run_until_attached()
+    cable = world.cables[frozenset(("s1", "s2"))]
+    cable.delay_s, cable.bytes_s = 0.005, 1e6 / 8
+    cable.fifo_s = 3_000 / cable.bytes_s
+    flows = [advertise(world, f"/t{number}", ROBOT) for number in range(topics)]
+    for flow in flows:
+        flow.read_by(READER)
+    assert world.network.run(topics, lambda: all(flow.is_read_by(1) for flow in flows))
+    flows[0].outlive()
 
 
 def test_numbers_alone_keep_no_branch_for_long(monkeypatch: pytest.MonkeyPatch) -> None:
