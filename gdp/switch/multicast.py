@@ -270,6 +270,8 @@ class MulticastTrees:
             raise StatementError(DropReason.QUOTA, "branches of one neighbour")
         if before is not None:
             self._received.remove(at, before.sequence)
+        if at == tree.shown_of and join.evidence != tree.shown:
+            tree.prove_at_s = 0.0
         self._received.put(at, join.sequence, tree)
         self._install(tree)
         self._assure(tree, now_s)
@@ -555,6 +557,8 @@ class MulticastTrees:
     def _cut(self, tree: Tree, at: Downstream) -> None:
         if (branch := tree.branches.pop(at, None)) is not None:
             self._received.remove(at, branch.sequence)
+            if at == tree.shown_of:
+                tree.prove_at_s = 0.0  # the neighbour must not depend on the evidence of a reader that has left
             self._branch_shares.release(_owner(at))
             self._after_cut(tree)
 
@@ -628,13 +632,12 @@ class MulticastTrees:
             tree.joins += 1
         elif self._outbox.loss_between(upstream[0], upstream[2]) >= JOINS_LOST_FROM:
             tree.renew_at_s = self._tick_s(JOIN_REFRESH_LOSSY_S, now_s)
-        is_proof_due = now_s >= tree.prove_at_s
+        is_proof_due = not renews or now_s >= tree.prove_at_s
         if is_proof_due:  # spread, so that the whole joins of many trees do not leave together
             tree.prove_at_s = now_s + JOIN_PROOF_S * (1 + tree.topic[0] / 255) / 2
-        renews = renews and not is_proof_due
-        self._show(tree, renews=renews)
+        self._show(tree, renews=not is_proof_due)
         if has_settled and self._paths.has_alternates:
-            self._ask_for_backup(tree, renews=renews)
+            self._ask_for_backup(tree, renews=not is_proof_due)
         if has_settled and tree.left:
             tree.left.clear()
             self._install(tree)
@@ -686,6 +689,7 @@ class MulticastTrees:
             return
         tree.is_doubted = tree.is_doubted and evidence == tree.shown
         tree.shown = evidence
+        tree.shown_of = next((at for at, branch in tree.branches.items() if branch.evidence == evidence), None)
         if evidence and tree.upstream is not None and tree.upstream_name is not None:
             self._joins.send_join(tree, tree.upstream, tree.upstream_name, terms, evidence)
 

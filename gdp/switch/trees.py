@@ -94,7 +94,8 @@ class Tree:
     renew_at_s: float = 0.0
     asked_route: Route = ()  # route in the last join
     followed: Route = ()  # that the upstream neighbour was chosen by
-    shown: bytes = b""  # evidence in the last join
+    shown: bytes = b""  # evidence in the last whole join
+    shown_of: Downstream | None = None  # the branch that it is of
     version: int = 0  # sequence number of ``proof``
     proof: bytes = b""  # the publisher's advertisement that ``switch`` was read from
     joins: int = 0  # sent to the upstream neighbour since it was chosen

@@ -14,7 +14,7 @@ from gdp.frame.codec import ETHER_BYTES, HEADER_BYTES, decode
 from gdp.frame.kinds import Kind
 from gdp.limits import JOIN_LEASE_S, JOIN_PROOF_S, JOIN_REFRESH_S, JOINS_AGAIN_MAX
 from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import chain
+from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology, chain
 from gdp.switch import multicast
 from tests.journeys.flows import Flow, advertise, flowing
 from tests.journeys.test_attacks import counted
@@ -140,6 +140,40 @@ def test_numbers_alone_keep_no_branch_for_long(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(multicast, "JOINS_AGAIN_MAX", JOINS_AGAIN_MAX)
     world.network.run(JOIN_REFRESH_S + 0.1)
     flow.outlive()
+
+
+def readers_by_evidence(world: Simulation, shown: list[bytes]) -> tuple[str, str]:
+    """Return the reader whose advertisement both switches hold, and the other one."""
+    names = {label: bytes(world.members[label].name) for label in ("s3/right", "s3/other")}
+    (held,) = {label for label, name in names.items() if all(name in evidence for evidence in shown)}
+    (other,) = set(names) - {held}
+    return held, other
+
+
+def test_the_evidence_of_a_reader_that_leaves_is_replaced_at_each_switch() -> None:
+    topology = Topology(
+        (Link("s1", "s2"), Link("s2", "s3")),
+        (DomainPlan("home", ("s1", "s2", "s3")),),
+        (
+            Attachment("s2", "rib", "rib"),
+            Attachment("s1", "proxy", "left"),
+            Attachment("s3", "proxy", "right"),
+            Attachment("s3", "proxy", "other"),
+        ),
+    )
+    world = Simulation(topology=topology)
+    assert world.run_until_attached()
+    flow = flowing(world, "/t", ROBOT, ("s3/right", "s3/other"))
+    world.network.run(JOIN_REFRESH_S)
+    trees = [world.switches[label].multicast.trees.of_topic(flow.topic.name)[0] for label in ("s1", "s2")]
+    left, stays = readers_by_evidence(world, [next(iter(tree.branches.values())).evidence for tree in trees])
+    world.members[left].unsubscribe(flow.topic.name)
+    world.network.send_pending(left)
+    world.network.run(3 * JOIN_REFRESH_S)
+    for tree in trees:
+        ((_, branch),) = tree.branches.items()
+        assert bytes(world.members[stays].name) in branch.evidence
+    flow.outlive(stays)
 
 
 def test_x03_a_neighbour_prolongs_no_branch_of_another_and_repeats_no_refresh() -> None:
