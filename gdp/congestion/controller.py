@@ -53,6 +53,7 @@ _FLAT_ROUNDS, _FLAT_GROWTH = 3, 1.25  # BBR: the pipe is full
 _LOSS_FRAMES: Final = 1_000
 _QUEUE_SHARE: Final = 0.1
 _LEAST_QUEUE: Final = 2.0  # frames; Copa: 1/delta
+_GROWTH_SHARE: Final = 0.125  # of the window, in a round trip
 _SAME_DIRECTION: Final = 3  # rounds before the velocity doubles
 _PACING_STARTUP, _PACING = 2.89, 1.2  # BBR: 2/ln 2 lets the window double each round trip
 _CREDIT_SHARE, _CREDIT_MOST_S = 0.125, 0.01  # of a round trip; less than a time slice loses the pace on a busy core
@@ -396,8 +397,8 @@ class PathController:
             self._velocity, self._same, self._direction = 1.0, 0, 1 if is_below else -1
         step = min(self._velocity * wanted * self._mtu, self.window / 2) * size / self.window
         least = float(_LEAST_FRAMES * self._mtu)
-        if is_below:
-            self.window += step
+        if is_below:  # of few frames, two more in a round trip would overflow a short FIFO
+            self.window += min(step, self._velocity * _GROWTH_SHARE * size)
         else:
             kept = min(_FULL_SHARE * self._last_rate * self._empty_path_s, self.window)  # less would idle the path
             self.window = max(self.window - step, kept, least)

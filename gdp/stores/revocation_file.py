@@ -75,11 +75,11 @@ class RevocationFile(BackgroundDatabase[Sequence[Change]]):
         self._slices.put_nowait(changes)
 
     def _open(self) -> sqlite3.Connection:
-        before = os.umask(0o077)
-        try:
-            return super()._open()
-        finally:
-            os.umask(before)
+        try:  # SQLite gives the files next to it the same mode; a umask would be that of other threads, too
+            os.close(os.open(self._path, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600))
+        except OSError as error:
+            raise sqlite3.OperationalError(error.strerror) from error
+        return super()._open()
 
     def _write(self, database: sqlite3.Connection, slice_: Sequence[Change], *, is_first: bool) -> None:
         del is_first

@@ -17,6 +17,7 @@ policy leave connected (``faults/oracle.py``) must continue. Promises:
     sudo .venv/bin/python scripts/bench/chaos.py --hours 3                   # seed after seed
     sudo .venv/bin/python scripts/bench/chaos.py --seed 7 --only cut --only roam
     sudo .venv/bin/python scripts/bench/chaos.py --seed 7 --cluster          # RIBs share a Valkey or Redis Cluster
+    sudo .venv/bin/python scripts/bench/chaos.py --seed 7 --thin 4           # all links are thin and full
 
 A run that fails prints its seed, its faults, what broke, and the last lines of the logs; the seed draws the same again.
 """
@@ -57,6 +58,7 @@ LIMIT_S: Final = 5.0
 REVOKED_S: Final = 3.0
 SETTLE_S: Final = 60.0
 LOOK_S: Final = 0.1
+IMAGE_SHARE: Final = 2.0  # of a thin link, as much as images offer
 REPORTED_S: Final = 0.25  # shorter silences are not reported
 SPARSE: Final = 1.5  # nor those of a flow that are shorter than so many of its periods
 CALL_S: Final = 5.0
@@ -319,7 +321,10 @@ def run_seed(runs: RunRegistry, seed: int, options: Options) -> list[str]:
         FailedError: the network did not come up.
         GdpError: the kernel refuses.
     """
-    plan = random_network(seed, options.switches, rate=options.rate, one_rib=options.one_rib)
+    thin_bits_s = 1e6 * (options.thin or 0.0)
+    plan = random_network(
+        seed, options.switches, rate=options.rate, one_rib=options.one_rib, image_bits_s=IMAGE_SHARE * thin_bits_s
+    )
     kinds = [SHORT[name] for name in options.only] if options.only else None
     in_store = _in_store(plan, seed, is_wanted=options.cluster)
     faults = make_schedule(plan, seed, options.seconds, pace_s=options.pace_s, kinds=kinds, has_store=bool(in_store))
@@ -335,6 +340,11 @@ def run_seed(runs: RunRegistry, seed: int, options: Options) -> list[str]:
         progress(f"seed {seed}: {len(plan.switches)} switches, {len(plan.ribs)} RIBs, {len(plan.members)} members up")
         chaos = Chaos(overlay, faults)
         chaos.settle()
+        if thin_bits_s:
+            between = [link for link in plan.topology.links if {link.a, link.b} <= set(plan.switches)]
+            for link in between:
+                overlay.make_thin(link.a, link.b, thin_bits_s, options.fifo_ms / 1e3)
+            progress(f"{len(between)} links have {options.thin:g} Mbit/s and a FIFO of {options.fifo_ms:g} ms")
         progress(f"everything is delivered after {time.monotonic() - begun_s:.1f} s; {len(faults)} faults")
         try:
             chaos.run()
@@ -430,6 +440,12 @@ def main() -> None:
         "--cluster",
         action=argparse.BooleanOptionalAction,
         help="RIBs of the top domain share a Valkey or Redis Cluster (default: for every third seed, if installed)",
+    )
+    parser.add_argument(
+        "--thin", type=float, metavar="MBIT_S", help="rate of all links between switches, which images then keep full"
+    )
+    parser.add_argument(
+        "--fifo-ms", type=float, default=200.0, help="depth of the FIFO of such a link (default: %(default)s)"
     )
     parser.add_argument("--one-rib", action="store_true", help="one RIB in each domain")
     parser.add_argument("--plane", default="auto", help="as gdp-switch --data-plane (default: %(default)s)")

@@ -286,6 +286,23 @@ class Trial:
 @example(  # what a full frame takes to leave was another flow's queue (decision 348)
     Plan(5, (), (Thin(1.0, 1, 0, 1, 60),), 0, (Fault("freeze", 0, 5.0, 5.2),), 1)
 )
+@example(  # a window of five frames grew by two in a round trip, and overflowed the FIFO (decision 349)
+    Plan(
+        7,
+        ((0, 3), (1, 2), (4, 3)),
+        (
+            Thin(2.0, 1, 0, 4, 200),
+            Thin(1.0, 20, 3, 1, 60),
+            Thin(4.0, 1, 0, 1, 200),
+            Thin(4.0, 5, 1, 1, 60),
+            Thin(4.0, 1, 0, 1, 60),
+            Thin(1.0, 5, 1, 1, 1_000),
+        ),
+        1,
+        (Fault("freeze", 20, 1.5, 1.7), Fault("freeze", 1, 1.0, 1.6)),
+        221,
+    )
+)
 @pytest.mark.momentary("every trial runs for three leases after its last fault; hypothesis also draws shorter attempts")
 def test_thin_links_that_fail_and_change_starve_nothing_and_hide_no_loss(plan: Plan) -> None:
     with short_leases():

@@ -23,16 +23,20 @@ _UPPERS: Final = {"middle": "top", "left": "middle", "right": "middle"}
 _RIBS: Final = {"top": 2, "middle": 1, "left": 1, "right": 2}
 _COSTS: Final = (10, 10, 10, 12, 15, 20)
 _HOMES: Final = 3
+_IMAGE_BYTES: Final = 30_000
 _READERS: Final = ("read1", "read2", "read3")
 
 
-def random_network(seed: int, switches: int = 14, *, rate: float = 1.0, one_rib: bool = False) -> Plan:
+def random_network(
+    seed: int, switches: int = 14, *, rate: float = 1.0, one_rib: bool = False, image_bits_s: float = 0.0
+) -> Plan:
     """Return a network with so many switches, and its members, flows and services.
 
     Args:
         switches: at least 12.
         rate: factor on every rate of messages and calls.
         one_rib: one in each domain.
+        image_bits_s: what a best-effort flow of images offers in addition; 0: there is none.
     """
     chance = random.Random(f"network {seed}")
     sizes = _sizes(switches, chance)
@@ -48,7 +52,7 @@ def random_network(seed: int, switches: int = 14, *, rate: float = 1.0, one_rib:
     topology, names = make_topology(domains, _UPPERS, links, ribs, members)
     everywhere = [switch for each in domains.values() for switch in each]
     homes = {mover: _homes(members[mover], everywhere, chance) for mover in ("talk1", "read1")}
-    flows = (
+    flows: tuple[Flow, ...] = (
         Flow("/reliable/1", "talk1", ("read1", "read2"), hz=40 * rate),
         Flow("/reliable/2", "talk2", ("read2", "read3"), hz=25 * rate, size=1_000),
         Flow("/reliable/3", "talk3", ("read1", "read3", "talk1"), hz=10 * rate, size=8_000),
@@ -56,6 +60,9 @@ def random_network(seed: int, switches: int = 14, *, rate: float = 1.0, one_rib:
         Flow("/best-effort/2", "talk3", _READERS, reliable=False, hz=20 * rate, size=3_000),
         Flow(REVOKED_TOPIC, VICTIM, ("read1", "read3"), hz=20 * rate),
     )
+    if image_bits_s:
+        hz = image_bits_s / 8 / _IMAGE_BYTES
+        flows += (Flow("/images", "talk1", _READERS, reliable=False, hz=hz, size=_IMAGE_BYTES),)
     services = (
         Service("/add", ("serve1", "serve2"), ("talk1", "read3"), hz=4 * rate),
         Service("/plan", ("serve2", "serve3", "serve1"), ("talk2",), hz=4 * rate),

@@ -20,6 +20,7 @@ from typing import Final
 import yaml
 from devices import hand_over, received, set_up
 from peers.process import Started
+from pyroute2 import IPRoute
 from testbed import Lab
 
 from faults.clock import Clock
@@ -40,6 +41,7 @@ from ring.credentials import OverlayCredentials
 __all__ = ["Overlay"]
 
 READY_S: Final = 60.0
+_BUCKET_BYTES: Final = 4_000  # of a thin link; two frames
 _OWNER: Final = "owner"
 
 
@@ -269,6 +271,11 @@ class Overlay:
         for own, other in ((a, b), (b, a)):
             self._links.clear(self.spaces.path(own), other)
 
+    def make_thin(self, a: str, b: str, bits_s: float, fifo_s: float) -> None:
+        """Give a link a rate and a plain FIFO, both ways, to the end of the run."""
+        for own, other in ((a, b), (b, a)):
+            self._lab.inside(own, partial(_shape, other, bits_s, fifo_s))
+
     def received(self, node: str, neighbours: Sequence[str]) -> dict[str, int]:
         """Return how many frames have come in at a node's devices towards these neighbours."""
         return self._lab.inside(node, partial(received, neighbours))
@@ -380,6 +387,14 @@ class Overlay:
             "iface": self.plan.home(member),  # a device has the name of the neighbour it first leads to
         }
         self._write(self.directory / f"end-{member}.yaml", content)
+
+
+def _shape(ifname: str, bits_s: float, fifo_s: float) -> None:
+    """Limit what leaves a device: a token bucket, before which frames wait in a FIFO."""
+    with IPRoute() as here:
+        (index,) = here.link_lookup(ifname=ifname)
+        limit = max(round(bits_s / 8 * fifo_s), _BUCKET_BYTES)
+        here.tc("add", "tbf", index, 0x10000, rate=round(bits_s / 8), burst=_BUCKET_BYTES, limit=limit)
 
 
 def _flow_part(channel: int, flow: Flow) -> dict[str, object]:

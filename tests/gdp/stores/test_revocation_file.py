@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import stat
 from pathlib import Path
@@ -12,6 +13,7 @@ from gdp.crypto.statements import Statement, parse
 from gdp.errors import LocalError
 from gdp.nodes.revocation_upkeep import RevocationUpkeep
 from gdp.sansio import Timestamps
+from gdp.stores.revocation_file import RevocationFile
 from gdp.trust.revocation import Revocation
 from gdp.trust.revocations import OPERATOR, Revocations
 from tests.gdp.trust.world import CAMERA, CLOUD, LAB, NOW, SCHOOL
@@ -65,6 +67,22 @@ def test_what_was_kept_comes_back_with_its_origin(tmp_path: Path) -> None:
 def test_only_this_user_may_read_the_file(tmp_path: Path) -> None:
     written(tmp_path, of_school(1))
     assert stat.S_IMODE((tmp_path / "revocations").stat().st_mode) == 0o600
+
+
+def test_files_that_sqlite_makes_next_to_it_are_private_and_the_mask_of_the_process_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    masks = list[int]()
+    monkeypatch.setattr(os, "umask", masks.append)
+    file = RevocationFile(tmp_path)
+    database = file._open()
+    database.execute("BEGIN IMMEDIATE")
+    database.execute("INSERT INTO revocations VALUES (x'00', 0, x'00', 0, x'00')")
+    database.commit()
+    modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in tmp_path.iterdir()}
+    database.close()
+    assert modes == {"revocations": 0o600, "revocations-wal": 0o600}
+    assert masks == []
 
 
 def test_what_a_killed_node_had_synced_comes_back(tmp_path: Path) -> None:
