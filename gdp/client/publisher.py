@@ -318,6 +318,17 @@ class Publisher:
             due_s = max(due_s, now_s + self._limit.seconds_for(1 - left))
         return None if due_s == _NEVER else due_s
 
+    def awaited_readers(self) -> frozenset[bytes]:
+        """Return the readers whose paths must all permit a frame at once; empty: one of them suffices."""
+        if not self.confirms:
+            return frozenset()
+        names = [name for name in self._readers if self._window.has_reader(name)]
+        return frozenset(names) if len(names) > 1 else frozenset()
+
+    def has_any(self, readers: frozenset[bytes]) -> bool:
+        """Return whether one of these nodes is a reader."""
+        return any(name in self._readers for name in readers)
+
     def note_idle(self) -> None:
         """Note that nothing waits, though the paths may permit more."""
         for path in self._paths():

@@ -2,7 +2,9 @@
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Urgent publishers come first, in the order of their
 priorities. The others share what their paths permit by deficit round robin, by priority and weight. A publisher that
-had nothing to send has its first round before those that wait, so that no image delays a scan. Sources: Linux
+had nothing to send has its first round before those that wait, so that no image delays a scan. A reliable publisher
+needs space on the paths to all its readers at once. When its turn has come and there is none, publishers behind it leave
+these paths alone for up to ``_RESERVED_S``; else they would take each space as it appears. Sources: Linux
 ``sch_prio``; M. Shreedhar and G. Varghese, Efficient Fair Queuing Using Deficit Round Robin, SIGCOMM 1995; RFC 8290,
 section 4 (new and old queues).
 """
@@ -20,6 +22,7 @@ __all__ = ["BYTES_AT_ONCE", "BYTES_WITH_URGENT", "SendScheduler"]
 BYTES_AT_ONCE: Final = 160 << 10  # of ordinary frames, before any other publisher has its turn
 BYTES_WITH_URGENT: Final = 64 << 10  # ... with an urgent topic, whose frames may have to wait for this amount
 _QUANTUM_FRAMES: Final = 2  # of the publisher with the least share in each round, where the path is the limit
+_RESERVED_S: Final = 0.25  # and for as long after that paths are not reserved, so that a slow reader stops no others
 _NEVER: Final = float("inf")
 
 
@@ -39,6 +42,8 @@ class SendScheduler:
         self._held_until_s: float | None = None  # the paths hold back all that wait
         self._uncounted: Publisher | None = None  # whose frames leave before they are counted
         self._is_idle = False  # it had nothing more
+        self._reserved_until_s = float("-inf")  # for the publisher whose turn it is
+        self._reserving: Publisher | None = None
 
     def __bool__(self) -> bool:
         return bool(self._urgent or self._new or self._ordinary) and self._held_until_s is None
@@ -120,13 +125,18 @@ class SendScheduler:
         due_s, left = _NEVER, self._at_once
         shares = [publisher.options.share for publisher in self._ordinary]
         total, least = sum(shares), min(shares, default=1)
+        reserved = frozenset[bytes]()
         for publisher, left_of_round in list(self._ordinary.items()):
             publisher.path_share = publisher.options.share / total
             allowance = publisher.allowance(now_s)
-            if allowance <= 0:
+            is_reserved = bool(reserved) and publisher.has_any(reserved)
+            if allowance <= 0 or is_reserved:
                 frames += self._poll(publisher, 0, now_s)
-                due_s = min(due_s, _or_never(publisher.next_send_s(now_s)))
+                due_s = min(due_s, self._reserved_until_s if is_reserved else _or_never(publisher.next_send_s(now_s)))
+                reserved = reserved or self._reserve(publisher, now_s)
                 continue
+            if publisher is self._reserving:
+                self._reserving, self._reserved_until_s = None, float("-inf")
             is_shared = allowance < left and len(self._ordinary) > 1
             deficit = left_of_round
             if is_shared and deficit <= 0:
@@ -146,6 +156,15 @@ class SendScheduler:
             if left < self._at_once // 2:
                 break
         return frames, due_s
+
+    def _reserve(self, publisher: Publisher, now_s: float) -> frozenset[bytes]:
+        """Reserve the paths of a publisher that has to wait for several; return its readers, or none."""
+        if publisher.is_limited(now_s) or not (readers := publisher.awaited_readers()):
+            return frozenset()
+        if now_s >= self._reserved_until_s + _RESERVED_S:
+            self._reserving, self._reserved_until_s = publisher, now_s + _RESERVED_S
+        is_its = publisher is self._reserving and now_s < self._reserved_until_s
+        return readers if is_its else frozenset()
 
     def _poll(self, publisher: Publisher, limit_bytes: int, now_s: float) -> list[bytes]:
         frames = publisher.poll_frames(now_s, limit_bytes)
