@@ -20,9 +20,10 @@ FULL_S, SETTLED_S = 15.0, 2.0
 
 def world_of() -> Simulation:
     links = (Link("s0", "s1"), Link("s1", "s2"), Link("s2", "s3"), Link("s1", "s4"))
-    ends = (("s1", "rib", "rib"), ("s0", "proxy", "robot"), *((each[:2], "proxy", each[3:]) for each in READERS))
+    ends = [Attachment("s1", "rib", "rib"), Attachment("s0", "proxy", "robot")]
+    ends += [Attachment(each[:2], "proxy", each[3:]) for each in READERS]
     world = Simulation(
-        topology=Topology(links, (DomainPlan("home", SWITCHES),), tuple(Attachment(*each) for each in ends)),
+        topology=Topology(links, (DomainPlan("home", SWITCHES),), tuple(ends)),
         keepalive_ms=None,
     )
     assert world.run_until_attached()
