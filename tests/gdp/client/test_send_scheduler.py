@@ -30,6 +30,16 @@ class Flood(Publisher):
         self.waiting = waiting
         self.frames_out = 0
         self.has_more = True
+        self.awaited: frozenset[bytes] = frozenset()
+
+    def is_limited(self, now_s: float) -> bool:
+        return False
+
+    def awaited_readers(self) -> frozenset[bytes]:
+        return self.awaited
+
+    def has_any(self, readers: frozenset[bytes]) -> bool:
+        return True
 
     @property
     def mtu(self) -> int:
@@ -154,3 +164,21 @@ def test_a_publisher_that_has_no_more_is_not_asked_again_until_it_has() -> None:
     assert not turns
     assert turns.poll_turn(101.0) == []
     assert asked == [publisher]
+
+
+def test_paths_are_reserved_for_a_publisher_to_several_readers_for_a_quarter_of_a_second_and_then_not_as_long() -> None:
+    waits, other = Flood([0]), Flood([1 << 20])
+    waits.awaited = frozenset((b"a", b"b"))
+    turns = scheduled(waits, other)
+    sent = []
+    for step in range(20):
+        turns.resume()
+        before = other.frames_out
+        turns.poll_turn(0.05 * step)
+        sent.append(other.frames_out > before)
+        other.path[0] = 1 << 20
+    assert sent == [*[False] * 5, *[True] * 5, *[False] * 5, *[True] * 5]
+    waits.path[0] = 1 << 20
+    turns.resume()
+    turns.poll_turn(1.0)
+    assert waits.frames_out > 0
