@@ -159,12 +159,12 @@ class SendScheduler:
 
     def _reserve(self, publisher: Publisher, now_s: float) -> frozenset[bytes]:
         """Reserve the paths of a publisher that has to wait for several; return its readers, or none."""
-        if publisher.is_limited(now_s) or not (readers := publisher.awaited_readers()):
-            return frozenset()
-        if now_s >= self._reserved_until_s + _RESERVED_S:
-            self._reserving, self._reserved_until_s = publisher, now_s + _RESERVED_S
         is_its = publisher is self._reserving and now_s < self._reserved_until_s
-        return readers if is_its else frozenset()
+        if (not is_its and now_s < self._reserved_until_s + _RESERVED_S) or publisher.is_limited(now_s):
+            return frozenset()
+        if (readers := publisher.awaited_readers()) and not is_its:
+            self._reserving, self._reserved_until_s = publisher, now_s + _RESERVED_S
+        return readers
 
     def _poll(self, publisher: Publisher, limit_bytes: int, now_s: float) -> list[bytes]:
         frames = publisher.poll_frames(now_s, limit_bytes)
