@@ -96,8 +96,8 @@ class AckNackHandler:
             self._give_up(name, reader, now_s)
 
     def exclude(self, name: bytes, now_s: float) -> None:
-        """Let a slow reader block the window no longer, for a penalty time."""
-        if self._window.has_reader(name):
+        """Let a slow reader block the others no longer, for a penalty time."""
+        if self._window.has_reader(name) or (name in self._readers and not self._queue.is_acknowledged):
             self._readers.suspend_again(name, now_s)
             self._window.drop_reader(name)
             self._heartbeats.wanted = True

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from typing import Final, TypeVar
+from typing import Final
 
 from gdp.client.ack_nack_handler import AckNackHandler
 from gdp.client.best_effort_cache import BestEffortCache
@@ -44,7 +44,6 @@ from gdp.token_bucket import TokenBucket
 
 __all__ = ["Publisher"]
 
-_Number = TypeVar("_Number", int, float)
 _ALL: Final = 1 << 30
 _NEVER: Final = float("inf")
 _ALONE_FROM_S: Final = 1.0  # after a second path: round trips enough to measure the one that remains
@@ -307,22 +306,20 @@ class Publisher:
         if len(paths) == 1:
             return paths[0].allowance(now_s, urgent=urgent)
         allowances = [path.allowance(now_s, urgent=urgent) for path in paths]
-        if self.confirms and len(allowances) > 1 and min(allowances) <= 0:
+        if len(allowances) > 1 and min(allowances) <= 0:
             self._record_blocks(now_s)
-        return self._governed(allowances, _ALL)
+        return min(allowances, default=_ALL)
 
     def next_send_s(self, now_s: float) -> float | None:
         """Return when ``allowance`` may be more than 0; None: not before a reader confirms something."""
-        due_s = -self._governed([-path.next_send_s() for path in self._paths()], -now_s)
+        due_s = max((path.next_send_s() for path in self._paths()), default=now_s)
         if self._limit is not None and (left := self._limit.left(now_s)) <= 0:
             due_s = max(due_s, now_s + self._limit.seconds_for(1 - left))
         return None if due_s == _NEVER else due_s
 
     def awaited_readers(self) -> frozenset[bytes]:
-        """Return the readers whose paths must all permit a frame at once; empty: one of them suffices."""
-        if not self.confirms:
-            return frozenset()
-        names = [name for name in self._readers if self._window.has_reader(name)]
+        """Return the readers whose paths must all permit a frame at once; empty: there is one path."""
+        names = self._governing_names()
         return frozenset(names) if len(names) > 1 else frozenset()
 
     def has_any(self, readers: frozenset[bytes]) -> bool:
@@ -337,7 +334,7 @@ class Publisher:
     @property
     def path_bytes_s(self) -> float | None:
         """Return the bytes a second that this topic may expect of its path; None: not measured, and no limit."""
-        rate = self._governed([rate for path in self._paths() if (rate := path.controller.bytes_s)], 0.0)
+        rate = min((rate for path in self._paths() if (rate := path.controller.bytes_s)), default=0.0)
         shares = [rate * self.path_share] if rate else []
         if self.options.max_bits_s is not None:
             shares.append(self.options.max_bits_s / 8)
@@ -435,6 +432,7 @@ class Publisher:
             is_copy = self.paths > 1 and error.reason is DropReason.REPLAYED
             self.drops[DropReason.SECOND_COPY if is_copy else error.reason] += 1
             return False
+        self._reader_paths.note_incarnation(header.source, self._readers[header.source].incarnation_id.started, now_s)
         if self._striper is not None:
             self._striper.handle_share(header.source, report.share)
         if not header.hops_left & SECOND_PATH:
@@ -464,7 +462,7 @@ class Publisher:
     def handle_timer(self, now_s: float) -> None:
         """Suspend silent readers, drop slow ones from the window, and probe those that owe a report."""
         self._acknowledgements.handle_timer(now_s)
-        for name in self._blocking.slow(self._window.sent_bytes, now_s):
+        for name in self._blocking.slow(self._under_way.sent_bytes, now_s):
             self._acknowledgements.exclude(name, now_s)
         self._late.drop_expired(now_s)
         self._heartbeats.wanted |= self._window.probe_due(now_s)
@@ -512,7 +510,7 @@ class Publisher:
             self.has_more = left <= len(self.parity)
             parity_after = self.parity.poll_frames(max(left, 0))
             if not self._is_doubled(now_s):
-                self._uncounted = sent, list(self._readers), now_s, self.repairs - repaired
+                self._uncounted = sent, self._present_readers(), now_s, self.repairs - repaired
             if self._limit is not None and (leaving := sum(map(len, parity + sent + parity_after))):
                 self._limit.charge(now_s, leaving)
         frames = status + parity + sent + parity_after
@@ -552,10 +550,9 @@ class Publisher:
 
     def _record_blocks(self, now_s: float) -> None:
         """Note which readers hold back the others."""
-        names = [name for name in self._readers if self._window.has_reader(name)]
-        paths = [(name, self._reader_paths.path(name, now_s)) for name in names]
+        paths = [(name, self._reader_paths.path(name, now_s)) for name in self._governing_names()]
         allowances = [(name, path.allowance(now_s)) for name, path in paths if not path.is_silent]
-        self._blocking.record(allowances, self._window.sent_bytes, now_s)
+        self._blocking.record(allowances, self._under_way.sent_bytes, now_s)
 
     def _measure_loss(self, now_s: float) -> None:
         """Note whether messages get parity from now on; reports change that, not each poll.
@@ -569,17 +566,26 @@ class Publisher:
         self._queue.has_parity = self.parity.is_wanted(self._loss, trip_s, self.options.deadline_s)
 
     def _paths(self) -> list[ReaderPath]:
-        """Return the paths to the readers that may govern: of a reliable topic those that keep up."""
-        names = [name for name in self._readers if self._window.has_reader(name)] if self.confirms else self._readers
-        return self._reader_paths.governing(names, self._seen_s)
+        """Return the paths to the readers that may govern, the slowest of which does."""
+        return self._reader_paths.governing(self._governing_names(), self._seen_s)
 
-    def _governed(self, values: list[_Number], otherwise: _Number) -> _Number:
-        """Return the value of the path that governs.
+    def _governing_names(self) -> list[bytes]:
+        """Return the readers that keep up: the others must not wait for one that does not. Without any, return all.
 
-        A reliable topic goes as slowly as its slowest reader that counts. A best-effort topic goes as fast as its
-        fastest, because no reader of it waits for another.
+        A best-effort reader whose program is slow drops frames itself, which costs no other. One behind a thin link
+        keeps up as long as that link carries something, because frames beyond its rate would harm all who share it.
         """
-        return (min if self.confirms else max)(values, default=otherwise)
+        names, paths, now_s = self._present_readers(), self._reader_paths, self._seen_s
+        if self.confirms:
+            return [name for name in names if self._window.has_reader(name)] or names
+        readers = self._readers
+        return [each for each in names if now_s >= readers[each].out_until_s and not paths.is_behind(each)] or names
+
+    def _present_readers(self) -> list[bytes]:
+        """Return the readers whose nodes have not started again since they began to read. Without any, return all."""
+        readers, is_former = self._readers, self._reader_paths.is_former
+        names = [name for name in readers if not is_former(name, readers[name].incarnation_id.started)]
+        return names or list(readers)
 
     def _set_flags(self) -> None:
         queue = self._queue

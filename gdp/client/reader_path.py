@@ -3,7 +3,8 @@
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). One congestion controller (``gdp/congestion``) for each reader
 node is shared by all publishers of a participant that this node reads. A frame to several readers counts on the path of
 each, and leaves when all of them permit it, so the slowest reader governs. A reader that confirms nothing for a timeout
-no longer governs the others; alone, it gets two frames each timeout.
+no longer governs the others; alone, it gets two frames each timeout. When a reader node restarts, its path begins
+again, and frames to its former incarnation do not count.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ _DOUBLINGS_MAX: Final = 3
 _PROBE_TRIPS, _PROBE_LEAST_S = 2.0, 0.1
 _LATE_TRIPS, _LATE_LEAST_S = 4.0, 0.1  # RFC 8985, section 6.2; reports of one topic may come so much after another's
 _SCAN_S: Final = 0.1
+_BEHIND_S: Final = 0.1  # a reader reports 20 ms after a frame came
+_BEHIND_REPORTS: Final = 2
 _URGENT_SHARE: Final = 1.5  # of the window: urgent frames find space where the others have filled it
 _URGENT_FRAMES: Final = 8
 _FORGET_S: Final = 60.0
@@ -38,11 +41,13 @@ class ReaderPath:
         controller: its congestion controller.
         may_probe: one frame may leave whatever the window: what a report of it shows as lost makes space.
         is_silent: nothing was confirmed for a timeout, though something is under way.
+        is_behind: frames wait in the reader's own socket, because its program is slow; the path is not the reason.
     """
 
     def __init__(self, mtu: int, now_s: float) -> None:
         self.controller = PathController(mtu)
-        self.is_silent = self.may_probe = self._has_probed = False
+        self.is_silent = self.is_behind = self.may_probe = self._has_probed = False
+        self._late_reports = 0  # in a row
         self._mtu = mtu
         self._number = self._left = 0
         self._hops: int | None = None
@@ -114,11 +119,24 @@ class ReaderPath:
             if self.controller.rtt_s is not None:  # not one of before a timeout
                 self._answered_s, self._trip_s, self._timeouts = now_s, self.controller.rtt_s, 0
 
+    def handle_held(self, held_s: float) -> None:
+        """Note how long the newest frame of a report had waited at the reader when it left."""
+        self._late_reports = self._late_reports + 1 if held_s > _BEHIND_S else 0
+        self.is_behind = self._late_reports >= _BEHIND_REPORTS
+
     def handle_heard(self) -> None:
         """Note that the reader is alive; what left during a silence and is not confirmed now was lost."""
         if self.is_silent:
             self.is_silent = False
             self.controller.forget_all()
+
+    def restart(self, now_s: float) -> None:
+        """Begin again: the reader node has restarted, and confirms nothing that is under way."""
+        self.controller = PathController(self._mtu)
+        self._confirmed_s = self._answered_s = now_s
+        self._timeouts, self._trip_s, self._hops = 0, 0.0, None
+        self.is_silent = self.is_behind = self.may_probe = self._has_probed = False
+        self._late_reports = 0
 
     def patience_s(self, now_s: float) -> float:
         """Return how long an answer may take: a round trip, or as long as nothing under way was confirmed."""
@@ -172,6 +190,7 @@ class ReaderPaths:
 
     def __init__(self) -> None:
         self._paths: dict[bytes, ReaderPath] = {}
+        self._started: dict[bytes, int] = {}  # when the newest incarnation of a reader node started
         self._scan_s: float | None = None
         self._mtu = MTU_MIN_BYTES  # of new paths
 
@@ -190,6 +209,24 @@ class ReaderPaths:
     def get(self, reader: bytes) -> ReaderPath | None:
         """Return the path to a reader node, or None."""
         return self._paths.get(reader)
+
+    def note_incarnation(self, reader: bytes, started: int, now_s: float) -> None:
+        """Note when an incarnation of a reader node started, as it says; the path to a new one begins again."""
+        known = self._started.get(reader, 0)
+        if started <= known:
+            return
+        self._started[reader] = started
+        if known and (path := self._paths.get(reader)) is not None:
+            path.restart(now_s)
+
+    def is_behind(self, reader: bytes) -> bool:
+        """Return whether a reader's own program is too slow for what arrives there."""
+        path = self._paths.get(reader)
+        return path is not None and path.is_behind
+
+    def is_former(self, reader: bytes, started: int) -> bool:
+        """Return whether a reader node has started again since; 0: not known when it started."""
+        return 0 < started < self._started.get(reader, 0)
 
     def set_mtu(self, readers: Iterable[bytes], mtu: int) -> None:
         """Set the bytes of a full frame to some readers, and on new paths."""
@@ -225,6 +262,7 @@ class ReaderPaths:
             timed_out |= path.controller.inflight < inflight or path.may_probe
             if path.is_unused(now_s):
                 del self._paths[reader]
+                self._started.pop(reader, None)
         self._scan_s = now_s + _SCAN_S if any(path.controller.inflight for path in self._paths.values()) else None
         return timed_out or before != sum(path.is_silent for path in self._paths.values())
 

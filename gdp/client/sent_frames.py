@@ -60,13 +60,16 @@ class SentFrames:
     Args:
         paths: of the participant.
         counts_losses: frames keep their order; not so if they are striped over two paths.
+
+    Attributes:
+        sent_bytes: of all frames so far.
     """
 
     def __init__(self, paths: ReaderPaths, *, counts_losses: bool = True) -> None:
         self._paths = paths
         self._counts_losses = counts_losses
         self._readers: dict[bytes, _Reader] = {}
-        self._count = 0
+        self._count = self.sent_bytes = 0
         self._runs: dict[int, list[_Run]] = {}  # by message number; oldest first
 
     def sent(self, frames: Sequence[bytes], names: Sequence[bytes], now_s: float, again: int = 0) -> None:
@@ -86,6 +89,7 @@ class SentFrames:
         for first in range(0, len(frames), _FLIGHT_FRAMES):
             flight = frames[first : first + _FLIGHT_FRAMES]
             size = sum(map(len, flight))
+            self.sent_bytes += size
             count = self._count = self._count + len(flight)
             for name in names:
                 path = self._paths.path(name, now_s)
@@ -154,6 +158,7 @@ class SentFrames:
         lost = 0 if lost > _COUNT_MASK // 2 else lost
         new_lost, reader.lost = max(lost - reader.lost, 0), max(lost, reader.lost)
         lost = min(new_lost, reader.resolved - before - 1) if self._counts_losses else 0
+        path.handle_held(report.held_us / 1e6)
         path.acknowledged(numbers, max(lost, 0), report.held_us / 1e6 + waited_s, now_s)
 
     def _confirm_repairs(self, reader: _Reader, path: ReaderPath, came: int, now_s: float) -> None:

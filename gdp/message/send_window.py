@@ -76,11 +76,6 @@ class SendWindow:
         return self._cache.held_bytes
 
     @property
-    def sent_bytes(self) -> int:
-        """Return how many bytes of frames were sent for the first time, since the first message."""
-        return self._sent_at
-
-    @property
     def retransmissions(self) -> int:
         """Return how many fragments were sent again."""
         return self._repairs.retransmissions

@@ -24,7 +24,7 @@ SOON_S = 0.02  # more than the path needs, less than any timer of a publisher or
 
 
 class Behind:
-    """Member behind a narrow link: data waits in a short queue, statements of neighbours do not.
+    """Member whose program is slow: data waits in its socket's short queue, statements of neighbours do not.
 
     Attributes:
         frames_s: how many frames a second get through; 0: none.
@@ -33,7 +33,7 @@ class Behind:
 
     def __init__(self, member: Participant, frames_s: float) -> None:
         self._member = member
-        self._queue = deque[ReceivedFrame]()
+        self._queue = deque[tuple[float, ReceivedFrame]]()  # with the time of arrival
         self._at_s = 0.0
         self.frames_s = frames_s
         self.dropped = 0
@@ -47,7 +47,7 @@ class Behind:
                 self._member.receive([arrival], now)
             elif len(self._queue) < QUEUE_FRAMES:
                 self._at_s = self._at_s if self._queue else max(self._at_s, now.mono_s)
-                self._queue.append(arrival)
+                self._queue.append((now.mono_s, arrival))
             else:
                 self.dropped += 1
 
@@ -57,7 +57,8 @@ class Behind:
     def handle_timer(self, now: Timestamps) -> None:
         while self._queue and self.frames_s and self._at_s <= now.mono_s:
             self._at_s += 1 / self.frames_s
-            self._member.receive([self._queue.popleft()], now)
+            came_s, arrival = self._queue.popleft()
+            self._member.receive([arrival._replace(waited_s=now.mono_s - came_s)], now)
         self._member.handle_timer(now)
 
     def get_timer(self) -> float | None:

@@ -179,7 +179,7 @@ class Books:
                 head = account.first - 1 if is_later else 0
                 least += account.missing(sent if is_last else account.last)
                 most += account.missing(max(sent, account.last)) + head
-            between = self.reported_between[channel, reader, incarnation_id]
+            between = self._between(channel, reader, incarnation_id)
             gap = sum(
                 self._gap(channel, reader, incarnation_id, source_incarnation) for source_incarnation, _ in accounts
             )
@@ -191,6 +191,18 @@ class Books:
                 lack = f"{least}" if least == most else f"{least} to {most}"
                 found.append(f"{who}: {lack} messages missing, {reported_losses} reported")
         return found
+
+    def _between(self, channel: int, reader: str, incarnation_id: int) -> int:
+        """Return the reported losses since the former incarnation of a reader that got a message.
+
+        Those in between got none, but may have learnt of losses.
+        """
+        reached = {life for of, who, life, _ in self.accounts if (of, who) == (channel, reader)}
+        former = max((life for life in reached if life < incarnation_id), default=incarnation_id - 1)
+        reported = self.reported_between[channel, reader, incarnation_id]
+        for life in range(former + 1, incarnation_id):
+            reported += self.reported_between[channel, reader, life] + self.reported_losses[channel, reader, life]
+        return reported
 
     def _gap(self, channel: int, reader: str, incarnation_id: int, source_incarnation: int) -> int:
         """Return how many messages in between reached neither this incarnation of a reader nor an earlier one."""

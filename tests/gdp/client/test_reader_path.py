@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gdp.client.reader_path import ReaderPaths
+from gdp.congestion.controller import PathController
 
 MTU, READER = 1_500, b"r" * 32
 TRIP_S, STEP_S = 0.01, 0.05
@@ -74,3 +75,41 @@ def test_timeouts_that_follow_each_other_double_until_a_round_trip_is_measured()
     assert path.patience_s(now_s) == pytest.approx(now_s - begun_s)
     path.acknowledged([path.sent(MTU, 1, now_s)], 0, 0.0, now_s + TRIP_S)
     assert path.patience_s(now_s + TRIP_S) == pytest.approx(TRIP_S)
+
+
+def test_a_reader_node_that_restarted_has_a_new_path_at_once() -> None:
+    paths, now_s = ReaderPaths(), 10.0
+    path = paths.path(READER, now_s)
+    path.set_mtu(MTU)
+    fresh = PathController(MTU).window
+    paths.note_incarnation(READER, 1_000, now_s)
+    for _ in range(3):  # it was killed: timeout after timeout
+        path.sent(2 * MTU, 2, now_s)
+        now_s += 3
+        paths.handle_timer(now_s)
+    assert path.is_silent
+    assert path.controller.window == 2 * MTU
+    path.sent(2 * MTU, 2, now_s)
+    for started in (1_000, 999):  # the same incarnation, and one of before
+        paths.note_incarnation(READER, started, now_s)
+        assert path.is_silent
+    paths.note_incarnation(READER, 1_001, now_s)
+    assert not path.is_silent
+    assert not path.controller.inflight
+    assert path.controller.window == fresh
+    assert paths.is_former(READER, 1_000)
+    assert not paths.is_former(READER, 1_001)
+    assert not paths.is_former(READER, 0), "not known when it started"
+    paths.path(READER, now_s).sent(MTU, 1, now_s)
+    paths.handle_timer(now_s + 0.35)
+    assert path.is_silent, "the first timeout of a new path is not doubled"
+
+
+def test_a_reader_is_behind_when_frames_wait_in_its_own_socket() -> None:
+    path = ReaderPaths().path(READER, 10.0)
+    path.handle_held(0.5)
+    assert not path.is_behind, "one report may be late for another reason"
+    path.handle_held(0.5)
+    assert path.is_behind
+    path.handle_held(0.02)
+    assert not path.is_behind

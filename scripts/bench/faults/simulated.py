@@ -1,0 +1,283 @@
+"""Chaos run in virtual time: the network, the faults and the accounts of the bench, on simulated links.
+
+Sans-I/O. A seed repeats the whole run, frame by frame, so what broke can be followed. Links between switches may be
+thin, with a FIFO. There are no processes, disks and clocks here, so faults of these are not injected; calls are not
+made.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from collections.abc import Sequence
+from functools import partial
+from typing import Final
+
+from topologies import ends_of
+
+from faults.accounts import Books, Silence, Timeline
+from faults.oracle import Oracle
+from faults.plan import Flow, Plan
+from faults.records import Kind, Record
+from faults.schedule import Fault, FaultKind, broken_by
+from gdp.client.participant import Participant
+from gdp.client.publisher import Publisher
+from gdp.message.loss import LossReason
+from gdp.names import Name
+from gdp.simulation.network import SimLink
+from gdp.simulation.simulation import Simulation
+from gdp.simulation.topology import Attachment, DomainPlan, Topology
+from gdp.trust.right import Right
+
+__all__ = ["SIMULATED", "SimulatedChaos"]
+
+SIMULATED: Final = (
+    FaultKind.CUT, FaultKind.SILENT, FaultKind.LOSS, FaultKind.REORDERED, FaultKind.KILL_SWITCH, FaultKind.KILL_RIB,
+    FaultKind.KILL_MEMBER, FaultKind.FREEZE, FaultKind.PARTITION, FaultKind.ROAM,
+)  # fmt: skip
+AFTER_S: Final = 8.0  # observation after the last fault
+_HEAD: Final = struct.Struct("!HHIQ")  # channel, publisher, incarnation, number
+_STEP_S: Final = 0.05
+_SETTLE_S: Final = 60.0
+_DRAIN_S: Final = 30.0  # until each message is there, or counted as lost
+_LOSS, _JITTER_S = 0.05, 0.02
+
+
+class SimulatedChaos:
+    """One run.
+
+    Args:
+        plan: the network.
+        faults: in the order of their starts, of the kinds in ``SIMULATED``.
+        seed: of keys, delays and losses.
+
+    Attributes:
+        world: the simulated network.
+        publishers: by channel; that of the last incarnation.
+        begun_s: virtual second at which the first fault was scheduled from.
+    """
+
+    def __init__(self, plan: Plan, faults: Sequence[Fault], seed: int) -> None:
+        self._plan, self._faults = plan, faults
+        self.world = Simulation(topology=_topology(plan), seed=seed, trusts=None)
+        self._labels = {label.rpartition("/")[2]: label for label in self.world.members}
+        self._at = {mover: homes[0] for mover, homes in plan.homes.items()}
+        self._incarnations: Counter[str] = Counter()
+        self._dead: set[str] = set()
+        self._numbers: Counter[tuple[int, int]] = Counter()  # by channel and incarnation of the publisher
+        self._seen: dict[tuple[str, int], Counter[LossReason]] = {}
+        self.publishers: dict[int, Publisher] = {}
+        self._names: dict[int, Name] = {}
+        self._under_way: list[Fault] = []
+        self._oracle = Oracle(plan)
+        self.books = Books(plan)
+        self._must = {pair: Timeline() for pair in self._oracle.pairs()}
+        self.begun_s = self._last_s = self._end_s = 0.0
+
+    @property
+    def now_s(self) -> float:
+        """Return the virtual second of the run."""
+        return self.world.network.now.mono_s - self.begun_s
+
+    def settle(self, *, thin_bits_s: float = 0.0, fifo_s: float = 0.0) -> None:
+        """Attach all members and return when every flow is delivered; then make the links thin, if they are to be.
+
+        Raises:
+            AssertionError: not in time.
+        """
+        assert self.world.run_until_attached(_SETTLE_S)
+        for member in self._plan.members:
+            self._begin_flows(member)
+        network = self.world.network
+        for channel, flow in enumerate(self._plan.flows):
+            network.call(channel * 0.01, partial(self._publish, channel, flow, 0))
+        latest_s = network.now.mono_s + _SETTLE_S
+        while missing := [pair for pair in self._must if not self.books.arrivals_ns[pair[0], pair[2]]]:
+            assert network.now.mono_s < latest_s, f"before any fault, nothing came: {missing}"
+            self._step(network.now.mono_s + _STEP_S)
+        if thin_bits_s:
+            for cable in self.world.cables.values():
+                cable.bytes_s, cable.fifo_s = thin_bits_s / 8, fifo_s
+
+    def run(self) -> None:
+        """Apply the faults, each at its time; observe for a while after the last, and until all is accounted for."""
+        network = self.world.network
+        self.begun_s = network.now.mono_s
+        self._note()
+        for fault in self._faults:
+            network.call(fault.start_s, partial(self._begin, fault))
+            network.call(fault.end_s, partial(self._end, fault))
+        self._last_s = self.begun_s + max((fault.end_s for fault in self._faults), default=0.0)
+        self._end_s = self._last_s + AFTER_S
+        self._step(self._end_s)
+
+    def broken_promises(self, limit_s: float, well_s: float) -> list[str]:
+        """Return what broke, in words.
+
+        Args:
+            limit_s: longest silence of connected ends during faults.
+            well_s: from so long after the last fault, and longest silence then.
+        """
+        begun_ns, last_ns, end_ns = (_ns(each) for each in (self.begun_s, self._last_s, self._end_s))
+        found = [f"after the last fault: {self._words(each)}" for each in self.silences(last_ns, end_ns, well_s)]
+        found += [f"black hole: {self._words(each)}" for each in self.silences(begun_ns, last_ns, limit_s)]
+        return [*found, *sorted(set(self.books.wrong)), *self.books.incomplete(self._is_last_life, end_ns - _ns(2.0))]
+
+    def silences(self, begin_ns: int, end_ns: int, above_s: float) -> list[Silence]:
+        """Return the longer silences in a time."""
+        return [
+            silence
+            for (channel, _, reader), must in self._must.items()
+            for silence in self.books.silences(channel, reader, begin_ns, end_ns, must, above_s)
+        ]
+
+    def _words(self, silence: Silence) -> str:
+        topic, at_s = self._plan.flows[silence.channel].topic, silence.begin_ns / 1e9 - self.begun_s
+        return f"{topic} at {silence.reader}: {silence.seconds:.2f} s of silence from {at_s:.2f} s on"
+
+    def _is_last_life(self, member: str, incarnation: int) -> bool:
+        return incarnation == self._incarnations[member]
+
+    def _member(self, member: str) -> Participant:
+        return self.world.members[self._labels[member]]
+
+    def _begin_flows(self, member: str) -> None:
+        """Let a member publish and read, in a new incarnation."""
+        self._incarnations[member] += 1
+        node = self._member(member)
+        for channel, flow in enumerate(self._plan.flows):
+            if member == flow.publisher:
+                topic = self.world.topic(flow.topic, node, [Right.PUBLISH])
+                self._names[channel] = topic.name
+                self.publishers[channel] = node.advertise(topic, b"chaos", reliable=flow.reliable)
+            elif member in flow.readers:
+                node.subscribe(self.world.topic(flow.topic, node, [Right.READ]))
+        self.world.network.send_pending(self._labels[member])
+
+    def _publish(self, channel: int, flow: Flow, skipped: int) -> None:
+        """Publish the next message of a flow, and again after its period, as long as its publisher runs."""
+        network, who = self.world.network, flow.publisher
+        network.call(1 / flow.hz, partial(self._publish, channel, flow, skipped))
+        if who in self._dead or (self._end_s and network.now.mono_s > self._end_s):
+            return
+        incarnation = self._incarnations[who]
+        self._numbers[channel, incarnation] += 1
+        number = self._numbers[channel, incarnation]
+        index = self._plan.members.index(who)
+        self._record(who, Kind.PUBLISHED, channel, incarnation, index, number)
+        head = _HEAD.pack(channel, index, incarnation, number)
+        self.publishers[channel].publish(head + bytes(max(flow.size - _HEAD.size, 0)))
+        self._member(who).flush(network.now.mono_s)
+        network.send_pending(self._labels[who])
+
+    def _step(self, until_s: float) -> None:
+        network = self.world.network
+        while network.now.mono_s < until_s:
+            network.run(min(_STEP_S, until_s - network.now.mono_s))
+            for member in self._plan.members:
+                if member not in self._dead:
+                    self._collect(member)
+
+    def _collect(self, member: str) -> None:
+        node, of = self._member(member), {name: channel for channel, name in self._names.items()}
+        for each in node.poll_messages():
+            channel, publisher, incarnation, number = _HEAD.unpack_from(each.delivered.message)
+            kind = Kind.DELIVERED if of[each.topic] == channel else Kind.WRONG
+            self._record(member, kind, of[each.topic], incarnation, publisher, number)
+        for channel, flow in enumerate(self._plan.flows):
+            if member in flow.readers:
+                counts = Counter(node.losses_of(self._names[channel]).counts)
+                seen = self._seen.get((member, channel), Counter())
+                for reason, more in (counts - seen).items():
+                    self._record(member, Kind.LOST, channel, 0, reason, more)
+                self._seen[member, channel] = counts
+
+    def _record(self, member: str, kind: Kind, channel: int, incarnation: int, other: int, number: int) -> None:
+        record = Record(kind, channel, incarnation, other, number, _ns(self.world.network.now.mono_s))
+        self.books.take(member, self._incarnations[member], iter([record]))
+
+    def _note(self) -> None:
+        """Record what must be connected from now on."""
+        broken = broken_by(self._under_way, self._at)
+        for (_, publisher, reader), timeline in self._must.items():
+            connected = self._oracle.must_talk(publisher, reader, broken)
+            timeline.note(_ns(self.world.network.now.mono_s), connected=connected)
+
+    def _cable(self, *ends: str) -> SimLink:
+        return self.world.cables[frozenset(ends)]
+
+    def _node(self, who: str) -> str:
+        """Return the name in the simulated network of a process, as in ``switch s1``."""
+        role, _, node = who.partition(" ")
+        if role == "rib":
+            return f"{node}/rib"
+        return self._labels[node] if role == "member" else node
+
+    def _begin(self, fault: Fault) -> None:
+        kind, targets, network = fault.kind, fault.targets, self.world.network
+        self._under_way.append(fault)
+        if kind is FaultKind.CUT:
+            network.set_link(self._cable(*targets), up=False)
+        elif kind in (FaultKind.SILENT, FaultKind.LOSS):
+            self._cable(*targets).loss = 1.0 if kind is FaultKind.SILENT else _LOSS
+        elif kind is FaultKind.REORDERED:
+            self._cable(*targets).jitter_s = _JITTER_S
+        elif kind is FaultKind.PARTITION:
+            for link in targets[1:]:
+                network.set_link(self._cable(*ends_of(link)), up=False)
+        elif kind is FaultKind.FREEZE:
+            network.freeze(self._node(targets[0]))
+        elif kind is FaultKind.ROAM:
+            self._at[targets[0]] = targets[1]
+            self.world.roam(self._labels[targets[0]], targets[1])
+        else:
+            if kind is FaultKind.KILL_MEMBER:
+                member = targets[0].removeprefix("member ")
+                self._collect(member)  # what it has confirmed reached its application
+                self._dead.add(member)
+            network.stop(self._node(targets[0]))
+        self._note()
+
+    def _end(self, fault: Fault) -> None:
+        kind, targets, network = fault.kind, fault.targets, self.world.network
+        node = targets[0].partition(" ")[2]
+        if kind is FaultKind.CUT:
+            network.set_link(self._cable(*targets), up=True)
+        elif kind in (FaultKind.SILENT, FaultKind.LOSS):
+            self._cable(*targets).loss = 0.0
+        elif kind is FaultKind.REORDERED:
+            self._cable(*targets).jitter_s = 0.0
+        elif kind is FaultKind.PARTITION:
+            for link in targets[1:]:
+                network.set_link(self._cable(*ends_of(link)), up=True)
+        elif kind is FaultKind.FREEZE:
+            network.thaw(self._node(targets[0]))
+        elif kind is FaultKind.KILL_SWITCH:
+            self.world.restart_switch(node)
+        elif kind is FaultKind.KILL_RIB:
+            label = next(each for each in self.world.ribs if self.world.rib_node(each) == f"{node}/rib")
+            self.world.restart_rib(label)
+        elif kind is FaultKind.KILL_MEMBER:
+            self.world.restart_member(self._labels[node])
+            self._dead.discard(node)
+            self._seen = {key: counts for key, counts in self._seen.items() if key[0] != node}
+            self._begin_flows(node)
+        self._under_way.remove(fault)
+        self._note()
+
+
+def _topology(plan: Plan) -> Topology:
+    """Return a plan's topology with its members as attachments, as a simulation takes it."""
+    members = set(plan.members)
+    links = tuple(link for link in plan.topology.links if not {link.a, link.b} & members)
+    domains = tuple(
+        DomainPlan(each.label, tuple(node for node in each.switches if node not in members), upper=each.upper)
+        for each in plan.topology.domains
+    )
+    ribs = tuple(Attachment(switch, "rib", "rib") for switch in plan.ribs)
+    ends = tuple(Attachment(plan.home(member), "proxy", member) for member in plan.members)
+    return Topology(links, domains, (*ribs, *ends))
+
+
+def _ns(seconds: float) -> int:
+    return round(seconds * 1e9)

@@ -1,0 +1,25 @@
+"""Chaos in virtual time, over thin links that images keep full: no flow starves, and each loss is reported."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+from faults.network import random_network
+from faults.schedule import make_schedule
+from faults.simulated import SIMULATED, SimulatedChaos
+
+FIRST, COUNT = 1, int(os.environ.get("GDP_RANDOM_CHAOS", "2"))
+SWITCHES, RATE, SECONDS = 12, 0.25, 40.0
+THIN_BITS_S, FIFO_S, IMAGE_SHARE = 4e6, 0.2, 2.0  # images offer so much of a link
+LIMIT_S, WELL_S = 8.0, 2.0
+
+
+@pytest.mark.parametrize("seed", range(FIRST, FIRST + COUNT))
+def test_flows_over_thin_full_links_outlive_overlapping_faults(seed: int) -> None:
+    plan = random_network(seed, SWITCHES, rate=RATE, image_bits_s=IMAGE_SHARE * THIN_BITS_S)
+    faults = make_schedule(plan, seed, SECONDS, kinds=SIMULATED)
+    chaos = SimulatedChaos(plan, faults, seed)
+    chaos.settle(thin_bits_s=THIN_BITS_S, fifo_s=FIFO_S)
+    chaos.run()
+    assert chaos.broken_promises(LIMIT_S, WELL_S) == [], "\n".join(map(str, faults))
