@@ -1,27 +1,38 @@
-"""Readers that block the others of a reliable topic, because their path is far slower.
+"""Readers that block the others of a topic, because their path is far slower.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). A publisher goes as slowly as its slowest reader. One that
-holds back the others for the tolerated lag, and got less than ``PROGRESS_BYTES`` meanwhile, no longer counts. It gets
-what is sent as before, and skips what is gone.
+holds back the others for the tolerated lag, and whose path carried less than ``PROGRESS_BYTES`` meanwhile, no longer
+counts. It gets what is sent as before, and skips what is gone. A path that other topics fill is no such one, however
+little this topic sends.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
-__all__ = ["PROGRESS_BYTES", "BlockingReaders"]
+__all__ = ["PROGRESS_BYTES", "BlockingReaders", "PathState"]
 
 PROGRESS_BYTES: Final = 256 << 10
 _BLOCKED_SHARE: Final = 0.5  # of the lag in which a reader was the only obstacle
 
 
+class PathState(NamedTuple):
+    """Path to one reader node: bytes that may leave now, and bytes of all topics that have left so far."""
+
+    reader: bytes
+    allowance: int
+    sent_bytes: int
+
+
 @dataclass(slots=True)
 class _Block:
     since_s: float
-    sent_bytes: int  # of the publisher, at that time
+    first_bytes: int  # sent on the path at that time
     checked_s: float
+    sent_bytes: int
+    is_blocking: bool = True
     blocked_s: float = 0.0
 
 
@@ -36,29 +47,33 @@ class BlockingReaders:
         self._lag_s = lag_s
         self._blocks: dict[bytes, _Block] = {}
 
-    def record(self, allowances: Sequence[tuple[bytes, int]], sent_bytes: int, now_s: float) -> None:
-        """Note what the paths to the readers permit now, in bytes."""
-        free = sum(allowance > 0 for _, allowance in allowances)
-        for name, allowance in allowances:
-            is_blocking = allowance <= 0 and free == len(allowances) - 1
+    def __bool__(self) -> bool:
+        return bool(self._blocks)
+
+    def record(self, paths: Sequence[PathState], now_s: float) -> None:
+        """Note the paths to the readers, while something waits for them or begins to leave."""
+        free = sum(each.allowance > 0 for each in paths)
+        for name, allowance, sent_bytes in paths:
+            is_blocking = allowance <= 0 and free == len(paths) - 1
             block = self._blocks.get(name)
             if block is None:
                 if is_blocking:
-                    self._blocks[name] = _Block(now_s, sent_bytes, now_s)
+                    self._blocks[name] = _Block(now_s, sent_bytes, now_s, sent_bytes)
                 continue
-            if is_blocking:
+            if block.is_blocking:
                 block.blocked_s += now_s - block.checked_s
-            block.checked_s = now_s
+            block.checked_s, block.sent_bytes, block.is_blocking = now_s, sent_bytes, is_blocking
 
-    def slow(self, sent_bytes: int, now_s: float) -> list[bytes]:
+    def slow(self, now_s: float) -> list[bytes]:
         """Return the readers that must no longer block the others; all are measured again after the lag."""
         slow = []
         for name, block in list(self._blocks.items()):
             if now_s - block.since_s < self._lag_s:
                 continue
             del self._blocks[name]
-            is_obstacle = block.blocked_s >= _BLOCKED_SHARE * (now_s - block.since_s)
-            if is_obstacle and sent_bytes - block.sent_bytes < PROGRESS_BYTES:
+            blocked_s = block.blocked_s + (now_s - block.checked_s if block.is_blocking else 0.0)
+            is_obstacle = blocked_s >= _BLOCKED_SHARE * (now_s - block.since_s)
+            if is_obstacle and block.sent_bytes - block.first_bytes < PROGRESS_BYTES:
                 slow.append(name)
         return slow
 

@@ -18,7 +18,7 @@ from typing import Final
 
 from gdp.client.ack_nack_handler import AckNackHandler
 from gdp.client.best_effort_cache import BestEffortCache
-from gdp.client.blocking_readers import BlockingReaders
+from gdp.client.blocking_readers import BlockingReaders, PathState
 from gdp.client.heartbeat_schedule import HeartbeatSchedule
 from gdp.client.identities import WriterIdentity
 from gdp.client.key_epochs import KeyEpochs, Secrets
@@ -31,7 +31,7 @@ from gdp.client.send_queue import SendQueue
 from gdp.client.sent_frames import SentFrames
 from gdp.client.sequence_numbers import FIRST, SequenceState
 from gdp.errors import DropReason, EnvelopeError, RemoteError
-from gdp.frame.codec import SECOND_PATH, Header, second_path_copy
+from gdp.frame.codec import NUMBER_AND_PART, NUMBER_AT, SECOND_PATH, Header, second_path_copy
 from gdp.frame.kinds import Flag
 from gdp.limits import MTU_MIN_BYTES, SPREAD, WINDOW_BYTES
 from gdp.message.bundle import BUNDLE_BYTES
@@ -306,7 +306,7 @@ class Publisher:
         if len(paths) == 1:
             return paths[0].allowance(now_s, urgent=urgent)
         allowances = [path.allowance(now_s, urgent=urgent) for path in paths]
-        if len(allowances) > 1 and min(allowances) <= 0:
+        if len(allowances) > 1 and (min(allowances) <= 0 or self._blocking):
             self._record_blocks(now_s)
         return min(allowances, default=_ALL)
 
@@ -462,7 +462,7 @@ class Publisher:
     def handle_timer(self, now_s: float) -> None:
         """Suspend silent readers, drop slow ones from the window, and probe those that owe a report."""
         self._acknowledgements.handle_timer(now_s)
-        for name in self._blocking.slow(self._under_way.sent_bytes, now_s):
+        for name in self._blocking.slow(now_s):
             self._acknowledgements.exclude(name, now_s)
         self._late.drop_expired(now_s)
         self._heartbeats.wanted |= self._window.probe_due(now_s)
@@ -510,7 +510,7 @@ class Publisher:
             self.has_more = left <= len(self.parity)
             parity_after = self.parity.poll_frames(max(left, 0))
             if not self._is_doubled(now_s):
-                self._uncounted = sent, self._present_readers(), now_s, self.repairs - repaired
+                self._uncounted = sent, self._confirming(sent), now_s, self.repairs - repaired
             if self._limit is not None and (leaving := sum(map(len, parity + sent + parity_after))):
                 self._limit.charge(now_s, leaving)
         frames = status + parity + sent + parity_after
@@ -551,8 +551,8 @@ class Publisher:
     def _record_blocks(self, now_s: float) -> None:
         """Note which readers hold back the others."""
         paths = [(name, self._reader_paths.path(name, now_s)) for name in self._governing_names()]
-        allowances = [(name, path.allowance(now_s)) for name, path in paths if not path.is_silent]
-        self._blocking.record(allowances, self._under_way.sent_bytes, now_s)
+        states = [PathState(name, path.allowance(now_s), path.sent_bytes) for name, path in paths if not path.is_silent]
+        self._blocking.record(states, now_s)
 
     def _measure_loss(self, now_s: float) -> None:
         """Note whether messages get parity from now on; reports change that, not each poll.
@@ -577,9 +577,19 @@ class Publisher:
         """
         names, paths, now_s = self._present_readers(), self._reader_paths, self._seen_s
         if self.confirms:
-            return [name for name in names if self._window.has_reader(name)] or names
+            window, following = self._window, self._queue.sent[0]
+            keeping_up = [each for each in names if window.has_reader(each)]
+            return [each for each in keeping_up if not window.is_ahead(each, following)] or keeping_up or names
         readers = self._readers
         return [each for each in names if now_s >= readers[each].out_until_s and not paths.is_behind(each)] or names
+
+    def _confirming(self, frames: list[bytes]) -> list[bytes]:
+        """Return the readers that confirm these frames: not one that began with a later message."""
+        names, window = self._present_readers(), self._window
+        if not frames or len(names) < 2 or not self.confirms:
+            return names
+        number, _ = NUMBER_AND_PART.unpack_from(frames[-1], NUMBER_AT)
+        return [name for name in names if not window.is_ahead(name, number)]
 
     def _present_readers(self) -> list[bytes]:
         """Return the readers whose nodes have not started again since they began to read. Without any, return all."""

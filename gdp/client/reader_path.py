@@ -39,6 +39,7 @@ class ReaderPath:
 
     Attributes:
         controller: its congestion controller.
+        sent_bytes: of all frames so far.
         may_probe: one frame may leave whatever the window: what a report of it shows as lost makes space.
         is_silent: nothing was confirmed for a timeout, though something is under way.
         is_behind: frames wait in the reader's own socket, because its program is slow; the path is not the reason.
@@ -49,7 +50,7 @@ class ReaderPath:
         self.is_silent = self.is_behind = self.may_probe = self._has_probed = False
         self._late_reports = 0  # in a row
         self._mtu = mtu
-        self._number = self._left = 0
+        self._number = self._left = self.sent_bytes = 0
         self._hops: int | None = None
         self._confirmed_s = now_s
         self._answered_s = now_s  # as _confirmed_s, but a timeout does not change it
@@ -96,6 +97,7 @@ class ReaderPath:
             self._confirmed_s = now_s
             self._answered_s = self._answered_s if self._timeouts else now_s
         self._number += 1
+        self.sent_bytes += size
         self.may_probe = False
         self.controller.sent(self._number, size, now_s, frames)
         return self._number

@@ -60,16 +60,13 @@ class SentFrames:
     Args:
         paths: of the participant.
         counts_losses: frames keep their order; not so if they are striped over two paths.
-
-    Attributes:
-        sent_bytes: of all frames so far.
     """
 
     def __init__(self, paths: ReaderPaths, *, counts_losses: bool = True) -> None:
         self._paths = paths
         self._counts_losses = counts_losses
         self._readers: dict[bytes, _Reader] = {}
-        self._count = self.sent_bytes = 0
+        self._count = 0
         self._runs: dict[int, list[_Run]] = {}  # by message number; oldest first
 
     def sent(self, frames: Sequence[bytes], names: Sequence[bytes], now_s: float, again: int = 0) -> None:
@@ -89,7 +86,6 @@ class SentFrames:
         for first in range(0, len(frames), _FLIGHT_FRAMES):
             flight = frames[first : first + _FLIGHT_FRAMES]
             size = sum(map(len, flight))
-            self.sent_bytes += size
             count = self._count = self._count + len(flight)
             for name in names:
                 path = self._paths.path(name, now_s)

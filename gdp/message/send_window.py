@@ -89,6 +89,11 @@ class SendWindow:
         """Return whether a reader is active."""
         return reader in self._readers.active
 
+    def is_ahead(self, reader: bytes, number: int) -> bool:
+        """Return whether a reader is active, and lacks no message up to a number: it began later, or has them."""
+        position = self._readers.active.get(reader)
+        return position is not None and position.next_number > number
+
     def is_suspended(self, reader: bytes) -> bool:
         """Return whether a reader is suspended."""
         return reader in self._readers.suspended

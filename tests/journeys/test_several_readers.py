@@ -73,3 +73,59 @@ def test_a_reliable_topic_and_images_to_three_readers_share_full_links(mbit_s: f
     for label in READERS:
         world.members[label].poll_messages()
     flows["/odom"].outlive()
+
+
+MAP_BYTES, MAP_RATE = 1_000_000, 4e6 / 8
+
+
+def test_a_reader_that_begins_while_a_large_message_leaves_does_not_delay_it() -> None:
+    world = world_of()
+    flow = advertise(world, "/map", "s0/robot")
+    flow.read_by(READERS[0])
+    assert world.network.run(5, lambda: flow.is_read_by(1))
+    world.cables[frozenset(("s0", "s1"))].bytes_s = MAP_RATE
+    flow.publish(bytes(MAP_BYTES))
+    world.network.run(0.2)
+    flow.read_by(READERS[2])  # its first message is the next one
+    begun_s = world.network.now.mono_s
+    assert world.network.run(20, lambda: flow.has(READERS[0], 1))
+    assert world.network.now.mono_s - begun_s <= 1.3 * MAP_BYTES / MAP_RATE
+    assert flow.is_read_by(2)
+    flow.outlive()
+
+
+def test_topics_reach_a_reader_that_restarts_and_the_others_at_once() -> None:
+    world = world_of()
+    flows = [advertise(world, f"/odom/{number}", "s0/robot") for number in range(3)]
+    flows.append(advertise(world, "/image", "s0/robot", reliable=False))
+    killed, other = READERS[:2]
+    for flow in flows:
+        flow.read_by(killed)
+        flow.read_by(other)
+    assert world.network.run(5, lambda: all(flow.is_read_by(2) for flow in flows))
+    for cable in world.cables.values():
+        cable.bytes_s, cable.fifo_s = 4e6 / 8, 0.2
+    world.network.stop(killed)
+    for flow in flows[:-1]:
+        flow.stream(200, 0.1, 100)
+    flows[-1].stream(600, 1 / 30, IMAGE_BYTES)
+    world.network.run(5.0)  # the path to it has timed out again and again
+    world.members[other].poll_messages()
+    world.restart_member(killed)
+    for flow in flows:
+        flow.read_by(killed)
+    came_s: defaultdict[tuple[str, bytes], list[float]] = defaultdict(list)
+    restarted_s = world.network.now.mono_s
+    while world.network.now.mono_s < restarted_s + 10:
+        world.network.run(0.05)
+        for label in (killed, other):
+            for each in world.members[label].poll_messages():
+                came_s[label, each.topic].append(world.network.now.mono_s - restarted_s)
+    for flow in flows:
+        assert came_s[killed, flow.topic.name][0] <= 1.0
+        assert max(b - a for a, b in pairwise(came_s[other, flow.topic.name])) <= 0.5
+    world.network.run(10)
+    for label in (killed, other):
+        world.members[label].poll_messages()
+    for flow in flows:
+        flow.outlive()
