@@ -54,7 +54,7 @@ class BlockingReaders:
         """Note the paths to the readers, while something waits for them or begins to leave."""
         free = sum(each.allowance > 0 for each in paths)
         for name, allowance, sent_bytes in paths:
-            is_blocking = allowance <= 0 and free == len(paths) - 1
+            is_blocking = allowance <= 0 < free == len(paths) - 1
             block = self._blocks.get(name)
             if block is None:
                 if is_blocking:

@@ -303,10 +303,10 @@ class Publisher:
         if self._is_doubled(now_s - _ALONE_FROM_S):
             return _ALL
         paths = self._paths()
-        if len(paths) == 1:
+        if len(paths) == 1 and not self._blocking:
             return paths[0].allowance(now_s, urgent=urgent)
         allowances = [path.allowance(now_s, urgent=urgent) for path in paths]
-        if len(allowances) > 1 and (min(allowances) <= 0 or self._blocking):
+        if self._blocking or (len(allowances) > 1 and min(allowances) <= 0):
             self._record_blocks(now_s)
         return min(allowances, default=_ALL)
 
@@ -510,7 +510,8 @@ class Publisher:
             self.has_more = left <= len(self.parity)
             parity_after = self.parity.poll_frames(max(left, 0))
             if not self._is_doubled(now_s):
-                self._uncounted = sent, self._confirming(sent), now_s, self.repairs - repaired
+                again = self.repairs - repaired
+                self._uncounted = sent, self._confirming(sent, again), now_s, again
             if self._limit is not None and (leaving := sum(map(len, parity + sent + parity_after))):
                 self._limit.charge(now_s, leaving)
         frames = status + parity + sent + parity_after
@@ -583,10 +584,13 @@ class Publisher:
         readers = self._readers
         return [each for each in names if now_s >= readers[each].out_until_s and not paths.is_behind(each)] or names
 
-    def _confirming(self, frames: list[bytes]) -> list[bytes]:
-        """Return the readers that confirm these frames: not one that began with a later message."""
+    def _confirming(self, frames: list[bytes], again: int) -> list[bytes]:
+        """Return the readers that confirm these frames, the first ``again`` of which are repairs.
+
+        One that began with a later message than the last of them does not.
+        """
         names, window = self._present_readers(), self._window
-        if not frames or len(names) < 2 or not self.confirms:
+        if len(frames) <= again or len(names) < 2 or not self.confirms:
             return names
         number, _ = NUMBER_AND_PART.unpack_from(frames[-1], NUMBER_AT)
         return [name for name in names if not window.is_ahead(name, number)]

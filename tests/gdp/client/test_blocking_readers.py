@@ -49,3 +49,10 @@ def test_what_waits_without_a_break_counts_as_blocked_up_to_now() -> None:
     blocks.record([PathState(SLOW, 0, 0), PathState(FAST, 1_500, 0)], 10.0)
     assert blocks.slow(10.0 + LAG_S) == [SLOW]
     assert not blocks
+
+
+def test_a_reader_that_is_left_alone_holds_back_no_other() -> None:
+    blocks = BlockingReaders(LAG_S)
+    blocks.record([PathState(SLOW, 0, 0), PathState(FAST, 1_500, 0)], 10.0)
+    blocks.record([PathState(SLOW, 0, 0)], 11.0)  # the other is silent
+    assert blocks.slow(10.0 + LAG_S) == []
