@@ -51,18 +51,17 @@ class BlockingReaders:
         return bool(self._blocks)
 
     def record(self, paths: Sequence[PathState], now_s: float) -> None:
-        """Note the paths to the readers, while something waits for them or begins to leave."""
+        """Note the paths that govern, while something waits for them or begins to leave."""
         free = sum(each.allowance > 0 for each in paths)
-        for name, allowance, sent_bytes in paths:
-            is_blocking = allowance <= 0 < free == len(paths) - 1
-            block = self._blocks.get(name)
-            if block is None:
-                if is_blocking:
-                    self._blocks[name] = _Block(now_s, sent_bytes, now_s, sent_bytes)
-                continue
+        blocking = {each.reader for each in paths if each.allowance <= 0 < free == len(paths) - 1}
+        sent_bytes = {each.reader: each.sent_bytes for each in paths}
+        for name, block in self._blocks.items():
             if block.is_blocking:
                 block.blocked_s += now_s - block.checked_s
-            block.checked_s, block.sent_bytes, block.is_blocking = now_s, sent_bytes, is_blocking
+            block.checked_s, block.is_blocking = now_s, name in blocking
+            block.sent_bytes = sent_bytes.get(name, block.sent_bytes)
+        for name in blocking - self._blocks.keys():
+            self._blocks[name] = _Block(now_s, sent_bytes[name], now_s, sent_bytes[name])
 
     def slow(self, now_s: float) -> list[bytes]:
         """Return the readers that must no longer block the others; all are measured again after the lag."""

@@ -42,6 +42,7 @@ _LEAST_FRAMES: Final = 2
 _FIRST_FRAMES: Final = 32  # as Google's QUIC; RFC 6928 has 10
 _FIRST_RTT_S: Final = 0.02  # until one is measured
 _LEAST_RTT_S: Final = 1e-5
+_DELAY_MOST_S: Final = 0.25  # by the pace; longer only if one frame takes longer
 _NOISE_S: Final = 0.002
 _HOLD_WINDOW_S, _HOLD_MOST_S = 0.2, 0.01  # of reports; a reader reports at least each 20 ms while frames come
 _BASE_WINDOW_S: Final = 10.0  # Copa, section 2
@@ -209,8 +210,13 @@ class PathController:
             flight.sent_s = now_s
 
     def charge(self, size: int, now_s: float) -> None:
-        """Delay what follows by the time that so many bytes take."""
-        self.due_s = max(self.due_s, now_s - self.credit_s) + size / self.pacing_bytes_s
+        """Delay what follows by the time that so many bytes take.
+
+        The delay has a bound, because what leaves while another path governs may exceed this one's pace for long.
+        """
+        pace = self.pacing_bytes_s
+        latest_s = now_s + max(_DELAY_MOST_S, self._mtu / pace)
+        self.due_s = min(max(self.due_s, now_s - self.credit_s) + size / pace, latest_s)
 
     def paced(self) -> None:
         """Report that a frame waits only for the pace, until ``next_send_s``: a late sender may catch up."""

@@ -56,3 +56,11 @@ def test_a_reader_that_is_left_alone_holds_back_no_other() -> None:
     blocks.record([PathState(SLOW, 0, 0), PathState(FAST, 1_500, 0)], 10.0)
     blocks.record([PathState(SLOW, 0, 0)], 11.0)  # the other is silent
     assert blocks.slow(10.0 + LAG_S) == []
+
+
+def test_a_reader_that_falls_silent_holds_back_no_other() -> None:
+    blocks = BlockingReaders(LAG_S)
+    blocks.record([PathState(SLOW, 0, 0), PathState(FAST, 1_500, 0)], 10.0)
+    for step in range(50):  # it is cut off, so it does not govern
+        blocks.record([PathState(FAST, 1_500, 0)], 11.0 + step * STEP_S)
+    assert blocks.slow(10.0 + LAG_S) == []

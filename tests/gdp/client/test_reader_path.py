@@ -113,3 +113,15 @@ def test_a_reader_is_behind_when_frames_wait_in_its_own_socket() -> None:
     assert path.is_behind
     path.handle_held(0.02)
     assert not path.is_behind
+
+
+def test_what_leaves_while_another_path_governs_delays_this_one_for_a_moment_only() -> None:
+    path, now_s = ReaderPaths().path(READER, 10.0), 10.0
+    path.set_mtu(MTU)
+    path.controller.timed_out(now_s)
+    for _ in range(600):  # 30 MB to all readers, while this one does not govern
+        path.sent(50_000, 34, now_s)
+        now_s += 0.01
+    path.controller.forget_all()
+    assert path.next_send_s() <= now_s + 0.25
+    assert path.allowance(now_s + 0.25) > 0
