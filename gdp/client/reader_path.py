@@ -46,11 +46,15 @@ class ReaderPath:
     """
 
     def __init__(self, mtu: int, now_s: float) -> None:
-        self.controller = PathController(mtu)
-        self.is_silent = self.is_behind = self.may_probe = self._has_probed = False
-        self._late_reports = 0  # in a row
         self._mtu = mtu
         self._number = self._left = self.sent_bytes = 0
+        self.restart(now_s)
+
+    def restart(self, now_s: float) -> None:
+        """Begin without knowledge; what is under way will not be confirmed, because its reader node has restarted."""
+        self.controller = PathController(self._mtu)
+        self.is_silent = self.is_behind = self.may_probe = self._has_probed = False
+        self._late_reports = 0  # in a row
         self._hops: int | None = None
         self._confirmed_s = now_s
         self._answered_s = now_s  # as _confirmed_s, but a timeout does not change it
@@ -131,14 +135,6 @@ class ReaderPath:
         if self.is_silent:
             self.is_silent = False
             self.controller.forget_all()
-
-    def restart(self, now_s: float) -> None:
-        """Begin again: the reader node has restarted, and confirms nothing that is under way."""
-        self.controller = PathController(self._mtu)
-        self._confirmed_s = self._answered_s = now_s
-        self._timeouts, self._trip_s, self._hops = 0, 0.0, None
-        self.is_silent = self.is_behind = self.may_probe = self._has_probed = False
-        self._late_reports = 0
 
     def patience_s(self, now_s: float) -> float:
         """Return how long an answer may take: a round trip, or as long as nothing under way was confirmed."""

@@ -2,9 +2,9 @@
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Urgent publishers come first, in the order of their
 priorities. The others share what their paths permit by deficit round robin, by priority and weight. A publisher that
-had nothing to send has its first round before those that wait, so that no image delays a scan. A reliable publisher
-needs space on the paths to all its readers at once. When its turn has come and there is none, publishers behind it
-leave these paths alone for up to ``_RESERVED_S``; else they would take each space as it appears. Sources: Linux
+had nothing to send has its first round before those that wait, so that no image delays a scan. A publisher with several
+readers needs space on all their paths at once. When its turn has come and there is none, publishers behind it leave
+these paths alone for up to ``_RESERVED_S``; else they would take each space as it appears. Sources: Linux
 ``sch_prio``; M. Shreedhar and G. Varghese, Efficient Fair Queuing Using Deficit Round Robin, SIGCOMM 1995; RFC 8290,
 section 4 (new and old queues).
 """

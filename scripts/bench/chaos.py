@@ -35,7 +35,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from faults.accounts import Books, Silence, Timeline
+from faults.accounts import Books, Silence
+from faults.continuity import Continuity
 from faults.disk import NOT_WRITTEN, snapshot_faults
 from faults.link_faults import FrameFaults
 from faults.network import VICTIM, random_network
@@ -91,7 +92,7 @@ class Chaos:
         self.books = Books(self._plan)
         self._under_way: list[Fault] = []
         self._ended_lives: set[tuple[str, int]] = set()
-        self.must = {pair: Timeline() for pair in self._oracle.pairs()}
+        self._continuity = Continuity(self._plan, self.books)
         self.moments: list[tuple[int, Fault, bool]] = []  # time, fault, whether it began
         self.begun_ns = 0
         self.late_s = 0.0  # total delay of faults and restarts against the schedule
@@ -145,9 +146,7 @@ class Chaos:
         found = [f"{who} ended by itself" for who in self._overlay.died()]
         well_s = WELL_S + WELL_TRIPS * full_s
         well_ns = last_ns + round(well_s * 1e9)
-        for silence in self._all_silences(last_ns, end_ns, well_s):
-            found.append(f"after the last fault: {self._words(silence)}")
-        found += [f"black hole: {self._words(each)}" for each in self._all_silences(self.begun_ns, last_ns, limit_s)]
+        found += self._continuity.broken_promises(self.begun_ns, last_ns, end_ns, limit_s, well_s)
         found += sorted(set(self.books.wrong))
         found += self.books.incomplete(self._is_last_life, end_ns - round(2e9))
         over_ns = end_ns - round((CALL_S + 1) * 1e9)
@@ -168,7 +167,7 @@ class Chaos:
     def silences(self) -> list[tuple[str, Silence]]:
         """Return the silences of the run, each with the last event before it."""
         found = []
-        for silence in self._all_silences(self.begun_ns, time.monotonic_ns(), REPORTED_S):
+        for silence in self._continuity.silences(self.begun_ns, time.monotonic_ns(), REPORTED_S):
             if silence.seconds < SPARSE / self._plan.flows[silence.channel].hz:
                 continue
             before = [each for each in self.moments if each[0] <= silence.begin_ns + round(1e9)]
@@ -183,11 +182,7 @@ class Chaos:
         return incarnation_id == self._overlay.incarnation_id(f"member {member}") and not is_revoked
 
     def _unreachable(self) -> list[str]:
-        silent = [
-            f"{self._plan.flows[channel].topic} at {reader}"
-            for channel, _, reader in self._oracle.pairs()
-            if not self.books.arrivals_ns[channel, reader]
-        ]
+        silent = self._continuity.unreached()
         return silent if silent or self.books.answered or not self._plan.services else ["any answer"]
 
     def _watch(self, until_s: float) -> None:
@@ -205,9 +200,7 @@ class Chaos:
         broken = broken_by(self._under_way, at)
         if self.revoked_ns is not None:
             broken.members.add(VICTIM)
-        for (_, publisher, reader), timeline in self.must.items():
-            connected = self._oracle.must_talk(publisher, reader, broken)
-            timeline.note(time.monotonic_ns(), connected=connected)
+        self._continuity.note(time.monotonic_ns(), broken)
 
     def _begin(self, fault: Fault) -> None:
         overlay, kind, targets = self._overlay, fault.kind, fault.targets
@@ -275,13 +268,6 @@ class Chaos:
         while not self._overlay.is_ready(who):
             self._watch(time.monotonic() + LOOK_S)
 
-    def _all_silences(self, begin_ns: int, end_ns: int, above_s: float) -> list[Silence]:
-        return [
-            silence
-            for (channel, publisher, reader), must in self.must.items()
-            for silence in self.books.silences(channel, reader, begin_ns, end_ns, must, above_s)
-        ]
-
     def _after_revocation(self) -> list[str]:
         if self.revoked_ns is None:
             return []
@@ -308,11 +294,6 @@ class Chaos:
         if not self.noticed() and any(fault.kind is FaultKind.DISK_FULL for fault in self._faults):
             found.append("no RIB noticed that the disk was full")
         return found
-
-    def _words(self, silence: Silence) -> str:
-        topic = self._plan.flows[silence.channel].topic
-        at_s = (silence.begin_ns - self.begun_ns) / 1e9
-        return f"{topic} at {silence.reader}: {silence.seconds:.2f} s of silence from {at_s:.2f} s on"
 
 
 def _moments(faults: list[Fault]) -> Iterator[tuple[float, Fault, bool]]:

@@ -13,10 +13,11 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
+from peers.process import FailedError
 from topologies import ends_of
 
-from faults.accounts import Books, Silence, Timeline
-from faults.oracle import Oracle
+from faults.accounts import Books
+from faults.continuity import Continuity
 from faults.plan import Flow, Plan
 from faults.records import Kind, Record
 from faults.schedule import Fault, FaultKind, broken_by
@@ -39,8 +40,8 @@ AFTER_S: Final = 8.0  # observation after the last fault
 _HEAD: Final = struct.Struct("!HHIQ")  # channel, publisher, incarnation, number
 _STEP_S: Final = 0.05
 _SETTLE_S: Final = 60.0
-_DRAIN_S: Final = 30.0  # until each message is there, or counted as lost
-_LOSS, _JITTER_S = 0.05, 0.02
+_LOSS_OF: Final = {FaultKind.SILENT: 1.0, FaultKind.LOSS: 0.05}
+_JITTER_S: Final = 0.02
 
 
 class SimulatedChaos:
@@ -59,7 +60,7 @@ class SimulatedChaos:
 
     def __init__(self, plan: Plan, faults: Sequence[Fault], seed: int) -> None:
         self._plan, self._faults = plan, faults
-        self.world = Simulation(topology=_topology(plan), seed=seed, trusts=None)
+        self.world = Simulation(topology=_topology(plan), seed=seed)
         self._labels = {label.rpartition("/")[2]: label for label in self.world.members}
         self._at = {mover: homes[0] for mover, homes in plan.homes.items()}
         self._incarnations: Counter[str] = Counter()
@@ -69,38 +70,34 @@ class SimulatedChaos:
         self.publishers: dict[int, Publisher] = {}
         self._names: dict[int, Name] = {}
         self._under_way: list[Fault] = []
-        self._oracle = Oracle(plan)
         self.books = Books(plan)
-        self._must = {pair: Timeline() for pair in self._oracle.pairs()}
+        self._continuity = Continuity(plan, self.books)
         self.begun_s = self._last_s = self._end_s = 0.0
-
-    @property
-    def now_s(self) -> float:
-        """Return the virtual second of the run."""
-        return self.world.network.now.mono_s - self.begun_s
 
     def settle(self, *, thin_bits_s: float = 0.0, fifo_s: float = 0.0) -> None:
         """Attach all members and return when every flow is delivered; then make the links thin, if they are to be.
 
         Raises:
-            AssertionError: not in time.
+            FailedError: not in time.
         """
-        assert self.world.run_until_attached(_SETTLE_S)
+        if not self.world.run_until_attached(_SETTLE_S):
+            raise FailedError("before any fault, a member was not attached")
         for member in self._plan.members:
             self._begin_flows(member)
         network = self.world.network
         for channel, flow in enumerate(self._plan.flows):
-            network.call(channel * 0.01, partial(self._publish, channel, flow, 0))
+            network.call(channel * 0.01, partial(self._publish, channel, flow))
         latest_s = network.now.mono_s + _SETTLE_S
-        while missing := [pair for pair in self._must if not self.books.arrivals_ns[pair[0], pair[2]]]:
-            assert network.now.mono_s < latest_s, f"before any fault, nothing came: {missing}"
+        while missing := self._continuity.unreached():
+            if network.now.mono_s >= latest_s:
+                raise FailedError(f"before any fault, nothing came: {', '.join(missing)}")
             self._step(network.now.mono_s + _STEP_S)
         if thin_bits_s:
             for cable in self.world.cables.values():
                 cable.bytes_s, cable.fifo_s = thin_bits_s / 8, fifo_s
 
     def run(self) -> None:
-        """Apply the faults, each at its time; observe for a while after the last, and until all is accounted for."""
+        """Apply the faults, each at its time; observe for a while after the last."""
         network = self.world.network
         self.begun_s = network.now.mono_s
         self._note()
@@ -116,24 +113,11 @@ class SimulatedChaos:
 
         Args:
             limit_s: longest silence of connected ends during faults.
-            well_s: from so long after the last fault, and longest silence then.
+            well_s: longest silence after the last fault.
         """
         begun_ns, last_ns, end_ns = (_ns(each) for each in (self.begun_s, self._last_s, self._end_s))
-        found = [f"after the last fault: {self._words(each)}" for each in self.silences(last_ns, end_ns, well_s)]
-        found += [f"black hole: {self._words(each)}" for each in self.silences(begun_ns, last_ns, limit_s)]
+        found = self._continuity.broken_promises(begun_ns, last_ns, end_ns, limit_s, well_s)
         return [*found, *sorted(set(self.books.wrong)), *self.books.incomplete(self._is_last_life, end_ns - _ns(2.0))]
-
-    def silences(self, begin_ns: int, end_ns: int, above_s: float) -> list[Silence]:
-        """Return the longer silences in a time."""
-        return [
-            silence
-            for (channel, _, reader), must in self._must.items()
-            for silence in self.books.silences(channel, reader, begin_ns, end_ns, must, above_s)
-        ]
-
-    def _words(self, silence: Silence) -> str:
-        topic, at_s = self._plan.flows[silence.channel].topic, silence.begin_ns / 1e9 - self.begun_s
-        return f"{topic} at {silence.reader}: {silence.seconds:.2f} s of silence from {at_s:.2f} s on"
 
     def _is_last_life(self, member: str, incarnation: int) -> bool:
         return incarnation == self._incarnations[member]
@@ -154,10 +138,10 @@ class SimulatedChaos:
                 node.subscribe(self.world.topic(flow.topic, node, [Right.READ]))
         self.world.network.send_pending(self._labels[member])
 
-    def _publish(self, channel: int, flow: Flow, skipped: int) -> None:
+    def _publish(self, channel: int, flow: Flow) -> None:
         """Publish the next message of a flow, and again after its period, as long as its publisher runs."""
         network, who = self.world.network, flow.publisher
-        network.call(1 / flow.hz, partial(self._publish, channel, flow, skipped))
+        network.call(1 / flow.hz, partial(self._publish, channel, flow))
         if who in self._dead or (self._end_s and network.now.mono_s > self._end_s):
             return
         incarnation = self._incarnations[who]
@@ -198,13 +182,16 @@ class SimulatedChaos:
 
     def _note(self) -> None:
         """Record what must be connected from now on."""
-        broken = broken_by(self._under_way, self._at)
-        for (_, publisher, reader), timeline in self._must.items():
-            connected = self._oracle.must_talk(publisher, reader, broken)
-            timeline.note(_ns(self.world.network.now.mono_s), connected=connected)
+        self._continuity.note(_ns(self.world.network.now.mono_s), broken_by(self._under_way, self._at))
 
     def _cable(self, *ends: str) -> SimLink:
         return self.world.cables[frozenset(ends)]
+
+    def _set_links(self, fault: Fault, *, up: bool) -> None:
+        """Cut or restore what a cut or a partition takes down."""
+        links = [fault.targets] if fault.kind is FaultKind.CUT else [ends_of(link) for link in fault.targets[1:]]
+        for ends in links:
+            self.world.network.set_link(self._cable(*ends), up=up)
 
     def _node(self, who: str) -> str:
         """Return the name in the simulated network of a process, as in ``switch s1``."""
@@ -216,15 +203,12 @@ class SimulatedChaos:
     def _begin(self, fault: Fault) -> None:
         kind, targets, network = fault.kind, fault.targets, self.world.network
         self._under_way.append(fault)
-        if kind is FaultKind.CUT:
-            network.set_link(self._cable(*targets), up=False)
-        elif kind in (FaultKind.SILENT, FaultKind.LOSS):
-            self._cable(*targets).loss = 1.0 if kind is FaultKind.SILENT else _LOSS
+        if kind in (FaultKind.CUT, FaultKind.PARTITION):
+            self._set_links(fault, up=False)
+        elif kind in _LOSS_OF:
+            self._cable(*targets).loss = _LOSS_OF[kind]
         elif kind is FaultKind.REORDERED:
             self._cable(*targets).jitter_s = _JITTER_S
-        elif kind is FaultKind.PARTITION:
-            for link in targets[1:]:
-                network.set_link(self._cable(*ends_of(link)), up=False)
         elif kind is FaultKind.FREEZE:
             network.freeze(self._node(targets[0]))
         elif kind is FaultKind.ROAM:
@@ -241,15 +225,12 @@ class SimulatedChaos:
     def _end(self, fault: Fault) -> None:
         kind, targets, network = fault.kind, fault.targets, self.world.network
         node = targets[0].partition(" ")[2]
-        if kind is FaultKind.CUT:
-            network.set_link(self._cable(*targets), up=True)
-        elif kind in (FaultKind.SILENT, FaultKind.LOSS):
+        if kind in (FaultKind.CUT, FaultKind.PARTITION):
+            self._set_links(fault, up=True)
+        elif kind in _LOSS_OF:
             self._cable(*targets).loss = 0.0
         elif kind is FaultKind.REORDERED:
             self._cable(*targets).jitter_s = 0.0
-        elif kind is FaultKind.PARTITION:
-            for link in targets[1:]:
-                network.set_link(self._cable(*ends_of(link)), up=True)
         elif kind is FaultKind.FREEZE:
             network.thaw(self._node(targets[0]))
         elif kind is FaultKind.KILL_SWITCH:
