@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import signal
 import time
@@ -25,6 +26,7 @@ CROSSINGS = (
     Crossing("/image", "sensor_msgs/msg/Image", "one", "a"),
     Crossing("/lamp", SET_BOOL, "one", "a", "service"),
     Crossing("/gate", SET_BOOL, "a", "one", "service", {"timeout_s": TIMEOUT_S}),
+    Crossing("/many", SET_BOOL, "a", "b", "service"),
     Crossing("/chat", STRING, "a", "dds"),
     Crossing("/chat_back", STRING, "dds", "a", options={"encoding": "cdr"}),
     Crossing("/fold", "test_msgs/action/Fibonacci", "a", "b", "action", {"timeout_s": TIMEOUT_S}),
@@ -132,6 +134,36 @@ def test_a_ros_2_server_serves_a_ros_1_client_or_sends_it_the_reason(a: Peer, on
     assert "no answer within 1 s" in refused
     assert pair.proxy("one").warnings("/gate") == ["timed-out: no answer within 1 s"]
     until(lambda: one.tell("call(SetBool, '/gate', True)") == [True, "open"], "the next call")
+
+
+def test_no_queue_of_a_node_loses_a_call_after_a_stall(a: Peer, b: Peer, pair: Pair) -> None:
+    a.tell(
+        "!asked, takes_s = [], 0.02\n"
+        "def switched(request, response):\n"
+        " asked.append(request.data)\n"
+        " __import__('time').sleep(takes_s)\n"
+        " response.success = request.data\n"
+        " return response\n"
+        "many = node.create_service(SetBool, '/many', switched)"
+    )
+    b.tell("!many = node.create_client(SetBool, '/many')")
+    b.waits_for("many.wait_for_service(0.1)", True)
+    calls = "!answers = [ask(many, SetBool.Request(data=at % 2 == 0)) for at in range(40)]"
+    right = [at % 2 == 0 for at in range(40)]
+    os.kill(pair.proxy("a").pid, signal.SIGSTOP)
+    b.tell(calls)
+    os.kill(pair.proxy("a").pid, signal.SIGCONT)  # all requests arrive, faster than the node answers them
+    b.waits_for("sum(map(len, answers))", 40)
+    assert b.tell("[each[0][0] for each in answers]") == right
+
+    a.tell("!asked.clear()")
+    b.tell(calls)
+    a.waits_for("len(asked) >= 20", True)
+    os.kill(pair.proxy("b").pid, signal.SIGSTOP)
+    a.waits_for("len(asked)", 40)
+    os.kill(pair.proxy("b").pid, signal.SIGCONT)  # half of the answers arrive
+    b.waits_for("sum(map(len, answers))", 40)
+    assert b.tell("[each[0][0] for each in answers]") == right
 
 
 def test_a_machine_without_ros_2_speaks_with_one_that_has_it(a: Peer, pair: Pair) -> None:

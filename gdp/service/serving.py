@@ -21,6 +21,7 @@ from gdp.errors import LocalError
 from gdp.message.fair_queue import FairQueue
 from gdp.names import Name
 from gdp.service.calls import Calls
+from gdp.service.server_window import ServerWindow
 
 __all__ = ["Asked", "Expired", "Serving", "Turn"]
 
@@ -75,7 +76,8 @@ class Serving(Generic[R]):
 
     Args:
         start: the first number of a call here, random in 64 bits.
-        at_once: how many the local server has at one time; None: all.
+        at_once: how many the local server has at one time; None: as many as ``window`` permits.
+        window: of a local server whose queue is short; None: it gets all.
     """
 
     def __init__(
@@ -84,6 +86,7 @@ class Serving(Generic[R]):
         at_once: int | None = None,
         limit: int = CALLS_MAX,
         waiting_max_bytes: int = WAITING_MAX_BYTES,
+        window: ServerWindow | None = None,
     ) -> None:
         self._calls: Calls[_Served[R]] = Calls(limit, start)
         self._numbers: dict[Asked, int] = {}
@@ -96,6 +99,7 @@ class Serving(Generic[R]):
         self._waiting_max_bytes = waiting_max_bytes
         self._waiting_bytes: Counter[Name] = Counter()  # by client
         self._at_once = at_once
+        self._window = window
         self._given = 0
 
     def __len__(self) -> int:
@@ -103,6 +107,11 @@ class Serving(Generic[R]):
 
     def __contains__(self, asked: Asked) -> bool:
         return asked in self._numbers
+
+    @property
+    def has_slots(self) -> bool:
+        """Return whether requests may wait for the local server to be done with others."""
+        return self._at_once is not None or self._window is not None
 
     def answer_of(self, asked: Asked) -> bytes | None:
         """Return the response of a call that ended recently: empty where it was stopped. None: it did not end."""
@@ -136,10 +145,12 @@ class Serving(Generic[R]):
             self._held_back.setdefault(after, {})[number] = None
         return number
 
-    def poll_turns(self) -> list[Turn[R]]:
+    def poll_turns(self, now_s: float) -> list[Turn[R]]:
         """Return, once, the requests whose turn it is."""
         turns: list[Turn[R]] = []
-        while self._waiting and (self._at_once is None or self._given < self._at_once):
+        if self._window is not None:
+            self._window.handle_waiting(now_s, waits=bool(self._waiting))
+        while self._waiting and self._has_free_slot():
             number = self._waiting.pop()
             served = self._calls.get(number)
             if served is not None and served.request is not None:
@@ -147,15 +158,17 @@ class Serving(Generic[R]):
                 _subtract(self._waiting_bytes, served.asked.client, served.size_bytes)
                 served.request = None
                 self._given += 1
+                if self._window is not None:
+                    self._window.give(number)
+        if self._window is not None:
+            self._window.handle_waiting(now_s, waits=bool(self._waiting))
         return turns
 
     def end(self, number: int) -> Asked | None:
         """Record that the local server is done with a call; return the call, None where no client waits any more."""
-        served = self._calls.end(number)
-        if served is None:
-            return None
-        self._forget(number, served)
-        return served.asked if served.is_wanted else None
+        if self._window is not None:
+            self._window.answered(number)
+        return self._end(number)
 
     def remember(self, asked: Asked, answer: bytes) -> None:
         """Keep a response for a while; empty: the call was stopped."""
@@ -181,10 +194,10 @@ class Serving(Generic[R]):
         served = self._calls.get(number)
         if served is not None and served.request is None:
             served.is_wanted = False
-            if self._at_once is None:
-                self.end(number)
+            if not self.has_slots:
+                self._end(number)
             return number
-        self.end(number)
+        self._end(number)
         return None
 
     @property
@@ -205,8 +218,8 @@ class Serving(Generic[R]):
                 continue
             is_given = served.request is None
             served.is_wanted = False
-            if not is_given or self._at_once is None:
-                self.end(number)
+            if not is_given or not self.has_slots:
+                self._end(number)
             ended.append(Expired(number, asked.part, asked, is_given))
         return ended
 
@@ -220,8 +233,9 @@ class Serving(Generic[R]):
         return ended
 
     def get_timer(self) -> float | None:
-        """Return the monotonic second of the next timeout of a call, or None."""
-        return self._calls.get_timer()
+        """Return the monotonic second of the next timeout of a call, or of a stall, or None."""
+        times = [self._calls.get_timer(), None if self._window is None else self._window.get_timer()]
+        return min((time for time in times if time is not None), default=None)
 
     def fail_all(self) -> list[Asked]:
         """End every call; return them."""
@@ -232,7 +246,22 @@ class Serving(Generic[R]):
         self._shares.clear()
         self._waiting_bytes.clear()
         self._given = 0
+        if self._window is not None:
+            self._window.clear()
         return ended
+
+    def _has_free_slot(self) -> bool:
+        if self._at_once is not None:
+            return self._given < self._at_once
+        return self._window is None or self._window.is_open
+
+    def _end(self, number: int) -> Asked | None:
+        """Forget a call; return it, None where no client waits any more."""
+        served = self._calls.end(number)
+        if served is None:
+            return None
+        self._forget(number, served)
+        return served.asked if served.is_wanted else None
 
     def _forget(self, number: int, served: _Served[R]) -> None:
         if self._numbers.get(served.asked) == number:
@@ -241,6 +270,8 @@ class Serving(Generic[R]):
         _subtract(self._shares, client, 1)
         if served.request is None:
             self._given -= 1
+            if self._window is not None:
+                self._window.drop(number)
         else:
             _subtract(self._waiting_bytes, client, served.size_bytes)
             self._waiting.discard(client, number)

@@ -188,7 +188,8 @@ class AsyncServer(BaseServer[LoopDriver]):
                 if not turns:
                     continue  # another worker handles it
                 turn = turns.popleft()
-                self._core.finish(turn.number, await self._outcome(Request(turn.request, turn.asked.client)))
+                outcome = await self._outcome(Request(turn.request, turn.asked.client))
+                self._core.finish(turn.number, outcome, time.monotonic())
                 self._driver.schedule()
         except ClosedError:
             return

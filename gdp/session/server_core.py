@@ -89,9 +89,9 @@ class ServerCore:
                 self._serving.stop(Asked(client, _PART, call))
         else:
             self._begin(client, frame, now_s)
-        self._give()
+        self._give(now_s)
 
-    def finish(self, number: int, outcome: bytes | str) -> None:
+    def finish(self, number: int, outcome: bytes | str, now_s: float) -> None:
         """Respond to a request.
 
         Args:
@@ -106,7 +106,7 @@ class ServerCore:
                 self._respond(asked, ResponseFrame.failed(asked.call, outcome))
             else:
                 self._respond(asked, ResponseFrame(asked.call, False, outcome))
-        self._give()
+        self._give(now_s)
 
     def leave(self) -> None:
         """Accept no new requests: clients learn to use other servers, and active requests finish."""
@@ -129,7 +129,7 @@ class ServerCore:
         if self._check_at_s is not None and now_s >= self._check_at_s:
             self._check_clients(now_s)
             self._check_at_s = now_s + _CHECK_CLIENTS_S if self._serving else None
-        self._give()
+        self._give(now_s)
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
@@ -155,8 +155,8 @@ class ServerCore:
         if self._check_at_s is None:
             self._check_at_s = now_s + _CHECK_CLIENTS_S
 
-    def _give(self) -> None:
-        self.turns.extend(self._serving.poll_turns())
+    def _give(self, now_s: float) -> None:
+        self.turns.extend(self._serving.poll_turns(now_s))
 
     def _respond(self, asked: Asked, frame: ResponseFrame) -> None:
         wire = frame.to_wire()

@@ -209,7 +209,7 @@ class Server(BaseServer[Driver], _ClosedOnExit):
                 except IndexError:
                     continue  # another worker handles it
                 outcome = outcome_of(self._handler, Request(turn.request, turn.asked.client))
-                self._driver.run(partial(self._core.finish, turn.number, outcome))
+                self._driver.run(partial(self._core.finish, turn.number, outcome, self._driver.now_s()))
         except ClosedError:
             return
 

@@ -22,6 +22,7 @@ from gdp.errors import LocalError, RemoteError
 from gdp.names import Name
 from gdp.service.follower import Refuse
 from gdp.service.replication_messages import FollowerMessage
+from gdp.service.server_window import ServerWindow
 from gdp.service.serving import Asked, Serving
 from gdp.trust.advertisement import paths_value, session_value
 from proxy.bridge.action_interface import CANCEL, GOAL, PROFILES, RESULT, ActionInterface
@@ -55,6 +56,9 @@ from proxy.wire.service import Answer, Request, Stop
 
 __all__ = ["ExposedService"]
 
+# requests that a ROS 2 server has at one time: its queue holds ten by default (rmw_qos_profile_services_default), and
+# clients on its own machine use it, too
+_QUEUE: Final = 8
 _GRACE_S: Final = 0.5  # the client's side ends a call; this side only forgets it
 _CANCEL_S: Final = 5.0
 # a leaving server accepts requests for this long, of clients that have not received its notice yet
@@ -79,7 +83,7 @@ class ExposedService:
         self._seat = seat
         self._flow_spec = flow_spec
         self._topic = topic
-        self._serving: Serving[bytes] = Serving(random_start, flow_spec.rule.at_once)
+        self._serving = _serving_of(flow_spec, seat.endpoint.ros, random_start)
         self._goals = GoalCalls()
         self.requests = 0
         self.request_bytes = 0
@@ -121,7 +125,7 @@ class ExposedService:
             goals=self._goals,
             servers=self._servers,
             stopper=self._stopper,
-            is_concurrent=rule.at_once is None,
+            is_concurrent=not self._serving.has_slots,
             cancel_goal=self._cancel_goal,
         )
 
@@ -142,7 +146,7 @@ class ExposedService:
                 self._ask(message, now_s)
         except RemoteError as error:
             self._site.faults.report(self._flow_spec.local, Fault.MALFORMED, str(error))
-        self._give()
+        self._give(now_s)
 
     def handle_event(self, event: Event, now_s: float) -> None:
         """Process an event of the local server or of an action's topics."""
@@ -163,7 +167,7 @@ class ExposedService:
                 self._responses.respond(asked, event.raw)
             elif asked is not None and isinstance(event, CallFailed):
                 self._responses.fail(asked, Fault.REFUSED, event.reason)
-            self._give()
+            self._give(now_s)
         elif isinstance(event, MessageReceived):
             at = self._topics.index(event.handle)
             self._responses.publish_news(at, event.raw, event.stamp_ns)
@@ -192,7 +196,7 @@ class ExposedService:
             if asked is not None:
                 self._goals.end(asked)
                 self._responses.fail(asked, Fault.TIMED_OUT, "the server did not answer in time")
-        self._give()
+        self._give(now_s)
 
     def parties(self, now_s: float) -> list[Party]:
         """Return the clients that are known now."""
@@ -327,9 +331,9 @@ class ExposedService:
         if goal and asked.part != CANCEL:
             self._goals.add(asked, goal)
 
-    def _give(self) -> None:
+    def _give(self, now_s: float) -> None:
         """Pass the next requests in order to the local server."""
-        for turn in self._serving.poll_turns():
+        for turn in self._serving.poll_turns(now_s):
             self._seat.endpoint.call(self._servers[turn.asked.part], turn.number, turn.request)
 
     def _cancel_goal(self, goal: bytes, now_s: float) -> None:
@@ -339,3 +343,14 @@ class ExposedService:
             self._begin(now_s, _CANCEL_S, cancel, cancel_of(goal))
         except LocalError as error:
             self._site.faults.report(self._flow_spec.local, Fault.TOO_FAST, str(error))
+
+
+def _serving_of(flow_spec: FlowSpec, ros: int, random_start: int) -> Serving[bytes]:
+    """Return the requests of a server, of which a ROS 2 service gets no more at one time than its queue holds.
+
+    The parts of an action have queues of their own, and few calls under way; results take as long as they want.
+    """
+    at_once = flow_spec.rule.at_once
+    if at_once is None and ros == 2 and flow_spec.rule.kind == "service":
+        return Serving(random_start, window=ServerWindow(_QUEUE))
+    return Serving(random_start, at_once)

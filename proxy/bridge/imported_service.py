@@ -5,7 +5,8 @@ exists while a remote one is reachable, so that local clients see whether there 
 response, with a reason, or when its time is up. A later response is counted, and servers that still work on the call
 get a cancellation.
 
-It combines ``server_discovery.py`` (the servers) and ``request_sender.py`` (the requests to each of them).
+It combines ``server_discovery.py`` (the servers), ``request_sender.py`` (the requests to each of them) and
+``local_responses.py`` (the pace of the responses).
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault
 from proxy.bridge.goals import Goals, goal_of, says_yes
 from proxy.bridge.liveliness import Party
+from proxy.bridge.local_responses import LocalResponses
 from proxy.bridge.request_sender import RequestSender
 from proxy.bridge.server_discovery import Response, ServerCalls, ServerDiscovery
 from proxy.endpoints.endpoint import EndpointError, Event, RequestReceived
@@ -95,7 +97,7 @@ class ImportedService:
             )
             for part in range(len(self._parts.services))
         )
-        self._now_s = 0.0  # of the last message of a server
+        self._now_s = 0.0  # of the last event
         self.requests = 0
         self.request_bytes = 0
         self.failed = 0
@@ -115,6 +117,8 @@ class ImportedService:
             options=flow_spec.rule.send_options(),
             is_session=session_value(flow_spec.rule.sign),
         )
+        is_paced = seat.endpoint.ros == 2 and flow_spec.rule.kind == "service"  # an action has few calls under way
+        self._responses = LocalResponses(seat.endpoint, is_paced=is_paced)
         self._sender = RequestSender(
             site=site, service=topic.name, calls=self._calls, goals=self._goals, publisher=self._publisher
         )
@@ -155,13 +159,14 @@ class ImportedService:
                 self._receive_news(message)
         except RemoteError as error:
             self._site.faults.report(self._flow_spec.local, Fault.MALFORMED, str(error))
-        self._sender.flush(now_s)
+        self._flush(now_s)
 
     def handle_event(self, event: Event, now_s: float) -> None:
         """Process a local client's request."""
         if isinstance(event, RequestReceived):
+            self._responses.handle_request(now_s)
             self._ask(event, now_s)
-            self._sender.flush(now_s)
+            self._flush(now_s)
         elif isinstance(event, EndpointError):
             self._site.report_error(self._flow_spec.local, event, Fault.REFUSED)
 
@@ -180,7 +185,7 @@ class ImportedService:
         """Run due timers between checks of the servers."""
         for dispatch in self._calls:
             dispatch.handle_timer(now_s)
-        self._sender.flush(now_s)
+        self._flush(now_s)
 
     def parties(self, now_s: float) -> list[Party]:
         """Return the servers that are known now."""
@@ -195,6 +200,7 @@ class ImportedService:
         if self._sender.is_ready:
             return 0.0
         times = [dispatch.get_timer() for dispatch in self._calls]
+        times.append(self._responses.get_timer(self._now_s))
         return min((time for time in times if time is not None), default=None)
 
     def close(self, now_s: float) -> None:
@@ -207,6 +213,11 @@ class ImportedService:
         """Replace the delegation."""
         self._topic = topic
         self._site.member.renew(topic)
+
+    def _flush(self, now_s: float) -> None:
+        self._now_s = now_s
+        self._sender.flush(now_s)
+        self._responses.flush(now_s)
 
     def _count(self) -> None:
         """Add the increments since the last call to the proxy's counters."""
@@ -241,6 +252,7 @@ class ImportedService:
         for dispatch in self._calls:
             dispatch.fail_all(reason)
         self._sender.clear()
+        self._responses.flush_all()
         if self._goals is not None:
             self._goals.clear()
         for handle in [*self._handles, *self._topics]:
@@ -324,7 +336,7 @@ class ImportedService:
             self._site.traffic.call_ended(self._topic.name.to_text(), max(self._now_s - waiting.begun_s, 0.0))
         self.first_answers[server] += 1
         self._site.tracer.answered(self._key(waiting.part, waiting.call), server)
-        self._seat.endpoint.answer(self._handles[waiting.part], waiting.ticket, raw)
+        self._responses.answer(self._handles[waiting.part], waiting.ticket, raw)
         if self._goals is None or not says_yes(waiting.part, raw):
             return
         if waiting.part == GOAL:
@@ -345,7 +357,7 @@ class ImportedService:
             self._refuse(waiting, Fault.TIMED_OUT, reason)
             return
         self._site.faults.report(self._flow_spec.local, Fault.TIMED_OUT, reason)
-        self._seat.endpoint.answer(self._handles[waiting.part], waiting.ticket, no_answer.to_raw(reason))
+        self._responses.answer(self._handles[waiting.part], waiting.ticket, no_answer.to_raw(reason))
 
     def _key(self, part: int, call: int) -> CallKey:
         return CallKey(self._topic.name, self._site.member.name, part, call)
@@ -373,4 +385,4 @@ class ImportedService:
     def _refuse(self, waiting: _Waiting, fault: Fault, reason: str) -> None:
         self._site.faults.report(self._flow_spec.local, fault, reason)
         if self._handles:
-            self._seat.endpoint.refuse(self._handles[waiting.part], waiting.ticket, reason)
+            self._responses.refuse(self._handles[waiting.part], waiting.ticket, reason)

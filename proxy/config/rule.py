@@ -342,7 +342,7 @@ class Rule(Section):
         ge=1,
         le=AT_ONCE_MAX,
         description="Services, under `expose`: how many requests the local server gets at one time; the others wait"
-        " in the proxy, where clients take turns. `null`: all.",
+        " in the proxy, where clients take turns. `null`: all; a ROS 2 service, as many as its queue holds.",
     )
     state: Literal["none", "ordered"] = Field(
         default="none",

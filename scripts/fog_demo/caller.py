@@ -2,11 +2,11 @@
 
 I/O; needs rclpy. Parameters: ``rate_hz``; ``calls``: total number, 0: until Ctrl-C; ``timeout_s``: time after which a
 call counts as failed; ``report_s``: interval of lines; ``depth``: queue of responses for this node (ROS 2's default is
-10, and it drops more; after an outage all pending calls are answered at once). After SIGUSR1 the node starts no calls
-and ends when the pending ones have ended. A line is ``{"calls", "answered", "failed", "wrong", "unserved", "under_way",
-"median_ms", "p99_ms", "silence_ms", "unix_s", "by_machine", "done"}``. ``unserved`` are calls omitted because no server
-existed after the first call. ``silence_ms`` is the longest time between two responses since the previous line,
-``unix_s`` the time of the line. The last line has ``"done": true``. Exit status 1 if any call failed.
+10, and it drops the oldest of more). After SIGUSR1 the node starts no calls and ends when the pending ones have ended.
+A line is ``{"calls", "answered", "failed", "wrong", "unserved", "under_way", "median_ms", "p99_ms", "silence_ms",
+"unix_s", "by_machine", "done"}``. ``unserved`` are calls omitted because no server existed after the first call.
+``silence_ms`` is the longest time between two responses since the previous line, ``unix_s`` the time of the line. The
+last line has ``"done": true``. Exit status 1 if any call failed.
 """
 
 from __future__ import annotations

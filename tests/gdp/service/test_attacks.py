@@ -111,11 +111,11 @@ def test_a_client_with_many_requests_waits_its_turn() -> None:
     serving: Serving[bytes] = Serving(0, at_once=1)
     numbers = [serving.begin(0.0, None, Asked(GREEDY, 0, call), b"") for call in range(100)]
     serving.begin(0.0, None, Asked(MODEST, 0, 0), b"")
-    assert [turn.asked.client for turn in serving.poll_turns()] == [GREEDY]
+    assert [turn.asked.client for turn in serving.poll_turns(0.0)] == [GREEDY]
     serving.end(numbers[0])
     clients = []
     for _ in range(2):
-        (turn,) = serving.poll_turns()
+        (turn,) = serving.poll_turns(0.0)
         clients.append(turn.asked.client)
         serving.end(turn.number)
     assert set(clients) == {GREEDY, MODEST}
@@ -136,7 +136,7 @@ def test_capacity_is_free_again_after_any_kind_of_end() -> None:
         for call in range(4):
             after = Asked(GREEDY, 0, 4 * at_s) if call == 3 else None
             serving.begin(at_s, 0.5, Asked(GREEDY, 0, 4 * at_s + call), bytes(10), after)
-        (turn,) = serving.poll_turns()
+        (turn,) = serving.poll_turns(0.0)
         serving.stop(Asked(GREEDY, 0, 4 * at_s + 1))
         serving.end(turn.number)
         serving.expired(at_s + 0.5)

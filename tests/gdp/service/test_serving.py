@@ -17,7 +17,7 @@ def begun(serving: Serving[str], *calls: int) -> list[int]:
 
 
 def given(serving: Serving[str]) -> list[str]:
-    return [turn.request for turn in serving.poll_turns()]
+    return [turn.request for turn in serving.poll_turns(0.0)]
 
 
 def test_without_a_limit_all_are_given_at_once_and_each_once() -> None:
@@ -65,7 +65,7 @@ def test_what_a_client_that_left_waits_for_is_never_given_and_what_the_server_ha
 def test_a_client_that_left_and_comes_back_may_ask_the_same_again() -> None:
     serving: Serving[str] = Serving(7)
     (first,) = begun(serving, 1)
-    serving.poll_turns()
+    serving.poll_turns(0.0)
     serving.remove_client(CLIENT)
     assert (len(serving), serving.end(first), asked(1) in serving) == (0, None, False)
     assert serving.answer_of(asked(1)) is None
@@ -76,7 +76,7 @@ def test_a_client_that_left_and_comes_back_may_ask_the_same_again() -> None:
 def test_without_a_limit_a_stopped_call_is_forgotten_at_once() -> None:
     serving: Serving[str] = Serving(7)
     (first,) = begun(serving, 1)
-    serving.poll_turns()
+    serving.poll_turns(0.0)
     assert (serving.stop(asked(1)), len(serving), serving.end(first)) == (first, 0, None)
 
 
@@ -98,7 +98,7 @@ def test_what_took_too_long_frees_its_place() -> None:
     serving: Serving[str] = Serving(7, at_once=1)
     first, *_ = begun(serving, 1)
     serving.begin(1.0, None, asked(2), "request 2")
-    serving.poll_turns()
+    serving.poll_turns(0.0)
     assert serving.get_timer() == 5.0
     assert (serving.expired(5.0), given(serving)) == ([Expired(first, 0, asked(1), True)], ["request 2"])
 
@@ -116,6 +116,6 @@ def test_what_waits_for_another_is_given_when_that_has_ended_however_it_ends() -
 def test_all_fail_except_those_without_a_waiting_client() -> None:
     serving: Serving[str] = Serving(7, at_once=1)
     begun(serving, 1, 2)
-    serving.poll_turns()
+    serving.poll_turns(0.0)
     serving.stop(asked(1))
     assert (serving.fail_all(), len(serving), given(serving)) == ([asked(2)], 0, [])

@@ -41,7 +41,7 @@ def begin(net: Simulated, timeout_s: float | None = 5.0, replication: str | int 
 def respond(net: Simulated, server: ServerCore, label: str, outcome: bytes | str) -> None:
     """Let the server finish its present request."""
     assert net.run(5.0, lambda: bool(server.turns)), "no request came"
-    server.finish(server.turns.popleft().number, outcome)
+    server.finish(server.turns.popleft().number, outcome, net.now_s)
     net.send(label)
 
 

@@ -203,8 +203,8 @@ def test_many_calls_of_a_fast_and_a_slow_server_cost_few_words(sites: Sites) -> 
         caller.call(switch(on=True))
     assert sites.run(2, lambda: len(caller.outcomes) == 50)
     sites.run(0.1)
-    assert slow.asked == 50
-    assert 51 <= client.site.traffic.messages_out - before <= 53
+    assert slow.asked == 8  # what its queue holds; the other calls were answered before their turn came
+    assert 51 <= client.site.traffic.messages_out - before <= 58, "a stop for each eight"
 
 
 def actions(
