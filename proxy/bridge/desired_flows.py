@@ -35,6 +35,14 @@ class FlowSpec(NamedTuple):
     name: Name
     rule: Rule
 
+    def has_short_queues(self, ros: int) -> bool:
+        """Return whether its local nodes drop requests or responses that come faster than they take them.
+
+        The services of ROS 2 do. The parts of an action have queues of their own, and few calls under way; results take
+        as long as they want.
+        """
+        return ros == 2 and self.rule.kind == "service"
+
 
 class ConfigProblem(NamedTuple):
     """Reason why something that a rule names cannot cross at present."""

@@ -346,11 +346,7 @@ class ExposedService:
 
 
 def _serving_of(flow_spec: FlowSpec, ros: int, random_start: int) -> Serving[bytes]:
-    """Return the requests of a server, of which a ROS 2 service gets no more at one time than its queue holds.
-
-    The parts of an action have queues of their own, and few calls under way; results take as long as they want.
-    """
+    """Return the requests of a server; without a rule it gets no more at one time than a short queue holds."""
     at_once = flow_spec.rule.at_once
-    if at_once is None and ros == 2 and flow_spec.rule.kind == "service":
-        return Serving(random_start, window=ServerWindow(_QUEUE))
-    return Serving(random_start, at_once)
+    has_window = at_once is None and flow_spec.has_short_queues(ros)
+    return Serving(random_start, at_once, window=ServerWindow(_QUEUE) if has_window else None)

@@ -117,8 +117,7 @@ class ImportedService:
             options=flow_spec.rule.send_options(),
             is_session=session_value(flow_spec.rule.sign),
         )
-        is_paced = seat.endpoint.ros == 2 and flow_spec.rule.kind == "service"  # an action has few calls under way
-        self._responses = LocalResponses(seat.endpoint, is_paced=is_paced)
+        self._responses = LocalResponses(seat.endpoint, is_paced=flow_spec.has_short_queues(seat.endpoint.ros))
         self._sender = RequestSender(
             site=site, service=topic.name, calls=self._calls, goals=self._goals, publisher=self._publisher
         )
