@@ -46,11 +46,12 @@ class AckNackHandler:
         self._heartbeats = heartbeats
         self.last_sent_s = float("-inf")
 
-    def handle_acknack(self, name: bytes, report: AckNack, *, is_new: bool, now_s: float) -> None:
+    def handle_acknack(self, name: bytes, report: AckNack, *, is_new: bool, now_s: float, trip_s: float = 0.0) -> None:
         """Process a report that was opened.
 
         Args:
             is_new: the reader, or this incarnation of it, was unknown before.
+            trip_s: round trip of its path; 0: not known.
         """
         queue, ledger = self._queue, self._queue.ledger
         reader, sequence = self._readers[name], min(report.sequence, ledger.last + 1)
@@ -68,7 +69,7 @@ class AckNackHandler:
             return
         reader.start = None
         if queue.is_acknowledged:
-            self._acknowledge(name, report, is_new=is_new, now_s=now_s)
+            self._acknowledge(name, report, is_new=is_new, now_s=now_s, trip_s=trip_s)
         if not self._window.is_suspended(name):
             reader.behind_s = None
         if is_new or sequence > reader.sequence:
@@ -205,7 +206,7 @@ class AckNackHandler:
             return queue.next_number
         return max(queue.oldest, queue.next_number + queue.deferred - queue.depth)
 
-    def _acknowledge(self, name: bytes, report: AckNack, *, is_new: bool, now_s: float) -> None:
+    def _acknowledge(self, name: bytes, report: AckNack, *, is_new: bool, now_s: float, trip_s: float) -> None:
         reader, window, queue = self._readers[name], self._window, self._queue
         oldest = queue.oldest
         if not (window.has_reader(name) or window.is_suspended(name)) and now_s >= reader.out_until_s:
@@ -215,7 +216,7 @@ class AckNackHandler:
                 queue.ledger.give_up(report.sequence, end - 1)
             window.add_reader(name, min(max(report.next_number, oldest), queue.next_number), now_s)
         if window.has_reader(name) or window.is_suspended(name):
-            window.handle_acknack(name, report, now_s)
+            window.handle_acknack(name, report, now_s, trip_s)
         lacks_from = report.missing[0].number if report.missing and not is_new else report.next_number
         is_gone = lacks_from < oldest
         if is_gone or (window.is_suspended(name) and not report.missing):

@@ -209,6 +209,14 @@ class Participant:
         """
         self._tell(Right.CALL, service, server, message)
 
+    def is_acknowledged(self, name: Name) -> bool:
+        """Return whether readers have confirmed all that was sent on a name; ``withdraw`` drops the rest."""
+        return self._publications.is_acknowledged(name)
+
+    def unacknowledged(self, name: Name) -> int:
+        """Return how many messages on a name are not confirmed."""
+        return self._publications.unacknowledged(name)
+
     def peers(self, service: Name) -> list[Name]:
         """Return the servers of a name called here, or the clients of one served here, that are connected and keep up.
 

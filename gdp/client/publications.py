@@ -67,6 +67,17 @@ class Publications:
         counts = sum((publisher.losses.counts for publisher in list(self)), self._losses)
         return sum((streams.losses for streams in list(self._private.values())), counts)
 
+    def is_acknowledged(self, name: Name) -> bool:
+        """Return whether every reader of a name has confirmed everything, what was sent to it alone included.
+
+        Readers that may return count. Best-effort messages have left instead. Without readers nothing waits.
+        """
+        return all(each.is_acknowledged() or not each.is_wanted for each in self._all_of(name))
+
+    def unacknowledged(self, name: Name) -> int:
+        """Return how many messages on a name some reader has not confirmed, or have not left if none does."""
+        return sum(each.messages - each.acknowledged for each in self._all_of(name) if each.is_wanted)
+
     def get(self, name: Name) -> Publisher | None:
         """Return the publisher of a name, or None."""
         return self._publishers.get(name)
@@ -225,6 +236,11 @@ class Publications:
         """Return the monotonic second of the next timer, or None."""
         times = [self._timers.next_due(), self._reader_paths.get_timer(), self.turns.next_due()]
         return min((time for time in times if time is not None), default=None)
+
+    def _all_of(self, name: Name) -> list[Publisher]:
+        """Return the publisher of a name and its unicast streams."""
+        public = self._publishers.get(name)
+        return [*([] if public is None else [public]), *self._private.get(name, ())]
 
     def _stream(self, stream: bytes, reader: bytes, now_s: float) -> Publisher:
         """Return the unicast stream that a report concerns."""

@@ -125,6 +125,12 @@ class ReaderPath:
             if self.controller.rtt_s is not None:  # not one of before a timeout
                 self._answered_s, self._trip_s, self._timeouts = now_s, self.controller.rtt_s, 0
 
+    def handle_part(self, number: int, held_s: float | None, now_s: float) -> None:
+        """Note that a part of a flight came, which delays the timeout; ``held_s`` as in ``acknowledged``."""
+        self._confirmed_s = now_s
+        if held_s is not None:
+            self.controller.measure_first(number, now_s, held_s)
+
     def handle_held(self, held_s: float) -> None:
         """Note how long the newest frame of a report had waited at the reader when it left."""
         self._late_reports = self._late_reports + 1 if held_s > _BEHIND_S else 0
@@ -135,6 +141,11 @@ class ReaderPath:
         if self.is_silent:
             self.is_silent = False
             self.controller.forget_all()
+
+    @property
+    def trip_s(self) -> float:
+        """Return the smoothed round trip, that of before a timeout if none was measured since; 0: none yet."""
+        return self.controller.rtt_s or self._trip_s
 
     def patience_s(self, now_s: float) -> float:
         """Return how long an answer may take: a round trip, or as long as nothing under way was confirmed."""

@@ -29,12 +29,14 @@ _COUNT_MASK: Final = (1 << 32) - 1
 class _Flight(NamedTuple):
     end: int  # count of frames sent up to its last one
     number: int  # on the reader's path
+    is_repair: bool  # all its frames were sent before
 
 
 class _Run(NamedTuple):
     first: int  # fragment of a message
     last: int  # ... and the one up to which the others left right after it
     place: int  # count of frames sent up to the first one
+    is_repair: bool
 
     @property
     def end(self) -> int:
@@ -49,6 +51,7 @@ class _Reader:
     flights: deque[_Flight] = field(default_factory=deque)
     resolved: int = 0  # count of frames whose fate is known
     received: int = -1  # count in its latest report; -1: none yet
+    newest: tuple[int, int] = (0, 0)  # message and fragment in its latest report
     partial: int = 0  # frames of the oldest flight that came, of frames sent again
     unseen: int = 0  # frames sent before it began to count
     lost: int = 0
@@ -80,11 +83,17 @@ class SentFrames:
             size = sum(map(len, frames[:again]))
             for name in names:
                 self._paths.path(name, now_s).controller.charge(size, now_s)
+            for frame in frames[:again]:  # no report of it gives a round trip
+                number, part = NUMBER_AND_PART.unpack_from(frame, NUMBER_AT)
+                self._runs.setdefault(number, []).append(_Run(part, part, self._find(number, part)[0], True))
             frames, again = frames[again:], 0
+        if again:
+            self._note_places(frames[:again], self._count + 1, is_repair=True)
         if len(frames) > again:
             self._note_places(frames[again:], self._count + again + 1)
-        for first in range(0, len(frames), _FLIGHT_FRAMES):
-            flight = frames[first : first + _FLIGHT_FRAMES]
+        firsts = [*range(0, again, _FLIGHT_FRAMES), *range(again, len(frames), _FLIGHT_FRAMES)]
+        for first in firsts:
+            flight = frames[first : min(first + _FLIGHT_FRAMES, again if first < again else len(frames))]
             size = sum(map(len, flight))
             count = self._count = self._count + len(flight)
             for name in names:
@@ -92,28 +101,31 @@ class SentFrames:
                 reader = self._readers.get(name)
                 if reader is None:
                     reader = self._readers[name] = _Reader(resolved=count - len(flight))
-                reader.flights.append(_Flight(count, path.sent(size, len(flight), now_s)))
+                reader.flights.append(_Flight(count, path.sent(size, len(flight), now_s), first < again))
         if not names or len(self._runs) > _MESSAGES_MAX:
             self._forget_places()
 
-    def _note_places(self, frames: Sequence[bytes], place: int) -> None:
-        """Note the counts of frames that leave for the first time; ``place`` is the first one's."""
+    def _note_places(self, frames: Sequence[bytes], place: int, *, is_repair: bool = False) -> None:
+        """Note the counts of frames that leave; ``place`` is the first one's."""
         (number, part), (last_number, last_part) = (
             NUMBER_AND_PART.unpack_from(frame, NUMBER_AT) for frame in (frames[0], frames[-1])
         )
-        if number == last_number and last_part - part == len(frames) - 1:  # of a large message, in order
-            self._runs.setdefault(number, []).append(_Run(part, last_part, place))
+        if not is_repair and number == last_number and last_part - part == len(frames) - 1:  # of one message, in order
+            self._runs.setdefault(number, []).append(_Run(part, last_part, place, False))
             return
         for each, frame in enumerate(frames, place):
             number, part = NUMBER_AND_PART.unpack_from(frame, NUMBER_AT)
-            self._runs.setdefault(number, []).append(_Run(part, part, each))
+            self._runs.setdefault(number, []).append(_Run(part, part, each, is_repair))
 
-    def _place_of(self, number: int, part: int) -> int:
-        """Return the count of frames sent up to one of them; 0: it is not known any more."""
+    def _find(self, number: int, part: int) -> tuple[int, bool]:
+        """Return the count of frames sent up to a frame, 0 if not known any more, and whether it was sent again.
+
+        A reader requests a frame when it would have come already. So of one that was sent again, the last one came.
+        """
         for run in reversed(self._runs.get(number, ())):
             if run.first <= part <= run.last:
-                return run.place + part - run.first
-        return 0
+                return run.place + part - run.first, run.is_repair
+        return 0, False
 
     def handle_hops(self, name: bytes, hops: int, now_s: float) -> None:
         """Note over how many hops a reader's report came."""
@@ -134,47 +146,62 @@ class SentFrames:
         while reader.flights and not path.controller.is_under_way(reader.flights[0].number):
             reader.resolved, reader.partial = reader.flights.popleft().end, 0  # it was given up with a silence
         came = (report.received - reader.received) & _COUNT_MASK if reader.received >= 0 else 0
-        place = self._place_of(report.newest, report.newest_part)
-        if place <= reader.resolved:
-            self._confirm_repairs(reader, path, came, now_s)
-            if came <= _COUNT_MASK // 2:
-                reader.received = report.received
+        has_begun = reader.received < 0 or came > _COUNT_MASK // 2
+        newest = report.newest, report.newest_part
+        (place, is_repair), is_newer = self._find(*newest), newest != reader.newest
+        reader.received, reader.newest = report.received, newest
+        if not is_newer:
+            self._confirm_repairs(reader, path, 0 if has_begun else came, place, now_s)
+        if not is_newer or place <= reader.resolved:  # what came now was given up before
             return
         before, numbers, reader.partial = reader.resolved, [], 0
         while reader.flights and reader.flights[0].end <= place:
             flight = reader.flights.popleft()
             reader.resolved = flight.end
             numbers.append(flight.number)
+        if has_begun:
+            reader.unseen, reader.lost = (place - report.received) & _COUNT_MASK, 0
+        held_s = None if is_repair else report.held_us / 1e6 + waited_s
         if not numbers:  # a part of one flight
+            path.handle_part(reader.flights[0].number, held_s, now_s)
             return
-        if reader.received < 0 or came > _COUNT_MASK // 2:
-            reader.unseen, reader.lost = (place - report.received) & _COUNT_MASK, 0  # it has begun to count
-        reader.received = report.received
         lost = (place - reader.unseen - report.received) & _COUNT_MASK
         lost = 0 if lost > _COUNT_MASK // 2 else lost
         new_lost, reader.lost = max(lost - reader.lost, 0), max(lost, reader.lost)
         lost = min(new_lost, reader.resolved - before - 1) if self._counts_losses else 0
         path.handle_held(report.held_us / 1e6)
-        path.acknowledged(numbers, max(lost, 0), report.held_us / 1e6 + waited_s, now_s)
+        path.acknowledged(numbers, max(lost, 0), held_s, now_s)
 
-    def _confirm_repairs(self, reader: _Reader, path: ReaderPath, came: int, now_s: float) -> None:
+    def _confirm_repairs(self, reader: _Reader, path: ReaderPath, came: int, place: int, now_s: float) -> None:
         """Confirm frames that came, though none was newer than before: they were sent again.
 
-        A report by which nothing more came shows that the rest of a flight is lost. Else a flight that lost one frame
-        would block the window until the timeout.
+        Frames that left for the first time before them would have come first, so they are lost. A report by which
+        nothing more came shows that the rest of a flight is lost. Else a flight that lost its end would block the
+        window until the timeout. Without a repair under way, what came is of flights that were given up. It confirms
+        no later one: each would then be confirmed by the report of the one before, and no round trip be measured.
         """
-        came = came if came <= _COUNT_MASK // 2 else 0
         is_over = not came and reader.partial > 0
         came += reader.partial
-        numbers = []
-        while reader.flights and (0 < reader.flights[0].end - reader.resolved <= came or is_over):
-            flight = reader.flights.popleft()
-            came = max(came - flight.end + reader.resolved, 0)
-            reader.resolved, is_over = flight.end, False
+        numbers, lost = list[int](), 0
+        while reader.flights:
+            flight = reader.flights[0]
+            size = flight.end - reader.resolved
+            if not flight.is_repair:
+                if not came or not any(each.is_repair for each in reader.flights):
+                    came = 0
+                    break
+                lost += flight.end - max(reader.resolved, place)
+            elif size > came and not is_over:
+                break
+            else:
+                came, is_over = max(came - size, 0), False
+            reader.flights.popleft()
+            reader.resolved = flight.end
             numbers.append(flight.number)
         reader.partial = came if reader.flights else 0
+        reader.lost += lost
         if numbers:
-            path.acknowledged(numbers, 0, None, now_s)
+            path.acknowledged(numbers, lost if self._counts_losses else 0, None, now_s)
 
     def keep(self, readers: Iterable[bytes]) -> None:
         """Take off the account what is under way to other readers than these: it will not be confirmed."""

@@ -279,6 +279,17 @@ class PathController:
             self._end_round(sample, now_s)
         self._set_limits()
 
+    def measure_first(self, number: int, now_s: float, held_s: float) -> None:
+        """Measure the first round trip by a part of a flight: the rest may be lost, and then nothing else does.
+
+        Args:
+            held_s: how long the reader held the report back.
+        """
+        flight = self._flights.get(number)
+        if self._srtt_s is None and flight is not None and flight.sent_s >= self._changed_s:
+            self._measure_rtt(max(now_s - flight.sent_s - held_s, _LEAST_RTT_S), now_s)
+            self._set_limits()
+
     def lost(self, numbers: Iterable[int], now_s: float) -> None:
         """Take frames that are taken for lost; unknown numbers are ignored."""
         flights = [flight for number in numbers if (flight := self._flights.pop(number, None)) is not None]

@@ -9,7 +9,7 @@ of repairs in a round trip. Each reader has an allowance of fragments that are e
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -102,13 +102,23 @@ class RetransmissionQueue:
                 queued = True
         return queued
 
-    def frames_to_send(self, messages: Mapping[int, CachedMessage], limit: int, now_s: float) -> list[bytes]:
-        """Remove and return at most ``limit`` frames from the queue; those that are no longer cached are left out."""
+    def frames_to_send(
+        self,
+        messages: Mapping[int, CachedMessage],
+        limit: int,
+        now_s: float,
+        is_lacked: Callable[[int, int], bool] | None = None,
+    ) -> list[bytes]:
+        """Remove and return at most ``limit`` frames from the queue, of those that some reader lacks still.
+
+        Args:
+            is_lacked: whether a reader may lack a fragment of a message that is cached; None: not known.
+        """
         frames: list[bytes] = []
         while self._queue and len(frames) < limit:
             (number, part), _ = self._queue.popitem(last=False)
             message = messages.get(number)
-            if message is not None:
+            if message is not None and (is_lacked is None or is_lacked(number, part)):
                 frames.append(message.frames[part])
                 self._sent_s.setdefault(number, {})[part] = now_s
                 self.retransmissions += 1

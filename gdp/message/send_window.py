@@ -216,8 +216,12 @@ class SendWindow:
         """Return the monotonic second at which a reader that lags behind another becomes slow, or None."""
         return self._readers.next_slow()
 
-    def handle_acknack(self, reader: bytes, report: AckNack, now_s: float) -> None:
-        """Process the report of a known reader: release what all have, and queue repairs."""
+    def handle_acknack(self, reader: bytes, report: AckNack, now_s: float, trip_s: float = 0.0) -> None:
+        """Process the report of a known reader: release what all have, and queue repairs.
+
+        Args:
+            trip_s: round trip of its path; 0: not known. Repairs give none here, so it may be known there alone.
+        """
         self._now_s = now_s
         message = self._cache.messages.get(report.next_number)
         position = message.position(report.next_part) if message else self._cache.begin_of(report.next_number)
@@ -225,7 +229,7 @@ class SendWindow:
         if suspended is not None:
             if self._readers.active and position < self._acked_at():  # the others must not wait for it
                 suspended.next_number = max(suspended.next_number, report.next_number)
-                self._request_repairs(reader, report, now_s)
+                self._request_repairs(reader, report, now_s, trip_s)
                 self._release_acknowledged()
                 return
             suspended.acked_at = min(position, self._sent_at)
@@ -237,7 +241,7 @@ class SendWindow:
         self._readers.acknowledge(state, min(position, self._sent_at), now_s)
         acked_at = self._acked_at()
         self._flow.handle_acknowledged(acked_at - before, acked_at, now_s)
-        self._request_repairs(reader, report, now_s)
+        self._request_repairs(reader, report, now_s, trip_s)
         self._release_acknowledged()
 
     @property
@@ -249,7 +253,7 @@ class SendWindow:
         """Return at most ``limit`` frames: repairs first, then new ones as far as the readers can hold them."""
         self._now_s = now_s
         frames: list[bytes] = []
-        if self._repairs and (frames := self._repairs.frames_to_send(self._cache.messages, limit, now_s)):
+        if self._repairs and (frames := self._repaired_frames(limit, now_s)):
             self._flow.round_trip.discard_sample()
         acked_at = self._acked_at()
         if self._sent_at == acked_at:
@@ -276,6 +280,16 @@ class SendWindow:
 
     def _acked_at(self) -> int:
         return self._readers.acked_at(self._sent_at)
+
+    def _repaired_frames(self, limit: int, now_s: float) -> list[bytes]:
+        """Return at most ``limit`` frames to be sent again; what arrived since it was requested is left out."""
+        messages, acked_at = self._cache.messages, self._acked_at()
+        least = self._readers.least() if self._readers.suspended else 0
+
+        def is_lacked(number: int, part: int) -> bool:
+            return messages[number].position(part) >= acked_at or number >= least > 0
+
+        return self._repairs.frames_to_send(messages, limit, now_s, is_lacked)
 
     def _new_frames(self, may_reach: int, limit: int) -> list[bytes]:
         """Return at most ``limit`` frames that were never sent, up to the position ``may_reach``."""
@@ -314,7 +328,7 @@ class SendWindow:
         is_spare = is_spare and oldest is not None and oldest < readers.least_active()
         return self._budget_bytes if readers.suspended and is_spare else 2 * self._budget_bytes
 
-    def _request_repairs(self, reader: bytes, report: AckNack, now_s: float) -> None:
+    def _request_repairs(self, reader: bytes, report: AckNack, now_s: float, trip_s: float) -> None:
         """Queue the fragments that a reader lacks."""
         position = self._readers.active.get(reader) or self._readers.suspended[reader]
         self._repairs.request(
@@ -322,7 +336,7 @@ class SendWindow:
             position.allowance,
             self._cache.messages,
             sent_at=self._sent_at,
-            rtt_s=self._flow.round_trip.rtt_s,
+            rtt_s=max(self._flow.round_trip.rtt_s or 0.0, trip_s),
             round_bytes=REPAIRS_MAX_BYTES,
             now_s=now_s,
         )

@@ -60,7 +60,7 @@ class Runtime:
         self._plane = plane
         self._costs = dict(costs or {})
         self._spin = BusyPoll(spin_s)
-        self._is_stopped = False
+        self._stops = 0  # calls of ``stop``
         self._is_woken = False  # by a watched source: the driver has work
         self._streak = 0  # consecutive steps with frames and without a check of the timers
         self._deadline_s: float | None = None
@@ -78,18 +78,18 @@ class Runtime:
     @property
     def is_stopped(self) -> bool:
         """Return whether ``stop`` was called."""
-        return self._is_stopped
+        return self._stops > 0
 
     def stop(self) -> None:
-        """End ``run`` after the present step."""
-        self._is_stopped = True
+        """End ``run``, or ``linger``, after the present step."""
+        self._stops += 1
 
     def run(self, until: Callable[[], bool] | None = None, deadline_s: float | None = None) -> bool:
         """Work until stopped, until ``until`` is true (checked after each step), or until a monotonic second.
 
         Returns whether ``until`` came true (without one: whether the node was stopped).
         """
-        while not self._is_stopped:
+        while not self._stops:
             if until is not None and until():
                 return True
             if deadline_s is not None and time.monotonic() >= deadline_s:
@@ -97,6 +97,18 @@ class Runtime:
             self.step(time.monotonic() + _DRAIN_LOOK_S if self.is_draining else deadline_s)
             self._end_when_drained()
         return until is None
+
+    def linger(self, deadline_s: float, until: Callable[[], bool] = lambda: False) -> bool:
+        """Work although stopped, until ``until`` is true or until a monotonic second; another ``stop`` ends it.
+
+        Returns whether ``until`` came true.
+        """
+        stops = self._stops
+        while not until():
+            if self._stops > stops or time.monotonic() >= deadline_s:
+                return False
+            self.step(deadline_s)
+        return True
 
     def watch(self, source: HasFileno, ready: Callable[[], None] | None = None) -> None:
         """End a step as soon as ``source`` is readable, after calling ``ready`` from within it."""

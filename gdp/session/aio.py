@@ -161,7 +161,8 @@ class AsyncServer(BaseServer[LoopDriver]):
         self._session.forget(self)
         self._core.leave()
         self._driver.schedule()
-        await self._driver.wait(lambda: self._core.is_idle, time.monotonic() + linger_s)
+        if not await self._driver.wait(lambda: self._core.is_idle, time.monotonic() + linger_s):
+            log.warning("server closed with active requests, or unconfirmed responses name=%s", self._label)
         self._is_closed = True
         for task in self._tasks:
             task.cancel()

@@ -73,8 +73,8 @@ class ServerCore:
 
     @property
     def is_idle(self) -> bool:
-        """Return whether no request is active."""
-        return not len(self._serving)
+        """Return whether no request is active, and the clients have confirmed their responses."""
+        return not self._serving and self._member.is_acknowledged(self._name)
 
     def receive(self, message: Message, now_s: float) -> None:
         """Process a client's request, or its notice that calls have ended.

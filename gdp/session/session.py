@@ -187,7 +187,8 @@ class Server(BaseServer[Driver], _ClosedOnExit):
             return
         self._session.forget(self)
         self._driver.run(self._core.leave)
-        self._driver.wait(lambda: self._core.is_idle, self._driver.now_s() + linger_s)
+        if not self._driver.wait(lambda: self._core.is_idle, self._driver.now_s() + linger_s):
+            log.warning("server closed with active requests, or unconfirmed responses name=%s", self._label)
         self._is_closed = True
         self._driver.run(lambda: self._session.core.close_server(self._core, self._driver.now_s()))
 

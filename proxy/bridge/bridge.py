@@ -42,6 +42,7 @@ __all__ = ["Bridge", "BridgeRules", "FlowChange"]
 log = logging.getLogger(__name__)
 
 _ENDED_MAX: Final = 256
+_FINISH_S: Final = 10.0  # in which readers may confirm the last messages of a publisher or server that has gone
 _CHANGES_MAX: Final = 512  # of unread flow changes; a bridge of a recording never reads them
 TICK_S: Final = 0.05  # interval at which services check their peers, and pending flows are checked
 
@@ -68,6 +69,14 @@ class FlowChange(NamedTuple):
 
     flow_spec: FlowSpec
     is_begun: bool
+
+
+class _Finishing(NamedTuple):
+    """A flow whose local publisher or server has gone, until readers have confirmed its last messages."""
+
+    flow_spec: FlowSpec
+    flow: ExposedTopic | ExposedService
+    ends_s: float
 
 
 class _Key(NamedTuple):
@@ -130,6 +139,7 @@ class Bridge:
         self._seats = [EndpointDispatcher(endpoint) for endpoint in endpoints]
         self._flows: dict[_Key, tuple[FlowSpec, Flow]] = {}
         self._inbound: dict[Name, Flow] = {}  # the flow that receives the overlay's messages of a name
+        self._finishing: dict[Name, _Finishing] = {}
         self._timed: list[ExposedService | ImportedService] = []
         self._probes: dict[_Key, ReadinessProbe] = {}  # of local servers, whether their flow has begun or not
         self._since: dict[_Key, float] = {}  # desired flows that wait for other proxies to begin
@@ -272,6 +282,7 @@ class Bridge:
             self._refresh(now_s)
         for seat in self._seats:
             seat.deliver_faults(now_s)
+        self._close_finished(now_s)
         is_tick = now_s >= self._tick_at_s
         for flow in self._timed:
             due_s = flow.get_timer()
@@ -297,7 +308,7 @@ class Bridge:
         if self._is_stale:
             return 0.0
         if not self._timed and not self._probes:
-            return self._tick_at_s if self._since else None
+            return self._tick_at_s if self._since or self._finishing else None
         times = [each.get_timer() for each in (*self._timed, *self._probes.values())]
         return min([self._tick_at_s, *(time for time in times if time is not None)])
 
@@ -320,13 +331,25 @@ class Bridge:
                 flow.drain(now_s)
 
     def is_drained(self, now_s: float) -> bool:
-        """Return whether every server here has answered everything since ``drain``."""
+        """Return whether clients have the responses of every server here to all requests before ``drain``."""
         return all(flow.is_drained(now_s) for _, flow in self.flows if isinstance(flow, ExposedService))
+
+    def finish(self) -> None:
+        """End every flow, as if the local nodes had gone; ``is_finished`` when remote readers have confirmed all."""
+        for key in list(self._flows):
+            self._finish(key)
+
+    @property
+    def is_finished(self) -> bool:
+        """Return whether readers have confirmed the last messages of all flows that ended."""
+        return all(self._site.member.is_acknowledged(name) for name in self._finishing)
 
     def close(self) -> None:
         """End every flow; endpoints stay open."""
         for key in list(self._flows):
             self._end(key)
+        for name in list(self._finishing):
+            self._close_finishing(name)
         for probe in self._probes.values():
             probe.close()
         self._probes.clear()
@@ -345,11 +368,12 @@ class Bridge:
         """Begin desired flows, end flows that are no longer desired, and pass the graph to the others."""
         self._is_stale = False
         complaints = list[ConfigProblem]()
-        wished = set[_Key]()
+        wished, shown = set[_Key](), set[_Key]()
         for at, seat in enumerate(self._seats):
             view = _View(seat.endpoint.graph(), self._me)
             for flow_spec in self._flow_specs(at, view.graph, complaints):
                 key = _Key(at, flow_spec.is_exposed, flow_spec.rule.kind, flow_spec.local, flow_spec.name)
+                shown.add(key)
                 conflict = view.conflicts.before_us(_shown_as(flow_spec), is_begun=key in self._flows)
                 if conflict:
                     complaints.append(
@@ -361,7 +385,7 @@ class Bridge:
                     self._end(key)
                 if not self._is_ready(key, flow_spec, now_s):
                     if key in self._flows:
-                        self._end(key)
+                        self._finish(key)
                     self._since.pop(key, None)
                     complaints += [self._failed[key]] if key in self._failed else []
                     continue
@@ -374,7 +398,10 @@ class Bridge:
                     self._failed[key] = ConfigProblem(flow_spec.local, Fault.NO_GRAPH, str(error))
                 complaints += [self._failed[key]] if key in self._failed else []
         for key in [key for key in self._flows if key not in wished]:
-            self._end(key)
+            if key in shown or not self._may_finish(key):
+                self._end(key)
+            else:
+                self._finish(key)
         for key in [key for key in self._probes if key not in wished]:
             self._probes.pop(key).close()
         self._since = {key: since for key, since in self._since.items() if key in wished}
@@ -431,6 +458,8 @@ class Bridge:
             self._failed[key] = ConfigProblem(flow_spec.local, Fault.NO_DELEGATION, self._how_to_delegate(flow_spec))
             return
         self._undelegated.pop(key, None)
+        if flow_spec.name in self._finishing:
+            self._close_finishing(flow_spec.name)
         try:
             flow = self._make(self._seats[key.seat], flow_spec, topic, view)
         except LocalError as error:
@@ -454,17 +483,52 @@ class Bridge:
             return ExposedTopic(site, seat, flow_spec, topic, view.ends(Role.PUBLISHES, flow_spec))
         return ImportedTopic(site, seat, flow_spec, topic)
 
+    def _may_finish(self, key: _Key) -> bool:
+        """Return whether the rule and the delegation of a flow still apply: it ends because its local node has gone."""
+        flow_spec, _ = self._flows[key]
+        rules = self._config.expose if flow_spec.is_exposed else self._config.imports
+        return flow_spec.rule in rules and self._held.find(flow_spec.name, _right(flow_spec)) is not None
+
+    def _finish(self, key: _Key) -> None:
+        """End a flow; the last messages of an exposed one stay until readers have confirmed them."""
+        flow_spec, flow = self._remove(key)
+        if isinstance(flow, ExposedTopic | ExposedService):
+            flow.finish(self._now_s)
+            self._finishing[flow_spec.name] = _Finishing(flow_spec, flow, self._now_s + _FINISH_S)
+        else:
+            self._close(flow_spec, flow)
+
     def _end(self, key: _Key) -> None:
+        """End a flow at once."""
+        self._close(*self._remove(key))
+
+    def _remove(self, key: _Key) -> tuple[FlowSpec, Flow]:
         flow_spec, flow = self._flows.pop(key)
         del self._flow_begun_s[key]
-        if self._inbound.get(flow_spec.name) is flow:
-            del self._inbound[flow_spec.name]
         if isinstance(flow, ExposedService | ImportedService):
             self._timed.remove(flow)
         if isinstance(flow, ImportedTopic):
             self._ended.append(flow.stats)
-        flow.close(self._now_s)
         self._changes.append(FlowChange(flow_spec, is_begun=False))
+        return flow_spec, flow
+
+    def _close_finished(self, now_s: float) -> None:
+        for name, each in list(self._finishing.items()):
+            if now_s >= each.ends_s or self._site.member.is_acknowledged(name):
+                self._close_finishing(name)
+
+    def _close_finishing(self, name: Name) -> None:
+        flow_spec, flow, _ = self._finishing.pop(name)
+        if not self._site.member.is_acknowledged(name):
+            count = self._site.member.unacknowledged(name)
+            detail = f"{count} messages were not confirmed after their {flow_spec.rule.kind} had ended here"
+            self._site.faults.report(flow_spec.local, Fault.TOO_FAST, detail)
+        self._close(flow_spec, flow)
+
+    def _close(self, flow_spec: FlowSpec, flow: Flow) -> None:
+        if self._inbound.get(flow_spec.name) is flow:
+            del self._inbound[flow_spec.name]
+        flow.close(self._now_s)
         log.debug("flow ended name=%s exposed=%s", flow_spec.name.short, flow_spec.is_exposed)
 
     def _how_to_delegate(self, flow_spec: FlowSpec) -> str:

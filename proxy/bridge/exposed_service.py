@@ -63,6 +63,7 @@ _GRACE_S: Final = 0.5  # the client's side ends a call; this side only forgets i
 _CANCEL_S: Final = 5.0
 # a leaving server accepts requests for this long, of clients that have not received its notice yet
 _NOTICE_S: Final = 1.0
+_GONE: Final = "the server is gone"
 
 
 class ExposedService:
@@ -89,6 +90,7 @@ class ExposedService:
         self.request_bytes = 0
         self._cancels = 0  # number of the last cancel request of the proxy itself
         self._refuses_from_s: float | None = None
+        self._is_finished = False
         self._liveness = ClientLiveness()
         self._early = UndescribedRequests()
         endpoint, rule = seat.endpoint, flow_spec.rule
@@ -131,6 +133,9 @@ class ExposedService:
 
     def receive(self, message: Message, now_s: float) -> None:
         """Process a remote client's request or its cancellations; both wait until the client's description arrives."""
+        if self._is_finished:
+            self._refuse(message)
+            return
         if not message.description:
             if not self._early.add(message):
                 self._drop_early("too many requests came before their client's description")
@@ -217,24 +222,33 @@ class ExposedService:
             self._publisher.describe(replace(self._exchange, is_leaving=True).to_wire())
 
     def is_drained(self, now_s: float) -> bool:
-        """Return whether no call is under way, and none will be accepted."""
+        """Return whether none will be accepted, none is under way, and the clients have confirmed their responses."""
         is_closed = self._refuses_from_s is not None and now_s >= self._refuses_from_s
         if is_closed and self._kept is not None:
             self._kept.close()
-        return is_closed and not self._serving and (self._kept is None or self._kept.is_idle)
+        is_idle = not self._serving and (self._kept is None or self._kept.is_idle)
+        return is_closed and is_idle and self._site.member.is_acknowledged(self._topic.name)
 
-    def close(self, now_s: float) -> None:
-        """Close the server; calls under way fail."""
+    def finish(self, now_s: float) -> None:
+        """Fail the calls under way, and refuse requests from now on."""
+        if self._is_finished:
+            return
+        self._is_finished = True
         for asked in self._serving.fail_all():
             self._goals.end(asked)
-            self._responses.fail(asked, Fault.NO_SERVER, "the server is gone")
+            self._responses.fail(asked, Fault.NO_SERVER, _GONE)
         for _ in range(self._early.forget_all_but(())):
             self._drop_early("the server is gone before their client's description came")
         stopper = [] if self._stopper is None else [self._stopper]
         kept = [] if self._kept is None else self._kept.handles
         for handle in [self._mark, *self._servers, *stopper, *kept, *self._topics]:
             self._seat.close(handle)
-        self._site.member.flush(now_s)  # the last messages must not wait: they would be dropped with their stream
+        self._publisher.describe(replace(self._exchange, is_leaving=True).to_wire())
+        self._site.member.flush(now_s)
+
+    def close(self, now_s: float) -> None:
+        """Close the server; calls under way fail, and unconfirmed responses are lost."""
+        self.finish(now_s)
         self._site.member.withdraw(self._topic.name)
 
     def renew(self, topic: Topic) -> None:
@@ -254,6 +268,16 @@ class ExposedService:
         here = {self._site.member.name, *self._site.member.connected_peers(self._topic.name)}
         for client in self._liveness.update(self._serving.clients, present=here, known=known.keys(), now_s=now_s):
             self._cancellation.handle_client_gone(client)
+
+    def _refuse(self, message: Message) -> None:
+        """Refuse what came after the server had gone."""
+        asked_for = message.delivered.message
+        try:
+            if not is_word(asked_for) and not Stop.is_in(asked_for):
+                request = Request.from_wire(asked_for)
+                self._responses.refuse(Asked(Name(message.delivered.publisher), request.part, request.call), _GONE)
+        except RemoteError as error:
+            self._site.faults.report(self._flow_spec.local, Fault.MALFORMED, str(error))
 
     def _drop_early(self, reason: str) -> None:
         self._site.faults.report(self._flow_spec.local, Fault.TOO_FAST, reason)

@@ -103,11 +103,15 @@ class ExposedTopic:
         elif isinstance(event, EndpointError):
             self._site.report_error(self._flow_spec.local, event, Fault.QOS)
 
-    def close(self, now_s: float) -> None:
-        """Close the subscription and the publisher."""
+    def finish(self, now_s: float) -> None:
+        """Publish nothing from now on."""
         self._seat.close(self.handle)
+        self._site.member.flush(now_s)
+
+    def close(self, now_s: float) -> None:
+        """Close the subscription and the publisher; unconfirmed messages are lost."""
+        self.finish(now_s)
         if self.publisher is not None:
-            self._site.member.flush(now_s)  # the last messages must not wait: they would be dropped with their stream
             self._site.member.withdraw(self._topic.name)
 
     def parties(self, now_s: float) -> list[Party]:

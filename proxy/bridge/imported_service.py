@@ -6,14 +6,14 @@ response, with a reason, or when its time is up. A later response is counted, an
 get a cancellation.
 
 It combines ``server_discovery.py`` (the servers), ``request_sender.py`` (the requests to each of them) and
-``local_responses.py`` (the pace of the responses).
+``virtual_server.py`` (what local clients see).
 """
 
 from __future__ import annotations
 
 import secrets
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
@@ -26,7 +26,7 @@ from gdp.service.replication import ALL, Mode
 from gdp.service.replication_messages import INCARNATION_BITS
 from gdp.service.sequencer import Sequencer
 from gdp.trust.advertisement import paths_value, session_value
-from proxy.bridge.action_interface import CANCEL, GOAL, PROFILES, RESULT, ActionInterface
+from proxy.bridge.action_interface import CANCEL, GOAL, RESULT, ActionInterface
 from proxy.bridge.call_tracer import CallKey
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.desired_flows import FlowSpec
@@ -34,9 +34,9 @@ from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault
 from proxy.bridge.goals import Goals, goal_of, says_yes
 from proxy.bridge.liveliness import Party
-from proxy.bridge.local_responses import LocalResponses
 from proxy.bridge.request_sender import RequestSender
-from proxy.bridge.server_discovery import Response, ServerCalls, ServerDiscovery
+from proxy.bridge.server_discovery import SERVER_GONE, Response, ServerCalls, ServerDiscovery
+from proxy.bridge.virtual_server import VirtualServer
 from proxy.endpoints.endpoint import EndpointError, Event, RequestReceived
 from proxy.serial.empty import NoAnswer
 from proxy.serial.serializer import Serializer
@@ -57,6 +57,7 @@ class _Waiting:
     """A local client's request, with its goal if it belongs to an action."""
 
     part: int
+    handle: int
     ticket: int
     goal: bytes
     begun_s: float
@@ -106,8 +107,6 @@ class ImportedService:
         self._counted: tuple[int, ...] = (0, 0, 0)  # late, unexpected and hedged, as reported last
         self._requests: tuple[Serializer, ...] = ()
         self._no_answers: tuple[NoAnswer | None, ...] = ()  # None: the dialect has errors
-        self._handles: list[int] = []
-        self._topics: list[int] = []
         self._publisher = site.member.call(
             topic,
             self._description(),
@@ -117,7 +116,7 @@ class ImportedService:
             options=flow_spec.rule.send_options(),
             is_session=session_value(flow_spec.rule.sign),
         )
-        self._responses = LocalResponses(seat.endpoint, is_paced=flow_spec.has_short_queues(seat.endpoint.ros))
+        self._virtual_server = VirtualServer(seat, self, is_paced=flow_spec.has_short_queues(seat.endpoint.ros))
         self._sender = RequestSender(
             site=site, service=topic.name, calls=self._calls, goals=self._goals, publisher=self._publisher
         )
@@ -163,7 +162,6 @@ class ImportedService:
     def handle_event(self, event: Event, now_s: float) -> None:
         """Process a local client's request."""
         if isinstance(event, RequestReceived):
-            self._responses.handle_request(now_s)
             self._ask(event, now_s)
             self._flush(now_s)
         elif isinstance(event, EndpointError):
@@ -199,13 +197,14 @@ class ImportedService:
         if self._sender.is_ready:
             return 0.0
         times = [dispatch.get_timer() for dispatch in self._calls]
-        times.append(self._responses.get_timer(self._now_s))
+        times.append(self._virtual_server.get_timer(self._now_s))
         return min((time for time in times if time is not None), default=None)
 
     def close(self, now_s: float) -> None:
         """Close the virtual server; calls under way fail."""
         del now_s
         self._shut("the proxy no longer carries this service")
+        self._virtual_server.close_now()
         self._site.member.withdraw(self._topic.name)
 
     def renew(self, topic: Topic) -> None:
@@ -216,7 +215,7 @@ class ImportedService:
     def _flush(self, now_s: float) -> None:
         self._now_s = now_s
         self._sender.flush(now_s)
-        self._responses.flush(now_s)
+        self._virtual_server.flush(now_s)
 
     def _count(self) -> None:
         """Add the increments since the last call to the proxy's counters."""
@@ -241,28 +240,26 @@ class ImportedService:
         self._publisher.describe(ours.to_wire())
         self._requests = tuple(Serializer(each.request, ours.encoding) for each in ours.services)
         self._no_answers = tuple(NoAnswer.of(each) for each in ours.services)
-        self._topics = [
-            self._seat.advertise(self, replace(each, qos=(profile,), latched=profile.durability == "transient_local"))
-            for each, profile in zip(ours.topics, PROFILES, strict=False)
-        ]
-        self._handles = [self._seat.serve(self, each) for each in ours.services]
+        self._virtual_server.open(ours)
 
     def _shut(self, reason: str) -> None:
         for dispatch in self._calls:
             dispatch.fail_all(reason)
         self._sender.clear()
-        self._responses.flush_all()
         if self._goals is not None:
             self._goals.clear()
-        for handle in [*self._handles, *self._topics]:
-            self._seat.close(handle)
-        self._handles, self._topics = [], []
+        self._virtual_server.close()
 
     def _ask(self, event: RequestReceived, now_s: float) -> None:
-        part, rule = self._handles.index(event.handle), self._flow_spec.rule
-        waiting = _Waiting(part, event.ticket, b"", now_s)
+        part, rule = self._virtual_server.part_of(event.handle), self._flow_spec.rule
+        self._virtual_server.handle_request(now_s)
         self.requests += 1
         self.request_bytes += len(event.raw)
+        if part is None:
+            self._site.faults.report(self._flow_spec.local, Fault.NO_SERVER, SERVER_GONE)
+            self._virtual_server.refuse(event.handle, event.ticket, SERVER_GONE)
+            return
+        waiting = _Waiting(part, event.handle, event.ticket, b"", now_s)
         body = self._requests[part].encode(event.raw)
         if reason := too_large("a request", len(event.raw), rule.max_bytes, len(body)):
             self._refuse(waiting, Fault.TOO_LARGE, reason)
@@ -335,7 +332,7 @@ class ImportedService:
             self._site.traffic.call_ended(self._topic.name.to_text(), max(self._now_s - waiting.begun_s, 0.0))
         self.first_answers[server] += 1
         self._site.tracer.answered(self._key(waiting.part, waiting.call), server)
-        self._responses.answer(self._handles[waiting.part], waiting.ticket, raw)
+        self._virtual_server.answer(waiting.handle, waiting.ticket, raw)
         if self._goals is None or not says_yes(waiting.part, raw):
             return
         if waiting.part == GOAL:
@@ -351,12 +348,12 @@ class ImportedService:
             self._refuse(waiting, _FAULTS[failure], reason)
             return
         reason = f"no answer within {self._flow_spec.rule.timeout_s:g} s"
-        no_answer = self._no_answers[waiting.part] if self._handles else None
+        no_answer = self._no_answers[waiting.part]
         if no_answer is None or no_answer.says_reason or self._flow_spec.rule.on_timeout == "silent":
             self._refuse(waiting, Fault.TIMED_OUT, reason)
             return
         self._site.faults.report(self._flow_spec.local, Fault.TIMED_OUT, reason)
-        self._responses.answer(self._handles[waiting.part], waiting.ticket, no_answer.to_raw(reason))
+        self._virtual_server.answer(waiting.handle, waiting.ticket, no_answer.to_raw(reason))
 
     def _key(self, part: int, call: int) -> CallKey:
         return CallKey(self._topic.name, self._site.member.name, part, call)
@@ -369,19 +366,18 @@ class ImportedService:
         news, name = News.from_wire(message.delivered.message), Name(message.delivered.publisher)
         server = self._discovery.servers.get(name)
         at = news.part - len(self._parts.services)
-        if server is None or self._goals is None or not 0 <= at < len(server.news) or not self._topics:
+        if server is None or self._goals is None or not 0 <= at < len(server.news):
             return
         raw = server.news[at].decode(news.body)
         if at > 0:
             self._tell_status(self._goals.statuses(name, raw))
         elif self._goals.may_feed(name, raw):
-            self._seat.endpoint.publish(self._topics[at], raw)
+            self._virtual_server.publish(at, raw)
 
     def _tell_status(self, raw: bytes | None) -> None:
-        if raw is not None and self._topics:
-            self._seat.endpoint.publish(self._topics[-1], raw)
+        if raw is not None:
+            self._virtual_server.publish(-1, raw)
 
     def _refuse(self, waiting: _Waiting, fault: Fault, reason: str) -> None:
         self._site.faults.report(self._flow_spec.local, fault, reason)
-        if self._handles:
-            self._responses.refuse(self._handles[waiting.part], waiting.ticket, reason)
+        self._virtual_server.refuse(waiting.handle, waiting.ticket, reason)

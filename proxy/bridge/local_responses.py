@@ -28,7 +28,10 @@ class LocalResponses:
     """Responses to the local clients of one service, in order.
 
     Args:
-        is_paced: whether the clients have short queues; else each response is passed on at once.
+        is_paced: whether the clients have short queues; else ``flush`` passes on everything.
+
+    Attributes:
+        last_s: monotonic second at which ``flush`` last passed on a response; minus infinity: it did not yet.
     """
 
     def __init__(self, endpoint: Endpoint, *, is_paced: bool) -> None:
@@ -37,6 +40,10 @@ class LocalResponses:
         self._waiting: deque[Callable[[], None]] = deque()
         self._bucket = TokenBucket(_PER_S, _BURST)
         self._requests, self._since_s = 0, float("-inf")
+        self.last_s = float("-inf")
+
+    def __len__(self) -> int:
+        return len(self._waiting)
 
     def handle_request(self, now_s: float) -> None:
         """Count a client's request: clients that make many take many responses."""
@@ -49,17 +56,18 @@ class LocalResponses:
 
     def answer(self, handle: int, ticket: int, raw: bytes) -> None:
         """Queue a response for ``flush``."""
-        self._put(partial(self._endpoint.answer, handle, ticket, raw))
+        self._waiting.append(partial(self._endpoint.answer, handle, ticket, raw))
 
     def refuse(self, handle: int, ticket: int, reason: str) -> None:
         """Queue the reason of a failure in place of a response, for ``flush``."""
-        self._put(partial(self._endpoint.refuse, handle, ticket, reason))
+        self._waiting.append(partial(self._endpoint.refuse, handle, ticket, reason))
 
     def flush(self, now_s: float) -> None:
         """Pass on the responses whose time has come."""
-        while self._waiting and self._bucket.left(now_s) > 1.0 - _ROUNDING:
+        while self._waiting and (not self._is_paced or self._bucket.left(now_s) > 1.0 - _ROUNDING):
             self._bucket.charge(now_s, 1.0)
             self._waiting.popleft()()
+            self.last_s = now_s
 
     def flush_all(self) -> None:
         """Pass on all responses now, because the clients' server ends."""
@@ -71,9 +79,3 @@ class LocalResponses:
         if not self._waiting:
             return None
         return now_s + self._bucket.seconds_for(1.0 - self._bucket.left(now_s))
-
-    def _put(self, passed_on: Callable[[], None]) -> None:
-        if self._is_paced:
-            self._waiting.append(passed_on)
-        else:
-            passed_on()

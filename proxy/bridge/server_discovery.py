@@ -21,9 +21,9 @@ from proxy.bridge.goals import Goals
 from proxy.bridge.remote_server import RemoteServer
 from proxy.wire.service import Exchange
 
-__all__ = ["Response", "ServerCalls", "ServerDiscovery"]
+__all__ = ["SERVER_GONE", "Response", "ServerCalls", "ServerDiscovery"]
 
-_SERVER_GONE: Final = "the far server is gone"
+SERVER_GONE: Final = "the far server is gone"
 
 Response: TypeAlias = "tuple[Name, bytes]"  # the sender, and its body in the local endpoint's wire form
 ServerCalls: TypeAlias = "Dispatch[Response] | Sequencer[Response]"
@@ -94,7 +94,7 @@ class ServerDiscovery:
                 self._add(name, incarnation, description, now_s)
         if not self.servers and self._is_open:
             self._is_open = False
-            self._closed(_SERVER_GONE)
+            self._closed(SERVER_GONE)
 
     def find(self, name: Name, now_s: float) -> RemoteServer | None:
         """Return a server, including one that joined just now, or None."""
@@ -107,7 +107,7 @@ class ServerDiscovery:
         if self._goals is not None:
             self._goals.remove_server(name)
         for dispatch in self._calls:
-            dispatch.replica_lost(name, now_s, _SERVER_GONE)
+            dispatch.replica_lost(name, now_s, SERVER_GONE)
 
     def _add(self, name: Name, incarnation: int, description: bytes, now_s: float) -> None:
         """Prepare the decoders of a server's responses; an invalid description is reported."""

@@ -38,7 +38,7 @@ from gdp.errors import LocalError
 from proxy.check.command import check_proxy
 from proxy.config.config import ProxyConfig
 from proxy.config.recorded import RecordedRules
-from proxy.node.node import GOODBYE_S, ProxyNode, run_node
+from proxy.node.node import ProxyNode, run_node
 from proxy.node.recording_bridge import open_recording_bridge
 from proxy.node.replayer import Replay, Unconfirmed
 from proxy.recordings.endpoint import ReplayEndpoint
@@ -144,8 +144,7 @@ def _replay(
         report()
         unconfirmed = replay.unconfirmed()
         _report(reader, replay, unconfirmed, json=json)
-        node.member.leave()
-        node.linger(GOODBYE_S)
+        node.leave()
     return is_whole and not (unconfirmed or refused or replay.too_large)
 
 

@@ -29,7 +29,8 @@ from proxy.config.config import ProxyConfig
 from proxy.doors.hub import Rights
 from proxy.doors.rules import DoorRules, rules_of
 from proxy.endpoints.door import DoorEndpoint
-from proxy.node.node import GOODBYE_S, ProxyNode, run_node
+from proxy.node.goodbye import say_goodbye
+from proxy.node.node import ProxyNode, run_node
 
 __all__ = ["OpenDoor", "door_config", "run_door"]
 
@@ -107,11 +108,9 @@ def run_door(config: ProxyConfig, open_door: OpenDoor, *, json: bool) -> None:
                 _work(node, bridge, door, state, json=json)
             finally:
                 node.runtime.unwatch(door)
-            bridge.close()
+            say_goodbye(node, bridge)
         finally:
             door.shut_down()
-        node.member.leave()
-        node.linger(GOODBYE_S)
         totals = {"sent": node.traffic.messages_out, "received": node.traffic.messages_in, "dropped": door.dropped}
         if json:
             emit("done", **totals, faults=dict(node.faults.counts))

@@ -27,7 +27,8 @@ from proxy.bridge.topic_stats import percentile
 from proxy.config.config import ProxyConfig
 from proxy.endpoints.endpoint import proxy_node_name
 from proxy.endpoints.live import open_endpoints
-from proxy.node.node import GOODBYE_S, ProxyNode, run_node
+from proxy.node.goodbye import say_goodbye
+from proxy.node.node import ProxyNode, run_node
 from proxy.node.otel_tracer import open_tracer
 from proxy.node.state_answer import answer_for_proxy
 
@@ -86,9 +87,7 @@ def run(path: Path, settings: ProxyConfig, *, json: bool) -> None:
                     node.runtime.unwatch(endpoint)
                 tracer.close()
             best_effort = bridge.best_effort
-            bridge.close()
-            node.member.leave()
-            node.linger(GOODBYE_S)
+            say_goodbye(node, bridge)
         if json:
             sent = [stats.to_fields() for stats in best_effort]
             topics = [stats.to_fields() for stats in bridge.stats]
@@ -124,6 +123,8 @@ def _work(node: ProxyNode, bridge: Bridge, *, json: bool) -> None:
                 leave_at_s = now_s + DRAIN_MAX_S
             bridge.drain(now_s)  # repeatedly: a local server may appear meanwhile
             node.has_drained = bridge.is_drained(now_s)
+            if now_s >= leave_at_s and not node.has_drained:
+                log.warning("leaving after %g s before all calls are answered and confirmed", DRAIN_MAX_S)
             if now_s >= leave_at_s or node.has_drained:
                 return
         if not is_ready and node.member.attachment.is_attached and bridge.is_settled:

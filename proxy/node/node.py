@@ -51,7 +51,7 @@ from proxy.bridge.faults import Faults
 from proxy.bridge.sent_stats import SentStats
 from proxy.config.config import ProxyConfig, Record
 
-__all__ = ["GOODBYE_S", "ProxyNode", "open_topics", "run_node"]
+__all__ = ["ProxyNode", "open_topics", "run_node"]
 
 log = logging.getLogger(__name__)
 
@@ -60,7 +60,7 @@ CALLED_MAX: Final = 256  # services in one status; each has less than 128 bytes
 DENIED_MAX: Final = 50  # names in one status; each has less than 1.5 KiB
 LIVELINESS_BYTES: Final = 96 << 10  # of a status, whose response has 256 KiB
 UNDELEGATED_MAX: Final = 100  # flows in one status; each has less than 2 KiB of a response's 256
-GOODBYE_S: Final = 0.2  # time in which a leaving node still sends
+_GOODBYE_S: Final = 0.2  # time in which a leaving node still sends
 
 
 @dataclass(slots=True, kw_only=True)
@@ -192,9 +192,10 @@ class ProxyNode:
     def _shown_name(self, name: Name) -> str:
         return self.local_name(name)  # which the command replaces later
 
-    def linger(self, duration_s: float) -> None:
-        """Run for this many seconds more, so that the goodbye is sent."""
-        self.runtime.run(lambda: False, time.monotonic() + duration_s)
+    def leave(self) -> None:
+        """Leave the overlay, stopped or not, and run until the goodbye is sent."""
+        self.member.leave()
+        self.runtime.linger(time.monotonic() + _GOODBYE_S)
 
     def tell_refusals(self) -> None:
         """Log a warning for each advertisement that the overlay has rejected."""

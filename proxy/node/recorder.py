@@ -18,7 +18,8 @@ from proxy.bridge.bridge import Bridge
 from proxy.bridge.topic_stats import TopicStats
 from proxy.config.config import ProxyConfig
 from proxy.config.recorded import RecordedRules
-from proxy.node.node import GOODBYE_S, ProxyNode, run_node
+from proxy.node.goodbye import say_goodbye
+from proxy.node.node import ProxyNode, run_node
 from proxy.node.recording_bridge import open_recording_bridge
 from proxy.recordings.endpoint import RecordingEndpoint
 from proxy.recordings.writer import BagWriter
@@ -45,9 +46,7 @@ def record(settings: ProxyConfig, *, json: bool) -> None:
         with open_recording_bridge(node, settings, rules, endpoint) as bridge:
             _work(node, bridge, json=json)
             stats = bridge.stats
-            bridge.close()
-            node.member.leave()
-            node.linger(GOODBYE_S)
+            say_goodbye(node, bridge)
         stack.close()
     _report(stats, json=json)
 

@@ -28,7 +28,8 @@ from proxy.config.rule import Rule
 from proxy.doors.node import door_config
 from proxy.doors.rules import DoorRules, rules_of
 from proxy.endpoints.probe import Probe
-from proxy.node.node import GOODBYE_S, run_node
+from proxy.node.goodbye import say_goodbye
+from proxy.node.node import run_node
 
 __all__ = ["ATTACH_S", "Access", "NoAnswerError", "Wanted", "find_access", "run_probe"]
 
@@ -159,10 +160,8 @@ def run_probe(access: Access, probe: Probe, tick: Tick, *, timeout_s: float | No
                     raise NoAnswerError(f"not attached on {access.config.iface} within {ATTACH_S:g} s: {waits}")
         finally:
             node.runtime.unwatch(probe)
-            bridge.close()
+            say_goodbye(node, bridge)
             probe.shut_down()
-        node.member.leave()
-        node.linger(GOODBYE_S)
 
 
 def names_held(node: Path, right: Right) -> Iterator[str]:

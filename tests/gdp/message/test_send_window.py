@@ -88,6 +88,27 @@ def test_a_part_is_not_repaired_twice_in_a_round_trip() -> None:
     assert window.retransmissions == 2
 
 
+def test_a_part_that_arrived_while_its_second_repair_waited_is_not_sent_again() -> None:
+    window = window_of(1, 100)
+    assert len(window.frames_to_send(0.0, limit=30)) == 30
+    window.handle_acknack(A, has(1, 9, (MissingRange(1, 9, 29),)), 1.0)
+    assert window.frames_to_send(1.0, limit=15) == message(1, 100)[9:24]
+    window.handle_acknack(A, has(1, 9, (MissingRange(1, 9, 29),)), 2.0)  # they are late, not lost
+    window.handle_acknack(A, has(1, 24, (MissingRange(1, 24, 29),)), 2.1)
+    assert window.frames_to_send(2.1, limit=10) == message(1, 100)[24:34]
+
+
+def test_a_part_that_a_suspended_reader_lacks_is_sent_though_the_others_have_it() -> None:
+    window = window_of(2, 20, (A, B))
+    window.frames_to_send(0.0)
+    window.suspend(B)
+    window.handle_acknack(A, has(3, 0), 0.1)
+    put(window, 3, message(3, 20))
+    window.frames_to_send(0.1)
+    window.handle_acknack(B, has(1, 5, (MissingRange(1, 5, 7),)), 0.2)
+    assert window.frames_to_send(0.2) == message(1, 20)[5:8]
+
+
 def test_what_was_never_sent_is_no_repair() -> None:
     window = window_of(20, 100)
     sent = len(window.frames_to_send(0.0, limit=10))

@@ -168,6 +168,24 @@ def test_a_server_that_leaves_refuses_new_requests(replicas: Simulated) -> None:
     assert "the server is leaving" in str(call.error)
 
 
+def test_a_server_closes_when_its_client_has_confirmed_the_response(replicas: Simulated) -> None:
+    server = serve(replicas, "edge")
+    replicas.run(1.0)
+    call = begin(replicas)
+    assert replicas.run(2.0, lambda: bool(server.turns))
+    lead = replicas.world.leads["s/edge"]
+    lead.loss = 1.0  # the response and its repetitions
+    respond(replicas, server, "edge", b"done")
+    assert not replicas.run(0.4, lambda: server.is_idle)
+    lead.loss = 0.0
+    assert replicas.run(2.0, lambda: server.is_idle)
+    replicas.cores["edge"].close_server(server, replicas.now_s)
+    replicas.send("edge")
+    assert replicas.run(1.0, lambda: call.is_done)
+    assert call.response is not None
+    assert call.response.payload == b"done"
+
+
 def test_at_most_as_many_requests_as_there_are_workers_are_given_out(replicas: Simulated) -> None:
     server = serve(replicas, "edge", at_once=1)
     calls = [begin(replicas, payload=payload) for payload in (b"a", b"b")]

@@ -176,7 +176,7 @@ def test_a_server_that_leaves_fails_the_waiting_results_with_a_reason(sites: Sit
     local.leave()
     assert sites.run(1, lambda: len(caller.results.outcomes) == 1)
     assert isinstance(caller.results.outcomes[0], str)
-    assert sites.run(1, lambda: not caller.sees_server())
+    assert sites.run(1.5, lambda: not caller.sees_server())
 
 
 def test_the_parts_of_an_action_do_not_cross_by_a_pattern_of_topics(sites: Sites) -> None:

@@ -71,6 +71,7 @@ def test_without_pace_the_same_burst_is_lost() -> None:
     responses = LocalResponses(clients, is_paced=False)
     for ticket in range(100):
         responses.answer(1, ticket, b"")
+    responses.flush(0.0)
     assert clients.lost == 100 - QUEUE
 
 

@@ -185,6 +185,23 @@ def test_a_server_that_drains_answers_what_it_has_and_gets_nothing_new(sites: Si
     assert first.asked == 1
 
 
+def test_a_server_that_drains_stays_until_the_client_has_its_response(sites: Sites) -> None:
+    (machine,), (local,), _, caller = replicas(sites, 1)
+    caller.call(switch(on=True))
+    assert sites.run(1, lambda: local.asked == 1)
+    machine.bridge.drain(sites.now_s)
+    sites.run(1.5)
+    lead = sites.world.leads[PLACES[0]]
+    lead.loss = 1.0  # the response and its repetitions
+    local.waiting[0][1](switched("done"))
+    assert not sites.run(0.4, lambda: machine.bridge.is_drained(sites.now_s))
+    lead.loss = 0.0
+    assert sites.run(2, lambda: machine.bridge.is_drained(sites.now_s))
+    sites.leave(machine)
+    sites.run(1)
+    assert caller.outcomes == [switched("done")]
+
+
 def test_the_only_server_still_answers_while_it_says_that_it_leaves(sites: Sites) -> None:
     (machine,), (local,), _, caller = replicas(sites, 1, mode="mode: hedged")
     local.answer = lambda _: switched("yes")

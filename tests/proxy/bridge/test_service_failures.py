@@ -56,7 +56,7 @@ def test_a_server_that_leaves_mid_call_fails_it_with_a_reason(sites: Sites) -> N
     local.handle.close()
     assert sites.run(1, lambda: len(caller.outcomes) == 1)
     assert caller.outcomes == ["the server is gone"]
-    assert sites.run(1, lambda: not caller.sees_server())
+    assert sites.run(1.5, lambda: not caller.sees_server())
     assert server.faults == {"no-server": 1}
 
 
@@ -70,6 +70,37 @@ def test_the_answer_of_a_server_that_leaves_at_once_arrives(sites: Sites) -> Non
     assert caller.outcomes == [switched("goodbye")]
 
 
+def test_the_answer_of_a_server_that_leaves_at_once_arrives_by_a_link_that_loses_it(sites: Sites) -> None:
+    server, _, local, caller = pair(sites)
+    caller.call(switch(on=True))
+    assert sites.run(1, lambda: local.asked == 1)
+    lead = sites.world.leads[server.label]
+    lead.loss = 1.0
+    local.waiting[0][1](switched("goodbye"))
+    local.handle.close()
+    sites.run(0.3)
+    lead.loss = 0.0
+    assert sites.run(1, lambda: len(caller.outcomes) == 1)
+    assert caller.outcomes == [switched("goodbye")]
+    assert sites.run(1.5, lambda: not caller.sees_server())
+
+
+def test_requests_to_a_server_that_has_gone_are_refused_while_its_last_answer_is_under_way(sites: Sites) -> None:
+    server, _, local, caller = pair(sites)
+    caller.call(switch(on=True))
+    assert sites.run(1, lambda: local.asked == 1)
+    lead = sites.world.leads[server.label]
+    lead.loss = 1.0
+    local.waiting[0][1](switched("goodbye"))
+    local.handle.close()
+    sites.run(0.3)
+    caller.call(switch(on=False))
+    lead.loss = 0.0
+    assert sites.run(1, lambda: len(caller.outcomes) == 2)
+    assert caller.outcomes[0] == switched("goodbye")
+    assert caller.outcomes[1] in ("the server is gone", "the far server is gone")
+
+
 def test_a_proxy_that_dies_mid_call_fails_it_before_the_client_gives_up(sites: Sites) -> None:
     server, _, local, caller = pair(sites, ", timeout_s: 60")
     caller.call(switch(on=True))
@@ -77,7 +108,7 @@ def test_a_proxy_that_dies_mid_call_fails_it_before_the_client_gives_up(sites: S
     sites.kill(server)
     assert sites.run(READER_LEASE_S + 2, lambda: len(caller.outcomes) == 1)
     assert caller.outcomes == ["the far server is gone"]
-    assert not caller.sees_server()
+    assert sites.run(1.5, lambda: not caller.sees_server())
 
 
 def test_a_server_that_comes_back_is_called_again(sites: Sites) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -81,6 +82,60 @@ def test_the_last_messages_of_a_publisher_that_leaves_at_once_arrive(sites: Site
     talker.close()
     assert sites.run(1, lambda: ear.texts == ["goodbye"])
     assert sites.run(1, lambda: not robot.member.publishers())
+
+
+@pytest.mark.parametrize("size", [20, 60_000])
+def test_the_last_message_of_a_publisher_that_leaves_at_once_arrives_by_a_thin_link_that_loses_it(
+    sites: Sites, size: int
+) -> None:
+    robot, _, talker, ear = flowing(sites)
+    lead = sites.world.leads[robot.label]
+    lead.bytes_s, lead.fifo_s = 1e6 / 8, 0.1  # 0.5 s for the large one
+    lead.loss = 1.0
+    sites.world.network.call(0.2, partial(setattr, lead, "loss", 0.01))
+    talker.publish(string("x" * size))
+    talker.close()
+    assert sites.run(5, lambda: len(ear.heard) == 1)
+    assert sites.run(2, lambda: not robot.member.publishers())
+    assert robot.faults == {}
+
+
+def test_messages_that_stay_unconfirmed_after_their_publisher_has_gone_are_reported(sites: Sites) -> None:
+    robot, _, talker, _ = flowing(sites)
+    sites.world.leads[robot.label].loss = 1.0
+    for number in range(3):
+        talker.publish(string(str(number)))
+    talker.close()
+    sites.run(9)
+    assert (len(robot.member.publishers()), robot.faults) == (1, {})
+    assert sites.run(2, lambda: not robot.member.publishers())
+    assert robot.faults == {"too-fast": 1}
+
+
+def test_a_publisher_that_returns_while_its_last_messages_are_under_way_goes_on(sites: Sites) -> None:
+    robot, _, talker, ear = flowing(sites)
+    lead = sites.world.leads[robot.label]
+    lead.loss = 1.0
+    talker.publish(string("last"))
+    talker.close()
+    sites.run(0.3)
+    again = talk(robot)
+    sites.run(0.1)
+    lead.loss = 0.0
+    assert sites.run(10, robot.is_read)
+    again.publish(string("again"))
+    assert sites.run(2, lambda: ear.texts[-1:] == ["again"])
+    assert robot.faults == {"too-fast": 1}  # what the first one sent last is reported, not confirmed
+
+
+def test_a_rule_that_ends_ends_its_flow_at_once(sites: Sites) -> None:
+    robot, _, talker, _ = flowing(sites)
+    sites.world.leads[robot.label].loss = 1.0
+    talker.publish(string("last"))
+    sites.run(0.1)
+    sites.reload(robot)
+    sites.run(0.2)
+    assert not robot.member.publishers()
 
 
 def test_two_talkers_of_one_topic_are_both_heard_and_one_may_leave(sites: Sites) -> None:

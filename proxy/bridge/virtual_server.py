@@ -1,0 +1,99 @@
+"""Virtual server: what local clients see in place of the remote servers of one service or action.
+
+I/O through the endpoint. The virtual server exists while a remote server is reachable. When the last one goes, it stays
+for a moment: a middleware drops a response that its client has not received when the server ends. Fast DDS and Cyclone
+DDS do so, and a busy client's process may not run for a while. Requests that come in this time are refused.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+from proxy.bridge.action_interface import PROFILES
+from proxy.bridge.endpoint_dispatch import EndpointDispatcher, EventHandler
+from proxy.bridge.local_responses import LocalResponses
+from proxy.wire.service import Exchange
+
+__all__ = ["VirtualServer"]
+
+_STAYS_S: Final = 1.0  # after the last response, before the server ends
+
+
+class VirtualServer:
+    """Server and an action's topics in one graph; opened and closed any number of times.
+
+    Args:
+        owner: of its events.
+        is_paced: whether the local clients have short queues.
+    """
+
+    def __init__(self, seat: EndpointDispatcher, owner: EventHandler, *, is_paced: bool) -> None:
+        self._seat = seat
+        self._owner = owner
+        self._responses = LocalResponses(seat.endpoint, is_paced=is_paced)
+        self._services: list[int] = []  # handles
+        self._topics: list[int] = []
+        self._closing: list[int] = []  # handles of both
+        self._ends_s: float | None = None  # when those are closed; None: a response still waits
+
+    def open(self, exchange: Exchange) -> None:
+        """Create the server and the topics of a description."""
+        self._end_closing()  # two servers of one name would both be asked
+        self._topics = [
+            self._seat.advertise(
+                self._owner, replace(each, qos=(profile,), latched=profile.durability == "transient_local")
+            )
+            for each, profile in zip(exchange.topics, PROFILES, strict=False)
+        ]
+        self._services = [self._seat.serve(self._owner, each) for each in exchange.services]
+
+    def close(self) -> None:
+        """Serve no client from now on; ``flush`` ends the server when clients have received their responses."""
+        self._closing += [*self._services, *self._topics]
+        self._services, self._topics = [], []
+
+    def close_now(self) -> None:
+        """Pass on all responses, and end the server."""
+        self.close()
+        self._end_closing()
+
+    def part_of(self, handle: int) -> int | None:
+        """Return the number of a service within the description; None: it closes."""
+        return self._services.index(handle) if handle in self._services else None
+
+    def handle_request(self, now_s: float) -> None:
+        """Count a client's request: clients that make many take many responses."""
+        self._responses.handle_request(now_s)
+
+    def answer(self, handle: int, ticket: int, raw: bytes) -> None:
+        """Queue a response for ``flush``."""
+        self._responses.answer(handle, ticket, raw)
+
+    def refuse(self, handle: int, ticket: int, reason: str) -> None:
+        """Queue the reason of a failure in place of a response, for ``flush``."""
+        self._responses.refuse(handle, ticket, reason)
+
+    def publish(self, at: int, raw: bytes) -> None:
+        """Publish a message of a topic of an action, -1: its last; dropped where the server is closed."""
+        if self._topics:
+            self._seat.endpoint.publish(self._topics[at], raw)
+
+    def flush(self, now_s: float) -> None:
+        """Pass on the responses whose time has come; end a closed server whose clients have had time for them."""
+        self._responses.flush(now_s)
+        if self._closing and self._ends_s is None and not self._responses:
+            self._ends_s = self._responses.last_s + _STAYS_S  # requests that are refused meanwhile do not delay it
+        if self._ends_s is not None and now_s >= self._ends_s:
+            self._end_closing()
+
+    def get_timer(self, now_s: float) -> float | None:
+        """Return the monotonic second at which ``flush`` has something to do, or None."""
+        times = [self._responses.get_timer(now_s), self._ends_s]
+        return min((time for time in times if time is not None), default=None)
+
+    def _end_closing(self) -> None:
+        self._responses.flush_all()
+        for handle in self._closing:
+            self._seat.close(handle)
+        self._closing, self._ends_s = [], None
