@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import pytest
+
 from gdp.client.reader_path import ReaderPaths
 from gdp.client.sent_frames import SentFrames
+from gdp.congestion.controller import PathController
 from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import Kind
 from gdp.message.acknack import AckNack, AckNackFlag
@@ -37,3 +40,72 @@ def test_a_lost_frame_among_those_sent_again_does_not_block_the_window() -> None
     assert controller.inflight > 0  # nothing of it has come
     under_way.handle_report(READER, report(3), 0.08)
     assert controller.inflight == 0
+
+
+def shown(received: int, newest: int) -> AckNack:
+    return AckNack(AckNackFlag.NONE, 7, 0, (), 1, received=received, newest=7, newest_part=newest)
+
+
+def controller_of(paths: ReaderPaths) -> PathController:
+    return paths.path(READER, 0.0).controller
+
+
+def test_a_repair_that_came_shows_that_the_end_of_the_flight_before_is_lost() -> None:
+    paths = ReaderPaths()
+    under_way, controller = SentFrames(paths), controller_of(paths)
+    under_way.sent([frame(part) for part in range(4)], [READER], 0.0)
+    under_way.handle_report(READER, shown(2, 1), 0.01)  # a part of the flight
+    assert controller.inflight > 0
+    under_way.sent([frame(2), frame(3)], [READER], 0.02, again=2)
+    before = controller.loss
+    under_way.handle_report(READER, shown(3, 2), 0.03)
+    under_way.handle_report(READER, shown(4, 3), 0.03)
+    assert controller.inflight == 0
+    assert controller.loss > before
+
+
+def test_what_was_given_up_and_comes_late_confirms_nothing_that_has_just_left() -> None:
+    paths = ReaderPaths()
+    under_way, controller = SentFrames(paths), controller_of(paths)
+    under_way.sent([frame(0)], [READER], 0.0)
+    under_way.handle_report(READER, shown(1, 0), 0.05)
+    under_way.sent([frame(1), frame(2)], [READER], 0.1)
+    controller.timed_out(0.5)
+    under_way.sent([frame(3), frame(4)], [READER], 0.5)
+    under_way.handle_report(READER, shown(3, 2), 0.51)
+    assert controller.inflight > 0
+    under_way.handle_report(READER, shown(5, 4), 0.6)
+    assert controller.inflight == 0
+    assert controller.rtt_s == pytest.approx(0.1)
+
+
+def test_a_frame_that_was_sent_again_gives_no_round_trip_since_its_first_time() -> None:
+    paths = ReaderPaths()
+    under_way, controller = SentFrames(paths), controller_of(paths)
+    under_way.sent([frame(0)], [READER], 0.0)
+    under_way.handle_report(READER, shown(1, 0), 0.05)
+    under_way.sent([frame(1)], [READER], 0.1)  # lost
+    under_way.sent([frame(1)], [READER], 0.4, again=1)
+    under_way.handle_report(READER, shown(2, 1), 0.45)
+    assert controller.inflight == 0
+    assert controller.rtt_s == pytest.approx(0.05)
+
+
+def test_a_repair_to_several_readers_gives_no_round_trip_either() -> None:
+    paths, other = ReaderPaths(), bytes([1]) * 32
+    under_way, controller = SentFrames(paths), controller_of(paths)
+    under_way.sent([frame(0)], [READER, other], 0.0)
+    under_way.handle_report(READER, shown(1, 0), 0.05)
+    under_way.sent([frame(1)], [READER, other], 0.1)
+    under_way.sent([frame(1)], [READER, other], 0.4, again=1)
+    under_way.handle_report(READER, shown(2, 1), 0.45)
+    assert controller.rtt_s == pytest.approx(0.05)
+
+
+def test_a_part_of_the_first_flight_measures_the_round_trip() -> None:
+    paths = ReaderPaths()
+    under_way, controller = SentFrames(paths), controller_of(paths)
+    under_way.sent([frame(part) for part in range(4)], [READER], 0.0)
+    under_way.handle_report(READER, shown(1, 0), 0.05)
+    assert controller.rtt_s == pytest.approx(0.05)
+    assert controller.inflight > 0

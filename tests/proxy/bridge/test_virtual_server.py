@@ -8,11 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from gdp.limits import READER_LEASE_S
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, switch, switched
 from tests.proxy.bridge.sites import ROBOT, SERVER, Machine, Sites
 
-SWITCH = f"kind: service, name: /switch, type: {SET_BOOL}"
+SWITCH = f"kind: service, name: /switch, type: {SET_BOOL}, timeout_s: 60"
 
 
 @pytest.fixture
@@ -83,13 +84,13 @@ def test_a_server_that_returns_meanwhile_is_the_only_one(sites: Sites) -> None:
 
 
 def test_failures_of_many_calls_are_paced_after_the_last_server_has_gone(sites: Sites) -> None:
-    local, caller, _ = pair(sites)
+    local, caller, client = pair(sites)
     local.answer = None
     for _ in range(50):
-        caller.call(switch(on=True))
+        call(caller)
     assert sites.run(1, lambda: local.asked >= 8)
-    local.handle.close()
-    assert sites.run(1, lambda: len(caller.outcomes) > 0)
+    sites.kill(next(each for each in sites.machines if each is not client))
+    assert sites.run(READER_LEASE_S + 2, lambda: len(caller.outcomes) > 0)
     assert len(caller.outcomes) <= 10  # what a client's queue holds
-    assert sites.run(1, lambda: caller.outcomes == ["the server is gone"] * 50)
+    assert sites.run(1, lambda: caller.outcomes == ["the far server is gone"] * 50)
     assert sites.run(2, lambda: not caller.sees_server())
