@@ -28,6 +28,7 @@ _COUNT_MASK: Final = (1 << 32) - 1
 
 class _Flight(NamedTuple):
     end: int  # count of frames sent up to its last one
+    frames: int
     number: int  # on the reader's path
     is_repair: bool  # all its frames were sent before
 
@@ -54,6 +55,7 @@ class _Reader:
     newest: tuple[int, int] = (0, 0)  # message and fragment in its latest report
     partial: int = 0  # frames of the oldest flight that came, of frames sent again
     unseen: int = 0  # frames sent before it began to count
+    repairs: int = 0  # frames sent again to several readers, which are in no flight
     lost: int = 0
 
 
@@ -71,6 +73,7 @@ class SentFrames:
         self._readers: dict[bytes, _Reader] = {}
         self._count = 0
         self._runs: dict[int, list[_Run]] = {}  # by message number; oldest first
+        self._uncounted: dict[int, set[int]] = {}  # fragments sent again to several readers: they give no round trip
 
     def sent(self, frames: Sequence[bytes], names: Sequence[bytes], now_s: float, again: int = 0) -> None:
         """Count frames that leave now to the readers of these names; the first ``again`` of them were sent before.
@@ -83,9 +86,12 @@ class SentFrames:
             size = sum(map(len, frames[:again]))
             for name in names:
                 self._paths.path(name, now_s).controller.charge(size, now_s)
-            for frame in frames[:again]:  # no report of it gives a round trip
+                if name in self._readers:
+                    self._readers[name].repairs += again
+            for frame in frames[:again]:
                 number, part = NUMBER_AND_PART.unpack_from(frame, NUMBER_AT)
-                self._runs.setdefault(number, []).append(_Run(part, part, self._find(number, part)[0], True))
+                if number in self._runs:
+                    self._uncounted.setdefault(number, set()).add(part)
             frames, again = frames[again:], 0
         if again:
             self._note_places(frames[:again], self._count + 1, is_repair=True)
@@ -101,7 +107,8 @@ class SentFrames:
                 reader = self._readers.get(name)
                 if reader is None:
                     reader = self._readers[name] = _Reader(resolved=count - len(flight))
-                reader.flights.append(_Flight(count, path.sent(size, len(flight), now_s), first < again))
+                number = path.sent(size, len(flight), now_s)
+                reader.flights.append(_Flight(count, len(flight), number, first < again))
         if not names or len(self._runs) > _MESSAGES_MAX:
             self._forget_places()
 
@@ -124,7 +131,7 @@ class SentFrames:
         """
         for run in reversed(self._runs.get(number, ())):
             if run.first <= part <= run.last:
-                return run.place + part - run.first, run.is_repair
+                return run.place + part - run.first, run.is_repair or part in self._uncounted.get(number, ())
         return 0, False
 
     def handle_hops(self, name: bytes, hops: int, now_s: float) -> None:
@@ -162,8 +169,9 @@ class SentFrames:
         if has_begun:
             reader.unseen, reader.lost = (place - report.received) & _COUNT_MASK, 0
         held_s = None if is_repair else report.held_us / 1e6 + waited_s
-        if not numbers:  # a part of one flight
-            path.handle_part(reader.flights[0].number, held_s, now_s)
+        if not numbers:
+            if reader.flights and reader.flights[0].end - reader.flights[0].frames < place:  # a part of it came
+                path.handle_part(reader.flights[0].number, held_s, now_s)
             return
         lost = (place - reader.unseen - report.received) & _COUNT_MASK
         lost = 0 if lost > _COUNT_MASK // 2 else lost
@@ -177,8 +185,9 @@ class SentFrames:
 
         Frames that left for the first time before them would have come first, so they are lost. A report by which
         nothing more came shows that the rest of a flight is lost. Else a flight that lost its end would block the
-        window until the timeout. Without a repair under way, what came is of flights that were given up. It confirms
-        no later one: each would then be confirmed by the report of the one before, and no round trip be measured.
+        window until the timeout. Repairs to several readers are in no flight, and confirm as many frames that left for
+        the first time. Without a repair under way, what came is of flights that were given up. It confirms no later
+        one: each would then be confirmed by the report of the one before, and no round trip be measured.
         """
         is_over = not came and reader.partial > 0
         came += reader.partial
@@ -186,15 +195,16 @@ class SentFrames:
         while reader.flights:
             flight = reader.flights[0]
             size = flight.end - reader.resolved
-            if not flight.is_repair:
-                if not came or not any(each.is_repair for each in reader.flights):
-                    came = 0
-                    break
+            if not flight.is_repair and came and any(each.is_repair for each in reader.flights):
                 lost += flight.end - max(reader.resolved, place)
+            elif not flight.is_repair and not reader.repairs:
+                came = 0
+                break
             elif size > came and not is_over:
                 break
             else:
                 came, is_over = max(came - size, 0), False
+                reader.repairs -= 0 if flight.is_repair else min(size, reader.repairs)
             reader.flights.popleft()
             reader.resolved = flight.end
             numbers.append(flight.number)
@@ -219,3 +229,4 @@ class SentFrames:
             if runs[number][-1].end > below and len(runs) <= _MESSAGES_MAX:
                 break
             del runs[number]
+            self._uncounted.pop(number, None)

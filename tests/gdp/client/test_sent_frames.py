@@ -109,3 +109,46 @@ def test_a_part_of_the_first_flight_measures_the_round_trip() -> None:
     under_way.handle_report(READER, shown(1, 0), 0.05)
     assert controller.rtt_s == pytest.approx(0.05)
     assert controller.inflight > 0
+
+
+def test_a_report_of_frames_that_left_for_other_readers_alone_confirms_nothing() -> None:
+    paths, other = ReaderPaths(), bytes([1]) * 32
+    under_way, controller = SentFrames(paths), controller_of(paths)
+    under_way.sent([frame(0)], [READER, other], 0.0)
+    under_way.handle_report(READER, shown(1, 0), 0.05)
+    controller.timed_out(0.1)
+    under_way.sent([frame(1), frame(2)], [other], 0.1)
+    under_way.handle_report(READER, shown(2, 1), 0.15)
+    under_way.sent([frame(3)], [READER, other], 0.2)
+    under_way.handle_report(READER, shown(3, 2), 0.21)
+    assert controller.rtt_s is None
+    under_way.handle_report(READER, shown(4, 3), 0.3)
+    assert controller.rtt_s == pytest.approx(0.1)
+
+
+def test_repairs_to_several_readers_confirm_the_lost_end_of_a_message() -> None:
+    paths, other = ReaderPaths(), bytes([1]) * 32
+    under_way, controller = SentFrames(paths), controller_of(paths)
+    under_way.sent([frame(0)], [READER, other], 0.0)
+    under_way.sent([frame(1), frame(2)], [READER, other], 0.0)
+    under_way.handle_report(READER, shown(1, 0), 0.05)
+    under_way.sent([frame(1), frame(2)], [READER, other], 0.06, again=2)
+    under_way.handle_report(READER, shown(1, 0), 0.07)
+    assert controller.inflight > 0
+    under_way.handle_report(READER, shown(2, 0), 0.1)
+    under_way.handle_report(READER, shown(3, 0), 0.1)
+    assert controller.inflight == 0
+
+
+def test_a_repair_to_several_readers_leaves_the_places_of_later_frames_known() -> None:
+    paths, other = ReaderPaths(), bytes([1]) * 32
+    under_way, controller = SentFrames(paths), controller_of(paths)
+    under_way.sent([frame(0), frame(1)], [READER, other], 0.0)
+    for name in (READER, other):
+        under_way.handle_report(name, shown(1, 0), 0.05)
+    under_way.sent([frame(2), frame(3)], [READER, other], 0.1)
+    under_way.sent([frame(1)], [READER, other], 0.1, again=1)
+    for name in (READER, other):
+        under_way.handle_report(name, shown(2, 2), 0.15)
+    under_way.handle_report(READER, shown(3, 3), 0.15)
+    assert controller.inflight == 0
