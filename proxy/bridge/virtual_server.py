@@ -17,7 +17,8 @@ from proxy.wire.service import Exchange
 
 __all__ = ["VirtualServer"]
 
-_STAYS_S: Final = 1.0  # after the last response, before the server ends
+# after the last response, before the server ends: longer, a client would take it for a server that has returned
+_STAYS_S: Final = 0.25
 
 
 class VirtualServer:
