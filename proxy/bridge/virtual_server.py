@@ -17,8 +17,7 @@ from proxy.wire.service import Exchange
 
 __all__ = ["VirtualServer"]
 
-# after the last response, before the server ends: longer, a client would take it for a server that has returned
-_STAYS_S: Final = 0.25
+_STAYS_S: Final = 0.25  # after the last response; a second is long enough for clients to take it for a new server
 
 
 class VirtualServer:
