@@ -441,8 +441,9 @@ class Publisher:
         self.redundancy.handle_report(header.source, report, is_new=is_new)
         self.parity.handle_report({each.number for each in report.missing})
         self._measure_loss(now_s)
-        path = self._reader_paths.path(header.source, now_s)
-        self._acknowledgements.handle_acknack(header.source, report, is_new=is_new, now_s=now_s, trip_s=path.trip_s)
+        path = self._reader_paths.get(header.source)
+        trip_s = 0.0 if path is None else path.trip_s
+        self._acknowledgements.handle_acknack(header.source, report, is_new=is_new, now_s=now_s, trip_s=trip_s)
         if report.missing and not self.confirms:
             newest = report.newest, report.newest_part
             self._late.request(header.source, report.missing, now_s, newest=newest, rtt_s=self.path_rtt_s)

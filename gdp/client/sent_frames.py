@@ -93,26 +93,27 @@ class SentFrames:
                 if number in self._runs:
                     self._uncounted.setdefault(number, set()).add(part)
             frames, again = frames[again:], 0
-        if again:
-            self._note_places(frames[:again], self._count + 1, is_repair=True)
-        if len(frames) > again:
-            self._note_places(frames[again:], self._count + again + 1)
-        firsts = [*range(0, again, _FLIGHT_FRAMES), *range(again, len(frames), _FLIGHT_FRAMES)]
-        for first in firsts:
-            flight = frames[first : min(first + _FLIGHT_FRAMES, again if first < again else len(frames))]
-            size = sum(map(len, flight))
-            count = self._count = self._count + len(flight)
-            for name in names:
-                path = self._paths.path(name, now_s)
-                reader = self._readers.get(name)
-                if reader is None:
-                    reader = self._readers[name] = _Reader(resolved=count - len(flight))
-                number = path.sent(size, len(flight), now_s)
-                reader.flights.append(_Flight(count, len(flight), number, first < again))
+        self._add(frames[:again], names, now_s, is_repair=True)
+        self._add(frames[again:], names, now_s, is_repair=False)
         if not names or len(self._runs) > _MESSAGES_MAX:
             self._forget_places()
 
-    def _note_places(self, frames: Sequence[bytes], place: int, *, is_repair: bool = False) -> None:
+    def _add(self, frames: Sequence[bytes], names: Sequence[bytes], now_s: float, *, is_repair: bool) -> None:
+        """Count frames that all leave for the first time, or all again."""
+        if frames:
+            self._note_places(frames, self._count + 1, is_repair=is_repair)
+        for first in range(0, len(frames), _FLIGHT_FRAMES):
+            flight = frames[first : first + _FLIGHT_FRAMES]
+            size = sum(map(len, flight))
+            count = self._count = self._count + len(flight)
+            for name in names:
+                path, reader = self._paths.path(name, now_s), self._readers.get(name)
+                if reader is None:
+                    reader = self._readers[name] = _Reader(resolved=count - len(flight))
+                number = path.sent(size, len(flight), now_s)
+                reader.flights.append(_Flight(count, len(flight), number, is_repair))
+
+    def _note_places(self, frames: Sequence[bytes], place: int, *, is_repair: bool) -> None:
         """Note the counts of frames that leave; ``place`` is the first one's."""
         (number, part), (last_number, last_part) = (
             NUMBER_AND_PART.unpack_from(frame, NUMBER_AT) for frame in (frames[0], frames[-1])

@@ -251,8 +251,7 @@ class ImportedService:
         self._virtual_server.close()
 
     def _ask(self, event: RequestReceived, now_s: float) -> None:
-        part, rule = self._virtual_server.part_of(event.handle), self._flow_spec.rule
-        self._virtual_server.handle_request(now_s)
+        part, rule = self._virtual_server.handle_request(event.handle, now_s), self._flow_spec.rule
         self.requests += 1
         self.request_bytes += len(event.raw)
         if part is None:

@@ -58,13 +58,10 @@ class VirtualServer:
         self.close()
         self._end_closing()
 
-    def part_of(self, handle: int) -> int | None:
-        """Return the number of a service within the description; None: it closes."""
-        return self._services.index(handle) if handle in self._services else None
-
-    def handle_request(self, now_s: float) -> None:
-        """Count a client's request: clients that make many take many responses."""
+    def handle_request(self, handle: int, now_s: float) -> int | None:
+        """Count a client's request; return the number of its service within the description, None: it closes."""
         self._responses.handle_request(now_s)
+        return self._services.index(handle) if handle in self._services else None
 
     def answer(self, handle: int, ticket: int, raw: bytes) -> None:
         """Queue a response for ``flush``."""

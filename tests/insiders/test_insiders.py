@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import os
 import random
 
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gdp.crypto.statements import StatementType
+from tests.draws import draws, is_long
 from tests.insiders.trial import Plan, Trial, prepared
 
-TRIALS = int(os.environ.get("GDP_INSIDERS", "2"))
-IS_LONG = "GDP_INSIDERS" in os.environ
+IS_LONG = is_long("GDP_INSIDERS")
 WORDS = 150
 
 numbers = st.integers(0, (1 << 32) - 1)
@@ -29,14 +28,7 @@ def plans(draw: st.DrawFn) -> Plan:
     )
 
 
-@settings(
-    max_examples=TRIALS,
-    deadline=None,
-    derandomize=not IS_LONG,
-    print_blob=True,
-    suppress_health_check=list(HealthCheck),
-    phases=(Phase.explicit, Phase.reuse, Phase.generate, Phase.shrink) if IS_LONG else (Phase.explicit, Phase.generate),
-)
+@draws("GDP_INSIDERS", 2)
 @given(plans())
 def test_no_statement_of_an_insider_ends_a_node_or_silences_the_others(plan: Plan) -> None:
     with prepared():

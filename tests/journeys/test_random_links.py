@@ -7,7 +7,6 @@ restart, the reader moves; in the end all of it is over. A drawn plan prints its
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -15,18 +14,17 @@ from itertools import pairwise
 from typing import Final
 
 import pytest
-from hypothesis import HealthCheck, Phase, example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from gdp.simulation.network import SimLink
 from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from gdp.trust.right import Right
+from tests.draws import draws
 from tests.journeys.flows import Flow, advertise
 from tests.journeys.networks import LEASE_S, SETTLE_S, short_leases
 
-TRIALS = int(os.environ.get("GDP_RANDOM_LINKS", "2"))
-IS_LONG = "GDP_RANDOM_LINKS" in os.environ
 KINDS = ("cut", "thin", "thick", "freeze", "restart", "rib", "roam")
 FAULTS_S: Final = 8.0  # all faults are over by then, from the first message on
 RECOVERED_S: Final = 4.0  # after the last fault: a dead neighbour, another path, a new window
@@ -252,14 +250,7 @@ class Trial:
         return ", ".join(f"{len(came_s)} of {self.sent[name]} of {name}" for name, came_s in self.came_s.items())
 
 
-@settings(
-    max_examples=TRIALS,
-    deadline=None,
-    derandomize=not IS_LONG,
-    print_blob=True,
-    suppress_health_check=list(HealthCheck),
-    phases=(Phase.explicit, Phase.reuse, Phase.generate, Phase.shrink) if IS_LONG else (Phase.explicit, Phase.generate),
-)
+@draws("GDP_RANDOM_LINKS", 2)
 @given(plans())
 @example(  # a reader that began late did not count what came before (decision 346)
     Plan(

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
-
 import pytest
-from hypothesis import HealthCheck, Phase, example, given, settings
+from hypothesis import example, given
 
+from tests.draws import draws
 from tests.journeys.networks import Fault, Plan, Trial, plans, short_leases
 
-TRIALS = int(os.environ.get("GDP_RANDOM_NETWORKS", "3"))
 # The path within a domain was longer than one through its neighbour, which sent back the frames that left.
 LOOPED_AT_A_BORDER = Plan(
     (9, 6, 6, 4), (0, 1, 1), (), (), (2, 3, 0, 0), (3, 0), frozenset({2}), (Fault(False, 0, 2.0),), seed=1
@@ -24,18 +22,10 @@ MIDDLE_TIER_DIES = Plan(
     (2, 4, 1, 9, 2), (0, 1, 1, 0), (), (), (2, 5, 6, 7, 3), (29, 28, 2), frozenset(),
     (Fault(True, 44, 2.0), Fault(True, 75, 2.0)), seed=175,
 )  # fmt: skip
-IS_LONG = "GDP_RANDOM_NETWORKS" in os.environ
 
 
 @pytest.mark.momentary("every trial runs for three leases after its last fault; hypothesis also draws shorter attempts")
-@settings(
-    max_examples=TRIALS,
-    deadline=None,
-    derandomize=not IS_LONG,  # the suite draws the same each time; additional draws are new
-    print_blob=True,
-    suppress_health_check=list(HealthCheck),
-    phases=(Phase.explicit, Phase.reuse, Phase.generate, Phase.shrink) if IS_LONG else (Phase.explicit, Phase.generate),
-)
+@draws("GDP_RANDOM_NETWORKS", 3)
 @given(plans())
 @example(LOOPED_AT_A_BORDER)
 @example(THREE_TIERS)

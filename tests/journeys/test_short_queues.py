@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import os
 from functools import partial
 
 import pytest
-from hypothesis import HealthCheck, Phase, example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from gdp.client.participant import Message
 from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from tests.draws import draws
 from tests.journeys.flows import advertise
 
-TRIALS = int(os.environ.get("GDP_RANDOM_QUEUES", "15"))
-IS_LONG = "GDP_RANDOM_QUEUES" in os.environ
 MESSAGES = 3
 FRAME_BYTES = 1_514
 PAIR = Topology(
@@ -37,14 +35,7 @@ def drawn() -> st.SearchStrategy[tuple[float, float, float, float, float]]:
 
 
 @pytest.mark.momentary("what is tried is how long single messages take")
-@settings(
-    max_examples=TRIALS,
-    deadline=None,
-    derandomize=not IS_LONG,
-    print_blob=True,
-    suppress_health_check=list(HealthCheck),
-    phases=(Phase.explicit, Phase.reuse, Phase.generate, Phase.shrink) if IS_LONG else (Phase.explicit, Phase.generate),
-)
+@draws("GDP_RANDOM_QUEUES", 15)
 @given(drawn())
 @example((1.0, 0.0005, 0.1, 0.0, 0.48))  # took 16 s, or did not arrive within 40 s (decision 357)
 @example((1.0, 0.03, 0.1, 0.01, 0.48))

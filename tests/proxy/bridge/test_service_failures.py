@@ -8,6 +8,7 @@ import pytest
 
 from gdp.limits import READER_LEASE_S
 from gdp.names import Name
+from gdp.simulation.network import SimLink
 from tests.proxy.bridge import known
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, switch, switched
@@ -70,7 +71,8 @@ def test_the_answer_of_a_server_that_leaves_at_once_arrives(sites: Sites) -> Non
     assert caller.outcomes == [switched("goodbye")]
 
 
-def test_the_answer_of_a_server_that_leaves_at_once_arrives_by_a_link_that_loses_it(sites: Sites) -> None:
+def answered_into_a_dead_link(sites: Sites) -> tuple[SimLink, Client]:
+    """Let a server answer and leave while its machine's link loses everything; return the link and the client."""
     server, _, local, caller = pair(sites)
     caller.call(switch(on=True))
     assert sites.run(1, lambda: local.asked == 1)
@@ -79,6 +81,11 @@ def test_the_answer_of_a_server_that_leaves_at_once_arrives_by_a_link_that_loses
     local.waiting[0][1](switched("goodbye"))
     local.handle.close()
     sites.run(0.3)
+    return lead, caller
+
+
+def test_the_answer_of_a_server_that_leaves_at_once_arrives_by_a_link_that_loses_it(sites: Sites) -> None:
+    lead, caller = answered_into_a_dead_link(sites)
     lead.loss = 0.0
     assert sites.run(1, lambda: len(caller.outcomes) == 1)
     assert caller.outcomes == [switched("goodbye")]
@@ -86,14 +93,7 @@ def test_the_answer_of_a_server_that_leaves_at_once_arrives_by_a_link_that_loses
 
 
 def test_requests_to_a_server_that_has_gone_are_refused_while_its_last_answer_is_under_way(sites: Sites) -> None:
-    server, _, local, caller = pair(sites)
-    caller.call(switch(on=True))
-    assert sites.run(1, lambda: local.asked == 1)
-    lead = sites.world.leads[server.label]
-    lead.loss = 1.0
-    local.waiting[0][1](switched("goodbye"))
-    local.handle.close()
-    sites.run(0.3)
+    lead, caller = answered_into_a_dead_link(sites)
     caller.call(switch(on=False))
     lead.loss = 0.0
     assert sites.run(1, lambda: len(caller.outcomes) == 2)
