@@ -140,7 +140,7 @@ class Bridge:
         self._flows: dict[_Key, tuple[FlowSpec, Flow]] = {}
         self._inbound: dict[Name, Flow] = {}  # the flow that receives the overlay's messages of a name
         self._finishing: dict[Name, _Finishing] = {}
-        self._timed: list[ExposedService | ImportedService] = []
+        self._timed: dict[ExposedService | ImportedService, str] = {}  # to its local name
         self._probes: dict[_Key, ReadinessProbe] = {}  # of local servers, whether their flow has begun or not
         self._since: dict[_Key, float] = {}  # desired flows that wait for other proxies to begin
         self._flow_begun_s: dict[_Key, float] = {}
@@ -268,7 +268,7 @@ class Bridge:
         """Process events of endpoints and messages of the overlay, and run due timers."""
         self._now_s = now_s
         for seat in self._seats:
-            if seat.deliver(now_s):
+            if seat.deliver(self._site, now_s):
                 self._is_stale = True
                 self._failed.clear()
         for message in self._site.member.poll_messages():
@@ -281,15 +281,15 @@ class Bridge:
         if self._is_stale or (self._since and now_s >= self._tick_at_s):
             self._refresh(now_s)
         for seat in self._seats:
-            seat.deliver_faults(now_s)
+            seat.deliver_faults(self._site, now_s)
         self._close_finished(now_s)
         is_tick = now_s >= self._tick_at_s
-        for flow in self._timed:
+        for flow, local in self._timed.items():
             due_s = flow.get_timer()
             if is_tick:
-                flow.tick(now_s)
+                self._site.contain(local, b"", now_s, flow.tick, now_s)
             elif due_s is not None and due_s <= now_s:
-                flow.handle_timer(now_s)
+                self._site.contain(local, b"", now_s, flow.handle_timer, now_s)
         for topic in self._status_topics:
             if topic.is_due(now_s):
                 topic.update(self.liveliness(now_s), now_s)
@@ -470,7 +470,7 @@ class Bridge:
         if not isinstance(flow, ExposedTopic):
             self._inbound[flow_spec.name] = flow
         if isinstance(flow, ExposedService | ImportedService):
-            self._timed.append(flow)
+            self._timed[flow] = flow_spec.local
         self._changes.append(FlowChange(flow_spec, is_begun=True))
         log.debug("flow begun name=%s exposed=%s", flow_spec.name.short, flow_spec.is_exposed)
 
@@ -506,7 +506,7 @@ class Bridge:
         flow_spec, flow = self._flows.pop(key)
         del self._flow_begun_s[key]
         if isinstance(flow, ExposedService | ImportedService):
-            self._timed.remove(flow)
+            del self._timed[flow]
         if isinstance(flow, ImportedTopic):
             self._ended.append(flow.stats)
         self._changes.append(FlowChange(flow_spec, is_begun=False))

@@ -133,6 +133,10 @@ class ExposedService:
 
     def receive(self, message: Message, now_s: float) -> None:
         """Process a remote client's request or its cancellations; both wait until the client's description arrives."""
+        client = message.delivered.publisher
+        self._site.contain(self._flow_spec.local, client, now_s, self._receive, message, now_s)
+
+    def _receive(self, message: Message, now_s: float) -> None:
         if self._is_finished:
             self._refuse(message)
             return
@@ -140,17 +144,13 @@ class ExposedService:
             if not self._early.add(message):
                 self._drop_early("too many requests came before their client's description")
             return
-        try:
-            if self._kept is not None and is_word(message.delivered.message):
-                client = Name(message.delivered.publisher)
-                self._kept.handle_message(client, sequencer_message(message.delivered.message), now_s)
-            elif Stop.is_in(message.delivered.message):
-                client, stop = Name(message.delivered.publisher), Stop.from_wire(message.delivered.message)
-                self._cancellation.handle_stop(client, stop, now_s)
-            else:
-                self._ask(message, now_s)
-        except RemoteError as error:
-            self._site.faults.report(self._flow_spec.local, Fault.MALFORMED, str(error))
+        client = Name(message.delivered.publisher)
+        if self._kept is not None and is_word(message.delivered.message):
+            self._kept.handle_message(client, sequencer_message(message.delivered.message), now_s)
+        elif Stop.is_in(message.delivered.message):
+            self._cancellation.handle_stop(client, Stop.from_wire(message.delivered.message), now_s)
+        else:
+            self._ask(message, now_s)
         self._give(now_s)
 
     def handle_event(self, event: Event, now_s: float) -> None:
@@ -165,13 +165,7 @@ class ExposedService:
             if isinstance(event, CallFailed):
                 self._site.faults.report(f"{self._flow_spec.rule.stop}", Fault.REFUSED, event.reason)
         elif isinstance(event, ResponseReceived | CallFailed):
-            asked = self._serving.end(event.call)
-            if asked is not None:
-                self._goals.end(asked)
-            if asked is not None and isinstance(event, ResponseReceived):
-                self._responses.respond(asked, event.raw)
-            elif asked is not None and isinstance(event, CallFailed):
-                self._responses.fail(asked, Fault.REFUSED, event.reason)
+            self._end_call(event.call, event.reason if isinstance(event, CallFailed) else event.raw)
             self._give(now_s)
         elif isinstance(event, MessageReceived):
             at = self._topics.index(event.handle)
@@ -272,12 +266,9 @@ class ExposedService:
     def _refuse(self, message: Message) -> None:
         """Refuse what came after the server had gone."""
         asked_for = message.delivered.message
-        try:
-            if not is_word(asked_for) and not Stop.is_in(asked_for):
-                request = Request.from_wire(asked_for)
-                self._responses.refuse(Asked(Name(message.delivered.publisher), request.part, request.call), _GONE)
-        except RemoteError as error:
-            self._site.faults.report(self._flow_spec.local, Fault.MALFORMED, str(error))
+        if not is_word(asked_for) and not Stop.is_in(asked_for):
+            request = Request.from_wire(asked_for)
+            self._responses.refuse(Asked(Name(message.delivered.publisher), request.part, request.call), _GONE)
 
     def _drop_early(self, reason: str) -> None:
         self._site.faults.report(self._flow_spec.local, Fault.TOO_FAST, reason)
@@ -357,8 +348,22 @@ class ExposedService:
 
     def _give(self, now_s: float) -> None:
         """Pass the next requests in order to the local server."""
+        call, what = self._seat.endpoint.call, self._flow_spec.local
         for turn in self._serving.poll_turns(now_s):
-            self._seat.endpoint.call(self._servers[turn.asked.part], turn.number, turn.request)
+            given = self._servers[turn.asked.part], turn.number, turn.request
+            if not self._site.contain(what, turn.asked.client, now_s, call, *given):
+                self._end_call(turn.number, "the request could not be passed on")
+
+    def _end_call(self, number: int, ending: str | bytes) -> None:
+        """Send the response of a call that has ended, or the reason why there is none."""
+        asked = self._serving.end(number)
+        if asked is None:
+            return
+        self._goals.end(asked)
+        if isinstance(ending, bytes):
+            self._responses.respond(asked, ending)
+        else:
+            self._responses.fail(asked, Fault.REFUSED, ending)
 
     def _cancel_goal(self, goal: bytes, now_s: float) -> None:
         self._cancels += 1

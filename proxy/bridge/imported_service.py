@@ -146,18 +146,8 @@ class ImportedService:
         """Process a remote server's response, or a message of its action's topics."""
         self._site.traffic.received(len(message.delivered.message))
         self._now_s = now_s
-        try:
-            if message.private and self._sequencer is not None and is_word(message.delivered.message):
-                word, name = follower_message(message.delivered.message), Name(message.delivered.publisher)
-                self._discovery.find(name, now_s)
-                self._sequencer.positioned(name, word, now_s)
-            elif message.private:
-                self._receive_response(message, now_s)
-            else:
-                self._receive_news(message)
-        except RemoteError as error:
-            self._site.faults.report(self._flow_spec.local, Fault.MALFORMED, str(error))
-        self._flush(now_s)
+        server = message.delivered.publisher
+        self._site.contain(self._flow_spec.local, server, now_s, self._receive, message, now_s)
 
     def handle_event(self, event: Event, now_s: float) -> None:
         """Process a local client's request."""
@@ -211,6 +201,17 @@ class ImportedService:
         """Replace the delegation."""
         self._topic = topic
         self._site.member.renew(topic)
+
+    def _receive(self, message: Message, now_s: float) -> None:
+        if message.private and self._sequencer is not None and is_word(message.delivered.message):
+            word, name = follower_message(message.delivered.message), Name(message.delivered.publisher)
+            self._discovery.find(name, now_s)
+            self._sequencer.positioned(name, word, now_s)
+        elif message.private:
+            self._receive_response(message, now_s)
+        else:
+            self._receive_news(message)
+        self._flush(now_s)
 
     def _flush(self, now_s: float) -> None:
         self._now_s = now_s

@@ -12,7 +12,7 @@ from collections.abc import Sequence, Set
 from typing import NamedTuple
 
 from gdp.client.participant import Message, Topic
-from gdp.errors import LocalError, RemoteError
+from gdp.errors import LocalError
 from gdp.message.loss import Losses
 from gdp.trust.advertisement import paths_value
 from proxy.bridge.context import BridgeContext
@@ -93,14 +93,17 @@ class ImportedTopic:
 
     def receive(self, message: Message, now_s: float) -> None:
         """Process a message of the overlay."""
-        self._heard_s.pop(message.delivered.publisher, None)
-        self._heard_s[message.delivered.publisher] = now_s
+        publisher = message.delivered.publisher
+        self._heard_s.pop(publisher, None)
+        self._heard_s[publisher] = now_s
         if len(self._heard_s) > _HEARD_MAX:
             del self._heard_s[next(iter(self._heard_s))]
+        if not self._site.contain(self._flow_spec.local, publisher, now_s, self._receive, message, now_s):
+            self.stats.refused += 1
+
+    def _receive(self, message: Message, now_s: float) -> None:
         try:
-            self._receive(message, now_s)
-        except RemoteError as error:
-            self._refuse(Fault.MALFORMED, str(error))
+            self._deliver(message, now_s)
         except LibraryError as error:
             self._refuse(Fault.NO_LIBRARY, str(error))
         except LocalError as error:
@@ -164,7 +167,7 @@ class ImportedTopic:
         self.stats.refused += 1
         self._site.faults.report(self._flow_spec.local, fault, detail)
 
-    def _receive(self, message: Message, now_s: float) -> None:
+    def _deliver(self, message: Message, now_s: float) -> None:
         delivered, traffic, rule = message.delivered, self._site.traffic, self._flow_spec.rule
         publisher = delivered.publisher
         if (publisher, message.description) not in self._sources:

@@ -77,7 +77,7 @@ class ServerDiscovery:
         }
         for name, writer_proxy in heard.items():  # first, so that calls of a server that goes now find them
             if name not in self.servers:
-                self._add(name, writer_proxy.incarnation, writer_proxy.description, now_s)
+                self._add(name, now_s, writer_proxy.incarnation, writer_proxy.description)
         for name, server in list(self.servers.items()):
             if name not in heard:
                 self._remove(name, now_s)
@@ -91,7 +91,7 @@ class ServerDiscovery:
                 self._announce(name, same, now_s)
             else:
                 self._remove(name, now_s)
-                self._add(name, incarnation, description, now_s)
+                self._add(name, now_s, incarnation, description)
         if not self.servers and self._is_open:
             self._is_open = False
             self._closed(SERVER_GONE)
@@ -109,9 +109,16 @@ class ServerDiscovery:
         for dispatch in self._calls:
             dispatch.replica_lost(name, now_s, SERVER_GONE)
 
-    def _add(self, name: Name, incarnation: int, description: bytes, now_s: float) -> None:
+    def _add(self, name: Name, now_s: float, incarnation: int, description: bytes) -> None:
+        """Add a server, unless it is quarantined."""
+        self._site.contain(self._flow_spec.local, name, now_s, self._prepare, name, incarnation, description)
+        if (server := self.servers.get(name)) is not None and server.exchange is not None:
+            self._announce(name, server, now_s)
+
+    def _prepare(self, name: Name, incarnation: int, description: bytes) -> None:
         """Prepare the decoders of a server's responses; an invalid description is reported."""
         rule = self._flow_spec.rule
+        self.servers[name] = RemoteServer(incarnation=incarnation, description=description)
         try:
             server = RemoteServer.set_description(incarnation, description, self._parts, self._endpoint, rule.encoding)
             if server.exchange is not None and server.exchange.is_ordered != rule.is_ordered:
@@ -122,10 +129,8 @@ class ServerDiscovery:
                 self._is_open = True
         except GdpError as error:
             self._site.faults.report(self._flow_spec.local, Fault.OTHER_TYPE, str(error))
-            self.servers[name] = RemoteServer(incarnation=incarnation, description=description)
             return
         self.servers[name] = server
-        self._announce(name, server, now_s)
 
     def _announce(self, name: Name, server: RemoteServer, now_s: float) -> None:
         for dispatch in self._calls:

@@ -96,6 +96,7 @@ class DoorEndpoint:
         self._output_bytes = 0  # written by the bridge's thread
         self._passed_bytes = 0  # written by the server's thread
         self._lost = 0  # messages that either bound has dropped
+        self._unwritten = 0  # messages that drew an error of this program when they were written for a client
         self._handles = count(1)
         self._sessions = count(1)
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
@@ -145,8 +146,8 @@ class DoorEndpoint:
 
     @property
     def dropped(self) -> int:
-        """Return the messages dropped because a queue was full."""
-        return self._hub.dropped + self._lost
+        """Return the messages dropped because a queue was full, or because they could not be written."""
+        return self._hub.dropped + self._lost + self._unwritten
 
     @property
     def clients(self) -> int:
@@ -364,10 +365,21 @@ class DoorEndpoint:
                 if item is None:
                     client.wake.clear()
                     await client.wake.wait()
-                else:
-                    await connection.send(session.encode(item) if isinstance(item, Pending) else item)
+                elif (wire := self._encoded(session, item) if isinstance(item, Pending) else item) is not None:
+                    await connection.send(wire)
         except ConnectionClosed:
             log.debug("client gone while sending session=%d", session.number)
+
+    def _encoded(self, session: Session, item: Pending) -> str | bytes | None:
+        """Return what a client gets; None: its message drew an error of this program, of which the client hears."""
+        try:
+            return session.encode(item)
+        except Exception as error:  # one message must not make its client deaf
+            self._unwritten += 1
+            if self._unwritten == 1:
+                log.exception("a message could not be written for a client; the door goes on")
+            session.tell_wrong(f"a message was left out: it drew an error of this door ({type(error).__name__})")
+            return None
 
 
 def _known_or_none(topic: str, type_name: str) -> Channel | None:

@@ -91,12 +91,13 @@ class BodyDecompressor:
     __slots__ = ("_dictionary", "_max_bytes", "_options")
 
     def __init__(self, max_bytes: int, dictionary: bytes = b"") -> None:
-        try:
-            self._dictionary = zstd.ZstdDict(dictionary) if dictionary else None
-        except ValueError as error:
-            raise RemoteError(DropReason.MALFORMED, f"zstd: {error}") from error
         self._max_bytes = max_bytes
         self._options = {int(zstd.DecompressionParameter.window_log_max): _WINDOW_LOG_MAX}
+        try:
+            self._dictionary = zstd.ZstdDict(dictionary) if dictionary else None
+            self._decompressor()  # the dictionary itself checks its first bytes only
+        except (ValueError, zstd.ZstdError) as error:
+            raise RemoteError(DropReason.MALFORMED, f"zstd: {error}") from error
 
     def decompress(self, frame: bytes) -> bytes:
         """Return the body; memory is bounded by ``max_bytes``, whatever the frame states.
@@ -104,8 +105,8 @@ class BodyDecompressor:
         Raises:
             RemoteError: the bytes are not exactly one frame, or it holds more than ``max_bytes``.
         """
-        decompressor = zstd.ZstdDecompressor(zstd_dict=self._dictionary, options=self._options)
         try:
+            decompressor = self._decompressor()
             body: bytes = decompressor.decompress(frame, max_length=self._max_bytes + 1)
         except zstd.ZstdError as error:
             raise RemoteError(DropReason.MALFORMED, f"zstd: {error}"[:200]) from error
@@ -114,6 +115,10 @@ class BodyDecompressor:
         if not decompressor.eof or decompressor.unused_data:
             raise RemoteError(DropReason.MALFORMED, "zstd: not exactly one frame")
         return body
+
+    def _decompressor(self) -> zstd.ZstdDecompressor:
+        made: zstd.ZstdDecompressor = zstd.ZstdDecompressor(zstd_dict=self._dictionary, options=self._options)
+        return made
 
 
 def body_max_bytes(encoding: Encoding, max_bytes: int) -> int:

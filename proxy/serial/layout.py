@@ -77,13 +77,13 @@ def inline_codes(kind: Type, inline_max: int, known: dict[int, str | None]) -> s
     """Return the codes of a type that consists of numbers only and has a fixed size, None for any other.
 
     Args:
-        inline_max: longest fixed array that may count.
+        inline_max: longest fixed array that may count; one of no items never does.
         known: results so far, by the record's identity; extended.
     """
     if isinstance(kind, Number):
         return kind.code
     if isinstance(kind, Array) and isinstance(kind.item, Number) and not kind.item.octet:
-        return kind.item.code * kind.count if kind.count <= inline_max else None
+        return kind.item.code * kind.count if 0 < kind.count <= inline_max else None
     if not isinstance(kind, Record):
         return None
     if id(kind) not in known:

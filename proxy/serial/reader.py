@@ -148,11 +148,11 @@ class _Compiler:
                 tree.update(zip(names, values, strict=True))
 
             return put_all
-        parts: list[tuple[str, int, int, _Shape | None]] = []  # start, stop, shape; stop 0: a single number
+        parts: list[tuple[str, int, int | None, _Shape | None]] = []  # start, stop, shape; stop None: a single number
         at = 0
         for name, kind in fields:
             if isinstance(kind, Number):
-                parts.append((name, at, 0, None))
+                parts.append((name, at, None, None))
                 at += 1
                 continue
             width = len(self._codes(kind))
@@ -166,7 +166,7 @@ class _Compiler:
                     child: Tree = {}
                     nested(values[start:stop], child)
                     tree[name] = child
-                elif stop:
+                elif stop is not None:
                     tree[name] = values[start:stop]
                 else:
                     tree[name] = values[start]
