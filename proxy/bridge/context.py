@@ -61,7 +61,7 @@ class BridgeContext:
             with self.boundary.guard(what.encode() + party, now_s):
                 handle(*given, **named)
         except RemoteError as error:
-            detail = f"{error}, from {Name(party).short}" if party else str(error)
+            detail = f"{error.detail or error}{f', from {Name(party).short}' if party else ''}"
             self.faults.report(what, _FAULTS.get(error.reason, Fault.MALFORMED), detail)
             for text in self.boundary.poll_tracebacks():
                 log.error("input of a far party drew an error of this program; the proxy goes on\n%s", text)

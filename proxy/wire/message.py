@@ -145,7 +145,7 @@ def _reductions(fields: Mapping[object, object]) -> tuple[bool, bytes, PictureFo
     codec, dictionary, image = fields.get("z"), fields.get("d", b""), fields.get("i")
     if codec not in (None, "zstd"):
         raise RemoteError(DropReason.BAD_VERSION, f"a codec that is unknown here: {str(codec)[:40]}")
-    if image is not None and image not in _IMAGES:
+    if image is not None and not (isinstance(image, str) and image in _IMAGES):
         raise RemoteError(DropReason.BAD_VERSION, f"an image format that is unknown here: {str(image)[:40]}")
     if not isinstance(dictionary, bytes) or len(dictionary) > DICTIONARY_MAX_BYTES:
         raise RemoteError(DropReason.MALFORMED, "dictionary")
