@@ -70,8 +70,10 @@ def test_a_publisher_of_broken_descriptions_ends_no_proxy_and_no_other_topic(lab
     (lab.folder / "recorder.yaml").write_text(yaml.safe_dump(config))
     proxy = lab.start("-m", "proxy.cli.proxy", "--config", "recorder.yaml", "--json")
     assert '"ready"' in lines_of(proxy, 1)[0]
-    lab.output(lab.start("-c", PUBLISHER, "robot", "/chatter"))
+    hostile = lab.start("-c", PUBLISHER, "robot", "/chatter")
+    hostile.wait(PATIENCE_S)
     assert proxy.poll() is None, proxy.communicate()[1][-2_000:]
+    lab.output(hostile)
     lab.output(lab.start("-c", PUBLISHER, "other", "/good"))
     status = json.loads(lab.output(lab.start("-m", "gdp.cli.gdp", "status", "recorder", "--json")))
     assert status["counters"]["faults"]["malformed"] == 2

@@ -239,7 +239,7 @@ def mtu_hole(view: View) -> Found:
 def malformed(view: View) -> Found:
     """Messages cannot be read."""
     for end in view.ends:
-        for label in ("malformed", "no-library", "refused"):
+        for label in ("malformed", "internal", "no-library", "refused"):
             if end.flow.faults.get(label):
                 return f"Messages are dropped {end.place}: {end.flow.details.get(label, label)}.", _CHECK
     return None

@@ -52,7 +52,7 @@ class BridgeContext:
     ) -> bool:
         """Have input of a far party handled; return whether it was, without an error and without a quarantine.
 
-        Any error ends that input alone. It is a fault of ``what``, the local name that the party uses.
+        An error ends that input alone. It is a fault of ``what``, the local name that the party uses.
 
         Args:
             party: that is quarantined for this local name if it repeats errors; empty: several have their share.

@@ -138,7 +138,8 @@ def parse(type_name: str, definition: str, definition_format: str, ros: int) -> 
     Raises:
         UnparsedError: the text cannot be read.
         DefinitionError: no definition, one of more than ``DEFINITION_MAX_BYTES``, a used type that it lacks, a type
-            within itself, or a field of a kind that has no form here (``wchar``, ``long double``, fixed point).
+            within itself, two fields of one name, or a field of a kind that has no form here (``wchar``, ``long double``,
+            fixed point).
     """
 
     def build() -> Record:
@@ -211,6 +212,8 @@ class _Builder:
             fields = _BUILTIN[self._ros][name]
         else:
             raise DefinitionError(f"{name}: the definition does not contain it")
+        if len(dict(fields)) != len(fields):
+            raise DefinitionError(f"{name}: two fields of one name")
         if not fields and self._ros == 2:
             fields = (_DUMMY,)
         self._counts[name] = sum(self._count(kind) for _, kind in fields)

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import cbor2
 import pytest
 
 from gdp.control.boundary import ErrorBoundary
@@ -139,6 +140,25 @@ def test_y03_whatever_step_a_message_states_an_error_of_the_tree_comes_out() -> 
         recorder.receive(description, *(RosMessage(0, 0, b"{}", each).to_wire() for each in steps))
     assert recorder.faults.counts["internal"] == 0
     assert recorder.faults.counts["malformed"] > 0
+
+
+def test_y10_a_type_with_two_fields_of_one_name_has_no_form_and_its_messages_lose_nothing() -> None:
+    source = defined("Inner a\nint8 a\n", 2)
+    assert "two fields of one name" in Serializer(source, "json").opaque
+    assert Serializer(source, "json").decode(Serializer(source, "json").encode(b"\0\1\0\0xy")) == b"\0\1\0\0xy"
+    with pytest.raises(DefinitionError):
+        NoAnswer(source)
+
+
+@pytest.mark.parametrize("key", ["e", "c", "z", "d", "i"])
+def test_y09_a_description_of_any_values_is_read_or_refused(key: str) -> None:
+    fields = cbor2.loads(described(channel()))
+    recorder = Recorder()
+    for value in (None, True, -1, 1 << 64, 1.5, "", b"", [], {}, [[]], [{}], {"": {}}):
+        recorder.receive(cbor2.dumps(fields | {key: value}, canonical=True), ros_message())
+    assert recorder.faults.counts["internal"] == 0
+    recorder.receive(described(channel()), ros_message())
+    assert recorder.sink.written[-1] == ("/chatter", b"\0\1\0\0x")
 
 
 @pytest.mark.usefixtures("contained")
