@@ -35,7 +35,7 @@ from proxy.wire.message import RosMessage, Step, TopicDescription
 label, name = sys.argv[1:]
 channel = Channel(name, "a/msg/B", 2, definition="bool[0] a\\nint8 b\\n", definition_format="msg")
 good = TopicDescription("json", (channel,)).to_wire()
-broken = bytes.fromhex("37a430ec") + bytes(60)
+broken = bytes.fromhex("37a430ec") + bytes([255] * 200)
 dictionary = TopicDescription("cdr", (channel,), is_compressed=True, dictionary=broken).to_wire()
 image = cbor2.dumps(cbor2.loads(good) | {"i": {}}, canonical=True)
 valid = RosMessage(0, time.time_ns(), b'{"a":[],"b":1}').to_wire()

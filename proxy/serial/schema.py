@@ -138,8 +138,8 @@ def parse(type_name: str, definition: str, definition_format: str, ros: int) -> 
     Raises:
         UnparsedError: the text cannot be read.
         DefinitionError: no definition, one of more than ``DEFINITION_MAX_BYTES``, a used type that it lacks, a type
-            within itself, two fields of one name, or a field of a kind that has no form here (``wchar``, ``long double``,
-            fixed point).
+            within itself, two fields of one name, or a field of a kind that has no form here (``wchar``, ``long
+            double``, fixed point).
     """
 
     def build() -> Record:

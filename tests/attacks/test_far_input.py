@@ -30,7 +30,7 @@ from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, STRING, string, switch, switched
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
 
-BROKEN = bytes.fromhex("37a430ec") + bytes(60)  # the magic number of a dictionary, and no dictionary
+BROKEN = bytes.fromhex("37a430ec") + b"\xff" * 200  # the magic number of a dictionary, and no dictionary
 RULE = "=" * 80 + "\n"
 CHATTER, OTHER = f"name: /chatter, type: {STRING}", f"name: /other, type: {STRING}"
 SWITCH, LAMP = (f"kind: service, name: {name}, type: {SET_BOOL}" for name in ("/switch", "/lamp"))
@@ -154,7 +154,8 @@ def test_y10_a_type_with_two_fields_of_one_name_has_no_form_and_its_messages_los
 def test_y09_a_description_of_any_values_is_read_or_refused(key: str) -> None:
     fields = cbor2.loads(described(channel()))
     recorder = Recorder()
-    for value in (None, True, -1, 1 << 64, 1.5, "", b"", [], {}, [[]], [{}], {"": {}}):
+    values: tuple[object, ...] = (None, True, -1, 1 << 64, 1.5, "", b"", [], {}, [[]], [{}], {"": {}})
+    for value in values:
         recorder.receive(cbor2.dumps(fields | {key: value}, canonical=True), ros_message())
     assert recorder.faults.counts["internal"] == 0
     recorder.receive(described(channel()), ros_message())
@@ -332,9 +333,9 @@ def test_y08_a_client_of_a_door_hears_of_a_message_that_cannot_be_written_and_ge
             until(lambda: bool(readers(door)))
             for raw in (b"bad", b"good"):
                 door.publish(handle, raw)
-            told = heard(listener)
-            assert (told["op"], told["level"]) == ("status", 2)
-            assert "ZeroDivisionError" in str(told["message"])
+            status = heard(listener)
+            assert (status["op"], status["level"]) == ("status", 2)
+            assert "ZeroDivisionError" in str(status["message"])
             assert message(listener) == (7, b"good")
             assert door.dropped == 1
     finally:

@@ -49,7 +49,7 @@ _DEFINITIONS: Final = (
     "",
 )
 _IMAGE: Final = "uint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data\n"
-_BROKEN: Final = bytes.fromhex("37a430ec") + bytes(60)
+_BROKEN: Final = bytes.fromhex("37a430ec") + b"\xff" * 200
 _QOS: Final = Qos(depth=5, reliability="reliable", durability="volatile")
 _TOKENS: Final = (
     b"[0] ",
