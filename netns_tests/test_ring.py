@@ -139,6 +139,20 @@ def test_what_fails_and_moves_one_after_the_other_costs_no_message(demo: Path, t
     crossed(tmp_path, demo, "--seconds", 12, "--lease", LEASE_S, *faults)
 
 
+@pytest.mark.parametrize("least", ["school", "backbone", "cloud"])
+def test_every_rib_dies_one_after_the_other_and_no_message_is_lost_whichever_has_the_least_name(
+    least: str, demo: Path, tmp_path: Path
+) -> None:
+    kills = ["--kill", "rib:backbone@0.5", "--kill", "rib:school@12", "--kill", "rib:cloud@12"]
+    arguments = [demo, "--seconds", 18.5, "--lease", LEASE_S, *kills, "--json", tmp_path / "result.json"]
+    argv = [sys.executable, "-m", "netns_tests.ordered_ring", least, *map(str, arguments)]
+    ended = subprocess.run(
+        argv, capture_output=True, text=True, timeout=PATIENCE_S, env=WHERE, cwd=PROJECT, check=False
+    )
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    noted.append(Lifetime("the ring without RIBs", LEASE_S, 18.5 - 12))
+
+
 @pytest.mark.momentary(FAST)
 def test_an_eavesdropper_in_the_middle_learns_no_topic_no_type_and_no_content(demo: Path, tmp_path: Path) -> None:
     crossed(tmp_path, demo, "--rate", 0, "--pcap", tmp_path / "seen.pcap")

@@ -1,4 +1,4 @@
-"""Query to a RIB, and its responses: one for each advertiser of the name, or one that there is none.
+"""Query to a RIB, and its responses: one for each advertiser of the name, one that there is none, or "unknown".
 
 Sans-I/O.
 """
@@ -47,13 +47,15 @@ class Query:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Response:
-    """One advertiser of a name, or none.
+    """One advertiser of a name, none, or unknown: the RIB could not ask the tier above.
 
     Args:
-        advertiser: node that advertises it; equal to ``name`` with an empty ``advertisement`` when no node does.
+        advertiser: node that advertises it; equal to ``name`` with an empty ``advertisement`` when no node does, or the
+            RIB does not know.
         advertisement: signed by the advertiser, for the receiver to verify; empty: it ended, or there is none.
         domain: where it is attached.
         transit: domains through which that domain lets its traffic pass.
+        lease_s: of the location, or of a negative response; 0: the advertisement ended, or the RIB does not know.
         sequence: of the newest advertisement that ended; a receiver that knows a newer one ignores this response.
     """
 
@@ -68,6 +70,15 @@ class Response:
     @property
     def is_negative(self) -> bool:
         """Return whether no node advertises the name."""
+        return self._is_about_no_node and not self.is_unknown
+
+    @property
+    def is_unknown(self) -> bool:
+        """Return whether the RIB could not ask those that would know."""
+        return self._is_about_no_node and self.lease_s == 0.0 and self.sequence == 0
+
+    @property
+    def _is_about_no_node(self) -> bool:
         return not self.advertisement and self.advertiser == self.name
 
     def to_wire(self, signer: Name, key: SigningKey, membership: bytes) -> bytes:

@@ -45,6 +45,7 @@ from gdp.names import Name
 from gdp.rib.digest_tree import DigestTree
 from gdp.rib.endpoints import RibEndpoints
 from gdp.rib.former import FormerAdvertisers
+from gdp.rib.lower_ribs import LowerRibs
 from gdp.rib.replication import Message, Replication
 from gdp.rib.revocations import RibRevocations
 from gdp.rib.route import Route, Withdrawn
@@ -123,6 +124,7 @@ class RibCore:
         self._holders = Watches(settings.watches)  # members that received a response, for its lease
         self._upstream_queries = UpstreamQueries(is_top=not settings.upper)
         self._upstream = UpstreamAdvertisements(settings.upper)
+        self._lower = LowerRibs()
         self._replication = self._replication_over(store.digests)
         self._endpoints = RibEndpoints(identity, policy, self._other_ribs, settings.watches)
         self._answer_paces = TokenBuckets(ANSWER_BYTES_PER_S, ANSWER_BYTES_BURST)
@@ -275,8 +277,9 @@ class RibCore:
     def handle_timer(self, now: Timestamps) -> None:
         """Expire routes and notify their watchers; repeat open queries upstream."""
         for route in self._store.expire(now.mono_s, now.unix_s):
-            self._former.note_gone(route, is_lapsed=True)
-            self._tell_gone(route, now.mono_s)
+            if not self._keep_of_silent_rib(route, now):
+                self._former.note_gone(route, is_lapsed=True)
+                self._tell_gone(route, now.mono_s)
         self._now_s = now.mono_s
         self._watches.expire(now.mono_s)
         self._holders.expire(now.mono_s)
@@ -324,6 +327,7 @@ class RibCore:
         if not (member.role.is_switch or member.role is Role.RIB):
             raise StatementError(DropReason.WRONG_DOMAIN, "relays are switches or RIBs")
         statement.verify(member.key)
+        self._lower.record_alive(member.name, now.mono_s)
         passed_on = parse(relay.statement)
         if passed_on.type is StatementType.REVOKE:
             self._handle_revocation(passed_on, member.name, now)
@@ -514,6 +518,7 @@ class RibCore:
         if not (member.role.is_switch or member.role is Role.RIB):
             raise StatementError(DropReason.NOT_DELEGATED, "only switches and RIBs ask")
         statement.verify(member.key)
+        self._lower.record_alive(member.name, now.mono_s)
         query = Query.from_fields(fields)
         if query.name == self._identity.name:
             self._deny(query.name, member.name)  # a probe for a sign of life
@@ -536,7 +541,7 @@ class RibCore:
         ):
             self._ask_upstream(query.name, self._upstream_queries.watch_s(query.name))
         elif not routes and not self._upstream_queries.is_waiting(query.name):
-            self._answer_negative(query.name, member.name)
+            self._answer_none(query.name, member.name, is_unknown=bool(self._settings.upper))
 
     def _watch(self, query: Query, asker: Asker, now_s: float) -> None:
         """Add a watch for an asker; above the watch limit it still gets a response, and will send its query again."""
@@ -571,24 +576,16 @@ class RibCore:
         self.answers += 1
         self._send(answer, to.name, (route.name, route.advertiser))
 
-    def _answer_negative(self, name: Name, to: Name) -> None:
+    def _answer_none(self, name: Name, to: Name, *, is_unknown: bool) -> None:
+        """Answer that no node advertises a name, or, if the tier above could not be asked, that it is not known."""
         if self._replication is not None and self._replication.is_cold(self._now_s):
             return  # a peer may know; the asker repeats its query, here or at that peer
-        self._deny(name, to)
+        self._deny(name, to, lease_s=0.0 if is_unknown else NEGATIVE_LEASE_S)
 
-    def _deny(self, name: Name, to: Name) -> None:
-        self.negative_answers += 1
-        self._send(
-            Response(
-                name=name,
-                advertiser=name,
-                advertisement=b"",
-                domain=self._policy.own,
-                transit=(),
-                lease_s=NEGATIVE_LEASE_S,
-            ),
-            to,
-        )
+    def _deny(self, name: Name, to: Name, lease_s: float = NEGATIVE_LEASE_S) -> None:
+        self.negative_answers += lease_s > 0.0
+        own = self._policy.own
+        self._send(Response(name=name, advertiser=name, advertisement=b"", domain=own, transit=(), lease_s=lease_s), to)
 
     def _send(self, answer: Response, to: Name, about: Key | None = None) -> None:
         wire = answer.to_wire(self._identity.name, self._identity.key, self._identity.membership)
@@ -649,7 +646,7 @@ class RibCore:
             self._ask_upstream(query.name, query.watch_s)
         for name, askers in given_up:
             for asker in askers:
-                self._answer_negative(name, asker.name)
+                self._answer_none(name, asker.name, is_unknown=True)
         for rib in self._upstream.preferred(now_s):
             self._query_upstream(rib, rib, 0.0)
         self._probe(now_s, PROBE_S)
@@ -667,9 +664,25 @@ class RibCore:
         for route in routes:
             is_lapsing = route.expires_s < until_s + _STALE_MARGIN_S
             if route.is_from_upstream and is_lapsing and now.unix_s < route.valid_until_unix_s:
-                stale = replace(route, expires_s=max(until_s, now.mono_s + WATCH_AGAIN_S) + _STALE_MARGIN_S)
-                self._store.put(stale)
-                self._tell(stale, route, now.mono_s)
+                self._keep(route, max(until_s, now.mono_s + WATCH_AGAIN_S), now.mono_s)
+
+    def _keep_of_silent_rib(self, route: Route, now: Timestamps) -> bool:
+        """Keep a route whose lease ended if the RIB below that relayed it is silent; return whether that is so."""
+        if route.is_from_upstream or route.sender == route.switch or now.unix_s >= route.valid_until_unix_s:
+            return False
+        keep_s = self._lower.keep_s(route.sender, now.mono_s)
+        if keep_s == 0.0:
+            return False
+        self._keep(route, now.mono_s + keep_s, now.mono_s)
+        if self._lower.is_probe_due(route.sender, now.mono_s):
+            self._send_query(route.sender, Query(route.sender, 0.0))
+        return True
+
+    def _keep(self, route: Route, until_s: float, now_s: float) -> None:
+        """Keep a route beyond its lease, and notify those that it concerns."""
+        stale = replace(route, expires_s=until_s + _STALE_MARGIN_S)
+        self._store.put(stale)
+        self._tell(stale, route, now_s)
 
     def _probe(self, now_s: float, quiet_s: float) -> None:
         """Send one of several RIBs above a probe if it gave no sign of life for ``quiet_s``."""
@@ -684,9 +697,11 @@ class RibCore:
         assert upper is not None
         assert name is not None
         self._upstream.record_asked(self._now_s)
-        query = Query(name, watch_s, self._policy.revoked.digest_about(name) if watch_s > 0 else None)
+        self._send_query(upper, Query(name, watch_s, self._policy.revoked.digest_about(name) if watch_s > 0 else None))
+
+    def _send_query(self, to: Name, query: Query) -> None:
         wire = query.to_wire(self._identity.name, self._identity.key, self._identity.membership)
-        self._outgoing_statements.append(OutgoingStatement(upper, Kind.RIB_REQUEST, wire))
+        self._outgoing_statements.append(OutgoingStatement(to, Kind.RIB_REQUEST, wire))
 
     def _upper_member(self, statement: Statement, now: Timestamps) -> Membership:
         """Return the signer of a statement from the tier above. Raises ``StatementError``: it is not from there."""
@@ -717,13 +732,19 @@ class RibCore:
 
     def _take_answer_from_above(self, statement: Statement, now: Timestamps) -> None:
         fields = statement.fields
-        member = self._upper_member(statement, now)
         answer = Response.from_fields(fields)
-        if answer.is_negative:
-            askers = self._upstream_queries.answered(answer.name, now.mono_s)
+        if answer.name == statement.signer and not self._upstream.has(statement.signer):
+            self._take_sign_of_life(statement, now)
+            return
+        member = self._upper_member(statement, now)
+        if answer.is_negative or answer.is_unknown:
+            record = self._upstream_queries.not_known if answer.is_unknown else self._upstream_queries.answered
+            askers = record(answer.name, now.mono_s)
+            if answer.is_unknown:
+                self._serve_stale(answer.name, now.mono_s + WATCH_AGAIN_S, now)
             if not self._store.routes(answer.name):
                 for asker in askers:
-                    self._answer_negative(answer.name, asker.name)
+                    self._answer_none(answer.name, asker.name, is_unknown=answer.is_unknown)
             return
         known = self._store.get(answer.name, answer.advertiser)
         if not answer.advertisement:
@@ -732,6 +753,12 @@ class RibCore:
                 self._tell_gone(known, now.mono_s)
             return
         self._learn_from_upstream(answer, member, known, now)
+
+    def _take_sign_of_life(self, statement: Statement, now: Timestamps) -> None:
+        """Take the answer of a RIB below to a probe."""
+        member = self._sender(statement.fields.bytes_("c"), statement, now)
+        statement.verify(member.key)
+        self._lower.record_alive(member.name, now.mono_s)
 
     def _learn_from_upstream(
         self, answer: Response, member: Membership, known: Route | Withdrawn | None, now: Timestamps

@@ -1,6 +1,6 @@
 """Queries to the tier above: for which askers, and when each is repeated.
 
-Sans-I/O; time comes in as ``now_s`` (monotonic seconds). A query that stays open too long gets a negative response,
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). A query that stays open too long gets the response "unknown",
 rather than a timeout at the asker. The query of a watched name is sent again while the watch and the lease of the
 response last, and repeated until a response comes.
 """
@@ -29,7 +29,7 @@ class DueQuery(NamedTuple):
     Attributes:
         watch_s: for how long to watch the name above.
         again_s: when it is sent again unless a response comes.
-        is_unanswered: the last one had no response.
+        is_unanswered: the last one had no response, or nothing has for a while.
     """
 
     name: Name
@@ -109,11 +109,19 @@ class UpstreamQueries:
         question = self._open.get(name)
         if question is None:
             return []
-        if not question.is_answered or question.renewals:  # another update renews no watch
-            question.is_answered, question.renewals = True, 0
-            question.again_s = now_s + max(min(WATCH_AGAIN_S, lease_s / 3), RETRY_S)
-            self._due_s = min(self._due_s, question.again_s)
+        again_s = now_s + max(min(WATCH_AGAIN_S, lease_s / 3), RETRY_S)
+        if not question.is_answered or question.renewals:
+            question.is_answered, question.renewals, question.again_s = True, 0, again_s
+        question.again_s = min(question.again_s, again_s)  # another update renews no watch, but its lease may be short
+        self._due_s = min(self._due_s, question.again_s)
         return list(question.askers)
+
+    def not_known(self, name: Name, now_s: float) -> list[Asker]:
+        """Record that the tier above does not know a name; return the askers. The next renewal is an unanswered one."""
+        askers = self.answered(name, now_s)
+        if askers or name in self._open:
+            self._open[name].renewals = 1
+        return askers
 
     def due(self, now_s: float, *, is_silent: bool = False) -> tuple[list[DueQuery], list[tuple[Name, list[Asker]]]]:
         """Return the queries to send now, and those given up, as (name, askers).
@@ -137,7 +145,7 @@ class UpstreamQueries:
             if not is_watched and (question.is_answered or not question.askers):
                 del self._open[name]
                 continue
-            is_unanswered = not question.is_answered or question.renewals > 0
+            is_unanswered = is_silent or not question.is_answered or question.renewals > 0
             if question.is_answered:
                 question.again_s = now_s + self._repeat_s(question, is_silent=is_silent)
             else:

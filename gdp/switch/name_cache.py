@@ -1,7 +1,8 @@
 """Name cache: the locations of names that RIBs and neighbours proved, and negative entries.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). While no RIB responds, an entry is served beyond its lease,
-until the proofs of its advertisement end themselves (RFC 8767 in spirit).
+until the proofs of its advertisement end themselves (RFC 8767 in spirit). Where a RIB responds but does not know a
+name, its entries get another lease within that time.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ class Location:
     expires_s: float
     proof: Advertisement | None = None  # what was verified; None in tests that build a location directly
     stale_until_s: float = 0.0  # end of the proofs: it is served until then while no RIB responds
+    source: tuple[Name, bytes] | None = None  # the RIB that gave it, and that RIB's session; None: a switch did
 
     @property
     def sequence(self) -> int:
@@ -48,6 +50,7 @@ class NameCache:
     """
 
     def __init__(self, lease_s: float = ADVERTISEMENT_LEASE_S) -> None:
+        self._lease_s = lease_s
         self._confirm_s = lease_s / 2
         self._places: dict[Name, dict[Name, Location]] = {}
         self._names_of: dict[Name, set[Name]] = {}  # what each advertiser advertises, of ``_places``
@@ -109,6 +112,12 @@ class NameCache:
             self.remove(name, advertiser)
         self._negative[name] = now_s + NEGATIVE_LEASE_S
         self._expire_at_s = min(self._expire_at_s, now_s + NEGATIVE_LEASE_S)
+
+    def extend(self, name: Name, now_s: float) -> None:
+        """Give the entries of a name another lease, up to the end of their proofs: the RIB does not know the name."""
+        for advertiser, place in self._places.get(name, {}).items():
+            until_s = max(place.expires_s, min(now_s + self._lease_s, place.stale_until_s))
+            self._places[name][advertiser] = replace(place, expires_s=until_s)
 
     def serve_stale(self, stale: bool, now_s: float) -> None:
         """Begin or end to serve entries beyond their leases.

@@ -8,12 +8,14 @@ frames loses both this renewal and the RIB's updates, so the renewal is repeated
 query window (``query_window.py``).
 
 An answer may not help the frames that wait: the node was attached here and is silent, which the RIB does not know yet.
-They ask again. So a query follows the one before after ``RETRY_S`` at the soonest, answered or not.
+They ask again. So a query follows the one before after ``RETRY_S`` at the soonest, answered or not. A RIB that does not
+know a name is passed over: the query goes to the next one at once, as long as there is another.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, field
 from typing import Final
 
 from gdp.limits import ADVERTISEMENT_LEASE_S, PENDING_S
@@ -43,6 +45,7 @@ class _Query:
     used_until_s: float = 0.0  # frames are sent to the name
     is_answered: bool = False
     renewals: int = 0  # of the watch, sent since the last response
+    passed_over: set[Name] = field(default_factory=set)  # RIBs that do not know the name
 
 
 class NameQueries:
@@ -133,6 +136,7 @@ class NameQueries:
         query = self._queries.get(name)
         if query is None:
             return
+        query.passed_over.clear()
         if not query.is_watch and query.used_until_s <= now_s:
             self._remove(name)
             return
@@ -140,6 +144,25 @@ class NameQueries:
         if not query.is_answered or query.renewals:  # another update renews no watch
             query.is_answered, query.renewals = True, 0
             query.due_s = now_s + self._renewal_s(query)
+
+    def receive_unknown(self, name: Name, rib: Name, now_s: float, others: AbstractSet[Name]) -> None:
+        """Send the query for a name that a RIB does not know to another one, if one is left; else at its next time."""
+        query = self._queries.get(name)
+        if query is None:
+            return
+        query.passed_over.add(rib)
+        if not others <= query.passed_over:
+            query.due_s = now_s
+            self._due_s = min(self._due_s, now_s)
+        elif query.is_watch or query.used_until_s > now_s:
+            self.receive_answer(name, now_s)
+        else:
+            query.passed_over.clear()
+
+    def passed_over(self, name: Name) -> AbstractSet[Name]:
+        """Return the RIBs that do not know a name, of this round of queries."""
+        query = self._queries.get(name)
+        return frozenset() if query is None else query.passed_over
 
     def repeat_all(self, now_s: float) -> None:
         """Send every open query and every watch again at once: there is a new RIB."""

@@ -8,13 +8,15 @@ and 7.2.2: a miss makes one query and keeps the frame; the response releases the
                       `-> resolve: unknown                        -> a query is open: buffer_frame
     timer of the core -> RibClient.ask -> queries_to_send            -> query to the RIB, repeated until a response
     response of a RIB -> RibClient.receive -> LocationUpdates.receive -> receive_location -> Unicast.release: the frame
-                                           `-> receive_negative      -> the frame is dropped, counted
+                                           |-> receive_negative      -> the frame is dropped, counted
+                                           `-> receive_unknown       -> known locations stay; the next RIB is queried
     timer of the core -> expire: leases, negative entries and pending frames end
 """
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Set as AbstractSet
 from typing import Final, NamedTuple
 
 from gdp.control.neighbour import Neighbour
@@ -206,6 +208,15 @@ class NameResolver:
         if not (keep and self.cache.of(name, now_s)):
             self.cache.put_negative(name, now_s)
             self._pending.drop(name, DropReason.NO_ROUTE)
+
+    def receive_unknown(self, name: Name, rib: Name, now_s: float, others: AbstractSet[Name]) -> None:
+        """Keep the locations of a name that a RIB does not know, and query the other RIBs, one after the other."""
+        self.cache.extend(name, now_s)
+        self._queries.receive_unknown(name, rib, now_s, others)
+
+    def passed_over(self, name: Name) -> AbstractSet[Name]:
+        """Return the RIBs that do not know a name, of this round of queries."""
+        return self._queries.passed_over(name)
 
     # -- time and the RIB
 

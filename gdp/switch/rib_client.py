@@ -3,14 +3,21 @@
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds).
 
 Queries go to the nearest RIB of the switch's own domain, over other domains where its own is partitioned. Where the own
-domain has none, they go to the nearest RIB of a domain through which traffic may pass. A RIB that owes a response for
-``SILENT_S`` is replaced by the next one. While none responds, known locations are still served (``name_cache.py``). The
-name resolver decides which queries are due; ``location_updates.py`` applies the responses.
+domain has none, they go to RIBs of domains through which traffic may pass: for a known name to the RIB that gave its
+location, or one of the advertiser's domain; else to the nearest, and to the next one if that does not know. RIBs at the
+same distance are ordered by a hash that differs for each switch, so that no name is preferred. A RIB that owes a
+response for ``SILENT_S`` is replaced by the next one.
+
+While no RIB responds, known locations are still served (``name_cache.py``). They are also kept where a RIB responds
+that it does not know, or denies a name that it could not know. The name resolver decides which queries are due;
+``location_updates.py`` applies the responses.
 """
 
 from __future__ import annotations
 
-from typing import Final
+import hashlib
+from dataclasses import replace
+from typing import Final, NamedTuple
 
 from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.channel import Channels, Opened
@@ -44,6 +51,13 @@ __all__ = ["SILENT_S", "RibClient"]
 SILENT_S: Final = 1.6  # longer than a RIB waits for the tier above
 _AVOID_S: Final = 10.0  # a RIB that owed a response for too long is avoided for so long, if there is another
 _REFILL_S: Final = 10.0  # how long negative responses of a RIB that is new here do not override known locations
+
+
+class _Reached(NamedTuple):
+    """A RIB in reach."""
+
+    name: Name
+    domain: Name
 
 
 class RibClient:
@@ -88,18 +102,22 @@ class RibClient:
         self.rib: Name | None = None
         self._session = b""  # of that RIB with its switch: another one means that it restarted or moved
         self._chosen_s = float("-inf")
-        self._owed_s: float | None = None  # since when it owes a response
+        self._others: tuple[_Reached, ...] = ()  # where the own domain has no RIB: those in reach, the nearest first
+        self._owed: dict[Name, float] = {}  # RIBs that owe a response, since when
         self._avoided: dict[Name, float] = {}  # RIBs that did not respond, until when
         self._review_s = float("inf")  # when one of them may be used again
         self._asked: dict[Name, None] = {}  # RIBs whose responses are accepted, the newest last
 
     def links_changed(self, now_s: float) -> None:
         """Select the RIB again; a new one receives all advertisements and queries."""
-        rib = self._nearest_rib(now_s)
+        reached = self._reached(now_s)
+        rib = reached[0].name if reached else None
+        self._others = tuple(reached) if reached and reached[0].domain != self._policy.own else ()
         known = None if rib is None else self._paths.ribs().get(rib)
         session = b"" if known is None else known.session
         if (rib, session) != (self.rib, self._session):
-            self.rib, self._session, self._chosen_s, self._owed_s = rib, session, now_s, None
+            self.rib, self._session, self._chosen_s = rib, session, now_s
+            self._owed.clear()
             if rib is not None:
                 self._channels.renew(rib)
             self._attached.relay_all(now_s)
@@ -107,17 +125,30 @@ class RibClient:
             self._endpoints.rib_changed(now_s)
         self.send_due(now_s)
 
-    def _nearest_rib(self, now_s: float) -> Name | None:
-        own, transit = self._policy.own, self._policy.transit
-        reached = []
+    def _reached(self, now_s: float) -> list[_Reached]:
+        """Return the RIBs in reach, the one to use first."""
+        own, transit, me = self._policy.own, self._policy.transit, self._identity.name
+        reached: list[tuple[bool, bool, int, bytes, _Reached]] = []
         for name, rib in self._paths.ribs().items():
             if rib.domain not in transit:
                 continue
             way, host = self._paths.to_rib(name, transit)
             if host is not None:
                 is_avoided = self._avoided.get(name, 0.0) > now_s
-                reached.append((is_avoided, rib.domain != own, 0 if way is None else way.distance, name))
-        return min(reached)[3] if reached else None
+                distance, spread = 0 if way is None else way.distance, hashlib.sha256(me + name).digest()
+                reached.append((is_avoided, rib.domain != own, distance, spread, _Reached(name, rib.domain)))
+        return [each[-1] for each in sorted(reached)]
+
+    def _rib_for(self, name: Name, now_s: float) -> Name | None:
+        """Return the RIB to query for a name."""
+        passed_over = self._resolver.passed_over(name)
+        left = [rib for rib in self._others if rib.name not in passed_over] or self._others
+        if not left:
+            return self.rib
+        known = self._resolver.cache.of(name, now_s)
+        sources, domains = {place.source[0] for place in known if place.source}, {place.domain for place in known}
+        avoided = {rib for rib, until_s in self._avoided.items() if until_s > now_s}
+        return min(left, key=lambda rib: (rib.name in avoided, rib.name not in sources, rib.domain not in domains)).name
 
     def send_due(self, now_s: float) -> None:
         """Send the relays and queries that are due."""
@@ -128,8 +159,8 @@ class RibClient:
         if now_s >= self._review_s:
             self._review_s = float("inf")
             self.links_changed(now_s)
-        if self._owed_s is not None and now_s - self._owed_s >= SILENT_S:
-            self._leave_silent_rib(now_s)
+        for rib in [rib for rib, since_s in self._owed.items() if now_s - since_s >= SILENT_S]:
+            self._leave_silent_rib(rib, now_s)
         if self._attached.is_relay_due(now_s):
             for attachment in self._attached.due(now_s, self._trip_s(self.rib)):
                 self.relay(attachment.advertisement.wire, now_s)
@@ -138,38 +169,38 @@ class RibClient:
         for name, watch_s in self._resolver.queries_to_send(now_s):
             is_heard = bool(self._multicast.readers(name))
             query = Query(name, watch_s, self._policy.revoked.digest_about(name) if is_heard else None)
-            self._to_rib(query.to_wire(self._identity.name, self._identity.key, self._identity.membership), now_s)
+            wire = query.to_wire(self._identity.name, self._identity.key, self._identity.membership)
+            self._to_rib(wire, now_s, self._rib_for(name, now_s))
 
     def _trip_s(self, rib: Name) -> float:
         """Return the round trip of the link towards a RIB, in seconds; 0: not measured, or the RIB is here."""
         way, _ = self._paths.to_rib(rib, self._policy.transit)
         return 0.0 if way is None else self._outbox.rtt_to(way.first)
 
-    def _leave_silent_rib(self, now_s: float) -> None:
-        """Switch to another RIB; where there is none, serve known locations."""
-        assert self.rib is not None
+    def _leave_silent_rib(self, silent: Name, now_s: float) -> None:
+        """Avoid a RIB; if it is the one in use, switch to another, and where there is none, serve known locations."""
         self._avoided = {rib: until_s for rib, until_s in self._avoided.items() if until_s > now_s}
-        self._avoided[self.rib] = self._review_s = now_s + _AVOID_S
-        self._owed_s = None
-        before = self.rib
-        self._resolver.serve_stale(now_s, stale=True)
-        if self._nearest_rib(now_s) != before:
-            self.links_changed(now_s)
+        self._avoided[silent] = self._review_s = now_s + _AVOID_S
+        self._owed.pop(silent, None)
+        if silent == self.rib:
+            self._resolver.serve_stale(now_s, stale=True)
+            if [rib.name for rib in self._reached(now_s)[:1]] != [silent]:
+                self.links_changed(now_s)
 
     def relay(self, statement: bytes, now_s: float) -> None:
         """Relay an attached node's advertisement or withdrawal, or a revocation, to the RIB."""
         self._to_rib(relayed(statement, self._identity, self._policy.transit), now_s)
 
-    def _to_rib(self, statement: bytes, now_s: float) -> None:
-        if self.rib is None:
+    def _to_rib(self, statement: bytes, now_s: float, rib: Name | None = None) -> None:
+        rib = rib or self.rib
+        if rib is None:
             return
-        if self._owed_s is None:
-            self._owed_s = now_s
-        self._asked.pop(self.rib, None)
-        self._asked[self.rib] = None
+        self._owed.setdefault(rib, now_s)
+        self._asked.pop(rib, None)
+        self._asked[rib] = None
         if len(self._asked) > 8:
             del self._asked[next(iter(self._asked))]
-        self._channels.send_query(self.rib, statement, now_s)
+        self._channels.send_query(rib, statement, now_s)
         self._send(now_s)
 
     def _send(self, now_s: float) -> None:
@@ -220,11 +251,13 @@ class RibClient:
         statement.expect(StatementType.ANSWER)
         answer = Response.from_fields(fields)
         if answer.is_negative:
-            self._receive_negative(answer.name, now.mono_s)
+            self._receive_negative(answer.name, member, now.mono_s)
+        elif answer.is_unknown:
+            self._receive_unknown(answer.name, member.name, now.mono_s)
         elif not answer.advertisement:
             self._locations.receive_removal(answer, now.mono_s)
         else:
-            self._found(answer, statement.wire, now)
+            self._found(answer, member, statement.wire, now)
 
     def revocation_in(self, statement: Statement, now: Timestamps) -> tuple[Statement, Name]:
         """Return the revocation, to be verified, that a RIB forwarded, and the RIB.
@@ -267,21 +300,38 @@ class RibClient:
 
     def _rib_answered(self, rib: Name, now_s: float) -> None:
         self._avoided.pop(rib, None)
+        self._owed.pop(rib, None)
         if rib == self.rib:
-            self._owed_s = None
             self._resolver.serve_stale(now_s, stale=False)
 
-    def _found(self, answer: Response, wire: bytes, now: Timestamps) -> None:
+    def _found(self, answer: Response, member: Membership, wire: bytes, now: Timestamps) -> None:
         try:
             place = self._evidence.from_answer(answer, now)
         except StatementError:
-            self._receive_negative(answer.name, now.mono_s)  # it is of no use here, but still counts as a response
+            # it is of no use here, but still counts as a response
+            self._receive_negative(answer.name, member, now.mono_s)
             raise
-        self._locations.receive(place, wire, now.mono_s)
+        self._locations.receive(replace(place, source=self._source(member.name)), wire, now.mono_s)
 
-    def _receive_negative(self, name: Name, now_s: float) -> None:
-        """Store that no node advertises a name; a RIB that has just started does not know all advertisers yet."""
+    def _source(self, rib: Name) -> tuple[Name, bytes]:
+        known = self._paths.ribs().get(rib)
+        return rib, b"" if known is None else known.session
+
+    def _receive_negative(self, name: Name, member: Membership, now_s: float) -> None:
+        """Store that no node advertises a name, if the RIB can know; one that has just started does not know all yet.
+
+        It can where it gave the known locations since it started, or where they and this switch are in its domain.
+        """
+        source, own = self._source(member.name), self._policy.own
+        for place in self._resolver.cache.of(name, now_s):
+            if place.source != source and not (place.domain == member.domain == own):
+                self._receive_unknown(name, member.name, now_s)
+                return
         self._resolver.receive_negative(name, now_s, keep=now_s - self._chosen_s < _REFILL_S)
+
+    def _receive_unknown(self, name: Name, rib: Name, now_s: float) -> None:
+        """Keep the known locations of a name; query other RIBs where the own domain has none."""
+        self._resolver.receive_unknown(name, rib, now_s, {each.name for each in self._others})
 
     def _take_context(self, statement: Statement, now: Timestamps) -> None:
         """Handle the names that a node reads, from the node's former switch; a RIB's information takes precedence."""
@@ -307,7 +357,7 @@ class RibClient:
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next query, or of the moment to leave a silent RIB."""
-        owed_s = None if self._owed_s is None else self._owed_s + SILENT_S
+        owed_s = min(self._owed.values()) + SILENT_S if self._owed else None
         times = [
             self._attached.next_event(),
             self._resolver.next_query(),

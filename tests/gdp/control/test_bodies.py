@@ -167,6 +167,13 @@ def test_a_response_that_names_the_name_itself_without_an_advertisement_is_negat
     assert not Response(name=A, advertiser=B, advertisement=b"", domain=C, transit=(), lease_s=0.0).is_negative
 
 
+def test_a_response_about_the_name_itself_without_a_lease_says_that_the_rib_does_not_know() -> None:
+    unknown = Response(name=A, advertiser=A, advertisement=b"", domain=C, transit=(), lease_s=0.0)
+    assert (unknown.is_unknown, unknown.is_negative) == (True, False)
+    left = Response(name=A, advertiser=A, advertisement=b"", domain=C, transit=(), lease_s=0.0, sequence=1)
+    assert (left.is_unknown, left.is_negative) == (False, True), "a node that withdrew its own name"
+
+
 @given(st.integers(0, 8_000), st.integers(0, 300), st.booleans())
 def test_a_reply_is_cut_to_the_length_of_its_request(max_bytes: int, count: int, knows: bool) -> None:
     result = {"branches": [{"n": bytes(A)}] * count, "in": {"port": "eth0"}}

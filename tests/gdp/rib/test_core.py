@@ -14,7 +14,7 @@ from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.statements import StatementType, parse, sign
 from gdp.crypto.subject import Subject
 from gdp.errors import DropReason, StoreError
-from gdp.limits import NEGATIVE_LEASE_S
+from gdp.limits import ADVERTISEMENT_LEASE_S, NEGATIVE_LEASE_S
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.rib.core import OutgoingStatement, RibCore, RibSettings
@@ -527,7 +527,7 @@ def test_an_asker_hears_of_every_advertiser_that_the_tier_above_knows() -> None:
     assert [outgoing.to for outgoing in (*first, *second)] == [SWITCH.name, SWITCH.name]
 
 
-def test_a_tier_above_that_is_silent_is_asked_again_and_then_answered_for() -> None:
+def test_a_tier_above_that_is_silent_is_asked_again_and_then_the_answer_is_unknown() -> None:
     at_rib = rib(UPPER.name)
     ask(at_rib)
     reported: list[Response] = []
@@ -542,9 +542,81 @@ def test_a_tier_above_that_is_silent_is_asked_again_and_then_answered_for() -> N
         reported += answers([outgoing for outgoing in letters if outgoing.to == SWITCH.name])
         following = at_rib.get_timer()
         assert following is None or following > due_s
-    assert [each.is_negative for each in reported] == [True]
+    assert [(each.is_negative, each.is_unknown) for each in reported] == [(False, True)]
     assert again >= 3
     assert at_rib.get_timer() is None
+
+
+def unknown_upstream(to: RibCore, now: Timestamps = START) -> list[OutgoingStatement]:
+    answer = Response(name=NAME, advertiser=NAME, advertisement=b"", domain=CLOUD.root.domain, transit=(), lease_s=0.0)
+    to.receive(answer.to_wire(UPPER.name, UPPER.key, UPPER.membership), UPPER.name, now)
+    return to.statements_to_send()
+
+
+def test_what_the_tier_above_does_not_know_is_unknown_here_too() -> None:
+    at_rib = rib(UPPER.name)
+    ask(at_rib)
+    assert [each.is_unknown for each in answers(unknown_upstream(at_rib))] == [True]
+    assert at_rib.negative_answers == 0
+    assert [outgoing.to for outgoing in ask(at_rib)] == [UPPER.name], "the next query is forwarded again"
+
+
+def test_a_route_that_the_tier_above_does_not_know_any_more_outlives_its_lease() -> None:
+    at_rib = rib(UPPER.name)
+    ask(at_rib, watch_s=3_600.0)
+    answer_from_upstream(at_rib, advertisement())
+    for second in range(1, 100):
+        at_rib.handle_timer(at(second))
+        for outgoing in at_rib.statements_to_send():
+            if outgoing.to == UPPER.name:
+                assert not any(not each.advertisement for each in answers(unknown_upstream(at_rib, at(second))))
+    assert at_rib.names == 1
+
+
+LOWER = NodeKeys.generate(Role.RIB, "lower").join(CLOUD, DAY)
+
+
+def sign_of_life(to: RibCore, now_s: float) -> None:
+    """Let the RIB below answer a probe."""
+    answer = Response(
+        name=LOWER.name, advertiser=LOWER.name, advertisement=b"", domain=CLOUD.root.domain, transit=(), lease_s=0.5
+    )
+    to.receive(answer.to_wire(LOWER.name, LOWER.key, LOWER.membership), LOWER.name, at(now_s))
+
+
+@pytest.mark.parametrize("lives", [True, False])
+def test_a_lease_that_a_rib_below_does_not_renew_ends_only_if_that_rib_lives(lives: bool) -> None:
+    at_rib = rib()
+    tell(at_rib, advertisement(lease_s=10.0), by=LOWER)
+    ask(at_rib, watch_s=3_600.0)
+    gone: list[Response] = []
+    for second in range(1, 60):
+        at_rib.handle_timer(at(second))
+        letters = at_rib.statements_to_send()
+        gone += [each for each in answers(letters) if not each.advertisement]
+        if lives and any(outgoing.to == LOWER.name for outgoing in letters):
+            sign_of_life(at_rib, second + 0.1)
+    assert (at_rib.names, bool(gone)) == ((0, True) if lives else (1, False))
+
+
+def test_a_rib_below_that_is_back_has_half_a_lease_to_relay_again_what_was_kept() -> None:
+    at_rib = rib()
+    tell(at_rib, advertisement(lease_s=10.0), by=LOWER)
+    ends_s = 0.0
+    for second in range(1, 80):
+        at_rib.handle_timer(at(second))
+        probed = any(outgoing.to == LOWER.name for outgoing in at_rib.statements_to_send())
+        if second >= 40 and probed:
+            sign_of_life(at_rib, second + 0.1)
+        ends_s = ends_s or (second if at_rib.names == 0 else 0.0)
+    assert ends_s >= 40 + ADVERTISEMENT_LEASE_S / 2
+
+
+def test_no_proof_of_an_advertiser_outlives_its_validity_because_a_rib_is_silent() -> None:
+    at_rib = rib()
+    tell(at_rib, advertisement(lease_s=10.0), by=LOWER)
+    at_rib.handle_timer(at(11.0, NOW + 40 * 86_400.0))
+    assert at_rib.names == 0
 
 
 def test_a_name_gone_upstream_is_gone_here_and_watchers_are_informed() -> None:

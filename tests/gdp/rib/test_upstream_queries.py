@@ -35,6 +35,15 @@ def test_a_watch_is_renewed_while_the_lease_of_the_response_lasts(lease_s: float
     assert asks(queries, again_s)
 
 
+def test_an_update_with_a_short_lease_is_renewed_in_time_and_one_with_a_long_lease_postpones_nothing() -> None:
+    queries = watched(1e9)
+    queries.answered(TOPIC, 1.0, 2.4)
+    assert asks(queries, 1.8)
+    queries = watched(2.4)
+    queries.answered(TOPIC, 0.5, 1e9)
+    assert asks(queries, 0.8)
+
+
 def test_a_renewal_is_repeated_until_a_response_comes() -> None:
     queries = watched()
     due_s = WATCH_AGAIN_S

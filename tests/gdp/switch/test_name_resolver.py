@@ -13,7 +13,7 @@ from gdp.switch.name_resolver import NameResolver
 from gdp.trust.right import Right
 from tests.gdp.switch.net import HOME, name
 
-ME, FAR, SERVER, TOPIC = name("me"), name("far"), name("server"), name("topic")
+ME, FAR, SERVER, TOPIC, RIB = name("me"), name("far"), name("server"), name("topic"), name("rib")
 NEIGHBOUR = b"n" + name("neighbour")
 
 
@@ -60,6 +60,37 @@ def test_a_rib_that_has_just_started_does_not_remove_known_locations() -> None:
     resolver.receive_location(location(), 0.0)
     resolver.receive_negative(SERVER, 0.1, keep=True)
     assert resolver.resolve(SERVER, 0.1) == ([location()], None)
+
+
+def test_a_location_that_a_rib_does_not_know_gets_another_lease_up_to_the_end_of_its_proofs() -> None:
+    resolver = NameResolver(ME)
+    resolver.receive_location(replace(location(), stale_until_s=70.0), 0.0)
+    for now_s in range(20, 200, 20):
+        resolver.receive_unknown(SERVER, RIB, float(now_s), {RIB})
+        resolver.expire(float(now_s))
+        assert bool(resolver.cache.of(SERVER, float(now_s))) == (now_s < 70)
+
+
+def test_a_name_that_one_rib_does_not_know_is_queried_at_each_other_one_once_and_then_later() -> None:
+    resolver = NameResolver(ME)
+    resolver.watch(SERVER, 0.0)
+    others = {name(f"rib{number}") for number in range(3)}
+    asked = []
+    for rib in sorted(others):
+        assert [query for query, _ in resolver.queries_to_send(0.1 * len(asked))] == [SERVER]
+        assert rib not in resolver.passed_over(SERVER)
+        resolver.receive_unknown(SERVER, rib, 0.1 * len(asked), others)
+        asked.append(rib)
+    assert (resolver.queries_to_send(1.0), resolver.passed_over(SERVER)) == ([], frozenset())
+    assert resolver.queries_to_send(ADVERTISEMENT_LEASE_S / 4 + 0.3) != []
+
+
+def test_a_frame_waits_while_ribs_do_not_know_its_name_and_then_is_dropped() -> None:
+    resolver = missed()
+    resolver.receive_unknown(SERVER, RIB, 0.1, {RIB})
+    assert resolver.pending_frames == 1
+    resolver.expire(PENDING_S)
+    assert resolver.drops == {DropReason.PENDING_EXPIRED: 1}
 
 
 def test_a_rib_that_has_just_started_may_deny_an_unknown_name() -> None:
