@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import pytest
@@ -114,6 +115,32 @@ def test_hops_tell_how_many_switches_stood_between() -> None:
     assert hops_in_words(Journey(hops=5)) == "5 (3 between)"
     assert hops_in_words(Journey(hops=5, hops_seen=(5, 2))) == "5 (3 between), also 2"
     assert hops_in_words(Journey()) == "-"
+
+
+LONG = {"topic": "/robot1/arm/camera/depth/image_rect_raw", "type_name": "control_msgs/action/FollowJointTrajectory"}
+
+
+def printed(of: Result, width: int, *, is_wide: bool = False) -> list[str]:
+    console = Console(width=width)
+    with console.capture() as captured:
+        console.print(table(of, is_wide=is_wide))
+    return captured.get().splitlines()
+
+
+@pytest.mark.parametrize("more", [{}, LONG, {"messages": 1_000_000, "lost": 999_999}], ids=["short", "long", "many"])
+def test_the_table_fits_100_columns_with_every_number_whole(more: dict[str, object]) -> None:
+    lines = printed(result(replace(GOOD, **more)), 100)  # type: ignore[arg-type]
+    assert max(map(len, lines)) <= 100
+    assert not [line for line in lines if "…" in line]
+    headings = ["topic", "type", "messages", "lost", "identical", "median ms", "hops"]
+    assert re.split(r"  +", lines[1].strip()) == headings
+
+
+def test_the_wide_table_has_all_columns() -> None:
+    heading = printed(result(), 200, is_wide=True)[1]
+    assert all(
+        each in heading for each in ("bytes", "delivered", "duplicated", "p99 ms", "max ms", "silent ms", "parts")
+    )
 
 
 def test_the_table_shows_topics_whose_names_look_like_markup() -> None:
