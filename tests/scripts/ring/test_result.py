@@ -14,6 +14,7 @@ from ring.events import Event
 from ring.options import Options
 from ring.result import Journey, Result, put_together
 from ring.table import hops_in_words, summary, table
+from tests.pages import ROOT
 
 GOOD = TopicComparison(
     topic="/imu",
@@ -161,3 +162,9 @@ def test_a_line_that_is_no_object_is_no_event(line: str) -> None:
 def test_an_event_without_the_wanted_value_is_refused(read: object) -> None:
     with pytest.raises(LocalError, match="ready: value: "):
         read(Event({"event": "ready", "value": None}), "value")  # type: ignore[operator]
+
+
+def test_the_readme_shows_the_table_as_it_is_printed() -> None:
+    heading = printed(result(), 100)[1].split("  ")
+    shown = next(line for line in (ROOT / "README.md").read_text().splitlines() if line.startswith("topic "))
+    assert [each.strip() for each in heading if each.strip()] == [each.strip() for each in shown.split("  ") if each]
