@@ -49,6 +49,13 @@ class ExportedInterface:
     options: Mapping[str, object] = field(default_factory=dict)
     served: Mapping[str, object] = field(default_factory=dict)
 
+    def salted(self, salt: str) -> ExportedInterface:
+        """Return it with an unguessable part in its overlay name, unless its metadata have one."""
+        more = self.options.get("metadata")
+        metadata = {"salt": salt, **(more if isinstance(more, dict) else {})}
+        given = {"metadata": metadata}
+        return replace(self, options={**self.options, **given}, served={**self.served, **given})
+
 
 @dataclass(frozen=True, slots=True)
 class MachineRequest:
@@ -97,6 +104,10 @@ class ClusterPlan:
         """Return so many machines: the first of the plan, and more like its last one in other regions."""
         more = max(count - len(self.machines), 0)
         return (*self.machines[:count], *[replace(self.machines[-1], region="")] * more)
+
+    def salted(self, salt: str) -> ClusterPlan:
+        """Return the plan with this unguessable part in the overlay names of its interfaces; empty: with none."""
+        return replace(self, carried=tuple(each.salted(salt) for each in self.carried)) if salt else self
 
     def to_json(self) -> str:
         """Return the text that ``from_json`` reads."""

@@ -419,7 +419,7 @@ def _own(folder: Path, identifier: str) -> Site:
     if not authority.domain.exists():
         make_domain(authority.domain, name)
     if not authority.owner.exists():
-        make_owner(authority.owner)
+        make_owner(authority.owner, is_salted=True)
     robot = folder / "robot"
     if not (robot / "boot.json").exists():  # this file is written last
         _install_again(robot, authority, devices)

@@ -1,4 +1,4 @@
-"""Bounds of the system, all in one file.
+"""Bounds that several packages share; a bound of one mechanism is in its module.
 
 Sans-I/O; imports nothing of this project. Units end the names.
 """

@@ -16,9 +16,7 @@ from gdp.names import Name, name_of
 
 __all__ = ["KINDS", "Metadata"]
 
-KINDS: Final = frozenset(
-    {"topic", "service", "action", "domain", "switch", "leaf", "rib", "proxy", "replica", "capsule", "enrolment"}
-)
+KINDS: Final = frozenset({"topic", "service", "action", "domain", "switch", "leaf", "rib", "proxy", "enrolment"})
 _VALUE_MAX_CHARS: Final = 4_096
 
 

@@ -25,6 +25,8 @@ from fog.providers.local.provider import LocalProvider
 from fog.topology import Gateway
 from gdp.errors import LocalError, StoreError
 from gdp.host import netns_files
+from gdp.host.netns_files import reach
+from gdp.host.processes import end_all
 from netns_tests.local_site import (
     PATIENCE_S,
     Domain,
@@ -262,6 +264,49 @@ def test_what_was_begun_by_a_killed_creator_is_swept(folder: Path) -> None:
     assert provider.sweep() == [machine]
     assert leftovers(folder, [machine]) == []
     provider.close_network()
+
+
+_FROM_ANOTHER_MOUNT_NAMESPACE = """
+import sys
+from pathlib import Path
+from fog.providers.local.provider import LocalProvider
+from netns_tests.local_site import plain_gateway, spec, ticking
+
+provider = LocalProvider(Path(sys.argv[1]), plain_gateway)
+provider.open_network()
+provider.create(spec("m1"), ticking())
+"""
+
+
+def test_machines_of_another_mount_namespace_are_reached_and_given_back(folder: Path) -> None:
+    # as with ip netns exec, of which each makes a mount namespace of its own
+    argv = ["unshare", "--mount", "--propagation", "private", sys.executable, "-c", _FROM_ANOTHER_MOUNT_NAMESPACE]
+    subprocess.run([*argv, str(folder)], cwd=ROOT, timeout=PATIENCE_S, check=True)
+    provider = LocalProvider(folder, plain_gateway)
+    provider.open_network()
+    first = provider.describe("test")[0].id
+    until(partial(is_running, provider, first), "running")
+    subprocess.run([*provider.shell(first), "-c", "true"], check=True)
+    second = booted(provider, "m2")
+    stray = subprocess.Popen(["nsenter", f"--net={reach(find(provider.runs, first).netns_path)}", "sleep", "1000"])
+    runs = [record.run for record in provider.runs.all()]
+    provider.terminate([first, second])
+    assert stray.wait(PATIENCE_S) != 0
+    provider.close_network()
+    assert leftovers(folder, runs) == []
+    assert not exists(None, "fog0")
+
+
+def test_a_network_whose_mount_namespace_has_ended_is_removed(folder: Path) -> None:
+    argv = ["unshare", "--mount", "--propagation", "private", sys.executable, "-c", _FROM_ANOTHER_MOUNT_NAMESPACE]
+    subprocess.run([*argv, str(folder)], cwd=ROOT, timeout=PATIENCE_S, check=True)
+    provider = LocalProvider(folder, plain_gateway)
+    for record in provider.runs.all():
+        end_all(record.processes)
+    runs = [record.run for record in provider.runs.all()]
+    provider.terminate([each.id for each in provider.describe("test")])
+    provider.close_network()
+    assert leftovers(folder, runs) == []
 
 
 def test_a_gateway_that_was_killed_runs_again_when_the_network_is_opened(provider: LocalProvider) -> None:

@@ -10,8 +10,8 @@ set -euo pipefail
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 
 if [[ -z "${AMENT_PREFIX_PATH-}" ]]; then  # a sourced ROS 2 stays in use
-    "$root/scripts/setup.sh" --ros2
+    "$root/scripts/setup.sh" --quiet --ros2
 else
-    "$root/scripts/setup.sh"
+    "$root/scripts/setup.sh" --quiet
 fi
 exec "$root/scripts/privileged.sh" "$root/.venv/bin/python" -m fog_demo "$root/examples/echo.launch.py" "$@"

@@ -9,5 +9,5 @@ set -euo pipefail
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 
-"$root/scripts/setup.sh"
+"$root/scripts/setup.sh" --quiet
 exec "$root/scripts/privileged.sh" "$root/.venv/bin/python" -m internet_demo "$@"

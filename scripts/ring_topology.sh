@@ -19,9 +19,9 @@ case " $* " in
     *) ros=() ;;
 esac
 if [[ " ${ros[*]-} " == *" 2 "* && -z "${AMENT_PREFIX_PATH-}" ]]; then  # a sourced ROS 2 stays in use
-    "$root/scripts/setup.sh" --ros2
+    "$root/scripts/setup.sh" --quiet --ros2
 else
-    "$root/scripts/setup.sh"
+    "$root/scripts/setup.sh" --quiet
 fi
 if [[ " ${ros[*]-} " == *" 1 "* ]] && ! (cd "$root" && "$python" -c "$has_ros1" 2>/dev/null); then
     "$root/scripts/setup_ros1.sh"

@@ -4,6 +4,7 @@
 #   scripts/setup.sh          to run
 #   scripts/setup.sh --ros2   to run where no ROS 2 is installed: with a real one from the package index
 #   scripts/setup.sh --dev    to test as well, with all that tests use: ROS 2, Cyclone DDS, SkyPilot, ROS 1 from Debian
+#   scripts/setup.sh --quiet  for scripts: says nothing where .venv is up to date
 #
 # Needs: python3 >= 3.10; PYTHON=/usr/bin/python3 chooses one, such as the distribution's next to a ROS. System
 # packages are installed only where something is missing, and only as root. Python packages are those of requirements/,
@@ -13,16 +14,22 @@ set -euo pipefail
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 cd "$root"
 venv=$root/.venv
-extras=""
-lock=run  # of requirements/
 dev="[dev,bench,cluster,dds,ros2,aws,skypilot,experiments,pkcs11]"
-case "${1:-}" in
-    --dev) extras=$dev lock=dev ;;
-    --ros2) extras="[ros2]" lock=ros2 ;;
-esac
+# what to install, its list in requirements/, how long that takes; the environments that have all of it
+extras="" lock=run duration="about a minute" enough=("" "[ros2]" "$dev")
+is_quiet=false
 
 say() { printf 'setup: %s\n' "$*" >&2; }
 fail() { say "$@"; exit 1; }
+
+for option in "$@"; do
+    case "$option" in
+        --dev) extras=$dev lock=dev duration="five minutes or more" enough=("$dev") ;;
+        --ros2) [[ $lock == dev ]] || extras="[ros2]" lock=ros2 duration="a few minutes" enough=("[ros2]" "$dev") ;;
+        --quiet) is_quiet=true ;;
+        *) say "unknown option $option; there are --ros2, --dev and --quiet"; exit 2 ;;
+    esac
+done
 
 find_python() {
     local candidate
@@ -75,11 +82,12 @@ compile_own() {
 
 python=$(find_python)
 wanted=$({ cat pyproject.toml requirements/*.lock; "$python" --version; echo "$root"; } | sha256sum | cut -d' ' -f1)
-# An installation for tests is enough to run.
-for stamp in "$venv/.installed$extras" "$venv/.installed[ros2]" "$venv/.installed$dev"; do
+for each in "${enough[@]}"; do
+    stamp=$venv/.installed$each
     if [[ -f "$stamp" && $(<"$stamp") == "$wanted" ]] && "$venv/bin/python" -c '' 2>/dev/null; then
         link_scripts
         compile_own
+        $is_quiet || say "up to date"
         exit 0
     fi
 done
@@ -129,7 +137,8 @@ if ! "$venv/bin/python" -c 'import pip' 2>/dev/null; then
     say "making .venv with $("$python" --version)"
     "$python" -m venv --clear "$venv"
 fi
-say "installing this package and what it needs (once; about a minute)"
+count=$(grep -oE '^[A-Za-z0-9._-]+' "requirements/$lock.lock" | sort -u | wc -l)
+say "installing this package and the $count packages of requirements/$lock.lock (once; $duration)"
 log=$(mktemp)
 trap 'rm -f "$log"' EXIT
 pip() { "$venv/bin/python" -m pip install --disable-pip-version-check --no-input --no-deps "$@" >"$log" 2>&1; }

@@ -10,7 +10,7 @@ set -euo pipefail
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 cd "$root"
-scripts/setup.sh --dev
+scripts/setup.sh --quiet --dev
 scripts/check.sh
 if [[ $(id -u) -ne 0 ]]; then
     # Root of a user namespace would share pytest's folder with the machine's root; pytest refuses that.

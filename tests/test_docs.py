@@ -284,6 +284,13 @@ def test_the_example_of_errors_is_what_is_printed(tmp_path: Path) -> None:
     assert str(caught.value).replace(f"{tmp_path}/", "") == shown[1].text.rstrip()
 
 
+def test_the_readme_has_the_one_command_of_the_tests_and_links_the_rules_for_a_change() -> None:
+    section = README.read_text().partition("\n## Tests\n")[2].partition("\n## ")[0]
+    assert "sudo scripts/test.sh\n" in section
+    assert "(CONTRIBUTING.md)" in section
+    assert "(CHANGELOG.md)" in section
+
+
 def test_the_readme_has_at_most_130_lines() -> None:
     assert len(README.read_text().splitlines()) <= 130
 

@@ -29,6 +29,7 @@ from fog.supervisor.infrastructure import command_of, open_provider, set_up
 from fog.supervisor.journal import Entry, Journal
 from gdp.cli.console import Columns
 from gdp.errors import LocalError
+from gdp.stores.keyring import load_salt
 
 __all__ = ["GatewayKind", "begin", "follow", "launch"]
 
@@ -156,7 +157,7 @@ def begin(site: Site, journal: Journal, plan: ClusterPlan) -> None:
     """Store a cluster's plan in the journal, and ensure that a supervisor runs."""
     set_up(site)
     save_topology(site)
-    journal.put_cluster(plan, time.time())
+    journal.put_cluster(plan.salted(load_salt(site.authority.owner)), time.time())
     ensure(site)
 
 

@@ -16,7 +16,7 @@ from fog.hardware import Hardware
 from fog.offer import Offer
 from gdp.errors import LocalError
 
-__all__ = ["BY_BOTH", "BY_PRICE", "Choice", "Weights", "choose"]
+__all__ = ["BY_BOTH", "Choice", "Weights", "choose"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,6 @@ class Weights:
 
 
 BY_BOTH: Final = Weights()
-BY_PRICE: Final = Weights(usd_per_hour_per_ms=0.0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import typer
 import typer.main
@@ -46,8 +46,10 @@ class ExtendedGroup(TyperGroup):
         if module is None or find_spec("proxy") is None:
             return super().get_command(ctx, cmd_name)  # type: ignore[return-value]
         try:
-            loaded = versioned(importlib.import_module(module).app)
+            loaded: Any = versioned(importlib.import_module(module).app)
         except (ModuleNotFoundError, MissingExtraError):
             # an extra is not installed: the placeholder says so when it runs
             return super().get_command(ctx, cmd_name)  # type: ignore[return-value]
-        return loaded.commands.get(cmd_name, loaded) if isinstance(loaded, TyperGroup) else loaded  # type: ignore[return-value]
+        found = loaded.commands.get(cmd_name, loaded) if isinstance(loaded, TyperGroup) else loaded
+        found.name = cmd_name
+        return cast("typer.core.TyperCommand", found)

@@ -94,6 +94,9 @@ MaxBits = Annotated[
 Wait = Annotated[
     float, typer.Option("--wait", min=0.0, metavar="SECONDS", help="How long to wait for a name without a type.")
 ]
+PlainName = Annotated[
+    bool, typer.Option("--plain-name", help="A 256-bit name without a salt: who has the owner's key can guess it.")
+]
 Remove = Annotated[bool, typer.Option("--remove", help="Remove the rule.")]
 List = Annotated[bool, typer.Option("--list", help="Show what there is, and change nothing.")]
 
@@ -111,6 +114,7 @@ def expose(
     no_repair: NoRepair = False,
     weight: Weight = None,
     max_bits_s: MaxBits = None,
+    plain_name: PlainName = False,
     remove: Remove = False,
     wait: Wait = 3.0,
     directory: MachineDir = None,
@@ -158,7 +162,7 @@ def expose(
                 weight=weight,
                 max_bits_s=max_bits_s,
             )
-            report = sharing.expose(wanted, time.time())
+            report = sharing.expose(wanted, time.time(), is_plain=plain_name)
         until_s = time.monotonic() + wait
         while not (given := _given(folder, kind, name)) and report.is_running and time.monotonic() < until_s:
             time.sleep(_POLL_S)  # the graph of the proxy has no event for this process
@@ -211,6 +215,7 @@ def share(
     type_: Type = "",
     owner: OwnerDir = None,
     days: options.Days = SHARE_DAYS,
+    plain_name: PlainName = False,
     revoke: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option("--revoke", metavar="NODE", help="Take back what NODE got."),
@@ -254,7 +259,15 @@ def share(
         if (publish and known != "topic") or (serve and known == "topic"):
             raise LocalError("share: --publish is for a topic, --serve for --kind service or action")
         report = sharing.share(
-            folder, name, nodes, time.time(), kind=known, type_name=type_, is_giving=publish or serve, days=days
+            folder,
+            name,
+            nodes,
+            time.time(),
+            kind=known,
+            type_name=type_,
+            is_giving=publish or serve,
+            is_plain=plain_name,
+            days=days,
         )
         _show_change(name, report, as_json=as_json)
 
@@ -276,7 +289,7 @@ def _owner_of(directory: Path, owner: Path | None) -> Iterator[Path]:
     if owner is not None or (folder / OWNER_KEY).exists():
         yield folder
         return
-    make_owner(folder)
+    make_owner(folder, is_salted=True)
     try:
         yield folder
     except GdpError:

@@ -99,7 +99,7 @@ def make_token(
 
 def _fill(draft: Path, plan: DomainPlan, unix_s: float) -> None:
     make_domain(draft / "domain", plan.name, unix_s=unix_s)
-    make_owner(draft / "owner")
+    make_owner(draft / "owner", is_salted=True)
     identities = list[Identity]()
     for folder, role in _NODES:
         identities.append(

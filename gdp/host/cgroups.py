@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import LocalError
+from gdp.host.mounts import roots
 
 __all__ = ["Cgroup"]
 
-_MOUNTS: Final = Path("/proc/self/mounts")
 _OLD_CONTROLLERS: Final = frozenset({"cpu", "memory"})
 _PERIOD_US: Final = 20_000  # a fifth of the kernel's default, so that a slow machine runs evenly
 _LEAST_US: Final = 1_000  # the kernel accepts no quota below this
@@ -159,11 +159,17 @@ def _pids(folder: Path) -> Iterator[int]:
 
 def _roots() -> tuple[Path | None, dict[str, Path]]:
     """Return the root of version 2, and the roots of version 1 by controller."""
-    new, old = None, {}
-    for line in _MOUNTS.read_text(encoding="utf-8", errors="replace").splitlines():
-        _, place, kind, options, *_ = line.split()
-        if kind == "cgroup2":
-            new = new or Path(place)
-        elif kind == "cgroup":
-            old.update({name: Path(place) for name in _OLD_CONTROLLERS.intersection(options.split(","))})
+    new, old = None, dict[str, Path]()
+    for root in roots():  # ``ip netns exec`` mounts a /sys without control groups
+        process = Path("/proc/self") if root == Path("/") else root.parent
+        with suppress(OSError):  # the process has ended
+            for line in (process / "mounts").read_text(encoding="utf-8", errors="replace").splitlines():
+                _, place, kind, options, *_ = line.split()
+                folder = root / place.removeprefix("/")
+                if kind == "cgroup2":
+                    new = new or folder
+                elif kind == "cgroup":
+                    old.update(dict.fromkeys(_OLD_CONTROLLERS.intersection(options.split(",")), folder))
+        if new is not None or old:
+            break
     return new, old

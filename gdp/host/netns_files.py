@@ -4,6 +4,9 @@ I/O; needs CAP_SYS_ADMIN in the user namespace of the process. If the kernel ref
 Source: network_namespaces(7), setns(2). A namespace is bound to a file, as in ip-netns(8). For root of the machine the
 file lies in ``/run/netns``, so that ``ip netns`` finds it. Inside a user namespace that folder may be missing or
 closed. Then the file lies in the run's own directory, and ``nsenter --net=FILE`` enters it.
+
+The binding exists in the mount namespace of its maker alone, and each ``ip netns exec`` makes a mount namespace of its
+own. So ``reach`` looks for the file in those of other processes, too.
 """
 
 from __future__ import annotations
@@ -17,14 +20,15 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 from gdp.errors import LocalError
-from gdp.host.mounts import unmount
+from gdp.host.mounts import roots, unmount
 from gdp.host.processes import Process
 from gdp.ports.sockets import AS_ROOT
 
-__all__ = ["IP_NETNS_DIRECTORY", "create", "disable_ipv6", "inside", "processes_inside", "release"]
+__all__ = ["IP_NETNS_DIRECTORY", "create", "disable_ipv6", "inside", "processes_inside", "reach", "release"]
 
 IP_NETNS_DIRECTORY: Final = Path("/run/netns")
 _NO_IPV6: Final = ("all", "default")
+_OWN: Final = Path("/proc/self/ns/net")
 _IPV6_SETTINGS: Final = Path("/proc/sys/net/ipv6/conf")
 
 T = TypeVar("T")
@@ -42,6 +46,21 @@ def create(path: Path) -> None:
         raise LocalError(f"network namespace {path.name} cannot be made: {why}") from error
 
 
+def reach(path: Path) -> Path | None:
+    """Return the path by which this process reaches the namespace of a file, whichever mount namespace binds it.
+
+    Returns:
+        None: the namespace is gone, or no process that this user may inspect has it bound.
+    """
+    device = _OWN.stat().st_dev
+    for root in roots():
+        with suppress(OSError):  # the process has ended, or its root has no such file
+            found = root / path.relative_to("/")
+            if found.stat().st_dev == device:
+                return found
+    return None
+
+
 def inside(path: Path, work: Callable[[], T]) -> T:
     """Do ``work`` in a thread that has entered the namespace, and return its result; the caller's thread stays outside.
 
@@ -56,7 +75,7 @@ def inside(path: Path, work: Callable[[], T]) -> T:
     def visit() -> None:
         """Enter the namespace and do the work."""
         try:
-            descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+            descriptor = os.open(reach(path) or path, os.O_RDONLY | os.O_CLOEXEC)
             try:
                 netns.setns(descriptor)
             finally:
@@ -75,7 +94,8 @@ def inside(path: Path, work: Callable[[], T]) -> T:
 
 def processes_inside(paths: Collection[Path]) -> list[Process]:
     """Return the processes in these namespaces that this user may inspect; files without a namespace are skipped."""
-    held = {where for path in paths if (where := _identity(path)) is not None}
+    reached = filter(None, map(reach, paths))
+    held = {where for path in reached if (where := _identity(path)) is not None}
     found = []
     for folder in Path("/proc").iterdir() if held else ():
         if folder.name.isdecimal() and _identity(folder / "ns" / "net") in held:

@@ -28,9 +28,10 @@ GIVING: Final = {"topic": Right.PUBLISH, "service": Right.SERVE, "action": Right
 TAKING: Final = {"topic": Right.READ, "service": Right.CALL, "action": Right.CALL}
 
 
-def described(kind: str, name: str, type_name: str) -> Metadata:
+def described(kind: str, name: str, type_name: str, salt: str = "") -> Metadata:
     """Return what the 256-bit name of a shared name digests, in addition to the owner's key."""
-    return Metadata({"kind": kind, "name": name, "type": type_name})
+    own = {"kind": kind, "name": name, "type": type_name}
+    return Metadata({**own, "salt": salt} if salt else own)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -87,12 +88,13 @@ class Grants:
             names = dict[bytes, Metadata]()
             for each in rules:
                 if each.type_name and "*" not in each.name:
-                    metadata = described(each.kind, each.name, each.type_name)
+                    metadata = described(each.kind, each.name, each.type_name, each.salt)
                     names[metadata.digest()] = metadata
             for lacking in found:
-                metadata = described(lacking.kind, lacking.shared, lacking.type_name)
-                if lacking.side == "expose" and metadata.name(key) == lacking.name:
-                    names[metadata.digest()] = metadata
+                for salt in {each.salt for each in rules}:
+                    metadata = described(lacking.kind, lacking.shared, lacking.type_name, salt)
+                    if lacking.side == "expose" and metadata.name(key) == lacking.name:
+                        names[metadata.digest()] = metadata
             for issued in store:
                 if issued.is_own and not issued.is_revoked:
                     names[issued.metadata.digest()] = issued.metadata
@@ -205,4 +207,5 @@ class Grants:
 
 def _covers(rule: ExposedName, metadata: Metadata) -> bool:
     kind, name, type_name = (str(metadata[key]) for key in ("kind", "name", "type"))
-    return rule.kind == kind and fits(rule.name, name) and rule.type_name in ("", type_name)
+    is_same = rule.kind == kind and rule.type_name in ("", type_name) and rule.salt == metadata.get("salt", "")
+    return is_same and fits(rule.name, name)

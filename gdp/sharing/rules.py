@@ -108,12 +108,18 @@ def render(folder: StateFolder, files: ProxyFiles, state: ShareState, used: Iter
     lines: dict[Side, list[str]] = {"expose": [], "import": []}
     for each in state.exposed:
         owner = PublicKey.from_compressed(bytes.fromhex(each.owner_key))
-        lines["expose"].append(_line(folder, files, each.kind, each.name, each.type_name, owner, each.rule_options))
+        more = {**each.rule_options, **_metadata(each.more_metadata)}
+        lines["expose"].append(_line(folder, files, each.kind, each.name, each.type_name, owner, more))
     for side, offer in used:
         if files.find(side, offer.kind, offer.ros_name) is None:
-            lines[side].append(_line(folder, files, offer.kind, offer.ros_name, offer.type_name, offer.owner, {}))
+            more = _metadata(offer.more_metadata)
+            lines[side].append(_line(folder, files, offer.kind, offer.ros_name, offer.type_name, offer.owner, more))
     sides = [f"{side}:\n{''.join(rules)}" for side, rules in lines.items() if rules]
     return _HEAD + "".join(sides) if sides else None
+
+
+def _metadata(items: dict[str, str | int]) -> dict[str, object]:
+    return {"metadata": items} if items else {}
 
 
 def _line(

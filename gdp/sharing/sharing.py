@@ -19,11 +19,11 @@ from gdp.nodes.drop_in import locked, read_drop_in
 from gdp.sharing.exchange import Exchange, Mail, MailKind, load_groups, resolve_recipients
 from gdp.sharing.grants import GIVING, TAKING, Grants, described
 from gdp.sharing.issued import IssuedDelegation, IssuedStore
-from gdp.sharing.proxy_files import ProxyFiles, Side, fits
+from gdp.sharing.proxy_files import ProxyFiles, Side, StatedRule, fits
 from gdp.sharing.report import ShareReport
 from gdp.sharing.rules import check_accepted, check_exposed, check_name, kind_from_text, render, usable
 from gdp.sharing.state import AcceptedName, ExposedName, Offer, ShareState, StateFolder, links_of
-from gdp.stores.keyring import CARD, load_card, load_delegation, load_root, save_delegation
+from gdp.stores.keyring import CARD, load_card, load_delegation, load_root, load_salt, save_delegation
 from gdp.trust.adcert import AdCertCache, Chain
 from gdp.trust.delegation import Delegation
 from gdp.trust.node_descriptor import NodeDescriptor
@@ -32,6 +32,7 @@ from gdp.trust.revocation import Revocation
 __all__ = ["GROUPS", "RevocationsSink", "Sharing"]
 
 GROUPS: Final = "groups.yaml"
+SALT: Final = "salt"  # its key in the metadata
 
 RevocationsSink: TypeAlias = "Callable[[Sequence[bytes]], bool]"
 
@@ -62,10 +63,13 @@ class Sharing:
         self._owners = [owner.absolute() for owner in owners]
         self._folder = StateFolder(self._path)
 
-    def expose(self, wanted: ExposedName, unix_s: float) -> ShareReport:
+    def expose(self, wanted: ExposedName, unix_s: float, *, is_plain: bool = False) -> ShareReport:
         """Expose a name to nodes or groups; the live proxy carries it at once.
 
         A name without a type, and a pattern, are delegated as the proxy finds them in its graph: by ``work``.
+
+        Args:
+            is_plain: the 256-bit name has no salt, also where the owner has one.
 
         Raises:
             ConfigError: ``proxy.yaml`` or ``groups.yaml`` is not as expected.
@@ -74,6 +78,8 @@ class Sharing:
         wanted = wanted.model_copy(update={"owner": wanted.owner.absolute()})
         with self._change(unix_s) as at:
             check_exposed(at.files, at.state, at.offers, wanted)
+            salt = self._salt(IssuedStore(wanted.owner), wanted.kind, wanted.name, is_plain=is_plain)
+            wanted = wanted.model_copy(update={"salt": salt})
             grants = at.grants
             added = resolve_recipients(wanted.to, at.grants.nodes(), grants.groups)
             kept = [each for each in at.state.exposed if (each.kind, each.name) != (wanted.kind, wanted.name)]
@@ -136,12 +142,14 @@ class Sharing:
         kind: str = "topic",
         type_name: str = "",
         is_giving: bool = False,
+        is_plain: bool = False,
         days: float,
     ) -> ShareReport:
         """Delegate a name of this owner to nodes or groups; a pattern means the names that are exposed here.
 
         Args:
             is_giving: the right to publish or serve; else to read or call.
+            is_plain: as for ``expose``.
 
         Raises:
             LocalError: no such node, or the type of the name is not known.
@@ -152,7 +160,7 @@ class Sharing:
             nodes = resolve_recipients(recipients, at.grants.nodes(), at.grants.groups)
             store = IssuedStore(owner.absolute())
             right = (GIVING if is_giving else TAKING)[kind]
-            for metadata in self._known(at, store, kind, name, type_name):
+            for metadata in self._known(at, store, kind, name, type_name, is_plain=is_plain):
                 for label, node in nodes.items():
                     at.grants.issue(store, label, node, metadata, [right], days=days)
             self._reload_changed(at)
@@ -277,21 +285,41 @@ class Sharing:
             at.report.is_running = at.files.reload()
             at.grants.is_changed = False
 
-    def _known(self, at: _Pass, store: IssuedStore, kind: str, name: str, type_name: str) -> list[Metadata]:
+    @staticmethod
+    def _salt(store: IssuedStore, kind: str, name: str, *, is_plain: bool) -> str:
+        """Return the salt of a name, or of a pattern of names; a name that was delegated before keeps its own.
+
+        Raises:
+            LocalError: it is to be plain, and has a salt already.
+        """
+        issued = (each.metadata for each in store)
+        before = next((each for each in issued if each["kind"] == kind and fits(name, str(each["name"]))), None)
+        if before is None:
+            return "" if is_plain else load_salt(store.owner)
+        salt = str(before.get(SALT, ""))
+        if is_plain and salt:
+            raise LocalError(f"{name} has a salt already, and a name never changes; leave --plain-name out")
+        return salt
+
+    def _known(
+        self, at: _Pass, store: IssuedStore, kind: str, name: str, type_name: str, *, is_plain: bool
+    ) -> list[Metadata]:
         """Return the names of this owner that a name or pattern means. Raises ``LocalError``: none is known."""
         found = list[Metadata]()
+        covering = (each for each in at.files.rules if (each.side, each.kind) == ("expose", kind))
         if type_name and "*" not in name:
-            found.append(described(kind, name, type_name))
+            exposed = next((each for each in at.state.exposed if each.kind == kind and fits(each.name, name)), None)
+            rule = next((each for each in covering if fits(each.name, name)), None)
+            if exposed is None and rule is not None:
+                found.append(_stated(rule, name, type_name))
+            else:
+                salt = exposed.salt if exposed else self._salt(store, kind, name, is_plain=is_plain)
+                found.append(described(kind, name, type_name, salt))
         else:
             for issued in store:
                 if issued.is_own and issued.metadata["kind"] == kind and fits(name, _ros_name(issued)):
                     found.append(issued.metadata)
-            for rule in at.files.rules:
-                if (rule.side, rule.kind) == ("expose", kind) and rule.type_name and fits(name, rule.name):
-                    if rule.is_salted:
-                        raise LocalError(f"{rule.where}: the name has a salt: gdp delegate name gives it to a node")
-                    own = {"kind": kind, "name": rule.name, "type": rule.type_name}
-                    found.append(Metadata({**rule.metadata, **own}))
+            found += [_stated(each, each.name, each.type_name) for each in covering if _means(name, each)]
         if not found:
             hint = "no rule of this machine matches it" if "*" in name else "its type is not known here: state --type"
             raise LocalError(f"{name}: {hint}")
@@ -338,6 +366,17 @@ class Sharing:
             self._exchange.send(issued.descriptor.name, MailKind.REVOCATION.value, wire)
         except GdpError as error:
             at.report.problems.append(f"{issued.label} is not informed: {error}")
+
+
+def _means(name: str, rule: StatedRule) -> bool:
+    return bool(rule.type_name) and fits(name, rule.name)
+
+
+def _stated(rule: StatedRule, name: str, type_name: str) -> Metadata:
+    """Return the name that a rule of a file gives to a ROS name. Raises ``LocalError``: a file holds its salt."""
+    if rule.is_salted:
+        raise LocalError(f"{rule.where}: the name has a salt: gdp delegate name gives it to a node")
+    return Metadata({**rule.metadata, "kind": rule.kind, "name": name, "type": type_name})
 
 
 def _ros_name(issued: IssuedDelegation) -> str:

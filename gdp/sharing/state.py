@@ -48,6 +48,7 @@ class ExposedName(Section):
         owner: directory of the owner.
         owner_key: the owner's public key, hex.
         days: life of each delegation.
+        salt: the unguessable part of its 256-bit name; empty: none.
         encoding, deadline_ms, repair, weight, max_bits_s: keys of the rule; None: the rule's default.
     """
 
@@ -58,6 +59,7 @@ class ExposedName(Section):
     owner: Path
     owner_key: str
     days: float
+    salt: str = ""
     encoding: str | None = None
     deadline_ms: float | None = None
     repair: Literal["never", "in-time"] | None = None
@@ -69,6 +71,11 @@ class ExposedName(Section):
         """Return the keys of the rule that are set."""
         keys = ("encoding", "deadline_ms", "repair", "weight", "max_bits_s")
         return {key: value for key in keys if (value := getattr(self, key)) is not None}
+
+    @property
+    def more_metadata(self) -> dict[str, str | int]:
+        """Return what its 256-bit name digests in addition to kind, name and type."""
+        return {"salt": self.salt} if self.salt else {}
 
 
 class AcceptedName(Section):
@@ -122,6 +129,11 @@ class Offer:
     def type_name(self) -> str:
         """Return the type."""
         return str(self._meaning["type"])
+
+    @property
+    def more_metadata(self) -> dict[str, str | int]:
+        """Return what its 256-bit name digests in addition to kind, name and type."""
+        return {key: value for key, value in self._meaning.items() if key not in ("kind", "name", "type")}
 
     @property
     def sides(self) -> tuple[Side, ...]:

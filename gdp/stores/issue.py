@@ -22,11 +22,12 @@ from gdp.errors import LocalError
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.stores.audit_log import note_once
-from gdp.stores.files import read_public, refuse_existing
+from gdp.stores.files import private, read_public, refuse_existing, write_all
 from gdp.stores.keyring import (
     DELEGATIONS,
     NODE_CERTIFICATE,
     OWNER_KEY,
+    OWNER_SALT,
     ROOT_CERTIFICATE,
     SUCCESSION,
     load_card,
@@ -35,6 +36,7 @@ from gdp.stores.keyring import (
     load_node_keys,
     load_owner,
     load_root,
+    load_salt,
     parsed,
     save_delegation,
     save_domain,
@@ -75,6 +77,7 @@ DAY_S: Final = 86_400
 ROOT_DAYS: Final = 3_650.0
 MEMBER_DAYS: Final = 365.0
 DELEGATION_DAYS: Final = 365.0
+_SALT_BYTES: Final = 16
 
 
 def make_domain(
@@ -103,15 +106,25 @@ def make_domain(
 
 
 def make_owner(
-    directory: Path, *, key: SigningKey | None = None, passphrase: bytes | None = None, force: bool = False
+    directory: Path,
+    *,
+    key: SigningKey | None = None,
+    passphrase: bytes | None = None,
+    force: bool = False,
+    is_salted: bool = False,
 ) -> Owner:
     """Make an owner's keys and keep them in ``directory``; ``key`` and ``passphrase`` as for ``make_domain``.
+
+    Args:
+        is_salted: the names that it shares get an unguessable part.
 
     Raises:
         LocalError: an owner exists there already.
     """
     owner = Owner(key or SigningKey.generate(), secrets.token_bytes(SECRET_BYTES))
     save_owner(directory, owner, passphrase=passphrase, force=force)
+    if is_salted:
+        write_all(directory, {OWNER_SALT: private(secrets.token_urlsafe(_SALT_BYTES).encode())}, force=force)
     return owner
 
 
@@ -142,6 +155,8 @@ def succeed_owner(
         save_owner(
             successor, Owner(key or SigningKey.generate(), present.master, present.public), passphrase=passphrase
         )
+        if salt := load_salt(owner):
+            write_all(successor, {OWNER_SALT: private(salt.encode())})
     heir = load_owner(successor)
     if heir.public != present.public or heir.key.public == present.key.public:
         raise LocalError(f"{successor}: not a successor of {owner}")

@@ -44,6 +44,7 @@ __all__ = [
     "NODE_CERTIFICATE",
     "OWNER_KEY",
     "OWNER_PUBLIC",
+    "OWNER_SALT",
     "REQUEST",
     "ROOT_CERTIFICATE",
     "ROOT_KEY",
@@ -57,6 +58,7 @@ __all__ = [
     "load_owner",
     "load_public_key",
     "load_root",
+    "load_salt",
     "parsed",
     "save_delegation",
     "save_domain",
@@ -73,6 +75,7 @@ ROOT_CERTIFICATE: Final = "root.crt"
 OWNER_KEY: Final = "owner.key"
 OWNER_PUBLIC: Final = "owner.pub"
 OWNER_MASTER: Final = "master.key"
+OWNER_SALT: Final = "name.salt"  # unguessable part of the names that this owner shares
 NODE_KEY: Final = "node.key"
 NODE_KEM: Final = "kem.key"
 NODE_METADATA: Final = "node.json"
@@ -152,6 +155,16 @@ def load_owner(directory: Path) -> Owner:
         return parsed(path, lambda master: Owner(key, master), read_secret(path))
     links = {each.name: each.chain for each in load_delegations(directory / SUCCESSION)}
     return parsed(path, lambda master: Owner(key, master, founder, links), read_secret(path))
+
+
+def load_salt(directory: Path) -> str:
+    """Return the unguessable part of the names that an owner shares; empty: they have none.
+
+    Raises:
+        LocalError: the file is not private, or is not text.
+    """
+    path = directory / OWNER_SALT
+    return parsed(path, lambda wire: wire.decode().strip(), read_private(path)) if path.exists() else ""
 
 
 def save_node_keys(

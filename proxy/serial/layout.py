@@ -12,7 +12,7 @@ from typing import Final
 from proxy.serial.dialect import BITS
 from proxy.serial.schema import SIZES, Array, Number, Record, Type
 
-__all__ = ["RUN_MAX", "Phases", "Wire", "inline_codes", "structs_for"]
+__all__ = ["RUN_MAX", "Phases", "Wire", "inline_codes"]
 
 _AS_BITS: Final = str.maketrans(BITS)
 # numbers of one record that are unpacked in runs; further arrays and records are unpacked one by one
@@ -55,11 +55,6 @@ class Wire:
         """Return the structs of a run, one for each start offset modulo 8."""
         letters = codes.translate(_AS_BITS) if as_bits else codes
         return Phases(letters, self.order, cdr=self.cdr)
-
-
-def structs_for(wire: Wire, code: str) -> struct.Struct:
-    """Return the struct of one number without padding."""
-    return struct.Struct(wire.order + code)
 
 
 def _padded(letters: str, phase: int) -> str:

@@ -14,12 +14,12 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 from proxy.serial.channel import Channel, RosVersion
-from proxy.serial.converter import MessageConverter, translated_channel
+from proxy.serial.converter import translated_channel
 from proxy.serial.schema import msg_name
 from proxy.serial.service import Service
 from proxy.serial.type_translation import md5_text, retyped, rihs01, types_of
 
-__all__ = ["ServiceConverter", "translated_service"]
+__all__ = ["translated_service"]
 
 _EVENT_INFO: Final = "service_msgs/msg/ServiceEventInfo"
 
@@ -37,16 +37,6 @@ def translated_service(service: Service, ros: RosVersion) -> Service:
     )
     digest = _md5(converter) if ros == 1 else _rihs01(converter)
     return Service(converter.name, converter.type_name, digest, converter.request, converter.response)
-
-
-class ServiceConverter:
-    """Converter between a client's description ``source`` and a server's description ``target`` of a service."""
-
-    __slots__ = ("request", "response")
-
-    def __init__(self, source: Service, target: Service) -> None:
-        self.request = MessageConverter(source.request, target.request)
-        self.response = MessageConverter(target.response, source.response)
 
 
 def _md5(service: Service) -> str:

@@ -64,7 +64,6 @@ SIZE: Final = 10_000
 CASE: Final = "10 kB, five machines"
 _READY_S: Final = 30.0
 _FRAMES_S: Final = 6.0
-_SCRAPE_S: Final = 5.0
 
 FRAMES: Final = """
 const done = arguments[arguments.length - 1];

@@ -21,6 +21,7 @@ from internet_demo.traffic import Traffic
 __all__ = ["Display"]
 
 _PLAIN_EVERY_S: Final = 2.5
+_WAYS: Final = (("direct", True), ("border", False))
 
 
 class Display:
@@ -53,16 +54,19 @@ class Display:
             self._live.update(_page(machines, links, counts), refresh=True)
         elif time.monotonic() - self._reported_s >= _PLAIN_EVERY_S:
             self._reported_s = time.monotonic()
-            ways = ", ".join(
-                f"{each.peer} {'direct' if each.is_direct else 'border'}" for each in links.get("robot", ())
-            )
-            self._console.print(Text(f"         {counts}   robot's tunnels: {ways}"), soft_wrap=True)
+            self._console.print(Text(f"         {counts}; {_ways(links.get('robot', ()))}"), soft_wrap=True)
 
 
 def _counts(traffic: Traffic) -> str:
     got = ", ".join(f"{each.label} {len(each.counts)}" for each in traffic.readers.values())
     calls = traffic.calls
-    return f"{traffic.camera.sent} images ({got}), {calls.answered} of {calls.begun} calls answered"
+    return f"{traffic.camera.sent} images ({got}), {calls.answered} of {calls.begun} calls"
+
+
+def _ways(tunnels: Sequence[Link]) -> str:
+    """Return which peers are joined directly and which are borders, each once."""
+    peers = {way: sorted({each.peer for each in tunnels if each.is_direct is is_direct}) for way, is_direct in _WAYS}
+    return "; ".join(f"{way} {', '.join(found)}" for way, found in peers.items() if found) or "no tunnel"
 
 
 def _page(machines: Iterable[Machine], links: Mapping[str, Sequence[Link]], counts: str) -> RenderableType:

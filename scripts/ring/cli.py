@@ -43,7 +43,7 @@ LIVES: Final[tuple[Live, ...]] = get_args(Live)
 _PASSED: Final = 0
 _FAILED: Final = 1
 _WRONG_INPUT: Final = 2
-_WIDE: Final = 200  # columns where the terminal's width is unknown
+_COLUMNS, _WIDE_COLUMNS = 100, 200  # where the terminal's width is unknown
 
 _EXAMPLES: Final = """\b
 Examples:
@@ -103,6 +103,7 @@ def ring(
     cores: Annotated[
         bool, typer.Option("--cores", help="Two cores' worth for the robot, four for each edge server, by cgroups.")
     ] = False,
+    wide: Annotated[bool, typer.Option("--wide", help="All columns of the table, 200 characters.")] = False,
     keep: Annotated[bool, typer.Option("--keep", help="Leave the ring up, and say what to try.")] = False,
     down: Annotated[bool, typer.Option("--down", help="Take down every ring that was kept, and end.")] = False,
 ) -> None:
@@ -135,6 +136,7 @@ def ring(
             lease_s=lease,
             keep=keep,
             cores=cores,
+            wide=wide,
             live=None if live is None else _one_of("live", live, LIVES),
             seconds=seconds,
             camera_hz=camera_hz,
@@ -198,7 +200,7 @@ async def _go(options: Options, run: Run, errors: Console) -> int:
             result = await standing.result()
         finally:
             standing.overlay.children.forget()
-    _show(result)
+    _show(result, is_wide=options.wide)
     _write(options, result, standing.recording)
     if options.keep:
         _hint(run, hints(standing, standing.start_again()), errors)
@@ -213,7 +215,7 @@ async def _go_live(options: Options, live: Live, run: Run, errors: Console) -> i
             result = await standing.result()
         finally:
             standing.overlay.children.forget()
-    _show(result)
+    _show(result, is_wide=options.wide)
     _write(options, result)
     if options.keep:
         standing.go_on()
@@ -228,11 +230,11 @@ def _hint(run: Run, hinted: Sequence[tuple[str, str]], errors: Console) -> None:
         errors.print(f"  [dim]# {escape(purpose)}[/dim]\n  {escape(command)}", highlight=False, soft_wrap=True)
 
 
-def _show(result: Result) -> None:
+def _show(result: Result, *, is_wide: bool) -> None:
     output = Console()
     if not output.is_terminal:
-        output = Console(width=_WIDE)
-    output.print(table(result))
+        output = Console(width=_WIDE_COLUMNS if is_wide else _COLUMNS)
+    output.print(table(result, is_wide=is_wide))
     output.print(summary(result), highlight=False, soft_wrap=True)
 
 

@@ -36,6 +36,7 @@ class Options:
         rate: 1 is the recorded pace, 0 as fast as possible.
         out: directory, created if necessary, for the received recording; None: it is deleted with the run.
         cores: bound and weight the processor time of each machine.
+        wide: print all columns of the table.
         live: real nodes instead of a recording; their ROS version. ``mixed``: ROS 1 at the robot, ROS 2 at the server.
         seconds: of traffic; a recording is replayed slower or faster to last this long, a generated one is created with
             this length. None: ``LIVE_S`` live, else the recording's own time.
@@ -59,6 +60,7 @@ class Options:
     kills: tuple[Kill, ...] = ()
     keep: bool = False
     cores: bool = False
+    wide: bool = False
     live: Live | None = None
     seconds: float | None = None
     camera_hz: float = CAMERA_HZ

@@ -5,6 +5,8 @@ I/O layer; it builds rich renderables, and prints nothing.
 
 from __future__ import annotations
 
+from typing import Final
+
 from rich.markup import escape
 from rich.table import Table
 
@@ -12,11 +14,17 @@ from ring.result import Journey, Result, TopicResult
 
 __all__ = ["hops_in_words", "summary", "table"]
 
-_EDGE_SWITCHES = 2
+_EDGE_SWITCHES: Final = 2
+_TEXTS: Final = ("topic", "type", "identical", "hops")
+_WIDE: Final = ("bytes", "delivered", "duplicated", "p99 ms", "max ms", "silent ms", "parts")
+_COLUMNS: Final = (
+    *("topic", "type", "messages", "bytes", "delivered", "lost", "duplicated", "identical"),
+    *("median ms", "p99 ms", "max ms", "silent ms", "parts", "hops"),
+)
 
 
-def table(result: Result) -> Table:
-    """Return one row per topic."""
+def table(result: Result, *, is_wide: bool = False) -> Table:
+    """Return one row per topic: the columns that fit 100 characters, or with ``is_wide`` all."""
     of = result.settings
     title = f"{of['encoding']}, {of['data_plane']}, MTU {of['mtu']}"
     if "live" in of:
@@ -25,17 +33,16 @@ def table(result: Result) -> Table:
         faults = of.get(what)
         if isinstance(faults, list) and faults:
             title += f", {what.removesuffix('s')} " + ", ".join(f"{fault} s" for fault in faults)
-    drawn = Table(title=title, title_justify="left", title_style="bold")
-    for heading in ("topic", "type"):
-        drawn.add_column(heading, overflow="fold")
-    for heading in ("messages", "bytes", "delivered", "lost", "duplicated"):
-        drawn.add_column(heading, justify="right", no_wrap=True)
-    drawn.add_column("identical", no_wrap=True)
-    for heading in ("median ms", "p99 ms", "max ms", "silent ms", "parts"):
-        drawn.add_column(heading, justify="right", no_wrap=True)
-    drawn.add_column("hops")
+    drawn = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
+    columns = [each for each in _COLUMNS if is_wide or each not in _WIDE]
+    for heading in columns:
+        if heading in _TEXTS:
+            drawn.add_column(heading, overflow="fold")
+        else:
+            drawn.add_column(heading, justify="right", no_wrap=True)
     for row in result.topics:
-        drawn.add_row(*_cells(row), style="red" if row.faults else None)
+        cells = dict(zip(_COLUMNS, _cells(row), strict=True))
+        drawn.add_row(*(cells[each] for each in columns), style="red" if row.faults else None)
     return drawn
 
 

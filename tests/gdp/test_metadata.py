@@ -44,6 +44,8 @@ def test_every_kind_is_accepted(kind: str) -> None:
     [
         {},
         {"kind": "planet"},
+        {"kind": "capsule"},
+        {"kind": "replica"},
         {"kind": "topic", "": "x"},
         {"kind": "topic", 1: "x"},
         {"kind": "topic", "x": 1.5},

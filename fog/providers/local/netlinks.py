@@ -129,7 +129,7 @@ def delete(space: Path | None, device: str) -> None:
             for index in links.link_lookup(ifname=device):
                 links.link("del", index=index)
 
-    if space is None or space.exists():
+    if space is None or netns_files.reach(space) is not None:
         _ask(space, work)
 
 
@@ -155,7 +155,7 @@ def _ask(space: Path | None, work: Callable[[IPRoute], T]) -> T:
 @contextmanager
 def _opened(space: Path) -> Iterator[int]:
     try:
-        descriptor = os.open(space, os.O_RDONLY | os.O_CLOEXEC)
+        descriptor = os.open(netns_files.reach(space) or space, os.O_RDONLY | os.O_CLOEXEC)
     except OSError as error:
         raise LocalError(f"namespace {space.name}: {error.strerror}") from error
     try:

@@ -33,6 +33,7 @@ from fog.providers.local.network import GatewayBoot, Network
 from fog.providers.local.spawn import spawn_detached
 from fog.topology import AUTOMATIC, Gateway
 from gdp.errors import LocalError, StoreError
+from gdp.host.netns_files import reach
 from gdp.host.processes import end_all
 from gdp.host.run_registry import Run, RunRegistry
 
@@ -207,7 +208,7 @@ class LocalProvider:
         """Return the command line of a shell inside a machine."""
         found = find(self.runs, machine)
         inside = ["env", f"--chdir={found.home}", f"FOG_MACHINE={found.file.spec.name}", "bash"]
-        return ["nsenter", f"--net={found.netns_path}", "--", *inside]
+        return ["nsenter", f"--net={reach(found.netns_path) or found.netns_path}", "--", *inside]
 
     def close(self) -> None:
         """Do nothing; the provider holds no resources."""

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import LocalError
+from gdp.host.netns_files import reach
 from gdp.host.run_registry import Run
 
 __all__ = ["spawn_detached"]
@@ -74,7 +75,7 @@ def _start(space: Path, module: Sequence[str], log: Path, hears: int, answers: i
     try:
         with log.open("ab") as said:
             return subprocess.Popen(
-                ["nsenter", f"--net={space}", "--", sys.executable, "-m", *module],
+                ["nsenter", f"--net={reach(space) or space}", "--", sys.executable, "-m", *module],
                 stdin=hears,
                 stdout=said if answers is None else answers,
                 stderr=said,

@@ -4,8 +4,7 @@ Process of its own, started by ``gdp_net.py``; or a client and a server without 
 responses. Each message is encoded, encrypted, signed, verified, ordered,
 acknowledged and decoded. That is all that a proxy does except for ROS.
 
-Each encoding has a topic of its own, ``/ping/json`` for one; answers come back on ``/pong``. ``bench/library.py`` runs
-the same with the internal path in place of the library, to measure what that costs.
+Each encoding has a topic of its own, ``/ping/json`` for one; answers come back on ``/pong``.
 """
 
 from __future__ import annotations
@@ -263,8 +262,6 @@ def endpoint_of(path: str, config: Path, spin_s: float) -> Endpoint:
     """Return an endpoint of a kind, as ``GdpNet`` names it."""
     if path == "library":
         return LibraryEndpoint(config, spin_s)
-    if path == "internal":
-        return InternalEndpoint(config, spin_s)
     return UnicastEndpoint(config, spin_s, is_session=path == "session")
 
 

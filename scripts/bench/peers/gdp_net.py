@@ -30,8 +30,8 @@ class GdpNet:
         plane: as ``gdp-switch --data-plane``.
         encodings: measured one after the other, by the same processes.
         spin_s: seconds for which endpoints poll for frames before they sleep.
-        path: kind of endpoint: ``library`` or ``internal``; ``unicast`` or ``session``: a request and its response,
-            signed or under a session secret.
+        path: kind of endpoint: ``library``; ``unicast`` or ``session``: a request and its response, signed or under a
+            session secret.
     """
 
     def __init__(self, plane: str, encodings: tuple[str, ...], spin_s: float, path: str = "library") -> None:

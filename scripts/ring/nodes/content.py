@@ -26,7 +26,6 @@ __all__ = [
     "Talk",
     "digest",
     "lamp_says",
-    "talk_of",
 ]
 
 Fit: TypeAlias = Callable[["array[int]"], object]  # converts an array to the form of a ROS version
@@ -81,11 +80,6 @@ def digest(message: object) -> str:
 def lamp_says(number: int, *, on: bool) -> str:
     """Return the lamp's reply to its ``number``-th switching."""
     return f"{'on' if on else 'off'}, switched {number} times"
-
-
-def talk_of(topic: str) -> Talk:
-    """Return the talk of a topic."""
-    return next(talk for talk in TALKS if talk.topic == topic)
 
 
 def _say(message: object, number: int, now_ns: int, fit: Fit) -> None:

@@ -13,13 +13,15 @@ from types import SimpleNamespace
 import pytest
 from typer.testing import CliRunner, Result
 
-from fog.cli import logs, options, status
+from fog.cli import launch, logs, options, status
 from fog.cli.app import app
 from fog.cli.views import stage
 from fog.cluster import ClusterPlan
+from fog.enrolment.members import metadata_of
 from fog.site import open_site
 from fog.supervisor.journal import FINAL_LOGS, Journal
 from fog.supervisor.record import Outcome
+from gdp.stores.keyring import OWNER_SALT, load_salt
 from tests.fog.supervisor.machines import record, serving
 from tests.fog.supervisor.test_journal import PLAN
 from tests.pages import ROOT
@@ -211,6 +213,27 @@ def test_states_and_events_are_followed_as_lines_of_json_in_a_pipe(
     monkeypatch.setattr(status, "time", SimpleNamespace(time=time.time, sleep=happen))
     events = [json.loads(line) for line in fog("status", "--events", "--follow", "--json").stdout.splitlines()]
     assert events[-1]["what"] == "draining"
+
+
+@pytest.mark.parametrize("is_salted", [True, False])
+def test_a_new_sites_names_have_the_salt_of_its_owner_and_those_of_an_older_site_stay_plain(
+    fog: Run, journal: Journal, monkeypatch: pytest.MonkeyPatch, *, is_salted: bool
+) -> None:
+    site = open_site(None)
+    salt = load_salt(site.authority.owner)
+    assert len(salt) >= 16
+    if not is_salted:
+        (site.authority.owner / OWNER_SALT).unlink()
+    for each in ("set_up", "ensure"):
+        monkeypatch.setattr(launch, each, lambda site: None)
+    launch.begin(site, journal, PLAN)
+    carried = journal.cluster(PLAN.name).plan.carried
+    wanted = {"salt": salt} if is_salted else {}
+    assert carried
+    assert all(
+        dict(metadata_of(each)) == {**metadata_of(own), **wanted}
+        for each, own in zip(carried, PLAN.carried, strict=True)
+    )
 
 
 def test_a_regions_latency_is_shown(fog: Run, journal: Journal, tmp_path: Path) -> None:

@@ -50,6 +50,7 @@ class Desk:
     tickets: Tickets
     responder: Responder
     authority: Authority
+    cluster: ClusterPlan = CLUSTER
 
     @property
     def socket(self) -> Path:
@@ -58,9 +59,9 @@ class Desk:
     def ticket(self, name: str = "m7", *, address: str = "", minutes: float = 10.0, is_gateway: bool = False) -> Ticket:
         now_s = time.time()
         return self.tickets.issue(
-            CLUSTER.name,
+            self.cluster.name,
             name,
-            machine_seats(CLUSTER, name, is_gateway=is_gateway),
+            machine_seats(self.cluster, name, is_gateway=is_gateway),
             secrets.token_bytes(TOKEN_BYTES),
             addresses=[address or f"unix:{self.socket}"],
             unix_s=now_s,
@@ -71,7 +72,7 @@ class Desk:
     def boot(self, name: str = "m7", ticket: Ticket | None = None) -> MachineBundle:
         return machine_boot(
             self.authority,
-            CLUSTER,
+            self.cluster,
             name,
             lambda node: ("run", node.package),
             ticket or self.ticket(name),
@@ -112,9 +113,9 @@ class Machine:
 
 
 @contextmanager
-def made_desk(folder: Path) -> Iterator[Desk]:
+def made_desk(folder: Path, cluster: ClusterPlan = CLUSTER) -> Iterator[Desk]:
     make_domain(folder / "domain", "site")
     make_owner(folder / "owner")
     authority = Authority(folder / "domain", folder / "owner")
     with closing(Tickets(folder / "enrolment")) as tickets:
-        yield Desk(folder, tickets, Responder(tickets, authority), authority)
+        yield Desk(folder, tickets, Responder(tickets, authority), authority, cluster)

@@ -69,6 +69,20 @@ def test_a_machine_may_give_what_is_carried_and_nothing_else(desk: Desk, tmp_pat
     }
 
 
+def test_machine_and_robot_derive_one_name_which_the_owners_key_alone_does_not_give(tmp_path: Path) -> None:
+    with made_desk(tmp_path, CLUSTER.salted("unguessable")) as desk:
+        desk.enrol(tmp_path / "home")
+        path = open_site(None, tmp_path / "state").robots[0]
+        add_rules(path, desk.authority, "c", desk.cluster.carried, days=1.0)
+    served, used = ProxyConfig.load(tmp_path / "home" / "proxy.yaml").expose, ProxyConfig.load(path).imports
+    names = {rule.overlay_name_of(rule.name, rule.type_name) for rule in served}
+    assert names == {rule.overlay_name_of(rule.name, rule.type_name) for rule in used}
+    key = load_owner(desk.authority.owner).key.public.compressed
+    assert names == {metadata_of(each).name(key) for each in desk.cluster.carried}
+    assert not names & {metadata_of(each).name(key) for each in (PLAN, MAP)}
+    assert {each.stat().st_mode & 0o777 for each in drop_in_directory(path).iterdir()} == {0o600}
+
+
 def test_no_two_machines_share_a_key(desk: Desk, tmp_path: Path) -> None:
     for name in ("m1", "m2"):
         desk.enrol(tmp_path / name, name)

@@ -7,7 +7,7 @@ import pytest
 from fog.cluster import MachineRequest
 from fog.hardware import Hardware
 from fog.offer import Offer
-from fog.plan.choice import BY_PRICE, Weights, choose
+from fog.plan.choice import Weights, choose
 from fog.plan.cost import compared
 from gdp.errors import LocalError
 
@@ -38,7 +38,7 @@ def test_a_region_is_shared_only_when_all_have_one() -> None:
 def test_a_near_region_is_worth_its_price() -> None:
     latency = {"east": 10.0, "west": 15.0, "far": 200.0}
     assert regions(LIST, [FOUR], latency_ms=latency) == ["east"]
-    assert regions(LIST, [FOUR], latency_ms=latency, weights=BY_PRICE) == ["far"]
+    assert regions(LIST, [FOUR], latency_ms=latency, weights=Weights(usd_per_hour_per_ms=0.0)) == ["far"]
 
 
 def test_an_unmeasured_region_counts_as_the_slowest() -> None:

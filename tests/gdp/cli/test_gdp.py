@@ -204,3 +204,10 @@ def test_every_command_has_help_with_an_example_and_json(gdp: Run, path: tuple[s
     assert done.code == 0
     assert re.search(rf"Examples?:\s+gdp {' '.join(path)} ", done.out)
     assert "--json" in done.out
+
+
+def test_the_help_of_every_group_gives_each_command_its_name(gdp: Run) -> None:
+    for path in {leaf[:-1] for leaf in leaves(get_command(app))}:
+        out = gdp("", *path, "--help").out
+        names = {leaf[len(path)] for leaf in leaves(get_command(app)) if leaf[: len(path)] == path}
+        assert names == {name for name in names if re.search(rf"(?m)^\W*{name}\s", out)}

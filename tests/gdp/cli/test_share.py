@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -12,7 +13,9 @@ import pytest
 
 from gdp.cli.gdp import main
 from gdp.sharing.folder_exchange import FolderExchange
-from gdp.stores.keyring import CARD, OWNER_KEY, load_card
+from gdp.stores.issue import succeed_owner
+from gdp.stores.keyring import CARD, OWNER_KEY, OWNER_SALT, load_card, load_salt
+from proxy.config.config import ProxyConfig
 from tests.gdp.sharing.machines import IMAGE, STRING, Machine, Site
 
 Run = Callable[..., "tuple[int, str, str]"]
@@ -198,3 +201,23 @@ def test_a_robot_with_a_prefix_takes_names_with_it_and_others_as_they_are(
     assert robot.config is not None
     rules = [(rule.local, rule.overlay_metadata["name"]) for rule in robot.config.imports]
     assert rules == [("/cmd", "/robot1/cmd"), ("/fleet/goal", "/fleet/goal")]
+
+
+@pytest.mark.parametrize("more", [[], ["--plain-name"]])
+def test_an_owner_that_expose_makes_has_a_salt_which_no_output_shows(
+    robot: Machine, server: Machine, run: Run, more: list[str]
+) -> None:
+    shutil.rmtree(robot.owner)
+    code, text, error = run("expose", "robot", "/camera/image", "--type", IMAGE, "--to", "server", *more, "--json")
+    assert (code, error) == (0, "")
+    salt = load_salt(robot.owner)
+    assert len(salt) >= 16
+    assert (robot.owner / OWNER_SALT).stat().st_mode & 0o777 == 0o600
+    assert salt not in text + run("share", "robot", "--list", "--json")[1]
+    (rule,) = ProxyConfig.load(robot.path).expose
+    assert rule.metadata == ({} if more else {"salt": salt})
+
+
+def test_a_successor_of_an_owner_shares_names_with_the_same_salt(robot: Machine, tmp_path: Path) -> None:
+    succeed_owner(robot.owner, tmp_path / "heir", (), days=1)
+    assert load_salt(tmp_path / "heir") == load_salt(robot.owner) != ""

@@ -132,3 +132,14 @@ def test_a_run_takes_its_group_down(
     assert found(group.name) == []
     with pytest.raises(LocalError, match="no run"):
         runs.resume(run.id)
+
+
+def test_a_group_is_found_from_a_mount_namespace_without_cgroups(group: Cgroup) -> None:
+    # as with ip netns exec, which mounts another /sys
+    if subprocess.run(["unshare", "--mount", "true"], check=False, capture_output=True).returncode:
+        pytest.skip("mount namespaces cannot be made here")
+    code = f"from gdp.host.cgroups import Cgroup; Cgroup({group.name!r}).remove()"
+    hidden = 'umount --lazy --recursive /sys/fs/cgroup; exec "$@"'
+    argv = ["unshare", "--mount", "--propagation", "private", "sh", "-c", hidden, "sh", sys.executable, "-c", code]
+    subprocess.run(argv, check=True)
+    assert not any(folder.exists() for folder in group._folders.values())

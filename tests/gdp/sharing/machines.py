@@ -173,12 +173,12 @@ class Site:
     def __post_init__(self) -> None:
         make_domain(self.folder / "lab", "lab", unix_s=self.now_s)
 
-    def add(self, label: str, rules: str = "") -> Machine:
+    def add(self, label: str, rules: str = "", *, is_salted: bool = True) -> Machine:
         """Add a machine with an owner key; ``rules`` are appended to its ``proxy.yaml``."""
         folder = self.folder / label
         make_node(folder / "proxy", Role.PROXY, label, self.folder / "lab", unix_s=self.now_s)
         (folder / "proxy" / "delegations").mkdir(mode=0o700)
-        owner = make_owner(folder / "owner")
+        owner = make_owner(folder / "owner", is_salted=is_salted)
         (folder / OWNER_PUBLIC).write_bytes(owner.public.to_pem())
         (folder / "proxy.yaml").write_text(_PROXY + rules)
         self.directory.cards[label] = load_card(folder / "proxy" / CARD)

@@ -11,9 +11,12 @@ import pytest
 from gdp.client.send_options import SendOptions
 from gdp.crypto.statements import parse
 from gdp.errors import LocalError
+from gdp.metadata import Metadata
+from gdp.names import Name
 from gdp.sharing.exchange import Mail, MailKind
 from gdp.sharing.issued import IssuedStore
 from gdp.sharing.state import AcceptedName, links_of
+from gdp.stores.keyring import OWNER_SALT, load_owner
 from gdp.trust.revocation import Revocation
 from proxy.config.config import ProxyConfig
 from tests.gdp.sharing.machines import DAY_S, IMAGE, PLAN, STRING, Machine, Site, importing
@@ -64,6 +67,87 @@ def test_a_topic_that_is_exposed_and_imported_has_its_rules_and_rights_on_both_m
     assert robot.rules("expose") == server.rules("import") == [("/camera/image", IMAGE)]
     assert (robot.rights(), server.rights()) == ({"/camera/image": {"publish"}}, {"/camera/image": {"read"}})
     assert robot.path.read_bytes() == before
+
+
+def name_of(machine: Machine, side: str) -> Name:
+    config = ProxyConfig.load(machine.path)
+    (rule,) = config.expose if side == "expose" else config.imports
+    name = rule.overlay_name_of("/camera/image", IMAGE)
+    assert name is not None
+    return name
+
+
+def plain_name(robot: Machine) -> Name:
+    metadata = Metadata({"kind": "topic", "name": "/camera/image", "type": IMAGE})
+    return metadata.name(load_owner(robot.owner).public.compressed)
+
+
+@pytest.mark.parametrize("asked", ["/camera/image", "/camera/**"])
+def test_both_machines_derive_the_same_name_which_the_owners_key_alone_does_not_give(
+    site: Site, robot: Machine, server: Machine, asked: str
+) -> None:
+    robot.graph = [("topic", "/camera/image", IMAGE)]
+    robot.sharing.expose(robot.exposing(asked, "server"), site.now_s)
+    site.upkeep()
+    server.sharing.accept(importing(asked), site.now_s)
+    assert name_of(robot, "expose") == name_of(server, "import") == robot.held[0].name == server.held[0].name
+    assert name_of(robot, "expose") != plain_name(robot)
+    for machine in (robot, server):
+        drop_in = machine.folder / "proxy.yaml.d" / "gdp-share.yaml"
+        assert drop_in.stat().st_mode & 0o777 == 0o600
+
+
+def test_a_name_without_a_salt_is_asked_for_by_an_option(site: Site, robot: Machine, server: Machine) -> None:
+    wanted = robot.exposing("/camera/image", "server", type_name=IMAGE)
+    robot.sharing.expose(wanted, site.now_s, is_plain=True)
+    server.sharing.accept(importing("/camera/image"), site.now_s)
+    assert name_of(robot, "expose") == name_of(server, "import") == plain_name(robot)
+
+
+def test_an_owner_without_a_salt_keeps_plain_names(site: Site, server: Machine, stack: ExitStack) -> None:
+    robot = site.add("robot", is_salted=False)
+    robot.start(stack)
+    robot.sharing.expose(robot.exposing("/camera/image", "server", type_name=IMAGE), site.now_s)
+    server.sharing.accept(importing("/camera/image"), site.now_s)
+    assert name_of(robot, "expose") == name_of(server, "import") == plain_name(robot)
+
+
+@pytest.mark.parametrize("is_plain", [False, True])
+def test_a_name_never_changes_though_its_rule_is_removed_and_the_owners_salt_changes(
+    site: Site, robot: Machine, server: Machine, *, is_plain: bool
+) -> None:
+    wanted = robot.exposing("/camera/image", "server", type_name=IMAGE)
+    robot.sharing.expose(wanted, site.now_s, is_plain=is_plain)
+    before = name_of(robot, "expose")
+    robot.sharing.stop_exposing("topic", "/camera/image", site.now_s)
+    (robot.owner / OWNER_SALT).write_text("another")
+    robot.sharing.expose(wanted, site.now_s)
+    assert name_of(robot, "expose") == before
+
+
+def test_a_name_with_a_salt_does_not_become_plain(site: Site, robot: Machine, server: Machine) -> None:
+    wanted = robot.exposing("/camera/image", "server", type_name=IMAGE)
+    robot.sharing.expose(wanted, site.now_s)
+    robot.sharing.stop_exposing("topic", "/camera/image", site.now_s)
+    with pytest.raises(LocalError, match="has a salt already, and a name never changes"):
+        robot.sharing.expose(wanted, site.now_s, is_plain=True)
+
+
+def test_a_name_that_is_shared_and_not_exposed_has_the_owners_salt(site: Site, robot: Machine, server: Machine) -> None:
+    robot.sharing.share(robot.owner, "/camera/image", ["server"], site.now_s, type_name=IMAGE, is_giving=True, days=30)
+    server.sharing.accept(AcceptedName(side="expose", name="/camera/image"), site.now_s)
+    assert name_of(server, "expose") == server.held[0].name != plain_name(robot)
+
+
+def test_a_shared_name_of_a_rule_with_metadata_is_imported_with_them(
+    site: Site, server: Machine, stack: ExitStack
+) -> None:
+    rule = f"expose: [{{name: /camera/image, type: {IMAGE}, owner: owner.pub, metadata: {{lens: wide}}}}]\n"
+    robot = site.add("robot", rule)
+    robot.start(stack)
+    robot.sharing.share(robot.owner, "/camera/image", ["server"], site.now_s, days=30)
+    server.sharing.accept(importing("/camera/image"), site.now_s)
+    assert name_of(robot, "expose") == name_of(server, "import") == server.held[0].name
 
 
 def test_a_service_is_served_here_and_called_there(site: Site, robot: Machine, server: Machine) -> None:

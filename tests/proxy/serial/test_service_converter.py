@@ -16,7 +16,7 @@ from proxy.serial.channel import Channel, RosVersion
 from proxy.serial.converter import MessageConverter, translated_channel
 from proxy.serial.schema import DefinitionError
 from proxy.serial.service import Service
-from proxy.serial.service_converter import ServiceConverter, translated_service
+from proxy.serial.service_converter import translated_service
 
 LITTLE = b"\x00\x01\x00\x00"
 SET_BOOL = "09fb03525b03e7ea1fd3992bafd87e16"
@@ -123,25 +123,29 @@ def test_ros_1_messages_have_the_hashes_of_the_ros_2_messages_installed() -> Non
 
 def test_a_ros_2_client_calls_a_ros_1_server() -> None:
     server = service("std_srvs/srv/SetBool", "bool data\n", "bool success\nstring message\n")
-    converter = ServiceConverter(translated_service(server, 2), server)
-    assert converter.request.convert(LITTLE + b"\x01") == b"\x01"
-    assert converter.response.convert(b"\x01" + struct.pack("<I", 2) + b"on") == LITTLE + b"\1\0\0\0\3\0\0\0on\0"
+    client = translated_service(server, 2)
+    request = MessageConverter(client.request, server.request)
+    response = MessageConverter(server.response, client.response)
+    assert request.convert(LITTLE + b"\x01") == b"\x01"
+    assert response.convert(b"\x01" + struct.pack("<I", 2) + b"on") == LITTLE + b"\1\0\0\0\3\0\0\0on\0"
     with pytest.raises(RemoteError):
-        converter.request.convert(LITTLE)
+        request.convert(LITTLE)
 
 
 def test_a_ros_1_client_calls_a_ros_2_server_with_an_empty_request() -> None:
     server = service("std_srvs/srv/Trigger", "", "bool success\nstring message\n", ros=2)
-    converter = ServiceConverter(translated_service(server, 1), server)
-    assert converter.request.convert(b"") == LITTLE + b"\0"
-    assert converter.response.convert(LITTLE + b"\1\0\0\0\1\0\0\0\0") == b"\1" + bytes(4)
+    client = translated_service(server, 1)
+    request = MessageConverter(client.request, server.request)
+    response = MessageConverter(server.response, client.response)
+    assert request.convert(b"") == LITTLE + b"\0"
+    assert response.convert(LITTLE + b"\1\0\0\0\1\0\0\0\0") == b"\1" + bytes(4)
 
 
 def test_services_that_differ_are_refused_with_the_field() -> None:
     one = service("a/srv/B", "int32 x\n", "int32 y\n")
     other = service("a/srv/B", "int32 x\n", "int64 y\n", ros=2)
     with pytest.raises(DefinitionError, match="y: int64 there, int32 here"):
-        ServiceConverter(one, other)
+        MessageConverter(other.response, one.response)
 
 
 def test_a_half_may_use_other_types() -> None:

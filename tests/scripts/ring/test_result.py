@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import pytest
@@ -13,6 +14,7 @@ from ring.events import Event
 from ring.options import Options
 from ring.result import Journey, Result, put_together
 from ring.table import hops_in_words, summary, table
+from tests.pages import ROOT
 
 GOOD = TopicComparison(
     topic="/imu",
@@ -116,6 +118,32 @@ def test_hops_tell_how_many_switches_stood_between() -> None:
     assert hops_in_words(Journey()) == "-"
 
 
+LONG = {"topic": "/robot1/arm/camera/depth/image_rect_raw", "type_name": "control_msgs/action/FollowJointTrajectory"}
+
+
+def printed(of: Result, width: int, *, is_wide: bool = False) -> list[str]:
+    console = Console(width=width)
+    with console.capture() as captured:
+        console.print(table(of, is_wide=is_wide))
+    return captured.get().splitlines()
+
+
+@pytest.mark.parametrize("more", [{}, LONG, {"messages": 1_000_000, "lost": 999_999}], ids=["short", "long", "many"])
+def test_the_table_fits_100_columns_with_every_number_whole(more: dict[str, object]) -> None:
+    lines = printed(result(replace(GOOD, **more)), 100)  # type: ignore[arg-type]
+    assert max(map(len, lines)) <= 100
+    assert not [line for line in lines if "…" in line]
+    headings = ["topic", "type", "messages", "lost", "identical", "median ms", "hops"]
+    assert re.split(r"  +", lines[1].strip()) == headings
+
+
+def test_the_wide_table_has_all_columns() -> None:
+    heading = printed(result(), 200, is_wide=True)[1]
+    assert all(
+        each in heading for each in ("bytes", "delivered", "duplicated", "p99 ms", "max ms", "silent ms", "parts")
+    )
+
+
 def test_the_table_shows_topics_whose_names_look_like_markup() -> None:
     console = Console(width=200, record=True, file=None, quiet=True)
     console.quiet = False
@@ -134,3 +162,9 @@ def test_a_line_that_is_no_object_is_no_event(line: str) -> None:
 def test_an_event_without_the_wanted_value_is_refused(read: object) -> None:
     with pytest.raises(LocalError, match="ready: value: "):
         read(Event({"event": "ready", "value": None}), "value")  # type: ignore[operator]
+
+
+def test_the_readme_shows_the_table_as_it_is_printed() -> None:
+    heading = printed(result(), 100)[1].split("  ")
+    shown = next(line for line in (ROOT / "README.md").read_text().splitlines() if line.startswith("topic "))
+    assert [each.strip() for each in heading if each.strip()] == [each.strip() for each in shown.split("  ") if each]
