@@ -174,6 +174,7 @@ def main() -> None:
     """Run the bench, or a part of it."""
     options = parse(arguments([each.name for each in baselines_of((), (), 0.0)]))
     options.no_plot = options.plot is None and not is_whole(options)
+    options.is_whole = is_whole
     perform(options, measure)
 
 
