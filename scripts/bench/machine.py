@@ -101,15 +101,15 @@ def machine_state() -> MachineState:
     )
 
 
-def git(*words: str) -> str:
-    """Return the output of a git command in this repository, also where another user owns it.
+def git(*words: str, root: Path = ROOT) -> str:
+    """Return the output of a git command in a repository, by default this one, also where another user owns it.
 
     Raises:
         OSError: there is no git.
         subprocess.CalledProcessError: the command failed, or this is no repository.
     """
-    argv = ["git", "-C", str(ROOT), "-c", "safe.directory=*", *words]
-    environment = {**os.environ, "GIT_CEILING_DIRECTORIES": str(ROOT.parent)}  # one around this folder is another one
+    argv = ["git", "-C", str(root), "-c", "safe.directory=*", *words]
+    environment = {**os.environ, "GIT_CEILING_DIRECTORIES": str(root.parent)}  # one around this folder is another one
     return subprocess.run(argv, capture_output=True, text=True, check=True, env=environment).stdout.strip()
 
 
