@@ -240,7 +240,7 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
         for name in case.reductions:
             what = f"{case.name}: {name} / {PLAIN}, bytes"
             targets.append(over.ratio(what, name, PLAIN, case.name, "bytes", None))
-    settings = {"rounds": options.rounds, "messages of a figure": options.passes * MESSAGES}
+    settings = {"rounds": options.rounds, "messages of a figure": options.passes * MESSAGES or "each once"}
     title = "Bytes and CPU time of reduced messages"
     return Outcome("reduce", title, over, targets, settings, lambda: _panels(over, every))
 
@@ -250,7 +250,9 @@ def _panels(over: Rounds, every: Sequence[Case]) -> list[Panel]:
 
 
 if __name__ == "__main__":
-    parser = command_line(__doc__, rounds=3, quick={"rounds": 1, "passes": 1}, has_record=True, has_plot=True)
+    parser = command_line(__doc__, rounds=3, quick={"rounds": 1, "passes": 0}, has_record=True, has_plot=True)
     parser.add_argument("--bags", type=Path, default=DATA / "bags", help="folder of recordings (default: %(default)s)")
-    parser.add_argument("--passes", type=int, default=2, help="messages of a figure, in 60 (default: %(default)s)")
+    parser.add_argument(
+        "--passes", type=int, default=2, help="messages of a figure, in 60; 0: each once (default: %(default)s)"
+    )
     run_bench(parser, measure)
