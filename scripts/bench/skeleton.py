@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from machine import MachineState, machine_state
+from machine import ROOT, MachineState, machine_state
 from peers.process import FailedError
 from plot import Panel, require_plot, save_bars
 from preconditions import RefusedError, require_trust, require_writable
@@ -29,7 +29,7 @@ from report import Rounds, Settings, Target, progress, show, write_json
 from gdp.errors import GdpError
 from gdp.host.run_registry import Run, RunRegistry
 
-OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks"
+OUTPUT: Final = ROOT / "docs" / "benchmarks"
 
 Options = argparse.Namespace
 

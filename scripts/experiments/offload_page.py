@@ -183,12 +183,9 @@ def _notes(tasks: Document, slower: Mapping[str, float]) -> list[str]:
         "Of Cyclone DDS there is no wheel for rclpy: its nodes serialise by rclpy and carry by this project's endpoint"
         " `dds`, without the overlay.",
     ]
-    machines = dict.fromkeys(
-        f"{MachineState(**each['machine'])} ({name}, {part})"
-        for name, task in tasks.items()
-        for part, each in task.items()
-    )
-    return [*notes, "Measured on " + "; ".join(machines) + "."]
+    for name, task in tasks.items():
+        notes += [f"{name}, {part}: measured on {MachineState(**each['machine'])}." for part, each in task.items()]
+    return notes
 
 
 def _text(values: Sequence[float]) -> str:
