@@ -193,7 +193,7 @@ def perform(options: Options, measure: Callable[[Options, RunRegistry], Outcome]
         require_plot()
     state, begun_s = machine_state(), time.monotonic()
     with clean_exit():
-        if is_saved:
+        if is_saved and hasattr(options, "allow_load"):
             _require_page(options, state)
         runs = RunRegistry()
         runs.sweep()
@@ -213,7 +213,7 @@ def _require_page(options: Options, state: MachineState) -> None:
     for folder in [path.parent for path in chosen] or ([] if is_quick else [OUTPUT]):
         require_writable(folder)
     if not is_quick and (chosen or is_whole is None or is_whole(options)):
-        require_trust(state, allow_load=getattr(options, "allow_load", False))
+        require_trust(state, allow_load=options.allow_load)
 
 
 def finish(

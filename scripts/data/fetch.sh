@@ -12,7 +12,10 @@ trap 'rm -rf "$scratch"' EXIT
 mkdir "$scratch/planning"
 grep -v Slit SHA256SUMS | grep planning/ >"$scratch/sums"
 while read -r _ file; do
-    curl --fail --silent --show-error --location --output "$scratch/$file" "$from/${file#planning/}"
+    curl --fail --silent --location --output "$scratch/$file" "$from/${file#planning/}" || {
+        printf 'error: no %s (name a folder that has it: scripts/data/fetch.sh FOLDER)\n' "$from/${file#planning/}" >&2
+        exit 2
+    }
 done <"$scratch/sums"
 (cd "$scratch" && sha256sum --check --quiet sums)
 cp "$scratch"/planning/* planning/

@@ -87,6 +87,24 @@ def test_problems_that_are_not_here_are_fetched_by_a_command_that_is_named(tmp_p
         preconditions.data_folder("planning", ["Home.cfg"], tmp_path)
 
 
+@pytest.mark.skipif(shutil.which("curl") is None, reason="curl is not installed")
+def test_only_files_with_the_listed_checksum_are_fetched(tmp_path: Path) -> None:
+    (tmp_path / "data" / "planning").mkdir(parents=True)
+    shutil.copy(DATA / "fetch.sh", tmp_path / "data")
+    digest = hashlib.sha256(b"mesh").hexdigest()
+    (tmp_path / "data" / "SHA256SUMS").write_text(f"{digest}  planning/Home.cfg\n{digest}  spot/a\n", encoding="utf-8")
+
+    def fetch() -> subprocess.CompletedProcess[str]:
+        argv = [str(tmp_path / "data" / "fetch.sh"), str(tmp_path)]
+        return subprocess.run(argv, capture_output=True, text=True, check=False)
+
+    assert (fetch().returncode, len(fetch().stderr.splitlines())) == (2, 1)
+    for text in ("other", "mesh"):
+        (tmp_path / "Home.cfg").write_text(text, encoding="utf-8")
+        assert (fetch().returncode == 0) == (text == "mesh")
+        assert (tmp_path / "data" / "planning" / "Home.cfg").exists() == (text == "mesh")
+
+
 def test_a_folder_that_cannot_be_written_is_found_before_anything_is_measured(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ends: Ends
 ) -> None:
