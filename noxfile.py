@@ -1,9 +1,10 @@
-"""Sessions of nox: fast, full, docs, bench, coverage, and an import test for each supported Python.
+"""Sessions of nox: fast, full, docs, pages, bench, coverage, and an import test for each supported Python.
 
     nox -s fast           static checks and tests without root, under 60 s
     nox -s full           everything that CI runs, as root
     nox -s coverage       branch coverage of the product code
     nox -s docs           the documentation as a site
+    nox -s pages          the age of measured pages; a nightly run fails where one is old
     nox -s bench          a benchmark, such as -- scripts/bench/frames.py; its options without arguments
     nox -s pythons        imports and quick tests under every supported Python that is installed
 
@@ -55,6 +56,12 @@ def docs(session: nox.Session) -> None:
 def bench(session: nox.Session) -> None:
     """Run a benchmark; arguments replace the default, which shows the options of the message benchmark."""
     session.run(PYTHON, *(session.posargs or ("scripts/bench/messages.py", "--help")), external=True)
+
+
+@nox.session(python=False)
+def pages(session: nox.Session) -> None:
+    """Fail where a measured page is older than 300 commits, or than the last change of what it measures."""
+    session.run(PYTHON, "scripts/bench/page_age.py", external=True)
 
 
 @nox.session(python=False)

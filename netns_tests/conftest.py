@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import socket
+import subprocess
+import sys
 import tempfile
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
@@ -19,6 +21,7 @@ from internet.laboratory import Laboratory
 from internet.space import TOOLS
 from netns_tests import lifetimes
 from netns_tests.spaces import Space
+from tests.clones import make_clone
 from tests.fixtures_forwarding import IN, IN_MAC, MTUS, NARROW, NARROW_MAC, PEER_MACS, WIDE, WIDE_MAC
 from tests.script_packages import share_script_packages
 
@@ -54,6 +57,22 @@ _REASON = _why_not()
 def pytest_runtest_setup(item: pytest.Item) -> None:
     if _REASON and item.get_closest_marker("netns"):
         pytest.skip(_REASON)
+
+
+@pytest.fixture(scope="session")
+def in_clone(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Return a function that runs a script by its path in a clone that has nothing around it."""
+    tree = tmp_path_factory.mktemp("clone") / "main"
+    make_clone(tree)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(tree), str(tree / "scripts")))}
+
+    def run(script: str, *words: str, patience_s: float) -> subprocess.CompletedProcess[str]:
+        argv = [sys.executable, str(tree / script), *words]
+        return subprocess.run(
+            argv, cwd=tree, env=environment, capture_output=True, text=True, timeout=patience_s, check=False
+        )
+
+    return run
 
 
 @pytest.fixture

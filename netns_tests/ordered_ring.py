@@ -5,11 +5,12 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 from typing import Final
+from unittest import mock
 
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.stores.issue import make_node
-from ring import cli, credentials
+from ring import cli
 
 _LEAST: Final = sys.argv.pop(1) if __name__ == "__main__" else ""
 
@@ -23,5 +24,5 @@ def make_ordered_node(directory: Path, role: Role, label: str, domain: Path) -> 
 
 
 if __name__ == "__main__":
-    credentials.make_node = make_ordered_node  # type: ignore[assignment]
-    cli.main()
+    with mock.patch("ring.credentials.make_node", make_ordered_node):
+        cli.main()

@@ -9,3 +9,4 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 .venv/bin/lint-imports
 scripts/lock.sh --check
 .venv/bin/python scripts/readability.py --check
+.venv/bin/python scripts/bench/page_age.py --warn

@@ -1,6 +1,6 @@
 """Generator of the data of ``fog.catalog``: a digest of the spot advisor with list prices, and spot trace statistics.
 
-Command: reads ``../shared/data/spot``, writes ``fog/catalog/aws.json`` and ``traces.json``. One command:
+Command: reads ``scripts/data/spot``, writes ``fog/catalog/aws.json`` and ``traces.json``. One command:
 
     python scripts/make_catalog.py
 
@@ -14,13 +14,19 @@ from __future__ import annotations
 
 import itertools
 import json
+import sys
 from pathlib import Path
 from typing import Final
 
 from fog.plan.trace import Trace, outages, times_independent
 
-ROOT: Final = Path(__file__).parent.parent
-SPOT: Final = ROOT.parent / "shared/data/spot"
+ROOT: Final = Path(__file__).resolve().parent.parent
+sys.path.append(str(ROOT / "scripts" / "bench"))
+from preconditions import data_folder  # noqa: E402
+from skeleton import clean_exit  # noqa: E402
+
+TRACES: Final = "aws_*.json"
+ADVISOR: Final = "spot-advisor-data.json"
 SOURCES: Final = (
     "on-demand: AWS EC2 list prices, Linux, shared tenancy, 2024",
     "savings, interruption bands, CPUs and memory: AWS Spot Instance Advisor's data file, as stored with this project",
@@ -65,13 +71,14 @@ SPANS_S: Final = (300, 600, 1200, 1800)
 
 def main() -> None:
     """Write both files."""
-    _write("aws.json", prices())
-    _write("traces.json", traces())
+    with clean_exit():
+        _write("aws.json", prices())
+        _write("traces.json", traces())
 
 
 def prices() -> dict[str, object]:
     """Return types, and for each region and type: USD an hour, savings of spot in percent, interruption band."""
-    advisor = json.loads((SPOT / "spot-advisor-data.json").read_text())
+    advisor = json.loads((data_folder("spot", [ADVISOR]) / ADVISOR).read_text())
     known = advisor["instance_types"]
     listed: dict[str, tuple[dict[str, float], str, int]] = {}
     for family, (usd, elsewhere) in BY_SIZE.items():
@@ -98,7 +105,7 @@ def traces() -> dict[str, object]:
     """Return statistics of the traces: uptime, and simultaneous failures."""
     zones = [
         Trace.from_document(path.stem.rsplit("_", 1)[1], json.loads(path.read_text()))
-        for path in sorted(SPOT.glob("aws_*.json"))
+        for path in sorted(data_folder("spot", [TRACES]).glob(TRACES))
     ]
     lost = sum(len(zone.preemptions) for zone in zones)
     free_s = sum(float((~zone.taken).sum()) * zone.step_s for zone in zones)

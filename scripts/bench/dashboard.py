@@ -298,6 +298,7 @@ def arguments() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = command_line(__doc__, rounds=3, has_record=True)
     parser.add_argument("--part", action="append", choices=PARTS, help="only this part; may be repeated")
+    parser.set_defaults(is_whole=lambda options: set(options.part or PARTS) == set(PARTS))
     parser.add_argument("--windows", type=int, default=20, help="of each kind (default: %(default)s)")
     parser.add_argument("--count", type=int, default=150, help="a quarter of the messages of a window (default: 150)")
     return parser

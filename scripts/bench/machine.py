@@ -18,6 +18,8 @@ import os
 import platform
 import socket
 import struct
+import subprocess
+import time
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -26,7 +28,9 @@ from pathlib import Path
 from typing import Final
 
 __all__ = [
+    "ROOT",
     "MachineState",
+    "git",
     "machine_state",
     "map_bytes",
     "offload_text",
@@ -38,6 +42,7 @@ __all__ = [
     "thread_s",
 ]
 
+ROOT: Final = Path(__file__).resolve().parents[2]
 _SIOCETHTOOL: Final = 0x8946
 _GET_SET: Final = {"tso": (0x1E, 0x1F), "gso": (0x23, 0x24), "gro": (0x2B, 0x2C), "tx-checksum": (0x16, 0x17)}
 _NEEDS: Final = ("tx-checksum", "tso")  # segmentation cannot be on without checksums: switch these in this order
@@ -45,19 +50,42 @@ _NEEDS: Final = ("tx-checksum", "tso")  # segmentation cannot be on without chec
 
 @dataclass(frozen=True, slots=True)
 class MachineState:
-    """State of the machine before a bench. ``load_before``: runnable processes, mean over the last minute."""
+    """State of the machine before a bench, and the code that it ran.
+
+    Attributes:
+        load_before: runnable processes, mean over the last minute.
+        commit: of the code, with ``-dirty`` after it where the code differs from it; empty: not known.
+        date: of the bench, in UTC, such as 2026-11-28; empty: not known.
+    """
 
     kernel: str
     processor: str
     cores: int
     python: str
     load_before: float
+    commit: str = ""
+    date: str = ""
+
+    @property
+    def is_busy(self) -> bool:
+        """Return whether other work took more than half of the cores."""
+        return self.load_before > self.cores / 2
+
+    @property
+    def mark(self) -> str:
+        """Return what is added to the label of each row: the load of a busy machine, or nothing."""
+        return f" (load {self.load_before:.1f})" if self.is_busy else ""
 
     def __str__(self) -> str:
         return (
             f"Linux {self.kernel}, {self.cores} cores ({self.processor}), Python {self.python},"
-            f" load before {self.load_before:.2f}"
+            f" load before {self.load_before:.2f}, {self.code}"
         )
+
+    @property
+    def code(self) -> str:
+        """Return day and commit, in words."""
+        return f"{self.date}, commit {self.commit}" if self.commit else "day and commit not recorded"
 
 
 def machine_state() -> MachineState:
@@ -68,7 +96,30 @@ def machine_state() -> MachineState:
         len(os.sched_getaffinity(0)),
         platform.python_version(),
         os.getloadavg()[0],
+        _commit(),
+        time.strftime("%Y-%m-%d", time.gmtime()),
     )
+
+
+def git(*words: str, root: Path = ROOT) -> str:
+    """Return the output of a git command in a repository, by default this one, also where another user owns it.
+
+    Raises:
+        OSError: there is no git.
+        subprocess.CalledProcessError: the command failed, or this is no repository.
+    """
+    argv = ["git", "-C", str(root), "-c", "safe.directory=*", *words]
+    environment = {**os.environ, "GIT_CEILING_DIRECTORIES": str(root.parent)}  # one around this folder is another one
+    return subprocess.run(argv, capture_output=True, text=True, check=True, env=environment).stdout.strip()
+
+
+def _commit() -> str:
+    """Return the commit of the code; measured pages do not count as changes."""
+    try:
+        commit = git("rev-parse", "--short=12", "HEAD")
+        return f"{commit}-dirty" if git("status", "--porcelain", "--", ".", ":!docs") else commit
+    except (OSError, subprocess.CalledProcessError):
+        return ""
 
 
 def _processor() -> str:

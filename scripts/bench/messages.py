@@ -25,7 +25,6 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Final
 
 from background_load import LOADS, SHARE
@@ -74,7 +73,7 @@ def panels_of(over: Rounds, plan: Plan) -> list[Panel]:
 
 def arguments(names: Sequence[str]) -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = command_line(__doc__)
+    parser = command_line(__doc__, has_record=True, has_plot=True)
     parser.add_argument("--rounds", type=positive, default=5)
     parser.add_argument(
         "--count", type=positive, default=80, help="messages above 100 kB; of smaller ones four times that"
@@ -95,8 +94,6 @@ def arguments(names: Sequence[str]) -> argparse.ArgumentParser:
         "--busy-poll-us", type=int, default=SPIN_US, help="as busy_poll_us of proxy.yaml (default: %(default)s)"
     )
     parser.add_argument("--realtime", action="store_true", help="SCHED_FIFO for all: what else runs does not disturb")
-    parser.add_argument("--json", type=Path, help="write all figures here")
-    parser.add_argument("--plot", type=Path, help="draw them here (PNG)")
     return parser
 
 
@@ -173,7 +170,8 @@ def is_whole(options: Options) -> bool:
 def main() -> None:
     """Run the bench, or a part of it."""
     options = parse(arguments([each.name for each in baselines_of((), (), 0.0)]))
-    options.no_plot = options.plot is None and not is_whole(options)
+    options.no_plot |= options.plot is None and not is_whole(options)
+    options.is_whole = is_whole
     perform(options, measure)
 
 

@@ -1,6 +1,6 @@
 """Bytes that each reduction of a rule saves, and the CPU time of a message that it costs at both ends.
 
-Recordings and frames of ../shared/data are used where they are there, else synthetic messages, as the case says.
+Frames and one recording are in scripts/data. Cases of recordings that --bags has not are left out, which is reported.
 
 .venv/bin/python scripts/bench/reduce.py
 .venv/bin/python scripts/bench/reduce.py --quick --no-save
@@ -20,7 +20,8 @@ import numpy as np
 import numpy.typing as npt
 from peers.process import FailedError
 from plot import Panel, panel_of
-from report import Rounds, Target
+from preconditions import DATA, RefusedError, data_folder
+from report import Rounds, Target, progress
 from rosbags.typesys import Stores, get_typestore
 from skeleton import Options, Outcome, command_line, run_bench
 
@@ -40,14 +41,6 @@ if sys.version_info >= (3, 14):
 else:
     from backports import zstd
 
-try:
-    from PIL import Image
-except ImportError:  # the extra `images` is not installed
-    HAS_FRAMES = False
-else:
-    HAS_FRAMES = True
-
-DATA: Final = Path(__file__).resolve().parents[3] / "shared" / "data"
 PLAIN: Final = "as it is"
 MESSAGES: Final = 60  # of a case, the first ones
 MAX_BYTES: Final = 24 << 20
@@ -94,16 +87,22 @@ def image(encoding: str, pixels: npt.NDArray[Any]) -> bytes:
 
 
 def frames(pattern: str) -> list[npt.NDArray[Any]]:
-    """Return recorded frames; none where the data or the library to read them is missing."""
-    if not HAS_FRAMES:
-        return []
-    return [np.asarray(Image.open(path)) for path in sorted((DATA / "rgbd").glob(pattern))]
+    """Return recorded frames.
+
+    Raises:
+        RefusedError: the data, or the library to read them, are missing.
+    """
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise RefusedError("Pillow is not installed: pip install 'gdp-ros[images]'") from error
+    return [np.asarray(Image.open(path)) for path in sorted(data_folder("rgbd", [pattern]).glob(pattern))]
 
 
-def recorded(bag: str, topic_type: str) -> tuple[Channel, list[bytes]] | None:
-    """Return the first messages of a type; None where the recording is missing."""
-    path = DATA / "bags" / bag
+def recorded(path: Path, topic_type: str) -> tuple[Channel, list[bytes]] | None:
+    """Return the first messages of a type; None where the recording is missing, which is reported."""
     if not path.exists():
+        progress(f"left out: {topic_type}, for there is no {path} (see --bags)")
         return None
     found: list[bytes] = []
     channel: Channel | None = None
@@ -118,42 +117,30 @@ def recorded(bag: str, topic_type: str) -> tuple[Channel, list[bytes]] | None:
     return None if channel is None else (channel, found)
 
 
-def smooth(generator: np.random.Generator) -> npt.NDArray[np.float64]:
-    """Return a synthetic picture, [480, 640] of 0 to 255: slow waves and little noise."""
-    rows, columns = np.mgrid[0:480, 0:640]
-    waves = 128 + 60 * np.sin(rows / 37) + 50 * np.cos(columns / 53)
-    return np.asarray(np.clip(waves + generator.normal(0, 3, waves.shape), 0, 255))
-
-
-def cases() -> list[Case]:
+def cases(bags: Path) -> list[Case]:
     """Return all cases with their messages."""
-    generator = np.random.default_rng(1)
-    colours, depths = frames("color_*.png"), frames("depth_*.pgm")
-    origin = "recorded" if colours else "synthetic"
-    bgr = [each[:, :, 2::-1] for each in colours] or [np.stack([smooth(generator)] * 3, -1).astype(np.uint8)]
+    bgr = [each[:, :, 2::-1] for each in frames("color_*.png")]
     grey = [each.mean(axis=-1).astype(np.uint8) for each in bgr]
-    depth = [each.astype(np.uint16) for each in depths] or [(20 * smooth(generator)).astype(np.uint16)]
+    depth = [each.astype(np.uint16) for each in frames("depth_*.png")]
     compressed = {f"zstd {level}": zstd_of(level) for level in LEVELS}
     jpegs: dict[str, Settings] = {f"jpeg {each}": {"image": "jpeg", "quality": each} for each in QUALITIES}
     png: dict[str, Settings] = {"png": {"image": "png"}}
-    channel = described(IMAGE)
-    found = [
-        Case(f"image bgr8 640x480, {origin}", channel, [image("bgr8", each) for each in bgr], jpegs | png | compressed),
-        Case(
-            f"image mono8 640x480, {origin}", channel, [image("mono8", one) for one in grey], jpegs | png | compressed
-        ),
-        Case(f"image 16UC1 640x480, {origin}", channel, [image("16UC1", each) for each in depth], png | compressed),
-    ]
     half: dict[str, Settings] = {"region, half of the width": {"region": Region(x=(0, 320))}}
-    found[0] = Case(found[0].name, channel, found[0].messages, {**found[0].reductions, **half})
-    found.append(_points(depth, origin))
-    optional = [
-        _of_bag("tilt_laser.bag", "sensor_msgs/msg/LaserScan", "scan of 1,078 beams"),
-        _of_bag("ros_numpy_test.bag", "nav_msgs/msg/OccupancyGrid", "map"),
-        _short("tilt_laser.bag", "sensor_msgs/msg/Imu"),
-        _short("rosbag2_test", "geometry_msgs/msg/PoseStamped"),
+    found = [
+        Case(f"image {encoding} 640x480, recorded", described(IMAGE), [image(encoding, each) for each in pixels], tried)
+        for encoding, pixels, tried in (
+            ("bgr8", bgr, jpegs | png | compressed | half),
+            ("mono8", grey, jpegs | png | compressed),
+            ("16UC1", depth, png | compressed),
+        )
     ]
-    return [*found, *(each for each in optional if each is not None)]
+    optional = [
+        _of_bag(bags / "tilt_laser.bag", "sensor_msgs/msg/LaserScan", "scan of 1,078 beams"),
+        _of_bag(bags / "ros_numpy_test.bag", "nav_msgs/msg/OccupancyGrid", "map"),
+        _short(bags / "tilt_laser.bag", "sensor_msgs/msg/Imu"),
+        _short(bags / "rosbag2_test", "geometry_msgs/msg/PoseStamped"),
+    ]
+    return [*found, _points(depth), *(each for each in optional if each is not None)]
 
 
 def cloud(points: npt.NDArray[np.float32]) -> bytes:
@@ -169,7 +156,7 @@ def cloud(points: npt.NDArray[np.float32]) -> bytes:
     return bytes(STORE.serialize_cdr(message, CLOUD))
 
 
-def _points(depths: Sequence[npt.NDArray[np.uint16]], origin: str) -> Case:
+def _points(depths: Sequence[npt.NDArray[np.uint16]]) -> Case:
     """Return clouds of every second row and column of depth frames, in metres."""
     messages = list[bytes]()
     for depth in depths:
@@ -181,19 +168,18 @@ def _points(depths: Sequence[npt.NDArray[np.uint16]], origin: str) -> Case:
     thinned: dict[str, Settings] = {f"voxel_m {edge:g}": {"voxel_m": edge} for edge in (0.02, 0.05, 0.1)}
     both: dict[str, Settings] = {"voxel_m 0.05, zstd 3": {"voxel_m": 0.05, **zstd_of(3)}}
     half: dict[str, Settings] = {"region, half of the width": {"region": Region(x=(0, 100))}}
-    compressed = {f"zstd {level}": zstd_of(level) for level in LEVELS}
-    name = f"point cloud of depth 320x240, {origin}"
-    return Case(name, described(CLOUD), messages, thinned | half | compressed | both)
+    tried = thinned | half | {f"zstd {level}": zstd_of(level) for level in LEVELS} | both
+    return Case("point cloud of depth 320x240, recorded", described(CLOUD), messages, tried)
 
 
-def _of_bag(bag: str, type_name: str, what: str) -> Case | None:
+def _of_bag(bag: Path, type_name: str, what: str) -> Case | None:
     found = recorded(bag, type_name)
     if found is None:
         return None
     return Case(f"{what}, recorded", *found, {f"zstd {level}": zstd_of(level) for level in LEVELS})
 
 
-def _short(bag: str, type_name: str) -> Case | None:
+def _short(bag: Path, type_name: str) -> Case | None:
     found = recorded(bag, type_name)
     if found is None:
         return None
@@ -243,7 +229,7 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
     """Measure every reduction on every case, round by round."""
     del runs
     over = Rounds()
-    every = cases()
+    every = cases(options.bags)
     for _ in range(options.rounds):
         for case in every:
             for name, settings in {PLAIN: {}, **case.reductions}.items():
@@ -254,7 +240,7 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
         for name in case.reductions:
             what = f"{case.name}: {name} / {PLAIN}, bytes"
             targets.append(over.ratio(what, name, PLAIN, case.name, "bytes", None))
-    settings = {"rounds": options.rounds, "messages of a figure": options.passes * MESSAGES}
+    settings = {"rounds": options.rounds, "messages of a figure": options.passes * MESSAGES or "each once"}
     title = "Bytes and CPU time of reduced messages"
     return Outcome("reduce", title, over, targets, settings, lambda: _panels(over, every))
 
@@ -264,6 +250,9 @@ def _panels(over: Rounds, every: Sequence[Case]) -> list[Panel]:
 
 
 if __name__ == "__main__":
-    parser = command_line(__doc__, rounds=3, quick={"rounds": 1, "passes": 1}, has_record=True, has_plot=True)
-    parser.add_argument("--passes", type=int, default=2, help="messages of a figure, in 60 (default: %(default)s)")
+    parser = command_line(__doc__, rounds=3, quick={"rounds": 1, "passes": 0}, has_record=True, has_plot=True)
+    parser.add_argument("--bags", type=Path, default=DATA / "bags", help="folder of recordings (default: %(default)s)")
+    parser.add_argument(
+        "--passes", type=int, default=2, help="messages of a figure, in 60; 0: each once (default: %(default)s)"
+    )
     run_bench(parser, measure)

@@ -278,7 +278,7 @@ def show(title: str, state: MachineState, settings: Settings, over: Rounds, targ
         for contender, cases in over.values.items():
             if case in cases:
                 spreads = (over.spread(contender, case, column) for column in columns)
-                table.add_row(contender, *("-" if spread is None else str(spread) for spread in spreads))
+                table.add_row(contender + state.mark, *("-" if spread is None else str(spread) for spread in spreads))
         console.print(table)
     for contender, reason in over.reasons.items():
         console.print(f"{contender} - not here: {reason}", markup=False, highlight=False, soft_wrap=True)
@@ -300,18 +300,20 @@ def write_json(
     *,
     keeps: bool = False,
 ) -> None:
-    """Write all values of all rounds, and the targets with their results.
+    """Write all values of all rounds, the targets with their results, and day, commit and load of each row.
 
     Args:
         keeps: rows and targets that the file has and this run has not are kept.
     """
     held = json.loads(path.read_text(encoding="utf-8")) if keeps and path.exists() else {"rounds": {}, "targets": []}
     new = {target.what for target in targets}
+    stamp = {"date": state.date, "commit": state.commit, "load_before": state.load_before}
     answer = {
         "bench": bench,
         "machine": asdict(state),
         "settings": dict(settings),
         "rounds": {**held["rounds"], **over.values},
+        "measured": {**held.get("measured", {}), **dict.fromkeys(over.values, stamp)},
         "not_here": over.reasons,
         "targets": [
             *(target for target in held["targets"] if target["what"] not in new),

@@ -31,7 +31,8 @@ import security_replays
 import security_revocation
 import security_rotation
 from machine import MachineState, machine_state
-from skeleton import clean_exit
+from preconditions import require_trust, require_writable
+from skeleton import add_allow_load, clean_exit
 
 OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks" / "security.json"
 COMMANDS: Final[Mapping[str, ModuleType]] = {
@@ -57,6 +58,7 @@ def arguments() -> argparse.ArgumentParser:
         command.add_argument("--json", type=Path, default=OUTPUT, help="where the figures go")
         command.add_argument("--no-save", action="store_true", help="print only")
         command.add_argument("--strict", action="store_true", help="exit 1 when a target was missed")
+        add_allow_load(command)
     return parser
 
 
@@ -77,6 +79,9 @@ def main() -> None:
     """Run one subcommand."""
     options, state = arguments().parse_args(), machine_state()
     with clean_exit():
+        if not options.no_save:
+            require_writable(options.json.parent)
+            require_trust(state, allow_load=options.allow_load)
         figures, has_met = COMMANDS[options.command].run(options, held(options.json).get(options.command, {}))
     if not options.no_save:
         save(options.json, options.command, figures, state)

@@ -20,15 +20,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from machine import MachineState, machine_state
+from machine import ROOT, MachineState, machine_state
 from peers.process import FailedError
 from plot import Panel, require_plot, save_bars
+from preconditions import RefusedError, require_trust, require_writable
 from report import Rounds, Settings, Target, progress, show, write_json
 
 from gdp.errors import GdpError
 from gdp.host.run_registry import Run, RunRegistry
 
-OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks"
+OUTPUT: Final = ROOT / "docs" / "benchmarks"
 
 Options = argparse.Namespace
 
@@ -111,7 +112,7 @@ def command_line(
         rounds: default of ``--rounds``; None: no such option.
         seconds: default of ``--seconds``; None: no such option.
         quick: what ``--quick`` sets; None: no such option.
-        has_record: adds ``--json``, ``--no-save`` and ``--strict``.
+        has_record: adds ``--json``, ``--no-save``, ``--strict`` and ``--allow-load``.
         has_plot: adds ``--plot`` and ``--no-plot``.
     """
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -121,16 +122,23 @@ def command_line(
         parser.add_argument("--seconds", type=float, default=seconds, help=f"{seconds_of} (default: %(default)s)")
     if quick is not None:
         text = ", ".join(f"{name} {value:g}" for name, value in quick.items())
-        parser.add_argument("--quick", action="store_true", help=f"a short run, to see that it works: {text}")
+        parser.add_argument("--quick", action="store_true", help=f"a short run that writes no page: {text}")
         parser.set_defaults(quick_values=quick)
     if has_record:
         parser.add_argument("--json", type=Path, help="where the figures go (default: docs/benchmarks)")
         parser.add_argument("--no-save", action="store_true", help="print only")
         parser.add_argument("--strict", action="store_true", help="exit 1 when a target was missed")
+        add_allow_load(parser)
     if has_plot:
         parser.add_argument("--plot", type=Path, help="where the picture goes (default: docs/benchmarks)")
         parser.add_argument("--no-plot", action="store_true", help="no picture")
     return parser
+
+
+def add_allow_load(parser: argparse.ArgumentParser) -> None:
+    """Add ``--allow-load``."""
+    text = "write the page also while the machine does other work, and mark each row with its load"
+    parser.add_argument("--allow-load", action="store_true", help=text)
 
 
 def parse(parser: argparse.ArgumentParser, words: Sequence[str] | None = None) -> Options:
@@ -143,12 +151,18 @@ def parse(parser: argparse.ArgumentParser, words: Sequence[str] | None = None) -
 
 @contextmanager
 def clean_exit() -> Iterator[None]:
-    """End the command with one line on an expected error, and let SIGTERM and Ctrl-C remove what was made."""
+    """End the command with one line on an expected error, and let SIGTERM and Ctrl-C remove what was made.
+
+    The exit status is 2 where a precondition does not hold, and 1 where the command failed later.
+    """
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     try:
         yield
     except KeyboardInterrupt:
         sys.exit(130)
+    except RefusedError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
     except (GdpError, FailedError) as error:
         sys.exit(f"error: {error}")
 
@@ -179,10 +193,27 @@ def perform(options: Options, measure: Callable[[Options, RunRegistry], Outcome]
         require_plot()
     state, begun_s = machine_state(), time.monotonic()
     with clean_exit():
+        if is_saved and hasattr(options, "allow_load"):
+            _require_page(options, state)
         runs = RunRegistry()
         runs.sweep()
         outcome = measure(options, runs)
     finish(outcome, options, state, time.monotonic() - begun_s, is_saved=is_saved, is_drawn=is_drawn)
+
+
+def _require_page(options: Options, state: MachineState) -> None:
+    """Refuse to measure for files that could not be written, or not be trusted.
+
+    Raises:
+        RefusedError: such files.
+    """
+    is_quick = getattr(options, "quick", False)
+    chosen = [path for path in (getattr(options, "json", None), getattr(options, "plot", None)) if path]
+    is_whole = getattr(options, "is_whole", None)
+    for folder in [path.parent for path in chosen] or ([] if is_quick else [OUTPUT]):
+        require_writable(folder)
+    if not is_quick and (chosen or is_whole is None or is_whole(options)):
+        require_trust(state, allow_load=options.allow_load)
 
 
 def finish(
@@ -191,7 +222,7 @@ def finish(
     """Print an outcome, and write the files that the options select."""
     settings: Settings = {**outcome.settings, "took, s": round(took_s)}
     show(outcome.title, state, settings, outcome.rounds, outcome.targets)
-    own = OUTPUT if outcome.is_whole else None
+    own = OUTPUT if outcome.is_whole and not getattr(options, "quick", False) else None
     record = getattr(options, "json", None) or (own and own / f"{outcome.name}.json")
     picture = getattr(options, "plot", None) or (own and own / f"{outcome.name}.png")
     if is_saved and record:

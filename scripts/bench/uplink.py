@@ -15,7 +15,7 @@ back (50 Hz): alone, then with one TCP flow (CUBIC) from the robot. Ages are one
     sudo .venv/bin/python scripts/bench/uplink.py                     # a small grid; writes docs/benchmarks/uplink.*
     sudo .venv/bin/python scripts/bench/uplink.py --quick --no-save   # a few seconds each: does it work?
     sudo .venv/bin/python scripts/bench/uplink.py --only gdp --rates 1 5 --rtt 10 --loss 0 burst --fifo bdp --no-save
-    sudo .venv/bin/python scripts/bench/uplink.py --rates Verizon-LTE-short --traces ../shared/data/uplinks --no-save
+    sudo .venv/bin/python scripts/bench/uplink.py --rates Verizon-LTE-short --no-save
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from typing import Final
 
 from peers.process import FailedError
 from plot import Panel, panel_of
+from preconditions import DATA, RefusedError
 from report import Rounds, Target, progress
 from skeleton import Options, Outcome, Recorder, Trial, command_line, new_run, run_bench
 from testbed import Lab
@@ -40,6 +41,7 @@ from thin_link.score import LINK_COLUMNS, STREAM_COLUMNS, Report, link_figures, 
 from thin_link.systems import SYSTEMS, System, start_role
 from thin_link.traffic import CAMERA_BYTES, carried_s, streams, wire_bytes
 
+from gdp.errors import LocalError
 from gdp.host.run_registry import RunRegistry
 
 OURS: Final = "gdp"
@@ -52,7 +54,6 @@ GRID: Final = (  # rate, round trip in ms, loss, FIFO
     ("100", 60.0, "0", "bdp"),
 )
 RECORDED: Final = ("Verizon-LTE-short", 60.0, "0", "second")
-TRACES: Final = Path(__file__).resolve().parents[3] / "shared" / "data" / "uplinks"
 RTTS_MS: Final = (10.0, 60.0, 200.0)
 WARM_UP_S: Final = 3.0
 DRAIN_S: Final = 2.5
@@ -81,7 +82,7 @@ def links_of(options: Options) -> list[Conditions]:
     """Return the links of the command line: the small grid, or all combinations of what was chosen.
 
     Raises:
-        LocalError: an unknown word, or a recording that is not there.
+        RefusedError: an unknown word, or a recording that is not there.
     """
     if any((options.rates, options.rtt, options.loss, options.fifo)):
         words = [
@@ -92,13 +93,11 @@ def links_of(options: Options) -> list[Conditions]:
             for fifo in options.fifo or ["second"]
         ]
     else:
-        words = [*GRID]
-        if (options.traces / f"{RECORDED[0]}.up").exists():
-            words.append(RECORDED)
-        else:
-            progress(f"no recording {RECORDED[0]} in {options.traces}: that link is left out (see --traces)")
-        words = words[:1] if options.quick else words
-    return [Conditions.of(*each, seed=options.seed, traces=options.traces) for each in words]
+        words = [*GRID[:1]] if options.quick else [*GRID, RECORDED]
+    try:
+        return [Conditions.of(*each, seed=options.seed, traces=options.traces) for each in words]
+    except LocalError as error:
+        raise RefusedError(str(error)) from error
 
 
 def exchange(
@@ -263,7 +262,9 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--loss", nargs="+", choices=list(LOSSES), help="of frames, %%; burst: 2 %% in runs of 8")
     parser.add_argument("--fifo", nargs="+", choices=FIFOS, help="depth of each queue")
     parser.add_argument("--camera", choices=("auto", *CAMERA_BYTES), default="auto", help="raw from 50 Mbit/s on: auto")
-    parser.add_argument("--traces", type=Path, default=TRACES, help="folder of recordings (default: %(default)s)")
+    parser.add_argument(
+        "--traces", type=Path, default=DATA / "uplinks", help="folder of recordings (default: %(default)s)"
+    )
     parser.add_argument("--seed", type=int, default=1, help="of the losses (default: %(default)s)")
     parser.add_argument(
         "--tcp-control", default="cubic", help="congestion control under Zenoh's TLS (default: %(default)s)"

@@ -1,9 +1,9 @@
 """Availability of a pool of spot machines, by replaying recorded preemptions.
 
-Command: reads ``../shared/data/spot``, prints a table, writes ``docs/experiments/availability.{md,png,json}``.
+Command: reads ``scripts/data/spot``, prints a table, writes ``docs/experiments/availability.{md,png,json}``.
 
     python scripts/experiments/availability.py                      # everything, about 15 seconds
-    python scripts/experiments/availability.py --recovery 20min --json --no-write
+    python scripts/experiments/availability.py --recovery 20min --json --quick
 """
 
 from __future__ import annotations
@@ -17,17 +17,14 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from experiment import OUTPUT, page_command_line, write
+from experiment import Computed, Options, command_line, run_experiment
+from preconditions import data_folder
 from report import print_table
-from skeleton import clean_exit
 
 from fog.catalog.measured import measured
 from fog.plan.duration import duration_text, seconds_from_text
 from fog.plan.trace import Share, Trace, none_up, outages, pool_down, replica_down, share_with_interval
-from gdp.errors import LocalError
 
-ROOT: Final = Path(__file__).parents[2]
-SPOT: Final = ROOT.parent / "shared/data/spot"
 RECOVERIES: Final = ("34s", "5min", "20min")
 BLOCK_S, RESAMPLES, MOST_REPLICAS = 6 * 3600.0, 2000, 3
 _HEAD: Final = ("way", "zones", "replicas", "recovery", "none up", "95 % interval", "if independent")
@@ -58,33 +55,34 @@ class Case:
 
 def main(words: Sequence[str] | None = None) -> None:
     """Compute the share of time in which no replica would have been up."""
-    parser = page_command_line(__doc__)
+    parser = command_line(__doc__)
     parser.add_argument("--recovery", action="append", help="from a preemption to a replacement; may be repeated")
     parser.add_argument("--seed", type=int, default=1, help="of the resampling")
-    options = parser.parse_args(words)
-    with clean_exit():
-        traces, chance = recorded(), np.random.default_rng(options.seed)
-        spans = [seconds_from_text(text) for text in options.recovery or RECOVERIES]
-        cases = [case for recovery_s in spans for case in replay(traces, recovery_s, chance)]
-    document = {"source": measured().source, "seed": options.seed, "cases": [asdict(case) for case in cases]}
-    if options.json:
-        print(json.dumps(document))
-    else:
-        print_table(_HEAD, map(_cells, cases), words=2)
-    if options.write:
-        write(OUTPUT, "availability", document, page(cases))
-        _draw(OUTPUT / "availability.png", cases)
+    run_experiment(parser, measure, words)
+
+
+def measure(options: Options) -> Computed:
+    """Replay every pool with every recovery time; ``--quick``: with the first one."""
+    traces, chance = recorded(), np.random.default_rng(options.seed)
+    spans = [seconds_from_text(text) for text in options.recovery or RECOVERIES[: 1 if options.quick else None]]
+    cases = [case for recovery_s in spans for case in replay(traces, recovery_s, chance)]
+    return Computed(
+        "availability",
+        "Availability, by replaying preemptions",
+        {"source": measured().source, "seed": options.seed, "cases": [asdict(case) for case in cases]},
+        page(cases),
+        lambda: print_table(_HEAD, map(_cells, cases), words=2),
+        lambda path, _: _draw(path, cases),
+    )
 
 
 def recorded() -> list[Trace]:
     """Read the traces.
 
     Raises:
-        LocalError: they are missing.
+        RefusedError: they are missing.
     """
-    paths = sorted(SPOT.glob("aws_*.json"))
-    if not paths:
-        raise LocalError(f"no traces in {SPOT}")
+    paths = sorted(data_folder("spot", ["aws_*.json"]).glob("aws_*.json"))
     return [Trace.from_document(path.stem[-1], json.loads(path.read_text())) for path in paths]
 
 

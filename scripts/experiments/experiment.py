@@ -1,7 +1,7 @@
 """Common parts of the experiments: command line, field, table, page, picture, and a file with every latency.
 
 I/O. Prints, and writes ``NAME.json``, ``NAME.md`` and ``NAME.png`` into the folder of the command line. An experiment
-states its options and measures::
+states its options and measures; one whose samples are no latencies returns a ``Computed``::
 
     def measure(options: Options) -> Report: ...
 
@@ -22,25 +22,25 @@ from typing import Final
 from bench_path import ROOT
 from field import ROBOT, Field, Served, Work
 from machine import MachineState, machine_state
+from preconditions import require_trust, require_writable
 from report import markdown_table, number_text, print_table, progress
 from samples import Sample, Summary
 from series import Series
-from skeleton import Options, clean_exit, new_run
+from skeleton import Options, add_allow_load, clean_exit, new_run
 
 __all__ = [
     "CASES",
     "OUTPUT",
     "Asking",
+    "Computed",
     "Finding",
     "Options",
     "Report",
     "command_line",
     "field_of",
     "latencies_of",
-    "page_command_line",
     "run_experiment",
     "work_of",
-    "write",
 ]
 
 OUTPUT: Final = ROOT / "docs" / "experiments"
@@ -75,10 +75,10 @@ class Finding:
             return ""
         return "met" if (self.measured <= self.target if self.at_most else self.measured >= self.target) else "MISSED"
 
-    def cells(self) -> tuple[str, ...]:
-        """Return its row of a table."""
+    def cells(self, state: MachineState) -> tuple[str, ...]:
+        """Return its row of a table; the machine's load marks it where it is high."""
         target = "" if self.target is None else f"{'≤' if self.at_most else '≥'} {number_text(self.target)}"
-        return self.what, number_text(self.measured), target, self.outcome, self.paper
+        return self.what + state.mark, number_text(self.measured), target, self.outcome, self.paper
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,13 +102,13 @@ class Report:
     settings: Mapping[str, str | int | float]
     draw: Callable[[Path, str], None]
 
-    def rows(self) -> list[tuple[str, ...]]:
-        """Return the table's rows, name first."""
+    def rows(self, state: MachineState) -> list[tuple[str, ...]]:
+        """Return the table's rows, name first; the machine's load marks each where it is high."""
         rows = []
         for name, samples in self.groups.items():
             found = Summary.of(samples)
-            times = (found.mean_s, found.p50_s, found.p99_s, found.worst_s)
-            rows.append((name, str(found.count), str(found.failed), *(number_text(1e3 * each) for each in times)))
+            times = [number_text(1e3 * each) for each in (found.mean_s, found.p50_s, found.p99_s, found.worst_s)]
+            rows.append((name + state.mark, str(found.count), str(found.failed), *times))
         return rows
 
     def to_dict(self, state: MachineState) -> dict[str, object]:
@@ -125,8 +125,8 @@ class Report:
         """Return the page in Markdown."""
         command = f"```bash\nsudo .venv/bin/python scripts/experiments/{self.name}.py\n```"
         parts = [f"# {self.title}", *self.setting, command, f"![{self.title}]({self.name}.png)"]
-        parts += [markdown_table(("", *_COLUMNS), self.rows())]
-        parts += [markdown_table(_FIGURES, [each.cells() for each in self.findings])]
+        parts += [markdown_table(("", *_COLUMNS), self.rows(state))]
+        parts += [markdown_table(_FIGURES, [each.cells(state) for each in self.findings])]
         parts += ["\n".join(f"- {note}" for note in self.notes)]
         stated = "; ".join(f"{key}: {value}" for key, value in self.settings.items())
         return "\n\n".join([*parts, f"Measured on {state}. {stated}."]) + "\n"
@@ -134,10 +134,41 @@ class Report:
     def show(self, state: MachineState) -> None:
         """Print the tables and the notes."""
         print(f"{self.title}\n{state}")
-        print_table(("", *_COLUMNS), self.rows(), title="latency at the robot's node")
-        print_table(_FIGURES, [each.cells() for each in self.findings], title="figures")
+        print_table(("", *_COLUMNS), self.rows(state), title="latency at the robot's node")
+        print_table(_FIGURES, [each.cells(state) for each in self.findings], title="figures")
         for note in self.notes:
             print(f"- {note}")
+
+
+@dataclass(frozen=True, slots=True)
+class Computed:
+    """Outcome of an experiment that writes a document and a page of its own kind.
+
+    Args:
+        name: of its files, such as ``table1``.
+        print_tables: without a machine, which the page names in its last line.
+        draw: as in ``Report``.
+    """
+
+    name: str
+    title: str
+    document: Mapping[str, object]
+    page: str
+    print_tables: Callable[[], None]
+    draw: Callable[[Path, str], None]
+
+    def to_dict(self, state: MachineState) -> dict[str, object]:
+        """Return the document, with the machine."""
+        return {"experiment": self.name, "machine": asdict(state), **self.document}
+
+    def to_page(self, state: MachineState) -> str:
+        """Return the page in Markdown."""
+        return f"{self.page}\nWritten on {state}.\n"
+
+    def show(self, state: MachineState) -> None:
+        """Print the tables."""
+        print(f"{self.title}\n{state}")
+        self.print_tables()
 
 
 @contextmanager
@@ -215,43 +246,38 @@ def command_line(description: str | None) -> argparse.ArgumentParser:
     parser.add_argument("--quick", action="store_true", help="a few seconds: does it work? writes nothing by itself")
     parser.add_argument("--json", action="store_true", help="print what would be written as JSON, and no table")
     parser.add_argument("--out", type=Path, help="folder for JSON, page and picture (default: docs/experiments)")
+    add_allow_load(parser)
     return parser
 
 
-def page_command_line(description: str | None) -> argparse.ArgumentParser:
-    """Return a parser for an experiment that only computes."""
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument(
-        "--write", action=argparse.BooleanOptionalAction, default=True, help="the page, the picture and the JSON"
-    )
-    return parser
+def run_experiment(
+    parser: argparse.ArgumentParser,
+    measure: Callable[[Options], Report | Computed],
+    words: Sequence[str] | None = None,
+) -> None:
+    """Run an experiment to its tables, page, picture and JSON.
 
-
-def run_experiment(parser: argparse.ArgumentParser, measure: Callable[[Options], Report]) -> None:
-    """Run an experiment to its tables, page, picture and JSON; a wrong option that ``measure`` finds exits with 2."""
-    options, state = parser.parse_args(), machine_state()
-    try:
-        with clean_exit():
-            report = measure(options)
-    except argparse.ArgumentTypeError as error:
-        parser.error(str(error))
+    Args:
+        words: as ``sys.argv[1:]``.
+    """
+    options, state = parser.parse_args(words), machine_state()
+    folder: Path | None = options.out or (None if options.quick else OUTPUT)
+    with clean_exit():
+        if folder is not None:
+            require_writable(folder)
+        if not options.quick:
+            require_trust(state, allow_load=options.allow_load)
+        report = measure(options)
     document = report.to_dict(state)
     if options.json:
         print(_text(document))
     else:
         report.show(state)
-    if folder := options.out or (None if options.quick else OUTPUT):
-        write(folder, report.name, document, report.to_page(state))
+    if folder is not None:
         report.draw(folder / f"{report.name}.png", report.title)
-
-
-def write(folder: Path, name: str, document: Mapping[str, object], page: str) -> None:
-    """Write the JSON and the page of an experiment."""
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / f"{name}.json").write_text(_text(document) + "\n", encoding="utf-8")
-    (folder / f"{name}.md").write_text(page, encoding="utf-8")
-    progress(f"written: {folder / name}.json and .md")
+        (folder / f"{report.name}.json").write_text(_text(document) + "\n", encoding="utf-8")
+        (folder / f"{report.name}.md").write_text(report.to_page(state), encoding="utf-8")
+        progress(f"written: {folder / report.name}.json, .md and .png")
 
 
 def _text(document: Mapping[str, object]) -> str:

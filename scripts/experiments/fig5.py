@@ -20,7 +20,6 @@ from pathlib import Path
 from statistics import fmean
 from typing import Final
 
-from bench_path import ROOT
 from experiment import (
     CASES,
     Asking,
@@ -35,15 +34,15 @@ from experiment import (
 )
 from field import Field, Served, Work
 from pictures import save_distributions
+from preconditions import DATA, RefusedError, data_folder
 from recorded import LIMIT_S, RECORDED, draw, load
 from samples import Sample, Summary, least_of_two, p99
 from series import Series
 
 TYPE: Final = "nav_msgs/srv/GetPlan"
-MESHES: Final = ROOT.parent / "shared" / "data" / "planning"
 TRIALS: Final = {"Home": 12, "Cubicles": 60, "Twistycool": 5}
 TIMEOUT_S: Final = 45.0
-QUICK: Final = ("Cubicles", 3, 5)  # problem, trials, waits
+QUICK: Final = ("Slit", 3, 5)  # problem, trials, waits
 _ONE, _TWO = "/plan/m1", "/plan"
 _MACHINES: Final = ("m1", "m2")
 _WAITS: Final = 100
@@ -91,7 +90,7 @@ def measure(options: Options) -> Report:
                 found = _ask(here, name, count, patience_s=timeout + _SLACK_S)
                 groups |= _named(f"{name}, computed", found)
                 findings += _planning_findings(name, found)
-    lists = _lists(waits, [QUICK[0]] if options.quick else RECORDED) if waits else {}
+    lists = _lists(waits, ["Cubicles"] if options.quick else RECORDED) if waits else {}
     if lists:
         own = {each: {"waits_s": {name: both[at] for name, both in lists.items()}} for at, each in enumerate(_MACHINES)}
         with field_of(*_fleet("replay", own, {}, _SLACK_S)) as here:
@@ -126,20 +125,20 @@ def _check(problems: Collection[str], planner: str, meshes: Path) -> None:
     """Refuse a planner or a problem that is not available.
 
     Raises:
-        argparse.ArgumentTypeError: one is not.
+        RefusedError: one is not.
     """
     try:
         from planning import PROBLEMS, planners
     except ImportError as error:
         missing = f"{error.name} is not installed: pip install 'gdp-ros[experiments]', or go without: --no-planning"
-        raise argparse.ArgumentTypeError(missing) from error
+        raise RefusedError(missing) from error
     if planner not in planners():
-        raise argparse.ArgumentTypeError(f"--planner {planner}: expected one of {', '.join(planners())}")
+        raise RefusedError(f"--planner {planner}: expected one of {', '.join(planners())}")
     for each in problems:
-        if each not in PROBLEMS or not (meshes / f"{PROBLEMS[each]}.cfg").is_file():
-            raise argparse.ArgumentTypeError(
-                f"--problem {each}: expected one of {', '.join(PROBLEMS)}, with its files in {meshes}"
-            )
+        if each not in PROBLEMS:
+            raise RefusedError(f"--problem {each}: expected one of {', '.join(PROBLEMS)}")
+        files = [f"{PROBLEMS[each]}{kind}" for kind in (".cfg", "_env.dae", "_robot.dae")]
+        data_folder(meshes.name, files, meshes.parent)
 
 
 def _fleet(
@@ -234,7 +233,7 @@ if __name__ == "__main__":
     parser.add_argument("--timeout", type=float, default=TIMEOUT_S, help="seconds of a planner (default: %(default)s)")
     parser.add_argument("--planner", default="RRTConnect", help="class in ompl.geometric (default: %(default)s)")
     parser.add_argument("--waits", type=int, default=_WAITS, help="trials of each wait; 0: none (default: %(default)s)")
-    parser.add_argument("--meshes", type=Path, default=MESHES, help="folder of the problems")
+    parser.add_argument("--meshes", type=Path, default=DATA / "planning", help="folder of the problems")
     parser.add_argument("--planning", action=argparse.BooleanOptionalAction, default=True, help="plan, or only wait")
     parser.add_argument("--stop", action=argparse.BooleanOptionalAction, default=True, help="stop the slower replica")
     run_experiment(parser, measure)

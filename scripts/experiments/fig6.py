@@ -32,7 +32,7 @@ from series import Contention, Series
 
 REQUESTS: Final = 300
 COMPUTED: Final = 100
-QUICK: Final = 5
+QUICK: Final = 2
 ON_S: Final = 1.1
 OFF_S: Final = 1.0
 _GAP_S: Final = 0.27  # longer than a wait, so that the slower replica is done; not in step with the second client

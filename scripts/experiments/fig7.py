@@ -29,7 +29,7 @@ from series import Series
 
 DELAY_S: Final = 0.1
 REQUESTS: Final = 300
-QUICK: Final = 6
+QUICK: Final = 2
 _TAKES_S: Final = 0.04
 _GAP_S: Final = 0.1  # between the end of a request and the next one, at least so long after the one before began
 _PATIENCE_S: Final = 10.0

@@ -20,7 +20,7 @@ from samples import Sample, Summary
 from series import Series
 
 MINUTES: Final = 2.0
-QUICK_MINUTES: Final = 0.13
+QUICK_MINUTES: Final = 0.06
 _SERVICE: Final = "/tag"
 _HZ: Final = 10.0
 _DOWN_S: Final = 2.0  # pause before a killed machine starts again

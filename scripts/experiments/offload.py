@@ -20,13 +20,13 @@ from dataclasses import asdict, dataclass, field
 from typing import Final
 
 from bench_path import ROOT
-from experiment import OUTPUT, command_line, write
+from experiment import OUTPUT, Computed, Options, command_line, run_experiment
 from machine import machine_state
 from offload_page import page_of, save_picture
 from peers.process import Started
 from report import progress
 from ros_row import DIRECT_DOMAIN, LEFT, READY_S, RIGHT, Carried, Row
-from skeleton import clean_exit, new_run
+from skeleton import new_run
 
 from gdp.host.cgroups import Cgroup
 
@@ -62,32 +62,29 @@ class Measured:
     failed: int = 0
 
 
-def main() -> None:
+def measure(options: Options) -> Computed:
     """Compute three tasks on the robot, and on a server behind three switches."""
-    parser = command_line(__doc__)
-    parser.add_argument("--task", action="append", choices=list(COMPUTED), help="may be repeated (default: all three)")
-    parser.add_argument("--part", choices=("network", "alone", "both"), default="both", help="(default: %(default)s)")
-    parser.add_argument("--rounds", type=int, default=ROUNDS, help="(default: %(default)s)")
-    options = parser.parse_args()
+    from offload_tasks import TASKS
+
     quick: bool = options.quick
-    place = options.out or (None if quick else OUTPUT)
+    names = [_QUICK] if quick else options.task or list(COMPUTED)
+    for name in names:
+        TASKS[name]()  # so that missing data are reported first
+    held = (options.out or OUTPUT) / "offload.json"
     tasks: dict[str, dict[str, object]] = {}
-    if place is not None and (place / "offload.json").exists():
-        tasks = json.loads((place / "offload.json").read_text(encoding="utf-8"))["tasks"]
-    with clean_exit():
-        for name in [_QUICK] if quick else options.task or COMPUTED:
-            machine = {"machine": asdict(machine_state())}
-            figures = tasks.setdefault(name, {})
-            if options.part != "alone":
-                figures["network"] = _network(name, 1 if quick else options.rounds, quick=quick) | machine
-            if options.part != "network":
-                figures["alone"] = _alone(name, quick=quick) | machine
-    document = {"experiment": "offload", "slower": SLOWER, "tasks": tasks}
+    if held.exists() and not quick:
+        tasks = json.loads(held.read_text(encoding="utf-8"))["tasks"]
+    for name in names:
+        machine = {"machine": asdict(machine_state())}
+        figures = tasks.setdefault(name, {})
+        if options.part != "alone":
+            figures["network"] = _network(name, 1 if quick else options.rounds, quick=quick) | machine
+        if options.part != "network":
+            figures["alone"] = _alone(name, quick=quick) | machine
+    document = {"slower": SLOWER, "tasks": tasks}
     page = page_of(document)
-    print(json.dumps(document) if options.json else page)
-    if place is not None:
-        write(place, "offload", document, page)
-        save_picture(place / "offload.png", document)
+    title = "FogROS G: Table I and Figure 5"
+    return Computed("offload", title, document, page, lambda: print(page), lambda at, _: save_picture(at, document))
 
 
 def _network(name: str, rounds: int, *, quick: bool) -> dict[str, object]:
@@ -183,4 +180,8 @@ def _short(value: object) -> object:
 
 
 if __name__ == "__main__":
-    main()
+    parser = command_line(__doc__)
+    parser.add_argument("--task", action="append", choices=list(COMPUTED), help="may be repeated (default: all three)")
+    parser.add_argument("--part", choices=("network", "alone", "both"), default="both", help="(default: %(default)s)")
+    parser.add_argument("--rounds", type=int, default=ROUNDS, help="(default: %(default)s)")
+    run_experiment(parser, measure)

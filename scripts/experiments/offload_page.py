@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from machine import MachineState
 from report import markdown_table, percentile
 
 __all__ = ["CYCLONE", "FAST", "OVERLAY", "PAPER", "added_s", "page_of", "save_picture", "seconds_text"]
@@ -120,7 +121,8 @@ def _rows(name: str, task: Document) -> list[tuple[str, ...]]:
     if "network" in task:
         contenders = task["network"]["contenders"]
         cells = [_text(contenders[who][key]) for who in (CYCLONE, OVERLAY) for key in ("there_s", "total_s")]
-    return [(name, "paper", *(f"{each:g}" for each in there)), ("", "here", alone, *cells)]
+    marks = dict.fromkeys(MachineState(**part["machine"]).mark for part in task.values())
+    return [(name, "paper", *(f"{each:g}" for each in there)), ("", "here" + "".join(marks), alone, *cells)]
 
 
 def _figure5(networks: Document) -> list[str]:
@@ -181,13 +183,9 @@ def _notes(tasks: Document, slower: Mapping[str, float]) -> list[str]:
         "Of Cyclone DDS there is no wheel for rclpy: its nodes serialise by rclpy and carry by this project's endpoint"
         " `dds`, without the overlay.",
     ]
-    machines = dict.fromkeys(
-        f"Linux {each['machine']['kernel']}, {each['machine']['cores']} cores ({each['machine']['processor']}), Python"
-        f" {each['machine']['python']}; load before {each['machine']['load_before']:.1f} ({name}, {part})"
-        for name, task in tasks.items()
-        for part, each in task.items()
-    )
-    return [*notes, "Measured on " + "; ".join(machines) + "."]
+    for name, task in tasks.items():
+        notes += [f"{name}, {part}: measured on {MachineState(**each['machine'])}." for part, each in task.items()]
+    return notes
 
 
 def _text(values: Sequence[float]) -> str:

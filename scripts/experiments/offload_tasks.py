@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import cv2
 import numpy as np
-from bench_path import ROOT
 from fogros_tasks import CAMERA, IMAGE, NUMBERS, OCTETS, POSE
 from geometry_msgs.msg import PoseStamped
 from numpy.typing import NDArray
+from preconditions import data_folder
 from ros_tasks import Message
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
@@ -29,9 +29,8 @@ from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 if TYPE_CHECKING:
     from planning import Problem
 
-__all__ = ["DATA", "TASKS", "OffloadTask"]
+__all__ = ["TASKS", "OffloadTask"]
 
-DATA: Final = ROOT.parent / "shared" / "data"
 _FRAMES: Final = (2, 3, 4, 5)  # the first of the five recorded frames is too far from the second to be matched well
 _NEAR_M: Final = 0.1
 _TURNED_RAD: Final = 0.1
@@ -79,12 +78,14 @@ class Vslam:
     parts = (("color", IMAGE), ("depth", IMAGE))
     answer = ("pose", POSE)
 
-    def __init__(self, data: Path = DATA) -> None:
+    def __init__(self) -> None:
         from odometry import Features, transform_of
 
-        colors = {at: _read(data / "rgbd" / f"color_{at}.png")[:, :, ::-1] for at in _FRAMES}
-        depths = {at: _read(data / "rgbd" / f"depth_{at}.pgm", cv2.IMREAD_UNCHANGED) for at in _FRAMES}
-        poses = [line.split() for line in (data / "rgbd" / "pose.txt").read_text(encoding="ascii").splitlines()]
+        files = (f"{kind}_{at}.png" for kind in ("color", "depth") for at in _FRAMES)
+        folder = data_folder("rgbd", ["pose.txt", *files])
+        colors = {at: _read(folder / f"color_{at}.png")[:, :, ::-1] for at in _FRAMES}
+        depths = {at: _read(folder / f"depth_{at}.png", cv2.IMREAD_UNCHANGED) for at in _FRAMES}
+        poses = [line.split() for line in (folder / "pose.txt").read_text(encoding="ascii").splitlines()]
         self._poses = {at: transform_of(tuple(map(float, poses[at - 1]))) for at in _FRAMES}
         self._images = {at: [_image("rgb8", colors[at]), _image("16UC1", depths[at])] for at in _FRAMES}
         self._before = Features.of(np.ascontiguousarray(colors[_FRAMES[0]]), depths[_FRAMES[0]])
@@ -133,11 +134,11 @@ class MotionPlanning:
     parts = (("environment_mesh", OCTETS), ("robot_mesh", OCTETS), ("motion_plan_request", NUMBERS))
     answer = ("motion_plan", NUMBERS)
 
-    def __init__(self, data: Path = DATA) -> None:
+    def __init__(self) -> None:
         from planning import be_quiet, limits
 
         be_quiet()
-        folder = data / "planning"
+        folder = data_folder("planning", ["Home.cfg", "Home_env.dae", "Home_robot.dae"])
         self._limits = limits(folder, "Home")
         meshes = ((folder / f"Home_{what}.dae").read_bytes() for what in ("env", "robot"))
         octets = [UInt8MultiArray(data=array.array("B", mesh)) for mesh in meshes]
@@ -181,15 +182,16 @@ class GraspPlanning:
     parts = (("camera_info", CAMERA), ("image_raw", IMAGE), ("mask_raw", IMAGE))
     answer = ("grasp", POSE)
 
-    def __init__(self, data: Path = DATA) -> None:
+    def __init__(self) -> None:
         from odometry import CAMERA as MATRIX
         from odometry import DEPTH_SCALE
 
+        folder = data_folder("rgbd", [f"depth_{at}.png" for at in _OBJECTS])
         self._masks = {}
         self._messages = {}
         info = CameraInfo(height=386, width=516, k=MATRIX.ravel().tolist())
         for at, (top, bottom, left, right) in _OBJECTS.items():
-            image = _read(data / "rgbd" / f"depth_{at}.pgm", cv2.IMREAD_UNCHANGED)
+            image = _read(folder / f"depth_{at}.png", cv2.IMREAD_UNCHANGED)
             depth = (image[_CROP] / DEPTH_SCALE).astype(np.float32)
             inside = np.zeros(depth.shape, dtype=bool)
             inside[top:bottom, left:right] = True

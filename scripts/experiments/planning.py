@@ -23,7 +23,8 @@ from ompl import base, geometric, util
 
 __all__ = ["PROBLEMS", "Problem", "Solved", "Way", "be_quiet", "limits", "planners"]
 
-PROBLEMS: Final = {"Home": "Home", "Cubicles": "cubicles", "Twistycool": "Twistycool", "Easy": "Easy"}
+# The last one is this project's own: a bar and a wall with a slit.
+PROBLEMS: Final = {"Home": "Home", "Cubicles": "cubicles", "Twistycool": "Twistycool", "Easy": "Easy", "Slit": "Slit"}
 _AXES: Final = "xyz"
 
 Mesh: TypeAlias = "tuple[NDArray[np.float64], NDArray[np.int64]]"

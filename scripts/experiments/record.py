@@ -15,13 +15,12 @@ import time
 from pathlib import Path
 from typing import Final
 
-from bench_path import ROOT
 from planning import PROBLEMS, Problem, be_quiet
+from preconditions import DATA
 from recorded import RECORDING
 
 PLANNER: Final = "RRTConnect"
 LIMIT_S: Final = 1_000.0  # limit by the wall clock; the paper's 100 s are applied when the recording is used
-MESHES: Final = ROOT.parent / "shared" / "data" / "planning"
 
 
 def main() -> None:
@@ -29,7 +28,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--problem", required=True, choices=list(PROBLEMS))
     parser.add_argument("--runs", type=int, default=20, help="how many to add (default: %(default)s)")
-    parser.add_argument("--meshes", type=Path, default=MESHES, help="folder of the problems")
+    parser.add_argument("--meshes", type=Path, default=DATA / "planning", help="folder of the problems")
     parser.add_argument("--out", type=Path, default=RECORDING, help="the file to add to")
     options = parser.parse_args()
     problem: str = options.problem

@@ -1,4 +1,4 @@
-"""Table of the papers' figures: theirs, ours, trials, spread, conditions; from the experiments' JSON.
+"""Table of the papers' figures: theirs, ours, trials, spread, conditions, origin; from the experiments' JSON.
 
 Reads the JSON files of a folder; otherwise sans-I/O.
 """
@@ -6,18 +6,21 @@ Reads the JSON files of a folder; otherwise sans-I/O.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean, median
 from typing import Any, Final
 
 import numpy as np
+from machine import MachineState
 from offload_page import CYCLONE, OVERLAY, PAPER, PAPER_ADDED_S, added_s, seconds_text
 from report import markdown_table
 from samples import p99
 
-__all__ = ["Row", "machines_of", "page_of", "rows_of"]
+__all__ = ["THIS_RUN", "Row", "machines_of", "page_of", "rows_of"]
+
+THIS_RUN: Final = "this run"
 
 _RESAMPLES: Final = 2_000
 _SEED: Final = 1
@@ -47,7 +50,12 @@ _NUMBERS: Final = {"fig5": "FT Figure 5", "fig6": "FT Figure 6", "fig7": "FT Fig
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """Figure of a paper and ours, as text. ``spread``: of ours, with its definition."""
+    """Figure of a paper and ours, as text.
+
+    Args:
+        spread: of ours, with its definition.
+        measured: ``THIS_RUN``, or day, commit and load of an earlier one; also of this one where the load was high.
+    """
 
     figure: str
     what: str
@@ -56,10 +64,15 @@ class Row:
     spread: str
     trials: str
     conditions: str
+    measured: str = ""
 
 
-def rows_of(folder: Path) -> list[Row]:
-    """Return the rows of those experiments whose JSON is in a folder."""
+def rows_of(folder: Path, measured: Collection[str]) -> tuple[list[Row], list[str]]:
+    """Return the rows of those experiments whose JSON is in a folder, and the names of the others.
+
+    Args:
+        measured: experiments that wrote their JSON in this run.
+    """
     makers: dict[str, Callable[[Any], Iterator[Row]]] = {
         "offload": _offload,
         "table1": _prices,
@@ -68,11 +81,16 @@ def rows_of(folder: Path) -> list[Row]:
         "outages": _outages,
     }
     rows: list[Row] = []
+    missing = []
     for name, make in makers.items():
         path = folder / f"{name}.json"
         if path.exists():
-            rows += make(json.loads(path.read_text(encoding="utf-8")))
-    return rows
+            document = json.loads(path.read_text(encoding="utf-8"))
+            origin = _origin(document, is_measured=name in measured)
+            rows += (replace(row, measured=origin) for row in make(document))
+        else:
+            missing.append(name)
+    return rows, missing
 
 
 def machines_of(folder: Path) -> list[str]:
@@ -82,22 +100,42 @@ def machines_of(folder: Path) -> list[str]:
         path = folder / f"{name}.json"
         if path.exists():
             document = json.loads(path.read_text(encoding="utf-8"))
-            parts = [part for task in document.get("tasks", {}).values() for part in task.values()] or [document]
-            for state in (part["machine"] for part in parts if "machine" in part):
-                machine = f"Linux {state['kernel']}, {state['cores']} cores ({state['processor']})"
-                found.setdefault(machine, []).append(f"{name} {state['load_before']:.1f}")
+            for state in _states(document):
+                machine = f"Linux {state.kernel}, {state.cores} cores ({state.processor})"
+                found.setdefault(machine, []).append(f"{name} {state.load_before:.1f}")
     return [f"{machine}; load before: {', '.join(loads)}." for machine, loads in found.items()]
 
 
-def page_of(rows: Sequence[Row], machines: Sequence[str]) -> str:
-    """Return the page, in Markdown."""
-    head = ("figure", "what", "paper", "here", "spread here", "trials here", "conditions here")
-    cells = [(r.figure, r.what, r.paper, r.here, r.spread, r.trials, r.conditions) for r in rows]
+def _states(document: Any) -> list[MachineState]:
+    """Return the machine of each part of a document, with its load before; none where it was not recorded."""
+    parts = [part for task in document.get("tasks", {}).values() for part in task.values()] or [document]
+    return [MachineState(**part["machine"]) for part in parts if "machine" in part]
+
+
+def _origin(document: Any, *, is_measured: bool) -> str:
+    """Return where the rows of a document come from."""
+    states = _states(document)
+    busy = max(states, key=lambda state: state.load_before / state.cores, default=None)
+    if is_measured:
+        return THIS_RUN + (busy.mark if busy else "")
+    codes = " and ".join(dict.fromkeys(state.code for state in states)) or "day and commit not recorded"
+    return f"earlier: {codes}, " + (f"load {busy.load_before:.1f}" if busy else "load not recorded")
+
+
+def page_of(rows: Sequence[Row], machines: Sequence[str], missing: Sequence[str]) -> str:
+    """Return the page, in Markdown.
+
+    Args:
+        missing: experiments that have no rows.
+    """
+    head = ("figure", "what", "paper", "here", "spread here", "trials here", "conditions here", "measured")
+    cells = [(r.figure, r.what, r.paper, r.here, r.spread, r.trials, r.conditions, r.measured) for r in rows]
     return "\n\n".join([
         "# The published figures next to ours",
         "G is FogROS G, FT is FogROS2-FT. One command measures everything and writes this page and"
         " [results.json](results.json); `--collect` only writes the page again.",
         "```bash\nsudo .venv/bin/python scripts/experiments/papers.py\n```",
+        *([f"**Not complete.** Not measured: {', '.join(missing)}."] if missing else []),
         markdown_table(head, cells),
         "Gains are the time of one server divided by that of two replicas. Their spread is the 95 % interval of a"
         f" bootstrap ({_RESAMPLES:,} resamples). Each experiment's own page has all latencies and its conditions"

@@ -4,20 +4,18 @@ Command: reads the price list of this package, prints a table, writes ``docs/exp
 First come the paper's six applications in its two regions, then some machine types of one region.
 
     python scripts/experiments/table1.py                         # everything, under 5 seconds
-    python scripts/experiments/table1.py --region us-west-2 --json --no-write
+    python scripts/experiments/table1.py --region us-west-2 --json --quick
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
-from experiment import OUTPUT, page_command_line, write
+from experiment import Computed, Options, command_line, run_experiment
 from report import print_table
-from skeleton import clean_exit
 
 from fog.catalog.aws import aws_prices
 from fog.hardware import Hardware
@@ -75,28 +73,31 @@ class Application:
 
 def main(words: Sequence[str] | None = None) -> None:
     """Compare the cost of one on-demand machine, two on-demand machines and two spot machines."""
-    parser = page_command_line(__doc__)
+    parser = command_line(__doc__)
     parser.add_argument("--region", default="us-east-1", help="of AWS (default: %(default)s)")
-    options = parser.parse_args(words)
+    run_experiment(parser, measure, words)
+
+
+def measure(options: Options) -> Computed:
+    """Look up the prices; ``--quick`` takes no less time."""
     region: str = options.region
-    with clean_exit():
-        rows, needed = bills(region), applications()
+    rows, needed = bills(region), applications()
+
+    def print_tables() -> None:
+        head = ("USD", "needs", "", "one /h", "two /h", "two spot /h", "two spot / one", "machines")
+        print_table(head, _application_rows(needed), words=3)
+        prices = [f"{each} /{per}" for per in ("h", "month") for each in _WAYS]
+        print_table((f"{region}, USD", *prices, "of one", "taken a month"), map(_cells, rows))
+
     document = {
         "region": region,
         "sources": aws_prices().sources,
         "applications": [asdict(each) for each in needed],
         "rows": [asdict(row) | {"times_cheaper": round(row.times_cheaper, 2)} for row in rows],
     }
-    if options.json:
-        print(json.dumps(document))
-    else:
-        head = ("USD", "needs", "", "one /h", "two /h", "two spot /h", "two spot / one", "machines")
-        print_table(head, _application_rows(needed), words=3)
-        prices = [f"{each} /{per}" for per in ("h", "month") for each in _WAYS]
-        print_table((f"{region}, USD", *prices, "of one", "taken a month"), map(_cells, rows))
-    if options.write:
-        write(OUTPUT, "table1", document, page(region, rows, needed))
-        _draw(OUTPUT / "table1.png", region, rows)
+    title = "Table I: the price of a replica"
+    pictured = page(region, rows, needed)
+    return Computed("table1", title, document, pictured, print_tables, lambda path, _: _draw(path, region, rows))
 
 
 def bills(region: str) -> list[Row]:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from reduce import CLOUD, Case, cloud, described, image, measure_one, smooth, zstd_of
+from reduce import CLOUD, Case, cloud, described, image, measure_one, zstd_of
 
 from proxy.config.reduction import Region
 from proxy.reduce.image import IMAGE
 from proxy.reduce.picture import HAS_LIBRARY
 
-PICTURE = smooth(np.random.default_rng(1)).astype(np.uint8)
+ROWS, COLUMNS = np.mgrid[0:480, 0:640]
+WAVES = 128 + 60 * np.sin(ROWS / 37) + 50 * np.cos(COLUMNS / 53)
+PICTURE = np.clip(WAVES + np.random.default_rng(1).normal(0, 3, WAVES.shape), 0, 255).astype(np.uint8)
 
 
 def test_a_synthetic_map_shrinks_and_comes_back() -> None:

@@ -14,6 +14,7 @@ import pytest
 sys.path.append(str(Path(__file__).resolve().parents[2] / "scripts" / "bench"))
 
 import uplink
+from preconditions import data_folder
 from report import Rounds
 from thin_link import score
 from thin_link.channel import Channel, ConstantRate, Loss, TraceRate
@@ -24,11 +25,9 @@ from thin_link.score import Report, idle_ms, link_figures, merged, stream_figure
 from thin_link.traffic import Stream, carried_s, make_message, open_message, streams, wire_bytes
 
 from gdp.errors import LocalError
-from tests.pages import ROOT
 
 MS = 1_000_000
 FRAME = 1_500
-UPLINKS = ROOT.parent / "shared" / "data" / "uplinks"
 
 
 def channel(
@@ -187,9 +186,8 @@ def test_a_recording_of_something_else_is_refused(tmp_path: Path) -> None:
         load_trace(tmp_path / "radio.up")
 
 
-@pytest.mark.skipif(not UPLINKS.exists(), reason="the recorded links are not here")
 def test_the_recorded_links_are_read_whole() -> None:
-    for path in UPLINKS.iterdir():
+    for path in data_folder("uplinks", ["*.up", "*.down"]).glob("*-LTE-*"):
         assert len(load_trace(path)) > 10_000
 
 

@@ -12,11 +12,9 @@ from experiment import OUTPUT
 
 from gdp.errors import LocalError
 
-needs_traces = pytest.mark.skipif(not availability.SPOT.is_dir(), reason="no ../shared/data/spot here")
-
 
 def test_table_one_compares_three_ways_to_run_a_service(capsys: pytest.CaptureFixture[str]) -> None:
-    table1.main(["--json", "--no-write"])
+    table1.main(["--json", "--quick"])
     (first, *_) = json.loads(capsys.readouterr().out)["rows"]
     assert [bill["of_single"] for bill in first["bills"][:2]] == [1.0, 2.0]
     assert first["bills"][2]["of_single"] < 1 < first["times_cheaper"]
@@ -29,7 +27,7 @@ def test_a_region_without_prices_is_refused() -> None:
 
 def test_the_page_of_table_one_is_of_the_shipped_prices() -> None:
     shown = (OUTPUT / "table1.md").read_text()
-    assert shown == table1.page("us-east-1", table1.bills("us-east-1"), table1.applications())
+    assert shown.startswith(table1.page("us-east-1", table1.bills("us-east-1"), table1.applications()))
 
 
 def test_every_application_of_the_paper_has_its_three_prices_next_to_ours() -> None:
@@ -42,7 +40,6 @@ def test_every_application_of_the_paper_has_its_three_prices_next_to_ours() -> N
         assert {where.split()[1] for where in each.spot} == set(table1.REGIONS)
 
 
-@needs_traces
 def test_replayed_pools_are_up_more_with_more_replicas() -> None:
     cases = list(availability.replay(availability.recorded(), 300, np.random.default_rng(1)))
     for way in availability.WAYS:
@@ -52,7 +49,6 @@ def test_replayed_pools_are_up_more_with_more_replicas() -> None:
         assert shares == sorted(shares, reverse=True)
 
 
-@needs_traces
 def test_zones_that_wait_for_machines_fail_together_more_often_than_independent_ones() -> None:
     cases = availability.replay(availability.recorded(), 34, np.random.default_rng(1))
     for case in cases:

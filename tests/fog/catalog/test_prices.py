@@ -14,8 +14,6 @@ from fog.catalog.prices import price_list, regions_of
 from fog.hardware import Hardware
 from gdp.errors import LocalError
 
-SPOT = Path(__file__).parents[3].parent / "shared/data/spot"
-
 
 def test_the_price_list_starts_with_the_cheapest_that_has_enough() -> None:
     wanted = Hardware.from_text("cpu:8,T4")
@@ -54,7 +52,6 @@ def test_pairs_of_one_region_go_together_more_often_than_independent_ones() -> N
     assert measured().uptime_s < measured().back_s
 
 
-@pytest.mark.skipif(not SPOT.is_dir(), reason="no ../shared/data/spot here")
 def test_the_shipped_data_are_what_the_script_makes() -> None:
     folder = Path(make_catalog.__file__).parent.parent / "fog/catalog"
     for name, made in (("aws.json", make_catalog.prices()), ("traces.json", make_catalog.traces())):

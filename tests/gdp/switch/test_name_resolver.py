@@ -75,7 +75,7 @@ def test_a_name_that_one_rib_does_not_know_is_queried_at_each_other_one_once_and
     resolver = NameResolver(ME)
     resolver.watch(SERVER, 0.0)
     others = {name(f"rib{number}") for number in range(3)}
-    asked = []
+    asked: list[Name] = []
     for rib in sorted(others):
         assert [query for query, _ in resolver.queries_to_send(0.1 * len(asked))] == [SERVER]
         assert rib not in resolver.passed_over(SERVER)
