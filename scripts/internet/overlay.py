@@ -146,8 +146,9 @@ class Overlay:
         for process in ending:
             process.communicate()
 
-    def kill(self, *labels: str) -> None:
-        """Kill the switches of these hosts, the RIB, or relays: none says goodbye."""
+    def kill_border(self, border: Host) -> None:
+        """Kill a border's switch, its RIB and its relay; ``start`` and ``start_rib`` bring them back."""
+        labels = {border.label, f"{border.label}-{_RELAY}", _RIB} & self._processes.keys()
         for process in [self._processes.pop(label) for label in labels]:
             os.killpg(process.pid, signal.SIGKILL)
             process.communicate()
