@@ -44,11 +44,12 @@ class Fault:
 
 @dataclass(frozen=True)
 class Drawn:
-    """NATs of the machines (None: UDP is blocked there), place of the second RIB, and the faults."""
+    """NATs of the machines (None: UDP is blocked there), place of the second RIB, the faults, and the leaves."""
 
     nats: tuple[Nat | None, ...]
     other_rib: str
     faults: tuple[Fault, ...]
+    leaves: frozenset[str] = frozenset()
     seed: int = 1
 
 
@@ -61,7 +62,9 @@ def _drawn() -> st.SearchStrategy[Drawn]:
         st.sampled_from([0.5, LEASE_S, LEASES_S]),
     )
     places = st.sampled_from([BORDER, *SITES])
-    return st.builds(Drawn, nats, places, st.lists(faults, min_size=1, max_size=3).map(tuple), st.integers(1, 1_000))
+    several = st.lists(faults, min_size=1, max_size=3).map(tuple)
+    leaves = st.sampled_from([frozenset(), frozenset(SITES[:1]), frozenset(SITES)])
+    return st.builds(Drawn, nats, places, several, leaves, st.integers(1, 1_000))
 
 
 @dataclass
@@ -186,11 +189,12 @@ KILLED: Final = (Fault("border", 0.0, LEASES_S),)
 @draws("GDP_WITHOUT_BORDER", 3)
 @given(_drawn())
 @example(Drawn((Nat.PORT, Nat.PORT, None), BORDER, KILLED))
+@example(Drawn((Nat.PORT, Nat.PORT, Nat.PORT), BORDER, KILLED, frozenset(SITES)))
 @example(Drawn((Nat.SYMMETRIC, Nat.FULL_CONE, Nat.PORT), BORDER, KILLED))
 @example(Drawn((Nat.PORT, Nat.PORT, Nat.SYMMETRIC), "a", (*KILLED, Fault("c", 1.0, 0.5))))
 def test_direct_pairs_outlive_their_border_and_all_others_return_with_it(drawn: Drawn) -> None:
     nats = dict(zip(SITES, drawn.nats, strict=True))
-    with tunnelled(nats, drawn.other_rib, drawn.seed) as bed:
+    with tunnelled(nats, drawn.other_rib, drawn.leaves, drawn.seed) as bed:
         direct = {
             (one, other)
             for one, other in permutations(SITES, 2)

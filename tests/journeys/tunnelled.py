@@ -8,7 +8,7 @@ machine whose network blocks UDP has the link of a relay instead.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -125,14 +125,17 @@ class Tunnelled:
     Args:
         nats: of the machines; None: UDP is blocked, so that a relay carries all frames.
         other_rib: where the second RIB is.
+        leaves: machines that carry no transit.
     """
 
-    def __init__(self, folder: Path, nats: Mapping[str, Nat | None], other_rib: str, seed: int) -> None:
+    def __init__(
+        self, folder: Path, nats: Mapping[str, Nat | None], other_rib: str, leaves: Collection[str], seed: int
+    ) -> None:
         self.nats, self.folder = nats, folder
         members = [Attachment(each, "proxy", "member") for each in nats]
         ribs = [Attachment(BORDER, "rib", "rib0"), Attachment(other_rib, "rib", "rib1")]
         self.topology = Topology((), (DomainPlan("lab", (BORDER, *nats)),), (*ribs, *members))
-        self.world = Simulation(topology=self.topology, lease_s=LEASE_S, seed=seed)
+        self.world = Simulation(topology=self.topology, lease_s=LEASE_S, leaves=leaves, seed=seed)
         self.network = self.world.network
         self.machines: dict[str, Machine] = {}
         self.links: dict[frozenset[str], TunnelLink] = {}
@@ -301,10 +304,12 @@ class Loop:
 
 
 @contextmanager
-def tunnelled(nats: Mapping[str, Nat | None], other_rib: str = BORDER, seed: int = 1) -> Iterator[Tunnelled]:
+def tunnelled(
+    nats: Mapping[str, Nat | None], other_rib: str = BORDER, leaves: Collection[str] = (), seed: int = 1
+) -> Iterator[Tunnelled]:
     """Yield machines behind NATs, with all members attached."""
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        bed = Tunnelled(Path(folder), nats, other_rib, seed)
+        bed = Tunnelled(Path(folder), nats, other_rib, leaves, seed)
         stack.callback(bed.close)
         now = SimpleNamespace(
             monotonic=lambda: bed.network.now.mono_s, time_ns=lambda: int(bed.network.now.unix_s * 1e9)
