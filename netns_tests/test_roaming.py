@@ -19,6 +19,7 @@ from internet.host import Host
 from internet.laboratory import Laboratory
 from internet.overlay import Overlay
 from internet.site import Site
+from netns_tests.lifetimes import LEASE_S
 
 pytestmark = [
     pytest.mark.netns,
@@ -39,6 +40,8 @@ class Field:
     """A robot that publishes and calls, and a server behind another NAT, which know one border only."""
 
     laboratory: Laboratory
+    overlay: Overlay
+    border: Host
     robot: Host
     caller: gdp.Session
     publisher: gdp.Publisher
@@ -67,14 +70,27 @@ class Field:
             message = self.subscription.receive(timeout_s=PATIENCE_S)
             self.read.append(int.from_bytes(message.payload, "big"))
 
+    def has_tunnels(self, *to: str) -> bool:
+        """Return whether the robot's tunnels to these switches are up."""
+        found = self.overlay.tunnels(self.robot)
+        return all(found.get(each, {}).get("up") for each in to)
+
+    def wait_for_tunnels(self, *to: str) -> None:
+        """Return when the robot's tunnels to these switches are up."""
+        end_s = time.monotonic() + PATIENCE_S
+        while not self.has_tunnels(*to):
+            assert time.monotonic() < end_s, f"no tunnels to {to}"
+            self.read_one_more()
+
     def read_one_more(self) -> None:
         """Read until a message comes that was published from now on."""
         self.read_until(self.published)
 
 
 @pytest.fixture
-def roamer(laboratory: Laboratory) -> Iterator[Field]:
-    """Yield the robot and the server, between which messages flow."""
+def roamer(laboratory: Laboratory, request: pytest.FixtureRequest) -> Iterator[Field]:
+    """Yield the robot and the server, between which messages flow; a parameter is the lease of their names."""
+    lease_s = getattr(request, "param", None)
     border = laboratory.add_host("border", laboratory.add_site("dc", Access.PUBLIC))
     robot = laboratory.add_host("robot", laboratory.add_site("home", Access.PORT_RESTRICTED))
     server = laboratory.add_host("server", laboratory.add_site("office", Access.PORT_RESTRICTED))
@@ -87,9 +103,13 @@ def roamer(laboratory: Laboratory) -> Iterator[Field]:
         overlay.start(robot, server)
         rights = {TOPIC: [Right.PUBLISH], SERVICE: [Right.CALL]}, {TOPIC: [Right.READ], SERVICE: [Right.SERVE]}
         nodes = [overlay.add_node(host, given) for host, given in zip((robot, server), rights, strict=True)]
-        with overlay.open_session(robot, nodes[0]) as caller, overlay.open_session(server, nodes[1]) as callee:
+        with (
+            overlay.open_session(robot, nodes[0], lease_s) as caller,
+            overlay.open_session(server, nodes[1], lease_s) as callee,
+        ):
             subscription = callee.subscribe(TOPIC, queue=UNREAD)
-            made = Field(laboratory, robot, caller, caller.publisher(TOPIC), subscription)
+            publisher = caller.publisher(TOPIC)
+            made = Field(laboratory, overlay, border, robot, caller, publisher, subscription)
             callee.serve(SERVICE, made.serve)
             made.publisher.wait_for_readers(timeout_s=PATIENCE_S)
             publishing = threading.Thread(target=made.publish)
@@ -118,11 +138,50 @@ def test_a_running_call_and_a_topic_outlive_changes_of_the_address_and_a_dead_ac
         assert not call.done()
         roamer.release.set()
         assert call.result(PATIENCE_S).payload == b"a long plan"
+    _check_end(roamer)
+    assert roamer.requests == [b"a long plan"]
+
+
+@pytest.mark.parametrize("roamer", [LEASE_S], indirect=True)
+def test_a_topic_and_calls_over_a_direct_tunnel_outlive_a_killed_border(roamer: Field) -> None:
+    roamer.release.set()
+    roamer.wait_for_tunnels("border", "server")
+    roamer.caller.call(SERVICE, b"finds the server", timeout_s=PATIENCE_S)
+    roamer.overlay.kill_border(roamer.border)
+    requests, end_s = [b"finds the server"], time.monotonic() + OUTAGE_S
+    while time.monotonic() < end_s:
+        requests.append(b"%d" % len(requests))
+        assert roamer.caller.call(SERVICE, requests[-1], timeout_s=PATIENCE_S).payload == requests[-1]
+        roamer.read_one_more()
+        assert roamer.has_tunnels("server")
+    assert not roamer.has_tunnels("border")
+    roamer.overlay.start(roamer.border)
+    roamer.overlay.start_rib(roamer.border)
+    roamer.wait_for_tunnels("border", "server")
+    _check_end(roamer)
+    assert roamer.requests == requests
+
+
+@pytest.mark.parametrize("roamer", [LEASE_S], indirect=True)
+def test_a_direct_tunnel_that_an_uplink_cut_ends_comes_back_without_the_border(roamer: Field) -> None:
+    roamer.wait_for_tunnels("border", "server")
+    roamer.overlay.kill_border(roamer.border)
+    home = roamer.robot.site()
+    while roamer.has_tunnels("border"):
+        roamer.read_one_more()
+    home.cut()
+    time.sleep(OUTAGE_S)  # the outage itself
+    home.restore()
+    roamer.read_one_more()
+    _check_end(roamer)
+
+
+def _check_end(roamer: Field) -> None:
+    """Stop publishing, and check that nothing was lost, and nothing came twice."""
     roamer.over.set()
     roamer.read_until(roamer.published - 1)
     assert (roamer.subscription.lost, roamer.subscription.dropped) == (0, 0)
-    assert roamer.read == list(range(len(roamer.read)))  # nothing lost, nothing twice
-    assert roamer.requests == [b"a long plan"]
+    assert roamer.read == list(range(len(roamer.read)))
 
 
 def _cafe(roamer: Field) -> Site:

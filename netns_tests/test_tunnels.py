@@ -134,6 +134,25 @@ def test_wireguard_go_gets_large_receive_buffers_also_after_a_rebind(sites: tupl
     until(has_large_buffers, *ends)
 
 
+def test_each_second_rebind_returns_to_the_first_port(sites: tuple[Site, Site], ends: Ends) -> None:
+    ports = [ends[0].listen_port]
+    for _ in range(4):
+        ends[0].rebind()
+        ports.append(ends[0].listen_port)
+    assert ports[0::2] == 3 * [PORT]
+    assert PORT not in ports[1::2]
+    until(crosses(sites[0].frames(), sites[1].frames()), *ends)
+
+
+def test_a_rebind_takes_another_port_if_the_first_one_is_taken(sites: tuple[Site, Site], ends: Ends) -> None:
+    ends[0].rebind()
+    with sites[0].entered(), socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as other:
+        other.bind(("", PORT))
+        ends[0].rebind()
+        assert ends[0].listen_port not in (0, PORT)
+        until(crosses(sites[0].frames(), sites[1].frames()), *ends)
+
+
 def test_changes_during_a_restart_are_applied_after_it(sites: tuple[Site, Site], ends: Ends) -> None:
     one, two = sites
     until(crosses(one.frames(), two.frames()), *ends)

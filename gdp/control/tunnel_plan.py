@@ -16,6 +16,7 @@ from gdp.names import Name
 
 __all__ = [
     "DIAL_S",
+    "REBIND_MAX_S",
     "REBIND_S",
     "UNDERLAY_PREFIXES",
     "Dialer",
@@ -28,7 +29,7 @@ __all__ = [
 
 DIAL_S: Final = 1.0  # one candidate is tried for this time before the next one
 REBIND_S: Final = 1.0
-_REBIND_MAX_S: Final = 30.0
+REBIND_MAX_S: Final = 30.0
 _DIGITS: Final = 11  # IFNAMSIZ - 1 less the prefix
 
 
@@ -107,25 +108,33 @@ class Dialer:
 
 @dataclass(slots=True)
 class RebindSchedule:
-    """When an uplink takes another UDP port, because none of the borders answers any more.
+    """When an uplink takes another UDP port, because none of the borders answers any more, and no other tunnel is up.
 
     A NAT may have changed its address and kept its mappings. Keepalives then keep a mapping alive that leads nowhere;
     only packets from another port get a new one. Source: RFC 4787, section 4.3, on refresh by outbound packets.
+    Another tunnel that is up proves that the NAT passes packets, and needs its mapping: its peer knows no other one.
     """
 
     was_up: bool = False
     due_s: float = float("inf")
     pause_s: float = REBIND_S
 
-    def update(self, now_s: float, *, is_up: bool) -> bool:
-        """Take in whether a border answers over the uplink; return whether to take another port now."""
+    def update(self, now_s: float, *, is_up: bool, is_held: bool = False) -> bool:
+        """Take in which tunnels over the uplink are up; return whether to take another port now.
+
+        Args:
+            is_up: one to a border.
+            is_held: any other one. If it outlived the borders and is lost later, it has the longest pause to come back.
+        """
         if is_up or not self.was_up:
             self.was_up, self.due_s, self.pause_s = self.was_up or is_up, float("inf"), REBIND_S
             return False
         if self.due_s == float("inf"):
             self.due_s = now_s + self.pause_s
+        if is_held and (now_s >= self.due_s or self.pause_s == REBIND_MAX_S):
+            self.pause_s, self.due_s = REBIND_MAX_S, now_s + REBIND_MAX_S
         if now_s < self.due_s:
             return False
-        self.pause_s = min(2 * self.pause_s, _REBIND_MAX_S)
+        self.pause_s = min(2 * self.pause_s, REBIND_MAX_S)
         self.due_s = now_s + self.pause_s
         return True

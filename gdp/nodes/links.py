@@ -205,11 +205,12 @@ class TunnelLinks:
             self._rebind_silent(now.mono_s)
 
     def _rebind_silent(self, now_s: float) -> None:
-        """Let an uplink over which no border answers any more send from another UDP port."""
-        dialled = [tunnel for tunnel, dialer in self._dialers.items() if dialer.endpoints]
+        """Let an uplink over which no border answers any more send from another UDP port, unless a tunnel is up."""
+        up = [tunnel for tunnel in self._tunnels.all if self._tunnels.is_up(tunnel)]
         for uplink, schedule in enumerate(self._rebinds):
-            is_up = any(self._tunnels.is_up(tunnel) for tunnel in dialled if tunnel.uplink == uplink)
-            if schedule.update(now_s, is_up=is_up):
+            dialers = [self._dialers.get(tunnel) for tunnel in up if tunnel.uplink == uplink]
+            is_border_up = any(dialer is not None and dialer.endpoints for dialer in dialers)
+            if schedule.update(now_s, is_up=is_border_up, is_held=bool(dialers)):
                 self._tunnels.rebind(uplink)
 
     def _report_silence(self, tunnel: TunnelId, peer: _Peer, now: Timestamps, *, is_up: bool) -> None:

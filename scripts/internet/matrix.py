@@ -1,7 +1,8 @@
 """Matrix of NATs: switches behind each kind of access, which of them reach each other, and which without the border.
 
 I/O. All switches belong to one domain with one border. For each pair, a node at the first switch calls a service at
-the second. The switch's status then says whether a direct tunnel is up.
+the second. The switch's status then says whether a direct tunnel is up. At last all programs of the border are killed:
+the direct pairs go on, and once it is back, all do.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from functools import partial
 from itertools import combinations, product
 from typing import Final, NamedTuple
 
@@ -25,6 +27,8 @@ __all__ = ["Outcome", "Pair", "batches", "measure"]
 _LOOK_S: Final = 0.25
 _GROUP: Final = 3
 _CALL_S: Final = 5.0
+_OUTAGE_S: Final = 10.0  # longer than the leases of names, neighbours, trees and readers
+_LEASE_S: Final = 2.0
 _SIDES: Final = ("a", "b")
 Pair = tuple[Access, Access]
 
@@ -35,14 +39,20 @@ class Outcome(NamedTuple):
     Attributes:
         reached_s: when the first call was answered, in seconds since all switches were up; None: never.
         direct_s: when the direct tunnel was seen up at the first switch; None: never.
+        outlived: whether every call was answered while the border was dead; tried with a direct tunnel only.
+        back_s: when a call was answered again, in seconds since the border was started again; None: never.
     """
 
     reached_s: float | None
     direct_s: float | None
+    outlived: bool
+    back_s: float | None
 
     def is_as_expected(self, pair: Pair) -> bool:
-        """Return whether the pair is connected, and directly where that is possible and nowhere else."""
-        return self.reached_s is not None and (self.direct_s is not None) is allows_direct(*pair)
+        """Return whether the pair is connected, and directly, also without the border, where that is possible."""
+        is_direct = allows_direct(*pair)
+        is_connected = self.reached_s is not None and self.back_s is not None
+        return is_connected and (self.direct_s is not None) is self.outlived is is_direct
 
 
 def measure(laboratory: Laboratory, kinds: Iterable[Access], *, timeout_s: float = 60.0) -> dict[Pair, Outcome]:
@@ -73,14 +83,20 @@ def measure(laboratory: Laboratory, kinds: Iterable[Access], *, timeout_s: float
         rights = [*([calls] * len(chosen)), *({name: [Right.SERVE]} for name in services.values())]
         nodes = [overlay.add_node(host, each) for host, each in zip(everyone, rights, strict=True)]
         with ThreadPoolExecutor(len(everyone)) as pool:
-            opened = pool.map(overlay.open_session, everyone, nodes)
+            opened = pool.map(partial(overlay.open_session, lease_s=_LEASE_S), everyone, nodes)
             sessions = [stack.enter_context(session) for session in opened]
             for session, host in zip(sessions[len(chosen) :], hosts["b"], strict=True):
                 session.serve(services[host.label], lambda request: request.payload)
         deadline_s = time.monotonic() + timeout_s
         reached = _call_all(sessions[: len(chosen)], list(services.values()), begun_s, deadline_s)
         direct = _wait_for_direct(overlay, hosts, pairs, begun_s, deadline_s)
-    return {pair: Outcome(reached[at], direct.get(at)) for at, pair in enumerate(pairs)}
+        overlay.kill_border(border)
+        outlived = _outlive(list(product(sessions[: len(chosen)], services.values())), direct)
+        overlay.start(border)
+        overlay.start_rib(border)
+        begun_s = time.monotonic()
+        back = _call_all(sessions[: len(chosen)], list(services.values()), begun_s, begun_s + timeout_s)
+    return {pair: Outcome(reached[at], direct.get(at), at in outlived, back[at]) for at, pair in enumerate(pairs)}
 
 
 def batches(kinds: Iterable[Access]) -> list[tuple[Access, ...]]:
@@ -122,6 +138,25 @@ def _answered_s(client: gdp.Session, service: str, begun_s: float, deadline_s: f
             continue
         return time.monotonic() - begun_s
     return None
+
+
+def _outlive(pairs: Sequence[tuple[gdp.Session, str]], direct: Iterable[int]) -> set[int]:
+    """Call over the direct pairs, given by number, during the outage; return those with every call answered."""
+    end_s = time.monotonic() + _OUTAGE_S
+
+    def goes_on(at: int) -> bool:
+        client, service = pairs[at]
+        while time.monotonic() < end_s:
+            try:
+                client.call(service, b"?", timeout_s=_CALL_S)
+            except gdp.SessionError:
+                return False
+            time.sleep(_LOOK_S)
+        return True
+
+    numbers = list(direct)
+    with ThreadPoolExecutor(max(len(numbers), 1)) as pool:
+        return {at for at, is_alive in zip(numbers, pool.map(goes_on, numbers), strict=True) if is_alive}
 
 
 def _wait_for_direct(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Collection, Mapping, Sequence
@@ -131,7 +132,8 @@ class Overlay:
     def start_rib(self, host: Host) -> None:
         """Start the domain's RIB on a border; return when it is ready."""
         identity = self.folder / _RIB
-        make_node(identity, Role.RIB, _RIB, self._domain)
+        if not identity.exists():
+            make_node(identity, Role.RIB, _RIB, self._domain)
         path = self.folder / f"{_RIB}.yaml"
         content = {"identity": str(identity), "domain": self._root(), "iface": f"{_RIB}0"}
         path.write_text(yaml.safe_dump(content), encoding="utf-8")
@@ -144,6 +146,13 @@ class Overlay:
         for process in ending:
             process.communicate()
 
+    def kill_border(self, border: Host) -> None:
+        """Kill a border's switch, its RIB and its relay; ``start`` and ``start_rib`` bring them back."""
+        labels = {border.label, f"{border.label}-{_RELAY}", _RIB} & self._processes.keys()
+        for process in [self._processes.pop(label) for label in labels]:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.communicate()
+
     def add_node(self, host: Host, rights: Mapping[str, Collection[Right]]) -> Path:
         """Make the keys of the host's node, with rights on names; return its directory."""
         node = self.folder / f"{host.label}-{_NODE}"
@@ -154,10 +163,10 @@ class Overlay:
             install_delegation(node, delegate(self._owner, node / CARD, metadata, list(given)))
         return node
 
-    def open_session(self, host: Host, node: Path) -> gdp.Session:
+    def open_session(self, host: Host, node: Path, lease_s: float | None = None) -> gdp.Session:
         """Open a session of this process at the host's switch, which may still have to find a way to the RIB."""
         root, iface = self._domain / ROOT_CERTIFICATE, f"{_NODE}0"
-        return host.space.inside(lambda: gdp.open(node, iface=iface, root=root, timeout_s=_ATTACH_S))
+        return host.space.inside(lambda: gdp.open(node, iface=iface, root=root, timeout_s=_ATTACH_S, lease_s=lease_s))
 
     def tunnels(self, host: Host) -> dict[str, dict[str, object]]:
         """Return the status of the tunnels of a host's switch, by the label of the peer's host."""

@@ -109,7 +109,7 @@ class WireGuardDevice:
             self._epoll.register(keeper, select.EPOLLIN)
             self._epoll.register(self._news, select.EPOLLIN)
             self._configure()
-            self._port = self._control.state().listen_port
+            self._port = self._first_port = self._control.state().listen_port
             opened.pop_all()
 
     @property
@@ -179,8 +179,14 @@ class WireGuardDevice:
             self._apply(Change(peers=_kicked(public_key, peer.keepalive_s)))
 
     def rebind(self) -> None:
-        """Send from another UDP port from now on, so that NATs on the way make new mappings; sessions stay."""
-        self._apply(Change(listen_port=0))
+        """Send from another UDP port from now on, so that NATs on the way make new mappings; sessions stay.
+
+        Each second time it is the first port, unless it is taken: peers know the mapping that most NATs make for it.
+        """
+        try:
+            self._apply(Change(listen_port=0 if self._port == self._first_port else self._first_port))
+        except LocalError:
+            self._apply(Change(listen_port=0))
         try:
             self._port = self._control.state().listen_port
         except ControlLostError:

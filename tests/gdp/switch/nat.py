@@ -52,16 +52,18 @@ class Packet:
 
 @dataclass(slots=True)
 class Gateway:
-    """A NAT with one public address and one inner socket."""
+    """A NAT with one public address and one inner socket; mappings of its former ports lead nowhere."""
 
     nat: Nat
     address: str
-    ports: dict[Endpoint | None, int] = field(default_factory=dict)  # by destination, or of all
+    socket: int = 51_820
+    # by the port of the socket, and by destination, or of all
+    ports: dict[tuple[int, Endpoint | None], int] = field(default_factory=dict)
     sent: dict[tuple[int, Endpoint], float] = field(default_factory=dict)  # port and destination: when
     next_port: int = 40_000
 
     def outbound(self, to: Endpoint, now_s: float) -> Endpoint:
-        key = to if self.nat is Nat.SYMMETRIC else None
+        key = self.socket, to if self.nat is Nat.SYMMETRIC else None
         if key not in self.ports:
             self.ports[key] = self.next_port
             self.next_port += 1
@@ -69,9 +71,11 @@ class Gateway:
         return Endpoint(self.address, self.ports[key])
 
     def admits(self, source: Endpoint, port: int, now_s: float) -> bool:
+        if not any(port == own and socket == self.socket for (socket, _), own in self.ports.items()):
+            return False
         live = [to for (own, to), at_s in self.sent.items() if own == port and now_s - at_s < MAPPING_S]
         if self.nat in (Nat.NONE, Nat.FULL_CONE):
-            return port in self.ports.values()
+            return True
         if self.nat is Nat.ADDRESS:
             return any(to.address == source.address for to in live)
         return source in live
