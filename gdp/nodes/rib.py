@@ -164,6 +164,7 @@ def _sources(host: RibHost, plane: Plane, node_log: NodeLog, runtime: Runtime) -
         rib_answers=lambda: {
             "found": rib.answers,
             "negative": rib.negative_answers,
+            "unknown": rib.unknown_answers,
             "accepted": rib.accepted,
         },
         rib_refusals=lambda: {reason.label: count for reason, count in list(rib.refusals.items())},

@@ -137,6 +137,7 @@ class RibCore:
         self.accepted = 0
         self.answers = 0
         self.negative_answers = 0
+        self.unknown_answers = 0
 
     @property
     def names(self) -> int:
@@ -583,7 +584,10 @@ class RibCore:
         self._deny(name, to, lease_s=0.0 if is_unknown else NEGATIVE_LEASE_S)
 
     def _deny(self, name: Name, to: Name, lease_s: float = NEGATIVE_LEASE_S) -> None:
-        self.negative_answers += lease_s > 0.0
+        if lease_s > 0.0:
+            self.negative_answers += 1
+        else:
+            self.unknown_answers += 1
         own = self._policy.own
         self._send(Response(name=name, advertiser=name, advertisement=b"", domain=own, transit=(), lease_s=lease_s), to)
 

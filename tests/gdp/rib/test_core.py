@@ -557,7 +557,7 @@ def test_what_the_tier_above_does_not_know_is_unknown_here_too() -> None:
     at_rib = rib(UPPER.name)
     ask(at_rib)
     assert [each.is_unknown for each in answers(unknown_upstream(at_rib))] == [True]
-    assert at_rib.negative_answers == 0
+    assert (at_rib.negative_answers, at_rib.unknown_answers) == (0, 1)
     assert [outgoing.to for outgoing in ask(at_rib)] == [UPPER.name], "the next query is forwarded again"
 
 
