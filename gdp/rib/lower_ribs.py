@@ -8,15 +8,16 @@ above are (RFC 8767 in spirit). A RIB that is back has half a lease to relay the
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.names import Name
 from gdp.rib.upstream_advertisements import QUIET_S
-from gdp.rib.upstream_queries import WATCH_AGAIN_S
 
 __all__ = ["LowerRibs"]
 
-_NEVER_S = float("-inf")
+_NEVER_S: Final = float("-inf")
+_KEEP_S: Final = ADVERTISEMENT_LEASE_S / 2  # at a time, and after a RIB is back: it renews within a third
 
 
 @dataclass(slots=True)
@@ -48,8 +49,8 @@ class LowerRibs:
         if known.heard_s < known.probed_s and since_s >= QUIET_S:
             known.is_silent = True
         if known.is_silent:
-            return WATCH_AGAIN_S
-        left_s = known.returned_s + ADVERTISEMENT_LEASE_S / 2 - now_s
+            return _KEEP_S
+        left_s = known.returned_s + _KEEP_S - now_s
         if left_s > 0.0:
             return left_s
         return 0.0 if known.heard_s >= known.probed_s and since_s <= 2 * QUIET_S else QUIET_S
