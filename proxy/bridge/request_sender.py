@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from gdp.client.publisher import Publisher
 from gdp.errors import LocalError
 from gdp.names import Name
-from gdp.service.dispatch import Ask
+from gdp.service.dispatch import Ask, End
 from gdp.service.replication_messages import ReplicaCommand
 from proxy.bridge.action_interface import CANCEL, RESULT
 from proxy.bridge.broadcast_queue import BroadcastQueue, Effect, wire_of
@@ -70,6 +70,9 @@ class RequestSender:
         for part, dispatch in enumerate(self._calls):
             while effects := dispatch.poll_effects():
                 for effect in effects:
+                    if isinstance(effect, End):
+                        self._site.member.end_call(self._service, (part, effect.call))
+                        continue
                     whom = effect.servers if isinstance(effect, Ask) else effect.server and (effect.server,)
                     if whom is None and not isinstance(effect, ReplicaCommand):
                         self._for_all.add(part, effect)
@@ -86,7 +89,10 @@ class RequestSender:
             self._record_holders(part, effect.call, set(servers))
         try:
             wire = wire_of(part, effect)
-            self._publisher.publish(wire)
+            if isinstance(effect, Ask) and self._goals is None:  # those of an action depend on their order
+                self._site.member.send_requests(self._service, wire, (part, effect.call))
+            else:
+                self._publisher.publish(wire)
             self._site.traffic.sent(len(wire))
             self._trace(part, effect, servers)
         except LocalError as error:
@@ -101,7 +107,8 @@ class RequestSender:
             self._record_holders(part, effect.call, {server})
         try:
             for wire in (*([] if again is None else [again]), wire_of(part, effect)):
-                self._site.member.send_request(self._service, server, wire)
+                call = (part, effect.call) if isinstance(effect, Ask) and self._goals is None else None
+                self._site.member.send_request(self._service, server, wire, call)
                 self._site.traffic.sent(len(wire))
             self._trace(part, effect, [server])
         except LocalError as error:
