@@ -176,9 +176,10 @@ class Publisher:
         """Return the readers that have introduced themselves and have not left, silent ones included."""
         return [Name(each) for each in self._readers.names()]
 
-    def active_readers(self) -> list[bytes]:
-        """Return the readers that report."""
-        return [] if self.mtu is None else list(self._readers)
+    def active_readers(self, now_s: float) -> list[bytes]:
+        """Return the readers that report; those that have missed reports come last."""
+        readers = self._readers
+        return [] if self.mtu is None else sorted(readers, key=lambda name: readers.is_quiet(name, now_s))
 
     def has_left(self, sequence: int) -> bool:
         """Return whether a message has left whole."""
@@ -467,7 +468,7 @@ class Publisher:
         self.parity.handle_report({each.number for each in report.missing})
         self._measure_loss(now_s)
         if self._fastest_governs:
-            self._window.governing = next(iter(self._reader_paths.fastest(self._governing_names())), None)
+            self._window.governing = next(iter(self._fastest_names()), None)
         path = self._reader_paths.get(header.source)
         trip_s = 0.0 if path is None else path.trip_s
         self._acknowledgements.handle_acknack(header.source, report, is_new=is_new, now_s=now_s, trip_s=trip_s)
@@ -610,13 +611,14 @@ class Publisher:
 
     def _measured_readers(self) -> Readers:
         """Return the readers whose losses copies and parity are for: where the fastest governs, its own alone."""
-        return self._reader_paths.fastest(self._governing_names()) if self._fastest_governs else self._readers
+        return self._fastest_names() if self._fastest_governs else self._readers
 
     def _measured_paths(self) -> list[ReaderPath]:
-        names = self._governing_names()
-        return self._reader_paths.governing(
-            self._reader_paths.fastest(names) if self._fastest_governs else names, self._seen_s
-        )
+        names = self._fastest_names() if self._fastest_governs else self._governing_names()
+        return self._reader_paths.governing(names, self._seen_s)
+
+    def _fastest_names(self) -> list[bytes]:
+        return self._reader_paths.fastest(self._governing_names(), self._seen_s)
 
     def _governing_names(self) -> list[bytes]:
         """Return the readers that keep up: the others must not wait for one that does not. Without any, return all.

@@ -14,7 +14,7 @@ from typing import Final
 
 from gdp.congestion.controller import FIRST_RTT_S, PathController
 from gdp.congestion.states import State
-from gdp.limits import MTU_MIN_BYTES
+from gdp.limits import MTU_MIN_BYTES, REPORT_DELAY_S
 
 __all__ = ["BURST_S", "ReaderPath", "ReaderPaths"]
 
@@ -150,9 +150,13 @@ class ReaderPath:
         return self.controller.rtt_s or self._trip_s
 
     @property
-    def has_stalled(self) -> bool:
-        """Return whether nothing under way was confirmed for two round trips or more."""
-        return self.is_silent or self._has_probed
+    def stall_s(self) -> float:
+        """Return how long a path that carries something may confirm nothing."""
+        return _PROBE_TRIPS * (self.trip_s or FIRST_RTT_S) + REPORT_DELAY_S
+
+    def has_stalled(self, now_s: float) -> bool:
+        """Return whether nothing under way was confirmed for two round trips and a report's delay."""
+        return self.is_silent or (self.controller.inflight > 0 and now_s - self._confirmed_s > self.stall_s)
 
     def arrival_s(self, size: int) -> float:
         """Return how long so many bytes take to be confirmed, while no queue stands; a loss takes a round trip more.
@@ -279,10 +283,10 @@ class ReaderPaths:
         paths = [self._paths.get(reader) or self.path(reader, now_s) for reader in readers]
         return [path for path in paths if not path.is_silent] or paths[:1]
 
-    def fastest(self, readers: Iterable[bytes]) -> list[bytes]:
+    def fastest(self, readers: Iterable[bytes], now_s: float) -> list[bytes]:
         """Return the one of these readers whose path is the shortest, and has not stalled; none of none."""
         paths = [(reader, self._paths.get(reader)) for reader in readers]
-        known = [(path.has_stalled, path.arrival_s(0), reader) for reader, path in paths if path is not None]
+        known = [(path.has_stalled(now_s), path.arrival_s(0), reader) for reader, path in paths if path is not None]
         return [min(known)[2]] if known else [reader for reader, _ in paths[:1]]
 
     def fastest_first(self, readers: Iterable[bytes], size: int, now_s: float) -> tuple[list[bytes], bool]:
@@ -291,7 +295,7 @@ class ReaderPaths:
         It may where each path can carry it as fast as the fastest one does.
         """
         paths = {reader: self.path(reader, now_s) for reader in readers}
-        order = sorted(paths, key=lambda reader: (paths[reader].has_stalled, paths[reader].arrival_s(size)))
+        order = sorted(paths, key=lambda reader: (paths[reader].has_stalled(now_s), paths[reader].arrival_s(size)))
         within_s = paths[order[0]].arrival_s(size) if order else 0.0
         return order, all(path.carries(size, within_s) for path in paths.values())
 

@@ -4,7 +4,7 @@ Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Source: docs/explanati
 
 The first answer counts, so the fastest path governs. The tree carries a request that fits what the path to each server
 may carry while it leaves. Else each server gets a copy by its own unicast stream. The next copy begins when those
-before have left, or take twice as long as their paths promised. Requests that are published meanwhile take the same
+before have left, or when the newest stalls or takes twice its time. Requests that are published meanwhile take the same
 streams, so each server keeps their order. When a call ends, what has not left of its copies never leaves, and is not
 repaired.
 """
@@ -31,7 +31,9 @@ class _Request:
     message: bytes
     copies: list[tuple[Publisher, int]] = field(default_factory=list)  # with the sequence number
     waiting: deque[Name] = field(default_factory=deque)  # servers whose copies have not begun
-    next_s: float = 0.0  # when the next one begins at the latest
+    server: Name | None = None  # of the newest copy
+    check_s: float = 0.0  # when its path is looked at
+    next_s: float = 0.0  # when the next copy begins at the latest
 
 
 class RequestStreams:
@@ -56,7 +58,7 @@ class RequestStreams:
         Raises:
             LocalError: above the limits.
         """
-        servers, fits = self._paths.fastest_first(self._public.active_readers(), len(message), now_s)
+        servers, fits = self._paths.fastest_first(self._public.active_readers(now_s), len(message), now_s)
         if len(servers) < 2 or (fits and not self._apart):
             self._public.publish(message)
             self._requests.setdefault(call, _Request(message)).copies.append(self._newest(self._public))
@@ -86,14 +88,14 @@ class RequestStreams:
     def release(self, now_s: float) -> None:
         """Begin the copies that have waited for a faster one to leave."""
         for call, request in list(self._held.items()):
-            while request.waiting and (now_s >= request.next_s or all(p.has_left(each) for p, each in request.copies)):
+            while request.waiting and self._may_follow(request, now_s):
                 self._begin_next(request, now_s)
             if not request.waiting:
                 del self._held[call]
 
     def get_timer(self) -> float | None:
         """Return the monotonic second at which the next copy begins at the latest, or None."""
-        return min((request.next_s for request in self._held.values()), default=None)
+        return min((request.check_s for request in self._held.values()), default=None)
 
     def _begin_next(self, request: _Request, now_s: float) -> None:
         server = request.waiting.popleft()
@@ -103,7 +105,19 @@ class RequestStreams:
             return  # it has gone: its calls learn that from the servers that are there
         stream.publish(request.message)
         request.copies.append(self._newest(stream))
-        request.next_s = now_s + _PATIENCE * self._paths.path(server, now_s).arrival_s(len(request.message))
+        path = self._paths.path(server, now_s)
+        request.server, request.check_s = server, now_s + path.stall_s
+        request.next_s = now_s + _PATIENCE * path.arrival_s(len(request.message))
+
+    def _may_follow(self, request: _Request, now_s: float) -> bool:
+        """Return whether the next copy may begin: those before have left, or the newest is late."""
+        if request.server is None or all(publisher.has_left(sequence) for publisher, sequence in request.copies):
+            return True
+        if now_s < request.check_s:
+            return False
+        path = self._paths.path(request.server, now_s)
+        request.check_s = min(now_s + path.stall_s, request.next_s)
+        return now_s >= request.next_s or path.has_stalled(now_s)
 
     @staticmethod
     def _newest(publisher: Publisher) -> tuple[Publisher, int]:
