@@ -609,6 +609,15 @@ class Publisher:
         """Return the paths to the readers that may govern, the slowest of which does; of requests the fastest does."""
         return self._reader_paths.governing(self._governing_names(), self._seen_s)
 
+    def governing_reader(self) -> tuple[Name, float, float] | None:
+        """Return the slowest of several readers, its round trip in seconds, and its bytes a second, or None."""
+        names = self._governing_names()
+        paths = {name: path for name in names if (path := self._reader_paths.get(name)) is not None and path.trip_s}
+        if len(names) < 2 or not paths or self._fastest_governs:
+            return None
+        name = min(paths, key=lambda each: paths[each].allowed_bytes_s)
+        return Name(name), paths[name].trip_s, paths[name].allowed_bytes_s
+
     def _measured_readers(self) -> Readers:
         """Return the readers whose losses copies and parity are for: where the fastest governs, its own alone."""
         return self._fastest_names() if self._fastest_governs else self._readers

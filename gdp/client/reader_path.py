@@ -165,15 +165,16 @@ class ReaderPath:
         """
         controller = self.controller
         trips = 1 + min(controller.loss * _MESSAGE_FRAMES, 1.0)
-        return size / max(controller.capacity_bytes_s or 0.0, self._allowed_bytes_s) + trips * controller.base_rtt_s
+        return size / max(controller.capacity_bytes_s or 0.0, self.allowed_bytes_s) + trips * controller.base_rtt_s
 
     def excess_s(self, size: int) -> float:
         """Return for how long bytes leave that do not fit the window now."""
         excess = size - max(self.controller.limit - self.controller.inflight, 0.0)
-        return max(excess, 0.0) / self._allowed_bytes_s
+        return max(excess, 0.0) / self.allowed_bytes_s
 
     @property
-    def _allowed_bytes_s(self) -> float:
+    def allowed_bytes_s(self) -> float:
+        """Return the bytes a second that the window permits."""
         return self.controller.window / (self.controller.rtt_s or FIRST_RTT_S)
 
     def carries(self, size: int, within_s: float) -> bool:
