@@ -9,6 +9,7 @@ sent, and skips what is gone. After a penalty it may block the window again.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 from gdp.client.heartbeat_schedule import HeartbeatSchedule
@@ -95,6 +96,12 @@ class AckNackHandler:
                 self.exclude(name, now_s)
         for name, reader in self._readers.overdue(now_s):
             self._give_up(name, reader, now_s)
+
+    def lose_ended(self, numbers: Sequence[int]) -> None:
+        """Count requests that some server will not get, because their call has ended; a Heartbeat says so at once."""
+        if numbers:
+            self._queue.ledger.record_evicted(numbers, LossReason.CALL_ENDED)
+            self._heartbeats.wanted = True
 
     def exclude(self, name: bytes, now_s: float) -> None:
         """Let a slow reader block the others no longer, for a penalty time."""
@@ -208,6 +215,7 @@ class AckNackHandler:
 
     def _acknowledge(self, name: bytes, report: AckNack, *, is_new: bool, now_s: float, trip_s: float) -> None:
         reader, window, queue = self._readers[name], self._window, self._queue
+        self.lose_ended(window.poll_cancelled(report))
         oldest = queue.oldest
         if not (window.has_reader(name) or window.is_suspended(name)) and now_s >= reader.out_until_s:
             # it lagged; what a forgotten reader lacked was given up before

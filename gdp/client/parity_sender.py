@@ -41,6 +41,7 @@ _AT_ONCE: Final = 8  # frames; an initial window is not larger (RFC 6928)
 _MARGIN_MAX: Final = 16.0
 _REMEMBERED: Final = 64  # messages whose requests are awaited
 _LOSS_STEPS: Final = 1_000  # loss is rounded up to a thousandth
+_NUMBER: Final = slice(NUMBER_AT, NUMBER_AT + 8)
 _NUMBER_PART_PARTS: Final = struct.Struct("!QII")
 _PARITY: Final = int(Flag.PARITY)
 
@@ -167,6 +168,11 @@ class ParitySender:
         self.sent += len(frames)
         self._at_once = max(self._at_once - len(frames), 0)
         return frames
+
+    def cancel(self, number: int) -> None:
+        """Drop the parity frames of a message that is cancelled."""
+        cancelled = number.to_bytes(8, "big")
+        self._waiting = deque(each for each in self._waiting if each[_NUMBER] != cancelled)
 
     def clear(self) -> None:
         """Drop the parity frames that wait: there is no reader any more."""

@@ -11,7 +11,7 @@ streams.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from typing import Final
 
 from gdp.client.attachment import Attachment
@@ -20,6 +20,7 @@ from gdp.client.identities import ReaderIdentity, WriterIdentity
 from gdp.client.publications import Publications
 from gdp.client.publisher import Publisher
 from gdp.client.reader_proxies import CALLS, TOPICS
+from gdp.client.request_streams import RequestStreams
 from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
 from gdp.client.subscription import Message, Subscription, Subscriptions, Topic
 from gdp.client.timer_queue import TimerQueue
@@ -200,14 +201,34 @@ class Participant:
         """
         self._tell(Right.SERVE, service, client, message)
 
-    def send_request(self, service: Name, server: Name, message: bytes) -> None:
+    def send_request(self, service: Name, server: Name, message: bytes, call: Hashable = None) -> None:
         """Send a request to one server of a name that is called here, apart from the stream to all of them.
+
+        Args:
+            call: by which ``end_call`` cancels it; None: it does not.
 
         Raises:
             LocalError: that server is not connected (any more), or there are too many; or the message is above the
                 limits.
         """
-        self._tell(Right.CALL, service, server, message)
+        if call is None:
+            self._tell(Right.CALL, service, server, message)
+        else:
+            self._requests_of(service).send_to(call, server, message, self._now_s)
+
+    def send_requests(self, service: Name, message: bytes, call: Hashable) -> None:
+        """Send a request to all servers of a name that is called here; the path to the fastest governs.
+
+        Raises:
+            LocalError: the message is above the limits.
+        """
+        self._requests_of(service).send_to_all(call, message, self._now_s)
+
+    def end_call(self, service: Name, call: Hashable) -> None:
+        """Cancel what has not left of a call's requests, and their repairs; those of a withdrawn name have ended."""
+        requests = self._publications.requests(service)
+        if requests is not None:
+            requests.cancel(call)
 
     def is_acknowledged(self, name: Name) -> bool:
         """Return whether readers have confirmed all that was sent on a name; ``withdraw`` drops the rest."""
@@ -435,6 +456,7 @@ class Participant:
         turns; urgent ones go first each time.
         """
         out = self.attachment.frames_to_send()
+        self._publications.release_requests(now_s)
         if not out and (self._turns or self._reporting):
             self.flush(now_s)
             out = self.attachment.frames_to_send()
@@ -496,6 +518,12 @@ class Participant:
         if now_s - self._now_s > _STALL_S:
             self._awake_s = now_s  # frames that the peers sent meanwhile are still to be processed
         self._now_s = now_s
+
+    def _requests_of(self, service: Name) -> RequestStreams:
+        requests = self._publications.requests(service)
+        if requests is None:
+            raise LocalError(f"no call of {service.short} here")
+        return requests
 
     def _tell(self, right: Right, service: Name, party: Name, message: bytes) -> None:
         subscription = self._subscriptions.get(service)

@@ -7,13 +7,15 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import partial
 
 from gdp.client.identities import WriterIdentity
 from gdp.client.key_epochs import Secrets
 from gdp.client.path_mtu import PathMtu
 from gdp.client.publisher import Publisher
 from gdp.client.reader_path import ReaderPaths
-from gdp.client.reader_proxies import TOPICS, ReaderTimeouts
+from gdp.client.reader_proxies import CALLS, TOPICS, ReaderTimeouts
+from gdp.client.request_streams import RequestStreams
 from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
 from gdp.client.send_scheduler import SendScheduler
 from gdp.client.sequence_numbers import SequenceRegistry
@@ -42,6 +44,7 @@ class Publications:
         self._heard = heard
         self._publishers: dict[Name, Publisher] = {}
         self._private: dict[Name, UnicastStreams] = {}  # by service
+        self._requests: dict[Name, RequestStreams] = {}  # by service that is called
         self._paths: dict[Name, PathMtu] = {}
         self._sequence_registry = SequenceRegistry()
         self._timers = TimerQueue[Publisher]()
@@ -109,6 +112,7 @@ class Publications:
             paths=paths,
             reader_paths=self._reader_paths,
             options=options,
+            fastest_governs=patience is CALLS,
         )
         publisher.published = self.turns.add
         self._publishers[name] = publisher
@@ -124,6 +128,8 @@ class Publications:
         options: SendOptions = DEFAULT_OPTIONS,
     ) -> None:
         """Enable unicast streams on a published name from now on."""
+        public, paths_to = self._publishers[name], self._reader_paths
+        self._requests[name] = RequestStreams(public, partial(self._stream_to, name), paths_to)
         self._private[name] = UnicastStreams(
             service=name,
             writer=self._source,
@@ -140,6 +146,7 @@ class Publications:
         """Stop publishing a name; return whether it was published."""
         publisher, streams = self._publishers.pop(name, None), self._private.pop(name, None)
         self._paths.pop(name, None)
+        self._requests.pop(name, None)
         if publisher is None:
             return False
         self._sequence_registry.put(name, publisher.past)
@@ -164,10 +171,16 @@ class Publications:
         Raises:
             LocalError: it is not connected, there are too many, or the message is above the limits.
         """
-        streams, heard = self._private.get(service), self._heard(service, party)
-        if streams is None or heard is None:
-            raise LocalError(f"{party.short} is not heard on {service.short}")
-        streams.stream(heard, self._publishers[service].mtu, now_s).publish(message)
+        self._stream_to(service, party, now_s).publish(message)
+
+    def requests(self, service: Name) -> RequestStreams | None:
+        """Return the requests to the servers of a name, or None."""
+        return self._requests.get(service)
+
+    def release_requests(self, now_s: float) -> None:
+        """Begin the copies of requests that have waited for a faster one to leave."""
+        for requests in self._requests.values():
+            requests.release(now_s)
 
     def forget(self, service: Name, party: PeerIncarnation) -> None:
         """Drop the stream to a party of a service that is gone."""
@@ -221,6 +234,7 @@ class Publications:
             streams.forget_idle(now_s)
         if self._reader_paths.handle_timer(now_s):
             self.turns.resume()
+        self.release_requests(now_s)
 
     def frames_leave(self, now_s: float) -> None:
         """Count the frames polled last, which left at ``now_s``."""
@@ -235,7 +249,19 @@ class Publications:
     def next_due(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
         times = [self._timers.next_due(), self._reader_paths.get_timer(), self.turns.next_due()]
+        times += [requests.get_timer() for requests in self._requests.values()]
         return min((time for time in times if time is not None), default=None)
+
+    def _stream_to(self, service: Name, party: Name, now_s: float) -> Publisher:
+        """Return the unicast stream to a party of a service.
+
+        Raises:
+            LocalError: it is not connected, or there are too many.
+        """
+        streams, heard = self._private.get(service), self._heard(service, party)
+        if streams is None or heard is None:
+            raise LocalError(f"{party.short} is not heard on {service.short}")
+        return streams.stream(heard, self._publishers[service].mtu, now_s)
 
     def _all_of(self, name: Name) -> list[Publisher]:
         """Return the publisher of a name and its unicast streams."""

@@ -35,6 +35,7 @@ from gdp.frame.codec import NUMBER_AND_PART, NUMBER_AT, SECOND_PATH, Header, sec
 from gdp.frame.kinds import Flag
 from gdp.limits import MTU_MIN_BYTES, SPREAD, WINDOW_BYTES
 from gdp.message.bundle import BUNDLE_BYTES
+from gdp.message.frame_loss import Readers
 from gdp.message.heartbeat import Heartbeat
 from gdp.message.loss import Losses, LossReason
 from gdp.message.send_window import SendWindow
@@ -65,6 +66,7 @@ class Publisher:
             messages are striped over both.
         reader_paths: what may leave to each reader node; shared by all publishers of a participant.
         options: how fresh, how much and how often its messages leave.
+        fastest_governs: the first answer to a message counts, so readers on slower paths do not hold it back.
 
     Attributes:
         options: as set last.
@@ -95,8 +97,10 @@ class Publisher:
         paths: int = 1,
         reader_paths: ReaderPaths | None = None,
         options: SendOptions = DEFAULT_OPTIONS,
+        fastest_governs: bool = False,
     ) -> None:
         self.topic = topic
+        self._fastest_governs = fastest_governs
         self.paths = paths
         self.options = options
         self._reader_paths = ReaderPaths() if reader_paths is None else reader_paths
@@ -171,6 +175,23 @@ class Publisher:
     def reader_names(self) -> list[Name]:
         """Return the readers that have introduced themselves and have not left, silent ones included."""
         return [Name(each) for each in self._readers.names()]
+
+    def active_readers(self, now_s: float) -> list[bytes]:
+        """Return the readers that report; those that have missed reports come last."""
+        readers = self._readers
+        return [] if self.mtu is None else sorted(readers, key=lambda name: readers.is_quiet(name, now_s))
+
+    def has_left(self, sequence: int) -> bool:
+        """Return whether a message has left whole."""
+        return self._queue.sequences[0] > sequence
+
+    def cancel(self, sequence: int) -> None:
+        """Send nothing more of a message, and repair nothing; bundled ones are small, and leave."""
+        number = self._queue.ledger.number_of(sequence)
+        if number is not None and self._window.cancel(number):
+            self.parity.cancel(number)
+            self._acknowledgements.lose_ended([number])
+            self.published(self)
 
     def is_silent(self, name: Name) -> bool:
         """Return whether ``name`` is a reader that has stopped reporting, and may return."""
@@ -306,13 +327,16 @@ class Publisher:
         if len(paths) == 1 and not self._blocking:
             return paths[0].allowance(now_s, urgent=urgent)
         allowances = [path.allowance(now_s, urgent=urgent) for path in paths]
+        if self._fastest_governs:
+            return max(allowances, default=_ALL)
         if self._blocking or (len(allowances) > 1 and min(allowances) <= 0):
             self._record_blocks(now_s)
         return min(allowances, default=_ALL)
 
     def next_send_s(self, now_s: float) -> float | None:
         """Return when ``allowance`` may be more than 0; None: not before a reader confirms something."""
-        due_s = max((path.next_send_s() for path in self._paths()), default=now_s)
+        governs = min if self._fastest_governs else max
+        due_s = governs((path.next_send_s() for path in self._paths()), default=now_s)
         if self._limit is not None and (left := self._limit.left(now_s)) <= 0:
             due_s = max(due_s, now_s + self._limit.seconds_for(1 - left))
         return None if due_s == _NEVER else due_s
@@ -320,7 +344,7 @@ class Publisher:
     def awaited_readers(self) -> frozenset[bytes]:
         """Return the readers whose paths must all permit a frame at once; empty: there is one path."""
         names = self._governing_names()
-        return frozenset(names) if len(names) > 1 else frozenset()
+        return frozenset(names) if len(names) > 1 and not self._fastest_governs else frozenset()
 
     def has_any(self, readers: frozenset[bytes]) -> bool:
         """Return whether one of these nodes is a reader."""
@@ -334,7 +358,7 @@ class Publisher:
     @property
     def path_bytes_s(self) -> float | None:
         """Return the bytes a second that this topic may expect of its path; None: not measured, and no limit."""
-        rate = min((rate for path in self._paths() if (rate := path.controller.bytes_s)), default=0.0)
+        rate = min((rate for path in self._measured_paths() if (rate := path.controller.bytes_s)), default=0.0)
         shares = [rate * self.path_share] if rate else []
         if self.options.max_bits_s is not None:
             shares.append(self.options.max_bits_s / 8)
@@ -343,17 +367,19 @@ class Publisher:
     @property
     def capacity_bytes_s(self) -> float | None:
         """Return how many bytes a second the narrowest path carries; None: not measured."""
-        return min((rate for path in self._paths() if (rate := path.controller.capacity_bytes_s)), default=None)
+        rates = (path.controller.capacity_bytes_s for path in self._measured_paths())
+        return min((rate for rate in rates if rate), default=None)
 
     @property
     def path_loss(self) -> float:
         """Return the share of frames that were lost lately on the worst path, 0 to 1."""
-        return max((path.controller.loss for path in self._paths()), default=0.0)
+        return max((path.controller.loss for path in self._measured_paths()), default=0.0)
 
     @property
     def path_rtt_s(self) -> float | None:
         """Return the smoothed round trip of the longest path in seconds; None: not measured."""
-        return max((trip for path in self._paths() if (trip := path.controller.rtt_s) is not None), default=None)
+        trips = (path.controller.rtt_s for path in self._measured_paths())
+        return max((trip for trip in trips if trip is not None), default=None)
 
     def close(self) -> None:
         """Forget all readers and what waits for them; nothing is sent any more."""
@@ -441,6 +467,8 @@ class Publisher:
         self.redundancy.handle_report(header.source, report, is_new=is_new)
         self.parity.handle_report({each.number for each in report.missing})
         self._measure_loss(now_s)
+        if self._fastest_governs:
+            self._window.governing = next(iter(self._fastest_names()), None)
         path = self._reader_paths.get(header.source)
         trip_s = 0.0 if path is None else path.trip_s
         self._acknowledgements.handle_acknack(header.source, report, is_new=is_new, now_s=now_s, trip_s=trip_s)
@@ -506,6 +534,8 @@ class Publisher:
             limit = max(limit_bytes // (mtu * (2 if has_pair and self._striper is None else 1)), 1)
             parity = self.parity.poll_frames(limit)
             sent = self._frames_to_send(now_s, limit - len(parity)) if len(parity) < limit else []
+            late = self._late_repairs(now_s, limit - len(parity) - len(sent))
+            sent = late + sent  # those that were sent before come first in the account
             if self._loss is not None:
                 self.parity.handle_sent(sent, self._loss, self.capacity_bytes_s, now_s)
             left = limit - len(parity) - len(sent)
@@ -519,7 +549,7 @@ class Publisher:
         frames = status + parity + sent + parity_after
         if frames:
             self._acknowledgements.last_sent_s = now_s
-        self.redundancy.handle_sent(sent, self._readers, now_s, has_pair=has_pair)
+        self.redundancy.handle_sent(sent, self._measured_readers(), now_s, has_pair=has_pair)
         copies = self.redundancy.poll_copies(now_s)
         if extra := copies + parity + parity_after:
             for path in self._paths():
@@ -547,6 +577,13 @@ class Publisher:
             self._late.record_sent(new, now_s)
         return repairs + new
 
+    def _late_repairs(self, now_s: float, limit: int) -> list[bytes]:
+        """Return at most ``limit`` frames that slower readers lack, as far as the paths to all permit."""
+        if limit <= 0 or self._window.governing is None:
+            return []
+        allowance = min((path.allowance(now_s) for path in self._paths()), default=0)
+        return self._window.late_repairs_to_send(now_s, min(limit, -(-allowance // (self.mtu or MTU_MIN_BYTES))))
+
     def _is_doubled(self, now_s: float) -> bool:
         """Return whether each frame travels over two paths now."""
         return self.paths > 1 and self._striper is None and now_s < self.second_path_until_s
@@ -562,15 +599,35 @@ class Publisher:
 
         The round trip of the empty path counts, because a busy machine lengthens the others on any link.
         """
-        controllers = [path.controller for path in self._paths()] if self.parity.is_enabled else []
+        controllers = [path.controller for path in self._measured_paths()] if self.parity.is_enabled else []
         trip_s = max((each.base_rtt_s for each in controllers if each.rtt_s is not None), default=None)
         is_long = trip_s is not None and trip_s >= RTT_MIN_S
-        self._loss = self.redundancy.loss(self._readers, now_s) if is_long else None
+        self._loss = self.redundancy.loss(self._measured_readers(), now_s) if is_long else None
         self._queue.has_parity = self.parity.is_wanted(self._loss, trip_s, self.options.deadline_s)
 
     def _paths(self) -> list[ReaderPath]:
-        """Return the paths to the readers that may govern, the slowest of which does."""
+        """Return the paths to the readers that may govern, the slowest of which does; of requests the fastest does."""
         return self._reader_paths.governing(self._governing_names(), self._seen_s)
+
+    def governing_reader(self) -> tuple[Name, float, float] | None:
+        """Return the slowest of several readers, its round trip in seconds, and its bytes a second, or None."""
+        names = self._governing_names()
+        paths = {name: path for name in names if (path := self._reader_paths.get(name)) is not None and path.trip_s}
+        if len(names) < 2 or not paths or self._fastest_governs:
+            return None
+        name = min(paths, key=lambda each: paths[each].allowed_bytes_s)
+        return Name(name), paths[name].trip_s, paths[name].allowed_bytes_s
+
+    def _measured_readers(self) -> Readers:
+        """Return the readers whose losses copies and parity are for: where the fastest governs, its own alone."""
+        return self._fastest_names() if self._fastest_governs else self._readers
+
+    def _measured_paths(self) -> list[ReaderPath]:
+        names = self._fastest_names() if self._fastest_governs else self._governing_names()
+        return self._reader_paths.governing(names, self._seen_s)
+
+    def _fastest_names(self) -> list[bytes]:
+        return self._reader_paths.fastest(self._governing_names(), self._seen_s)
 
     def _governing_names(self) -> list[bytes]:
         """Return the readers that keep up: the others must not wait for one that does not. Without any, return all.

@@ -2,9 +2,9 @@
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). One congestion controller (``gdp/congestion``) for each reader
 node is shared by all publishers of a participant that this node reads. A frame to several readers counts on the path of
-each, and leaves when all of them permit it, so the slowest reader governs. A reader that confirms nothing for a timeout
-no longer governs the others; alone, it gets two frames each timeout. When a reader node restarts, its path begins
-again, and frames to its former incarnation do not count.
+each. On a topic it leaves when all of them permit it, so the slowest reader governs; of requests the fastest path
+governs. A reader that confirms nothing for a timeout governs no others; alone, it gets two frames each timeout. When a
+reader node restarts, its path begins again, and frames to its former incarnation do not count.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Final
 
-from gdp.congestion.controller import PathController
-from gdp.limits import MTU_MIN_BYTES
+from gdp.congestion.controller import FIRST_RTT_S, PathController
+from gdp.congestion.states import State
+from gdp.limits import MTU_MIN_BYTES, REPORT_DELAY_S
 
 __all__ = ["BURST_S", "ReaderPath", "ReaderPaths"]
 
@@ -29,6 +30,7 @@ _BEHIND_S: Final = 0.1  # a reader reports 20 ms after a frame came
 _BEHIND_REPORTS: Final = 2
 _URGENT_SHARE: Final = 1.5  # of the window: urgent frames find space where the others have filled it
 _URGENT_FRAMES: Final = 8
+_MESSAGE_FRAMES: Final = 100  # of a large message, one loss among which costs a round trip
 _FORGET_S: Final = 60.0
 _NEVER: Final = float("inf")
 _UNLIMITED: Final = 1 << 30
@@ -147,6 +149,39 @@ class ReaderPath:
         """Return the smoothed round trip, that of before a timeout if none was measured since; 0: none yet."""
         return self.controller.rtt_s or self._trip_s
 
+    @property
+    def stall_s(self) -> float:
+        """Return how long a path that carries something may confirm nothing."""
+        return _PROBE_TRIPS * (self.trip_s or FIRST_RTT_S) + REPORT_DELAY_S
+
+    def has_stalled(self, now_s: float) -> bool:
+        """Return whether nothing under way was confirmed for two round trips and a report's delay."""
+        return self.is_silent or (self.controller.inflight > 0 and now_s - self._confirmed_s > self.stall_s)
+
+    def arrival_s(self, size: int) -> float:
+        """Return how long so many bytes take to be confirmed, while no queue stands; a loss takes a round trip more.
+
+        Window and smoothed round trip change with each queue that other paths share, so the order would follow them.
+        """
+        controller = self.controller
+        trips = 1 + min(controller.loss * _MESSAGE_FRAMES, 1.0)
+        return size / max(controller.capacity_bytes_s or 0.0, self.allowed_bytes_s) + trips * controller.base_rtt_s
+
+    def excess_s(self, size: int) -> float:
+        """Return for how long bytes leave that do not fit the window now."""
+        excess = size - max(self.controller.limit - self.controller.inflight, 0.0)
+        return max(excess, 0.0) / self.allowed_bytes_s
+
+    @property
+    def allowed_bytes_s(self) -> float:
+        """Return the bytes a second that the window permits."""
+        return self.controller.window / (self.controller.rtt_s or FIRST_RTT_S)
+
+    def carries(self, size: int, within_s: float) -> bool:
+        """Return whether so many bytes may leave within a time, as far as the path was measured."""
+        excess_s = self.excess_s(size)
+        return not excess_s or (excess_s <= within_s and self.controller.state is not State.STARTUP)
+
     def patience_s(self, now_s: float) -> float:
         """Return how long an answer may take: a round trip, or as long as nothing under way was confirmed."""
         is_waiting = self._timeouts > 0 or self.controller.inflight > 0
@@ -248,6 +283,22 @@ class ReaderPaths:
         """Return the paths that govern what leaves for these readers: silent ones only if all are."""
         paths = [self._paths.get(reader) or self.path(reader, now_s) for reader in readers]
         return [path for path in paths if not path.is_silent] or paths[:1]
+
+    def fastest(self, readers: Iterable[bytes], now_s: float) -> list[bytes]:
+        """Return the one of these readers whose path is the shortest, and has not stalled; none of none."""
+        paths = [(reader, self._paths.get(reader)) for reader in readers]
+        known = [(path.has_stalled(now_s), path.arrival_s(0), reader) for reader, path in paths if path is not None]
+        return [min(known)[2]] if known else [reader for reader, _ in paths[:1]]
+
+    def fastest_first(self, readers: Iterable[bytes], size: int, now_s: float) -> tuple[list[bytes], bool]:
+        """Return readers in the order in which ``size`` bytes would reach them, and whether one copy may go to all.
+
+        It may where each path can carry it as fast as the fastest one does.
+        """
+        paths = {reader: self.path(reader, now_s) for reader in readers}
+        order = sorted(paths, key=lambda reader: (paths[reader].has_stalled(now_s), paths[reader].arrival_s(size)))
+        within_s = paths[order[0]].arrival_s(size) if order else 0.0
+        return order, all(path.carries(size, within_s) for path in paths.values())
 
     def attachment_changed(self, now_s: float) -> None:
         """Start every path again: frames leave by another switch."""

@@ -36,11 +36,11 @@ from gdp.congestion.delivery_rate import DeliveryRate, Flight, RateSample
 from gdp.congestion.filters import WindowedExtreme
 from gdp.congestion.states import TRANSITIONS, Signal, State
 
-__all__ = ["PathController"]
+__all__ = ["FIRST_RTT_S", "PathController"]
 
 _LEAST_FRAMES: Final = 2
 _FIRST_FRAMES: Final = 32  # as Google's QUIC; RFC 6928 has 10
-_FIRST_RTT_S: Final = 0.02  # until one is measured
+FIRST_RTT_S: Final = 0.02  # until one is measured
 _LEAST_RTT_S: Final = 1e-5
 _DELAY_MOST_S: Final = 0.25  # by the pace; longer only if one frame takes longer
 _NOISE_S: Final = 0.002
@@ -152,7 +152,7 @@ class PathController:
     @property
     def base_rtt_s(self) -> float:
         """Return the round trip of the empty path."""
-        return self._base.value(_FIRST_RTT_S)
+        return self._base.value(FIRST_RTT_S)
 
     @property
     def rtt_s(self) -> float | None:
@@ -182,7 +182,7 @@ class PathController:
 
     @property
     def _standing_s(self) -> float:
-        return self._standing.value(_FIRST_RTT_S)
+        return self._standing.value(FIRST_RTT_S)
 
     @property
     def _empty_path_s(self) -> float:
@@ -392,7 +392,7 @@ class PathController:
             self._drain()
         elif self.state is State.COMPETITIVE and self._cubic is not None:
             if may_grow:
-                self._cubic.acknowledged(size / self._mtu, now_s, self._srtt_s or _FIRST_RTT_S)
+                self._cubic.acknowledged(size / self._mtu, now_s, self._srtt_s or FIRST_RTT_S)
             if now_s < self._claims_until_s:
                 self._cubic.raise_to(self._half_window() / self._mtu)
             self.window = self._cubic.window * self._mtu

@@ -75,6 +75,8 @@ class FlowFact:
         idle_s: since the last message; None: there was none.
         age_s: since the flow began.
         is_throttled: messages wait for the rule's ``max_bits_s`` now.
+        governing: the far reader that governs the pace of an exposed topic; empty: one reader, or nothing measured.
+        governing_rtt_s: round trip of its path; ``governing_bits_s``: what that path permits.
     """
 
     side: str
@@ -119,6 +121,9 @@ class FlowFact:
     age_s: float = 0.0
     mtu: int = 0
     is_throttled: bool = False
+    governing: str = ""
+    governing_rtt_s: float = 0.0
+    governing_bits_s: float = 0.0
 
     @property
     def key(self) -> tuple[str, str, str, str]:

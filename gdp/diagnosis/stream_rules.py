@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from gdp.diagnosis.network_rules import Found
-from gdp.diagnosis.view import View
+from gdp.diagnosis.view import View, short
 
 __all__ = [
     "arrives",
@@ -53,13 +53,14 @@ def arrives(view: View) -> Found:
             rate = f", {flow.received / window_s:.3g} Hz" if window_s else ""
             thinned = flow.thinned + sum(far.flow.thinned for far in view.exporters)
             left_out = f"; max_hz leaves out {thinned} of {thinned + flow.received} messages" if thinned else ""
-            return f"It arrives {end.place}: last message {age}{rate}{left_out}.", ""
+            return f"It arrives {end.place}: last message {age}{rate}{left_out}{_governs(view)}.", ""
     for end in view.exporters:
         if end.proxy.is_near and not view.importers and end.flow.is_carried and end.flow.readers:
             if end.flow.kind != "topic":
                 return f"It is served: {end.flow.readers} remote clients of {end.flow.local} connected.", ""
             if end.flow.sent and not any(end.flow.lost.values()):
-                return f"It leaves: {end.flow.sent} messages to {end.flow.readers} remote readers just now.", ""
+                left = f"{end.flow.sent} messages to {end.flow.readers} remote readers just now"
+                return f"It leaves: {left}{_governs(view)}.", ""
     return None
 
 
@@ -275,6 +276,15 @@ def call_failed(view: View) -> Found:
         for label in _failures(end.flow.faults):
             return f"Calls of {end.flow.local} fail {end.place}: {end.flow.details.get(label, label)}.", _CHECK
     return None
+
+
+def _governs(view: View) -> str:
+    """Return which of several readers governs the pace of a topic, as a clause; empty: none does, or not known."""
+    flow = next((each.flow for each in view.exporters if each.flow.governing), None)
+    if flow is None:
+        return ""
+    path = f"round trip {1e3 * flow.governing_rtt_s:.3g} ms, {flow.governing_bits_s / 1e6:.3g} Mbit/s"
+    return f"; the slowest reader, proxy {short(flow.governing)}, governs ({path})"
 
 
 def _failures(faults: Mapping[str, int]) -> list[str]:

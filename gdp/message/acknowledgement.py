@@ -90,6 +90,10 @@ class ReaderPositions:
         """Return the lowest message number that an active reader lacks."""
         return min([each.next_number for each in self.active.values()], default=_BEYOND_ALL)
 
+    def most_active(self) -> int:
+        """Return the highest message number before which an active reader lacks nothing."""
+        return max([each.next_number for each in self.active.values()], default=_BEYOND_ALL)
+
     def least(self) -> int:
         """Return the lowest message number that any reader lacks, suspended or not."""
         least = self.least_active()
@@ -100,7 +104,7 @@ class ReaderPositions:
         if acked_at > position.acked_at:
             position.acked_at = acked_at
             position.last_progress_s = now_s
-        first_at = self._first_at()
+        first_at = self.first_at()
         for each in self.active.values():
             if each.mark_at <= each.acked_at < first_at:
                 each.mark_at, each.mark_s = first_at, now_s
@@ -113,7 +117,7 @@ class ReaderPositions:
 
     def slow(self, sent_at: int, now_s: float) -> list[bytes]:
         """Return the active readers that have stalled, or lag behind another for longer than tolerated."""
-        first_at = self._first_at()
+        first_at = self.first_at()
         return [
             name
             for name, each in self.active.items()
@@ -126,11 +130,11 @@ class ReaderPositions:
 
     def next_slow(self) -> float | None:
         """Return the monotonic second at which a reader that lags behind another becomes slow, or None."""
-        first_at = self._first_at()
+        first_at = self.first_at()
         behind = [each.mark_s for each in self.active.values() if each.acked_at < each.mark_at <= first_at]
         mark_s = min(behind, default=None)
         return None if mark_s is None else mark_s + self._lag_s + 0.001
 
-    def _first_at(self) -> int:
+    def first_at(self) -> int:
         """Return the position of the most advanced active reader."""
         return max([each.acked_at for each in self.active.values()], default=0)

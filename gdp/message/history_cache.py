@@ -95,5 +95,4 @@ class HistoryCache:
 
     def begin_of(self, number: int) -> int:
         """Return the position at which a message begins, or would begin if it were cached."""
-        oldest = self.oldest
-        return self.messages[oldest].begin_at if oldest is not None and number < oldest else self.end_at
+        return next((each.begin_at for cached, each in self.messages.items() if cached >= number), self.end_at)

@@ -33,6 +33,7 @@ class Ledger:
         self.losses = Losses()
         self.gone: deque[LostRange] = deque(maxlen=GONE_MAX)
         self._unconfirmed = RangeSet()
+        self._numbers: dict[int, int] = {}  # sequence number -> message number of one that carries nothing else
         self._of: dict[int, tuple[int, int]] = {}  # message number -> first sequence number, messages; numbers rise
 
     @property
@@ -48,6 +49,12 @@ class Ledger:
     def put(self, number: int, sequence: int, messages: int) -> None:
         """Note what the newest message number carries."""
         self._of[number] = sequence, messages
+        if messages == 1:
+            self._numbers[sequence] = number
+
+    def number_of(self, sequence: int) -> int | None:
+        """Return the message number that carries one message alone; None: it is unknown, or carries others, too."""
+        return self._numbers.get(sequence)
 
     def is_bundle(self, number: int) -> bool:
         """Return whether a message number carries several messages."""
@@ -61,11 +68,12 @@ class Ledger:
     def forget(self, below: int) -> None:
         """Forget message numbers under ``below``."""
         while self._of and (first := next(iter(self._of))) < below:
-            del self._of[first]
+            self._numbers.pop(self._of.pop(first)[0], None)
 
     def move(self, move: Renumbering) -> None:
         """Apply a renumbering."""
         self._of = {move.new_number(number): carried for number, carried in self._of.items()}
+        self._numbers = {sequence: number for number, (sequence, messages) in self._of.items() if messages == 1}
 
     def record_evicted(self, numbers: Iterable[int], reason: LossReason) -> int:
         """Note that message numbers are gone before every reader had them; return how many messages they carried."""

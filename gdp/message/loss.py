@@ -36,6 +36,7 @@ class LossReason(IntEnum):
     READER_RESTARTED = 9  # this reader restarted
     DETACHED = 10  # the route to the publisher was gone in between
     LIFESPAN = 11  # it could not leave its publisher in time, on a best-effort topic
+    CALL_ENDED = 12  # a request whose call ended before it was complete here
 
     @property
     def label(self) -> str:

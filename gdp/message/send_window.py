@@ -24,7 +24,7 @@ from gdp.limits import FLIGHT_MESSAGES_MAX, READER_LEASE_S, REPAIRS_MAX_BYTES, W
 from gdp.message.acknack import AckNack
 from gdp.message.acknowledgement import ReaderPositions
 from gdp.message.flow_control import FlowControl
-from gdp.message.history_cache import HistoryCache
+from gdp.message.history_cache import CachedMessage, HistoryCache
 from gdp.message.renumbering import Renumbering
 from gdp.message.retransmission import RetransmissionQueue
 
@@ -42,6 +42,7 @@ class SendWindow:
         lag_s: how long a reader may block the window while others have acknowledged.
 
     Attributes:
+        governing: the reader that alone governs what leaves; None: all do, and the slowest decides.
         evicted: messages removed from a full window before every reader had them.
     """
 
@@ -58,11 +59,14 @@ class SendWindow:
         self._flow = FlowControl()
         self._readers = ReaderPositions(lag_s)
         self._repairs = RetransmissionQueue()
+        self._late_repairs = RetransmissionQueue()  # of readers that do not govern: they leave after what is new
+        self._cancelled: set[int] = set()  # messages that were sent, and are not repaired
         self._best_effort_queue = deque[tuple[int, int]]()  # (number, first fragment not sent), oldest first
         self._newest = first_number - 1
         self._sent_at = 0
         self._now_s = 0.0  # of the latest event
         self._sent_before = 0  # messages before this one were sent, if under an old number
+        self.governing: bytes | None = None
         self.evicted = 0
 
     @property
@@ -78,7 +82,7 @@ class SendWindow:
     @property
     def retransmissions(self) -> int:
         """Return how many fragments were sent again."""
-        return self._repairs.retransmissions
+        return self._repairs.retransmissions + self._late_repairs.retransmissions
 
     @property
     def readers(self) -> int:
@@ -163,6 +167,31 @@ class SendWindow:
         self._best_effort_queue.append((number, 0))
         return evicted
 
+    def cancel(self, number: int) -> bool:
+        """Send nothing more of a message, and repair nothing; return whether some reader lacks it for good.
+
+        One that was sent whole is on its way: readers lack it only if they request something of it.
+        """
+        message, waiting = self._cache.messages.get(number), self._best_effort_queue
+        if message is None:
+            return False
+        if number < self.sent[0]:
+            self._cancelled.add(number)
+            return False
+        unsent = next(index for index, (each, _) in enumerate(waiting) if each == number)
+        if not unsent:
+            self._sent_at = message.end_at
+        del waiting[unsent]
+        self._forget(number)
+        return True
+
+    def poll_cancelled(self, report: AckNack) -> list[int]:
+        """Remove and return the cancelled messages of which a reader requests something."""
+        lacked = self._cancelled & {each.number for each in report.missing} if self._cancelled else set()
+        for number in lacked:
+            self._forget(number)
+        return sorted(lacked)
+
     def cached(self) -> list[tuple[int, Sequence[bytes]]]:
         """Return the numbers and frames that are cached, oldest first."""
         return [(number, message.frames) for number, message in self._cache.messages.items()]
@@ -178,6 +207,8 @@ class SendWindow:
         for number in list(self._cache.messages):
             self._release(number)
         self._repairs.clear()
+        self._late_repairs.clear()
+        self._cancelled = {move.new_number(number) for number in self._cancelled}
         self._flow.round_trip.discard_sample()
         for number, each, size in frames:
             self.add(number, each, size, ages_s.get(number))
@@ -253,19 +284,27 @@ class SendWindow:
         """Return at most ``limit`` frames: repairs first, then new ones as far as the readers can hold them."""
         self._now_s = now_s
         frames: list[bytes] = []
-        if self._repairs and (frames := self._repaired_frames(limit, now_s)):
+        if self._repairs and (frames := self._repaired_frames(limit, now_s, self._repairs)):
             self._flow.round_trip.discard_sample()
         acked_at = self._acked_at()
         if self._sent_at == acked_at:
             self._flow.restart_probe(now_s)
         if self._best_effort_queue:
             self._readers.reset_stall_timers(self._sent_at, now_s)
-            frames += self._new_frames(acked_at + self._flow.window_bytes, limit - len(frames))
-        if frames and not self._repairs.has_repaired:
+            first_at = self._readers.first_at() if self.governing is not None else acked_at
+            frames += self._new_frames(first_at + self._flow.window_bytes, limit - len(frames))
+        if frames and not (self._repairs.has_repaired or self._late_repairs.has_repaired):
             self._flow.round_trip.handle_sent(self._sent_at, now_s)
         if not self._readers.active and not self._best_effort_queue:
             self._release_acknowledged()
         return frames
+
+    def late_repairs_to_send(self, now_s: float, limit: int) -> list[bytes]:
+        """Return at most ``limit`` frames to be sent again for readers that do not govern, once nothing new waits."""
+        if self._best_effort_queue or not self._late_repairs or limit <= 0:
+            return []
+        self._flow.round_trip.discard_sample()
+        return self._repaired_frames(limit, now_s, self._late_repairs)
 
     def probe_due(self, now_s: float) -> bool:
         """Return whether readers have been silent for too long while something is under way; backs off."""
@@ -281,7 +320,7 @@ class SendWindow:
     def _acked_at(self) -> int:
         return self._readers.acked_at(self._sent_at)
 
-    def _repaired_frames(self, limit: int, now_s: float) -> list[bytes]:
+    def _repaired_frames(self, limit: int, now_s: float, repairs: RetransmissionQueue) -> list[bytes]:
         """Return at most ``limit`` frames to be sent again; what arrived since it was requested is left out."""
         messages, acked_at = self._cache.messages, self._acked_at()
         least = self._readers.least() if self._readers.suspended else 0
@@ -289,12 +328,13 @@ class SendWindow:
         def is_lacked(number: int, part: int) -> bool:
             return messages[number].position(part) >= acked_at or number >= least > 0
 
-        return self._repairs.frames_to_send(messages, limit, now_s, is_lacked)
+        return repairs.frames_to_send(messages, limit, now_s, is_lacked)
 
     def _new_frames(self, may_reach: int, limit: int) -> list[bytes]:
         """Return at most ``limit`` frames that were never sent, up to the position ``may_reach``."""
         frames: list[bytes] = []
-        below = self._readers.least_active() + FLIGHT_MESSAGES_MAX
+        least = self._readers.least_active() if self.governing is None else self._readers.most_active()
+        below = least + FLIGHT_MESSAGES_MAX
         while (
             self._best_effort_queue
             and self._sent_at < may_reach
@@ -302,7 +342,8 @@ class SendWindow:
             and self._best_effort_queue[0][0] < below
         ):
             number, part = self._best_effort_queue[0]
-            message = self._cache.messages[number].frames
+            message, begin_at = self._cache.messages[number].frames, self._cache.messages[number].begin_at
+            self._sent_at = max(self._sent_at, begin_at)  # what lies before it was cancelled
             count = min(max(1, (may_reach - self._sent_at) // len(message[0])), limit - len(frames))
             batch = message[part : part + count]
             frames += batch
@@ -311,6 +352,8 @@ class SendWindow:
                 self._best_effort_queue[0] = (number, part + len(batch))
             else:
                 self._best_effort_queue.popleft()
+        if not self._best_effort_queue:
+            self._sent_at = self._cache.end_at
         return frames
 
     def _skip_received(self) -> None:
@@ -331,7 +374,8 @@ class SendWindow:
     def _request_repairs(self, reader: bytes, report: AckNack, now_s: float, trip_s: float) -> None:
         """Queue the fragments that a reader lacks."""
         position = self._readers.active.get(reader) or self._readers.suspended[reader]
-        self._repairs.request(
+        is_late = self.governing not in (None, reader)
+        (self._late_repairs if is_late else self._repairs).request(
             report.missing,
             position.allowance,
             self._cache.messages,
@@ -350,8 +394,13 @@ class SendWindow:
             self._release(number)
 
     def _release(self, number: int) -> None:
-        message = self._cache.remove(number)
-        self._repairs.forget(number)
+        message = self._forget(number)
         self._sent_at = max(self._sent_at, message.end_at)
         while self._best_effort_queue and self._best_effort_queue[0][0] <= number:
             self._best_effort_queue.popleft()
+
+    def _forget(self, number: int) -> CachedMessage:
+        self._repairs.forget(number)
+        self._late_repairs.forget(number)
+        self._cancelled.discard(number)
+        return self._cache.remove(number)

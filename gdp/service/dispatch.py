@@ -28,7 +28,7 @@ from gdp.service.calls import Calls
 from gdp.service.latency import Latencies
 from gdp.service.replication import ALL, Mode, Replication
 
-__all__ = ["STOP_MAX", "Ask", "Dispatch", "Effect", "Failure", "Stop"]
+__all__ = ["STOP_MAX", "Ask", "Dispatch", "Effect", "End", "Failure", "Stop"]
 
 A = TypeVar("A")
 
@@ -67,7 +67,13 @@ class Stop(NamedTuple):
     server: Name | None
 
 
-Effect: TypeAlias = "Ask | Stop"
+class End(NamedTuple):
+    """A call has ended: cancel what is still under way of its request."""
+
+    call: int
+
+
+Effect: TypeAlias = "Ask | Stop | End"
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
@@ -271,7 +277,7 @@ class Dispatch(Generic[A]):
     def poll_effects(self) -> list[Effect]:
         """Return, once, what to send, in order; no request of a call that has ended meanwhile."""
         effects, self._effects = self._effects, []
-        return [each for each in effects if isinstance(each, Stop) or each.call in self._calls]
+        return [each for each in effects if not isinstance(each, Ask) or each.call in self._calls]
 
     def _remove_owed(self, number: int, server: Name, now_s: float, *, says_no: bool = False) -> _Call[A] | None:
         """Return the call to which this server owed a response, and record that it owes none any more."""
@@ -338,6 +344,8 @@ class Dispatch(Generic[A]):
 
     def _release(self, number: int, call: _Call[A]) -> None:
         self._held_bytes -= len(call.request)
+        if self._stops:
+            self._effects.append(End(number))
         self._late.pop(number, None)
 
     def _fail(self, number: int, call: _Call[A], failure: Failure, reason: str) -> None:

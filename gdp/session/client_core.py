@@ -14,7 +14,7 @@ from gdp.client.participant import Message, Participant, Topic
 from gdp.client.publisher import Publisher
 from gdp.errors import LocalError
 from gdp.names import Name
-from gdp.service.dispatch import Ask, Dispatch, Effect, Failure
+from gdp.service.dispatch import Ask, Dispatch, End, Failure, Stop
 from gdp.service.replication import Replication
 from gdp.session.errors import CallError, CallTimeoutError, NoServerError, SessionError
 from gdp.session.messages import Response
@@ -86,7 +86,7 @@ class ClientCore:
         self._leaving: set[Name] = set()
         self._unasked: list[Call] = []  # calls that wait for a server
         # effects that wait for the window of the common stream
-        self._for_all: deque[tuple[Dispatch[Response], Effect]] = deque()
+        self._for_all: deque[tuple[Dispatch[Response], Ask | Stop]] = deque()
         self._follow_at_s = 0.0
 
     @property
@@ -241,6 +241,9 @@ class ClientCore:
         for dispatch in self._dispatches.values():
             while effects := dispatch.poll_effects():
                 for effect in effects:
+                    if isinstance(effect, End):
+                        self._member.end_call(self._name, effect.call)
+                        continue
                     servers = effect.servers if isinstance(effect, Ask) else effect.server and (effect.server,)
                     if servers is None:
                         self._for_all.append((dispatch, effect))
@@ -251,18 +254,22 @@ class ClientCore:
             if isinstance(effect, Ask) and effect.call not in dispatch:
                 continue  # it ended in the meantime
             try:
-                self._publisher.publish(_wire_of(effect))
+                if isinstance(effect, Ask):
+                    self._member.send_requests(self._name, effect.request, effect.call)
+                else:
+                    self._publisher.publish(_wire_of(effect))
             except LocalError as error:
                 self._not_sent(dispatch, effect, dispatch.servers, str(error), now_s)
 
-    def _send_to(self, dispatch: Dispatch[Response], server: Name, effect: Effect, now_s: float) -> None:
+    def _send_to(self, dispatch: Dispatch[Response], server: Name, effect: Ask | Stop, now_s: float) -> None:
         try:
-            self._member.send_request(self._name, server, _wire_of(effect))
+            call = effect.call if isinstance(effect, Ask) else None
+            self._member.send_request(self._name, server, _wire_of(effect), call)
         except LocalError as error:
             self._not_sent(dispatch, effect, [server], str(error), now_s)
 
     def _not_sent(
-        self, dispatch: Dispatch[Response], effect: Effect, servers: list[Name], reason: str, now_s: float
+        self, dispatch: Dispatch[Response], effect: Ask | Stop, servers: list[Name], reason: str, now_s: float
     ) -> None:
         if isinstance(effect, Ask):
             for server in servers:
@@ -279,5 +286,5 @@ class ClientCore:
         return CallError(f"{self._label}: every server refused: {reason}")
 
 
-def _wire_of(effect: Effect) -> bytes:
+def _wire_of(effect: Ask | Stop) -> bytes:
     return effect.request if isinstance(effect, Ask) else StopFrame(effect.calls).to_wire()

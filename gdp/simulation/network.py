@@ -242,7 +242,7 @@ class SimNetwork:
         """Schedule the call of a core for when its next timer is due."""
         node = self._nodes[name]
         due_s = node.machine.get_timer()
-        if due_s is None or (node.timer_s is not None and node.timer_s <= due_s):
+        if due_s is None or node.stalled is not None or (node.timer_s is not None and node.timer_s <= due_s):
             return
         node.timer_s = max(due_s, self._now_s)
         self._push(node.timer_s, lambda: self._timer(name, node))

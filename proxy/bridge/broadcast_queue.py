@@ -9,13 +9,14 @@ from collections import OrderedDict
 from typing import TypeAlias
 
 from gdp.service.dispatch import Ask
-from gdp.service.dispatch import Effect as DispatchEffect
+from gdp.service.dispatch import Stop as DispatchStop
 from gdp.service.replication_messages import ReplicaCommand
 from proxy.wire.replication import to_wire
 from proxy.wire.service import Stop
 
 __all__ = ["BroadcastQueue", "Effect", "wire_of"]
 
+DispatchEffect: TypeAlias = "Ask | DispatchStop"
 Effect: TypeAlias = "DispatchEffect | ReplicaCommand"
 
 

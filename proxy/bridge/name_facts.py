@@ -274,6 +274,13 @@ def _exposed(flow: ExposedTopic, now: Timestamps) -> dict[str, object]:
             "mtu": publisher.mtu or 0,
             "is_throttled": publisher.is_limited(now.mono_s),
         }
+        if (governing := publisher.governing_reader()) is not None:
+            reader, rtt_s, bytes_s = governing
+            known |= {
+                "governing": reader.to_text(),
+                "governing_rtt_s": round(rtt_s, 4),
+                "governing_bits_s": round(8 * bytes_s),
+            }
     return known
 
 

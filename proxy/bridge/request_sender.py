@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from gdp.client.publisher import Publisher
 from gdp.errors import LocalError
 from gdp.names import Name
-from gdp.service.dispatch import Ask
+from gdp.service.dispatch import Ask, Dispatch, End
 from gdp.service.replication_messages import ReplicaCommand
 from proxy.bridge.action_interface import CANCEL, RESULT
 from proxy.bridge.broadcast_queue import BroadcastQueue, Effect, wire_of
@@ -70,6 +70,9 @@ class RequestSender:
         for part, dispatch in enumerate(self._calls):
             while effects := dispatch.poll_effects():
                 for effect in effects:
+                    if isinstance(effect, End):
+                        self._site.member.end_call(self._service, (part, effect.call))
+                        continue
                     whom = effect.servers if isinstance(effect, Ask) else effect.server and (effect.server,)
                     if whom is None and not isinstance(effect, ReplicaCommand):
                         self._for_all.add(part, effect)
@@ -86,7 +89,11 @@ class RequestSender:
             self._record_holders(part, effect.call, set(servers))
         try:
             wire = wire_of(part, effect)
-            self._publisher.publish(wire)
+            call = self._key_of(part, effect)
+            if call is None:
+                self._publisher.publish(wire)
+            else:
+                self._site.member.send_requests(self._service, wire, call)
             self._site.traffic.sent(len(wire))
             self._trace(part, effect, servers)
         except LocalError as error:
@@ -101,11 +108,16 @@ class RequestSender:
             self._record_holders(part, effect.call, {server})
         try:
             for wire in (*([] if again is None else [again]), wire_of(part, effect)):
-                self._site.member.send_request(self._service, server, wire)
+                self._site.member.send_request(self._service, server, wire, self._key_of(part, effect))
                 self._site.traffic.sent(len(wire))
             self._trace(part, effect, [server])
         except LocalError as error:
             self._refuse(part, effect, [server], str(error), now_s)
+
+    def _key_of(self, part: int, effect: Effect) -> tuple[int, int] | None:
+        """Return what cancels a request when its call ends; None: goals and entries of a log depend on their order."""
+        is_free = self._goals is None and isinstance(self._calls[part], Dispatch)
+        return (part, effect.call) if isinstance(effect, Ask) and is_free else None
 
     def _trace(self, part: int, effect: Effect, servers: list[Name]) -> None:
         if isinstance(effect, Ask):

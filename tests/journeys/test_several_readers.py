@@ -129,3 +129,23 @@ def test_topics_reach_a_reader_that_restarts_and_the_others_at_once() -> None:
         world.members[label].poll_messages()
     for flow in flows:
         flow.outlive()
+
+
+def test_the_slowest_reader_of_a_topic_is_known_to_govern_it() -> None:
+    world = world_of()
+    flow = advertise(world, "/image", "s0/robot", reliable=False)
+    for label in READERS:
+        flow.read_by(label)
+    assert world.network.run(5, lambda: flow.is_read_by(len(READERS)))
+    thin = world.cables[frozenset(("s1", "s4"))]
+    thin.bytes_s, thin.fifo_s = 2e6 / 8, 0.2
+    flow.stream(150, 1 / 30, IMAGE_BYTES)
+    world.network.run(5.0)
+    governing = flow.publisher.governing_reader()
+    assert governing is not None
+    reader, rtt_s, bytes_s = governing
+    assert reader == world.members["s4/r4"].name
+    assert 0.001 <= rtt_s <= 0.3
+    assert 0.5 <= bytes_s / (2e6 / 8) <= 2.0
+    world.network.run(2.0)
+    flow.outlive()

@@ -10,6 +10,7 @@ from gdp.diagnosis.answer import Cause, Verdict
 from gdp.diagnosis.diagnosis import RULES, diagnose
 from gdp.diagnosis.facts import Facts, FlowFact, ProxyFacts, RibFacts, SwitchFacts, Unreachable
 from gdp.diagnosis.survey import ROLES, Survey
+from gdp.names import Name
 
 NEAR, SWITCH, RIB, FAR = "1" * 64, "2" * 64, "3" * 64, "4" * 64
 FLOW = FlowFact(
@@ -38,6 +39,17 @@ def test_what_flows_is_never_a_fault() -> None:
     flow = replace(FLOW, received=10, idle_s=0.03, faults={"too-large": 3}, refused="quota")
     switch = SwitchFacts(name=SWITCH, is_near=True, drops={"too-big": 9})
     assert diagnose(facts(flow=flow, switches=(switch,))).cause is Cause.ARRIVES
+
+
+@pytest.mark.parametrize("side", ["import", "expose"])
+def test_the_reader_that_governs_a_topic_is_named_with_its_path(side: str) -> None:
+    exposed = replace(FLOW, side="expose", sent=9, readers=2)
+    exposed = replace(exposed, governing=FAR, governing_rtt_s=0.042, governing_bits_s=3.1e6)
+    flows = (exposed,) if side == "expose" else (replace(FLOW, received=10, idle_s=0.03), exposed)
+    answer = diagnose(Facts(asked="/a", proxies=(replace(PROXY, flows=flows),), window_s=1.0))
+    assert answer.cause is Cause.ARRIVES
+    named = f"the slowest reader, proxy {Name.from_text(FAR).short}, governs (round trip 42 ms, 3.1 Mbit/s)"
+    assert named in answer.sentence
 
 
 def test_a_message_a_while_ago_is_idle() -> None:

@@ -331,3 +331,39 @@ def test_a_newcomer_begins_at_its_message() -> None:
     assert window.frames_to_send(0.3) == message(2, 10) + message(3, 10)
     window.handle_acknack(B, has(4), 0.4)
     assert window.is_acknowledged()
+
+
+def test_a_cancelled_message_sends_nothing_more_and_the_next_one_goes_on() -> None:
+    window = window_of(3, 10)
+    window.frames_to_send(0.0, 4)
+    assert window.cancel(1)
+    assert window.cancel(3)
+    assert window.frames_to_send(0.1) == message(2, 10)
+    window.handle_acknack(A, has(4), 0.2)
+    assert window.is_acknowledged()
+    assert window.cached_bytes == 0
+
+
+def test_a_cancelled_message_that_was_sent_is_given_up_when_a_reader_lacks_something_of_it() -> None:
+    window = window_of(2, 10, (A, B))
+    window.frames_to_send(0.0)
+    assert not window.cancel(1)
+    assert not window.cancel(2)
+    window.handle_acknack(A, has(3), 0.1)
+    lacks = has(1, 3, (MissingRange(1, 3, 5),))
+    assert window.poll_cancelled(lacks) == [1]
+    window.handle_acknack(B, lacks, 0.2)
+    assert window.frames_to_send(0.2) == []
+    assert window.oldest == 2
+    window.handle_acknack(B, has(3), 0.3)
+    assert window.is_acknowledged()
+
+
+def test_where_one_reader_governs_the_repairs_of_others_leave_after_what_is_new() -> None:
+    window = window_of(2, 10, (A, B))
+    window.governing = A
+    window.frames_to_send(0.0, 10)
+    window.handle_acknack(B, has(1, 3, (MissingRange(1, 3, 3),)), 0.1)
+    assert window.late_repairs_to_send(0.1, 10) == []
+    assert window.frames_to_send(0.1) == message(2, 10)
+    assert window.late_repairs_to_send(0.1, 10) == message(1, 10)[3:4]

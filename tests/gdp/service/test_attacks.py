@@ -6,7 +6,7 @@ import pytest
 
 from gdp.errors import LocalError
 from gdp.names import Name
-from gdp.service.dispatch import GATHER_S, HEDGE_FIRST_S, Ask, Dispatch
+from gdp.service.dispatch import GATHER_S, HEDGE_FIRST_S, Ask, Dispatch, End
 from gdp.service.latency import LATELY_S
 from gdp.service.replication import ALL, Mode, Replication
 from gdp.service.replication_messages import LogId, ReplicaStatus, Snapshot, call_of
@@ -171,11 +171,11 @@ def test_a_replica_that_reports_more_than_the_log_has_does_not_break_it() -> Non
 
 def test_a_request_whose_call_has_ended_is_not_sent() -> None:
     dispatch = dispatch_to(ONE, FAST, SLOW)
-    begin(dispatch, 0.0)
+    call = begin(dispatch, 0.0)
     dispatch.poll_effects()
     for server in (FAST, SLOW):
         dispatch.replica_lost(server, 0.1, "both in one moment")
-    assert dispatch.poll_effects() == []
+    assert dispatch.poll_effects() == [End(call)]
 
 
 def test_a_request_beyond_the_capacity_is_not_even_written() -> None:
