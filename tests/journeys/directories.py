@@ -18,7 +18,7 @@ from gdp.crypto.identity import Identity, NodeKeys
 from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from tests.journeys.flows import Flow, advertise
-from tests.journeys.networks import LEASE_S, PERIOD_S, SETTLE_S
+from tests.journeys.networks import LEASE_S, PERIOD_S, SETTLE_S, draw_uppers
 
 DOMAINS_MAX: Final = 12
 TIERS_MAX: Final = 4
@@ -115,12 +115,7 @@ class Plan:
 def plans(draw: st.DrawFn) -> Plan:
     """Draw a plan: 3 to 12 domains in 2 to 4 tiers."""
     count = draw(st.integers(3, DOMAINS_MAX))
-    uppers: list[int] = []
-    tier = [1]
-    for number in range(1, count):
-        upper = draw(st.sampled_from([d for d in range(number) if tier[d] < TIERS_MAX]))
-        uppers.append(upper)
-        tier.append(tier[upper] + 1)
+    uppers = draw_uppers(draw, count, TIERS_MAX)
     index = st.integers(0, DOMAINS_MAX - 1)
     return Plan(
         tuple(uppers),

@@ -123,6 +123,17 @@ class Plan:
         return {each.label: open_to_all for each in topology.domains}
 
 
+def draw_uppers(draw: st.DrawFn, domains: int, tiers_max: int) -> list[int]:
+    """Draw the domain of the tier above for each domain but the first."""
+    uppers: list[int] = []
+    tier = [1]
+    for number in range(1, domains):
+        upper = draw(st.sampled_from([d for d in range(number) if tier[d] < tiers_max]))
+        uppers.append(upper)
+        tier.append(tier[upper] + 1)
+    return uppers
+
+
 @st.composite
 def plans(draw: st.DrawFn, faults_max: int = 2) -> Plan:
     """Draw a plan."""
@@ -132,12 +143,7 @@ def plans(draw: st.DrawFn, faults_max: int = 2) -> Plan:
     sizes = (sizes[0] + lacking, *sizes[1:])
     while sum(sizes) > SWITCHES_MAX:
         sizes = tuple(max(size - 1, 1) for size in sizes)
-    uppers: list[int] = []
-    tier = [1]
-    for number in range(1, domains):
-        upper = draw(st.sampled_from([d for d in range(number) if tier[d] < TIERS_MAX]))
-        uppers.append(upper)
-        tier.append(tier[upper] + 1)
+    uppers = draw_uppers(draw, domains, TIERS_MAX)
     index = st.integers(0, SWITCHES_MAX - 1)
     may_be_barred = sorted(set(range(domains)) - set(uppers) - {0})
     barred = draw(st.sets(st.sampled_from(may_be_barred), max_size=1)) if may_be_barred else set()
