@@ -1,4 +1,4 @@
-"""Participant of the overlay: publishes, reads, serves and calls names; the core of a proxy, a replica or a capsule.
+"""Participant of the overlay: publishes, reads, serves and calls names; the core of a proxy.
 
 Sans-I/O; an I/O layer or a simulated network passes it frames and time, and takes out frames and messages.
 
