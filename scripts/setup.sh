@@ -65,11 +65,11 @@ hand_over() {
     fi
 }
 
-# link_scripts: lets every Python of the environment import the packages below scripts/, which no wheel contains
+# link_scripts: lets every Python of the environment import what no wheel contains: packages of scripts/ and the example
 link_scripts() {
     local folder
     folder=$("$venv/bin/python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
-    printf '%s\n' "$root/scripts" >"$folder/gdp_scripts.pth"
+    printf '%s\n' "$root/scripts" "$root/examples/grasp" >"$folder/gdp_scripts.pth"
 }
 
 # compile_own: byte-compiles our packages, so that root leaves no caches that their owner cannot delete
