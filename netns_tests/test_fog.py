@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -40,7 +41,7 @@ class Fog:
             "ROS_DOMAIN_ID": "171",
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
             "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
-            "PYTHONPATH": PYTHON_PATH,
+            "PYTHONPATH": f"{PYTHON_PATH}{os.pathsep}{ROOT / 'examples' / 'grasp'}",
         }
 
     def run(self, *words: str) -> str:
@@ -152,6 +153,28 @@ def test_the_live_view_shows_machines_first_answers_and_a_loss(fog: Fog) -> None
         for each in (caller, view):
             each.kill()
             each.communicate()
+
+
+@pytest.mark.parametrize("command", ["fog launch", "ros2 launch"])
+def test_the_listing_of_the_paper_plans_grasps_on_two_machines_and_the_robot_finds_each_right(
+    command: str, fog: Fog
+) -> None:
+    for module in ("cv2", "scipy"):
+        pytest.importorskip(module, reason="needs the extra experiments")
+    listing = str(ROOT / "examples" / "listing1.launch.py")
+    if command == "fog launch":
+        said = fog.run("launch", listing)
+        assert {"us-west-1", "us-west-2"} <= set(said.split())
+    elif (ros2 := shutil.which("ros2")) is None:
+        pytest.skip("ROS 2's launch is not installed: no command ros2")
+    else:
+        environment = {**fog.environment, "PYTHONUNBUFFERED": "1"}
+        words = [ros2, "launch", listing]
+        done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=_MACHINES_S, check=False)
+        said = done.stdout + done.stderr
+    assert "3 of 3 grasps are right" in said
+    assert said.count("planned on m") == 3  # a machine of the cluster, not the robot
+    assert json.loads(fog.run("ls", "--json")) == []  # the cluster ended with the launch
 
 
 _SCALED = """

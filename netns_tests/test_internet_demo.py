@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from gdp.host.run_registry import RunRegistry, outer_uid
+from tests.proxy.endpoints.ros1_net import need_ros1
 
 pytestmark = [
     pytest.mark.netns,
@@ -35,3 +37,22 @@ def test_no_image_and_no_call_is_lost_while_addresses_change_nats_forget_and_an_
     assert len(reported["events"]) == 6
     registry = RunRegistry(Path(tempfile.gettempdir()) / f"gdp-internet-demo-{outer_uid()}")
     assert all(each.owner.alive for each in registry.all())
+
+
+def test_figure_1_a_ros_2_drone_changes_networks_and_no_image_and_no_command_of_a_ros_1_cloud_is_lost() -> None:
+    pytest.importorskip("rclpy", reason="needs the extra ros2")
+    need_ros1()
+    argv = [sys.executable, "-m", "internet_demo", "--figure1", "--calm", "3", "--delay", "0", "--rate", "10", "--json"]
+    ended = subprocess.run(argv, capture_output=True, text=True, timeout=_PATIENCE_S, check=False)
+    assert ended.stdout, ended.stderr
+    reported = json.loads(ended.stdout)
+    assert (reported["lost"], reported["doubled"], ended.returncode) == (0, 0, 0), reported
+    assert [event["text"] for event in reported["events"]] == [
+        f"{topic}: 60 sent, 60 arrived, 0 lost" for topic in ("/images", "/commands")
+    ]
+    drawn = "\n".join(reported["drawing"])
+    assert drawn.index("ROS 2") < drawn.index("enterprise") < drawn.index("university")
+    assert "ROS 1" in drawn
+    names = re.findall(r"(/\w+) +is ([0-9a-f]{64})", drawn)
+    assert len(names) == 4
+    assert len(set(names)) == 2  # the names stay while the networks change

@@ -65,18 +65,18 @@ hand_over() {
     fi
 }
 
-# link_scripts: lets every Python of the environment import the packages below scripts/, which no wheel contains
+# link_scripts: lets every Python of the environment import what no wheel contains: packages of scripts/ and the example
 link_scripts() {
     local folder
     folder=$("$venv/bin/python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
-    printf '%s\n' "$root/scripts" >"$folder/gdp_scripts.pth"
+    printf '%s\n' "$root/scripts" "$root/examples/grasp" >"$folder/gdp_scripts.pth"
 }
 
 # compile_own: byte-compiles our packages, so that root leaves no caches that their owner cannot delete
 compile_own() {
-    "$venv/bin/python" -m compileall -q gdp proxy fog scripts/ring scripts/fog_demo scripts/internet scripts/internet_demo || fail "the source does not compile"
+    "$venv/bin/python" -m compileall -q gdp proxy fog scripts/ring scripts/fog_demo scripts/internet scripts/internet_demo examples/grasp/grasp || fail "the source does not compile"
     if [[ $(id -u) -eq 0 && -n "${SUDO_UID:-}" ]]; then
-        find gdp proxy fog scripts -name __pycache__ -user 0 -exec chown -R "$SUDO_UID:${SUDO_GID:-$SUDO_UID}" {} +
+        find gdp proxy fog scripts examples -name __pycache__ -user 0 -exec chown -R "$SUDO_UID:${SUDO_GID:-$SUDO_UID}" {} +
     fi
 }
 

@@ -22,6 +22,7 @@ _FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"\]\(([^)\s]+)\)")
 _HEADING = re.compile(r"^#+ (.+)$", re.MULTILINE)
 _WRAPPED = re.compile(r"\\\n\s*")
+_CLAIMED = re.compile(r"`([^`]+)`(?: \((\d+) (s|min)\))?")
 _PROGRAM = re.compile(r"(?:gdp(?:-\w+)?|fog|scripts/\w+\.(?:sh|py)|scripts/(?:bench|supply)/\w+\.py)\Z")
 
 
@@ -52,6 +53,32 @@ class Block:
                 found.append(line)
             depth += line.startswith("for ") - (line == "done")
         return found
+
+
+@dataclass(frozen=True)
+class Claim:
+    """Row of ``docs/papers.md``; ``commands``: each with its seconds, None for a test of the project."""
+
+    title: str
+    commands: tuple[tuple[str, int | None], ...]
+    cells: tuple[str, ...]
+
+    @property
+    def shown(self) -> list[str]:
+        """Return what its commands are to print: the code in the third cell."""
+        return [text for text, _, _ in _CLAIMED.findall(self.cells[2])]
+
+
+def claims() -> list[Claim]:
+    """Return the rows of ``docs/papers.md``, in order."""
+    found = []
+    for line in (ROOT / "docs/papers.md").read_text().splitlines():
+        cells = tuple(cell.strip() for cell in line.split("|")[1:-1])
+        if cells and cells[1] != "command" and not cells[1].startswith("---"):
+            said = _CLAIMED.findall(cells[1])
+            times = (int(number) * {"s": 1, "min": 60}[unit] if number else None for _, number, unit in said)
+            found.append(Claim(cells[0], tuple(zip((text for text, _, _ in said), times, strict=True)), cells))
+    return found
 
 
 def blocks(page: Path) -> list[Block]:

@@ -30,7 +30,7 @@ from proxy.cli import delegate, proxy, replay
 from proxy.config.config import ProxyConfig, Rule
 from ring import cli as ring
 from tests.machines import Machines
-from tests.pages import PAGES, ROOT, Block, anchors, blocks, blocks_between, commands, links, rows
+from tests.pages import PAGES, ROOT, Block, anchors, blocks, blocks_between, claims, commands, links, rows
 
 README = ROOT / "README.md"
 TWO_MACHINES = ROOT / "docs/tutorials/two-machines.md"
@@ -69,6 +69,8 @@ def _every_command() -> Iterator[Any]:
             if block.language in SHELLS:
                 for words in commands(block.lines):
                     yield pytest.param(words, id=f"{page.name}: {' '.join(words)[:60]}")
+    for words in commands(sorted({text for claim in claims() for text, _ in claim.commands})):
+        yield pytest.param(words, id=f"papers.md: {' '.join(words)[:60]}")
 
 
 def _parse(command: Any, words: list[str]) -> None:

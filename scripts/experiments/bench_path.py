@@ -1,4 +1,4 @@
-"""Import path of the benches: importing this module lets the experiments import what they share with them.
+"""Import path of the benches and of the package ``grasp``: importing this module lets the experiments import both.
 
 I/O.
 """
@@ -14,5 +14,4 @@ __all__ = ["BENCHES", "ROOT"]
 ROOT: Final = Path(__file__).resolve().parents[2]
 BENCHES: Final = ROOT / "scripts" / "bench"
 
-if str(BENCHES) not in sys.path:
-    sys.path.append(str(BENCHES))
+sys.path += [str(each) for each in (BENCHES, ROOT / "examples" / "grasp") if str(each) not in sys.path]

@@ -6,7 +6,7 @@ wheel are replaced by standard ones that carry the same numbers.
 
     vSLAM             colour (rgb8) and depth (16UC1) of 640 x 480 -> pose          stand-in: odometry.py
     motion planning   meshes of OMPL's Home and a request -> path                   OMPL's RRTConnect, FCL
-    grasp planning    depth (32FC1) and mask of 516 x 386, camera -> grasp          stand-in: grasp.py
+    grasp planning    depth (32FC1) and mask of 516 x 386, camera -> grasp          stand-in: examples/grasp
 """
 
 from __future__ import annotations
@@ -34,10 +34,6 @@ __all__ = ["TASKS", "OffloadTask"]
 _FRAMES: Final = (2, 3, 4, 5)  # the first of the five recorded frames is too far from the second to be matched well
 _NEAR_M: Final = 0.1
 _TURNED_RAD: Final = 0.1
-_CROP: Final = (slice(47, 433), slice(62, 578))  # 516 x 386, the size of Dex-Net's camera
-# An armchair, by frame: first and last row and column of a box around it, in the cropped image.
-_OBJECTS: Final = {3: (85, 235, 272, 374), 4: (77, 243, 212, 382), 5: (57, 263, 244, 418)}
-_THICK_M: Final = 0.4
 _PLANNER: Final = "RRTConnect"
 _PLANNING_LIMIT_S: Final = 1_000.0
 
@@ -183,22 +179,13 @@ class GraspPlanning:
     answer = ("grasp", POSE)
 
     def __init__(self) -> None:
+        from grasp.frames import FILES, SHAPE, read_frames
         from odometry import CAMERA as MATRIX
-        from odometry import DEPTH_SCALE
 
-        folder = data_folder("rgbd", [f"depth_{at}.png" for at in _OBJECTS])
-        self._masks = {}
-        self._messages = {}
-        info = CameraInfo(height=386, width=516, k=MATRIX.ravel().tolist())
-        for at, (top, bottom, left, right) in _OBJECTS.items():
-            image = _read(folder / f"depth_{at}.png", cv2.IMREAD_UNCHANGED)
-            depth = (image[_CROP] / DEPTH_SCALE).astype(np.float32)
-            inside = np.zeros(depth.shape, dtype=bool)
-            inside[top:bottom, left:right] = True
-            distance_m = np.median(depth[inside & (depth > 0)])
-            mask = (inside & (np.abs(depth - distance_m) < _THICK_M)).astype(np.uint8) * 255
-            self._masks[at] = mask
-            self._messages[at] = [info, _image("32FC1", depth), _image("mono8", mask)]
+        height, width = SHAPE
+        info = CameraInfo(height=height, width=width, k=MATRIX.ravel().tolist())
+        self._frames = read_frames(data_folder("rgbd", FILES))
+        self._messages = [[info, _image("32FC1", each.depth), _image("mono8", each.mask)] for each in self._frames]
 
     def warm_up(self) -> None:
         """Compute request 0."""
@@ -206,11 +193,11 @@ class GraspPlanning:
 
     def request(self, number: int) -> list[Message]:
         """Return camera, depth and mask."""
-        return list(self._messages[_object(number)])
+        return list(self._messages[number % len(self._messages)])
 
     def compute(self, messages: Sequence[Message]) -> Message:
         """Return the grasp: middle (column, row, metres), and angle, width and quality as orientation x, y, z."""
-        from grasp import plan_grasp
+        from grasp.sampler import plan_grasp
 
         info, depth, mask = messages
         found = plan_grasp(_pixels(depth), _pixels(mask), float(info.k[0]), seed=1)
@@ -223,12 +210,15 @@ class GraspPlanning:
 
     def is_right(self, number: int, answer: Message) -> bool:
         """Return whether the middle of the grasp is on the object, and the gripper opens wide enough."""
-        from grasp import WIDEST_M
+        from grasp.frames import is_right
+        from grasp.sampler import Grasp
 
-        if not isinstance(answer, PoseStamped) or answer.pose.orientation.z <= 0:
+        if not isinstance(answer, PoseStamped):
             return False
-        row, column = int(answer.pose.position.y), int(answer.pose.position.x)
-        return bool(self._masks[_object(number)][row, column]) and answer.pose.orientation.y <= WIDEST_M
+        place, turn = answer.pose.position, answer.pose.orientation
+        return is_right(
+            Grasp(place.y, place.x, turn.x, place.z, turn.y, turn.z), self._frames[number % len(self._frames)]
+        )
 
 
 TASKS: Final[Mapping[str, Callable[[], OffloadTask]]] = {
@@ -257,10 +247,6 @@ def _frame(number: int) -> int:
     last = len(_FRAMES) - 1
     at = number % (2 * last)
     return _FRAMES[min(at, 2 * last - at)]
-
-
-def _object(number: int) -> int:
-    return list(_OBJECTS)[number % len(_OBJECTS)]
 
 
 def _image(encoding: str, pixels: NDArray[Any]) -> Image:

@@ -10,6 +10,7 @@ import shutil
 import signal
 import sys
 import tempfile
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from types import FrameType
@@ -25,6 +26,7 @@ from gdp.host.run_registry import RunRegistry, outer_uid
 from internet.laboratory import Laboratory
 from internet.space import TOOLS
 from internet_demo.display import Display
+from internet_demo.figure1 import run_figure1
 from internet_demo.scenario import Outcome, Pace, run_scenario
 
 __all__ = ["app", "main"]
@@ -39,6 +41,7 @@ _EXAMPLES: Final = """\b
 Examples:
   sudo scripts/internet_demo.sh
   sudo scripts/internet_demo.sh --rate 50 --delay 20
+  sudo scripts/internet_demo.sh --figure1
   sudo scripts/internet_demo.sh --json > outcome.json
 """
 
@@ -55,6 +58,7 @@ def demo(
     size: Annotated[int, typer.Option(min=100, max=1_000_000, help="Bytes of an image.")] = _PACE.image_bytes,
     calm: Annotated[float, typer.Option(min=0.5, help="Seconds after each event.")] = _PACE.calm_s,
     delay: Annotated[float, typer.Option(min=0, max=500, help="Delay of each uplink, in ms.")] = _PACE.delay_ms,
+    figure1: Annotated[bool, typer.Option("--figure1", help="Figure 1 of FogROS G: ROS 2 drone, ROS 1 cloud.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the outcome as JSON; all else on stderr.")] = False,
 ) -> None:
     """A robot behind NATs, two clouds and an edge box on IPv6 form a domain by tokens, and their networks change.
@@ -68,7 +72,7 @@ def demo(
         console = Console(stderr=as_json, width=_WIDE)
     errors = Console(stderr=True, highlight=False, soft_wrap=True)
     try:
-        code = _run(Pace(rate, size, calm, delay), console, as_json=as_json)
+        code = _run(run_figure1 if figure1 else run_scenario, Pace(rate, size, calm, delay), console, as_json=as_json)
     except _Ended as ended:
         console.print("interrupted")
         code = 128 + int(ended.args[0])
@@ -83,7 +87,7 @@ def main() -> None:
     app(prog_name="internet_demo.sh")
 
 
-def _run(pace: Pace, console: Console, *, as_json: bool) -> int:
+def _run(play: Callable[[Laboratory, Pace, Display], Outcome], pace: Pace, console: Console, *, as_json: bool) -> int:
     if missing := [tool for tool in TOOLS if shutil.which(tool) is None]:
         raise LocalError(f"not installed: {', '.join(missing)} (packages iproute2, nftables, conntrack)")
     runs = RunRegistry(Path(tempfile.gettempdir()) / f"gdp-internet-demo-{outer_uid()}")
@@ -94,7 +98,7 @@ def _run(pace: Pace, console: Console, *, as_json: bool) -> int:
     run = runs.start()
     try:
         with Laboratory(run) as laboratory, Display(console) as display:
-            outcome = run_scenario(laboratory, pace, display)
+            outcome = play(laboratory, pace, display)
     finally:
         let_nothing_interrupt()
         run.end()
@@ -108,7 +112,7 @@ def _end(number: int, frame: FrameType | None) -> None:
 
 
 def _tell(outcome: Outcome, console: Console, *, as_json: bool) -> None:
-    for reason in outcome.reasons:
+    for reason in (*outcome.reasons, *outcome.drawing):
         console.print(escape(reason), highlight=False, soft_wrap=True)
     for event in outcome.events:
         console.print(f"longest pause {event.pause_s * 1e3:5.0f} ms: {event.text}", highlight=False)
@@ -116,7 +120,6 @@ def _tell(outcome: Outcome, console: Console, *, as_json: bool) -> None:
         json.dump(asdict(outcome), sys.stdout, indent=1)
         sys.stdout.write("\n")
         return
-    summary = (
-        f"{outcome.images} images to two readers, {outcome.calls} calls, {outcome.doubled} doubled, {outcome.lost} lost"
-    )
+    what = "images and commands" if outcome.drawing else f"images to two readers, {outcome.calls} calls"
+    summary = f"{outcome.images} {what}, {outcome.doubled} doubled, {outcome.lost} lost"
     console.print(summary, style="bold red" if outcome.lost else "bold green", highlight=False)

@@ -60,6 +60,7 @@ class Outcome:
     typed: list[str] = field(default_factory=list)
     events: list[Event] = field(default_factory=list)
     reasons: list[str] = field(default_factory=list)
+    drawing: list[str] = field(default_factory=list)
 
 
 def run_scenario(laboratory: Laboratory, pace: Pace, display: Display) -> Outcome:

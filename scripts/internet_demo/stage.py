@@ -8,8 +8,8 @@ I/O; creates namespaces, keys, files and processes of one run.
     cloud-a ------- provider, port-restricted NAT -+
     edge    ------- office, IPv6 only -------------+
 
-Commands and programs are those that a person or systemd starts on real machines. The ROS proxy of a machine is left
-out: sessions of this process take its place, with its keys.
+Commands and programs are those that a person or systemd starts on real machines. The ROS proxy of a machine without an
+environment of ROS is left out: sessions of this process take its place, with its keys.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 import gdp
 from gdp.control.endpoints import Endpoint
@@ -51,6 +51,7 @@ _LOOK_S: Final = 0.2
 _STATUS_S: Final = 2.0
 _SHOWN: Final = 40  # characters of a word
 _SCRIPTS: Final = Path(__file__).resolve().parent.parent
+_StageT = TypeVar("_StageT", bound="Stage")
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +85,7 @@ class Stage:
 
     Attributes:
         typed: the commands that a person types, each after its machine.
+        environments: of ROS by machine; the ROS proxy of such a machine runs, too.
     """
 
     def __init__(self, laboratory: Laboratory, delay_ms: float) -> None:
@@ -93,14 +95,19 @@ class Stage:
         self._processes: list[subprocess.Popen[bytes]] = []
         self.machines: dict[str, Machine] = {}
         self.typed: list[str] = []
-        self.cloud_b = self._add_host("cloud-b", self.add_site("dc", Access.PUBLIC))
-        self.home, self.mobile = self.add_site("home", Access.PORT_RESTRICTED), self.add_site("5g", Access.SYMMETRIC)
-        self.robot = laboratory.add_host("robot", self.home, WIFI)
-        self.robot.attach(self.mobile, WWAN)
-        self.cloud_a = self._add_host("cloud-a", self.add_site("provider", Access.PORT_RESTRICTED))
-        self.edge = self._add_host("edge", self.add_site("office", Access.IPV6_ONLY))
+        self.environments: dict[str, Mapping[str, str]] = {}
+        self.cloud_b = laboratory.add_host("cloud-b", self.add_site("dc", Access.PUBLIC))
+        self._add_members()
 
-    def __enter__(self) -> Stage:
+    def _add_members(self) -> None:
+        """Make the machines that join."""
+        self.home, self.mobile = self.add_site("home", Access.PORT_RESTRICTED), self.add_site("5g", Access.SYMMETRIC)
+        self.robot = self._laboratory.add_host("robot", self.home, WIFI)
+        self.robot.attach(self.mobile, WWAN)
+        self.cloud_a = self._laboratory.add_host("cloud-a", self.add_site("provider", Access.PORT_RESTRICTED))
+        self.edge = self._laboratory.add_host("edge", self.add_site("office", Access.IPV6_ONLY))
+
+    def __enter__(self: _StageT) -> _StageT:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -124,9 +131,12 @@ class Stage:
 
     def make_token(self) -> str:
         """Return a token for one more machine."""
-        words = ("domain", "token", _DOMAIN)
-        self._typed(self.cloud_b, words)
-        return self._run(self.cloud_b, *words, f"--directory={self._directory(self.cloud_b)}").split()[-1]
+        return self.type_at(self.cloud_b, "domain", "token", _DOMAIN).split()[-1]
+
+    def type_at(self, host: Host, *words: str) -> str:
+        """Run a command of ``gdp`` about a machine on it; return its output."""
+        self._typed(host, words)
+        return self._run(host, *words, f"--directory={self._directory(host)}")
 
     def join(self, host: Host, token: str, *options: str) -> None:
         """Let a machine join by a token."""
@@ -140,8 +150,8 @@ class Stage:
         """Start the programs of machines, as the last step of their commands does; the kernel ends them with us."""
         for host in hosts:
             for program in programs_of(MemberFiles.load(self._directory(host))):
-                if program.name != "proxy":
-                    self._start(host, program.argv)
+                if program.name != "proxy" or host.label in self.environments:
+                    self.start_program(host, program.argv)
 
     def wait_until_joined(self) -> None:
         """Return when each machine has a tunnel to the border. Raises ``LocalError``: one has none in time."""
@@ -187,9 +197,6 @@ class Stage:
         """Return what the programs of a machine have logged."""
         return (self._folder / f"{label}.log").read_text(encoding="utf-8", errors="replace")
 
-    def _add_host(self, label: str, site: Site) -> Host:
-        return self._laboratory.add_host(label, site)
-
     def _directory(self, host: Host) -> Path:
         return self._folder / host.label
 
@@ -207,24 +214,26 @@ class Stage:
 
     def _run(self, host: Host, *words: str) -> str:
         argv = host.command([sys.executable, "-m", "gdp.cli.gdp", *words])
-        done = subprocess.run(argv, capture_output=True, check=False, text=True, env=_environment())
+        done = subprocess.run(argv, capture_output=True, check=False, text=True, env=self._environment(host))
         if done.returncode:
             raise LocalError(f"{host.label}: gdp {words[0]}: {done.stderr.strip()}")
         return done.stdout
 
-    def _start(self, host: Host, argv: Sequence[str]) -> None:
+    def start_program(self, host: Host, argv: Sequence[str], output: int | None = None) -> subprocess.Popen[bytes]:
+        """Start a program of a machine; without ``output`` it goes to the machine's log, as its errors do."""
         with (self._folder / f"{host.label}.log").open("ab") as log:
             process = subprocess.Popen(
                 host.command(argv),
                 stdin=subprocess.DEVNULL,
-                stdout=log,
+                stdout=log if output is None else output,
                 stderr=log,
-                env=_environment(),
+                env=self._environment(host),
                 start_new_session=True,
             )
         self._processes.append(process)
         self._laboratory.run.note_process(process.pid)
+        return process
 
-
-def _environment() -> dict[str, str]:
-    return {**os.environ, "PYTHONPATH": os.pathsep.join((str(_SCRIPTS.parent), str(_SCRIPTS)))}
+    def _environment(self, host: Host) -> dict[str, str]:
+        path = os.pathsep.join((str(_SCRIPTS.parent), str(_SCRIPTS)))
+        return {**os.environ, "PYTHONPATH": path, **self.environments.get(host.label, {})}

@@ -143,7 +143,7 @@ def test_a_grasp_is_on_the_object_that_the_mask_shows() -> None:
 def test_there_is_no_grasp_of_nothing() -> None:
     needs("scipy")
     import numpy as np
-    from grasp import plan_grasp
+    from grasp.sampler import plan_grasp
 
     shape = (40, 50)
     assert plan_grasp(np.ones(shape, np.float32), np.zeros(shape, np.uint8), 500.0, seed=1) is None

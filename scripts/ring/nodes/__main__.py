@@ -1,6 +1,7 @@
-"""Module entry ``python -m ring.nodes ROS NODE COUNT [HZ]``: ROS is 1 or 2; COUNT messages or calls, if it has any.
+"""Module entry ``python -m ring.nodes ROS NODE COUNT [HZ [ROWS]]``: ROS is 1 or 2; COUNT messages or calls, if any.
 
-HZ: a talker's messages a second, if not its usual ones.
+NODE: ``listener`` hears every talker, ``listener:camera`` one of them. HZ: a talker's messages a second, if not its
+usual ones. ROWS: of the camera's pictures. Arguments of ROS may follow.
 
 I/O.
 """
@@ -9,9 +10,10 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
+from functools import partial
 
 from ring.nodes import roles
-from ring.nodes.content import TALKS
+from ring.nodes.content import TALKS, take_small_picture
 from ring.nodes.node import Node
 from ring.nodes.orders import Orders
 
@@ -31,18 +33,23 @@ def _node(ros: str, name: str) -> Node:
 
 def main() -> None:
     """Run one of the nodes until killed."""
-    ros, name, count = sys.argv[1], sys.argv[2], int(sys.argv[3])
+    ros, count = sys.argv[1], int(sys.argv[3])
+    name, _, heard = sys.argv[2].partition(":")
     orders = Orders()
     node = _node(ros, name)
     if name == "listener":
-        roles.listen(node, orders, TALKS)
+        roles.listen(node, orders, [talk for talk in TALKS if heard in ("", talk.node)])
     elif name == "lamp":
         roles.serve(node, orders)
     elif name == "caller":
         roles.call(node, orders, count)
     else:
         talk = next(talk for talk in TALKS if talk.node == name)
-        roles.talk(node, orders, replace(talk, hz=float(sys.argv[4])) if len(sys.argv) > 4 else talk, count)
+        if pace := sys.argv[4:]:
+            talk = replace(talk, hz=float(pace[0]))
+        if pace[1:] and name == "camera":
+            talk = replace(talk, fill=partial(take_small_picture, int(pace[1])))
+        roles.talk(node, orders, talk, count)
 
 
 if __name__ == "__main__":

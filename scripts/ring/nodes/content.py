@@ -26,6 +26,7 @@ __all__ = [
     "Talk",
     "digest",
     "lamp_says",
+    "take_small_picture",
 ]
 
 Fit: TypeAlias = Callable[["array[int]"], object]  # converts an array to the form of a ROS version
@@ -108,6 +109,14 @@ def _take_picture(message: object, number: int, now_ns: int, fit: Fit) -> None:
             "data": fit(array("B", number.to_bytes(_NUMBER_BYTES, "big") + pixels)),
         },
     )
+
+
+def take_small_picture(rows: int, message: object, number: int, now_ns: int, fit: Fit) -> None:
+    """Fill an image with the first rows of a picture."""
+    _take_picture(message, number, now_ns, fit)
+    pixels = _get(message, "data")
+    assert isinstance(pixels, bytes | array)
+    _put(message, {"height": rows, "data": pixels[: rows * _WIDTH * _PIXEL]})
 
 
 def _look_at_picture(message: object) -> Mark:

@@ -13,7 +13,7 @@ import pytest
 from fog.launch.load import load
 from tests.pages import ROOT
 
-DEMO = ROOT / "scripts" / "fog_demo"
+PACKAGES = (ROOT / "scripts" / "fog_demo", ROOT / "examples" / "grasp")
 FIND = """
 import sys
 from fog.cluster import CloudNode
@@ -24,20 +24,22 @@ print(file_of(CloudNode(sys.argv[1], sys.argv[2]), {}))
 
 @pytest.fixture(scope="module")
 def machine(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with the unpacked wheel of the demonstration; it is built offline from a copy."""
+    """Return a folder with the unpacked wheels of the examples' packages; they are built offline from copies."""
     made = tmp_path_factory.mktemp("machine")
-    shutil.copytree(DEMO, made / "source", ignore=shutil.ignore_patterns("__pycache__"))
+    sources = [made / "source" / package.name for package in PACKAGES]
+    for package, source in zip(PACKAGES, sources, strict=True):
+        shutil.copytree(package, source, ignore=shutil.ignore_patterns("__pycache__"))
     pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
-    build = ["wheel", "--no-index", "--no-deps", "--no-build-isolation", "--wheel-dir", str(made), str(made / "source")]
+    build = ["wheel", "--no-index", "--no-deps", "--no-build-isolation", "--wheel-dir", str(made), *map(str, sources)]
     subprocess.run([*pip, *build], check=True, capture_output=True)
-    (wheel,) = made.glob("*.whl")
-    with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(made / "installed")
+    for wheel in made.glob("*.whl"):
+        with zipfile.ZipFile(wheel) as archive:
+            archive.extractall(made / "installed")
     return made / "installed"
 
 
-@pytest.mark.parametrize("name", ["echo", "counter"])
-def test_a_rented_machine_finds_an_examples_nodes_in_the_demonstrations_wheel(name: str, machine: Path) -> None:
+@pytest.mark.parametrize("name", ["echo", "counter", "listing1"])
+def test_a_rented_machine_finds_an_examples_nodes_in_the_wheel_of_their_package(name: str, machine: Path) -> None:
     nodes = load(ROOT / "examples" / f"{name}.launch.py", {}).plan.nodes
     assert nodes
     for node in nodes:

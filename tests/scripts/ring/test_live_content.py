@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from array import array
+from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
 
-from ring.nodes.content import TALKS, Mark, Talk, digest, lamp_says
+from ring.nodes.content import TALKS, Mark, Talk, digest, lamp_says, take_small_picture
 
 NOW_NS = 1_700_000_000_123_456_789
 
@@ -99,3 +101,15 @@ def test_lists_of_other_cuts_have_other_digests() -> None:
 
 def test_a_lamp_says_its_state_and_how_often_it_was_switched() -> None:
     assert lamp_says(3, on=True) == "on, switched 3 times"
+
+
+@pytest.mark.parametrize("ros", [1, 2])
+def test_a_small_picture_has_its_number_its_time_and_only_the_first_rows(ros: int) -> None:
+    (camera,) = (talk for talk in TALKS if talk.node == "camera")
+    small = replace(camera, fill=partial(take_small_picture, 10))
+    message, whole = (vars(said(each, 7, ros=ros)) for each in (small, camera))
+    assert small.read(SimpleNamespace(**message)) == Mark(7, NOW_NS)
+    size = 10 * message["step"]
+    assert message["height"] == 10
+    assert bytes(message["data"]) == bytes(whole["data"][:size])
+    assert len(message["data"]) == size
