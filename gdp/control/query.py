@@ -70,16 +70,12 @@ class Response:
     @property
     def is_negative(self) -> bool:
         """Return whether no node advertises the name."""
-        return self._is_about_no_node and not self.is_unknown
+        return not self.advertisement and self.advertiser == self.name and not self.is_unknown
 
     @property
     def is_unknown(self) -> bool:
         """Return whether the RIB could not ask those that would know."""
-        return self._is_about_no_node and self.lease_s == 0.0 and self.sequence == 0
-
-    @property
-    def _is_about_no_node(self) -> bool:
-        return not self.advertisement and self.advertiser == self.name
+        return self.advertiser == self.name and not (self.advertisement or self.lease_s or self.sequence)
 
     def to_wire(self, signer: Name, key: SigningKey, membership: bytes) -> bytes:
         """Return the signed statement."""

@@ -75,11 +75,6 @@ class SendWindow:
         return self._cache.oldest
 
     @property
-    def cached_bytes(self) -> int:
-        """Return how many bytes of frames are cached."""
-        return self._cache.held_bytes
-
-    @property
     def retransmissions(self) -> int:
         """Return how many fragments were sent again."""
         return self._repairs.retransmissions + self._late_repairs.retransmissions

@@ -86,11 +86,6 @@ class NameResolver:
         """Return how many frames wait for a response."""
         return len(self._pending)
 
-    @property
-    def open_queries(self) -> int:
-        """Return how many names are queried or watched."""
-        return len(self._queries)
-
     @staticmethod
     def owner_of(neighbour: Neighbour) -> bytes:
         """Return the owner of the queries and pending frames that a neighbour causes."""

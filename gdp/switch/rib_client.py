@@ -17,11 +17,12 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import Final
 
 from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.channel import Channels, Opened
 from gdp.control.endpoint_query import EndpointResponse
+from gdp.control.link_state import AttachedRib
 from gdp.control.presence import Presence
 from gdp.control.query import Query, Response
 from gdp.control.relay import Relay, relayed
@@ -51,13 +52,6 @@ __all__ = ["SILENT_S", "RibClient"]
 SILENT_S: Final = 1.6  # longer than a RIB waits for the tier above
 _AVOID_S: Final = 10.0  # a RIB that owed a response for too long is avoided for so long, if there is another
 _REFILL_S: Final = 10.0  # how long negative responses of a RIB that is new here do not override known locations
-
-
-class _Reached(NamedTuple):
-    """A RIB in reach."""
-
-    name: Name
-    domain: Name
 
 
 class RibClient:
@@ -102,7 +96,7 @@ class RibClient:
         self.rib: Name | None = None
         self._session = b""  # of that RIB with its switch: another one means that it restarted or moved
         self._chosen_s = float("-inf")
-        self._others: tuple[_Reached, ...] = ()  # where the own domain has no RIB: those in reach, the nearest first
+        self._others: tuple[AttachedRib, ...] = ()  # where the own domain has no RIB: those in reach, the nearest first
         self._owed: dict[Name, float] = {}  # RIBs that owe a response, since when
         self._avoided: dict[Name, float] = {}  # RIBs that did not respond, until when
         self._review_s = float("inf")  # when one of them may be used again
@@ -125,10 +119,10 @@ class RibClient:
             self._endpoints.rib_changed(now_s)
         self.send_due(now_s)
 
-    def _reached(self, now_s: float) -> list[_Reached]:
+    def _reached(self, now_s: float) -> list[AttachedRib]:
         """Return the RIBs in reach, the one to use first."""
         own, transit, me = self._policy.own, self._policy.transit, self._identity.name
-        reached: list[tuple[bool, bool, int, bytes, _Reached]] = []
+        reached: list[tuple[bool, bool, int, bytes, AttachedRib]] = []
         for name, rib in self._paths.ribs().items():
             if rib.domain not in transit:
                 continue
@@ -136,7 +130,7 @@ class RibClient:
             if host is not None:
                 is_avoided = self._avoided.get(name, 0.0) > now_s
                 distance, spread = 0 if way is None else way.distance, hashlib.sha256(me + name).digest()
-                reached.append((is_avoided, rib.domain != own, distance, spread, _Reached(name, rib.domain)))
+                reached.append((is_avoided, rib.domain != own, distance, spread, rib))
         return [each[-1] for each in sorted(reached)]
 
     def _rib_for(self, name: Name, now_s: float) -> Name | None:

@@ -171,7 +171,7 @@ def test_a_neighbour_that_looks_for_everything_is_bounded() -> None:
     for number in range(2 * QUERIES_MAX):
         header = Header(Kind.DATA, Flag.LAST, HOPS_MAX, 1, 0, 1, 0, 1, 9, number.to_bytes(32, "big"), b"e" * 32)
         world.network._nodes["nuc1"].machine.receive([ReceivedFrame(port, mac, encode(header))], world.network.now)
-    assert nuc1.resolver.open_queries <= QUERIES_MAX + 8
+    assert len(nuc1.resolver._queries) <= QUERIES_MAX + 8
     assert nuc1.drops()[DropReason.PENDING_FULL] > 0
     world.network.send_pending("nuc1")
     world.network.run(6)

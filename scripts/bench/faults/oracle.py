@@ -7,7 +7,7 @@ and links between these. Known names need no RIB, and a RIB is reached the same 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from faults.plan import Plan
@@ -73,9 +73,3 @@ class Oracle:
         """Yield each flow's channel, publisher and reader."""
         for channel, flow in enumerate(self._plan.flows):
             yield from ((channel, flow.publisher, reader) for reader in flow.readers)
-
-    def survives_any_single(self, what: Collection[str] = ("switch", "link")) -> bool:
-        """Return whether the network stays whole when any single switch or link fails (it is 2-connected)."""
-        switches = [Broken(switches={each}) for each in self._switches] if "switch" in what else []
-        links = [Broken(links={each}) for each in self._links] if "link" in what else []
-        return all(self.is_whole(each) for each in (*switches, *links))

@@ -64,7 +64,7 @@ def test_what_goes_out_is_every_frame_once_and_in_order() -> None:
         window.handle_acknack(A, has(at + 1, part), now_s)
     assert sent == [frame for number in range(1, 31) for frame in message(number, 40)]
     assert window.oldest is None
-    assert window.cached_bytes == 0
+    assert window._cache.held_bytes == 0
 
 
 def test_a_missing_part_is_sent_again_before_anything_new() -> None:
@@ -222,7 +222,7 @@ def test_a_full_window_says_so_and_lets_the_oldest_go_at_twice_its_budget() -> N
     for number in range(11, 26):
         put(window, number, message(number, 1))
     assert window.evicted == 5
-    assert window.cached_bytes <= 20 * PART
+    assert window._cache.held_bytes <= 20 * PART
     assert window.oldest == 6
 
 
@@ -341,7 +341,7 @@ def test_a_cancelled_message_sends_nothing_more_and_the_next_one_goes_on() -> No
     assert window.frames_to_send(0.1) == message(2, 10)
     window.handle_acknack(A, has(4), 0.2)
     assert window.is_acknowledged()
-    assert window.cached_bytes == 0
+    assert window._cache.held_bytes == 0
 
 
 def test_a_cancelled_message_that_was_sent_is_given_up_when_a_reader_lacks_something_of_it() -> None:

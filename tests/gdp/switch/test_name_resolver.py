@@ -103,7 +103,7 @@ def test_a_query_without_an_answer_drops_the_frame_when_it_fails() -> None:
     resolver = missed()
     for tries in range(1, TRIES_MAX + 4):
         resolver.queries_to_send(tries * RETRY_S)
-    assert (resolver.open_queries, resolver.pending_frames) == (0, 0)
+    assert (len(resolver._queries), resolver.pending_frames) == (0, 0)
     assert resolver.drops == {DropReason.NO_ROUTE: 1}
 
 
@@ -112,7 +112,7 @@ def test_a_frame_expires_while_its_query_is_open() -> None:
     assert resolver.next_expiry() == PENDING_S
     resolver.expire(PENDING_S)
     assert resolver.drops == {DropReason.PENDING_EXPIRED: 1}
-    assert resolver.open_queries == 1
+    assert len(resolver._queries) == 1
 
 
 def test_a_frame_that_has_no_query_is_counted() -> None:
@@ -128,9 +128,9 @@ def test_a_neighbour_above_its_rate_opens_no_query() -> None:
     resolver = NameResolver(ME)
     for number in range(int(QUESTIONS_BURST) + 10):
         resolver.resolve(name(str(number)), 0.0, NEIGHBOUR)
-    assert resolver.open_queries == QUESTIONS_BURST
+    assert len(resolver._queries) == QUESTIONS_BURST
     resolver.resolve(SERVER, 0.0, b"n" + name("other"))
-    assert resolver.open_queries == QUESTIONS_BURST + 1
+    assert len(resolver._queries) == QUESTIONS_BURST + 1
 
 
 def test_a_name_that_only_publishes_has_no_reader() -> None:
