@@ -27,7 +27,7 @@ def test_a_cut_of_either_uplink_delays_no_message_over_two_paths_and_loses_none(
     record = tmp_path / "record.json"
     bench = ROOT / "scripts" / "bench" / "uplink_cut.py"
     options = {"rounds": 2, "quiet-s": 3, "settle-s": 5, "limit-ms": BEFORE_DETECTION_MS, "json": record}
-    argv = [sys.executable, str(bench), *(f"--{name}={value}" for name, value in options.items())]
+    argv = [sys.executable, str(bench), "--allow-load", *(f"--{name}={value}" for name, value in options.items())]
     environment = {**os.environ, "PYTHONPATH": PYTHON_PATH}
     ran = subprocess.run(argv, capture_output=True, text=True, timeout=PATIENCE_S, check=False, env=environment)
     assert ran.returncode == 0, ran.stderr

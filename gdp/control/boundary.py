@@ -110,8 +110,8 @@ class _Guard:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if not isinstance(error, Exception) or isinstance(error, RemoteError):
-            return
+        if not isinstance(error, Exception) or isinstance(error, RemoteError | BrokenPipeError):
+            return  # a pipe that breaks is the reader of our own output, which has ended
         self._boundary.record(error)
         self._boundary.offend(self._origin, self._now_s)
         raise FrameError(DropReason.INTERNAL, type(error).__name__) from error
