@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import os
-import select
 import signal
 import subprocess
 import sys
@@ -21,6 +20,7 @@ from typing import Final, TypedDict
 
 from fog.child_environment import child_environment
 from gdp.errors import LocalError
+from gdp.ports.readiness import readable
 from proxy.bridge.action_interface import action_of, is_part
 from proxy.endpoints.endpoint import Graph, Role
 from proxy.endpoints.ros2 import Ros2Endpoint
@@ -84,7 +84,7 @@ def _settled(endpoint: Ros2Endpoint, ends: Mapping[int, Path]) -> list[tuple[str
         until_s = news_s + QUIET_S if before else begin_s + PATIENCE_S
         if now_s >= until_s:
             break
-        ready = select.select([endpoint.fileno(), *ends], [], [], until_s - now_s)[0]
+        ready = readable([endpoint.fileno(), *ends], until_s - now_s)
         for ended in ends.keys() & set(ready):
             raise LocalError(f"a node ended: {_last(ends[ended])}")
         endpoint.poll_events()

@@ -6,7 +6,6 @@ I/O; over the control socket of a node of this machine, which sends the requests
 from __future__ import annotations
 
 import json
-import select
 import time
 from collections.abc import Mapping
 from typing import Annotated, Final, Optional
@@ -19,6 +18,7 @@ from gdp.cli.places import NOWHERE, find_places
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.nodes.control_client import NodeConnection
+from gdp.ports.readiness import readable
 
 __all__ = ["ping"]
 
@@ -114,7 +114,7 @@ class _Run:
         """Handle responses until a monotonic second; None: until none is outstanding."""
         while due_s is not None or self._sent:
             left_s = None if due_s is None else max(due_s - time.monotonic(), 0.0)
-            if not self._connection.has_received and not select.select([self._connection], [], [], left_s)[0]:
+            if not self._connection.has_received and not readable([self._connection], left_s):
                 return
             self._handle(self._connection.read_result())
 

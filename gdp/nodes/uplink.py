@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import select
 import time
 from collections.abc import Iterable, Iterator
 
@@ -17,6 +16,7 @@ from gdp.nodes.config import UplinkPlane
 from gdp.nodes.single_instance import own_devices
 from gdp.ports.netdev import NetdevPlane, NoDeviceError
 from gdp.ports.raw import RawPlane
+from gdp.ports.readiness import readable
 from gdp.ports.rtnetlink import LinkMonitor
 
 __all__ = ["load_plane", "open_uplink", "refuse_loopback", "wait_for_device"]
@@ -77,5 +77,5 @@ def wait_for_device(ifname: str, patience_s: float) -> None:
             if rest_s <= 0:
                 return
             log.debug("waiting for device ifname=%s", ifname)
-            select.select([links], [], [], rest_s)
+            readable([links], rest_s)
             found = links.poll()

@@ -8,7 +8,6 @@ for addresses and hops left, because Scapy rebuilds only changed layers.
 
 from __future__ import annotations
 
-import select
 import socket
 from collections.abc import Collection, Sequence
 from functools import partial
@@ -28,6 +27,7 @@ from gdp.frame.layers import GDP
 from gdp.ports.mmsg import send_failure
 from gdp.ports.netdev import NetdevPlane
 from gdp.ports.plane import MAC_BYTES, Port, ReceivedFrame
+from gdp.ports.readiness import readable
 from gdp.ports.sockets import NO_RAW_SOCKETS, attach_ethertype_filter, kernel_drops, large_buffers
 from gdp.switch.forwarder import Drop, Forward, decide
 from gdp.switch.table import Table
@@ -106,7 +106,7 @@ class ScapyPlane(NetdevPlane):
             prn=partial(self._consider, index),
             store=False,
             count=_BURST,
-            stop_filter=lambda _: not select.select([opened], [], [], 0)[0],
+            stop_filter=lambda _: not readable([opened], 0),
             chainCC=True,
         )
         if opened.closed:  # Scapy closed it because of an error

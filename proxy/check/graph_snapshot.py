@@ -5,11 +5,11 @@ I/O.
 
 from __future__ import annotations
 
-import select
 import time
 from collections.abc import Sequence
 from typing import Final
 
+from gdp.ports.readiness import readable
 from proxy.config.graph import RosGraphConfig
 from proxy.endpoints.endpoint import Graph, proxy_node_name
 from proxy.endpoints.live import open_endpoints
@@ -32,7 +32,7 @@ def read_graphs(ends: Sequence[RosGraphConfig], name_hex: str, purpose: str) -> 
         end_s = time.monotonic() + LOOK_S
         for endpoint in endpoints:
             while (rest_s := end_s - time.monotonic()) > 0:
-                select.select([endpoint], [], [], rest_s)
+                readable([endpoint], rest_s)
                 endpoint.poll_events()  # events are ignored, only the final graph counts
         for endpoint in endpoints:
             endpoint.poll_events()

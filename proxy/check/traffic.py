@@ -7,12 +7,12 @@ than for any other.
 from __future__ import annotations
 
 import contextlib
-import select
 import time
 from collections.abc import Sequence
 from dataclasses import replace
 
 from gdp.errors import LocalError
+from gdp.ports.readiness import readable
 from proxy.check.suggestion import Offered, Traffic
 from proxy.endpoints.endpoint import Endpoint, Graph, MessageReceived, Role
 from proxy.endpoints.qos import request
@@ -37,7 +37,7 @@ def measured(endpoint: Endpoint, graph: Graph, offered: Sequence[Offered], secon
             counted[at] = [0, 0]
     end_s = time.monotonic() + seconds
     while (rest_s := end_s - time.monotonic()) > 0:
-        select.select([endpoint], [], [], rest_s)
+        readable([endpoint], rest_s)
         for event in endpoint.poll_events():
             if isinstance(event, MessageReceived) and event.handle in handles:
                 count = counted[handles[event.handle]]

@@ -6,7 +6,6 @@ I/O.
 from __future__ import annotations
 
 import importlib.util
-import select
 import sys
 import time
 from pathlib import Path
@@ -16,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gdp.errors import LocalError
+from gdp.ports.readiness import readable
 from gdp.stores.files import public, write_all
 from proxy.check.graph_snapshot import LOOK_S
 from proxy.check.suggestion import Offered, offered_names, suggested_file
@@ -61,7 +61,7 @@ def suggest(directory: Path) -> Path:
 def _observed(endpoint: Endpoint) -> Graph:
     end_s = time.monotonic() + LOOK_S
     while (rest_s := end_s - time.monotonic()) > 0:
-        select.select([endpoint], [], [], rest_s)
+        readable([endpoint], rest_s)
         endpoint.poll_events()  # only the final graph counts
     return endpoint.graph()
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import fcntl
 import os
 import resource
-import select
 import signal
 import site
 import sys
@@ -22,6 +21,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import ConfigError, LocalError
+from gdp.ports.readiness import readable
 from gdp.ports.sandbox import Capability, Needs, confine
 from proxy.recordings.decoder import BagDecoder
 from proxy.recordings.source import Message
@@ -53,17 +53,25 @@ def main(words: Sequence[str]) -> None:
             lifeline; bytes of address space; seconds of processor time; bytes of the largest file in that folder.
     """
     path, scratch = Path(words[0]), Path(words[1]) if words[1] else None
-    output, lifeline, memory_bytes, cpu_s, file_bytes = map(int, words[2:])
-    _die_with(lifeline)
-    confine_decoder(path, scratch, memory_bytes, cpu_s, file_bytes)
-    _serve(path, _Output(output))
+    number, lifeline, memory_bytes, cpu_s, file_bytes = map(int, words[2:])
+    output = _Output(number)
+    try:
+        _die_with(lifeline)
+        confine_decoder(path, scratch, memory_bytes, cpu_s, file_bytes)
+        _serve(path, output)
+    except BrokenPipeError:
+        return
+    except MemoryError:
+        output.write(Kind.FAILED)
+    except Exception as error:
+        output.write(Kind.FAILED, text_to(f"{type(error).__name__}: {error}"))
 
 
 def _die_with(lifeline: int) -> None:
     fcntl.fcntl(lifeline, fcntl.F_SETSIG, signal.SIGKILL)
     fcntl.fcntl(lifeline, fcntl.F_SETOWN, os.getpid())
     fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | os.O_ASYNC)
-    if select.select([lifeline], [], [], 0)[0]:  # the lifeline was closed before
+    if readable([lifeline], 0):  # the lifeline was closed before
         sys.exit(1)
 
 
@@ -155,10 +163,6 @@ def _serve(path: Path, output: _Output) -> None:
             while sys.stdin.buffer.read(1):
                 output.write_messages(bag.messages())
                 output.write(Kind.END, text_to(bag.unread))
-    except BrokenPipeError:
-        return
-    except MemoryError:
-        output.write(Kind.FAILED)
     except ConfigError as error:
         if isinstance(error.__cause__, MemoryError):
             output.write(Kind.FAILED)
@@ -166,8 +170,6 @@ def _serve(path: Path, output: _Output) -> None:
             output.write(Kind.REFUSED, text_to(error.expected))
     except LocalError as error:
         output.write(Kind.REFUSED, text_to(f"cannot be read: {error}"))
-    except Exception as error:
-        output.write(Kind.FAILED, text_to(f"{type(error).__name__}: {error}"))
 
 
 def _write_opened(bag: BagDecoder, output: _Output) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import resource
 import shutil
 import sqlite3
 import struct
@@ -63,6 +66,19 @@ def cut(path: Path, share: float) -> Path:
 
 
 # --- whole recordings
+
+
+def test_a_process_with_more_than_1024_descriptors_reads_a_recording(tmp_path: Path) -> None:
+    record(tmp_path / "one.mcap", 2, numbered(2, 3))
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(4096, hard), hard))
+    try:
+        with contextlib.ExitStack() as held:
+            for _ in range(1024):
+                held.callback(os.close, os.open(os.devnull, os.O_RDONLY))
+            assert len(read(tmp_path / "one.mcap")[0]) == 3
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 @pytest.mark.parametrize("name", READABLE)
