@@ -27,7 +27,6 @@ needs_wireguard = pytest.mark.skipif(
         pytest.param(["scale.py", "--quick", "--no-save"], marks=soak),
         pytest.param(["messages.py", "--quick", "--mtu", "9000", "--offloads", "off"], marks=soak),
         pytest.param(["priority.py", "--quick", "--no-save"], marks=soak),
-        pytest.param(["bundles.py", "--quick", "--no-save"], marks=soak),
         pytest.param(["tunnel.py", "--quick", "--no-save", "--only", "kernel"], marks=[soak, needs_wireguard]),
         pytest.param(["first_topic.py", "--rounds", "1", "--no-save"], marks=[soak, needs_ros2, needs_wireguard]),
         ["uplink.py", "--quick", "--no-save", "--no-tcp", "--fifo", "bdp", "--only", "line", "gdp"],

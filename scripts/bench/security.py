@@ -1,10 +1,9 @@
-"""Security bench: cost of security and resistance to attacks, one subcommand for each question.
+"""Security bench: cost of single measures and resistance to attacks, one subcommand for each question.
 
     sudo .venv/bin/python scripts/bench/security.py revocation            # the whole; docs/benchmarks/security.json
     .venv/bin/python scripts/bench/security.py revocation --part kept     # 10^5 revocations in one process; no root
     sudo .venv/bin/python scripts/bench/security.py revocation --part closed --rounds 3 --no-save
     .venv/bin/python scripts/bench/security.py rotation                   # messages lost while epochs change; no root
-    sudo .venv/bin/python scripts/bench/security.py cost                  # compared with an earlier commit
     sudo .venv/bin/python scripts/bench/security.py flood                 # by strangers and by members; an hour
 
 Each subcommand is a module in this folder with ``add_arguments(parser)`` and ``run(options, held)``; ``held`` are its
@@ -24,7 +23,6 @@ from types import ModuleType
 from typing import Any, Final
 
 import security_amplification
-import security_cost
 import security_flood
 import security_insiders
 import security_replays
@@ -38,7 +36,6 @@ OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks" / "s
 COMMANDS: Final[Mapping[str, ModuleType]] = {
     "revocation": security_revocation,
     "rotation": security_rotation,
-    "cost": security_cost,
     "flood": security_flood,
     "amplification": security_amplification,
     "replays": security_replays,
