@@ -137,8 +137,8 @@ class Policy:
         raise refusal
 
 
-def _keys_of(roots: Iterable[Root]) -> frozenset[bytes]:
-    return frozenset(each.key.compressed for root in roots for each in root.lineage)
+def _keys_of(roots: Iterable[Root]) -> list[bytes]:
+    return [each.key.compressed for root in roots for each in root.lineage]
 
 
 def _by_issuer(roots: Iterable[Root]) -> dict[bytes, list[Root]]:
