@@ -119,15 +119,15 @@ class SendQueue:
         """Return the message number and the fragment before which everything has been sent."""
         if self.is_acknowledged:
             return self._window.sent
-        best_effort_queue = self._best_effort.oldest
-        return (self.next_number if best_effort_queue is None else best_effort_queue.number), 0
+        waiting = self._best_effort.oldest
+        return (self.next_number if waiting is None else waiting.number), 0
 
     @property
     def sequences(self) -> tuple[int, int]:
         """Return the sequence numbers of what is sent next, and of what is cached first."""
-        best_effort_queue, oldest = self._best_effort.oldest, self._window.oldest
+        waiting, oldest = self._best_effort.oldest, self._window.oldest
         if not self.is_acknowledged:
-            sent = self.first_waiting if best_effort_queue is None else best_effort_queue.sequence
+            sent = self.first_waiting if waiting is None else waiting.sequence
         else:
             sent = self.ledger.begin_of(self._window.sent[0], self.first_waiting)
         return sent, sent if oldest is None else self.ledger.begin_of(oldest, sent)
@@ -226,7 +226,7 @@ class SendQueue:
         frames = self._best_effort.poll_frames(max(limit, 1))
         if not self._gathered or self._window.has_frames:
             frames += self._window.frames_to_send(now_s, max(limit - len(frames), 1))
-        while self._gathered and len(frames) < limit and not self._has_best_effort_queue():
+        while self._gathered and len(frames) < limit and not self._has_unsent():
             self._seal_next()
             left = limit - len(frames)
             sends_window = self.is_acknowledged
@@ -235,10 +235,10 @@ class SendQueue:
 
     def refragment_best_effort(self, mtu: int) -> bool:
         """Seal unsent best-effort messages again if one is too large for the path; return whether any was."""
-        best_effort_queue = self._best_effort.requeue(mtu)
-        for body, carried in best_effort_queue:
+        requeued = self._best_effort.requeue(mtu)
+        for body, carried in requeued:
             self._seal_message(body, carried.sequence, carried.messages, carried.added_s)
-        return bool(best_effort_queue)
+        return bool(requeued)
 
     def refragment(self, mtu: int) -> Renumbering | None:
         """Seal all that is cached again, under new numbers, if something is too large for the path.
@@ -268,7 +268,7 @@ class SendQueue:
         self.drops[DropReason.NO_READER] += len(self._gathered) + self._drop_deferred(0)
         self._gathered, self._best_effort = Gathered(), BestEffortQueue(self.options.deadline_s)
 
-    def _has_best_effort_queue(self) -> bool:
+    def _has_unsent(self) -> bool:
         return self._window.sent[0] < self.next_number if self.is_acknowledged else bool(self._best_effort)
 
     def _bundle_capacity(self) -> int:

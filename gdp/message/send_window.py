@@ -61,7 +61,7 @@ class SendWindow:
         self._repairs = RetransmissionQueue()
         self._late_repairs = RetransmissionQueue()  # of readers that do not govern: they leave after what is new
         self._cancelled: set[int] = set()  # messages that were sent, and are not repaired
-        self._best_effort_queue = deque[tuple[int, int]]()  # (number, first fragment not sent), oldest first
+        self._unsent = deque[tuple[int, int]]()  # (number, first fragment not sent), oldest first
         self._newest = first_number - 1
         self._sent_at = 0
         self._now_s = 0.0  # of the latest event
@@ -115,7 +115,7 @@ class SendWindow:
     @property
     def sent(self) -> tuple[int, int]:
         """Return the message number and the fragment before which everything has been sent."""
-        return self._best_effort_queue[0] if self._best_effort_queue else (self._newest + 1, 0)
+        return self._unsent[0] if self._unsent else (self._newest + 1, 0)
 
     @property
     def acknowledged(self) -> int:
@@ -159,7 +159,7 @@ class SendWindow:
         self.evicted += len(evicted)
         self._newest = number
         self._cache.add(number, frames, size, self._now_s if added_s is None else added_s)
-        self._best_effort_queue.append((number, 0))
+        self._unsent.append((number, 0))
         return evicted
 
     def cancel(self, number: int) -> bool:
@@ -167,7 +167,7 @@ class SendWindow:
 
         One that was sent whole is on its way: readers lack it only if they request something of it.
         """
-        message, waiting = self._cache.messages.get(number), self._best_effort_queue
+        message, waiting = self._cache.messages.get(number), self._unsent
         if message is None:
             return False
         if number < self.sent[0]:
@@ -273,7 +273,7 @@ class SendWindow:
     @property
     def has_frames(self) -> bool:
         """Return whether something waits to be sent, or sent again; or no reader waits for it."""
-        return bool(self._best_effort_queue or self._repairs) or not self._readers.active
+        return bool(self._unsent or self._repairs) or not self._readers.active
 
     def frames_to_send(self, now_s: float, limit: int = 1 << 30) -> list[bytes]:
         """Return at most ``limit`` frames: repairs first, then new ones as far as the readers can hold them."""
@@ -284,19 +284,19 @@ class SendWindow:
         acked_at = self._acked_at()
         if self._sent_at == acked_at:
             self._flow.restart_probe(now_s)
-        if self._best_effort_queue:
+        if self._unsent:
             self._readers.reset_stall_timers(self._sent_at, now_s)
             first_at = self._readers.first_at() if self.governing is not None else acked_at
             frames += self._new_frames(first_at + self._flow.window_bytes, limit - len(frames))
         if frames and not (self._repairs.has_repaired or self._late_repairs.has_repaired):
             self._flow.round_trip.handle_sent(self._sent_at, now_s)
-        if not self._readers.active and not self._best_effort_queue:
+        if not self._readers.active and not self._unsent:
             self._release_acknowledged()
         return frames
 
     def late_repairs_to_send(self, now_s: float, limit: int) -> list[bytes]:
         """Return at most ``limit`` frames to be sent again for readers that do not govern, once nothing new waits."""
-        if self._best_effort_queue or not self._late_repairs or limit <= 0:
+        if self._unsent or not self._late_repairs or limit <= 0:
             return []
         self._flow.round_trip.discard_sample()
         return self._repaired_frames(limit, now_s, self._late_repairs)
@@ -330,13 +330,8 @@ class SendWindow:
         frames: list[bytes] = []
         least = self._readers.least_active() if self.governing is None else self._readers.most_active()
         below = least + FLIGHT_MESSAGES_MAX
-        while (
-            self._best_effort_queue
-            and self._sent_at < may_reach
-            and len(frames) < limit
-            and self._best_effort_queue[0][0] < below
-        ):
-            number, part = self._best_effort_queue[0]
+        while self._unsent and self._sent_at < may_reach and len(frames) < limit and self._unsent[0][0] < below:
+            number, part = self._unsent[0]
             message, begin_at = self._cache.messages[number].frames, self._cache.messages[number].begin_at
             self._sent_at = max(self._sent_at, begin_at)  # what lies before it was cancelled
             count = min(max(1, (may_reach - self._sent_at) // len(message[0])), limit - len(frames))
@@ -344,18 +339,18 @@ class SendWindow:
             frames += batch
             self._sent_at += sum(map(len, batch))
             if part + len(batch) < len(message):
-                self._best_effort_queue[0] = (number, part + len(batch))
+                self._unsent[0] = (number, part + len(batch))
             else:
-                self._best_effort_queue.popleft()
-        if not self._best_effort_queue:
+                self._unsent.popleft()
+        if not self._unsent:
             self._sent_at = self._cache.end_at
         return frames
 
     def _skip_received(self) -> None:
         """Do not send again, under its new number, what every active reader has received under its old one."""
         least = min(self._readers.least_active(), self._sent_before) if self._readers.active else 0
-        while self._best_effort_queue and self._best_effort_queue[0][0] < least:
-            self._sent_at = self._cache.messages[self._best_effort_queue.popleft()[0]].end_at
+        while self._unsent and self._unsent[0][0] < least:
+            self._sent_at = self._cache.messages[self._unsent.popleft()[0]].end_at
             for reader in self._readers.active.values():
                 reader.acked_at = max(reader.acked_at, self._sent_at)
 
@@ -383,16 +378,16 @@ class SendWindow:
     def _release_acknowledged(self) -> None:
         least = self._readers.least()
         for number in self._cache.beyond_depth(self._now_s):
-            is_best_effort_queue = self._readers.active and self._cache.messages[number].end_at > self._sent_at
-            if number >= least or is_best_effort_queue:
+            is_unsent = self._readers.active and self._cache.messages[number].end_at > self._sent_at
+            if number >= least or is_unsent:
                 break
             self._release(number)
 
     def _release(self, number: int) -> None:
         message = self._forget(number)
         self._sent_at = max(self._sent_at, message.end_at)
-        while self._best_effort_queue and self._best_effort_queue[0][0] <= number:
-            self._best_effort_queue.popleft()
+        while self._unsent and self._unsent[0][0] <= number:
+            self._unsent.popleft()
 
     def _forget(self, number: int) -> CachedMessage:
         self._repairs.forget(number)
