@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final, Protocol, TypeAlias
 
-from image_request import request_of, said_in
+from image_request import mask_in, request_of, said_in
 from nav_msgs.srv import GetPlan
 from rcl_interfaces.srv import SetParameters
 from vision import Scene
@@ -74,10 +74,7 @@ class Plan:
 
 
 class Detect:
-    """Request for the positions of the objects of a scene; right is each of them and nothing else.
-
-    Note: their number.
-    """
+    """Request for the words of a scene and their boxes; right is each of them and nothing else. Note: their number."""
 
     kind = SetParameters
 
@@ -92,18 +89,25 @@ class Detect:
     def judge(self, number: int, response: Response) -> Judged:
         """Return the value of an answer."""
         said, scene = said_in(response), self._scenes[number % _FRAMES]
+        return _judged(said, is_right=self._is_right(said, scene), note=len(scene.words))
+
+    def _is_right(self, said: Mapping[str, object], scene: Scene) -> bool:
         found = said["found"]
-        is_right = isinstance(found, list) and scene.agrees([(row, column) for row, column in found])
-        return _judged(said, is_right=is_right, note=len(scene.centres))
+        return isinstance(found, list) and scene.agrees([(text, tuple(box)) for text, box in found])
 
 
 class Segment(Detect):
-    """Request for the number of regions of a scene; right is the number of objects drawn, which is also the note."""
+    """Request for the mask of a scene's words; right is a region for each word, and nothing else."""
 
-    def judge(self, number: int, response: Response) -> Judged:
-        """Return the value of an answer."""
-        said, count = said_in(response), len(self._scenes[number % _FRAMES].centres)
-        return _judged(said, is_right=said["regions"] == count, note=count)
+    def _is_right(self, said: Mapping[str, object], scene: Scene) -> bool:
+        return scene.is_covered(mask_in(str(said["mask"])))
+
+
+class Count(Detect):
+    """Request for the number of words of a scene; right is that of the drawn ones."""
+
+    def _is_right(self, said: Mapping[str, object], scene: Scene) -> bool:
+        return said["words"] == len(scene.words)
 
 
 class Tag:
@@ -140,6 +144,7 @@ TASKS: Final[Mapping[str, Callable[[str], Task]]] = {
     "plan": Plan,
     "detect": Detect,
     "segment": Segment,
+    "count": Count,
     "tag": Tag,
 }
 
