@@ -65,10 +65,9 @@ _SETTINGS: Final = {
 }
 _SETTING: Final = (
     "A robot calls a service that finds the words in frames of 640 x 480 bytes. *Contended*: a second client of the"
-    f" same service, next to the replica m1, alternates. For {ON_S:g} s it asks m1 again and again, then it rests for {OFF_S:g}"
-    " s. The"
-    " node serves one request after the other. *One server* is m1; *two replicas* are m1 and m2, and no other client"
-    " asks."
+    f" same service, next to the replica m1, alternates. For {ON_S:g} s it asks m1 again and again, then it rests for"
+    f" {OFF_S:g} s. The node serves one request after the other. *One server* is m1; *two replicas* are m1 and m2, and"
+    " no other client asks."
     " Both cases take turns, request by request, with the same frames.",
     "*Servers compute*: each runs DBNet, a neural network that gives every pixel its probability of being text, and"
     " answers the mask. *Servers wait*: they run no network, count the words by their brightness, and wait for the rest"
@@ -96,15 +95,11 @@ _NOTES: Final = (
 def measure(options: Options) -> Report:
     """Segment frames while a second client contends for one replica."""
     wanted = {_WAIT: options.requests, _COMPUTE: options.computed}
-    if options.quick:
-        wanted = {_WAIT: QUICK, _COMPUTE: QUICK if options.compute else 0}
+    wanted = {_WAIT: QUICK, _COMPUTE: QUICK * options.compute} if options.quick else wanted
     if wanted[_COMPUTE]:
         require_networks("let no servers compute: --computed 0")
-    counts = {
-        what: wanted[each.role]
-        for what, each in _SETTINGS.items()
-        if wanted[each.role] and (each.is_contended or not options.quick)
-    }
+    chosen = [what for what, each in _SETTINGS.items() if each.is_contended or not options.quick]
+    counts = {what: count for what in chosen if (count := wanted[_SETTINGS[what].role])}
     served = [Served(_TWO, TYPE, _MACHINES), Served(_ONE, TYPE, _MACHINES[:1])]
     groups: dict[str, list[Sample]] = {}
     findings = []
@@ -146,8 +141,6 @@ def _times() -> dict[str, list[float]]:
 if __name__ == "__main__":
     parser = command_line(__doc__)
     parser.add_argument("--requests", type=int, default=REQUESTS, help="while servers wait (default: %(default)s)")
-    parser.add_argument(
-        "--computed", type=int, default=COMPUTED, help="while they compute; 0: none (default: %(default)s)"
-    )
+    parser.add_argument("--computed", type=int, default=COMPUTED, help="while they compute (default: %(default)s)")
     parser.add_argument("--compute", action="store_true", help="with --quick: let servers compute, too")
     run_experiment(parser, measure)

@@ -21,7 +21,7 @@ from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue, SetPara
 from rcl_interfaces.srv import SetParameters
 from vision import SHAPE, Grey, Mask
 
-__all__ = ["TYPE", "answer_of", "frame_of", "mask_in", "number_of", "request_of", "said_in", "text_of"]
+__all__ = ["TYPE", "answer_of", "frame_of", "mask_in", "request_of", "said_in", "text_of"]
 
 TYPE: Final = "rcl_interfaces/srv/SetParameters"
 
@@ -37,11 +37,6 @@ def frame_of(request: SetParameters.Request) -> Grey:
     """Return the frame that a request carries."""
     words = np.asarray(request.parameters[0].value.integer_array_value, dtype=np.int64)
     return words.view(np.uint8).reshape(SHAPE)
-
-
-def number_of(request: SetParameters.Request) -> int:
-    """Return the number of a request's frame."""
-    return int(request.parameters[0].name)
 
 
 def answer_of(said: Mapping[str, object]) -> SetParameters.Response:

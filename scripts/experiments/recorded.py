@@ -1,9 +1,9 @@
 """Waits of servers that compute nothing, drawn from recorded runs of planners and of a network.
 
-Sans-I/O, but for reading the recordings. Each run of ``RRTConnect`` is a pair. ``record.py`` writes the number of states
-that the run checked, and its processor time. The number is proportional to the time of the run on an idle machine.
-Where the number is 0 it was not counted: the second number is then the time on such a machine (the computed trials of
-figure 5). A run of DBNet is its processor time (``record_segmentation.py``).
+Sans-I/O, but for reading the recordings. Each run of ``RRTConnect`` is a pair. ``record.py`` writes the number of
+states that the run checked, and its processor time. The number is proportional to the time of the run on an idle
+machine. Where the number is 0 it was not counted: the second number is then the time on such a machine (the computed
+trials of figure 5). Of a run of DBNet there is only the processor time (``record_segmentation.py``).
 """
 
 from __future__ import annotations
@@ -56,8 +56,7 @@ def load(path: Path = RECORDING) -> dict[str, list[float]]:
 
 def segmentation_runs() -> list[float]:
     """Return the processor time of each recorded run of DBNet, in seconds."""
-    recording: dict[str, list[float]] = json.loads(SEGMENTATION.read_text(encoding="utf-8"))
-    return recording["seconds"]
+    return [float(seconds) for seconds in json.loads(SEGMENTATION.read_text(encoding="utf-8"))]
 
 
 def draw(runs: list[float], faster: float, count: int, chance: random.Random) -> list[float]:

@@ -73,13 +73,13 @@ class Plan:
         return Judged(head.frame_id, head.stamp.sec + head.stamp.nanosec * _NANO, count > 0, count)
 
 
-class Detect:
-    """Request for the words of a scene and their boxes; right is each of them and nothing else. Note: their number."""
+class Look:
+    """Request for what a scene shows; ``is_right`` judges an answer. Note: the number of words."""
 
     kind = SetParameters
 
-    def __init__(self, problem: str) -> None:
-        del problem
+    def __init__(self, is_right: Callable[[Mapping[str, object], Scene], bool]) -> None:
+        self._is_right = is_right
         self._scenes = [Scene.draw(seed) for seed in range(_FRAMES)]
 
     def request(self, number: int) -> Request:
@@ -90,24 +90,6 @@ class Detect:
         """Return the value of an answer."""
         said, scene = said_in(response), self._scenes[number % _FRAMES]
         return _judged(said, is_right=self._is_right(said, scene), note=len(scene.words))
-
-    def _is_right(self, said: Mapping[str, object], scene: Scene) -> bool:
-        found = said["found"]
-        return isinstance(found, list) and scene.agrees([(text, tuple(box)) for text, box in found])
-
-
-class Segment(Detect):
-    """Request for the mask of a scene's words; right is a region for each word, and nothing else."""
-
-    def _is_right(self, said: Mapping[str, object], scene: Scene) -> bool:
-        return scene.is_covered(mask_in(str(said["mask"])))
-
-
-class Count(Detect):
-    """Request for the number of words of a scene; right is that of the drawn ones."""
-
-    def _is_right(self, said: Mapping[str, object], scene: Scene) -> bool:
-        return said["words"] == len(scene.words)
 
 
 class Tag:
@@ -142,9 +124,9 @@ class Tag:
 
 TASKS: Final[Mapping[str, Callable[[str], Task]]] = {
     "plan": Plan,
-    "detect": Detect,
-    "segment": Segment,
-    "count": Count,
+    "detect": lambda _: Look(lambda said, scene: scene.agrees(said["found"])),
+    "segment": lambda _: Look(lambda said, scene: scene.is_covered(mask_in(str(said["mask"])))),
+    "count": lambda _: Look(lambda said, scene: said["words"] == len(scene.words)),
     "tag": Tag,
 }
 

@@ -1,17 +1,14 @@
 """Frames with words, and neural networks that find and read them: the load of figures 6 and 7.
 
-Sans-I/O, but for loading the networks. They are those of the wheel ``rapidocr-onnxruntime`` (Apache-2.0): DBNet, which
-gives each pixel the probability that it belongs to a line of text, and a recogniser, which reads a line. The frames are
-drawn here, so an answer can be checked.
-Source: Liao et al., "Real-time Scene Text Detection with Differentiable Binarization" (AAAI 2020); constants of
-``rapidocr_onnxruntime/config.yaml``, but for the ratio of ``_UNCLIP``.
+Sans-I/O, but for loading the networks, which the wheel ``rapidocr-onnxruntime`` (Apache-2.0) has: DBNet gives each
+pixel the probability that it is text, and a recogniser reads a line. The frames are drawn here: answers can be checked.
+Source: Liao et al., "Real-time Scene Text Detection with Differentiable Binarization" (AAAI 2020).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Final, TypeAlias
 
 import bench_path  # noqa: F401 - finds ``preconditions``
@@ -36,8 +33,7 @@ _BLOCK: Final = 8  # pixels; between the gaps in a word and those between words
 _OVERLAP: Final = 0.5  # least intersection over union of an answer and what was drawn, as in PASCAL VOC
 _WHEEL: Final = "rapidocr_onnxruntime"
 _PIXEL, _REGION, _SIDE_PX = 0.3, 0.5, 3  # least probability of a pixel, least mean and least side of a region
-_UNCLIP: Final = 1.2  # the wheel's 1.6 gives boxes with a wider margin
-_LINE_PX: Final = 48  # height of a line that the recogniser reads
+_UNCLIP: Final = 0.9  # the wheel's 1.6 gives boxes with a wider margin
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,40 +62,33 @@ class Scene:
         noisy = np.asarray(image) + random.normal(0.0, _NOISE, SHAPE)
         return cls(np.clip(noisy, 0, 255).astype(np.uint8), tuple(words))
 
-    def agrees(self, found: list[tuple[str, Box]]) -> bool:
-        """Return whether exactly the words were found, each read right and in its place."""
-        near = [
-            any(text == word and _overlap(_mask_of([box]), _mask_of([place])) >= _OVERLAP for text, place in found)
+    def agrees(self, found: object) -> bool:
+        """Return whether ``found``, as of ``detect``, is exactly the words, each read right and in its place."""
+        places = [(text, _mask_of(box)) for text, box in found] if isinstance(found, list) else []
+        return len(places) == len(self.words) and all(
+            any(text == word and _overlap(_mask_of(box), place) >= _OVERLAP for text, place in places)
             for word, box in self.words
-        ]
-        return len(found) == len(self.words) and all(near)
+        )
 
     def is_covered(self, mask: Mask) -> bool:
         """Return whether a mask has a region for each word, and covers the words."""
-        drawn = _mask_of([box for _, box in self.words])
+        drawn = _mask_of(*(box for _, box in self.words))
         return int(ndimage.label(mask)[1]) == len(self.words) and _overlap(mask, drawn) >= _OVERLAP
 
 
 class Networks:
-    """DBNet and the recogniser, on one thread of the caller (about 70 ms a frame, and 10 ms more a word)."""
+    """DBNet and the recogniser, on one thread (about 70 ms a frame, and 10 ms more a word)."""
 
     def __init__(self) -> None:
-        import onnxruntime
+        from rapidocr_onnxruntime import RapidOCR
 
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        spec = find_spec(_WHEEL)
-        folder = Path(str(spec and spec.origin)).parent / "models"
-        self._detector, self._recogniser = (
-            onnxruntime.InferenceSession(folder / f"ch_PP-OCRv4_{each}_infer.onnx", options) for each in ("det", "rec")
-        )
-        characters = self._recogniser.get_modelmeta().custom_metadata_map["character"]
-        self._characters = ["", *characters.splitlines(), " "]  # the first one is CTC's blank
+        # Without the last one the wheel would enlarge the frame.
+        self._reader = RapidOCR(intra_op_num_threads=1, inter_op_num_threads=1, det_limit_side_len=SHAPE[0])
 
     def segment(self, frame: Grey) -> Mask:
         """Return which pixels belong to a line of text."""
-        (probability,) = self._detector.run(None, {"x": _tensor(frame)})
-        chance = probability[0, 0]
+        channels = np.repeat((frame.astype(np.float32) / 127.5 - 1)[None, None], 3, axis=1)
+        chance = self._reader.text_det.infer(channels)[0][0, 0]
         regions, _ = ndimage.label(chance > _PIXEL)
         mask = np.zeros(SHAPE, dtype=np.bool_)
         for number, place in enumerate(ndimage.find_objects(regions), 1):
@@ -110,28 +99,13 @@ class Networks:
 
     def detect(self, frame: Grey) -> list[tuple[str, Box]]:
         """Return the text and the box of each line."""
-        boxes = [
-            _unclipped(rows, columns) for rows, columns in ndimage.find_objects(ndimage.label(self.segment(frame))[0])
-        ]
-        return [
-            (self._read(frame[top:bottom, left:right]), (top, left, bottom, right))
-            for top, left, bottom, right in boxes
-        ]
-
-    def _read(self, line: Grey) -> str:
-        width = round(_LINE_PX * line.shape[1] / line.shape[0])
-        scaled = np.asarray(Image.fromarray(line).resize((width, _LINE_PX), Image.Resampling.BILINEAR))
-        (chances,) = self._recogniser.run(None, {"x": _tensor(scaled)})
-        best = chances[0].argmax(axis=1)
-        starts = np.flatnonzero(np.diff(best, prepend=0))  # CTC: a run of one character is that character once
-        return "".join(self._characters[each] for each in best[starts])
+        lines, _ = self._reader(frame, use_cls=False, unclip_ratio=_UNCLIP)
+        corners = [(text, np.array(four, dtype=int)) for four, text, _ in lines or ()]
+        return [(text, (*four.min(axis=0)[::-1].tolist(), *four.max(axis=0)[::-1].tolist())) for text, four in corners]
 
 
 def require_networks(instead: str) -> None:
-    """Refuse to compute without the networks.
-
-    Args:
-        instead: what else to do.
+    """Refuse to compute without the networks; ``instead`` is what else to do.
 
     Raises:
         RefusedError: they are not installed.
@@ -147,20 +121,7 @@ def count_words(frame: Grey) -> int:
     return int(ndimage.label(blocks > (_GROUND + _INK) / 2, np.ones((3, 3)))[1])
 
 
-def _tensor(image: Grey) -> NDArray[np.float32]:
-    """Return an image as the networks take it: three equal channels from -1 to 1."""
-    return np.repeat((image.astype(np.float32) / 127.5 - 1)[None, None], 3, axis=1)
-
-
-def _unclipped(rows: slice, columns: slice) -> Box:
-    """Return the box of a region's text: DBNet's regions are shrunk by an offset of area over perimeter."""
-    height, width = rows.stop - rows.start, columns.stop - columns.start
-    wider = round(_UNCLIP * height * width / (2 * (height + width)))
-    top, left = max(rows.start - wider, 0), max(columns.start - wider, 0)
-    return top, left, min(rows.stop + wider, SHAPE[0]), min(columns.stop + wider, SHAPE[1])
-
-
-def _mask_of(boxes: list[Box]) -> Mask:
+def _mask_of(*boxes: Box) -> Mask:
     mask = np.zeros(SHAPE, dtype=np.bool_)
     for top, left, bottom, right in boxes:
         mask[top:bottom, left:right] = True
