@@ -82,8 +82,7 @@ _NOTES: Final = (
     "The network is that of the wheel rapidocr-onnxruntime, on one thread of a processor. The paper ran SAM, a larger"
     " one, on machines of its own. Each mask is checked against the drawn words: a region for each, and intersection"
     " over union of at least 0.5. Of servers that wait the number of words is checked.",
-    "The recording has processor time. It leaves out waiting for a core, and keeps what other work costs by its use of"
-    " the caches.",
+    "The recording has processor time: it leaves out waiting for a core, but not what other work costs in the caches.",
     "The service type is rcl_interfaces/srv/SetParameters, whose integer array carries the frame (307,200 bytes): the"
     " installed packages have no service that takes an image.",
     "The paper has 300 requests, as the cases in which the servers wait.",

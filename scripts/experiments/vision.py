@@ -32,7 +32,7 @@ _GROUND, _INK, _NOISE = 70, 220, 12.0
 _BLOCK: Final = 8  # pixels; between the gaps in a word and those between words
 _OVERLAP: Final = 0.5  # least intersection over union of an answer and what was drawn, as in PASCAL VOC
 _WHEEL: Final = "rapidocr_onnxruntime"
-_PIXEL, _REGION, _SIDE_PX = 0.3, 0.5, 3  # least probability of a pixel, least mean and least side of a region
+_PIXEL, _SIDE_PX = 0.3, 3  # least probability of a pixel, and least side of a region
 _UNCLIP: Final = 0.9  # the wheel's 1.6 gives boxes with a wider margin
 
 
@@ -88,14 +88,8 @@ class Networks:
     def segment(self, frame: Grey) -> Mask:
         """Return which pixels belong to a line of text."""
         channels = np.repeat((frame.astype(np.float32) / 127.5 - 1)[None, None], 3, axis=1)
-        chance = self._reader.text_det.infer(channels)[0][0, 0]
-        regions, _ = ndimage.label(chance > _PIXEL)
-        mask = np.zeros(SHAPE, dtype=np.bool_)
-        for number, place in enumerate(ndimage.find_objects(regions), 1):
-            region = regions[place] == number
-            if min(region.shape) >= _SIDE_PX and chance[place][region].mean() >= _REGION:
-                mask[place] |= region
-        return mask
+        (chance,) = self._reader.text_det.infer(channels)[0][0]
+        return np.asarray(ndimage.binary_opening(chance > _PIXEL, np.ones((_SIDE_PX, _SIDE_PX))))
 
     def detect(self, frame: Grey) -> list[tuple[str, Box]]:
         """Return the text and the box of each line."""
