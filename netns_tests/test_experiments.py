@@ -18,6 +18,8 @@ _NEEDS = {
     "fig5": ("rclpy", "ompl", "fcl", "trimesh", "collada", "scipy", "matplotlib"),
     "fig6": ("rclpy", "scipy", "matplotlib"),
     "fig7": ("rclpy", "scipy", "matplotlib"),
+    "fig6 --compute": ("rclpy", "scipy", "matplotlib", "rapidocr_onnxruntime"),
+    "fig7 --compute": ("rclpy", "scipy", "matplotlib", "rapidocr_onnxruntime"),
     "fig9": ("rclpy", "pupil_apriltags", "scipy", "matplotlib"),
     "outages": ("rclpy", "matplotlib"),
     "offload": ("rclpy", "cyclonedds", "cv2", "scipy", "matplotlib"),
@@ -37,7 +39,8 @@ def run(in_clone: InClone, tmp_path: Path) -> Callable[[str], dict[str, Any]]:
         if missing := [module for module in _NEEDS[name] if find_spec(module) is None]:
             needed = "scripts/setup.sh --ros2, pip install 'gdp-ros[experiments]'"
             pytest.skip(f"not installed: {', '.join(missing)}: {needed}")
-        words = ["--quick", "--json", "--out", str(tmp_path), *_OPTIONS.get(name, ())]
+        name, *own = name.split()
+        words = ["--quick", "--json", "--out", str(tmp_path), *own, *_OPTIONS.get(name, ())]
         ran = in_clone(f"scripts/experiments/{name}.py", *words, patience_s=_PATIENCE_S)
         assert ran.returncode == 0, ran.stderr
         assert {each.name for each in tmp_path.iterdir()} == {f"{name}.{kind}" for kind in ("json", "md", "png")}
@@ -49,7 +52,7 @@ def run(in_clone: InClone, tmp_path: Path) -> Callable[[str], dict[str, Any]]:
     return run_one
 
 
-@pytest.mark.parametrize("name", ["fig5", "fig6", "fig7", "fig9"])
+@pytest.mark.parametrize("name", ["fig5", "fig6", "fig7", "fig6 --compute", "fig7 --compute", "fig9"])
 def test_an_experiment_runs_to_its_page_without_a_failed_request(
     name: str, run: Callable[[str], dict[str, Any]]
 ) -> None:

@@ -23,7 +23,8 @@ compile() {
 }
 
 [[ $# -gt 0 ]] || rm -f requirements/dev.lock
-compile dev.lock --all-extras "$@" pyproject.toml
+# rapidocr-onnxruntime asks for opencv-python, whose files would replace those of opencv-python-headless; only its models are used.
+compile dev.lock --all-extras --no-emit-package opencv-python "$@" pyproject.toml
 compile run.lock -c requirements/dev.lock --extra proxy --extra fog --extra scapy pyproject.toml
 compile ros2.lock -c requirements/dev.lock --extra proxy --extra fog --extra scapy --extra ros2 pyproject.toml
 compile build.lock -c requirements/dev.lock requirements/build.in

@@ -4,22 +4,24 @@ Sans-I/O.
 
 The installed packages have no service that takes an image, so ``rcl_interfaces/srv/SetParameters`` carries it. The
 request has one parameter, named by the frame's number. Its integer array holds the 640 x 480 bytes of the frame, eight
-to an integer. The answer's ``reason`` is JSON.
+to an integer. The answer's ``reason`` is JSON; a mask in it is text.
 """
 
 from __future__ import annotations
 
 import array
+import base64
 import json
+import zlib
 from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue, SetParametersResult
 from rcl_interfaces.srv import SetParameters
-from vision import SHAPE, Grey
+from vision import SHAPE, Grey, Mask
 
-__all__ = ["TYPE", "answer_of", "frame_of", "number_of", "request_of", "said_in"]
+__all__ = ["TYPE", "answer_of", "frame_of", "mask_in", "request_of", "said_in", "text_of"]
 
 TYPE: Final = "rcl_interfaces/srv/SetParameters"
 
@@ -37,11 +39,6 @@ def frame_of(request: SetParameters.Request) -> Grey:
     return words.view(np.uint8).reshape(SHAPE)
 
 
-def number_of(request: SetParameters.Request) -> int:
-    """Return the number of a request's frame."""
-    return int(request.parameters[0].name)
-
-
 def answer_of(said: Mapping[str, object]) -> SetParameters.Response:
     """Return the response with this content."""
     return SetParameters.Response(results=[SetParametersResult(successful=True, reason=json.dumps(said))])
@@ -51,3 +48,14 @@ def said_in(response: SetParameters.Response) -> dict[str, object]:
     """Return the content of a response."""
     said = json.loads(response.results[0].reason)
     return said if isinstance(said, dict) else {}
+
+
+def text_of(mask: Mask) -> str:
+    """Return a mask as text, for an answer."""
+    return base64.b64encode(zlib.compress(np.packbits(mask).tobytes())).decode()
+
+
+def mask_in(text: str) -> Mask:
+    """Return the mask that a text of ``text_of`` has."""
+    packed = np.frombuffer(zlib.decompress(base64.b64decode(text)), dtype=np.uint8)
+    return np.unpackbits(packed).reshape(SHAPE).astype(np.bool_)

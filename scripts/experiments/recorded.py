@@ -1,9 +1,9 @@
-"""Waits of servers that compute nothing, drawn from recorded planning runs.
+"""Waits of servers that compute nothing, drawn from recorded runs of planners and of a network.
 
-Sans-I/O, but for reading the recording. Each run of ``RRTConnect`` is a pair. ``record.py`` writes the number of states
-that the run checked, and its processor time. The number is proportional to the time of the run on an idle machine.
-Where the number is 0 it was not counted: the second number is then the time on such a machine (the computed trials of
-figure 5).
+Sans-I/O, but for reading the recordings. Each run of ``RRTConnect`` is a pair. ``record.py`` writes the number of
+states that the run checked, and its processor time. The number is proportional to the time of the run on an idle
+machine. Where the number is 0 it was not counted: the second number is then the time on such a machine (the computed
+trials of figure 5). Of a run of DBNet there is only the processor time (``record_segmentation.py``).
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ from pathlib import Path
 from statistics import fmean
 from typing import Final
 
-__all__ = ["LIMIT_S", "RECORDED", "RECORDING", "Recorded", "draw", "load"]
+__all__ = ["LIMIT_S", "RECORDED", "RECORDING", "SEGMENTATION", "Recorded", "draw", "load", "segmentation_runs"]
 
 RECORDING: Final = Path(__file__).with_name("planning_runs.json")
+SEGMENTATION: Final = Path(__file__).with_name("segmentation_runs.json")
 LIMIT_S: Final = 100.0  # the paper's timeout
 
 
@@ -51,6 +52,11 @@ def load(path: Path = RECORDING) -> dict[str, list[float]]:
         scale = RECORDED[name].mean_s / fmean(counted) if counted else 0.0
         found[name] = [min(scale * checks if checks else seconds, LIMIT_S) for checks, seconds in runs]
     return found
+
+
+def segmentation_runs() -> list[float]:
+    """Return the processor time of each recorded run of DBNet, in seconds."""
+    return [float(seconds) for seconds in json.loads(SEGMENTATION.read_text(encoding="utf-8"))]
 
 
 def draw(runs: list[float], faster: float, count: int, chance: random.Random) -> list[float]:

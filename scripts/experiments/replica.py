@@ -5,7 +5,7 @@ Process of its own, started by ``field.py`` on a machine: ``replica.py ROLE SETT
 ``plan`` and ``replay`` serve ``nav_msgs/srv/GetPlan``. The request's start names the problem in its ``frame_id``; an
 unknown problem is answered at once, without a path. The stamp of its goal holds the number of the request in seconds.
 The answer's header names the machine, and its stamp is the computing time. Both stop when the service's ``/stop`` is
-called (``std_srvs/srv/Trigger``). ``detect``, ``segment``, ``light`` and ``tag`` serve what ``image_request.py``
+called (``std_srvs/srv/Trigger``). ``detect``, ``segment``, ``count`` and ``tag`` serve what ``image_request.py``
 describes, one request at a time.
 """
 
@@ -26,7 +26,7 @@ import bench_path  # noqa: F401 - finds ``peers``
 import rclpy
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
-from image_request import answer_of, frame_of
+from image_request import answer_of, frame_of, text_of
 from nav_msgs.srv import GetPlan
 from peers.jsonl import say
 from rcl_interfaces.srv import SetParameters
@@ -34,10 +34,9 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.node import Node
 from std_srvs.srv import Trigger
-from vision import Grey
+from vision import Grey, Networks, count_words
 
 _THREADS: Final = 32
-_COARSE: Final = 4
 Settings = Mapping[str, object]
 
 
@@ -136,29 +135,25 @@ def _look(node: Node, settings: Settings, see: Callable[[Grey], Mapping[str, obj
 
 
 def _detect(node: Node, settings: Settings) -> None:
-    from vision import find_objects
-
-    _look(node, settings, lambda frame: {"found": find_objects(frame)})
+    networks = Networks()
+    _look(node, settings, lambda frame: {"found": networks.detect(frame)})
 
 
 def _segment(node: Node, settings: Settings) -> None:
-    from vision import count_regions
+    networks = Networks()
+    _look(node, settings, lambda frame: {"mask": text_of(networks.segment(frame))})
 
-    _look(node, settings, lambda frame: {"regions": count_regions(frame)})
 
-
-def _light(node: Node, settings: Settings) -> None:
-    """Segment coarsely, and wait for the rest of the request's time, as if another processor worked."""
-    from vision import count_regions
-
+def _count(node: Node, settings: Settings) -> None:
+    """Count words without a network, and wait for the rest of the request's time, as if another processor worked."""
     times = settings["takes_s"]
     takes_s = itertools.cycle(times if isinstance(times, list) else [])
 
     def see(frame: Grey) -> dict[str, object]:
         done_s = time.monotonic() + next(takes_s)
-        regions = count_regions(frame, _COARSE)
+        words = count_words(frame)
         time.sleep(max(done_s - time.monotonic(), 0))
-        return {"regions": regions}
+        return {"words": words}
 
     _look(node, settings, see)
 
@@ -180,7 +175,7 @@ _ROLES: Final[Mapping[str, Callable[[Node, Settings], object]]] = {
     "replay": _Replay,
     "detect": _detect,
     "segment": _segment,
-    "light": _light,
+    "count": _count,
     "tag": _tag,
 }
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final, Protocol, TypeAlias
 
-from image_request import request_of, said_in
+from image_request import mask_in, request_of, said_in
 from nav_msgs.srv import GetPlan
 from rcl_interfaces.srv import SetParameters
 from vision import Scene
@@ -73,16 +73,13 @@ class Plan:
         return Judged(head.frame_id, head.stamp.sec + head.stamp.nanosec * _NANO, count > 0, count)
 
 
-class Detect:
-    """Request for the positions of the objects of a scene; right is each of them and nothing else.
-
-    Note: their number.
-    """
+class Look:
+    """Request for what a scene shows; ``is_right`` judges an answer. Note: the number of words."""
 
     kind = SetParameters
 
-    def __init__(self, problem: str) -> None:
-        del problem
+    def __init__(self, is_right: Callable[[Mapping[str, object], Scene], bool]) -> None:
+        self._is_right = is_right
         self._scenes = [Scene.draw(seed) for seed in range(_FRAMES)]
 
     def request(self, number: int) -> Request:
@@ -92,18 +89,7 @@ class Detect:
     def judge(self, number: int, response: Response) -> Judged:
         """Return the value of an answer."""
         said, scene = said_in(response), self._scenes[number % _FRAMES]
-        found = said["found"]
-        is_right = isinstance(found, list) and scene.agrees([(row, column) for row, column in found])
-        return _judged(said, is_right=is_right, note=len(scene.centres))
-
-
-class Segment(Detect):
-    """Request for the number of regions of a scene; right is the number of objects drawn, which is also the note."""
-
-    def judge(self, number: int, response: Response) -> Judged:
-        """Return the value of an answer."""
-        said, count = said_in(response), len(self._scenes[number % _FRAMES].centres)
-        return _judged(said, is_right=said["regions"] == count, note=count)
+        return _judged(said, is_right=self._is_right(said, scene), note=len(scene.words))
 
 
 class Tag:
@@ -138,8 +124,9 @@ class Tag:
 
 TASKS: Final[Mapping[str, Callable[[str], Task]]] = {
     "plan": Plan,
-    "detect": Detect,
-    "segment": Segment,
+    "detect": lambda _: Look(lambda said, scene: scene.agrees(said["found"])),
+    "segment": lambda _: Look(lambda said, scene: scene.is_covered(mask_in(str(said["mask"])))),
+    "count": lambda _: Look(lambda said, scene: said["words"] == len(scene.words)),
     "tag": Tag,
 }
 

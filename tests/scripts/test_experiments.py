@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import json
 import os
@@ -55,37 +56,135 @@ def test_a_failed_request_counts_with_the_time_that_it_cost() -> None:
     assert (summary.count, summary.failed, summary.mean_s, summary.worst_s) == (2, 1, 5.0, 9.0)
 
 
-def test_what_is_drawn_is_found_and_counted() -> None:
-    needs("scipy")
-    from vision import Scene, count_regions, find_objects
+def test_the_networks_read_the_drawn_words_and_cover_them() -> None:
+    needs("scipy", "rapidocr_onnxruntime")
+    from vision import Networks, Scene
 
+    networks = Networks()
     for seed in range(3):
         scene = Scene.draw(seed)
-        assert scene.agrees(find_objects(scene.frame))
-        assert count_regions(scene.frame) == count_regions(scene.frame, 4) == len(scene.centres)
+        assert scene.agrees(networks.detect(scene.frame))
+        assert scene.is_covered(networks.segment(scene.frame))
 
 
-def test_an_object_too_many_or_elsewhere_is_wrong() -> None:
+def test_the_networks_find_nothing_where_nothing_is_drawn() -> None:
+    needs("scipy", "rapidocr_onnxruntime")
+    import numpy as np
+    from vision import SHAPE, Networks
+
+    networks, ground = Networks(), np.full(SHAPE, 70, np.uint8)
+    assert networks.detect(ground) == []
+    assert not networks.segment(ground).any()
+
+
+def test_words_are_counted_without_a_network() -> None:
+    needs("scipy")
+    from vision import Scene, count_words
+
+    for seed in range(24):
+        scene = Scene.draw(seed)
+        assert count_words(scene.frame) == len(scene.words)
+
+
+def test_a_word_too_many_or_too_few_or_elsewhere_or_another_is_wrong() -> None:
     needs("scipy")
     from vision import Scene
 
     scene = Scene.draw(1)
-    found = list(scene.centres)
+    found = list(scene.words)
     assert scene.agrees(found)
-    assert not scene.agrees([*found, (5, 5)])
-    assert not scene.agrees([(row + 10, column) for row, column in found])
+    assert not scene.agrees([*found, ("ROBOT", (5, 5, 25, 90))])
+    assert not scene.agrees(found[1:])
+    assert not scene.agrees([("R0BOT", box) for _, box in found])
+    assert not scene.agrees(
+        [(word, (top + 10, left, bottom + 10, right)) for word, (top, left, bottom, right) in found]
+    )
+
+
+def test_a_mask_with_a_region_too_many_or_too_few_or_a_part_of_each_is_wrong() -> None:
+    needs("scipy")
+    import numpy as np
+    from vision import SHAPE, Scene
+
+    scene = Scene.draw(1)
+    drawn = np.zeros(SHAPE, np.bool_)
+    part = drawn.copy()
+    for _, (top, left, bottom, right) in scene.words:
+        drawn[top:bottom, left:right] = True
+        part[top:bottom, left : (2 * left + right) // 3] = True
+    assert scene.is_covered(drawn)
+    assert not scene.is_covered(part)
+    more, less = drawn.copy(), drawn.copy()
+    more[0, 0] = True
+    top, left, bottom, right = scene.words[0][1]
+    less[top:bottom, left:right] = False
+    assert not scene.is_covered(more)
+    assert not scene.is_covered(less)
+
+
+def test_an_answer_is_judged_by_what_the_task_asked_for() -> None:
+    needs("scipy", "rcl_interfaces")
+    import numpy as np
+    from image_request import answer_of, text_of
+    from tasks import TASKS
+    from vision import SHAPE, Scene
+
+    words = Scene.draw(3).words
+    mask = np.zeros(SHAPE, np.bool_)
+    for _, (top, left, bottom, right) in words:
+        mask[top:bottom, left:right] = True
+    answers: dict[str, tuple[dict[str, object], dict[str, object]]] = {
+        "detect": ({"found": [*words]}, {"found": [*words[1:]]}),
+        "segment": ({"mask": text_of(mask)}, {"mask": text_of(~mask)}),
+        "count": ({"words": len(words)}, {"words": 0}),
+    }
+    for name, both in answers.items():
+        task = TASKS[name]("")
+        judged = [task.judge(3, answer_of({"machine": "m1", "worked_s": 0.1, **said})) for said in both]
+        assert [each.is_right for each in judged] == [True, False], name
+
+
+@pytest.mark.parametrize("figure", ["fig6", "fig7"])
+def test_a_figure_that_computes_refuses_without_the_networks(
+    figure: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    needs("scipy", "rcl_interfaces", "matplotlib")
+    import vision
+    from experiment import command_line, run_experiment
+
+    monkeypatch.setattr(vision, "find_spec", lambda _: None)
+    parser = command_line("")
+    parser.add_argument("--compute", action="store_true")
+    parser.set_defaults(requests=2, computed=2)
+    with pytest.raises(SystemExit) as ended:
+        run_experiment(parser, importlib.import_module(figure).measure, ["--quick", "--compute"])
+    assert ended.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "rapidocr_onnxruntime is not installed: pip install" in line
+
+
+def test_the_waits_of_figure_six_are_recorded_runs_of_the_network() -> None:
+    needs("scipy", "rcl_interfaces", "matplotlib")
+    from fig6 import REQUESTS, _times
+    from recorded import segmentation_runs
+
+    one, other = _times().values()
+    assert len(segmentation_runs()) >= REQUESTS
+    assert {*one, *other} <= {*segmentation_runs()}
+    assert one != other
 
 
 def test_a_frame_comes_through_its_carrier_unchanged() -> None:
     needs("scipy", "rcl_interfaces")
-    from image_request import answer_of, frame_of, number_of, request_of, said_in
+    from image_request import answer_of, frame_of, mask_in, request_of, said_in, text_of
     from vision import Scene
 
     frame = Scene.draw(2).frame
     request = request_of(frame, 7)
     assert (frame_of(request) == frame).all()
-    assert number_of(request) == 7
+    assert request.parameters[0].name == "7"
     assert said_in(answer_of({"machine": "m1"})) == {"machine": "m1"}
+    assert (mask_in(text_of(frame > 100)) == (frame > 100)).all()
 
 
 def test_a_drawn_tag_is_found_where_it_is() -> None:
