@@ -117,6 +117,7 @@ def _network(name: str, rounds: int, *, quick: bool, is_limited: bool) -> dict[s
                 orders |= {"at_once": at_once, "count": at_once + computed}
                 size = _trip(row, found[who], orders, at_once, direct=who not in ENCODINGS)
     return {
+        "over": "the ring of three domains",
         "cores": cores,
         "request_bytes": size,
         "rounds": rounds,

@@ -5,7 +5,6 @@ Sans-I/O, but for the picture's file.
 
 from __future__ import annotations
 
-import json
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,12 +14,24 @@ from typing import Any, Final
 from machine import MachineState
 from report import markdown_table, percentile
 
-__all__ = ["CDR", "CYCLONE", "FAST", "JSON", "PAPER", "PAPER_ADDED_S", "added_s", "page_of", "save_picture", "seconds_text"]
+__all__ = [
+    "CDR",
+    "CYCLONE",
+    "FAST",
+    "JSON",
+    "PAPER",
+    "PAPER_ADDED_S",
+    "added_s",
+    "page_of",
+    "save_picture",
+    "seconds_text",
+]
 
 CYCLONE: Final = "ROS 2, Cyclone DDS"
 FAST: Final = "ROS 2, Fast DDS"
 JSON: Final = "overlay, JSON"
 CDR: Final = "overlay, CDR"
+_MISSING: Final = "not measured"
 _CELLS: Final = ("network", "total")
 _SHOWN: Final = (CYCLONE, JSON, CDR)  # in Table I
 _COLOURS: Final = {CYCLONE: "#99a8b2", FAST: "#5d6b75", JSON: "#7fb3c4", CDR: "#1f6f8b"}
@@ -74,8 +85,8 @@ def page_of(document: Document) -> str:
     parts = [
         "# FogROS G: Table I and Figure 5",
         "A robot computes three tasks by itself, or sends them to a server. Both ends are nodes of ROS 2. Five switches"
-        " in three trust domains carry the overlay: the [ring](../tutorials/the-ring.md), with the robot at `nuc1` and"
-        " the server at `nuc5`. *JSON* is the paper's encoding and the default one; *CDR* is that of ROS 2.",
+        " in three trust domains carry the overlay: the [ring](../tutorials/first-ring.md), with the robot at `nuc1`"
+        " and the server at `nuc5`. *JSON* is the paper's encoding and the default one; *CDR* is that of ROS 2.",
         "*Network* is one way, as in the paper. *There* is from the robot's first `publish` to the server's callback"
         " with the last part of the request. *Back* is from the computed answer to its arrival at the robot. *Total* is"
         " from the first `publish` to the answer at the robot, computing included.",
@@ -105,16 +116,17 @@ def save_picture(path: Path, document: Document) -> None:
     if not networks:
         return
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.6), layout="constrained")
-    for at, (who, colour) in enumerate(_COLOURS.items()):
+    shown = [who for who in _COLOURS if all(who in network["contenders"] for network in networks.values())]
+    for at, who in enumerate(shown):
         times = [1e3 * statistics.median(network["contenders"][who]["there_s"]) for network in networks.values()]
         places = [place + (at - 1.5) * 0.21 for place in range(len(networks))]
-        left.bar(places, times, 0.19, color=colour, label=who)
+        left.bar(places, times, 0.19, color=_COLOURS[who], label=who)
     names = list(networks)
     paper = [1e3 * PAPER[name].network_s for name in names]
     left.plot(range(len(names)), paper, "_", ms=30, color="#c96f3b", label="FogROS G, the paper")
     left.set_xticks(range(len(names)), names, fontsize=8)
     left.set_title("network, one way, ms (median)", loc="left", fontsize=10)
-    for at, who in enumerate((JSON, CDR)):
+    for at, who in enumerate(each for each in (JSON, CDR) if each in shown):
         added = [found for network in networks.values() if (found := added_s(network, who, CYCLONE))]
         spread = [[1e3 * (a - low) for a, low, _ in added], [1e3 * (high - a) for a, _, high in added]]
         places = [place + (at - 0.5) * 0.4 for place in range(len(names))]
@@ -129,22 +141,22 @@ def save_picture(path: Path, document: Document) -> None:
 
 def _rows(name: str, task: Document) -> list[tuple[str, ...]]:
     paper = PAPER[name]
-    overlay = (f"{paper.network_s:g}", f"{paper.total_s:g}")
-    rows = [(name, "paper", f"{paper.alone_s:g}", f"{paper.ros_network_s:g}", f"{paper.ros_total_s:g}", *overlay, "", "")]
+    theirs = (paper.alone_s, paper.ros_network_s, paper.ros_total_s, paper.network_s, paper.total_s)
     mark = "".join(dict.fromkeys(MachineState(**part["machine"]).mark for part in task.values()))
     contenders = task["network"]["contenders"] if "network" in task else {}
     found = [contenders.get(who) for who in _SHOWN]
-    alone = "not measured"
+    alone = _MISSING
     if "alone" in task:
         cores = task["alone"]["cores"]
-        alone = f"{_text(task['alone']['took_s'])}, {_share_text(cores)}"
-    there = [_text(each[key]) if each else "not measured" for each in found for key in ("there_s", "total_s")]
-    back = [cell for each in found for cell in (_text(each["back_s"]) if each else "not measured", "")]
-    return [*rows, ("", f"here, there{mark}", alone, *there), ("", f"here, back{mark}", "", *back)]
-
-
-def _share_text(cores: float) -> str:
-    return "one core" if cores == 1 else f"1/{1 / cores:.0f} of a core"
+        share = "one core" if cores == 1 else f"1/{1 / cores:.0f} of a core"
+        alone = f"{_text(task['alone']['took_s'])}, {share}"
+    there = [_text(each[key]) if each else _MISSING for each in found for key in ("there_s", "total_s")]
+    back = [cell for each in found for cell in (_text(each["back_s"]) if each else _MISSING, "")]
+    return [
+        (name, "paper", *(f"{each:g}" for each in theirs), "", ""),
+        ("", f"here, there{mark}", alone, *there),
+        ("", f"here, back{mark}", "", *back),
+    ]
 
 
 def _figure5(networks: Document) -> list[str]:
@@ -152,13 +164,13 @@ def _figure5(networks: Document) -> list[str]:
     added = {name: [added_s(network, *pair) for pair in pairs] for name, network in networks.items()}
     rows = []
     for name, network in networks.items():
-        cells = [f"{each[0]:.4f} ({each[1]:.4f} to {each[2]:.4f})" if each else "not measured" for each in added[name]]
+        cells = [f"{each[0]:.4f} ({each[1]:.4f} to {each[2]:.4f})" if each else _MISSING for each in added[name]]
         paper_s = PAPER[name].network_s - PAPER[name].ros_network_s
         rows.append((name, f"{network['request_bytes']:,}", *cells, f"{paper_s:.3f}"))
     means = []
     for column in zip(*added.values(), strict=True):
         middles = [each[0] for each in column if each]
-        means.append(f"{statistics.fmean(middles):+.4f}" if len(middles) == len(PAPER) else "not measured")
+        means.append(f"{statistics.fmean(middles):+.4f}" if len(middles) == len(PAPER) else _MISSING)
     rows.append(("mean of the tasks", "", *means, f"{PAPER_ADDED_S:+g}"))
     head = ("scenario", "request, bytes", *(f"{overlay} less {other}" for overlay, other in pairs), "paper")
     text = (
@@ -178,7 +190,7 @@ def _details(networks: Document) -> list[str]:
     head = ("scenario", "", "there", "back", "computed", "total", "wrong answers")
     trials = "; ".join(
         f"{name}: {each['rounds']} rounds, {each['answered_at_once']} requests answered at once (there, back) and"
-        f" {each['computed']} computed (computed, total)"
+        f" {each['computed']} computed (computed, total), the overlay over {each['over']}, {_cores_text(each)}"
         for name, each in networks.items()
     )
     return [markdown_table(head, rows), f"Of each contender: {trials}."]
@@ -198,8 +210,8 @@ def _notes(tasks: Document, slower: Mapping[str, float]) -> list[str]:
         " result; the times are measured. Where the paper's robot was the faster one (vSLAM) ours has a whole core, as"
         " the server has.",
         "The paper used five NUCs. Here all machines are network namespaces of one. It shares its cores among"
-        f" robot, switches, proxies and server. {_cores_text(tasks)} Links are veth pairs, without the time of a cable, and the switches forward in the"
-        " kernel.",
+        " robot, switches, proxies and server; `--cores` bounds each. Links are veth pairs, without the time of a"
+        " cable, and the switches forward in the kernel.",
         "Of Cyclone DDS there is no wheel for rclpy: its nodes serialise by rclpy and carry by this project's endpoint"
         " `dds`, without the overlay.",
     ]
@@ -208,14 +220,10 @@ def _notes(tasks: Document, slower: Mapping[str, float]) -> list[str]:
     return notes
 
 
-def _cores_text(tasks: Document) -> str:
-    """Return by which bound of processor time the machines of the network were measured."""
-    bounds = {json.dumps(task["network"].get("cores")) for task in tasks.values() if "network" in task}
-    limited = [bound for bound in bounds if bound != "null"]
-    if not limited:
-        return "No machine is limited (`--cores` gives the robot two cores' worth and each edge server four)."
-    cores = ", ".join(f"{node} {count}" for node, count in json.loads(limited[0]).items())
-    return f"`--cores` limits them by control groups, in cores: {cores}" + ("." if len(bounds) == 1 else "; not each task.")
+def _cores_text(network: Document) -> str:
+    if network["cores"] is None:
+        return "machines share all cores"
+    return "cores by control groups: " + ", ".join(f"{node} {count}" for node, count in network["cores"].items())
 
 
 def _text(values: Sequence[float]) -> str:

@@ -181,7 +181,7 @@ def _offload(document: Any) -> Iterator[Row]:
         ):
             if (found := task["network"]["contenders"].get(who)) is None:
                 continue
-            hops = "three bridges" if who == CYCLONE else "the ring of three domains"
+            hops = "three bridges" if who == CYCLONE else task["network"]["over"]
             yield _seconds("G Table I", f"{name}: {who}, network one way", network_s, found["there_s"], hops)
             yield _seconds("G Table I", f"{name}: {who}, total", total_s, found["total_s"], f"{hops}; computed")
     for who in (JSON, CDR):
