@@ -227,8 +227,7 @@ def _notes(counts: Mapping[str, int], timeout_s: float) -> list[str]:
         " with each"
         " other, the robot and the overlay, and the planner calls back into Python for each check: gains of computed"
         " trials are less than those of two machines.",
-        "The paper's planner is not named in what is at hand; the gains depend on how heavy a planner's tail is. RRT"
-        " and KPIECE1 were tried in Cubicles, too: their tails are no heavier.",
+        "The paper's planner is not named in what is at hand; the gains depend on how heavy a planner's tail is.",
     ]
 
 
