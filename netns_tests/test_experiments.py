@@ -74,12 +74,14 @@ def test_an_experiment_that_computes_runs_to_its_page(name: str, run: Callable[[
     assert run(name)["experiment"] == name
 
 
-def test_a_task_is_computed_on_the_robot_and_beyond_three_switches_and_every_answer_is_right(
+def test_a_task_is_computed_on_the_robot_and_beyond_three_domains_in_either_encoding_and_every_answer_is_right(
     run: Callable[[str], dict[str, Any]],
 ) -> None:
     (task,) = run("offload")["tasks"].values()
     assert task["alone"]["failed"] == 0
-    for contender in task["network"]["contenders"].values():
+    contenders = task["network"]["contenders"]
+    assert {"overlay, JSON", "overlay, CDR"} <= contenders.keys()
+    for contender in contenders.values():
         assert contender["failed"] == 0
         assert len(contender["there_s"]) == 3
         assert len(contender["total_s"]) == 2

@@ -1,4 +1,4 @@
-"""Row of the benches with real ROS nodes: A - s1 - s2 - s3 - B, a proxy at either end, and a cable from A to B.
+"""Row of the benches with real ROS nodes: A and B, a proxy at either end, switches between, and a cable from A to B.
 
 I/O. Makes namespaces and keys, and starts the commands that robots run.
 ::
@@ -9,6 +9,8 @@ I/O. Makes namespaces and keys, and starts the commands that robots run.
 With ``bridged`` the direct path is as long as the other one: three more namespaces, each with a Linux bridge::
 
     a -- p1 -- p2 -- p3 -- b      direct
+
+The overlay may be the ring with its three trust domains instead, of which A is nuc1 and B is nuc5.
 
 A node is started ``direct`` or not. Direct nodes meet over the cable, in a ROS domain of their own. The others have a
 domain for each end, so that nothing but the proxies joins them, and reach their proxy inside their namespace.
@@ -21,7 +23,7 @@ then dominate the time. ROS 2's guide to tuning recommends the same.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -38,6 +40,7 @@ from topologies import LEFT, MIDDLE, RIGHT, ROW, flat_topology
 
 from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
+from gdp.simulation.topology import DomainPlan, Link, Topology
 from gdp.trust.right import Right
 from proxy.config.config import Encoding
 
@@ -80,13 +83,15 @@ class Carried:
 
 
 class Row:
-    """The row with switches, RIB and proxies running; a context manager that ends them.
+    """The row with switches, RIBs and proxies running; a context manager that ends them.
 
     Args:
         run: of which the namespaces are.
         carried: what the proxies carry.
-        mtu: of every device, the cable included.
+        mtu: of every device, the cable included; that of the ring is its own.
         bridged: whether the direct path leads through three bridges instead of one cable.
+        ring: the overlay in place of the row: A and B are its first and its last switch.
+        cores: of each machine of the ring; None: the machines share all cores.
         shared_memory: whether the processes of one machine share memory; else they use UDP there too.
 
     Raises:
@@ -95,23 +100,37 @@ class Row:
     """
 
     def __init__(
-        self, run: Run, carried: Sequence[Carried], *, mtu: int, bridged: bool = False, shared_memory: bool = True
+        self,
+        run: Run,
+        carried: Sequence[Carried],
+        *,
+        mtu: int,
+        bridged: bool = False,
+        ring: Topology | None = None,
+        cores: Mapping[str, int] | None = None,
+        shared_memory: bool = True,
     ) -> None:
-        direct = (LEFT, *(_BRIDGES if bridged else ()), RIGHT)
-        links = [*pairwise(ROW), *pairwise(direct)]
-        topology = flat_topology(links, mtu=mtu, rib="s2", members=(LEFT, RIGHT))
-        self._lab = Lab(run, topology, own_shared_memory=(LEFT, RIGHT) if shared_memory else ())
+        overlay = ring or flat_topology(pairwise(ROW), mtu=mtu, rib="s2", members=(LEFT, RIGHT))
+        switches = ring.nodes if ring else MIDDLE
+        self._machines = dict(zip((LEFT, RIGHT), (at.switch for at in overlay.attached("proxy")), strict=True))
+        bridges = _BRIDGES if bridged else ()
+        direct = (self._machines[LEFT], *bridges, self._machines[RIGHT])
+        cables = tuple(Link(a, b, mtu=mtu) for a, b in pairwise(direct))
+        domains = (*overlay.domains, *([DomainPlan("direct", bridges)] if bridges else []))
+        topology = Topology((*overlay.links, *cables), domains, overlay.attachments)
+        ends = tuple(self._machines.values())
+        self._lab = Lab(run, topology, own_shared_memory=ends if shared_memory else (), cores=cores)
         for before, node, after in zip(direct, direct[1:-1], direct[2:], strict=False):
             self._lab.inside(node, partial(add_bridge, _BRIDGE, (before, after)))
-        for node, device in ((LEFT, direct[1]), (RIGHT, direct[-2])):
-            self._lab.inside(node, partial(add_address, device, _ADDRESSES[node]))
+        for side, device in ((LEFT, direct[1]), (RIGHT, direct[-2])):
+            self._lab.inside(self._machines[side], partial(add_address, device, _ADDRESSES[side]))
         with ExitStack() as undo:
-            self._nodes = OverlayNodes(self._lab, MIDDLE, plane="kernel", ready_s=READY_S)
+            self._nodes = OverlayNodes(self._lab, switches, plane="kernel", ready_s=READY_S, overlay=overlay)
             undo.callback(self._nodes.close)
             proxies = []
-            for node in (LEFT, RIGHT):
-                argv = ["-m", "proxy.cli.proxy", "--config", self._admit(node, carried)]
-                environment = self._environment(node, _DOMAINS[node])
+            for side, node in self._machines.items():
+                argv = ["-m", "proxy.cli.proxy", "--config", self._admit(side, carried)]
+                environment = self._environment(node, _DOMAINS[side])
                 proxies.append(undo.enter_context(self._lab.start(node, "proxy", argv, environment)))
             for proxy in proxies:
                 proxy.read_line(READY_S)
@@ -124,14 +143,15 @@ class Row:
     def __exit__(self, *_: object) -> None:
         self._undo.close()
 
-    def node(self, node: str, module: str, role: str, *, direct: bool, **settings: object) -> Started:
+    def node(self, side: str, module: str, role: str, *, direct: bool, **settings: object) -> Started:
         """Start a ROS node at A or B: ``python -m module role settings``."""
-        return self.process(node, role, ["-m", module, role, json.dumps(settings)], direct=direct)
+        return self.process(side, role, ["-m", module, role, json.dumps(settings)], direct=direct)
 
-    def process(self, node: str, what: str, arguments: Sequence[str], *, direct: bool) -> Started:
+    def process(self, side: str, what: str, arguments: Sequence[str], *, direct: bool) -> Started:
         """Start a Python process with a ROS node at A or B."""
-        environment = self._environment(node, DIRECT_DOMAIN if direct else _DOMAINS[node])
-        return self._lab.start(node, what, arguments, [*environment, f"CYCLONEDDS_URI={_cyclone(node)}"])
+        node = self._machines[side]
+        environment = self._environment(node, DIRECT_DOMAIN if direct else _DOMAINS[side])
+        return self._lab.start(node, what, arguments, [*environment, f"CYCLONEDDS_URI={_cyclone(side)}"])
 
     def proxies_cpu_s(self) -> float:
         """Return the processor time that both proxies have used."""
@@ -140,20 +160,21 @@ class Row:
     def _environment(self, node: str, domain: int) -> list[str]:
         return ros_environment(self._nodes.files, domain, shared_memory=self._lab.has_shared_memory(node))
 
-    def _admit(self, node: str, carried: Sequence[Carried]) -> str:
+    def _admit(self, side: str, carried: Sequence[Carried]) -> str:
         """Give a proxy the delegations of its side, and write its configuration; return the file."""
+        node = self._machines[side]
         sides: dict[str, list[dict[str, object]]] = {"expose": [], "import": []}
         for each in carried:
-            is_source = each.source == node
+            is_source = each.source == side
             self._nodes.admit(node, each.metadata, _RIGHTS[each.kind][not is_source])
             sides["expose" if is_source else "import"].append(each.rule(self._nodes.owner_key))
-        return str(self._nodes.admit_proxy(node, _DOMAINS[node], sides))
+        return str(self._nodes.admit_proxy(node, _DOMAINS[side], sides))
 
 
-def _cyclone(node: str) -> str:
+def _cyclone(side: str) -> str:
     """Return the configuration of Cyclone DDS for a direct node: interface, and socket buffers as the others have."""
     return (
-        f'<CycloneDDS><Domain id="any"><General><Interfaces><NetworkInterface address="{_ADDRESSES[node]}"/>'
+        f'<CycloneDDS><Domain id="any"><General><Interfaces><NetworkInterface address="{_ADDRESSES[side]}"/>'
         f'</Interfaces></General><Internal><SocketReceiveBufferSize max="{BUFFER_BYTES}B"/></Internal></Domain>'
         "</CycloneDDS>"
     )

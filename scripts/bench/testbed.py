@@ -25,8 +25,9 @@ from gdp.metadata import Metadata
 from gdp.simulation.namespaces import Namespaces
 from gdp.simulation.topology import Topology
 from gdp.stores.issue import delegate, install_delegation
-from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE
+from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC
 from gdp.trust.right import Right
+from ring.cores import MachineCores
 from ring.credentials import OverlayCredentials
 from ring.plan import METRICS_PORTS
 
@@ -39,6 +40,7 @@ class Lab:
     Args:
         priorities: SCHED_FIFO priority by the first word of a process's name; empty: the ordinary scheduler.
         own_shared_memory: these machines have a ``/dev/shm`` each; the others see the one of the host.
+        cores: bound of processor time by machine; None: the machines share all cores.
 
     Raises:
         LocalError: the kernel refuses.
@@ -51,6 +53,7 @@ class Lab:
         *,
         priorities: Mapping[str, int] | None = None,
         own_shared_memory: Sequence[str] = (),
+        cores: Mapping[str, int] | None = None,
     ) -> None:
         self.run = run
         self.directory = run.directory
@@ -58,6 +61,7 @@ class Lab:
         self.namespaces = Namespaces(topology, run)
         self._priorities = priorities or {}
         self._memories = {node: SharedMemory(run, node) for node in own_shared_memory}
+        self._cores = MachineCores(run, dict(cores)) if cores else None
 
     def has_shared_memory(self, node: str) -> bool:
         """Return whether a machine has a ``/dev/shm`` of its own."""
@@ -88,18 +92,21 @@ class Lab:
         started = Started(self.run, f"{what} at {node}", command, arguments, has_orders=has_orders)
         if (priority := self._priorities.get(what)) is not None:
             os.sched_setscheduler(started.pid, os.SCHED_FIFO, os.sched_param(priority))
+        if self._cores is not None:
+            self._cores.add(node, started.pid)
         return started
 
 
 class OverlayNodes:
-    """Switches and RIB of a lab, running, with keys of their own; a context manager that ends them.
+    """Switches and RIBs of a lab, running, with keys of their own; a context manager that ends them.
 
     Args:
-        members: nodes without a switch.
-        switches: nodes with one, in the order in which they start.
+        switches: nodes with one, in the order in which they start. A member at one of them is attached to it; another
+            member is joined to its switch by a link.
         plane: as ``gdp-switch --data-plane``; any but ``auto`` must be the one that the switch takes.
         label: of the folder with keys; one lab may have several in turn.
         metrics: every node serves them, at the ports of the ring.
+        overlay: the lab's topology without what is no part of the overlay; None: all of it is.
 
     Raises:
         FailedError: a process did not come up.
@@ -114,12 +121,14 @@ class OverlayNodes:
         ready_s: float = 20.0,
         label: str = "keys",
         metrics: bool = False,
+        overlay: Topology | None = None,
     ) -> None:
         self.lab = lab
+        self._topology = overlay or lab.topology
         number = sum(1 for _ in lab.directory.glob(f"{label}-*"))
         self.files = lab.directory / f"{label}-{number}"
         self.files.mkdir(mode=0o700)
-        credentials = OverlayCredentials(lab.topology, self.files, metrics=metrics)
+        self._credentials = credentials = OverlayCredentials(self._topology, self.files, metrics=metrics)
         self._switch_nodes = tuple(switches)
         self.planes: set[str] = set()
         self.undo = ExitStack()
@@ -135,15 +144,15 @@ class OverlayNodes:
                 if plane != "auto" and not taken.startswith(plane):
                     raise FailedError(f"the switch took the data plane {taken} instead of {plane}")
                 self.planes.add(taken)
-            (at,) = lab.topology.attached("rib")
-            rib = ["-m", "gdp.cli.rib", "--json", "--config", str(credentials.rib(at))]
-            undo.enter_context(lab.start(at.switch, "rib", rib)).read(ready_s)
+            for at in self._topology.attached("rib"):
+                rib = ["-m", "gdp.cli.rib", "--json", "--config", str(credentials.rib(at))]
+                undo.enter_context(lab.start(at.switch, "rib", rib)).read(ready_s)
             self.undo = undo.pop_all()
 
     def metrics_urls(self) -> dict[str, list[str]]:
         """Return the addresses of the nodes' metrics by machine; to be read from within the machine."""
-        (at,) = self.lab.topology.attached("rib")
-        roles = {node: ["switch", *(["rib"] if node == at.switch else [])] for node in self._switch_nodes}
+        ribs = {at.switch for at in self._topology.attached("rib")}
+        roles = {node: ["switch", *(["rib"] if node in ribs else [])] for node in self._switch_nodes}
         return {node: [f"http://127.0.0.1:{METRICS_PORTS[role]}" for role in each] for node, each in roles.items()}
 
     def close(self) -> None:
@@ -177,9 +186,11 @@ class OverlayNodes:
         return self.files / "nodes" / f"proxy-{node}"
 
     def _member(self, node: str) -> dict[str, object]:
-        iface = next(self.lab.topology.links_of(node)).other(node)
-        root = str(self.files / "domains" / self.lab.topology.domain_of(node).label / ROOT_CERTIFICATE)
-        return {"identity": str(self._identity(node)), "domain": {"root": root}, "iface": iface}
+        if node in self._switch_nodes:
+            (iface,) = (at.ifname for at in self._topology.attached("proxy") if at.switch == node)
+        else:
+            iface = next(self._topology.links_of(node)).other(node)
+        return {**self._credentials.of_proxy(node).to_yaml(), "iface": iface}
 
     def _write(self, name: str, content: Mapping[str, object]) -> Path:
         path = self.files / name

@@ -4,8 +4,9 @@
     sudo .venv/bin/python scripts/experiments/offload.py --quick       # a few seconds: does it work?
     sudo .venv/bin/python scripts/experiments/offload.py --task vSLAM --part network     # a piece; the rest is kept
 
-Robot and server are nodes of ROS 2. Between them are three machines, which are switches of the overlay or, for the
-unsecured ROS 2, Linux bridges (``scripts/bench/ros_row.py``). ``offload_tasks.py`` describes the tasks.
+Robot and server are nodes of ROS 2 on the first and the last machine of the ring, with its three trust domains. The
+unsecured ROS 2 takes as many links over Linux bridges (``scripts/bench/ros_row.py``). ``offload_tasks.py`` describes
+the tasks.
 """
 
 from __future__ import annotations
@@ -22,16 +23,19 @@ from typing import Final
 from bench_path import ROOT
 from experiment import OUTPUT, Computed, Options, command_line, run_experiment
 from machine import machine_state
-from offload_page import page_of, save_picture
+from offload_page import CDR, CYCLONE, FAST, JSON, page_of, save_picture
 from peers.process import Started
 from report import progress
 from ros_row import DIRECT_DOMAIN, LEFT, READY_S, RIGHT, Carried, Row
 from skeleton import new_run
 
 from gdp.host.cgroups import Cgroup
+from gdp.simulation.topology import ring5
+from proxy.config.config import Encoding
+from ring.cores import CORES_HELP, cores_of
 
-OVERLAY: Final = "overlay"
-BASELINES: Final = {"ROS 2, Cyclone DDS": "cyclone", "ROS 2, Fast DDS": "fast", OVERLAY: "fast"}
+CONTENDERS: Final = {CYCLONE: "cyclone", FAST: "fast", JSON: "fast", CDR: "fast"}  # with the middleware of its ends
+ENCODINGS: Final[Mapping[str, Encoding]] = {JSON: "json", CDR: "cdr"}
 ROUNDS: Final = 3
 AT_ONCE: Final = 34  # requests a round that are answered without computing: the network alone
 COMPUTED: Final = {"vSLAM": 34, "grasp planning": 34, "motion planning": 1}  # requests a round that are computed
@@ -52,7 +56,7 @@ _ALONE_S: Final = 1_100.0
 
 @dataclass(slots=True)
 class Measured:
-    """Times of one baseline, in seconds, a value a request. ``failed``: answers that were wrong."""
+    """Times of one contender, in seconds, a value a request. ``failed``: answers that were wrong."""
 
     there_s: list[float] = field(default_factory=list)
     back_s: list[float] = field(default_factory=list)
@@ -63,7 +67,7 @@ class Measured:
 
 
 def measure(options: Options) -> Computed:
-    """Compute three tasks on the robot, and on a server behind three switches."""
+    """Compute three tasks on the robot, and on a server at the other end of the ring."""
     from offload_tasks import TASKS
 
     quick: bool = options.quick
@@ -78,7 +82,8 @@ def measure(options: Options) -> Computed:
         machine = {"machine": asdict(machine_state())}
         figures = tasks.setdefault(name, {})
         if options.part != "alone":
-            figures["network"] = _network(name, 1 if quick else options.rounds, quick=quick) | machine
+            rounds = 1 if quick else options.rounds
+            figures["network"] = _network(name, rounds, quick=quick, is_limited=options.cores) | machine
         if options.part != "network":
             figures["alone"] = _alone(name, quick=quick) | machine
     document = {"slower": SLOWER, "tasks": tasks}
@@ -87,25 +92,33 @@ def measure(options: Options) -> Computed:
     return Computed("offload", title, document, page, lambda: print(page), lambda at, _: save_picture(at, document))
 
 
-def _network(name: str, rounds: int, *, quick: bool) -> dict[str, object]:
-    """Let every baseline carry a task, in turn, round by round."""
+def _network(name: str, rounds: int, *, quick: bool, is_limited: bool) -> dict[str, object]:
+    """Let every contender carry a task, in turn, round by round."""
     from offload_tasks import TASKS
 
     shape = TASKS[name]()
     prefix = f"/{name.replace(' ', '_').lower()}/"
-    carried = [Carried(prefix + topic, type_name, "cdr") for topic, type_name in shape.parts]
-    carried.append(Carried(prefix + shape.answer[0], shape.answer[1], "cdr", source=RIGHT))
+    carried = []
+    for encoding in ENCODINGS.values():
+        carried += [Carried(f"{prefix}{encoding}/{topic}", kind, encoding) for topic, kind in shape.parts]
+        topic, kind = shape.answer
+        carried.append(Carried(f"{prefix}{encoding}/{topic}", kind, encoding, source=RIGHT))
     at_once, computed = (3, 2) if quick else (AT_ONCE, COMPUTED[name])
-    found = {who: Measured() for who in BASELINES}
+    found = {who: Measured() for who in CONTENDERS}
     size = 0
-    with new_run() as run, Row(run, carried, mtu=MTU, bridged=True) as row:
+    ring = ring5(MTU)
+    cores = cores_of(ring) if is_limited else None
+    with new_run() as run, Row(run, carried, mtu=MTU, bridged=True, ring=ring, cores=cores) as row:
         for at in range(1, rounds + 1):
-            for who, middleware in BASELINES.items():
+            for who, middleware in CONTENDERS.items():
                 progress(f"{name}, round {at} of {rounds}: {who}")
-                orders = {"task": name, "prefix": prefix, "middleware": middleware, "domain": DIRECT_DOMAIN}
+                topics = f"{prefix}{ENCODINGS.get(who, 'direct')}/"
+                orders = {"task": name, "prefix": topics, "middleware": middleware, "domain": DIRECT_DOMAIN}
                 orders |= {"at_once": at_once, "count": at_once + computed}
-                size = _trip(row, found[who], orders, at_once, direct=who != OVERLAY)
+                size = _trip(row, found[who], orders, at_once, direct=who not in ENCODINGS)
     return {
+        "over": "the ring of three domains",
+        "cores": cores,
         "request_bytes": size,
         "rounds": rounds,
         "answered_at_once": rounds * at_once,
@@ -184,4 +197,5 @@ if __name__ == "__main__":
     parser.add_argument("--task", action="append", choices=list(COMPUTED), help="may be repeated (default: all three)")
     parser.add_argument("--part", choices=("network", "alone", "both"), default="both", help="(default: %(default)s)")
     parser.add_argument("--rounds", type=int, default=ROUNDS, help="(default: %(default)s)")
+    parser.add_argument("--cores", action="store_true", help=CORES_HELP)
     run_experiment(parser, measure)

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import configparser
 import io
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import count
 from pathlib import Path
 from typing import Final, NamedTuple, TypeAlias
 
@@ -73,13 +73,16 @@ class Problem:
         vertices, faces = _mesh(robot)
         return cls((vertices - vertices.mean(axis=0), faces), _mesh(world), start, goal, low, high)
 
-    def solve(self, planner: str, patience_s: float, is_over: Callable[[], bool]) -> Solved:
+    def solve(
+        self, planner: str, patience_s: float, is_over: Callable[[], bool], most_checks: float = math.inf
+    ) -> Solved:
         """Search for a path.
 
         Args:
             planner: its class in ``ompl.geometric``, such as ``RRTConnect``.
             patience_s: limit of the search, in seconds.
             is_over: polled during the search; whether the path is no longer wanted.
+            most_checks: limit of the search, in states; it does not depend on other load of the machine.
         """
         space = base.SE3StateSpace()
         bounds = base.RealVectorBounds(3)
@@ -88,7 +91,7 @@ class Problem:
             bounds.setHigh(axis, self.high[axis])
         space.setBounds(bounds)
         setup = geometric.SimpleSetup(space)
-        checks = count()
+        checks = [0]
         setup.setStateValidityChecker(self._checker(checks))
         ends = []
         for place in (self.start, self.goal):
@@ -99,20 +102,20 @@ class Problem:
         setup.setStartAndGoalStates(*ends)
         setup.setPlanner(getattr(geometric, planner)(setup.getSpaceInformation()))
         timed = base.timedPlannerTerminationCondition(patience_s)
-        stopped = base.PlannerTerminationCondition(is_over)
+        stopped = base.PlannerTerminationCondition(lambda: checks[0] >= most_checks or is_over())
         setup.solve(base.plannerOrTerminationCondition(timed, stopped))
         if not setup.haveExactSolutionPath():
-            return Solved(None, next(checks))
+            return Solved(None, checks[0])
         states = setup.getSolutionPath().getStates()
         way = [(each.getX(), each.getY(), each.getZ(), *_turn(each.rotation())) for each in states]
-        return Solved(way, next(checks))
+        return Solved(way, checks[0])
 
-    def _checker(self, checks: Iterator[int]) -> Callable[[base.State], bool]:
+    def _checker(self, checks: list[int]) -> Callable[[base.State], bool]:
         robot, world = (fcl.CollisionObject(_volume(mesh), fcl.Transform()) for mesh in (self.robot, self.world))
         request, low, high = fcl.CollisionRequest(), self.low, self.high
 
         def is_free(state: base.State) -> bool:
-            next(checks)
+            checks[0] += 1
             at, turn = (state.getX(), state.getY(), state.getZ()), state.rotation()
             if not all(a <= x <= b for a, x, b in zip(low, at, high, strict=True)):
                 return False

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 from machine import MachineState
-from offload_page import CYCLONE, OVERLAY, PAPER, PAPER_ADDED_S, added_s, seconds_text
+from offload_page import CDR, CYCLONE, JSON, PAPER, PAPER_ADDED_S, added_s, seconds_text
 from report import markdown_table
 from samples import p99
 
@@ -165,7 +165,7 @@ _NOTES: Final = (
 
 
 def _offload(document: Any) -> Iterator[Row]:
-    added = []
+    networks = {}
     for name, paper in PAPER.items():
         task = document["tasks"].get(name, {})
         if "alone" in task:
@@ -174,32 +174,36 @@ def _offload(document: Any) -> Iterator[Row]:
             yield _seconds("G Table I", f"{name}: robot only", paper.alone_s, times, where)
         if "network" not in task:
             continue
-        network = task["network"]
-        for who, label, there_s, total_s in (
-            (CYCLONE, "ROS 2", paper.ros_network_s, paper.ros_total_s),
-            (OVERLAY, "overlay", paper.network_s, paper.total_s),
+        networks[name] = task["network"]
+        for who, network_s, total_s in (
+            (CYCLONE, paper.ros_network_s, paper.ros_total_s),
+            (JSON, paper.network_s, paper.total_s),
+            (CDR, paper.network_s, paper.total_s),
         ):
-            found = network["contenders"][who]
-            hops = "three bridges, Cyclone DDS" if who == CYCLONE else "three switches"
-            yield _seconds("G Table I", f"{name}: {label}, network one way", there_s, found["there_s"], hops)
-            yield _seconds("G Table I", f"{name}: {label}, total", total_s, found["total_s"], f"{hops}; computed")
-        added.append((name, network, paper.network_s - paper.ros_network_s))
-    for name, network, paper_s in added:
-        middle, low, high = added_s(network, CYCLONE)
-        spread = f"{low:.4f} to {high:.4f} s, rounds"
-        trials = f"{network['rounds']} x {network['answered_at_once'] // network['rounds']}"
-        yield Row(
-            "G Figure 5",
-            f"{name}: added to Cyclone DDS",
-            f"{paper_s:.3f} s",
-            f"{middle:.4f} s",
-            spread,
-            trials,
-            "one way",
-        )
-    if added:
-        middle = fmean(added_s(network, CYCLONE)[0] for _, network, _ in added)
-        yield Row("G Figure 5", "added on average", f"{PAPER_ADDED_S} s", f"{middle:.4f} s", "", "", "one way")
+            if (found := task["network"]["contenders"].get(who)) is None:
+                continue
+            hops = "three bridges" if who == CYCLONE else task["network"]["over"]
+            yield _seconds("G Table I", f"{name}: {who}, network one way", network_s, found["there_s"], hops)
+            yield _seconds("G Table I", f"{name}: {who}, total", total_s, found["total_s"], f"{hops}; computed")
+    for who in (JSON, CDR):
+        middles = []
+        for name, network in networks.items():
+            if (added := added_s(network, who, CYCLONE)) is None:
+                continue
+            middles.append(added[0])
+            paper_s = PAPER[name].network_s - PAPER[name].ros_network_s
+            yield Row(
+                "G Figure 5",
+                f"{name}: {who}, added to Cyclone DDS",
+                f"{paper_s:.3f} s",
+                f"{added[0]:.4f} s",
+                f"{added[1]:.4f} to {added[2]:.4f} s, rounds",
+                f"{network['rounds']} x {network['answered_at_once'] // network['rounds']}",
+                "one way",
+            )
+        if len(middles) == len(PAPER):
+            middle = f"{fmean(middles):.4f} s"
+            yield Row("G Figure 5", f"{who}, added on average", f"{PAPER_ADDED_S} s", middle, "", "", "one way")
 
 
 def _prices(document: Any) -> Iterator[Row]:

@@ -25,6 +25,7 @@ from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.simulation.topology import MTU_BYTES
 from proxy.config.config import Encoding
 from ring.child import ChildError
+from ring.cores import CORES_HELP
 from ring.faults import Cut, Kill, Roam
 from ring.hints import hints, live_hints
 from ring.live_run import LiveRing
@@ -100,9 +101,7 @@ def ring(
     lease: Annotated[
         float, typer.Option(help="Of names, in seconds: what is not renewed is forgotten.")
     ] = ADVERTISEMENT_LEASE_S,
-    cores: Annotated[
-        bool, typer.Option("--cores", help="Two cores' worth for the robot, four for each edge server, by cgroups.")
-    ] = False,
+    cores: Annotated[bool, typer.Option("--cores", help=CORES_HELP)] = False,
     wide: Annotated[bool, typer.Option("--wide", help="All columns of the table, 200 characters.")] = False,
     keep: Annotated[bool, typer.Option("--keep", help="Leave the ring up, and say what to try.")] = False,
     down: Annotated[bool, typer.Option("--down", help="Take down every ring that was kept, and end.")] = False,

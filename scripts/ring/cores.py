@@ -11,11 +11,19 @@ from typing import Final
 from gdp.errors import LocalError
 from gdp.host.cgroups import Cgroup
 from gdp.host.run_registry import Run
+from gdp.simulation.topology import Topology
 
-__all__ = ["EDGE_CORES", "ROBOT_CORES", "MachineCores"]
+__all__ = ["CORES_HELP", "EDGE_CORES", "ROBOT_CORES", "MachineCores", "cores_of"]
 
 ROBOT_CORES: Final = 2
 EDGE_CORES: Final = 4
+CORES_HELP: Final = "Two cores' worth for the robot, four for each edge server, by cgroups."
+
+
+def cores_of(topology: Topology) -> dict[str, int]:
+    """Return the cores of each machine; the robot's proxy is the first one."""
+    robot, *_ = topology.attached("proxy")
+    return {node: ROBOT_CORES if node == robot.switch else EDGE_CORES for node in topology.nodes}
 
 
 class MachineCores:

@@ -127,6 +127,10 @@ class OverlayCredentials:
         )
         return self._write(Role.PROXY, at.switch, {**content, "ros": graph})
 
+    def of_proxy(self, switch: str) -> Credentials:
+        """Return identity and trust anchors of the proxy at a switch."""
+        return self._credentials(Role.PROXY, switch)
+
     def proxy_file(self, at: Attachment) -> Path:
         """Return the path of a proxy's ``proxy.yaml``."""
         return self.file("proxy", at.switch)

@@ -16,7 +16,7 @@ from gdp.host.run_registry import Run
 from gdp.simulation.namespaces import Namespaces
 from ring.child import Child
 from ring.children import READY_S, Children
-from ring.cores import EDGE_CORES, ROBOT_CORES, MachineCores
+from ring.cores import EDGE_CORES, ROBOT_CORES, MachineCores, cores_of
 from ring.credentials import OverlayCredentials
 from ring.faults import Cut, Kill, Roam, roamers
 from ring.options import Options
@@ -131,9 +131,8 @@ class Overlay:
         await asyncio.to_thread(self.namespaces.connect_device, home, roam.who, roam.to)
 
     def _make_cores(self, run: Run) -> MachineCores | None:
-        cores = {node: ROBOT_CORES if node == self.robot.switch else EDGE_CORES for node in self.topology.nodes}
         try:
-            made = MachineCores(run, cores)
+            made = MachineCores(run, cores_of(self.topology))
         except LocalError as error:
             self.reporter.step(f"--cores has no effect: no control groups can be made here ({error})")
             return None

@@ -38,7 +38,7 @@ _RUN_BY: Final = {  # what another test runs already, with the same options or s
     ),
     "python scripts/experiments/offload.py --quick": (
         "netns_tests/test_experiments.py"
-        "::test_a_task_is_computed_on_the_robot_and_beyond_three_switches_and_every_answer_is_right"
+        "::test_a_task_is_computed_on_the_robot_and_beyond_three_domains_in_either_encoding_and_every_answer_is_right"
     ),
 }
 _MINUTE_S: Final = 60

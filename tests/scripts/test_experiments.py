@@ -9,6 +9,7 @@ import os
 import random
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -23,8 +24,9 @@ slit = Problem.load(pathlib.Path(sys.argv[1]), "Slit")
 way = slit.solve("RRTConnect", 100.0, lambda: False).way
 asked = iter([False, True])
 stopped = slit.solve("RRTConnect", 100.0, lambda: next(asked, True)).way
+limited = slit.solve("RRTConnect", 100.0, lambda: False, 10)
 ends = {"start": list(slit.start), "goal": list(slit.goal)}
-print(json.dumps({"way": [list(each) for each in way], **ends, "stopped": stopped}))
+print(json.dumps({"way": [list(each) for each in way], **ends, "stopped": stopped, "limited": limited}))
 """
 MESHES = ROOT / "scripts" / "data" / "planning"
 
@@ -200,7 +202,7 @@ def test_a_drawn_tag_is_found_where_it_is() -> None:
         assert found.turned_rad(truth) < 0.03
 
 
-def test_a_planner_finds_a_path_and_stops_on_command() -> None:
+def test_a_planner_finds_a_path_and_stops_on_command_or_at_a_number_of_checks() -> None:
     for module in ("ompl", "fcl", "trimesh", "collada"):
         if importlib.util.find_spec(module) is None:
             pytest.skip(f"{module} is not installed: pip install 'gdp-ros[experiments]'")
@@ -215,6 +217,9 @@ def test_a_planner_finds_a_path_and_stops_on_command() -> None:
     assert said["way"][0][:3] == pytest.approx(said["start"])
     assert said["way"][-1][:3] == pytest.approx(said["goal"])
     assert said["stopped"] is None
+    way, checks = said["limited"]
+    assert way is None
+    assert checks >= 10
 
 
 def test_the_camera_moves_as_recorded() -> None:
@@ -249,13 +254,32 @@ def test_there_is_no_grasp_of_nothing() -> None:
 
 
 def test_waits_are_recorded_runs_shortened_and_drawn_for_each_replica_alone() -> None:
-    from recorded import RECORDED, draw, load
+    from recorded import FASTER, draw, load
 
-    for name, runs in load().items():
-        waits = draw(runs, RECORDED[name].faster, 20, random.Random(1))
-        others = draw(runs, RECORDED[name].faster, 20, random.Random(2))
-        assert {round(wait * RECORDED[name].faster, 9) for wait in waits} <= {round(each, 9) for each in runs}
+    recorded = load()
+    assert recorded.keys() == FASTER.keys()
+    for name, each in recorded.items():
+        waits = draw(each.runs_s, FASTER[name], 20, random.Random(1))
+        others = draw(each.runs_s, FASTER[name], 20, random.Random(2))
+        assert {round(wait * FASTER[name], 9) for wait in waits} <= {round(run_s, 9) for run_s in each.runs_s}
         assert waits != others
+
+
+def test_a_run_that_reaches_the_limit_of_checks_counts_as_the_timeout_of_the_paper(tmp_path: Path) -> None:
+    from recorded import LIMIT_S, MOST_CHECKS, load
+
+    recording = tmp_path / "runs.json"
+    recording.write_text(json.dumps({"Home": {"planner": "RRT", "checks": [MOST_CHECKS // 4, MOST_CHECKS]}}))
+    home = load(recording)["Home"]
+    assert (home.planner, home.runs_s) == ("RRT", [LIMIT_S / 4, LIMIT_S])
+
+
+def test_the_least_of_two_recorded_runs_gains_by_how_rare_the_long_ones_are() -> None:
+    from recorded import Recorded
+
+    mean_gain, p99_gain = Recorded("RRT", [1.0] * 97 + [5.0] * 3).gains()
+    assert mean_gain == pytest.approx(1.12 / (4_962 / 4_950))
+    assert p99_gain == 5.0
 
 
 def test_a_request_is_lost_only_while_all_its_machines_stay_down() -> None:
