@@ -1,0 +1,103 @@
+"""Figure 4: bytes on the robot's uplink, with a request to each replica, a dedicated gateway, a replica as gateway.
+
+sudo .venv/bin/python scripts/experiments/fig4.py                  # writes docs/experiments/fig4.*
+sudo .venv/bin/python scripts/experiments/fig4.py --quick          # few requests: does it work?
+sudo .venv/bin/python scripts/experiments/fig4.py --replicas 3
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from experiment import Asking, Finding, Options, Report, command_line, run_experiment
+from recovery_stage import DEDICATED, REPLICA
+from samples import Sample
+from series import Series
+from tag_cluster import SERVICE, TagCluster
+
+REQUESTS: Final = 100
+QUICK: Final = 10
+DIRECT: Final = "direct"
+FORMS: Final = {DIRECT: DIRECT, DEDICATED: "dedicated gateway", REPLICA: "replica as gateway"}
+COUNTED: Final = ("bytes a request from the robot", "bytes a request to the robot", "bytes a request at all replicas")
+_PATIENCE_S: Final = 10.0
+_WARM_UP: Final = 1  # counted: it has the size of the others
+_EXTRA_SHARE: Final = 0.1  # accepted above one copy of as many as there are replicas
+_SETTING: Final = (
+    "A robot sends frames of 640 x 480 bytes, one after the other, to a service that finds an AprilTag's pose. The"
+    " service has replicas, on machines of `fog`'s provider `local`. *Direct*: each replica is a service of its own,"
+    " and the robot calls each one. *Dedicated gateway* and *replica as gateway*: the robot makes one call, and the"
+    " gateway's switch copies it (`fog launch --gateway dedicated`, `--gateway replica`).",
+    "Bytes are those of Ethernet frames, counted by the kernel where they arrive. They include all control traffic of"
+    " that time. A request of *direct* is a call to each replica.",
+)
+_NOTES: Final = (
+    "The paper draws both gateways and states that they spare the uplink; it has no figures of them.",
+    "Latencies of *direct* are of one call each. A robot that calls each replica must also choose among the answers.",
+    "In the direct form the frames pass a dedicated gateway, too, which then copies nothing.",
+)
+
+
+def measure(options: Options) -> Report:
+    """Send the same requests in each form."""
+    count = QUICK if options.quick else options.requests
+    groups: dict[str, list[Sample]] = {}
+    figures: dict[str, list[float]] = {}
+    for form, label in FORMS.items():
+        groups[label], figures[label] = _ask(form, options.replicas, count)
+    findings = [
+        Finding(f"{at}: {what}", each) for at, of in figures.items() for what, each in zip(COUNTED, of, strict=True)
+    ]
+    most = (1 + _EXTRA_SHARE) / options.replicas
+    for label in list(figures)[1:]:
+        share = figures[label][0] / figures[DIRECT][0]
+        findings.append(
+            Finding(f"{label}: share of direct, from the robot", share, most, True, f"1/{options.replicas}")
+        )
+    return Report(
+        "fig4",
+        "Figure 4: bytes on the robot's uplink",
+        _SETTING,
+        groups,
+        findings,
+        _NOTES,
+        {"replicas": options.replicas, "requests": count},
+        lambda path, title: _draw(path, title, figures),
+    )
+
+
+def _ask(form: str, replicas: int, count: int) -> tuple[list[Sample], list[float]]:
+    """Return the calls of a form, and its figures as in ``COUNTED``."""
+    is_direct = form == DIRECT
+    services = tuple(f"{SERVICE}{number + 1}" for number in range(replicas)) if is_direct else (SERVICE,)
+    with TagCluster(services, 1 if is_direct else replicas, DEDICATED if is_direct else form, _PATIENCE_S) as cluster:
+        samples: list[Sample] = []
+        for number in (_WARM_UP, count):  # the first series sets up the paths
+            before = cluster.received_bytes()
+            series = Series("tag", services, number * len(services), (), _PATIENCE_S, warm_up=_WARM_UP * len(services))
+            with Asking(cluster, series) as asking:
+                samples = list(asking)
+            after = cluster.received_bytes()
+    return samples, [(now - then) / (count + _WARM_UP) for then, now in zip(before, after, strict=True)]
+
+
+def _draw(path: Path, title: str, figures: Mapping[str, Sequence[float]]) -> None:
+    from pictures import plt, save, tidy
+
+    figure, axis = plt.subplots(figsize=(8, 3), layout="constrained")
+    for at, (what, colour) in enumerate(zip(COUNTED, ("#1f6f8b", "#c96f3b", "#99a8b2"), strict=True)):
+        places = [place + 0.25 * at for place in range(len(figures))]
+        axis.barh(places, [each[at] for each in figures.values()], 0.22, color=colour, label=what)
+    axis.set_yticks(range(len(figures)), list(figures), fontsize=8)
+    axis.invert_yaxis()
+    tidy(axis)
+    save(figure, path, title)
+
+
+if __name__ == "__main__":
+    parser = command_line(__doc__)
+    parser.add_argument("--requests", type=int, default=REQUESTS, help="of each form (default: %(default)s)")
+    parser.add_argument("--replicas", type=int, choices=range(2, 9), default=2, help="(default: %(default)s)")
+    run_experiment(parser, measure)
