@@ -23,7 +23,7 @@ from tag_cluster import SERVICE, TagCluster
 from fog.supervisor.record import Record
 
 MINUTES: Final = 2.0
-QUICK_MINUTES: Final = 0.06
+QUICK_MINUTES: Final = 0.25
 _HZ: Final = 10.0
 _STEADY_S: Final = 4.0  # time in which all serve, before the next machine is killed
 _QUICK_STEADY_S: Final = 1.0

@@ -36,7 +36,8 @@ def generate_launch_description():
     FogCluster(
         name={name!r},
         cloud_nodes=[Node(package="experiments", executable="replica", arguments={arguments}, additional_env={path})],
-        deployments=[SpotMachine(hardware="cpu:1")] * {replicas},
+        deployments=[SpotMachine(hardware="cpu:1")],
+        replicas={replicas},
         services={services},
     )
     return LaunchDescription([])
