@@ -20,7 +20,7 @@ from tag_cluster import SERVICE, TagCluster
 REQUESTS: Final = 100
 QUICK: Final = 10
 DIRECT: Final = "direct"
-FORMS: Final = {DIRECT: DIRECT, DEDICATED: "dedicated gateway", REPLICA: "replica as gateway"}
+FORMS: Final = {DIRECT: DEDICATED, "dedicated gateway": DEDICATED, "replica as gateway": REPLICA}
 COUNTED: Final = ("bytes a request from the robot", "bytes a request to the robot", "bytes a request at all replicas")
 _PATIENCE_S: Final = 10.0
 _WARM_UP: Final = 1  # counted: it has the size of the others
@@ -48,17 +48,13 @@ def measure(options: Options) -> Report:
     count = QUICK if options.quick else options.requests
     groups: dict[str, list[Sample]] = {}
     figures: dict[str, list[float]] = {}
-    for form, label in FORMS.items():
-        groups[label], figures[label] = _ask(form, options.replicas, count)
-    findings = [
-        Finding(f"{at}: {what}", each) for at, of in figures.items() for what, each in zip(COUNTED, of, strict=True)
-    ]
-    most = (1 + _EXTRA_SHARE) / options.replicas
-    for label in list(figures)[1:]:
-        share = figures[label][0] / figures[DIRECT][0]
-        findings.append(
-            Finding(f"{label}: share of direct, from the robot", share, most, True, f"1/{options.replicas}")
-        )
+    for form in FORMS:
+        groups[form], figures[form] = _ask(form, options.replicas, count)
+    findings = [Finding(f"{form}: {COUNTED[at]}", each) for form, of in figures.items() for at, each in enumerate(of)]
+    one, most = f"1/{options.replicas}", (1 + _EXTRA_SHARE) / options.replicas
+    for form in list(FORMS)[1:]:
+        share = figures[form][0] / figures[DIRECT][0]
+        findings.append(Finding(f"{form}: share of direct, from the robot", share, most, True, one))
     return Report(
         "fig4",
         "Figure 4: bytes on the robot's uplink",
@@ -73,10 +69,8 @@ def measure(options: Options) -> Report:
 
 def _ask(form: str, replicas: int, count: int) -> tuple[list[Sample], list[float]]:
     """Return the calls of a form, and its figures as in ``COUNTED``."""
-    is_direct = form == DIRECT
-    services = tuple(f"{SERVICE}{number + 1}" for number in range(replicas)) if is_direct else (SERVICE,)
-    with TagCluster(services, 1 if is_direct else replicas, DEDICATED if is_direct else form, _PATIENCE_S) as cluster:
-        samples: list[Sample] = []
+    services = tuple(f"{SERVICE}{number + 1}" for number in range(replicas)) if form == DIRECT else (SERVICE,)
+    with TagCluster(services, replicas // len(services), FORMS[form], _PATIENCE_S) as cluster:
         for number in (_WARM_UP, count):  # the first series sets up the paths
             before = cluster.received_bytes()
             series = Series("tag", services, number * len(services), (), _PATIENCE_S, warm_up=_WARM_UP * len(services))

@@ -7,8 +7,8 @@ sudo .venv/bin/python scripts/experiments/fig9.py --minutes 30 --machines 3
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Final
 
@@ -19,8 +19,6 @@ from report import progress
 from samples import Sample, Summary
 from series import Series
 from tag_cluster import SERVICE, TagCluster
-
-from fog.supervisor.record import Record
 
 MINUTES: Final = 2.0
 QUICK_MINUTES: Final = 0.25
@@ -56,39 +54,30 @@ class _FaultInjector:
     """Kills the machine that has served for longest, whenever all serve; driven by the answers as they arrive.
 
     Attributes:
-        spans: machine, and when it was killed and its replacement served; the same while none does.
-        replaced: machine by the one that replaces it.
+        spans: from the death of a machine until its replacement served; the last one may have no end.
+        labels: by machine, the name of the first of those that replace each other.
     """
 
     def __init__(self, cluster: TagCluster, steady_s: float) -> None:
         self._cluster = cluster
         self._steady_s = steady_s
-        self._whole_s: float | None = None
-        self._lost: Record | None = None
-        self._lost_unix_s = 0.0
-        self.spans: list[tuple[str, float, float]] = []
-        self.replaced: dict[str, str] = {}
+        self._whole_s = 0.0
+        self._killed_unix_s: float | None = None  # None: all serve
+        self.spans: list[Span] = []
+        self.labels: dict[str, str] = {}
 
-    def see(self) -> None:
-        """Handle an answer: kill a machine if it is time, or look whether its replacement serves."""
-        now_s = time.monotonic()
-        if self._lost is not None:
-            self._look(self._lost, now_s)
-        elif self._whole_s is None:
-            self._whole_s = now_s
-        elif now_s - self._whole_s >= self._steady_s:
-            self._lost, self._lost_unix_s = self._cluster.oldest(), time.time()
-            self._cluster.kill(self._lost)
-            self.spans.append((self._lost.name, now_s, now_s))
-
-    def _look(self, lost: Record, now_s: float) -> None:
-        served = self._cluster.replacement(self._lost_unix_s)
-        if served is not None:
-            _, from_s, _ = self.spans.pop()
-            self.spans.append((lost.name, from_s, now_s))
-            self.replaced[served.name] = lost.name
-            progress(f"{lost.name} was replaced by {served.name} after {now_s - from_s:.1f} s")
-            self._lost, self._whole_s = None, now_s
+    def see(self, since_s: float) -> None:
+        """Kill a machine if it is time, or look whether its replacement serves, ``since_s`` after the beginning."""
+        if self._killed_unix_s is not None:
+            if (served := self._cluster.replacement(self._killed_unix_s)) is not None:
+                self.spans[-1] = span = replace(self.spans[-1], to_s=since_s)
+                self.labels[served.name] = span.machine
+                progress(f"{served.name} serves {span.to_s - span.from_s:.1f} s after a death")
+                self._killed_unix_s, self._whole_s = None, since_s
+        elif since_s - self._whole_s >= self._steady_s:
+            lost, self._killed_unix_s = self._cluster.oldest(), time.time()
+            self._cluster.kill(lost)
+            self.spans.append(Span(self.labels.setdefault(lost.name, lost.name), since_s, math.inf))
 
 
 def measure(options: Options) -> Report:
@@ -97,14 +86,16 @@ def measure(options: Options) -> Report:
     series = Series(
         "tag", (SERVICE,), count, (), _PATIENCE_S, lanes=_LANES, gap_s=1 / _HZ, warm_up=10, counts_answers=True
     )
+    samples: list[Sample] = []
     with TagCluster([SERVICE], options.machines, DEDICATED, _PATIENCE_S) as cluster, Asking(cluster, series) as asking:
         fault_injector = _FaultInjector(cluster, _QUICK_STEADY_S if options.quick else _STEADY_S)
-        samples = []
         for sample in asking:
             samples.append(sample)
-            fault_injector.see()
-    from_s, end_s = samples[0].begun_s, max(each.begun_s for each in samples)
-    spans = [Span(label, a - from_s, (b if b > a else end_s) - from_s) for label, a, b in fault_injector.spans]
+            fault_injector.see(time.monotonic() - samples[0].begun_s)
+    from_s, labels = samples[0].begun_s, fault_injector.labels
+    end_s = max(each.begun_s for each in samples) - from_s
+    spans = [replace(each, to_s=min(each.to_s, end_s)) for each in fault_injector.spans]
+    drawn = [replace(each, machine=labels.get(each.machine, each.machine)) for each in samples]
     return Report(
         "fig9",
         "Figure 9: a tag's pose while machines are killed and the supervisor replaces them",
@@ -113,23 +104,7 @@ def measure(options: Options) -> Report:
         _findings(samples, asking, spans),
         _NOTES,
         {"machines": options.machines, "requests a second": _HZ, "kills": len(spans)},
-        lambda path, title: save_timeline(path, title, *_drawn(samples, spans, fault_injector.replaced), from_s),
-    )
-
-
-def _drawn(
-    samples: Iterable[Sample], spans: Iterable[Span], replaced: Mapping[str, str]
-) -> tuple[list[Sample], list[Span]]:
-    """Return both with one name for a machine and those that replace it: the first one's."""
-
-    def first(machine: str) -> str:
-        while machine in replaced:
-            machine = replaced[machine]
-        return machine
-
-    return (
-        [replace(each, machine=first(each.machine)) for each in samples],
-        [replace(each, machine=first(each.machine)) for each in spans],
+        lambda path, title: save_timeline(path, title, drawn, spans, from_s),
     )
 
 
@@ -146,7 +121,7 @@ def _groups(samples: list[Sample], spans: list[Span], from_s: float) -> dict[str
 
 
 def _findings(samples: list[Sample], asking: Asking, spans: list[Span]) -> list[Finding]:
-    found = Summary.of(samples)
+    found, away_s = Summary.of(samples), [each.to_s - each.from_s for each in spans]
     return [
         Finding("requests", found.count),
         Finding("kills", len(spans)),
@@ -154,9 +129,7 @@ def _findings(samples: list[Sample], asking: Asking, spans: list[Span]) -> list[
         Finding("answers too many", asking.twice or 0, 0, at_most=True),
         Finding("answers that reached a call", asking.heard or 0, found.count),
         Finding("largest error of a pose, mm", 1e3 * max(each.note for each in samples)),
-        Finding(
-            "longest time until a replacement served, s", max((each.to_s - each.from_s for each in spans), default=0)
-        ),
+        Finding("longest time until a replacement served, s", max(away_s, default=0.0)),
     ]
 
 
