@@ -17,8 +17,7 @@ from samples import Sample
 from series import Series
 from tag_cluster import SERVICE, TagCluster
 
-REQUESTS: Final = 100
-QUICK: Final = 10
+REQUESTS, QUICK = 100, 10
 DIRECT: Final = "direct"
 FORMS: Final = {DIRECT: DEDICATED, "dedicated gateway": DEDICATED, "replica as gateway": REPLICA}
 COUNTED: Final = ("bytes a request from the robot", "bytes a request to the robot", "bytes a request at all replicas")
@@ -46,10 +45,8 @@ _NOTES: Final = (
 def measure(options: Options) -> Report:
     """Send the same requests in each form."""
     count = QUICK if options.quick else options.requests
-    groups: dict[str, list[Sample]] = {}
-    figures: dict[str, list[float]] = {}
-    for form in FORMS:
-        groups[form], figures[form] = _ask(form, options.replicas, count)
+    found = {form: _ask(form, options.replicas, count) for form in FORMS}
+    figures = {form: of for form, (_, of) in found.items()}
     findings = [Finding(f"{form}: {COUNTED[at]}", each) for form, of in figures.items() for at, each in enumerate(of)]
     one, most = f"1/{options.replicas}", (1 + _EXTRA_SHARE) / options.replicas
     for form in list(FORMS)[1:]:
@@ -59,7 +56,7 @@ def measure(options: Options) -> Report:
         "fig4",
         "Figure 4: bytes on the robot's uplink",
         _SETTING,
-        groups,
+        {form: samples for form, (samples, _) in found.items()},
         findings,
         _NOTES,
         {"replicas": options.replicas, "requests": count},

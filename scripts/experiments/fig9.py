@@ -24,7 +24,6 @@ MINUTES: Final = 2.0
 QUICK_MINUTES: Final = 0.25
 _HZ: Final = 10.0
 _STEADY_S: Final = 4.0  # time in which all serve, before the next machine is killed
-_QUICK_STEADY_S: Final = 1.0
 _LANES: Final = 1_000  # the camera does not wait for answers
 _PATIENCE_S: Final = 10.0
 _SETTING: Final = (
@@ -42,11 +41,9 @@ _NOTES: Final = (
     " is pupil-apriltags, family 36h11. The service type is rcl_interfaces/srv/SetParameters, whose integer array"
     " carries the frame: the installed packages have no service that takes an image.",
     "The paper's robot and spot machines were apart. Here robot, supervisor and all machines share the cores of one"
-    " host. So a machine that boots (Python, rclpy, keys) takes time from those that serve. That is most of what the"
-    " timeline shows.",
-    "A local machine boots in seconds, and a machine of a cloud in minutes. Its spot machines get a notice before they"
-    " are gone; these get none.",
-    "A colour is one machine and those that replace it, one after the other.",
+    " host. So a machine that boots (Python, rclpy, keys) takes time from those that serve.",
+    "A local machine boots in seconds, one of a cloud in minutes. Spot machines get a notice; these get none.",
+    "A colour is one machine and those that replace it. On a busy host latency rises for seconds after one has joined.",
 )
 
 
@@ -58,9 +55,8 @@ class _FaultInjector:
         labels: by machine, the name of the first of those that replace each other.
     """
 
-    def __init__(self, cluster: TagCluster, steady_s: float) -> None:
+    def __init__(self, cluster: TagCluster) -> None:
         self._cluster = cluster
-        self._steady_s = steady_s
         self._whole_s = 0.0
         self._killed_unix_s: float | None = None  # None: all serve
         self.spans: list[Span] = []
@@ -74,7 +70,7 @@ class _FaultInjector:
                 self.labels[served.name] = span.machine
                 progress(f"{served.name} serves {span.to_s - span.from_s:.1f} s after a death")
                 self._killed_unix_s, self._whole_s = None, since_s
-        elif since_s - self._whole_s >= self._steady_s:
+        elif since_s - self._whole_s >= _STEADY_S:
             lost, self._killed_unix_s = self._cluster.oldest(), time.time()
             self._cluster.kill(lost)
             self.spans.append(Span(self.labels.setdefault(lost.name, lost.name), since_s, math.inf))
@@ -88,7 +84,7 @@ def measure(options: Options) -> Report:
     )
     samples: list[Sample] = []
     with TagCluster([SERVICE], options.machines, DEDICATED, _PATIENCE_S) as cluster, Asking(cluster, series) as asking:
-        fault_injector = _FaultInjector(cluster, _QUICK_STEADY_S if options.quick else _STEADY_S)
+        fault_injector = _FaultInjector(cluster)
         for sample in asking:
             samples.append(sample)
             fault_injector.see(time.monotonic() - samples[0].begun_s)

@@ -216,8 +216,8 @@ def _uplink(document: Any) -> Iterator[Row]:
     for each in document["findings"]:
         if each["paper"]:
             conditions = f"{settings['replicas']} replicas, frames of 307,200 bytes"
-            here, trials = f"{each['measured']:.2f}", str(settings["requests"])
-            yield Row("FT Figure 4", each["what"], each["paper"], here, "", trials, conditions)
+            here = f"{each['measured']:.2f}"
+            yield Row("FT Figure 4", each["what"], each["paper"], here, "", str(settings["requests"]), conditions)
 
 
 def _gains(name: str, document: Any) -> Iterator[Row]:

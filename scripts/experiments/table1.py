@@ -24,7 +24,9 @@ from fog.plan.cost import Bill, compared
 from gdp.errors import LocalError
 
 TYPES: Final = ("c5.4xlarge", "c6i.4xlarge", "m6i.4xlarge", "r5.16xlarge", "t3.xlarge", "g4dn.xlarge", "p3.2xlarge")
-_WAYS: Final = ("one", "two", "two spot")
+_WAYS: Final = ("one on-demand", "two on-demand", "two spot")
+_HEAD: Final = ("application", "needs", "", *_WAYS, "two spot / one on-demand", "machines")
+_TYPE_HEAD: Final = (*_WAYS, "a month: one", "two", "two spot", "two spot cost", "taken a month")
 REGIONS: Final = ("us-west-1", "us-west-2")  # the paper's
 # Application -> what a machine must have, and the paper's USD an hour: one on-demand, two on-demand, two spot.
 APPLICATIONS: Final[dict[str, tuple[str, tuple[float, float, float]]]] = {
@@ -88,11 +90,9 @@ def measure(options: Options) -> Computed:
     rows, needed = bills(region), applications()
 
     def print_tables() -> None:
-        head = ("USD", "needs", "", "one /h", "two /h", "two spot /h", "two spot / one", "machines")
-        print_table(head, _application_rows(needed), words=3)
+        print_table(_HEAD, _application_rows(needed), words=3)
         print_table(_RATIO_HEAD, _ratio_rows(needed))
-        prices = [f"{each} /{per}" for per in ("h", "month") for each in _WAYS]
-        print_table((f"{region}, USD", *prices, "of one", "taken a month"), map(_cells, rows))
+        print_table((f"{region}, USD", *_TYPE_HEAD), map(_cells, rows))
 
     document = {
         "region": region,
@@ -197,9 +197,7 @@ def page(region: str, rows: Sequence[Row], needed: Sequence[Application]) -> str
         " on-demand in the "
         f"cheaper of {' and '.join(REGIONS)}, two as one in either region.",
         "",
-        "| application | needs | | one on-demand | two on-demand | two spot | two spot / one on-demand | machines |",
-        "|---|---|---|--:|--:|--:|--:|---|",
-        *("| " + " | ".join(row) + " |" for row in _application_rows(needed)),
+        markdown_table(_HEAD, _application_rows(needed)),
         "",
         "The paper's prices for MPT are those of m5.8xlarge and m5.16xlarge in us-west-1 on this list (1.792 and"
         " 3.584), "
@@ -219,12 +217,7 @@ def page(region: str, rows: Sequence[Row], needed: Sequence[Application]) -> str
         "",
         "USD an hour, and a month of 730 hours.",
         "",
-        f"| {region} | one on-demand | two on-demand | two spot | a month: one | two | two spot "
-        "| two spot cost | taken a month |",
-        "|---|--:|--:|--:|--:|--:|--:|--:|--:|",
-    ]
-    lines += ["| " + " | ".join(_cells(row)) + " |" for row in rows]
-    lines += [
+        markdown_table((region, *_TYPE_HEAD), map(_cells, rows)),
         "",
         "![prices](table1.png)",
         "",
