@@ -26,14 +26,13 @@ from typing import Final
 
 from peers.process import FailedError
 from plot import Panel, panel_of
-from recovery_stage import Cluster
+from recovery_stage import DEDICATED, ECHO, REPLICA, Cluster
 from report import Rounds, Target, progress
 from skeleton import Options, Outcome, command_line, run_bench
 
 from gdp.host.run_registry import RunRegistry
 
 PREEMPTED, KILLED, FROZEN, SUPERVISOR = "preempted", "killed", "frozen", "supervisor"
-DEDICATED, REPLICA = "dedicated", "replica"
 CASES: Final = {
     PREEMPTED: "a machine preempted with notice",
     KILLED: "a machine killed",
@@ -72,8 +71,8 @@ def measure_case(cluster: Cluster, case: str) -> dict[str, float | None]:
         cluster.kill(victim)
         at_s = cluster.start_supervisor()
         served = cluster.await_replacement(at_s)
-        asked = cluster.await_event(served.name, {"asked"}, at_s)
-        seen = cluster.await_event(victim.name, {"taken"}, at_s)
+        asked = cluster.await_event(served.name, {"requested"}, at_s)
+        seen = cluster.await_event(victim.name, {"preempted"}, at_s)
         first: dict[str, float | None] = {RECONCILED: max(asked, seen) - at_s}
     else:
         at_s = time.time()
@@ -84,7 +83,7 @@ def measure_case(cluster: Cluster, case: str) -> dict[str, float | None]:
         else:
             cluster.kill(victim)
         served = cluster.await_replacement(at_s)
-        signs = {"notice"} if case == PREEMPTED else {"taken", "unheard"}
+        signs = {"notice"} if case == PREEMPTED else {"preempted", "unreachable"}
         first = {DETECTED: cluster.await_event(victim.name, signs, at_s) - at_s}
     cluster.await_whole(victim)
     if cluster.gateway == REPLICA:
@@ -122,7 +121,8 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
     if FROZEN in cases and not is_replica:
         raise FailedError("--only frozen is measured with --gateway replica")
     over, machines = Rounds(), options.machines or (3 if is_replica else 2)
-    with Cluster(options.rate, machines, options.gateway) as cluster:
+    with Cluster([ECHO.read_text(encoding="utf-8")], machines, options.gateway) as cluster:
+        cluster.call(options.rate)
         for at in range(1, options.rounds + 1):
             for case in cases:
                 progress(f"round {at}/{options.rounds}: {CASES[case]}")

@@ -1,4 +1,4 @@
-"""Cluster of ``recovery.py``: machines of the provider ``local``, a robot, and a calling node.
+"""Cluster of ``recovery.py`` and of figures 4 and 9: machines of the provider ``local``, a robot, and a calling node.
 
 I/O. A run owns what this module makes; ``fog down`` ends what ``fog`` makes for it, also after a crash.
 """
@@ -17,6 +17,7 @@ from typing import Final, TypeVar
 
 from peers.process import FailedError, Started
 from report import progress
+from ros_environment import ros_environment
 from testbed import Lab
 from topologies import single
 
@@ -26,14 +27,14 @@ from fog.supervisor.background import pid_of
 from fog.supervisor.infrastructure import local_provider
 from fog.supervisor.journal import Journal
 from fog.supervisor.record import Record
-from fog_demo.environment import ENVIRONMENT, STATE, end_all_of, fog_command, standing_runs, sweep
+from fog_demo.environment import STATE, end_all_of, fog_command, standing_runs, sweep
 
-__all__ = ["Cluster"]
+__all__ = ["DEDICATED", "ECHO", "REPLICA", "ROBOT", "Cluster"]
 
-_LAUNCH_FILE: Final = Path(__file__).resolve().parents[2] / "examples" / "echo.launch.py"
-_ROBOT: Final = "robot"
-_ENVIRONMENT: Final = [f"{name}={value}" for name, value in ENVIRONMENT.items()]
-_LAUNCHED: Final = 2  # by the launch file
+ECHO: Final = Path(__file__).resolve().parents[2] / "examples" / "echo.launch.py"
+DEDICATED, REPLICA = "dedicated", "replica"
+ROBOT: Final = "robot"
+_DOMAIN: Final = 30
 _REPORT_S: Final = 1.0
 _DEPTH: Final = 1_000  # answers to all calls of an outage come in one burst
 _PATIENCE_S: Final = 90.0
@@ -41,62 +42,70 @@ _LAUNCH_S: Final = 200.0
 _STEP_S: Final = 0.02
 
 T = TypeVar("T")
+C = TypeVar("C", bound="Cluster")
 
 
 class Cluster:
-    """Replicas that serve, and a robot that calls; a context manager that removes everything.
+    """Replicas that serve, and a robot; a context manager that removes everything.
 
     Args:
-        rate_hz: requests a second.
-        machines: how many, at least two.
-        gateway: ``dedicated`` or ``replica``.
+        launch_files: their texts; each has one ``FogCluster``.
+        machines: how many; more than the launch files have only where there is one.
+        gateway: ``DEDICATED`` or ``REPLICA``.
 
     Raises:
         LocalError: the kernel refuses.
         FailedError: a process did not come up.
     """
 
-    def __init__(self, rate_hz: float, machines: int, gateway: str) -> None:
+    def __init__(self, launch_files: Sequence[str], machines: int, gateway: str) -> None:
         self.gateway = gateway
         self._machines_wanted = machines
         runs = standing_runs("bench")
         sweep(runs)
         self._run = runs.start()
-        self._undo = ExitStack()
         with ExitStack() as undo:
             undo.callback(end_all_of, self._run)
-            self._lab = Lab(self._run, single(_ROBOT))
-            progress(f"{machines} machines boot")
-            self._launch()
+            self._lab = Lab(self._run, single(ROBOT))
+            self._environment = ros_environment(self._run.directory, _DOMAIN)
+            progress(f"{machines} machines boot, gateway: {gateway}")
+            path = self._run.directory / "cluster.launch.py"
+            for text in launch_files:
+                path.write_text(text, encoding="utf-8")
+                self._fog("launch", str(path), "--detach", "--gateway", gateway)
             self._site = open_site(None, self._run.directory / STATE)
             self._journal = undo.enter_context(closing(Journal(self._site.journal)))
+            if (missing := machines - len(self.machines())) > 0:
+                self._fog("scale", "up", str(missing))
+            self._until(lambda: all(each.is_serving for each in self.machines()) or None, "all machines that serve")
             self._runs = local_provider(self._site).runs
-            parameters = {"rate_hz": rate_hz, "report_s": _REPORT_S, "depth": _DEPTH}
-            words = [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
-            self._caller = undo.enter_context(self._start("caller", ["-m", "fog_demo.caller", "--ros-args", *words]))
-            end_s = time.monotonic() + _PATIENCE_S
-            while not self._caller.read(_PATIENCE_S)["answered"]:
-                if time.monotonic() > end_s:
-                    raise FailedError("the robot's node is not answered")
             self._supervisors = undo.enter_context(ExitStack())
             self._undo = undo.pop_all()
 
-    def __enter__(self) -> Cluster:
+    def __enter__(self: C) -> C:
         return self
 
     def __exit__(self, *_: object) -> None:
         self._undo.close()
 
+    def call(self, rate_hz: float) -> None:
+        """Let the robot's node call ``/echo``; return when it is answered."""
+        parameters = {"rate_hz": rate_hz, "report_s": _REPORT_S, "depth": _DEPTH}
+        words = [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
+        self._caller = self._undo.enter_context(self._start("caller", ["-m", "fog_demo.caller", "--ros-args", *words]))
+        end_s = time.monotonic() + _PATIENCE_S
+        while not self._caller.read(_PATIENCE_S)["answered"]:
+            if time.monotonic() > end_s:
+                raise FailedError("the robot's node is not answered")
+
     def oldest(self) -> Record:
         """Return the machine that has served for longest."""
-        serving = [each for each in self._machines() if each.is_serving]
+        serving = [each for each in self.machines() if each.is_serving]
         return min(serving, key=lambda each: each.served_unix_s or 0.0)
 
     def gateway_machine(self) -> Record:
         """Return the machine that is the gateway."""
-        return self._until(
-            lambda: next((each for each in self._machines() if each.gateway and not each.is_gone), None), "a gateway"
-        )
+        return self._until(lambda: next((each for each in self.machines() if each.gateway), None), "a gateway")
 
     def longest_silence(self, after_s: float) -> float:
         """Return the longest time without an answer from this moment until now, in seconds."""
@@ -136,14 +145,18 @@ class Cluster:
         self._supervisors.enter_context(self._start("supervisor", fog_command(self._run, ["supervise"])))
         return at_s
 
+    def machines(self) -> list[Record]:
+        """Return all machines that are not gone."""
+        plans = (each.plan for each in self._journal.clusters())
+        return [each for plan in plans for each in self._journal.machines(plan.name, gone=False)]
+
+    def replacement(self, after_s: float) -> Record | None:
+        """Return the first machine that was requested after this moment and serves."""
+        return next((each for each in self.machines() if each.asked_unix_s >= after_s and each.is_serving), None)
+
     def await_replacement(self, after_s: float) -> Record:
-        """Return the first machine that was requested after this moment, when it serves."""
-
-        def served() -> Record | None:
-            later = (each for each in self._machines() if each.asked_unix_s >= after_s and each.is_serving)
-            return next(later, None)
-
-        return self._until(served, "a replacement that serves")
+        """Return the replacement when it serves."""
+        return self._until(lambda: self.replacement(after_s), "a replacement that serves")
 
     def await_event(self, machine: str | None, what: set[str], after_s: float) -> float:
         """Return when one of these events was recorded of a machine, or of any, in seconds since 1970."""
@@ -158,7 +171,7 @@ class Cluster:
         """Return when this machine is gone and the wanted number of other machines serve."""
 
         def is_whole() -> bool | None:
-            there = [each for each in self._machines() if not each.is_gone]
+            there = self.machines()
             is_rid = all(each.name != victim.name for each in there)
             return (is_rid and len(there) == self._machines_wanted and all(each.is_serving for each in there)) or None
 
@@ -169,28 +182,20 @@ class Cluster:
         os.kill(self._caller.pid, signal.SIGUSR1)
         while not (said := self._caller.read(_PATIENCE_S))["done"]:
             pass  # an earlier line of progress
-        for line in (self._run.directory / f"caller-at-{_ROBOT}.log").read_text(encoding="utf-8").splitlines():
+        for line in (self._run.directory / f"caller-at-{ROBOT}.log").read_text(encoding="utf-8").splitlines():
             progress(f"caller: {line}")
         calls, answered, wrong, unserved = (int(str(said[key])) for key in ("calls", "answered", "wrong", "unserved"))
         return {"requests": calls + unserved, "failed": calls - answered + wrong + unserved}
 
-    def _machines(self) -> list[Record]:
-        return [each for cluster in self._journal.clusters() for each in self._journal.machines(cluster.plan.name)]
-
-    def _launch(self) -> None:
-        self._fog("launch", str(_LAUNCH_FILE), "--detach", "--gateway", self.gateway)
-        if self._machines_wanted > _LAUNCHED:
-            self._fog("scale", "up", str(self._machines_wanted - _LAUNCHED))
-
     def _fog(self, *words: str) -> None:
         argv = [sys.executable, *fog_command(self._run, words)]
-        command = self._lab.command(_ROBOT, argv, _ENVIRONMENT)
+        command = self._lab.command(ROBOT, argv, self._environment)
         ended = subprocess.run(command, capture_output=True, text=True, timeout=_LAUNCH_S, check=False)
         if ended.returncode:
             raise FailedError(f"fog {words[0]}: {(ended.stderr or ended.stdout).strip()}")
 
     def _start(self, what: str, arguments: Sequence[str]) -> Started:
-        return self._lab.start(_ROBOT, what, arguments, _ENVIRONMENT)
+        return self._lab.start(ROBOT, what, arguments, self._environment)
 
     def _until(self, found: Callable[[], T | None], what: str) -> T:
         """Poll until a state is reached that sends no event."""

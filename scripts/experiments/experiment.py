@@ -27,6 +27,7 @@ from report import markdown_table, number_text, print_table, progress
 from samples import Sample, Summary
 from series import Series
 from skeleton import Options, add_allow_load, clean_exit, new_run
+from tag_cluster import TagCluster
 
 __all__ = [
     "CASES",
@@ -188,7 +189,7 @@ class Asking:
         heard: answers in all; the same.
     """
 
-    def __init__(self, place: Field, series: Series) -> None:
+    def __init__(self, place: Field | TagCluster, series: Series) -> None:
         self._series = series
         self._client = place.client(ROBOT, "ask", **asdict(series))
         self.twice: int | None = None

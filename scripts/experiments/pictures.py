@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
 from typing import Final, Literal
 
@@ -58,7 +59,7 @@ def save_timeline(path: Path, title: str, samples: Sequence[Sample], spans: Sequ
     """Draw each request as a point, coloured by the machine that answered; grey: a machine was away; red: failed."""
     figure, axis = plt.subplots(figsize=(11, 3.6), layout="constrained")
     machines = sorted({each.machine for each in samples if each.is_right} | {span.machine for span in spans})
-    colours = dict(zip(machines, _COLOURS[1:], strict=False))
+    colours = dict(zip(machines, cycle(_COLOURS[1:]), strict=False))
     for machine in machines:
         of = [each for each in samples if each.machine == machine and each.is_right]
         times, latencies = [each.begun_s - from_s for each in of], [1e3 * each.latency_s for each in of]

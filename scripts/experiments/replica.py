@@ -1,6 +1,6 @@
 """Service nodes of the experiments: ordinary rclpy nodes without knowledge of the overlay.
 
-Process of its own, started by ``field.py`` on a machine: ``replica.py ROLE SETTINGS``.
+Process of its own, started by ``field.py`` or ``fog`` on a machine: ``replica.py ROLE SETTINGS``.
 
 ``plan`` and ``replay`` serve ``nav_msgs/srv/GetPlan``. The request's start names the problem in its ``frame_id``; an
 unknown problem is answered at once, without a path. The stamp of its goal holds the number of the request in seconds.
@@ -14,6 +14,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import os
 import sys
 import threading
 import time
@@ -193,7 +194,7 @@ def _stamped(place: tuple[float, ...]) -> PoseStamped:
 
 def main() -> None:
     """Serve until killed."""
-    role, settings = sys.argv[1], json.loads(sys.argv[2])
+    role, settings = sys.argv[1], {"machine": os.getenv("FOG_MACHINE"), **json.loads(sys.argv[2])}
     rclpy.init()
     node = Node(f"replica_{role}")
     executor = MultiThreadedExecutor(_THREADS) if role in ("plan", "replay") else SingleThreadedExecutor()

@@ -77,6 +77,7 @@ def rows_of(folder: Path, measured: Collection[str]) -> tuple[list[Row], list[st
     makers: dict[str, Callable[[Any], Iterator[Row]]] = {
         "offload": _offload,
         "table1": _prices,
+        "fig4": _uplink,
         **{name: lambda document, name=name: _gains(name, document) for name in _GAINS},  # type: ignore[misc]
         "fig9": _kills,
         "outages": _outages,
@@ -97,7 +98,7 @@ def rows_of(folder: Path, measured: Collection[str]) -> tuple[list[Row], list[st
 def machines_of(folder: Path) -> list[str]:
     """Return the machine of each experiment, and its load, from the JSON in a folder."""
     found: dict[str, list[str]] = {}
-    for name in ("offload", *_GAINS, "fig9", "outages"):
+    for name in ("offload", "fig4", *_GAINS, "fig9", "outages"):
         path = folder / f"{name}.json"
         if path.exists():
             document = json.loads(path.read_text(encoding="utf-8"))
@@ -213,6 +214,15 @@ def _prices(document: Any) -> Iterator[Row]:
         yield Row(
             "FT Table I", what, paper, here, "", "", f"{each['on_demand'][0]}, {each['on_demand'][1]}; list of 2024"
         )
+
+
+def _uplink(document: Any) -> Iterator[Row]:
+    settings = document["settings"]
+    for each in document["findings"]:
+        if each["paper"]:
+            conditions = f"{settings['replicas']} replicas, frames of 307,200 bytes"
+            here = f"{each['measured']:.2f}"
+            yield Row("FT Figure 4", each["what"], each["paper"], here, "", str(settings["requests"]), conditions)
 
 
 def _gains(name: str, document: Any) -> Iterator[Row]:

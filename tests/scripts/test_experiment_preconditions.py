@@ -228,7 +228,7 @@ def test_a_row_of_an_earlier_run_names_its_day_commit_and_load(
     measured = {row["figure"]: row["measured"] for row in rows}
     assert measured == {"FT Table I": THIS_RUN, "FT Figure 6": "earlier: 2026-01-02, commit 0ld, load 1.5"}
     page = (out / "papers.md").read_text(encoding="utf-8")
-    assert "Not complete.** Not measured: offload, fig5, fig7, fig9, outages." in page
+    assert "Not complete.** Not measured: offload, fig4, fig5, fig7, fig9, outages." in page
 
 
 def test_a_row_measured_now_under_load_is_marked(tmp_path: Path) -> None:
