@@ -88,11 +88,7 @@ class Replicas:
         elif case == "lossy":
             other.loss = 0.05
         for label in self.servers:
-            core = self.net.cores[label]
-            self.serving[label] = core.serve(
-                core.resolve("plan", Right.SERVE), at_once=None, is_global=True, urgent=False
-            )
-            self.net.send(label)
+            self.serve(label)
         self.call(1, 1)
         member = self.net.cores[ROBOT].member
         assert self.run(10.0, lambda: len(member.peers(self.topic.name)) == len(self.servers))
@@ -101,6 +97,12 @@ class Replicas:
             self.net.world.network.replace(f"s/{OTHER}", Stalled(self.net.cores[OTHER].member))
         elif case == "frozen":
             self.freeze(OTHER)
+
+    def serve(self, label: str) -> None:
+        """Let a server serve from now on."""
+        core = self.net.cores[label]
+        self.serving[label] = core.serve(core.resolve("plan", Right.SERVE), at_once=None, is_global=True, urgent=False)
+        self.net.send(label)
 
     def freeze(self, label: str) -> None:
         del self.serving[label]
@@ -181,6 +183,37 @@ def test_the_call_that_meets_a_server_as_it_freezes_takes_a_few_round_trips_more
     first_s, *later_s = replicas.call(size, CALLS[size])
     assert first_s <= alone_s[0] + 0.06
     assert_as_fast(later_s, alone_s)
+
+
+@pytest.mark.parametrize("case", ["as near", "far"])
+def test_a_server_that_joins_while_requests_follow_each_other_delays_at_most_the_call_that_meets_it(case: str) -> None:
+    replicas = Replicas((OTHER, NEAR))
+    replicas.links[OTHER].delay_s += 0.1 * (case == "far")
+    replicas.serve(NEAR)
+    core, calls = replicas.net.cores[ROBOT], list[tuple[float, Call]]()
+    took_s: dict[int, float] = {}
+
+    def ask() -> None:
+        calls.append((replicas.net.now_s, Call(payload=bytes(307_200), timeout_s=20.0, replication=ALL)))
+        core.call(replicas.topic, calls[-1][1], replicas.net.now_s)
+        replicas.net.send(ROBOT)
+
+    def look() -> bool:
+        for number, (begun_s, call) in enumerate(calls):
+            if call.is_done:
+                took_s.setdefault(number, replicas.net.now_s - begun_s)
+        return len(took_s) == 120
+
+    replicas.call(1, 2)
+    for number in range(120):
+        replicas.net.world.network.call(0.1 * number, ask)
+    replicas.net.world.network.call(4.02, partial(replicas.serve, OTHER))
+    assert replicas.run(20.0, look)
+    assert len(core.member.peers(replicas.topic.name)) == 2
+    before_s = median(took_s[number] for number in range(20, 40))
+    after_s = sorted(took_s[number] for number in range(40, 120))
+    assert after_s[-1] <= 2 * before_s, [round(1e3 * each, 1) for each in after_s[-5:]]
+    assert after_s[-3] <= SHARE * before_s, [round(1e3 * each, 1) for each in after_s[-5:]]
 
 
 def test_on_a_thin_uplink_a_far_server_costs_no_time_and_hardly_a_byte_once_its_path_is_known() -> None:
