@@ -2,8 +2,9 @@
 """Readability figures of the source, printed and compared with committed limits.
 
     scripts/readability.py                   print the figures
-    scripts/readability.py --check           fail if a figure is worse than its limit in scripts/readability.json
-    scripts/readability.py --save            write the present figures as limits
+    scripts/readability.py --check           fail if a figure is worse than its limit in scripts/readability.json,
+                                             or if a limit was raised without a reason in scripts/raised_limits.yaml
+    scripts/readability.py --save            write the better of limit and figure as limits: they never get looser
     scripts/readability.py --words           list each listed word as file:line:column: word
     scripts/readability.py --names           list method names that many packages define
     scripts/readability.py --docstrings      list public definitions without docstring
@@ -23,16 +24,21 @@ import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import grimp
 import networkx
+import yaml
 from rich.console import Console
 from rich.table import Table
 
+from gdp.crypto.statements import StatementType
+
 ROOT = Path(__file__).resolve().parent.parent
 SETTINGS = ROOT / "scripts" / "readability.json"
+RAISED = ROOT / "scripts" / "raised_limits.yaml"
 PRODUCT = ("gdp", "proxy", "fog")
 SCANNED = frozenset({".cff", ".in", ".lua", ".md", ".py", ".service", ".sh", ".toml", ".yaml", ".yml"})
 HIGHER_IS_BETTER = frozenset({"tests"})
@@ -41,6 +47,9 @@ _TOKEN = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 _CODE_SPAN = re.compile(r"`[^`]*`")
 _LIST_ITEM = re.compile(r"\s*(?:[-*+]|\d+\.)\s+")
 _SENTENCE_END = re.compile(r"(?<=[.!?])[\"')*_]*\s+(?=[\"'(*_`\[]*[A-Z0-9`])")
+_SECONDS = re.compile(r"_?[A-Z][A-Z0-9_]*_S")
+_MANY_METHODS = 30
+_MANY_ARGUMENTS = 9
 _ABBREVIATION = re.compile(r"\b(?:e\.g|i\.e|etc|cf|vs)\.")
 
 
@@ -162,10 +171,13 @@ def word_count(sentence: str) -> int:
     return sum(any(sign.isalnum() for sign in word) for word in sentence.split())
 
 
+def _pages(root: Path) -> list[Path]:
+    return [root / "README.md", *sorted((root / "docs").rglob("*.md"))]
+
+
 def sentence_lengths(root: Path) -> list[int]:
     """Return the words of each sentence of README.md and docs, longest first."""
-    pages = [root / "README.md", *sorted((root / "docs").rglob("*.md"))]
-    return sorted((word_count(each) for page in pages for each in sentences(page.read_text())), reverse=True)
+    return sorted((word_count(each) for page in _pages(root) for each in sentences(page.read_text())), reverse=True)
 
 
 Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
@@ -235,9 +247,37 @@ def broken_import_rules(root: Path) -> int:
     return int(match[1])
 
 
-def _line_count(files: Iterable[Path], root: Path, folders: tuple[str, ...]) -> int:
-    chosen = (file for file in files if file.suffix in (".py", ".sh", ".lua"))
-    return sum(len(file.read_text().splitlines()) for file in chosen if file.relative_to(root).parts[0] in folders)
+def line_counts(files: Iterable[Path], root: Path) -> tuple[int, int]:
+    """Return the lines of the product, and those of scripts and of the test beds of ``netns_tests``."""
+    product = beds = 0
+    for file in files:
+        folder = file.relative_to(root).parts[0]
+        if file.suffix not in (".py", ".sh", ".lua"):
+            continue
+        count = len(file.read_text().splitlines())
+        product += count * (folder in PRODUCT)
+        beds += count * (folder == "scripts" or (folder == "netns_tests" and not file.name.startswith("test_")))
+    return product, beds
+
+
+def shape_counts(trees: Iterable[ast.Module]) -> dict[str, float]:
+    """Return the number of constants in seconds, of classes with many methods, of constructors with many arguments."""
+    seconds = classes = constructors = 0
+    for node in (node for tree in trees for node in ast.walk(tree)):
+        if isinstance(node, (ast.Assign, ast.AnnAssign)):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            seconds += sum(isinstance(each, ast.Name) and bool(_SECONDS.fullmatch(each.id)) for each in targets)
+        elif isinstance(node, ast.ClassDef):
+            methods = [each for each in node.body if isinstance(each, _FUNCTIONS)]
+            classes += len(methods) >= _MANY_METHODS
+            made = [each.args for each in methods if each.name == "__init__"]
+            counts = (len([*each.posonlyargs, *each.args, *each.kwonlyargs]) - 1 for each in made)
+            constructors += sum(count >= _MANY_ARGUMENTS for count in counts)
+    return {
+        "constants in seconds": seconds,
+        f"classes of {_MANY_METHODS} methods": classes,
+        f"constructors of {_MANY_ARGUMENTS} arguments": constructors,
+    }
 
 
 def _test_count(files: Iterable[Path], root: Path) -> int:
@@ -274,6 +314,7 @@ def measure(root: Path, settings: Settings) -> Report:
     bare = undocumented(trees)
     names = shared_names(trees, settings.protocol_names)
     circles = import_circles()
+    product, beds = line_counts(files, root)
     figures: dict[str, float] = {
         "listed words": len(words),
         "words a sentence": round(sum(lengths) / max(1, len(lengths)), 1),
@@ -282,7 +323,11 @@ def measure(root: Path, settings: Settings) -> Report:
         "import circles": len(circles),
         "broken import rules": broken_import_rules(root),
         "packages that define one method name": names[0][0] if names else 0,
-        "product and script lines": _line_count(files, root, parts),
+        "product lines": product,
+        "lines of scripts and test beds": beds,
+        **shape_counts(tree for path, tree in trees.items() if path.split("/", 1)[0] in PRODUCT),
+        "signed statement types": len(StatementType),
+        "words of docs": sum(len(page.read_text().split()) for page in _pages(root)),
         "tests": _test_count(files, root),
     }
     return Report(figures, words, bare, names, circles)
@@ -305,10 +350,48 @@ def regressions(figures: dict[str, float], limits: dict[str, float]) -> list[str
 
 
 def save_limits(path: Path, figures: dict[str, float]) -> None:
-    """Write the figures as limits; every other key of the file stays."""
+    """Write the better of the old limit and the figure as limit; every other key of the file stays."""
     data: dict[str, Any] = json.loads(path.read_text())
-    data["limits"] = figures
+    old = data["limits"]
+    data["limits"] = {
+        figure: old[figure] if figure in old and is_worse(figure, value, old[figure]) else value
+        for figure, value in figures.items()
+    }
     path.write_text(json.dumps(data, indent=2) + "\n")
+
+
+def limit_versions(root: Path) -> list[dict[str, float]]:
+    """Return the limits as they were committed since ``RAISED`` exists, and those of the working tree, oldest first.
+
+    Outside of a repository, and before the first commit of that file, these are the working tree's only.
+    """
+
+    def git(*words: str) -> str:
+        asked = subprocess.run(["git", "-C", str(root), *words], capture_output=True, text=True, check=False)
+        return asked.stdout.strip() if asked.returncode == 0 else ""
+
+    settings, raised = (each.relative_to(ROOT).as_posix() for each in (SETTINGS, RAISED))
+    begun = git("log", "--diff-filter=A", "--format=%H", "--", raised).split()[-1:]
+    commits = (
+        [*begun, *git("log", "--reverse", "--format=%H", f"{begun[0]}..HEAD", "--", settings).split()] if begun else []
+    )
+    texts = [*(git("show", f"{commit}:{settings}") for commit in commits), (root / settings).read_text()]
+    return [json.loads(text)["limits"] for text in texts]
+
+
+def loosened(versions: Sequence[dict[str, float]], reasons: Iterable[dict[str, Any]]) -> list[str]:
+    """Return one line for each limit that became looser from a version to the next, and has no reason.
+
+    Args:
+        reasons: for each one that may: ``figure``, the new ``limit``, and ``reason``.
+    """
+    permitted = {(each["figure"], each["limit"]) for each in reasons if each["reason"]}
+    return [
+        f"{figure}: the limit was raised from {before[figure]:g} to {limit:g} without a reason in {RAISED.name}"
+        for before, after in pairwise(versions)
+        for figure, limit in after.items()
+        if figure in before and is_worse(figure, limit, before[figure]) and (figure, limit) not in permitted
+    ]
 
 
 def _table(report: Report, settings: Settings) -> Table:
@@ -330,7 +413,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         description=head, epilog=text, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--check", action="store_true", help="fail if a figure is worse than its limit")
-    parser.add_argument("--save", action="store_true", help="write the present figures as limits")
+    parser.add_argument("--save", action="store_true", help="lower the limits to the present figures")
     parser.add_argument("--words", action="store_true", help="list each place of a listed word")
     parser.add_argument("--names", action="store_true", help="list method names that several packages define")
     parser.add_argument("--docstrings", action="store_true", help="list public definitions without docstring")
@@ -358,6 +441,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         save_limits(SETTINGS, report.figures)
     elif options.check:
         worse = regressions(report.figures, settings.limits)
+        worse += loosened(limit_versions(ROOT), yaml.safe_load(RAISED.read_text()))
         for line in worse:
             print(f"readability: worse: {line}", file=sys.stderr)
         return 1 if worse else 0

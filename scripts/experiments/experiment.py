@@ -130,7 +130,7 @@ class Report:
         parts += [markdown_table(_FIGURES, [each.cells(state) for each in self.findings])]
         parts += ["\n".join(f"- {note}" for note in self.notes)]
         stated = "; ".join(f"{key}: {value}" for key, value in self.settings.items())
-        return "\n\n".join([*parts, f"Measured on {state}. {stated}."]) + "\n"
+        return "\n\n".join([*parts, f"Measured on {state}. Settings: {stated}."]) + "\n"
 
     def show(self, state: MachineState) -> None:
         """Print the tables and the notes."""
