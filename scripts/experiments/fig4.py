@@ -83,10 +83,12 @@ def _draw(path: Path, title: str, figures: Mapping[str, Sequence[float]]) -> Non
     figure, axis = plt.subplots(figsize=(8, 3), layout="constrained")
     for at, (what, colour) in enumerate(zip(COUNTED, ("#1f6f8b", "#c96f3b", "#99a8b2"), strict=True)):
         places = [place + 0.25 * at for place in range(len(figures))]
-        axis.barh(places, [each[at] for each in figures.values()], 0.22, color=colour, label=what)
+        axis.barh(places, [each[at] / 1e3 for each in figures.values()], 0.22, color=colour, label=what)
     axis.set_yticks(range(len(figures)), list(figures), fontsize=8)
     axis.invert_yaxis()
+    axis.set_xlabel("kB a request", fontsize=8)
     tidy(axis)
+    axis.legend(fontsize=8, frameon=False, ncols=len(COUNTED), loc="lower left", bbox_to_anchor=(0, 1))
     save(figure, path, title)
 
 
