@@ -6,13 +6,14 @@ I/O. Source: proc(5), field 22 of ``/proc/PID/stat``; pidfd_open(2).
 from __future__ import annotations
 
 import os
-import select
 import signal
 import time
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+
+from gdp.ports.readiness import readable
 
 __all__ = ["Process", "boot_id", "end_all"]
 
@@ -81,13 +82,9 @@ def end_all(processes: Iterable[Process], patience_s: float = 3.0, *, are_leader
 
 def _still_running(waiting: dict[int, Process], patience_s: float) -> list[Process]:
     """Wait for the process descriptors to become readable, which happens when their process ends."""
-    poller = select.poll()
     left = {descriptor: process for descriptor, process in waiting.items() if process.alive}
-    for descriptor in left:
-        poller.register(descriptor, select.POLLIN)
     deadline_s = time.monotonic() + patience_s
     while left and (rest_s := deadline_s - time.monotonic()) > 0:
-        for descriptor, _ in poller.poll(rest_s * 1_000):
-            poller.unregister(descriptor)
+        for descriptor in readable(left, rest_s):
             del left[descriptor]
     return list(left.values())

@@ -33,6 +33,7 @@ from gdp.nodes.control_protocol import (
     decode_request,
     encode_response,
 )
+from gdp.ports.readiness import readable
 
 __all__ = [
     "CONTROL_SOCKET",
@@ -260,10 +261,7 @@ def serve_control_in_thread(path: Path, handlers: ControlHandlers) -> Iterator[C
 
     def serve() -> None:
         """Handle events until the context ends."""
-        poll = select.poll()
-        poll.register(server, select.POLLIN)
-        poll.register(ended, select.POLLIN)
-        while ended.fileno() not in (fd for fd, _ in poll.poll()):
+        while ended.fileno() not in readable([server.fileno(), ended.fileno()]):
             server.handle_events()
 
     thread = threading.Thread(target=serve, name="control", daemon=True)

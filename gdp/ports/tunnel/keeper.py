@@ -17,7 +17,6 @@ import errno
 import fcntl
 import json
 import os
-import select
 import shutil
 import signal
 import socket
@@ -33,6 +32,7 @@ from typing import Final
 from gdp.errors import LocalError
 from gdp.ports.confine.system import prctl
 from gdp.ports.netlink import LINK_GROUP, READ_BYTES, RefusedError, listen
+from gdp.ports.readiness import readable
 from gdp.ports.sockets import AS_ROOT
 from gdp.ports.tunnel.control import ControlLostError
 from gdp.ports.tunnel.devices import (
@@ -151,12 +151,10 @@ class _Owner:
 
     def wait(self, *others: int, timeout_s: float | None = None) -> bool:
         """Wait for the owner's end or for one of the other descriptors; return whether the owner is still there."""
-        poll = select.poll()
-        for fd in (self.fileno(), *others, *self._watched):
-            poll.register(fd, select.POLLIN)
         end_s = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
-            ready = {fd for fd, _ in poll.poll(None if end_s is None else max(end_s - time.monotonic(), 0.0) * 1000)}
+            left_s = None if end_s is None else max(end_s - time.monotonic(), 0.0)
+            ready = set(readable((self.fileno(), *others, *self._watched), left_s))
             for fd in ready & self._watched.keys():
                 self._watched[fd]()
             if self.fileno() in ready:

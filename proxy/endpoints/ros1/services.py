@@ -9,7 +9,6 @@ from __future__ import annotations
 import ast
 import itertools
 import queue
-import select
 import threading
 from collections.abc import Iterator
 from typing import Final
@@ -19,6 +18,7 @@ from rospy.exceptions import ROSInternalException, TransportInitError
 from rospy.impl.tcpros_base import TCPROSTransport
 from rospy.impl.tcpros_service import ServiceProxy
 
+from gdp.ports.readiness import readable
 from proxy.endpoints.ros1.ipc import IpcLink, Kind
 from proxy.endpoints.ros1.raw import KnownMessage, KnownService, Raw, raw_service, ros1_name
 
@@ -204,9 +204,7 @@ def _has_ended(proxy: ServiceProxy) -> bool:
     transport = proxy.transport
     if transport is None or transport.done or transport.socket is None:
         return True
-    poller = select.poll()
-    poller.register(transport.socket, select.POLLIN)
-    return bool(poller.poll(0))
+    return bool(readable([transport.socket], 0))
 
 
 def _reason(error: Exception) -> str:
