@@ -82,7 +82,7 @@ class Problem:
             planner: its class in ``ompl.geometric``, such as ``RRTConnect``.
             patience_s: limit of the search, in seconds.
             is_over: polled during the search; whether the path is no longer wanted.
-            most_checks: limit of the search, in states; it does not depend on other load of the machine.
+            most_checks: limit of the search, in states, whatever the load; a path that took as many counts as none.
         """
         space = base.SE3StateSpace()
         bounds = base.RealVectorBounds(3)
@@ -104,7 +104,7 @@ class Problem:
         timed = base.timedPlannerTerminationCondition(patience_s)
         stopped = base.PlannerTerminationCondition(lambda: checks[0] >= most_checks or is_over())
         setup.solve(base.plannerOrTerminationCondition(timed, stopped))
-        if not setup.haveExactSolutionPath():
+        if checks[0] >= most_checks or not setup.haveExactSolutionPath():
             return Solved(None, checks[0])
         states = setup.getSolutionPath().getStates()
         way = [(each.getX(), each.getY(), each.getZ(), *_turn(each.rotation())) for each in states]

@@ -32,7 +32,7 @@ __all__ = ["COUNT", "TRACES", "Trace", "record"]
 
 TRACES: Final = Path(__file__).with_name("traces.json")
 COUNT: Final = 200
-_LENGTH_S: Final = 60.0
+_LENGTH_S, _BEGIN_S = 60.0, 3.0
 _FAULTS_S: Final = (12.0, 50.0)
 _TICK_S: Final = 0.5
 _SWITCHES_MAX: Final = 7
@@ -109,12 +109,11 @@ class _Run:
                 cable.loss, cable.jitter_s = chance.choice([0.01, 0.05]), chance.choice([0.0, 0.002])
         for at_s in sorted(chance.uniform(*_FAULTS_S) for _ in range(chance.randint(1, 4))):
             world.network.call(at_s, self._draw_fault())
-        world.network.run(3.0)
+        world.network.run(_BEGIN_S)
         self._begin()
-        ticks = int((_LENGTH_S - 3.0) / _TICK_S)
-        for number in range(ticks):
+        for number in range(int((_LENGTH_S - _BEGIN_S) / _TICK_S)):
             world.network.call(number * _TICK_S, partial(self._tick, number))
-        world.network.run(_LENGTH_S - 3.0)
+        world.network.run(_LENGTH_S - _BEGIN_S)
 
     def _begin(self) -> None:
         labels = list(self.world.members)
