@@ -138,7 +138,7 @@ def _holder(descriptor: int) -> str | None:
 def _command(pid: int) -> str:
     """Return a process's command line as typed; empty if this user may not read it."""
     try:
-        words = Path(f"/proc/{pid}/cmdline").read_text(encoding="utf-8", errors="replace").split("\0")[:-1]
+        words = Path(f"/proc/{pid}/cmdline").read_text(encoding="utf-8", errors="replace").rstrip("\0").split("\0")
     except OSError:
         return ""
     if len(words) > 1 and Path(words[0]).name.startswith(_PYTHON) and not words[1].startswith("-"):

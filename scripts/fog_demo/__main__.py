@@ -6,8 +6,12 @@ I/O. Imports take one second, in which no resource exists yet, so Ctrl-C then en
 import os
 import signal
 
+from lab import zygote
+
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, lambda number, _: os._exit(128 + number))
+    if not zygote.is_installed():
+        zygote.install()
     from fog_demo.cli import main
 
     main()

@@ -6,8 +6,12 @@ I/O. Importing takes half a second, in which nothing is created yet: Ctrl-C then
 import os
 import signal
 
+from lab import zygote
+
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, lambda number, _: os._exit(128 + number))
+    if not zygote.is_installed():
+        zygote.install()
     from ring.cli import main
 
     main()

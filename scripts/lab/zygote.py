@@ -1,0 +1,403 @@
+"""Zygote: a process that has imported the project once, and forks each program that a harness starts.
+
+I/O; Linux. An import of ``gdp-switch`` costs about half a second of processor time, a fork some milliseconds. ``Popen``
+is ``subprocess.Popen`` with the same command lines: where a line starts one of the project's own programs, the zygote
+forks it, otherwise it is executed. The forked process is a child of the caller, so that waiting, signals, process
+groups and ``/proc/PID/cmdline`` are the same. Coverage, other settings of the interpreter, another mount namespace or
+another copy of the project mean the real program.
+
+    zygote.install()
+    process = subprocess.Popen([sys.executable, "-m", "gdp.cli.switch", "--help"])
+
+Source: prctl(2) ``PR_SET_CHILD_SUBREAPER``, proc(5) ``stat``, setns(2), unix(7).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import fcntl
+import functools
+import gc
+import importlib
+import importlib.metadata
+import io
+import json
+import os
+import resource
+import runpy
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+__all__ = ["Popen", "Zygote", "install", "is_installed"]
+
+ROOT: Final = Path(__file__).resolve().parents[2]
+_PRELOADED: Final = (
+    "gdp.cli.switch",
+    "gdp.cli.rib",
+    "gdp.cli.gdp",
+    "gdp.cli.relay",
+    "proxy.cli.proxy",
+    "proxy.cli.replay",
+    "fog.cli.app",
+    "gdp.simulation.namespaces",
+    "pyroute2.netns",
+)
+_STARTERS: Final = ("fog.cli.app", "fog.host.cli", "ring", "internet_demo", "fog_demo")  # these start many programs
+_PACKAGES: Final = ("gdp", "proxy", "fog", "ring", "internet", "internet_demo", "fog_demo", "netns_tests")
+_KEPT: Final = ("PYTHONPATH", "PYTHONUNBUFFERED")  # settings of the interpreter that a forked program follows
+_SETTINGS: Final = ("PYTHON", "LD_", "COVERAGE", "OPENBLAS", "OMP_")
+_SPACES: Final = ("cgroup", "ipc", "mnt", "pid", "user", "uts")
+_LIMITS: Final = tuple(value for name, value in vars(resource).items() if name.startswith("RLIMIT_"))
+_REQUEST_BYTES: Final = 1 << 18
+_FIRST_FD: Final = 512  # received descriptors wait above this number until each has its own
+_SET_PDEATHSIG, _SET_CHILD_SUBREAPER = 1, 36
+_PLACE_OF_NAME: Final = "-" * 4096  # an argument, which each forked process replaces with its own command line
+_CLONE_NEWNET: Final = 0x40000000
+_LIBC: Final = ctypes.CDLL(None, use_errno=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Program:
+    """What to run in a forked process; ``module`` as by ``python -m``, or else ``file`` as a script."""
+
+    argv: list[str]
+    module: str = ""
+    file: str = ""
+    netns: str = ""
+    pdeathsig: int = 0
+    environment: tuple[tuple[str, str], ...] = ()
+
+    @classmethod
+    def from_argv(cls, argv: Sequence[str]) -> Program | None:
+        """Return the project's program that a command line starts; None: it starts something else."""
+        words = [os.fspath(each) for each in argv]
+        netns, pdeathsig, environment = "", 0, []
+        while words:
+            if words[0] == "nsenter" and len(words) > 2 and words[1].startswith("--net="):
+                netns, words = words[1].removeprefix("--net="), words[2:]
+            elif words[:3] == ["setpriv", "--pdeathsig", "KILL"]:
+                pdeathsig, words = signal.SIGKILL, words[3:]
+            elif words[0] == "env" and len(words) > 1 and not words[1].startswith("-"):
+                words = words[1:]
+                while words and "=" in words[0]:
+                    name, _, value = words.pop(0).partition("=")
+                    environment.append((name, value))
+            else:
+                break
+            words = words[1:] if words[:1] == ["--"] else words
+        if not words or Path(words[0]).parent != Path(sys.executable).parent:
+            return None
+        program = cls(words, netns=netns, pdeathsig=pdeathsig, environment=tuple(environment))
+        if not Path(words[0]).name.startswith("python"):
+            return replace(program, file=words[0]) if Path(words[0]).name in _scripts() else None
+        if words[1:2] == ["-m"] and len(words) > 2 and words[2].partition(".")[0] in _PACKAGES:
+            return replace(program, module=words[2])
+        if len(words) > 1 and words[1].endswith(".py") and Path(words[1]).resolve().is_relative_to(ROOT):
+            return replace(program, file=words[1])
+        return None
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """One program with what its process inherits.
+
+    Descriptors travel with it: 0 to 2, the namespace, a pipe that is closed when the program begins, then ``fds``.
+    """
+
+    program: dict[str, Any]
+    parent: int
+    cwd: str
+    environment: dict[str, str]
+    limits: list[list[int]]
+    fds: list[int]
+    new_session: bool
+    umask: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Birth:
+    """What an interpreter of this installation begins with: ``sys.path`` from its second entry on, and variables."""
+
+    path: list[str]
+    added: dict[str, str]
+
+
+_born: list[_Birth] = []  # set in processes that a zygote has forked
+
+
+class Zygote:
+    """A running zygote, seen by the process that starts it; one request at a time, from any thread."""
+
+    def __init__(self, pid: int, link: socket.socket) -> None:
+        self.pid = pid
+        self._link = link
+        self._lock = threading.Lock()
+        self._place = _place()
+        self._settings = _settings(os.environ)
+
+    @classmethod
+    def start(cls) -> Zygote:
+        """Start a zygote: in an interpreter of its own, or as a fork of a process that a zygote has forked.
+
+        Call this before there are threads. In the new process it does not return.
+        """
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs:
+            if _born:
+                if (pid := os.fork()) == 0:
+                    ours.close()
+                    _live(theirs, _born[0])
+                    sys.exit()
+                return cls(pid, ours)
+            environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+            theirs.set_inheritable(True)
+            words = [sys.executable, "-m", "lab.zygote", str(theirs.fileno()), _PLACE_OF_NAME]
+            return cls(os.posix_spawn(sys.executable, words, environment), ours)
+
+    def fork(self, request: Request, descriptors: Sequence[int]) -> int:
+        """Return the process id of a new child of the caller. Raises ``OSError``: the zygote is gone."""
+        with self._lock:
+            _prctl(_SET_CHILD_SUBREAPER, 1)  # the new process is an orphan for a moment; it becomes our child
+            try:
+                data = json.dumps(asdict(request)).encode()
+                socket.send_fds(self._link, [data], list(descriptors))
+                answer = self._link.recv(64)
+            finally:
+                _prctl(_SET_CHILD_SUBREAPER, 0)
+        if not answer:
+            raise OSError("the zygote has ended")
+        return int(answer)
+
+    def can_run(self, program: Program, environment: Mapping[str, str], cwd: Path) -> bool:
+        """Return whether a forked process is the same as an executed one would be."""
+        if _settings(environment) != self._settings:
+            return False
+        first = Path(program.file).parent if program.file else cwd
+        folders = [first, *map(Path, filter(None, environment.get("PYTHONPATH", "").split(os.pathsep)))]
+        return self._place == _place() and not any(
+            (each / "gdp").is_dir() and not (each / "gdp").samefile(ROOT / "gdp") for each in folders
+        )
+
+    def close(self) -> None:
+        """End the zygote; what it has forked goes on."""
+        self._link.close()
+        with contextlib.suppress(ChildProcessError):
+            os.waitpid(self.pid, 0)
+
+
+def install() -> None:
+    """Let ``subprocess`` fork what this process starts of the project; call this before there are threads."""
+    Popen.zygote = Zygote.start()
+    subprocess.Popen = Popen  # type: ignore[misc]
+
+
+def is_installed() -> bool:
+    """Return whether ``subprocess`` forks the project's programs."""
+    return subprocess.Popen is Popen
+
+
+class Popen(subprocess.Popen):  # type: ignore[type-arg]
+    """``subprocess.Popen`` that forks the project's own programs from ``zygote``, if there is one."""
+
+    zygote: Zygote | None = None
+
+    def _execute_child(
+        self, args: Any, executable: Any, preexec_fn: Any, close_fds: Any, pass_fds: Any, cwd: Any, env: Any, *rest: Any
+    ) -> None:
+        """Fork, or execute; the arguments are those of the standard library from 3.10 to 3.14."""
+        zygote, program = self.zygote, None
+        (_, _, shell, *pipes), others = rest[:9], rest[9:]
+        _, gid, gids, uid, umask, new_session, *group = others
+        plain = not (shell or executable or preexec_fn or gid is not None or gids is not None or uid is not None)
+        if (
+            zygote is not None
+            and plain
+            and close_fds
+            and not isinstance(args, (str, bytes))
+            and all(each == -1 for each in group)
+        ):
+            program = Program.from_argv(args)
+        if zygote is None or program is None:
+            super()._execute_child(args, executable, preexec_fn, close_fds, pass_fds, cwd, env, *rest)  # type: ignore[misc]
+            return
+        environment = {**(os.environ if env is None else env), **dict(program.environment)}
+        environment = {os.fsdecode(name): os.fsdecode(value) for name, value in environment.items()}
+        folder = Path(os.getcwd() if cwd is None else os.fspath(cwd)).absolute()
+        if not folder.is_dir() or not zygote.can_run(program, environment, folder):
+            super()._execute_child(args, executable, preexec_fn, close_fds, pass_fds, cwd, env, *rest)  # type: ignore[misc]
+            return
+        fds = sorted(pass_fds)
+        request = Request(
+            asdict(program),
+            os.getpid(),
+            str(folder),
+            environment,
+            [list(resource.getrlimit(each)) for each in _LIMITS],
+            fds,
+            new_session,
+            umask,
+        )
+        p2cread, _, _, c2pwrite, _, errwrite = pipes
+        with open("/proc/thread-self/ns/net", "rb") as space:
+            standard = [number if each == -1 else each for number, each in enumerate((p2cread, c2pwrite, errwrite))]
+            begun, begins = os.pipe()
+            try:
+                self.pid = zygote.fork(request, [*standard, space.fileno(), begins, *fds])
+            finally:
+                os.close(begins)
+                with open(begun, "rb") as pipe:
+                    pipe.read()
+        self._child_created = True
+        self._close_pipe_fds(*pipes)  # type: ignore[attr-defined]
+
+
+def main() -> None:
+    """Import the project, then fork programs until the caller closes its end of the socket."""
+    path = sys.path[1:]
+    link = socket.socket(fileno=int(sys.argv[1]))
+    for module in _PRELOADED:
+        importlib.import_module(module)
+    started = dict(entry.partition("=")[::2] for entry in Path("/proc/self/environ").read_text().split("\0") if entry)
+    added = {name: value for name, value in os.environ.items() if name not in started}
+    gc.collect()
+    gc.freeze()
+    _live(link, _Birth(path, added))
+
+
+def _live(link: socket.socket, birth: _Birth) -> None:
+    """Fork programs until the caller is gone; in each forked process, run its program."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the programs
+    if (program := _serve(link, birth)) is not None:
+        _born[:] = [birth]
+        if program.module.partition(".")[0] in _STARTERS or program.module in _STARTERS:
+            install()
+        _run(program)
+
+
+def _serve(link: socket.socket, birth: _Birth) -> Program | None:
+    """Return the program to run, in each forked process; None in the zygote, at its end."""
+    while True:
+        data, descriptors, _, _ = socket.recv_fds(link, _REQUEST_BYTES, 64)
+        if not data:
+            return None
+        gate, opens = os.pipe()
+        reads, writes = os.pipe()
+        if (between := os.fork()) == 0:
+            if child := os.fork():
+                os.write(writes, str(child).encode())
+                os._exit(0)
+            os.close(opens)
+            os.read(gate, 1)  # until the caller has adopted us
+            return _become(Request(**json.loads(data)), descriptors, birth)
+        for each in (gate, writes, *descriptors):
+            os.close(each)
+        os.waitpid(between, 0)
+        link.send(os.read(reads, 64))
+        os.close(reads)
+        os.close(opens)
+
+
+def _become(request: Request, descriptors: Sequence[int], birth: _Birth) -> Program:
+    """Take over what the process inherits, and return its program."""
+    program = Program(**request.program)
+    if request.new_session:
+        os.setsid()
+    if request.umask >= 0:
+        os.umask(request.umask)
+    waiting = [fcntl.fcntl(each, fcntl.F_DUPFD, _FIRST_FD) for each in descriptors]
+    os.closerange(0, _FIRST_FD)
+    space = waiting[3]
+    for number, each in zip([0, 1, 2, *request.fds], [*waiting[:3], *waiting[5:]], strict=True):
+        os.dup2(each, number, inheritable=True)
+    _enter(space)
+    os.chdir(request.cwd)
+    if program.netns:
+        with open(program.netns, "rb") as file:
+            _enter(file.fileno())
+    for which, limits in zip(_LIMITS, request.limits, strict=True):
+        if list(resource.getrlimit(which)) != limits:
+            resource.setrlimit(which, (limits[0], limits[1]))
+    if program.pdeathsig:
+        _prctl(_SET_PDEATHSIG, program.pdeathsig)
+        if os.getppid() != request.parent:
+            os._exit(128 + program.pdeathsig)
+    os.environ.clear()
+    os.environ.update({**birth.added, **request.environment})
+    first = str(Path(program.file).resolve().parent) if program.file else request.cwd
+    paths = filter(None, request.environment.get("PYTHONPATH", "").split(os.pathsep))
+    sys.path[:] = [first, *paths, *birth.path]
+    _name(program.argv)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    _open_streams(is_unbuffered=bool(request.environment.get("PYTHONUNBUFFERED")))
+    os.closerange(_FIRST_FD, waiting[-1] + 1)
+    return program
+
+
+def _run(program: Program) -> None:
+    if program.module:
+        sys.argv = [program.module, *program.argv[3:]]
+        sys.modules.pop(program.module, None)  # as a fresh interpreter, which runs it once, as __main__
+        runpy.run_module(program.module, run_name="__main__", alter_sys=True)
+        return
+    sys.argv = program.argv[program.argv.index(program.file) :]
+    runpy.run_path(program.file, run_name="__main__")
+
+
+def _open_streams(*, is_unbuffered: bool) -> None:
+    """Give standard output and standard error the buffers that a fresh interpreter gives them."""
+    if not is_unbuffered:
+        if isinstance(sys.stdout, io.TextIOWrapper):
+            sys.stdout.reconfigure(line_buffering=os.isatty(1))
+        return
+    for name, number, errors in (("stdout", 1, "strict"), ("stderr", 2, "backslashreplace")):
+        raw = io.FileIO(number, "wb", closefd=False)
+        stream = io.TextIOWrapper(raw, encoding="utf-8", errors=errors, write_through=True)
+        setattr(sys, name, stream)
+        setattr(sys, f"__{name}__", stream)
+
+
+def _enter(descriptor: int) -> None:
+    if _LIBC.setns(descriptor, _CLONE_NEWNET):
+        raise OSError(ctypes.get_errno(), "setns")
+
+
+def _prctl(option: int, value: int, more: int = 0) -> int:
+    return int(_LIBC.prctl(option, ctypes.c_ulong(value), ctypes.c_ulong(more), 0, 0))
+
+
+def _name(argv: Sequence[str]) -> None:
+    """Let ``/proc/PID/cmdline`` say what runs here: write over the zygote's own arguments, which were long enough."""
+    fields = Path("/proc/self/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+    start, end = int(fields[45]), int(fields[46])
+    words = b"\0".join(map(os.fsencode, argv))[: end - start - 1]
+    ctypes.memmove(start, words.ljust(end - start, b"\0"), end - start)
+
+
+def _settings(environment: Mapping[str, str]) -> dict[str, str]:
+    """Return the variables that an interpreter or its libraries read before a program can change them."""
+    return {name: value for name, value in environment.items() if name.startswith(_SETTINGS) and name not in _KEPT}
+
+
+def _place() -> list[str]:
+    """Return what a forked process inherits from the zygote rather than from its caller."""
+    return [Path("/proc/self/cgroup").read_text(), *(os.readlink(f"/proc/self/ns/{each}") for each in _SPACES)]
+
+
+@functools.cache
+def _scripts() -> frozenset[str]:
+    """Return the names of the project's console scripts."""
+    return frozenset(
+        each.name for each in importlib.metadata.distribution("gdp-ros").entry_points if each.group == "console_scripts"
+    )
+
+
+if __name__ == "__main__":
+    main()
