@@ -23,17 +23,15 @@ from netns_tests import lifetimes
 from netns_tests.spaces import Space
 from tests.clones import make_clone
 from tests.fixtures_forwarding import IN, IN_MAC, MTUS, NARROW, NARROW_MAC, PEER_MACS, WIDE, WIDE_MAC
-from tests.forked_programs import fork_programs
 from tests.script_packages import share_script_packages
 
 MakeKernel = Callable[..., KernelPlane]
 PORT_MACS = {IN: IN_MAC, WIDE: WIDE_MAC, NARROW: NARROW_MAC}
 
 
-def pytest_configure(config: pytest.Config) -> None:
+def pytest_configure() -> None:
     """Let the processes that tests start import the ring and the demonstration."""
     share_script_packages()
-    fork_programs(config)
 
 
 @pytest.hookimpl(wrapper=True)

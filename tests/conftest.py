@@ -5,14 +5,12 @@ from __future__ import annotations
 import signal
 
 import hypothesis
-import pytest
 
 from gdp.control.boundary import ErrorBoundary
-from tests.forked_programs import fork_programs
 from tests.script_packages import share_script_packages
 
 
-def pytest_configure(config: pytest.Config) -> None:
+def pytest_configure() -> None:
     """Accept Ctrl-C again: a shell starts background processes with it ignored, and children inherit that.
 
     Errors that a node would contain fail the test that draws them. No generated example has a time limit: how long it
@@ -22,6 +20,5 @@ def pytest_configure(config: pytest.Config) -> None:
     hypothesis.settings.load_profile("unhurried")
     ErrorBoundary.reraises = True
     share_script_packages()
-    fork_programs(config)
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)

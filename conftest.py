@@ -1,0 +1,3 @@
+"""Plugin of all tests; fixtures are in the folders' own files."""
+
+pytest_plugins = ["tests.pool"]
