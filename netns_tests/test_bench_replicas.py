@@ -31,7 +31,7 @@ def test_no_request_fails_while_two_of_three_replicas_are_killed_and_come_back()
     assert reported.count("target ≤ 0.00, measured 0.00, met") == 3, reported
 
 
-@pytest.mark.soak
+@pytest.mark.nightly
 def test_replicas_are_compared_with_a_single_server() -> None:
     reported = bench("replicas.py", "--only", "hedged", "--rounds", "1", "--requests", "60")
     assert "two replicas, the second if late" in reported

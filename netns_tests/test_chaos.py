@@ -40,7 +40,7 @@ def argv_of(name: str, options: Sequence[str]) -> list[str]:
     return [sys.executable, str(ROOT / "scripts" / "bench" / name), *options]
 
 
-@pytest.mark.soak
+@pytest.mark.nightly
 def test_nothing_grows_in_memory_while_readers_and_publishers_come_and_go() -> None:
     ran = bench("soak.py", "--only", "memory", "--cycles", "150", "--publishers", "60", patience_s=_START_S)
     assert ran.returncode == 0, ran.stdout + ran.stderr

@@ -94,7 +94,7 @@ def account() -> dict[str, list[str]]:
     return found
 
 
-@pytest.mark.soak
+@pytest.mark.nightly
 def test_a_booted_replica_answers_the_robot_and_is_replaced_when_it_is_preempted(
     image: Path, software: Path, run: Run, space: Space, tmp_path: Path
 ) -> None:

@@ -133,7 +133,7 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @needs_debhelper
-@pytest.mark.soak
+@pytest.mark.nightly
 def test_the_package_is_installed_in_a_clean_debian_and_removed_without_a_trace(package: Path, tmp_path: Path) -> None:
     for each in ("upper/srv", "work", "root"):
         (tmp_path / each).mkdir(parents=True)
@@ -149,7 +149,7 @@ def test_the_package_is_installed_in_a_clean_debian_and_removed_without_a_trace(
 
 
 @needs_debhelper
-@pytest.mark.soak
+@pytest.mark.nightly
 @pytest.mark.skipif(shutil.which("lintian") is None, reason="needs lintian: apt-get install lintian")
 def test_lintian_finds_nothing_that_is_not_overridden_with_a_reason(package: Path) -> None:
     words = ["lintian", "--allow-root", "--fail-on", "error,warning", str(package)]
@@ -158,7 +158,7 @@ def test_lintian_finds_nothing_that_is_not_overridden_with_a_reason(package: Pat
 
 
 @needs_debhelper
-@pytest.mark.soak
+@pytest.mark.nightly
 def test_each_command_has_a_manual_page_and_completion_in_three_shells(package: Path) -> None:
     words = ["dpkg-deb", "--contents", str(package)]
     listing = subprocess.run(words, capture_output=True, text=True, check=True).stdout
@@ -186,7 +186,7 @@ class Images:
 
 
 @needs_debhelper
-@pytest.mark.soak
+@pytest.mark.nightly
 @pytest.mark.skipif(shutil.which("buildah") is None, reason="needs buildah: apt-get install buildah")
 def test_the_image_runs_the_nodes_of_a_machine(package: Path, tmp_path: Path, space: Space) -> None:
     images = Images(tmp_path)

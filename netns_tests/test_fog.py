@@ -193,7 +193,7 @@ def generate_launch_description():
 """
 
 
-@pytest.mark.soak
+@pytest.mark.nightly
 def test_load_adds_a_machine_and_one_on_demand_takes_the_place_of_a_spot_machine_that_is_not_to_be_had(
     fog: Fog, tmp_path: Path
 ) -> None:

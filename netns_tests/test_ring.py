@@ -31,12 +31,12 @@ PROJECT: Final = Path(__file__).parents[1]
 SHARED: Final = PROJECT.parent / "shared" / "data" / "bags"
 RECORDINGS: Final = (
     "tilt_laser.bag",
-    pytest.param("rosbag2_test", marks=pytest.mark.soak),
-    pytest.param("ros_numpy_test.bag", marks=pytest.mark.soak),
-    pytest.param("event_camera.bag", marks=pytest.mark.soak),
+    pytest.param("rosbag2_test", marks=pytest.mark.nightly),
+    pytest.param("ros_numpy_test.bag", marks=pytest.mark.nightly),
+    pytest.param("event_camera.bag", marks=pytest.mark.nightly),
     "ninety_four_types.mcap",
-    pytest.param("turtlesim.bag", marks=pytest.mark.soak),
-    pytest.param("aruco_compressed.bag", marks=pytest.mark.soak),
+    pytest.param("turtlesim.bag", marks=pytest.mark.nightly),
+    pytest.param("aruco_compressed.bag", marks=pytest.mark.nightly),
 )
 PATIENCE_S: Final = 240
 LASTING: Final = ("--seconds", 7, "--lease", LEASE_S)  # past three leases
@@ -208,7 +208,7 @@ def test_a_recording_of_a_real_robot_crosses(recording: str, tmp_path: Path) -> 
 
 @pytest.mark.momentary(FAST)
 @pytest.mark.parametrize(
-    "recording", ["ninety_four_types.mcap", pytest.param("tilt_laser.bag", marks=pytest.mark.soak)]
+    "recording", ["ninety_four_types.mcap", pytest.param("tilt_laser.bag", marks=pytest.mark.nightly)]
 )
 def test_with_cdr_the_very_bytes_cross(recording: str, tmp_path: Path) -> None:
     if not (SHARED / recording).exists():

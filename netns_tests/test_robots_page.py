@@ -183,7 +183,7 @@ def test_a_robot_and_a_server_meet_by_the_commands_of_the_page(
     assert " 0 faults" in said["gdp-proxy, exit 0"]
 
 
-@pytest.mark.soak
+@pytest.mark.nightly
 def test_a_ros_1_server_sees_a_ros_2_robot_by_the_commands_of_the_page(reader: Reader, terminals: Terminals) -> None:
     need_ros1()
     terminals.end("gdp-proxy --config server")

@@ -96,7 +96,7 @@ def states(machine: BootedMachine) -> dict[str, dict[str, Any]]:
     return {each["unit"]: each for each in json.loads(done)["units"]}
 
 
-@pytest.mark.soak
+@pytest.mark.nightly
 def test_installed_units_run_survive_a_reboot_and_leave_nothing_when_removed(
     boot: Callable[[], BootedMachine],
 ) -> None:

@@ -136,7 +136,7 @@ def origins(world: Simulation, label: str) -> set[bytes]:
 
 
 @pytest.mark.momentary("nothing flows")
-@pytest.mark.parametrize("later_s", [0.0, pytest.param(600.0, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("later_s", [0.0, pytest.param(600.0, marks=pytest.mark.nightly)])
 def test_a38_a_recorded_link_state_of_a_dead_switch_is_refused(later_s: float) -> None:
     world = ring(keepalive_ms=2_000)
     world.network.run(1)

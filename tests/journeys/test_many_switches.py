@@ -45,7 +45,7 @@ def wide(switches: int, seed: int = 1) -> Topology:
     )
 
 
-@pytest.mark.parametrize("switches", [8, pytest.param(25, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("switches", [8, pytest.param(25, marks=pytest.mark.nightly)])
 def test_up_to_two_hundred_switches_settle_and_deliver(switches: int) -> None:
     world = Simulation(topology=wide(switches), hello_s=5.0, dead_s=18.0, lease_s=5.0, keepalive_ms=4_000)
     assert len(world.switches) == DOMAINS * switches

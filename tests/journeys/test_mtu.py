@@ -194,7 +194,7 @@ def test_a_stream_goes_on_while_links_shrink_and_grow_between_its_messages() -> 
     flow.outlive()
 
 
-@pytest.mark.parametrize("where", ["links", pytest.param("leads", marks=pytest.mark.soak)])
+@pytest.mark.parametrize("where", ["links", pytest.param("leads", marks=pytest.mark.nightly)])
 def test_of_news_that_overtake_each_other_the_newest_counts(where: str) -> None:
     flow = flowing(wide(ring5()))
     flow.publisher.set_options(SendOptions(fec=False))  # frames that leave space for parity are smaller than the MTU

@@ -109,7 +109,7 @@ def radio(*, loss: float, reliable: bool = False, seed: int = 1, fec: bool = Tru
     return made
 
 
-@pytest.mark.parametrize("count", [4_000, pytest.param(20_000, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("count", [4_000, pytest.param(20_000, marks=pytest.mark.nightly)])
 def test_urgent_messages_survive_5_percent_of_loss_without_a_round_trip(count: int) -> None:
     made = radio(loss=0.05)
     made.publish(count, 0.02)

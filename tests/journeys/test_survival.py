@@ -85,7 +85,7 @@ MOVES = {
 
 
 @pytest.mark.parametrize("moves", MOVES.values(), ids=MOVES)
-@pytest.mark.parametrize("who", [A, pytest.param(C, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("who", [A, pytest.param(C, marks=pytest.mark.nightly)])
 def test_a_node_that_moves_keeps_every_flow(who: str, moves: list[str]) -> None:
     world = sites()
     there, back = flowing(world, source=A, readers=(C,)), flowing(world, "/answers", C, (A,))

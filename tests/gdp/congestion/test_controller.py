@@ -108,7 +108,7 @@ def test_a_path_that_becomes_slower_is_drained_within_two_seconds() -> None:
     assert flow.share(7, 12, 5e6) >= 0.9
 
 
-@pytest.mark.parametrize("collapsed_bits_s", [3e5, 1e6, pytest.param(5e6, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("collapsed_bits_s", [3e5, 1e6, pytest.param(5e6, marks=pytest.mark.nightly)])
 def test_a_path_that_collapses_behind_a_short_fifo_is_drained_and_used(collapsed_bits_s: float) -> None:
     link, flow = SimulatedPath(bits_s=200e6, rtt_s=0.01, fifo_bytes=64_000), own()
     link.add(flow)
@@ -182,7 +182,7 @@ _FAST_PATHS = [(fifo_s, is_first) for is_first in (False, True) for fifo_s in (R
 
 
 @pytest.mark.parametrize(
-    ("fifo_s", "is_first"), [_FAST_PATHS[0], *(pytest.param(*each, marks=pytest.mark.soak) for each in _FAST_PATHS[1:])]
+    ("fifo_s", "is_first"), [_FAST_PATHS[0], *(pytest.param(*each, marks=pytest.mark.nightly) for each in _FAST_PATHS[1:])]
 )
 def test_next_to_a_cubic_flow_on_a_fast_path_each_has_35_to_65_percent(fifo_s: float, *, is_first: bool) -> None:
     link, flow = path(100, fifo_s=fifo_s), own(start_s=0 if is_first else 5)

@@ -96,7 +96,7 @@ def test_readers_that_come_and_go(sites: Sites) -> None:
     assert sites.run(1, lambda: ear.texts == ["still here"])
 
 
-@pytest.mark.soak
+@pytest.mark.nightly
 def test_servers_that_come_and_go(sites: Sites) -> None:
     server, client = sites.add(SERVER, expose=[SWITCH]), sites.add(ROBOT, imports=[SWITCH])
 
