@@ -12,6 +12,7 @@ from tests.pages import ROOT
 
 pytestmark = [
     pytest.mark.netns,
+    pytest.mark.nightly,
     pytest.mark.skipif(find_spec("rclpy") is None, reason="rclpy is not installed: scripts/setup.sh --ros2"),
 ]
 
@@ -31,7 +32,6 @@ def test_no_request_fails_while_two_of_three_replicas_are_killed_and_come_back()
     assert reported.count("target ≤ 0.00, measured 0.00, met") == 3, reported
 
 
-@pytest.mark.nightly
 def test_replicas_are_compared_with_a_single_server() -> None:
     reported = bench("replicas.py", "--only", "hedged", "--rounds", "1", "--requests", "60")
     assert "two replicas, the second if late" in reported

@@ -9,10 +9,9 @@ from shutil import which
 
 import pytest
 
-pytestmark = pytest.mark.netns
+pytestmark = [pytest.mark.netns, pytest.mark.nightly]
 
 _PATIENCE_S = 300.0
-nightly = pytest.mark.nightly
 needs_ros2 = pytest.mark.skipif(find_spec("rclpy") is None, reason="rclpy is not installed: scripts/setup.sh --ros2")
 needs_pillow = pytest.mark.skipif(find_spec("PIL") is None, reason="Pillow is not installed: gdp-ros[images]")
 needs_wireguard = pytest.mark.skipif(
@@ -24,17 +23,17 @@ needs_wireguard = pytest.mark.skipif(
     "command",
     [
         ["forwarding.py", "--quick", "--no-save"],
-        pytest.param(["scale.py", "--quick", "--no-save"], marks=nightly),
-        pytest.param(["messages.py", "--quick", "--mtu", "9000", "--offloads", "off"], marks=nightly),
-        pytest.param(["priority.py", "--quick", "--no-save"], marks=nightly),
-        pytest.param(["tunnel.py", "--quick", "--no-save", "--only", "kernel"], marks=[nightly, needs_wireguard]),
-        pytest.param(["first_topic.py", "--rounds", "1", "--no-save"], marks=[nightly, needs_ros2, needs_wireguard]),
+        ["scale.py", "--quick", "--no-save"],
+        ["messages.py", "--quick", "--mtu", "9000", "--offloads", "off"],
+        ["priority.py", "--quick", "--no-save"],
+        pytest.param(["tunnel.py", "--quick", "--no-save", "--only", "kernel"], marks=needs_wireguard),
+        pytest.param(["first_topic.py", "--rounds", "1", "--no-save"], marks=[needs_ros2, needs_wireguard]),
         ["uplink.py", "--quick", "--no-save", "--no-tcp", "--fifo", "bdp", "--only", "line", "gdp"],
         pytest.param(["reduce.py", "--quick"], marks=needs_pillow),
-        pytest.param(["ros.py", "--quick", "--no-save", "--mtu", "9000"], marks=[nightly, needs_ros2]),
-        pytest.param(["services.py", "--quick", "--no-save"], marks=[nightly, needs_ros2]),
-        pytest.param(["fogros.py", "--quick", "--no-save", "--mtu", "9000"], marks=[nightly, needs_ros2]),
-        pytest.param(["survive.py", "--only", "cut", "--rounds", "1", "--no-save"], marks=nightly),
+        pytest.param(["ros.py", "--quick", "--no-save", "--mtu", "9000"], marks=needs_ros2),
+        pytest.param(["services.py", "--quick", "--no-save"], marks=needs_ros2),
+        pytest.param(["fogros.py", "--quick", "--no-save", "--mtu", "9000"], marks=needs_ros2),
+        ["survive.py", "--only", "cut", "--rounds", "1", "--no-save"],
     ],
     ids=lambda command: command[0],
 )

@@ -25,7 +25,7 @@ from netns_tests.live_pair import until
 from tests.pages import ROOT
 from tests.script_packages import PYTHON_PATH
 
-pytestmark = pytest.mark.netns
+pytestmark = [pytest.mark.netns, pytest.mark.nightly]
 
 _START_S = 200.0
 
@@ -40,7 +40,6 @@ def argv_of(name: str, options: Sequence[str]) -> list[str]:
     return [sys.executable, str(ROOT / "scripts" / "bench" / name), *options]
 
 
-@pytest.mark.nightly
 def test_nothing_grows_in_memory_while_readers_and_publishers_come_and_go() -> None:
     ran = bench("soak.py", "--only", "memory", "--cycles", "150", "--publishers", "60", patience_s=_START_S)
     assert ran.returncode == 0, ran.stdout + ran.stderr

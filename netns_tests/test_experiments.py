@@ -53,7 +53,10 @@ def run(in_clone: InClone, tmp_path: Path) -> Callable[[str], dict[str, Any]]:
     return run_one
 
 
-@pytest.mark.parametrize("name", ["fig4", "fig5", "fig6", "fig7", "fig6 --compute", "fig7 --compute", "fig9"])
+_OTHERS = ("fig4", "fig5", "fig6", "fig6 --compute", "fig7 --compute", "fig9")
+
+
+@pytest.mark.parametrize("name", ["fig7", *(pytest.param(each, marks=pytest.mark.nightly) for each in _OTHERS)])
 def test_an_experiment_runs_to_its_page_without_a_failed_request(
     name: str, run: Callable[[str], dict[str, Any]]
 ) -> None:
@@ -65,16 +68,18 @@ def test_an_experiment_runs_to_its_page_without_a_failed_request(
         assert found["failed requests"] == found["answers too many"] == 0
 
 
+@pytest.mark.nightly
 def test_machines_stop_and_go_on_and_every_request_is_counted(run: Callable[[str], dict[str, Any]]) -> None:
     groups = run("outages")["groups"]
     assert {name: len(group) for name, group in groups.items()} == {"one machine": 60, "two machines": 60}
 
 
-@pytest.mark.parametrize("name", ["availability", "table1"])
+@pytest.mark.parametrize("name", [pytest.param("availability", marks=pytest.mark.nightly), "table1"])
 def test_an_experiment_that_computes_runs_to_its_page(name: str, run: Callable[[str], dict[str, Any]]) -> None:
     assert run(name)["experiment"] == name
 
 
+@pytest.mark.nightly
 def test_a_task_is_computed_on_the_robot_and_beyond_three_domains_in_either_encoding_and_every_answer_is_right(
     run: Callable[[str], dict[str, Any]],
 ) -> None:

@@ -47,7 +47,10 @@ def kept(mode: str) -> str:
     return ended.stderr.split("The ring of run ")[1].split(" ")[0]
 
 
-@pytest.mark.parametrize("mode", ["mixed", *(pytest.param(each, marks=pytest.mark.nightly) for each in ("ros1", "ros2"))])
+_SAME = [pytest.param(each, marks=pytest.mark.nightly) for each in ("ros1", "ros2")]
+
+
+@pytest.mark.parametrize("mode", ["mixed", *_SAME])
 def test_what_real_nodes_say_is_heard_at_the_other_end(mode: str, tmp_path: Path) -> None:
     needs(mode)
     result = crossed(tmp_path, "--live", mode, "--seconds", SECONDS, "--lease", LEASE_S, *CAMERA)

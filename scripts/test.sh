@@ -34,7 +34,7 @@ run() {
 case "${1:-}" in
     "") lane=(-m "not nightly" --budgets) ;;
     --nightly)
-        export GDP_REAL_PROGRAMS=1 GDP_RANDOM_NETWORKS=8 GDP_RANDOM_LINKS=4 GDP_INSIDERS=3
+        export GDP_REAL_PROGRAMS=1 GDP_DRAWS=4
         lane=()
         shift
         ;;

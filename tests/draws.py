@@ -1,27 +1,26 @@
-"""Settings of tests that draw their cases: the suite draws the same few each time, a variable asks for more."""
+"""Settings of tests that draw their cases: always the same few, or with ``GDP_DRAWS=N`` N times as many new ones."""
 
 from __future__ import annotations
 
 import os
+from typing import Final
 
 from hypothesis import HealthCheck, Phase, settings
 
-__all__ = ["draws", "is_long"]
+__all__ = ["IS_LONG", "draws"]
+
+_TIMES: Final = int(os.environ.get("GDP_DRAWS", "1"))
+IS_LONG: Final = _TIMES > 1
 
 
-def is_long(variable: str) -> bool:
-    """Return whether an environment variable asks for a number of cases."""
-    return variable in os.environ
-
-
-def draws(variable: str, usual: int) -> settings:
-    """Return the settings of a test that draws ``usual`` cases, or as many as an environment variable asks for."""
+def draws(usual: int) -> settings:
+    """Return the settings of a test that draws ``usual`` cases, or as many times more as ``GDP_DRAWS`` asks for."""
     phases = (Phase.explicit, Phase.reuse, Phase.generate, Phase.shrink)
     return settings(
-        max_examples=int(os.environ.get(variable, str(usual))),
+        max_examples=usual * _TIMES,
         deadline=None,
-        derandomize=not is_long(variable),
+        derandomize=not IS_LONG,
         print_blob=True,
         suppress_health_check=list(HealthCheck),
-        phases=phases if is_long(variable) else (Phase.explicit, Phase.generate),
+        phases=phases if IS_LONG else (Phase.explicit, Phase.generate),
     )

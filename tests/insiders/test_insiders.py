@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import random
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gdp.crypto.statements import StatementType
-from tests.draws import draws, is_long
+from tests.draws import IS_LONG, draws
 from tests.insiders.trial import Plan, Trial, prepared
 
-IS_LONG = is_long("GDP_INSIDERS")
 WORDS = 150
 
 numbers = st.integers(0, (1 << 32) - 1)
@@ -28,7 +28,8 @@ def plans(draw: st.DrawFn) -> Plan:
     )
 
 
-@draws("GDP_INSIDERS", 2)
+@pytest.mark.nightly
+@draws(2)
 @given(plans())
 def test_no_statement_of_an_insider_ends_a_node_or_silences_the_others(plan: Plan) -> None:
     with prepared():

@@ -250,7 +250,7 @@ class Trial:
         return ", ".join(f"{len(came_s)} of {self.sent[name]} of {name}" for name, came_s in self.came_s.items())
 
 
-@draws("GDP_RANDOM_LINKS", 2)
+@draws(2)
 @given(plans())
 @example(  # a reader that began late did not count what came before (decision 346)
     Plan(

@@ -182,7 +182,8 @@ _FAST_PATHS = [(fifo_s, is_first) for is_first in (False, True) for fifo_s in (R
 
 
 @pytest.mark.parametrize(
-    ("fifo_s", "is_first"), [_FAST_PATHS[0], *(pytest.param(*each, marks=pytest.mark.nightly) for each in _FAST_PATHS[1:])]
+    ("fifo_s", "is_first"),
+    [_FAST_PATHS[0], *(pytest.param(*each, marks=pytest.mark.nightly) for each in _FAST_PATHS[1:])],
 )
 def test_next_to_a_cubic_flow_on_a_fast_path_each_has_35_to_65_percent(fifo_s: float, *, is_first: bool) -> None:
     link, flow = path(100, fifo_s=fifo_s), own(start_s=0 if is_first else 5)
