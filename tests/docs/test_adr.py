@@ -16,7 +16,7 @@ _FORM = re.compile(
     r"\n\n\*\*Decision\.\*\* .+?\n\n\*\*Consequence\.\*\* .+)",
     re.DOTALL,
 )
-_WORDS_MAX = 110
+_WORDS_MAX = 100
 _REFERENCE = re.compile(r"\b(?:ADR|[Dd]ecision) (\d+)\b")
 _SOURCES = ("gdp", "proxy", "fog", "scripts", "tests", "netns_tests", "docs")
 
