@@ -15,7 +15,7 @@ PAGES = (
     *(ROOT / path for path in _ALONE),
     *sorted((ROOT / "docs").glob("*.md")),
     *(page for kind in KINDS for page in sorted((ROOT / "docs" / kind).glob("*.md"))),
-    *(page for shown in ("benchmarks", "experiments") for page in sorted((ROOT / "docs" / shown).glob("*.md"))),
+    *(page for shown in ("benchmarks", "experiments", "adr") for page in sorted((ROOT / "docs" / shown).glob("*.md"))),
 )
 
 _FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)

@@ -252,7 +252,7 @@ class Trial:
 
 @draws(2)
 @given(plans())
-@example(  # a reader that began late did not count what came before (decision 346)
+@example(  # a reader that began late did not count what came before
     Plan(
         6,
         (),
@@ -268,16 +268,16 @@ class Trial:
         474,
     )
 )
-@example(  # of three joins that left together the last was lost each time (decision 347)
+@example(  # of three joins that left together the last was lost each time (ADR 347)
     Plan(6, (), (Thin(1.0, 1, 0, 1, 60),), 1, (Fault("cut", 0, 1.0, 1.2),), 1)
 )
-@example(  # the replies that joins are unknown were lost (decision 347)
+@example(  # the replies that joins are unknown were lost (ADR 347)
     Plan(3, (), (Thin(1.0, 1, 0, 1, 60),), 1, (Fault("thick", 0, 3.1, 3.3),), 1)
 )
-@example(  # what a full frame takes to leave was another flow's queue (decision 348)
+@example(  # what a full frame takes to leave was another flow's queue
     Plan(5, (), (Thin(1.0, 1, 0, 1, 60),), 0, (Fault("freeze", 0, 5.0, 5.2),), 1)
 )
-@example(  # a window of five frames grew by two in a round trip, and overflowed the FIFO (decision 349)
+@example(  # a window of five frames grew by two in a round trip, and overflowed the FIFO
     Plan(
         7,
         ((0, 3), (1, 2), (4, 3)),
