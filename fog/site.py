@@ -66,66 +66,52 @@ class SiteConfig(Section):
     renamed: ClassVar[Mapping[str, str]] = {"papers_days": "credential_days"}
 
     border: Directory | None = Field(
-        default=None,
-        description="What `gdp domain create` made on this host. Its domain is the site's, rented machines join it, and"
-        " domain, owner, robots, switch and watch are those of the border.",
+        default=None, description="What `gdp domain create` made on this host; rented machines need it."
     )
     domain: Directory | None = Field(
-        default=None, description="Directory of the trust domain, with its root key: admits machines."
+        default=None, description="Without `border`: directory of the trust domain with its root key."
     )
     owner: Directory | None = Field(
-        default=None, description="Directory of the owner of the names that clusters serve."
+        default=None, description="Without `border`: directory of the owner of the served names."
     )
     robots: Annotated[tuple[ExistingFile, ...], Unique] = Field(
-        default=(), description="`proxy.yaml` of each robot that is to use clusters; they are given rules."
+        default=(), description="`proxy.yaml` of each robot that uses clusters; missing rules are added."
     )
     switch: ExistingFile | None = Field(
-        default=None, description="`switch.yaml` of the robot's switch: its `revocations` learn which machines are gone"
+        default=None, description="The robot's `switch.yaml`: its `revocations` learn which machines are gone."
     )
     watch: Ifname | None = Field(
-        default=None, description="A name of that switch's `attach`: from there it is seen which replicas serve."
+        default=None, description="Name of that switch's `attach` for the watch. `null`: a machine that is up serves."
     )
     provider: ProviderName = Field(default="local", description="Where machines come from.")
-    aws: AwsConfig = Field(default=AwsConfig(), description="Of provider `aws`; see docs/reference/providers.md.")
-    skypilot: SkyPilotConfig = Field(
-        default=SkyPilotConfig(), description="Of provider `skypilot`; see docs/reference/providers.md."
-    )
+    aws: AwsConfig = Field(default=AwsConfig(), description="Provider `aws`.")
+    skypilot: SkyPilotConfig = Field(default=SkyPilotConfig(), description="Provider `skypilot`.")
     machine_iface: Ifname | None = Field(
-        default=None, description="`local`: a machine's device towards the overlay. Default: eth0."
+        default=None, description="`local`: a machine's device towards the overlay. `null`: eth0."
     )
     uplink: Ifname | None = Field(
-        default=None, description="`local`: the port of the robot's switch that leads to the machines; it is made."
+        default=None, description="`local`: the robot's end of the link to the gateway. `null`: `fog<site>-up`."
     )
     topology: Topology = Field(
-        default=AUTOMATIC,
-        description="`local`: the tree of gateways to the machines, or `replica`: one gateway, which is a machine. "
-        "Without it there is one dedicated gateway.",
+        default=AUTOMATIC, description="`local`: tree of gateways, or `replica`: one of the machines is the gateway."
     )
     state: Annotated[Path, AfterValidator(relative)] | None = Field(
-        default=None, description="Folder of the journal. Default: $FOG_STATE, else ~/.local/state/gdp-fog."
+        default=None, description="Folder of journal, lock and logs. `null`: $FOG_STATE, else ~/.local/state/gdp-fog."
     )
-    credential_days: float = Field(
-        default=7.0, gt=0, le=3_650, description="How long a machine's keys hold; it is replaced before they end."
-    )
+    credential_days: float = Field(default=7.0, gt=0, le=3_650, description="Days for which a machine's keys hold.")
     lease_s: LeaseSeconds = Field(
-        default=ADVERTISEMENT_LEASE_S,
-        description="Lease of the machines' advertisements, in seconds: `lease_s` of their proxy.yaml.",
+        default=ADVERTISEMENT_LEASE_S, description="Lease of the machines' advertisements, in seconds."
     )
-    enrolment: EnrolmentConfig = Field(
-        default=EnrolmentConfig(), description="`local`: how machines, with keys of their own, get memberships."
-    )
+    enrolment: EnrolmentConfig = Field(default=EnrolmentConfig(), description="`local`: enrolment of machines.")
     software: SoftwareConfig = Field(
-        default=SoftwareConfig(), description="What rented machines fetch from the supervisor: wheels, a workspace."
+        default=SoftwareConfig(), description="What rented machines fetch from the supervisor."
     )
-    idle_s: float | None = Field(default=None, gt=0, description="Default of a cluster's idle limit, in seconds.")
-    budget_usd: float | None = Field(default=None, gt=0, description="Default of a cluster's budget.")
+    idle_s: float | None = Field(default=None, gt=0, description="Idle limit of clusters that state none, in seconds.")
+    budget_usd: float | None = Field(default=None, gt=0, description="Budget of clusters that state none.")
     latency_ms: Mapping[str, Annotated[float, Field(ge=0)]] = Field(
-        default_factory=dict,
-        description="Region: round trip from the robot, in ms; weighed against the price. Stands for a measurement.",
+        default_factory=dict, description="Region: round trip from the robot in ms, in place of a measurement."
     )
-    latency: LatencyConfig = Field(
-        default=LatencyConfig(), description="How latency is measured: an endpoint a region, and for how long it holds."
-    )
+    latency: LatencyConfig = Field(default=LatencyConfig(), description="How round trips are measured.")
 
     @property
     def device(self) -> str:

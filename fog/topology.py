@@ -32,16 +32,16 @@ _REPLICA: Final = "replica"
 
 
 class Gateway(Section):
-    """Gateway, the regions whose machines are its neighbours, and the gateways behind it.
+    """Gateway, the regions whose machines are its neighbours, and the gateways behind it."""
 
-    Attributes:
-        replica: one of the machines of these regions is the gateway. Otherwise it is dedicated: a separate switch.
-    """
-
-    gateway: str = Field(pattern=_LABEL)
-    replica: bool = False
-    regions: Annotated[tuple[str, ...], Unique] = ()
-    children: tuple[Gateway, ...] = ()
+    gateway: str = Field(pattern=_LABEL, description="Name: up to 11 lower-case letters, digits and `-`.")
+    replica: bool = Field(
+        default=False, description="One of the machines is this gateway. `false`: a namespace with a switch of its own."
+    )
+    regions: Annotated[tuple[str, ...], Unique] = Field(
+        default=(), description="Regions whose machines are next to it."
+    )
+    children: tuple[Gateway, ...] = Field(default=(), description="Gateways behind it; a replica has none.")
 
     def traverse(self) -> Iterator[Gateway]:
         """Yield this gateway and all gateways behind it, each before its children."""

@@ -51,6 +51,5 @@ class EnrolmentConfig(Section):
     """Section ``enrolment:`` of ``fog.yaml``."""
 
     revoke_misused: bool = Field(
-        default=True,
-        description="`local`: whether a machine whose ticket was used again, with another key, is replaced.",
+        default=True, description="Revoke and replace a machine whose ticket was used again with another key."
     )

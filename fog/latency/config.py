@@ -70,11 +70,15 @@ class LatencyConfig(Section):
 
     endpoints: Mapping[str, Annotated[str, AfterValidator(_readable)]] = Field(
         default_factory=dict,
-        description="Region: `HOST:PORT` to connect to, or `udp://HOST:PORT` of an echo service. `*`: every other"
-        " region; `{region}` stands for its name. A region without one is not measured.",
+        description="Region or `*`: `HOST:PORT` (TCP) or `udp://HOST:PORT` (echo); `{region}` is its name.",
     )
-    lifetime_s: float = Field(default=3_600.0, gt=0, le=86_400, description="For how long a measurement holds.")
-    timeout_s: float = Field(default=1.0, gt=0, le=30, description="How long one try may take.")
+    lifetime_s: float = Field(
+        default=3_600.0,
+        gt=0,
+        le=86_400,
+        description="Seconds for which a measurement holds; repeated after half of that.",
+    )
+    timeout_s: float = Field(default=1.0, gt=0, le=30, description="Seconds that one of the five tries may take.")
 
     def for_aws(self) -> LatencyConfig:
         """Return the section with EC2's public endpoint of each region, unless endpoints are stated."""

@@ -24,19 +24,16 @@ class FogCluster:
     Args:
         cloud_nodes: list of ``Node``.
         deployments: one machine for each replica.
-        name: name of the cluster for ``fog scale NAME`` and other verbs; empty: the name of the first node's
-            executable.
+        name: of the cluster, for ``fog scale NAME``; empty: the first node's executable.
         replicas: at least this many machines, in different regions; None: 2, or as many as ``deployments`` has.
-        services, actions, topics: full name -> type of the interfaces that the nodes offer to the robot. Without any of
-            the three, services and actions are discovered: the nodes run once on this machine, in a separate graph.
-        replication: ``"all"``, ``"some"`` or ``"hedged"``, or the rule's map; None: all replicas receive each request.
+        services, actions, topics: full name to type of what the nodes offer; without any, services and actions are
+            discovered.
+        replication: ``"all"``, ``"some"`` or ``"hedged"``, or the rule's map; None: ``"all"``.
         timeout_s: time limit of a response; None: the proxy's 5 s.
-        idle: after this long without a call (seconds, or a text such as ``"30min"``) the machines are released.
-        budget_usd: when the machines have cost this much they are released.
-        availability: share of time for which at least one machine is to serve, such as 0.9995, instead of ``replicas``:
-            ``fog launch`` adds copies of the listed machines until it is reached, and prints its assumptions.
-        scale: between which numbers of machines the cluster moves, by load and by schedule within a budget: a map with
-            ``max``, and ``min``, ``target_ms``, ``target_calls_per_s``, ``schedule``, ``budget_usd_per_h``.
+        idle: time without a call (seconds, or ``"30min"``) after which the machines are released; None: the site's.
+        budget_usd: cost at which the machines are released; None: the site's.
+        availability: instead of ``replicas``, the share of time to serve, such as 0.9995: copies are added until then.
+        scale: instead of ``replicas``, bounds and targets of the number of machines.
         keep: leave the cluster running when the launch ends.
 
     Raises:

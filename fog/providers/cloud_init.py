@@ -130,29 +130,31 @@ WantedBy=multi-user.target
 
 
 class AptSource(Section):
-    """Repository of packages, such as that of ROS; ``key_file``: its signing key, in ASCII armour."""
+    """Repository of packages, such as that of ROS."""
 
-    uri: str = Field(pattern=r"^https?://[!-~]+$")
-    suite: str = Field(pattern=r"^[A-Za-z0-9._/-]+$")
-    components: tuple[Annotated[str, Field(pattern=r"^[A-Za-z0-9._/-]+$")], ...] = ("main",)
-    key_file: ExistingFile
+    uri: str = Field(pattern=r"^https?://[!-~]+$", description="URL of the repository.")
+    suite: str = Field(pattern=r"^[A-Za-z0-9._/-]+$", description="Suite.")
+    components: tuple[Annotated[str, Field(pattern=r"^[A-Za-z0-9._/-]+$")], ...] = Field(
+        default=("main",), description="Components."
+    )
+    key_file: ExistingFile = Field(description="Signing key, ASCII-armoured.")
 
 
 class Setup(Section):
     """Software that a machine installs in addition to its bundle and to the site's ``software``.
 
-    For pip, each with its hash: ``requirements`` (the wheel of this package, wheels with the nodes, and all
-    dependencies) and the file ``requirements_file``. ``packages`` are packages of the distribution in addition to the
-    required ones, and ``apt_sources`` are further repositories of such. ``source`` are shell scripts that the machine
-    sources before its programs start. There is no default for pip, because anyone could register an unused name on an
-    index.
+    There is no default for pip, because anyone could register an unused name on an index.
     """
 
-    requirements: tuple[Annotated[str, AfterValidator(pinned)], ...] = ()
-    requirements_file: ExistingFile | None = None
-    apt_sources: tuple[AptSource, ...] = ()
-    packages: tuple[str, ...] = ()
-    source: tuple[Annotated[str, Field(pattern=r"^/[A-Za-z0-9._/+-]+$")], ...] = ()
+    requirements: tuple[Annotated[str, AfterValidator(pinned)], ...] = Field(
+        default=(), description="For pip, each with its hash: `URL#sha256=...` or `name==version --hash=sha256:...`."
+    )
+    requirements_file: ExistingFile | None = Field(default=None, description="The same as a requirements file.")
+    apt_sources: tuple[AptSource, ...] = Field(default=(), description="Further repositories for apt, such as ROS's.")
+    packages: tuple[str, ...] = Field(default=(), description="Packages for apt.")
+    source: tuple[Annotated[str, Field(pattern=r"^/[A-Za-z0-9._/+-]+$")], ...] = Field(
+        default=(), description="Shell scripts that are sourced before programs start."
+    )
 
     @property
     def has_requirements(self) -> bool:

@@ -22,23 +22,20 @@ class SoftwareConfig(Section):
     """Section ``software:`` of ``fog.yaml``."""
 
     wheels: Directory | None = Field(
-        default=None, description="Folder of wheels that each machine installs, as `fog wheels` fills it."
+        default=None, description="Folder of wheels, as `fog wheels` fills it; each machine installs all."
     )
     workspace: Directory | None = Field(
         default=None, description="`install` folder of a colcon workspace; it comes to /opt/fog-workspace."
     )
     ignore: tuple[str, ...] = Field(
-        default=IGNORED,
-        description="Patterns of what is left out of the workspace, in addition to its file `.fogignore`.",
+        default=IGNORED, description="What is left out of the workspace; its file `.fogignore` has more."
     )
     address: Annotated[str, AfterValidator(reachable_place)] | None = Field(
-        default=None,
-        description="`HOST:PORT` at which a machine fetches these, by HTTPS. Default: the border's host, port"
-        f" {SOFTWARE_PORT}.",
+        default=None, description="`HOST:PORT` of the software server. `null`: the border's host, port 4781."
     )
     listen: Annotated[str, AfterValidator(listening_place)] | None = Field(
         default=None,
-        description="`HOST:PORT` on which the supervisor listens for that. Default: every address, port of `address`.",
+        description="`HOST:PORT` on which the supervisor listens. `null`: every address, port of `address`.",
     )
 
     @property

@@ -37,26 +37,30 @@ def _endpoint(text: str) -> str:
 
 
 class DomainConfig(Section):
-    """``domain.yaml``: keys, folders and addresses of a domain's enrolment server.
+    """``domain.yaml``: keys, folders and addresses of a domain's enrolment server."""
 
-    ``listen`` is the TCP port of the server; ``servers`` are the addresses that tokens name; ``public`` are the UDP
-    endpoints of the border's tunnels, and ``relays`` the TCP addresses of its relay, ``host:port``.
-    """
-
-    domain: Directory
-    owner: Directory
-    switch: Directory
-    state: Directory
-    peers: Directory
-    revocations: Directory
-    listen: int = Field(ge=0, le=65_535)
+    domain: Directory = Field(description="Directory of the domain's root key.")
+    owner: Directory = Field(description="Directory of the owner of names.")
+    switch: Directory = Field(description="Directory of the border's switch.")
+    state: Directory = Field(description="Private directory of registry and TLS key.")
+    peers: Directory = Field(description="Where a record of each member is written.")
+    revocations: Directory = Field(description="Where revocations are written.")
+    listen: int = Field(ge=0, le=65_535, description="TCP port of the server.")
     servers: Annotated[tuple[Annotated[str, AfterValidator(checked_host_port)], ...], Unique] = Field(
-        min_length=1, max_length=SERVERS_MAX
+        min_length=1, max_length=SERVERS_MAX, description="`HOST:PORT` of the server, for tokens."
     )
-    public: Annotated[tuple[Annotated[str, AfterValidator(_endpoint)], ...], Unique] = ()
-    relays: Annotated[tuple[Annotated[str, AfterValidator(checked_host_port)], ...], Unique] = ()
-    trusts: Annotated[tuple[ExistingFile, ...], Unique] = ()
-    member_days: float = Field(default=MEMBER_DAYS, ge=0.001, le=3_650.0)
+    public: Annotated[tuple[Annotated[str, AfterValidator(_endpoint)], ...], Unique] = Field(
+        default=(), description="Numeric `ADDRESS:PORT` of the border's tunnels."
+    )
+    relays: Annotated[tuple[Annotated[str, AfterValidator(checked_host_port)], ...], Unique] = Field(
+        default=(), description="`HOST:PORT` of its relay, for members without UDP."
+    )
+    trusts: Annotated[tuple[ExistingFile, ...], Unique] = Field(
+        default=(), description="Roots of other domains, for members."
+    )
+    member_days: float = Field(
+        default=MEMBER_DAYS, ge=0.001, le=3_650.0, description="Days of a membership; agents renew it after two thirds."
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -35,15 +35,15 @@ MEMBER_FILE: Final = "member.yaml"
 class MemberConfig(Section):
     """``member.yaml``: identities of one machine, and the enrolment servers of its domain."""
 
-    label: str
-    role: str
-    domain: Domain
-    switch: Directory
-    proxy: Directory | None = None
-    rib: Directory | None = None
-    peers: Directory
+    label: str = Field(description="Label of the machine in its domain.")
+    role: str = Field(description="Role of its switch.")
+    domain: Domain = Field(description="The trust domain, and the others whose members are believed.")
+    switch: Directory = Field(description="Directory of its switch.")
+    proxy: Directory | None = Field(default=None, description="Directory of its proxy. `null`: none.")
+    rib: Directory | None = Field(default=None, description="Directory of its RIB. `null`: none.")
+    peers: Directory = Field(description="Directory of endpoint records.")
     servers: Annotated[tuple[Annotated[str, AfterValidator(checked_host_port)], ...], Unique] = Field(
-        min_length=1, max_length=SERVERS_MAX
+        min_length=1, max_length=SERVERS_MAX, description="`HOST:PORT` of the domain's enrolment servers."
     )
 
 

@@ -43,14 +43,20 @@ from gdp.limits import (
     TABLE_MAX,
 )
 from gdp.nodes.schema import (
+    AuditFolder,
+    ControlSocket,
     Directory,
     Domain,
     ExistingFile,
+    Identity,
     Ifname,
     Metrics,
     NewFile,
     RequiredName,
+    Sandbox,
     Section,
+    StateFolder,
+    TokenFolders,
     Unique,
     load,
 )
@@ -116,39 +122,47 @@ LinkCost = Annotated[int, Field(ge=1, le=COST_MAX), WrapValidator(_cost)]
 
 
 class PortConfig(Section):
-    """A layer-2 device towards neighbours; an ``optional`` one may appear later.
+    """A layer-2 device towards neighbours; a ``cost`` of ``auto`` is ``COST_AUTO``."""
 
-    Keepalive settings that are absent here come from the switch. A ``cost`` of ``auto`` is
-    ``COST_AUTO``: measured.
-    """
-
-    iface: Ifname
-    optional: bool = False
-    cost: LinkCost = COST_DEFAULT
-    keepalive_ms: KeepaliveMs | None = None
-    detect_multiplier: DetectMultiplier | None = None
+    iface: Ifname = Field(description="Device towards neighbours.")
+    optional: bool = Field(default=False, description="The device may be absent; the port opens when it appears.")
+    cost: LinkCost = Field(default=COST_DEFAULT, description="What a path pays for this link; `auto`: measured.")
+    keepalive_ms: KeepaliveMs | None = Field(default=None, description="`null`: the switch's.")
+    detect_multiplier: DetectMultiplier | None = Field(default=None, description="`null`: the switch's.")
 
 
 TunnelBackend = Literal["auto", "kernel", "wireguard-go"]
 
 
 class LinksConfig(Section):
-    """Tunnels across IP networks: VXLAN inside WireGuard, one for each peer.
+    """Tunnels across IP networks: VXLAN inside WireGuard, one for each peer."""
 
-    ``peers`` holds an endpoint record for each peer, in files ``*.endpoints``; files may come and go. ``public`` states
-    where this switch can be reached from everywhere: it is a border, and others dial it. A border limits whom it relays
-    for to the labels and roles of ``relay_for``, and what it sends into each tunnel to ``relay_rate`` bytes per second.
-    """
-
-    listen: int = Field(default=LISTEN_DEFAULT, ge=0, le=65_535)
-    public: Annotated[tuple[EndpointText, ...], Unique] = ()
-    uplinks: Annotated[tuple[Ifname, ...], Unique] = Field(default=(), max_length=UPLINKS_MAX)
-    peers: Directory | None = None
-    direct: bool = True
-    backend: TunnelBackend = "auto"
-    keepalive_s: int = Field(default=25, ge=1, le=65_535)
-    relay_for: Annotated[tuple[str, ...], Unique] = ()
-    relay_rate: int | None = Field(default=None, ge=RELAY_RATE_MIN, le=RELAY_RATE_MAX)
+    listen: int = Field(
+        default=LISTEN_DEFAULT,
+        ge=0,
+        le=65_535,
+        description="UDP port of WireGuard; each further uplink takes the next. 0: any free one.",
+    )
+    public: Annotated[tuple[EndpointText, ...], Unique] = Field(
+        default=(), description="Numeric `ADDRESS:PORT` at which all reach it: a border."
+    )
+    uplinks: Annotated[tuple[Ifname, ...], Unique] = Field(
+        default=(), max_length=UPLINKS_MAX, description="Devices with a tunnel each. Empty: one, by the host's routes."
+    )
+    peers: Directory | None = Field(
+        default=None, description="Directory of records, `*.endpoints`; each file is a tunnel, without a restart."
+    )
+    direct: bool = Field(default=True, description="Open direct tunnels to other members where both NATs allow it.")
+    backend: TunnelBackend = Field(default="auto", description="Which WireGuard; `auto`: the kernel's if it has one.")
+    keepalive_s: int = Field(
+        default=25, ge=1, le=65_535, description="Seconds between WireGuard's keepalives to dialled peers."
+    )
+    relay_for: Annotated[tuple[str, ...], Unique] = Field(
+        default=(), description="Labels or roles with tunnels here. Empty: all of `peers`."
+    )
+    relay_rate: int | None = Field(
+        default=None, ge=RELAY_RATE_MIN, le=RELAY_RATE_MAX, description="Bytes a second into each tunnel."
+    )
 
     def public_endpoints(self) -> tuple[Endpoint, ...]:
         """Return the stated endpoints."""
@@ -156,33 +170,48 @@ class LinksConfig(Section):
 
 
 class SwitchConfig(Section):
-    """``switch.yaml``.
+    """``switch.yaml``."""
 
-    For each ``NAME`` of ``attach`` the command makes a veth pair ``NAME``/``NAME-s``; a RIB or proxy on this host uses
-    ``NAME`` as its device. The node reads the files in ``revocations`` at start and on SIGHUP. The kernel plane holds
-    ``table_max`` entries, and the process forwards by the others.
-    """
-
-    identity: Directory
-    domain: Domain
-    ports: tuple[PortConfig, ...] = ()
-    attach: Annotated[tuple[AttachName, ...], Unique] = ()
-    links: LinksConfig | None = None
-    relay: bool = False
-    data_plane: DataPlane = "auto"
-    table_max: int = Field(default=ENTRIES_DEFAULT, ge=1, le=TABLE_MAX)
-    revocations: Directory | None = None
-    state: Directory | None = None
-    metrics: Metrics | None = None
-    audit: NewFile | None = None
-    token_folders: Annotated[tuple[Directory, ...], Unique] = ()
-    hello_s: float = Field(default=HELLO_S, ge=0.01, le=60.0)
-    dead_s: float = Field(default=DEAD_S, ge=0.02, le=600.0)
-    lease_s: LeaseSeconds = ADVERTISEMENT_LEASE_S
-    keepalive_ms: KeepaliveMs | None = None
-    detect_multiplier: DetectMultiplier = DETECT_MULTIPLIER
-    control_socket: NewFile | None = None
-    sandbox: bool = True
+    identity: Identity
+    domain: Domain = Field(description="The trust domain, and the others whose members are believed.")
+    ports: tuple[PortConfig, ...] = Field(default=(), description="Devices towards neighbours; `--iface` adds to them.")
+    attach: Annotated[tuple[AttachName, ...], Unique] = Field(
+        default=(), description="Veth pairs `NAME`, `NAME-s`; a RIB or proxy here takes `NAME`."
+    )
+    links: LinksConfig | None = Field(default=None, description="Tunnels.")
+    relay: bool = Field(default=False, description="Devices of the relay are ports.")
+    data_plane: DataPlane = Field(default="auto", description="`auto`: `kernel` (eBPF), else `raw` (AF_PACKET).")
+    table_max: int = Field(
+        default=ENTRIES_DEFAULT,
+        ge=1,
+        le=TABLE_MAX,
+        description="Entries in the kernel, 16 bytes each and on every processor; others are in the process.",
+    )
+    revocations: Directory | None = Field(
+        default=None, description="Revocations to spread, read at the start and on SIGHUP."
+    )
+    state: StateFolder = None
+    metrics: Metrics | None = Field(default=None, description="Prometheus text and probes.")
+    audit: AuditFolder = None
+    token_folders: TokenFolders = ()
+    hello_s: float = Field(default=HELLO_S, ge=0.01, le=60.0, description="Seconds between hellos.")
+    dead_s: float = Field(
+        default=DEAD_S,
+        ge=0.02,
+        le=600.0,
+        description="Silence that ends a neighbour without keepalives; at least twice `hello_s`.",
+    )
+    lease_s: LeaseSeconds = Field(
+        default=ADVERTISEMENT_LEASE_S, description="Lease of its watches, seconds; renewed after a quarter."
+    )
+    keepalive_ms: KeepaliveMs | None = Field(
+        default=None, description="0: none. `null`: 70, or 500 with `scapy`. The slower end decides."
+    )
+    detect_multiplier: DetectMultiplier = Field(
+        default=DETECT_MULTIPLIER, description="Missed keepalives after which the other end gives up."
+    )
+    control_socket: ControlSocket = None
+    sandbox: Sandbox = True
 
     @property
     def keepalive_or_default_ms(self) -> int:
@@ -243,20 +272,26 @@ class SwitchConfig(Section):
 class Quotas(Section):
     """Upper bounds on what one RIB does for others."""
 
-    names_per_sender: int = Field(default=RIB_NAMES_PER_SENDER, ge=1)
-    watches: int = Field(default=RIB_WATCHES_MAX, ge=1)
-    lease_max_s: float = Field(default=LEASE_MAX_S, ge=LEASE_MIN_S, le=LEASE_MAX_S)
+    names_per_sender: int = Field(
+        default=RIB_NAMES_PER_SENDER, ge=1, description="Names of one switch, or one RIB below."
+    )
+    watches: int = Field(default=RIB_WATCHES_MAX, ge=1, description="Watches at once.")
+    lease_max_s: float = Field(
+        default=LEASE_MAX_S, ge=LEASE_MIN_S, le=LEASE_MAX_S, description="Longest lease accepted, in seconds."
+    )
 
 
 class ClusterConfig(Section):
-    """A Valkey or Redis Cluster; ``nodes`` are some of its servers, each ``host:port``."""
+    """A Valkey or Redis Cluster."""
 
-    nodes: Annotated[tuple[ServerText, ...], Unique] = Field(min_length=1)
-    username: str = ""
-    password_file: ExistingFile | None = None
-    ca: ExistingFile | None = None
-    cert: ExistingFile | None = None
-    key: ExistingFile | None = None
+    nodes: Annotated[tuple[ServerText, ...], Unique] = Field(
+        min_length=1, description="Servers of a Valkey or Redis Cluster for the routes, `host:port`."
+    )
+    username: str = Field(default="", description="ACL user.")
+    password_file: ExistingFile | None = Field(default=None, description="Private file with its password.")
+    ca: ExistingFile | None = Field(default=None, description="Their certificate authority, PEM; without it no TLS.")
+    cert: ExistingFile | None = Field(default=None, description="Client certificate, PEM.")
+    key: ExistingFile | None = Field(default=None, description="Its key, PEM.")
 
     def address(self) -> ClusterAddress:
         """Return the address of the cluster; reads the file of the password.
@@ -275,7 +310,7 @@ class ClusterConfig(Section):
 class SharedStore(Section):
     """A store outside the process, which the RIBs of a domain share."""
 
-    cluster: ClusterConfig
+    cluster: ClusterConfig = Field(description="A Valkey or Redis Cluster, in place of `peers` and `snapshot`.")
 
 
 def _as_names(value: object) -> object:
@@ -286,29 +321,33 @@ def _as_names(value: object) -> object:
 
 
 class RibConfig(Section):
-    """``rib.yaml``.
+    """``rib.yaml``."""
 
-    ``upper`` names the RIB of the tier above, or several of which the first that answers is used; ``null``: none. Those
-    of the tier above that may follow. ``peers`` names other RIBs of this domain, which hold the same routes.
-    """
-
-    identity: Directory
-    domain: Domain
-    iface: Ifname
-    upper: Annotated[tuple[RequiredName, ...], Unique, BeforeValidator(_as_names)] = ()
-    peers: Annotated[tuple[RequiredName, ...], Unique] = ()
-    allow_unowned: bool = False
-    lease_s: LeaseSeconds = ADVERTISEMENT_LEASE_S
-    store: Literal["memory"] | SharedStore = "memory"
-    snapshot: NewFile | None = None
-    data_plane: UplinkPlane = "raw"
-    state: Directory | None = None
-    quotas: Quotas = Quotas()
-    metrics: Metrics | None = None
-    audit: NewFile | None = None
-    token_folders: Annotated[tuple[Directory, ...], Unique] = ()
-    control_socket: NewFile | None = None
-    sandbox: bool = True
+    identity: Identity
+    domain: Domain = Field(description="The trust domain, and the others whose members are believed.")
+    iface: Ifname = Field(description="Device towards its switch: a name of `attach`, or a NIC.")
+    upper: Annotated[tuple[RequiredName, ...], Unique, BeforeValidator(_as_names)] = Field(
+        default=(), description="RIBs above, the next tier first; the first that answers is used."
+    )
+    peers: Annotated[tuple[RequiredName, ...], Unique] = Field(
+        default=(), description="Other RIBs of this domain, with the same routes."
+    )
+    allow_unowned: bool = Field(default=False, description="Any member may advertise names without an owner.")
+    lease_s: LeaseSeconds = Field(
+        default=ADVERTISEMENT_LEASE_S, description="Lease of its advertisement, seconds; renewed after a third."
+    )
+    store: Literal["memory"] | SharedStore = Field(default="memory", description="Where routes are kept.")
+    snapshot: NewFile | None = Field(
+        default=None, description="SQLite file for a warm restart; a broken one becomes `FILE.broken`."
+    )
+    data_plane: UplinkPlane = Field(default="raw", description="`scapy` is slow, for learning.")
+    state: StateFolder = None
+    quotas: Quotas = Field(default=Quotas(), description="Bounds on what the RIB does for others.")
+    metrics: Metrics | None = Field(default=None, description="Prometheus text and probes.")
+    audit: AuditFolder = None
+    token_folders: TokenFolders = ()
+    control_socket: ControlSocket = None
+    sandbox: Sandbox = True
 
     @model_validator(mode="after")
     def _a_shared_store_needs_no_copies(self) -> RibConfig:

@@ -12,7 +12,19 @@ from pydantic import Field, IPvAnyAddress, field_validator, model_validator
 
 from gdp.names import Name
 from gdp.nodes.config import ServerText
-from gdp.nodes.schema import Directory, Domain, Metrics, NewFile, RequiredName, Section, Unique, load
+from gdp.nodes.schema import (
+    ControlSocket,
+    Directory,
+    Domain,
+    Identity,
+    Metrics,
+    NewFile,
+    RequiredName,
+    Sandbox,
+    Section,
+    Unique,
+    load,
+)
 from gdp.relay.framing import MTU_MAX, MTU_MIN
 
 __all__ = ["RelayBorder", "RelayConfig", "RelayServer"]
@@ -26,19 +38,20 @@ _HEX_NAME_CHARS: Final = 64
 
 
 class RelayServer(Section):
-    """What a border relays, and for whom.
+    """What a border relays, and for whom."""
 
-    ``allow`` holds labels of members of the own domain, or names of any trusted switch; ``null``: all trusted
-    switches. ``address: null`` listens on all of them. ``rate`` is in bytes a second for each client and direction.
-    ``enrolment`` is the socket at which the enrolment server of this host takes connections that come to this port.
-    """
-
-    port: int = Field(default=RELAY_PORT, ge=1, le=65_535)
-    address: IPvAnyAddress | None = None
-    allow: Annotated[tuple[str, ...], Unique] | None = None
-    rate: int | None = Field(default=None, ge=RATE_MIN)
-    clients_max: int = Field(default=CLIENTS_MAX, ge=1, le=1_000)
-    enrolment: NewFile | None = None
+    port: int = Field(default=RELAY_PORT, ge=1, le=65_535, description="TCP port.")
+    address: IPvAnyAddress | None = Field(default=None, description="Numeric address to listen on.")
+    allow: Annotated[tuple[str, ...], Unique] | None = Field(
+        default=None, description="Labels of the own domain, or names of trusted switches. `null`: all trusted."
+    )
+    rate: int | None = Field(default=None, ge=RATE_MIN, description="Bytes a second for each member and direction.")
+    clients_max: int = Field(
+        default=CLIENTS_MAX, ge=1, le=1_000, description="Members at once; half may be of other domains."
+    )
+    enrolment: NewFile | None = Field(
+        default=None, description="Socket of the enrolment server, for connections of `gdp-enrolment/1`."
+    )
 
     @field_validator("allow")
     @classmethod
@@ -49,36 +62,44 @@ class RelayServer(Section):
 
 
 class RelayBorder(Section):
-    """A border that this member dials: the name of its switch, and its endpoints in the order of attempts.
+    """A border that this member dials."""
 
-    With ``standby`` it is dialled only while the switch on this host has no tunnel to it that is up.
-    """
-
-    peer: RequiredName
-    endpoints: Annotated[tuple[ServerText, ...], Unique] = Field(min_length=1)
-    standby: bool = True
+    peer: RequiredName = Field(description="Its switch, 64 hex digits; another is refused.")
+    endpoints: Annotated[tuple[ServerText, ...], Unique] = Field(
+        min_length=1, description="`HOST:PORT` in the order of attempts; IPv6 in brackets."
+    )
+    standby: bool = Field(default=True, description="Dial only while no tunnel to it is up.")
 
 
 class RelayConfig(Section):
-    """``relay.yaml``: ``server`` on a border, ``borders`` on a member.
+    """``relay.yaml``: ``server`` on a border, ``borders`` on a member."""
 
-    ``identity`` is that of the switch whose frames are relayed. ``switch_socket`` is its ``control_socket``, where that
-    is configured.
-    """
-
-    identity: Directory
-    domain: Domain
-    server: RelayServer | None = None
-    borders: tuple[RelayBorder, ...] = ()
-    mtu: int = Field(default=MTU_DEFAULT, ge=MTU_MIN, le=MTU_MAX)
-    queue_bytes: int = Field(default=QUEUE_BYTES, ge=1 << 16, le=1 << 26)
-    keepalive_ms: int = Field(default=250, ge=10, le=60_000)
-    dead_ms: int = Field(default=1_000, ge=100, le=600_000)
-    revocations: Directory | None = None
-    metrics: Metrics | None = None
-    control_socket: NewFile | None = None
-    switch_socket: NewFile | None = None
-    sandbox: bool = True
+    identity: Identity
+    domain: Domain = Field(description="The trust domain, and the others whose members are believed.")
+    server: RelayServer | None = Field(default=None, description="Of a border: for whom it relays.")
+    borders: tuple[RelayBorder, ...] = Field(default=(), description="Borders that this member dials.")
+    mtu: int = Field(
+        default=MTU_DEFAULT,
+        ge=MTU_MIN,
+        le=MTU_MAX,
+        description="MTU of the devices, of both ends the smaller; 1350 as a tunnel.",
+    )
+    queue_bytes: int = Field(
+        default=QUEUE_BYTES, ge=1 << 16, le=1 << 26, description="Waiting bytes; then the oldest best-effort frames go."
+    )
+    keepalive_ms: int = Field(default=250, ge=10, le=60_000, description="Pause in its data before a keepalive.")
+    dead_ms: int = Field(
+        default=1_000, ge=100, le=600_000, description="Silence that ends a connection; at least twice `keepalive_ms`."
+    )
+    revocations: Directory | None = Field(
+        default=None, description="Revocations, read twice a second; a revoked member is disconnected."
+    )
+    metrics: Metrics | None = Field(default=None, description="Prometheus text and probes.")
+    control_socket: ControlSocket = None
+    switch_socket: NewFile | None = Field(
+        default=None, description="The switch's `control_socket`, which `standby` asks."
+    )
+    sandbox: Sandbox = True
 
     @classmethod
     def load(cls, path: Path) -> RelayConfig:

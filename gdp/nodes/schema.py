@@ -19,14 +19,20 @@ from gdp.nodes.machine_file import section_source
 from gdp.nodes.yaml_source import ConfigFileError, KeyPath, YamlSource, read_yaml
 
 __all__ = [
+    "AuditFolder",
+    "ControlSocket",
     "Directory",
     "Domain",
     "ExistingFile",
+    "Identity",
     "Ifname",
     "Metrics",
     "NewFile",
     "RequiredName",
+    "Sandbox",
     "Section",
+    "StateFolder",
+    "TokenFolders",
     "Unique",
     "load",
     "read_name",
@@ -128,22 +134,44 @@ Unique = AfterValidator(_unique)
 Ifname = Annotated[str, AfterValidator(_ifname)]
 RequiredName = Annotated[Name, BeforeValidator(read_name)]
 
+# Keys that several files have
+Identity = Annotated[Directory, Field(description="Keys and membership; its role is the file's.")]
+StateFolder = Annotated[
+    Directory | None,
+    Field(description="Private directory that keeps revocations across restarts."),
+]
+AuditFolder = Annotated[
+    NewFile | None, Field(description="Folder of the audit log. `null`: below `$STATE_DIRECTORY`, if set.")
+]
+TokenFolders = Annotated[
+    tuple[Directory, ...], Unique, Field(description="Folders that the library of a token goes on to use.")
+]
+ControlSocket = Annotated[
+    NewFile | None,
+    Field(description="Control socket. `null`: next to the locks of nodes."),
+]
+Sandbox = Annotated[bool, Field(description="Drop rights that are not needed once the node is up.")]
+
 
 class Domain(Section):
     """The trust domain of a node, and the others whose members it believes."""
 
-    root: ExistingFile
-    trusts: Annotated[tuple[ExistingFile, ...], Unique] = ()
-    transit: Annotated[tuple[str, ...] | None, Field(default=None)]  # labels; None: every trusted domain
+    root: ExistingFile = Field(description="Root certificate of the node's own trust domain.")
+    trusts: Annotated[tuple[ExistingFile, ...], Unique] = Field(
+        default=(), description="Roots of other domains whose members are believed; not inherited."
+    )
+    transit: tuple[str, ...] | None = Field(
+        default=None, description="Labels of further domains that may carry its traffic. `null`: all trusted."
+    )
     diagnostics: tuple[str, ...] = Field(
-        default=(), description="Labels of the trusted domains whose members get whole diagnostic replies."
+        default=(), description="Labels of domains whose members get whole diagnostic replies."
     )
 
 
 class Metrics(Section):
     """Prometheus text on a loopback port."""
 
-    port: int = Field(ge=1, le=65_535)
+    port: int = Field(ge=1, le=65_535, description="Port on 127.0.0.1.")
 
 
 def load(

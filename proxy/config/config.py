@@ -25,7 +25,19 @@ from gdp.errors import LocalError
 from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.nodes.busy_poll import SPIN_MAX_US, SPIN_US
 from gdp.nodes.config import LeaseSeconds, UplinkPlane
-from gdp.nodes.schema import Directory, Domain, Ifname, Metrics, NewFile, Section, load
+from gdp.nodes.schema import (
+    ControlSocket,
+    Directory,
+    Domain,
+    Identity,
+    Ifname,
+    Metrics,
+    NewFile,
+    Sandbox,
+    Section,
+    StateFolder,
+    load,
+)
 from proxy.config.drop_ins import DROP_INS, DropIns, add_drop_in_patterns, add_drop_in_rules
 from proxy.config.graph import RosGraphConfig
 from proxy.config.matching import Fault, clashes
@@ -38,13 +50,6 @@ __all__ = ["DIALECT", "Encoding", "ProxyConfig", "Record", "RosGraphConfig", "Ru
 JsonSchema: TypeAlias = "dict[str, object]"
 
 DIALECT: Final = "https://json-schema.org/draft/2020-12/schema"
-
-_SHARED: Final = {  # keys of every node's file; docs/reference/configuration.md describes them in full
-    ("Domain", "root"): "Root certificate of the node's own trust domain.",
-    ("Domain", "trusts"): "Root certificates of other domains whose members are believed.",
-    ("Domain", "transit"): "Labels of the domains through which traffic may pass. `null`: every trusted one.",
-    ("ProxyMetrics", "port"): "TCP port on 127.0.0.1.",
-}
 
 
 def _one_or_several(value: object, validate: ValidatorFunctionWrapHandler, info: ValidationInfo) -> object:
@@ -63,29 +68,24 @@ def _or_one(schema: JsonDict) -> None:
 class Record(Section):
     """Where what arrives is written."""
 
-    path: NewFile = Field(description="File that is written; its directory must exist.")
-    format: Literal["mcap", "ros1"] = Field(default="mcap", description="`mcap` or `ros1` (a bag).")
+    path: NewFile = Field(description="File for what arrives; its directory must exist.")
+    format: Literal["mcap", "ros1"] = Field(default="mcap", description="`ros1`: a bag.")
 
 
 class ProxyMetrics(Metrics):
     """Prometheus text of a proxy."""
 
     topic_names: bool = Field(
-        default=False,
-        description="Label topics with local ROS names, which every user of this host may then read.",
+        default=False, description="Label topics with local names, for all users of the host to read."
     )
 
 
 class Traces(Section):
     """Where OpenTelemetry spans of service calls go."""
 
-    endpoint: str = Field(
-        pattern=r"^https?://\S+$", description="OTLP over HTTP, such as `http://127.0.0.1:4318/v1/traces`."
-    )
-    ratio: float = Field(
-        default=1.0, ge=0.0, le=1.0, description="Share of the calls that are traced; use the same one at both ends."
-    )
-    timeout_s: float = Field(default=2.0, gt=0.0, le=60.0, description="Longest time that one request may take.")
+    endpoint: str = Field(pattern=r"^https?://\S+$", description="OTLP over HTTP.")
+    ratio: float = Field(default=1.0, ge=0.0, le=1.0, description="Share of calls traced; the same at both ends.")
+    timeout_s: float = Field(default=2.0, gt=0.0, le=60.0, description="Limit of one request, seconds.")
 
 
 class ProxyConfig(Section):
@@ -93,28 +93,27 @@ class ProxyConfig(Section):
 
     renamed: ClassVar[Mapping[str, str]] = {"spin_us": "busy_poll_us"}
 
-    identity: Directory = Field(description="Directory of the proxy's keys and membership.")
+    identity: Identity
     domain: Domain = Field(description="The trust domain, and the others whose members are believed.")
-    iface: Ifname = Field(description="Device towards the switch: a name of its `attach`, or a NIC.")
-    delegations: Directory = Field(description="Directory of what owners gave this node.")
+    iface: Ifname = Field(description="Device towards its switch: a name of `attach`, or a NIC.")
+    delegations: Directory = Field(
+        description="Directory of what owners gave this node; `gdp delegate install` fills it."
+    )
     ros: Annotated[tuple[RosGraphConfig, ...], WrapValidator(_one_or_several)] = Field(
         default=(),
-        description="The ROS graph, or a list of graphs, to take part in. Without it there are only recordings.",
+        description="ROS graphs to take part in, one or a list. Without: recordings only.",
         json_schema_extra=_or_one,
     )
     owner: Annotated[Owner | None, AfterValidator(keep_owner)] = Field(
-        default=None, description="Public key file of the owner of all names whose rules state none."
+        default=None, description="Owner's public key file, for rules without one."
     )
     prefix: NamePrefix = Field(
-        default=None,
-        description="Namespace of this machine on the overlay, such as robot1: /scan here is /robot1/scan elsewhere."
-        " `null`: none.",
+        default=None, description="Namespace of this machine on the overlay: /scan here is /robot1/scan elsewhere."
     )
     deny: Annotated[NamePatterns, AfterValidator(add_drop_in_patterns)] = Field(
         default=(),
         validate_default=True,
-        description="Names, and patterns of such, that never cross, whatever the rules say: names of this machine, or"
-        " with their prefix. Hidden segments match, too.",
+        description="Names and patterns that never cross, with or without prefix; `*` means hidden ones, too.",
     )
     expose: Annotated[tuple[Rule, ...], AfterValidator(add_drop_in_rules)] = Field(
         default=(), validate_default=True, description="Rules for what leaves this machine."
@@ -124,37 +123,23 @@ class ProxyConfig(Section):
     )
     record: Record | None = Field(default=None, description="Write what arrives into a file.")
     status: StatusTopicConfig | None = Field(
-        default=None,
-        description="A latched local topic (std_msgs/msg/String, JSON) with who publishes, reads, serves and calls the"
-        " names of this proxy. `null`: none.",
+        default=None, description="Latched local topic with who publishes, reads, serves and calls."
     )
-    state: Directory | None = Field(
-        default=None, description="Directory that keeps revocations across restarts, for this user alone."
-    )
-    metrics: ProxyMetrics | None = Field(default=None, description="Serve Prometheus text on 127.0.0.1.")
-    traces: Traces | None = Field(
-        default=None, description="Send OpenTelemetry spans of service calls to a collector; needs the extra `otel`."
-    )
-    data_plane: UplinkPlane = Field(
-        default="raw", description="How frames are sent and received: `raw`, or by Scapy, which is slow."
-    )
+    state: StateFolder = None
+    metrics: ProxyMetrics | None = Field(default=None, description="Prometheus text and probes.")
+    traces: Traces | None = Field(default=None, description="Spans of service calls; needs the extra `otel`.")
+    data_plane: UplinkPlane = Field(default="raw", description="`scapy` is slow, for learning.")
     lease_s: LeaseSeconds = Field(
-        default=ADVERTISEMENT_LEASE_S,
-        description="Lease of this node's advertisements, in seconds; each is renewed after a third of it.",
+        default=ADVERTISEMENT_LEASE_S, description="Lease of its advertisements, seconds; renewed after a third."
     )
     busy_poll_us: int = Field(
         default=SPIN_US,
         ge=0,
         le=SPIN_MAX_US,
-        description="Microseconds to look for more frames before sleeping, where most waits were shorter. 0: never.",
+        description="Microseconds of polling before a sleep, where most waits were shorter.",
     )
-    control_socket: NewFile | None = Field(
-        default=None,
-        description="Socket for `gdp reload`, `status` and `drain`. Default: in the folder of the locks of nodes.",
-    )
-    sandbox: bool = Field(
-        default=True, description="Whether the process gives away the rights that it needs no more once it is up."
-    )
+    control_socket: ControlSocket = None
+    sandbox: Sandbox = True
 
     @classmethod
     def load(cls, path: Path) -> ProxyConfig:
@@ -246,9 +231,6 @@ def editor_schema(model: type[Section], title: str) -> JsonSchema:
     """Return the schema of a file; every key in it has a description."""
     schema = model.model_json_schema(by_alias=True)
     sections = schema.get("$defs", {})
-    for (section, key), text in _SHARED.items():
-        if section in sections:
-            sections[section]["properties"][key].setdefault("description", text)
     for each in (schema, *sections.values()):
         del each["title"]
         each["description"] = each["description"].replace("``", "`")

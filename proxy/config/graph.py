@@ -27,14 +27,9 @@ class RosGraphConfig(Section):
 
     renamed: ClassVar[Mapping[str, str]] = {"alone": "exclusive"}
 
-    endpoint: Literal["ros2", "ros1", "dds"] = Field(
-        description="`ros2`: through rclpy; `dds`: ROS 2 through Cyclone DDS, where no ROS is installed; `ros1`: rospy."
-    )
+    endpoint: Literal["ros2", "ros1", "dds"] = Field(description="`dds`: ROS 2 by Cyclone DDS, without ROS.")
     domain: int | None = Field(
-        default=None,
-        ge=0,
-        le=DOMAIN_MAX,
-        description="ROS 2 domain. `null`: ROS_DOMAIN_ID of the environment, else 0.",
+        default=None, ge=0, le=DOMAIN_MAX, description="ROS 2 domain. `null`: ROS_DOMAIN_ID, else 0."
     )
     master: str | None = Field(
         default=None,
@@ -42,8 +37,7 @@ class RosGraphConfig(Section):
         json_schema_extra={"pattern": "^http://[^/]+:[0-9]+/?$"},
     )
     exclusive: bool = Field(
-        default=False,
-        description="No other proxy takes part in this graph: what it carries begins without looking for one (2 s).",
+        default=False, description="No other proxy is in the graph: flows begin at once, not after two seconds."
     )
 
     @property

@@ -21,19 +21,11 @@ AGE_MAX_S: Final = 86_400.0
 class History(Section):
     """Bounds of what is kept; the first that is reached counts."""
 
-    messages: int = Field(
-        default=HISTORY_MESSAGES_MAX, ge=1, le=HISTORY_MESSAGES_MAX, description="Most messages that are kept."
-    )
+    messages: int = Field(default=HISTORY_MESSAGES_MAX, ge=1, le=HISTORY_MESSAGES_MAX, description="Most messages.")
     max_bytes: int = Field(
-        default=8 << 20,
-        alias="bytes",
-        ge=1,
-        le=HISTORY_BYTES_MAX,
-        description="Most bytes that are kept, as they travel.",
+        default=8 << 20, alias="bytes", ge=1, le=HISTORY_BYTES_MAX, description="Most bytes, as they travel."
     )
-    age_s: float | None = Field(
-        default=None, gt=0, le=AGE_MAX_S, description="Longest time that a message is kept, in seconds. `null`: any."
-    )
+    age_s: float | None = Field(default=None, gt=0, le=AGE_MAX_S, description="Longest time in seconds. `null`: any.")
 
 
 def _history(value: object) -> object:

@@ -35,22 +35,16 @@ LocalName = Annotated[
 class Readiness(Section):
     """Probe of one local server: a service that must succeed, or a topic that must tick."""
 
-    service: LocalName = Field(
-        default=None, description="A local `std_srvs/srv/Trigger` that must answer with `success: true`."
-    )
-    topic: LocalName = Field(
-        default=None, description="A local topic on which a message must come in each period; needs `type`."
-    )
-    type_name: str = Field(default="", alias="type", description="Type of that topic, such as std_msgs/msg/Empty.")
+    service: LocalName = Field(default=None, description="Local std_srvs/srv/Trigger that must answer `success: true`.")
+    topic: LocalName = Field(default=None, description="Or a local topic with a message in each period; needs `type`.")
+    type_name: str = Field(default="", alias="type", description="Type of that topic.")
     period_s: float = Field(default=1.0, ge=0.05, le=PERIOD_MAX_S, description="Seconds between two probes.")
-    timeout_s: float = Field(
-        default=1.0, gt=0, le=PERIOD_MAX_S, description="Seconds that the service may take for its answer."
-    )
+    timeout_s: float = Field(default=1.0, gt=0, le=PERIOD_MAX_S, description="Seconds that the service may take.")
     initial_delay_s: float = Field(
         default=0.0, ge=0, le=PERIOD_MAX_S, description="Seconds from the server's appearance to the first probe."
     )
     failure_threshold: int = Field(
-        default=3, ge=1, le=THRESHOLD_MAX, description="Failures in a row after which it is not ready any more."
+        default=3, ge=1, le=THRESHOLD_MAX, description="Failures in a row after which it is not ready."
     )
     success_threshold: int = Field(
         default=1, ge=1, le=THRESHOLD_MAX, description="Successes in a row after which it is ready."

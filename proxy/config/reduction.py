@@ -55,13 +55,12 @@ SomeBounds = Annotated[Bounds | None, BeforeValidator(_bounds)]
 class Compress(Section):
     """How the bodies of a topic are compressed."""
 
-    codec: Literal["zstd"] = Field(default="zstd", description="`zstd` (RFC 8878).")
+    codec: Literal["zstd"] = Field(
+        default="zstd", description="RFC 8878; what does not shrink by 3 % travels as it is."
+    )
     level: int = Field(default=_LEVEL, ge=1, le=LEVEL_MAX, description="1 (fast) to 19 (small).")
     dictionary: Dictionary | None = Field(
-        default=None,
-        repr=False,
-        description="A dictionary file of `zstd --train`, at most 32 KiB; readers get it with the"
-        " topic's description. `null`: none.",
+        default=None, repr=False, description="File of `zstd --train`, at most 32 KiB; readers get it."
     )
 
 

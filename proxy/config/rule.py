@@ -175,11 +175,9 @@ class Spread(Section):
     """How requests are spread over a service's servers."""
 
     mode: Literal["all", "some", "hedged"] = Field(
-        default="all",
-        description="`all`: every server gets each request, by one copy on this machine's link; `some`: so many as"
-        " `copies` says, those that answered fastest lately; `hedged`: one, and a second one if it is late.",
+        default="all", description="Imported calls: which servers get a request."
     )
-    copies: int = Field(default=2, ge=1, le=COPIES_MAX, description="With `some`: how many servers get each request.")
+    copies: int = Field(default=2, ge=1, le=COPIES_MAX, description="With `some`: how many servers.")
     budget: float = Field(
         default=0.02, ge=0, le=1, description="With `hedged`: most second copies, as a share of requests."
     )
@@ -193,205 +191,119 @@ class Rule(Section):
 
     model_config = ConfigDict(json_schema_extra={"allOf": [_by_kind("topic"), _by_kind("service"), _by_kind("action")]})
 
-    kind: Kind = Field(default="topic", description="What it is about: `topic`, `service` or `action` (ROS 2).")
-    name: NamePattern = Field(
-        description="The name that all sides know: a full ROS name such as /camera/image, or a pattern of such: `*` is"
-        " any part of one segment, `**` one or more segments. Hidden segments (`_action`) are written out."
-    )
+    kind: Kind = Field(default="topic", description="What it is about.")
+    name: NamePattern = Field(description="Full ROS name that all sides know, or a pattern.")
     type_name: str = Field(
         default="",
         alias="type",
-        description="The type as ROS 2 writes it, for ROS 1 too, such as sensor_msgs/msg/Image. Without it the rule"
-        " takes what it finds: on the graph or in the recording (expose), in the delegations (import).",
+        description="As ROS 2 writes it, for ROS 1 too. Empty: of graph, recording or delegation.",
     )
     remap: str | None = Field(
         default=None,
-        description="What this machine calls it, where that differs from `name`; not with a pattern.",
+        description="Its name on this machine; not with a pattern.",
         json_schema_extra={"pattern": f"^{NAME_FORM}$", "maxLength": NAME_MAX_CHARS},
     )
     prefix: NamePrefix = Field(
-        default=None,
-        description="Namespace in front of `name` on the overlay, such as robot1; empty: none. `null`: the file's.",
+        default=None, description="Namespace in front of `name` on the overlay. Empty: none. `null`: the file's."
     )
     metadata: ExtraMetadata = Field(
         default_factory=dict,
-        description="Whatever else the 256-bit name digests: text or whole numbers.",
+        description="What else the name digests: text or whole numbers.",
         json_schema_extra={"propertyNames": {"not": {"enum": list(_OWN_KEYS)}}},
     )
     salt: Salt = Field(
-        default=None,
-        alias="salt_file",
-        description="A private file (mode 0600) with the unguessable part of the 256-bit name: `salt` of its metadata.",
+        default=None, alias="salt_file", description="Private file with a text that the name digests as `salt`."
     )
     owner: Owner = Field(
         default=None,
         validate_default=True,
-        description="Public key file of the name's owner (`owner.pub`). Default: the file's `owner`.",
+        description="Owner's public key file. `null`: the file's; not in drop-ins.",
         json_schema_extra=_without_default,
     )
-    encoding: Encoding = Field(
-        default="json", description="How messages travel: `json`, `cbor`, or `cdr` (the bytes as ROS wrote them)."
-    )
+    encoding: Encoding = Field(default="json", description="How messages travel; the sender's choice holds.")
     wants_reliable: bool | None = Field(
-        default=None,
-        alias="reliable",
-        description="Topics: whether readers ask for what they miss. `null`: as the publisher's QoS says.",
+        default=None, alias="reliable", description="Topics: readers ask for what they miss. `null`: by QoS."
     )
     wants_latched: bool | None = Field(
-        default=None,
-        alias="latched",
-        description="Topics: whether late joiners get the last message. `null`: as the publisher's QoS says.",
+        default=None, alias="latched", description="Topics: late joiners get the last message. `null`: by QoS."
     )
     history: SomeHistory = Field(
-        default=None,
-        description="Topics, under `expose`: the messages that this machine keeps for late joiners. `null`: as many as"
-        " the publishers' QoS says, at most 64.",
+        default=None, description="Exposed topics: what is kept for late joiners; a number: messages."
     )
     max_hz: float | None = Field(
-        default=None,
-        gt=0,
-        le=RATE_MAX_HZ,
-        description="Topics: most messages a second that cross; more are left out and counted. `null`: all.",
+        default=None, gt=0, le=RATE_MAX_HZ, description="Topics: most messages a second; others are counted."
     )
     deadline_ms: float | None = Field(
         default=None,
         gt=0,
         le=1_000 * DEADLINE_MAX_S,
-        description="Topics without `reliable`, under `expose`: a message that cannot leave whole within this time is"
-        " dropped whole and counted. `null`: as the publisher's QoS says (lifespan, else deadline); without both, a"
-        " message that has waited for 50 ms gives way to a newer one.",
+        description="Exposed best-effort topics: time to leave whole. `null`: by QoS.",
     )
     repair: Literal["never", "in-time"] = Field(
-        default="in-time",
-        description="Topics without `reliable`, under `expose`: `in-time`: lost parts of a message are sent again while"
-        " that can be in time. `never`: they stay lost.",
+        default="in-time", description="Exposed best-effort topics: send lost parts again in time."
     )
-    weight: int = Field(
-        default=1,
-        ge=1,
-        le=WEIGHT_MAX,
-        description="The share of a full path that it gets, next to others of the same `priority` on this machine.",
-    )
+    weight: int = Field(default=1, ge=1, le=WEIGHT_MAX, description="Share of a full path at the same `priority`.")
     max_bits_s: float | None = Field(
-        default=None,
-        ge=RATE_MIN_BITS_S,
-        le=RATE_MAX_BITS_S,
-        description="Most bits of frames a second that this machine sends for it. `null`: what the path carries.",
+        default=None, ge=RATE_MIN_BITS_S, le=RATE_MAX_BITS_S, description="Most bits of frames a second from here."
     )
     max_bytes: int = Field(
         default=MESSAGE_MAX_BYTES,
         ge=1,
         le=MESSAGE_MAX_BYTES,
-        description="Larger messages, as ROS wrote them, do not cross and are counted.",
+        description="Larger messages, as ROS wrote them, are counted only.",
     )
-    compress: SomeCompress = Field(
-        default=None,
-        description="Topics, under `expose`: how bodies are compressed, `zstd` for short. One that would not shrink"
-        " travels as it is. `null`: not.",
-    )
+    compress: SomeCompress = Field(default=None, description="Exposed topics: compressed bodies.")
     image: PictureFormat | None = Field(
-        default=None,
-        description="Topics of sensor_msgs/msg/Image, under `expose`: images travel as `jpeg` or `png`, and are images"
-        " again on the other side. Encodings without such a file travel as they are. `null`: all do.",
+        default=None, description="Exposed sensor_msgs/msg/Image: travels so; needs the extra `images`."
     )
     quality: int = Field(default=QUALITY, ge=1, le=100, description="With `image: jpeg`: its quality.")
     voxel_m: float | None = Field(
         default=None,
         gt=0,
         le=VOXEL_MAX_M,
-        description="Topics of sensor_msgs/msg/PointCloud2, under `expose`: edge in metres of the voxels of which only"
-        " the first point crosses. `null`: all points do.",
+        description="Exposed sensor_msgs/msg/PointCloud2: edge of voxels with one point each, metres.",
     )
-    region: Region | None = Field(
-        default=None,
-        description="Topics of images and point clouds, under `expose`: the part that crosses. `null`: all.",
-    )
-    adapt: SomeAdapt = Field(
-        default=None,
-        description="Topics, under `expose`: rate and JPEG quality follow what the path carries, so that the newest"
-        " message is fresh. `true`: between the usual bounds.",
-    )
+    region: Region | None = Field(default=None, description="Exposed images and point clouds: the part that crosses.")
+    adapt: SomeAdapt = Field(default=None, description="Exposed topics: rate and JPEG quality follow the path.")
     timeout_s: CallSeconds | None = Field(
-        default=CALL_S,
-        description="Services and actions: seconds that an answer may take. An action's result may always take as long"
-        " as it wants. `null`: no limit.",
+        default=CALL_S, description="Calls: seconds for an answer; an action's result has no limit."
     )
     on_timeout: Literal["empty", "silent"] = Field(
-        default="empty",
-        description="Services and actions of ROS 2, under `import`: what a client gets when no answer came in time."
-        " `empty`: a response of zeros. `silent`: nothing. A response with `success` and `message` says why in any"
-        " case, and a client of ROS 1 gets an error.",
+        default="empty", description="Imported ROS 2 calls: response of zeros, or none."
     )
     replication: Spread = Field(
-        default_factory=Spread,
-        description="Services and actions, under `import`: which of several servers get each request.",
+        default_factory=Spread, description="Imported calls: which of several servers get a request."
     )
-    readiness: Readiness | None = Field(
-        default=None,
-        description="Services and actions, under `expose`: a probe of the local server. Remote clients find the server"
-        " only while it passes. `null`: whenever it is there.",
-    )
+    readiness: Readiness | None = Field(default=None, description="Exposed calls: probe of the local server.")
     stop: str | None = Field(
         default=None,
-        description="Services, under `expose`: a local `std_srvs/srv/Trigger` that is called when no caller waits"
-        " any more for what the server works on; needs `at_once: 1`. `null`: it works on.",
+        description="Exposed services, `at_once: 1`: local std_srvs/srv/Trigger to call when no client waits.",
         json_schema_extra={"pattern": f"^{NAME_FORM}$", "maxLength": NAME_MAX_CHARS},
     )
     at_once: int | None = Field(
-        default=None,
-        ge=1,
-        le=AT_ONCE_MAX,
-        description="Services, under `expose`: how many requests the local server gets at one time; the others wait"
-        " in the proxy, where clients take turns. `null`: all; a ROS 2 service, as many as its queue holds.",
+        default=None, ge=1, le=AT_ONCE_MAX, description="Exposed services: requests that the server has at a time."
     )
     state: Literal["none", "ordered"] = Field(
-        default="none",
-        description="Services, on both sides: `ordered` where answers depend on requests before: every server gets all"
-        " of them in one order.",
+        default="none", description="Services, both sides: every server gets all requests in one order."
     )
     state_node: str | None = Field(
         default=None,
-        description="Services, under `expose` with `state: ordered`: the local node whose parameter `state`, a byte"
-        " array, is the server's state. `null`: it tells none.",
+        description="Then: local node whose byte array parameter `state` it is.",
         json_schema_extra={"pattern": f"^{NAME_FORM}$", "maxLength": NAME_MAX_CHARS},
     )
-    priority: Priority = Field(
-        default="normal",
-        description="`urgent`, then `interactive`: go before all others, wherever frames queue. The others share a full"
-        " path of this machine: `high` 16, `normal` 8, `low` 4, `bulk` 2, `background` 1, times `weight`.",
-    )
+    priority: Priority = Field(default="normal", description="Rank on a full path.")
     paths: Literal[1, 2, "spread"] = Field(
-        default=1,
-        description="Over how many disjoint paths frames travel. `2`: each frame twice, so that the cut of one path"
-        " costs no message and no time. `spread`: the fragments of large messages are shared out by what each path"
-        " carries. Both sides state one of the two; the publisher's counts. Over a single path, frames travel once.",
+        default=1, description="Both sides: frames twice over disjoint paths, or large messages shared out."
     )
-    fec: Literal["auto", "never"] = Field(
-        default="auto",
-        description="Redundancy against measured loss. `auto`: small `urgent` messages are sent up to three times, some"
-        " milliseconds apart, within a twentieth of the path. Messages of three or more fragments get parity frames,"
-        " within a quarter of their frames and 15 % of the path. `never`: each frame is sent once.",
-    )
+    fec: Literal["auto", "never"] = Field(default="auto", description="Repeats and parity against measured loss.")
     sign: Literal["always", "session"] = Field(
-        default="always",
-        description="Services and actions, on both sides: `session` where requests to one server and responses need no"
-        " signature. A secret of the two proxies authenticates them if both say so. They prove their writer to the"
-        " other proxy, and to no third party.",
+        default="always", description="Calls, both sides: a secret of the proxies replaces signatures."
     )
-    ros: Literal[1, 2] | None = Field(
-        default=None, description="Which ROS it is about, where the proxy speaks both. `null`: the one that there is."
-    )
+    ros: Literal[1, 2] | None = Field(default=None, description="Which ROS, where several graphs fit.")
     domain: int | None = Field(
-        default=None,
-        ge=0,
-        le=DOMAIN_MAX,
-        description="Which ROS 2 domain it is about, where the proxy is in several. `null`: the one that there is.",
+        default=None, ge=0, le=DOMAIN_MAX, description="Which ROS 2 domain, where several graphs fit."
     )
-    is_global: bool = Field(
-        default=True,
-        alias="global",
-        description="Whether the name climbs to the tier above, so that other domains can find it.",
-    )
+    is_global: bool = Field(default=True, alias="global", description="The tier above learns the name.")
 
     _denied: tuple[str, ...] = PrivateAttr(default=())
 

@@ -22,14 +22,14 @@ class StatusTopicConfig(Section):
 
     topic: str = Field(
         default="/gdp_status",
-        description="Its local name.",
+        description="Local std_msgs/msg/String, JSON.",
         json_schema_extra={"pattern": f"^{NAME_FORM}$", "maxLength": NAME_MAX_CHARS},
     )
     deadline_s: float | None = Field(
         default=None,
         gt=0,
         le=DEADLINE_MAX_S,
-        description="A publisher that sends nothing for so many seconds is silent. `null`: only who stopped reporting.",
+        description="Seconds without a message after which a publisher is silent.",
     )
 
     @field_validator("topic")

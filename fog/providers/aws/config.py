@@ -19,28 +19,32 @@ __all__ = ["AwsConfig", "Ssh"]
 
 
 class Ssh(Section):
-    """Settings of logins: ``key_pair`` is EC2's name, ``sources`` are the addresses for which port 22 is open."""
+    """Settings of logins."""
 
-    key_pair: str
-    sources: IPv4Network
-    key_file: Path | None = None
-    user: str = "admin"
+    key_pair: str = Field(description="Name of EC2's key pair.")
+    sources: IPv4Network = Field(description="Addresses for which port 22 is open.")
+    key_file: Path | None = Field(default=None, description="Private key for `fog` itself.")
+    user: str = Field(default="admin", description="User of the image.")
 
 
 class AwsConfig(Section):
-    """Section ``aws:`` of ``fog.yaml``.
+    """Section ``aws:`` of ``fog.yaml``."""
 
-    Without ``regions``, all enabled regions of the account are used. ``images``, ``subnets`` and ``security_groups``
-    map regions to values. Defaults are the newest image of that owner and name, the default VPC, and a new security
-    group. The group admits only what ``ssh`` needs: machines dial out to the border.
-    """
-
-    regions: tuple[str, ...] = ()
-    images: Mapping[str, str] = Field(default_factory=dict)
-    image_owner: str = "136693071363"
-    image_name: str = "debian-12-amd64-*"
-    disk_gib: int = Field(default=20, ge=8, le=16_384)
-    subnets: Mapping[str, str] = Field(default_factory=dict)
-    security_groups: Mapping[str, tuple[str, ...]] = Field(default_factory=dict)
-    ssh: Ssh | None = None
-    setup: Setup = Setup()
+    regions: tuple[str, ...] = Field(
+        default=(), description="Where machines are made and looked for. Empty: all that the account has enabled."
+    )
+    images: Mapping[str, str] = Field(
+        default_factory=dict,
+        description="Region: image id. Without one: the newest of `image_owner` that fits `image_name`.",
+    )
+    image_owner: str = Field(default="136693071363", description="Account of the images: Debian's.")
+    image_name: str = Field(default="debian-12-amd64-*", description="x86-64 only.")
+    disk_gib: int = Field(default=20, ge=8, le=16_384, description="Root disk (gp3), gone with the machine.")
+    subnets: Mapping[str, str] = Field(
+        default_factory=dict, description="Region: subnet id. Without one: the default VPC."
+    )
+    security_groups: Mapping[str, tuple[str, ...]] = Field(
+        default_factory=dict, description="Region: group ids. Without one: one of our own, nothing in but `ssh`."
+    )
+    ssh: Ssh | None = Field(default=None, description="Logins. `null`: none.")
+    setup: Setup = Field(default=Setup(), description="What a machine installs.")

@@ -30,12 +30,13 @@ def _has_machines(place: str) -> str:
 class SkyPilotConfig(Section):
     """Section ``skypilot:`` of ``fog.yaml``.
 
-    ``places`` are SkyPilot's ``infra``, each a cloud and a region: the regions of this provider. SkyPilot manages
-    clouds, credentials and images (``sky check``). Kubernetes, SkyPilot's local back end too, is refused.
+    Kubernetes, SkyPilot's local back end too, is refused.
     """
 
     places: tuple[Annotated[str, AfterValidator(_has_machines)], ...] = Field(
-        default=("aws/us-east-1", "aws/us-west-2"), min_length=1
+        default=("aws/us-east-1", "aws/us-west-2"),
+        min_length=1,
+        description="Regions, as SkyPilot's `infra` writes them.",
     )
-    disk_gib: int = Field(default=50, ge=30, le=16_384)
-    setup: Setup = Setup()
+    disk_gib: int = Field(default=50, ge=30, le=16_384, description="Root disk.")
+    setup: Setup = Field(default=Setup(), description="What a machine installs.")
