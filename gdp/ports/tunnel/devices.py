@@ -1,4 +1,4 @@
-"""Network devices, addresses and routes of tunnels, made and removed through netlink.
+"""Network devices, addresses and routes of a node, made and removed through netlink.
 
 I/O. Source: rtnetlink(7); ``include/uapi/linux/if_link.h``, ``if_addr.h``, ``rtnetlink.h``. Every device carries the
 alias of its switch. The alias tells the devices of a dead run of the same switch from those of other programs::
@@ -15,7 +15,8 @@ import ipaddress
 import os
 import socket
 import struct
-from contextlib import closing
+from contextlib import closing, suppress
+from pathlib import Path
 from typing import Final, NamedTuple
 
 from gdp.errors import LocalError
@@ -26,7 +27,9 @@ __all__ = [
     "Device",
     "add_address",
     "add_device",
+    "add_pair",
     "add_route",
+    "bring_up",
     "find_device",
     "make_up",
     "refusal_text",
@@ -43,6 +46,7 @@ _INFO: Final = struct.Struct("=BxHiII")
 _ADDRESS: Final = struct.Struct("=BBBBI")
 _IFF_UP: Final = 1
 _INFO_KIND, _INFO_DATA = 1, 2  # IFLA_INFO_KIND, IFLA_INFO_DATA
+_PEER: Final = 1  # VETH_INFO_PEER
 _AF_SPEC, _ADDR_GEN_MODE, _MODE_NONE = 26, 8, 1  # IFLA_AF_SPEC, IFLA_INET6_ADDR_GEN_MODE, IN6_ADDR_GEN_MODE_NONE
 _IFA_ADDRESS, _IFA_LOCAL = 1, 2
 _IFA_F_NODAD: Final = 0x02  # the address follows from a name: a duplicate is an error that DAD would not find
@@ -102,6 +106,13 @@ def add_device(ifname: str, kind: str, data: bytes = b"", attributes: bytes = b"
     _change(Rtm.NEWLINK, body, Change.CREATE | Change.EXCLUSIVE)
 
 
+def add_pair(ifname: str, other: str, mtu: int) -> None:
+    """Make a veth pair. Raises ``RefusedError``."""
+    size = attribute(LinkAttribute.MTU, NUMBER.pack(mtu))
+    far = bytes(_INFO.size) + attribute(LinkAttribute.IFNAME, other.encode() + b"\0") + size
+    add_device(ifname, "veth", attribute(_PEER, far), size)
+
+
 def set_alias(ifindex: int, alias: str) -> None:
     """Set the alias of a device. Raises ``RefusedError``."""
     _set(ifindex, attribute(LinkAttribute.IFALIAS, alias.encode()))
@@ -126,6 +137,24 @@ def without_addresses(ifindex: int) -> None:
     """Keep the kernel from giving a device an IPv6 address of its own; it then sends nothing by itself."""
     inet6 = attribute(socket.AF_INET6 | _NESTED, attribute(_ADDR_GEN_MODE, bytes([_MODE_NONE])))
     _set(ifindex, attribute(_AF_SPEC | _NESTED, inet6))
+
+
+def bring_up(ifname: str, alias: str, *further: tuple[LinkAttribute, int]) -> int:
+    """Give a new device its alias and further numbers, switch it on without IPv6, and return its ifindex.
+
+    Raises:
+        RefusedError: the kernel refuses.
+        LocalError: another program removed the device.
+    """
+    with suppress(OSError):  # absent or read-only in some containers; the cost is only a few dropped frames
+        Path(f"/proc/sys/net/ipv6/conf/{ifname}/disable_ipv6").write_text("1", encoding="ascii")
+    device = find_device(ifname)
+    if device is None:
+        raise LocalError(f"another program removed the device {ifname}")
+    body = _INFO.pack(socket.AF_UNSPEC, 0, device.ifindex, _IFF_UP, _IFF_UP)
+    body += attribute(LinkAttribute.IFALIAS, alias.encode())
+    _change(Rtm.SETLINK, body + b"".join(attribute(kind, NUMBER.pack(value)) for kind, value in further))
+    return device.ifindex
 
 
 def remove_device(ifindex: int) -> None:
