@@ -88,7 +88,7 @@ def test_news_that_the_kernel_had_to_skip_is_made_up_for(watch: LinkMonitor, spa
     space.veth("one", "two", MAC, PEER_MAC)
     space.veth("three", "four", MAC, PEER_MAC)
     watch.poll()
-    watch._news.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2_048)  # space for one or two messages
+    watch._news._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2_048)  # space for one or two messages
     for mtu in range(1_000, 1_020):
         space.ip("set", "one", "mtu", str(mtu))
     space.ip("del", "three")

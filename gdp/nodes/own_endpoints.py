@@ -17,8 +17,7 @@ from gdp.errors import DropReason, LocalError, StatementError
 from gdp.nodes.config import LinksConfig
 from gdp.nodes.endpoint_files import own_record, public_candidates
 from gdp.nodes.tunnels import Tunnels
-from gdp.ports.address_monitor import AddressMonitor
-from gdp.ports.host_addresses import host_addresses
+from gdp.ports.host_addresses import AddressMonitor, host_addresses
 from gdp.sansio import Timestamps
 from gdp.switch.core import SwitchCore
 
@@ -61,7 +60,7 @@ class OwnEndpoints:
 
     def publish_changes(self, now: Timestamps) -> None:
         """Publish a record if the candidates differ from the published ones, or the RIB keeps a later record."""
-        if self._monitor.poll() or now.mono_s >= self._hosts_s:
+        if self._monitor.has_news() or now.mono_s >= self._hosts_s:
             self._hosts_s = now.mono_s + _ADDRESSES_LOOK_S
             try:
                 self._hosts = self._host_candidates()

@@ -11,7 +11,7 @@ from contextlib import closing
 from typing import Final
 
 from gdp.errors import LocalError
-from gdp.ports.netlink import DeviceInfo, LinkAttribute, NetlinkSocket
+from gdp.ports.netlink import LinkAttribute, NetlinkSocket
 from gdp.ports.plane import Port
 from gdp.telemetry.sources import DeviceCounts, PortRow
 
@@ -31,11 +31,8 @@ def port_rows(ports: Mapping[int, Port]) -> list[PortRow]:
 
 def _counts(question: NetlinkSocket, ifname: str) -> DeviceCounts | None:
     try:
-        messages = question.link_named(ifname)
+        device = question.link_named(ifname)
     except LocalError:
         return None  # the device goes just now
-    for message in messages:
-        stats = DeviceInfo.from_body(message.body).attributes.get(LinkAttribute.STATS64, b"")
-        if len(stats) >= _STATS.size:
-            return DeviceCounts(*_STATS.unpack_from(stats))
-    return None
+    stats = b"" if device is None else device.attributes.get(LinkAttribute.STATS64, b"")
+    return DeviceCounts(*_STATS.unpack_from(stats)) if len(stats) >= _STATS.size else None

@@ -36,7 +36,7 @@ from gdp.nodes.rights import confine_relay
 from gdp.nodes.runtime import now
 from gdp.nodes.single_instance import run_alone
 from gdp.nodes.switch_watch import SwitchWatch
-from gdp.ports.address_monitor import AddressMonitor
+from gdp.ports.host_addresses import AddressMonitor
 from gdp.ports.tap import TapDevice, tap_name
 from gdp.relay.connection import ConnectionCounters
 from gdp.telemetry.health import Health
@@ -202,7 +202,7 @@ class Relay:
 
     def _addresses_changed(self, events: int) -> None:
         del events
-        if self._monitor.poll():
+        if self._monitor.has_news():
             for dialer in self.dialers:
                 dialer.network_changed()
 

@@ -26,7 +26,7 @@ from gdp.nodes.relay_config import RelayBorder
 from gdp.nodes.relay_context import RelayContext
 from gdp.nodes.relay_link import RelayLink, RelayPort, prepare_socket
 from gdp.nodes.relay_server import port_status
-from gdp.ports.address_monitor import source_address
+from gdp.ports.host_addresses import source_address
 from gdp.ports.tap import TapDevice, tap_name
 from gdp.relay.admission import verified_border
 from gdp.relay.backoff import Backoff

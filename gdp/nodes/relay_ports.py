@@ -14,7 +14,7 @@ from typing import Final
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.nodes.runtime import Runtime
-from gdp.ports.netlink import LINK_GROUP, READ_BYTES, DeviceInfo, LinkAttribute, NetlinkSocket, listen
+from gdp.ports.netlink import LINK_GROUP, LinkAttribute, NetlinkSocket, Notifications
 from gdp.ports.tap import relay_alias
 from gdp.sansio import Timestamps
 from gdp.switch.core import SwitchCore
@@ -43,13 +43,13 @@ class RelayPorts:
     def __init__(
         self, *, name: Name, switch: SwitchCore, runtime: Runtime, excluded: frozenset[str], cost: int = RELAY_COST
     ) -> None:
-        self._alias = relay_alias(name).encode()
+        self._alias = relay_alias(name)
         self._switch = switch
         self._runtime = runtime
         self._excluded = excluded
         self._cost = cost
         self._questions = NetlinkSocket()
-        self._news = listen(LINK_GROUP)
+        self._news = Notifications(LINK_GROUP)
         self._has_news = True
         self._ports: dict[str, int] = {}
         self._closed: deque[tuple[float, int]] = deque()  # ports that the control plane may still name
@@ -106,19 +106,9 @@ class RelayPorts:
         log.info("port of the relay removed ifname=%s", ifname)
 
     def _devices(self) -> frozenset[str]:
-        found = set()
-        for message in self._questions.links():
-            values = DeviceInfo.from_body(message.body).attributes
-            if values.get(LinkAttribute.IFALIAS, b"").rstrip(b"\0") == self._alias:
-                found.add(values[LinkAttribute.IFNAME].rstrip(b"\0").decode(errors="replace"))
-        return frozenset(found - self._excluded)
+        ours = (each for each in self._questions.links() if each.text(LinkAttribute.IFALIAS) == self._alias)
+        return frozenset(each.text(LinkAttribute.IFNAME) for each in ours) - self._excluded
 
     def _take_news(self) -> None:
         self._has_news = True
-        while True:
-            try:
-                self._news.recv(READ_BYTES)
-            except BlockingIOError:
-                return
-            except OSError as error:  # notifications were skipped; the next look lists all devices
-                log.debug("link notifications skipped reason=%s", error.strerror)
+        self._news.has_news()

@@ -5,24 +5,11 @@ I/O; two NETLINK_ROUTE sockets (``netlink.py``), so that no notification comes b
 
 from __future__ import annotations
 
-import errno
 import socket
-import sys
 from contextlib import ExitStack, closing
 from typing import Final, NamedTuple
 
-from gdp.ports.netlink import (
-    LINK_GROUP,
-    READ_BYTES,
-    RTM_DELLINK,
-    RTM_NEWLINK,
-    DeviceInfo,
-    LinkAttribute,
-    Message,
-    NetlinkSocket,
-    listen,
-    messages,
-)
+from gdp.ports.netlink import LINK_GROUP, DeviceInfo, LinkAttribute, NetlinkSocket, Notifications, Rtm, messages
 
 __all__ = ["Link", "LinkMonitor"]
 
@@ -56,8 +43,7 @@ class LinkMonitor:
     def __init__(self) -> None:
         with ExitStack() as opened:
             self._questions = opened.enter_context(closing(NetlinkSocket()))
-            self._news = opened.enter_context(listen(LINK_GROUP))
-            self._news.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+            self._news = opened.enter_context(closing(Notifications(LINK_GROUP, _BUFFER_BYTES)))
             self._known = {link.ifindex: link for link in self.all()}
             opened.pop_all()
 
@@ -76,11 +62,12 @@ class LinkMonitor:
         A device with a carrier drops sent frames until the kernel activates it a little later. Since Linux 6.8 this
         request (and no other) waits for that, so ``up`` holds for the first frame.
         """
-        return next((link for each in self._questions.link_named(ifname) for link in _links(each)), None)
+        device = self._questions.link_named(ifname)
+        return None if device is None else _link(device)
 
     def all(self) -> list[Link]:
         """Return every present device."""
-        return [link for each in self._questions.links() for link in _links(each)]
+        return [link for each in self._questions.links() if (link := _link(each)) is not None]
 
     def poll(self) -> list[Link]:
         """Return the changes since the last call, in order.
@@ -89,20 +76,12 @@ class LinkMonitor:
         preceded by the missing ones, marked as gone.
         """
         links: list[Link] = []
-        skipped = False
-        while True:
-            try:
-                data = self._news.recv(READ_BYTES)
-            except BlockingIOError:
-                break
-            except OSError as error:  # ENOBUFS precedes older notifications that still wait
-                if error.errno != errno.ENOBUFS:
-                    raise
-                skipped = True
-                continue
-            for message in messages(data):
-                links += _links(message)
-        if skipped:
+        datagrams, has_skipped = self._news.read()
+        for message in (each for data in datagrams for each in messages(data)):
+            if message.kind in (Rtm.NEWLINK, Rtm.DELLINK):
+                link = _link(DeviceInfo.from_body(message.body), gone=message.kind == Rtm.DELLINK)
+                links += [] if link is None else [link]
+        if has_skipped:
             now = self.all()
             lost = self._known.keys() - {link.ifindex for link in now}
             links += [self._known[ifindex]._replace(up=False, gone=True) for ifindex in lost]
@@ -115,22 +94,15 @@ class LinkMonitor:
         return links
 
 
-def _links(message: Message) -> list[Link]:
-    """Return the one device of a message, or none: bridges and wireless drivers also use these types."""
-    if message.kind not in (RTM_NEWLINK, RTM_DELLINK):
-        return []
-    info = DeviceInfo.from_body(message.body)
-    values = info.attributes
-    if info.family != socket.AF_UNSPEC or not values.keys() >= {LinkAttribute.IFNAME, LinkAttribute.MTU}:
-        return []
-    gone = message.kind == RTM_DELLINK
-    return [
-        Link(
-            ifindex=info.ifindex,
-            ifname=values[LinkAttribute.IFNAME].rstrip(b"\0").decode(errors="replace"),
-            mac=values.get(LinkAttribute.ADDRESS, b""),
-            mtu=int.from_bytes(values[LinkAttribute.MTU], sys.byteorder),
-            up=bool(info.flags & _IFF_UP and info.flags & _IFF_LOWER_UP) and not gone,
-            gone=gone,
-        )
-    ]
+def _link(device: DeviceInfo, *, gone: bool = False) -> Link | None:
+    """Return a device of a message; None for bridges and wireless drivers, which use the same types."""
+    if device.family != socket.AF_UNSPEC or not device.attributes.keys() >= {LinkAttribute.IFNAME, LinkAttribute.MTU}:
+        return None
+    return Link(
+        ifindex=device.ifindex,
+        ifname=device.text(LinkAttribute.IFNAME),
+        mac=device.attributes.get(LinkAttribute.ADDRESS, b""),
+        mtu=device.number(LinkAttribute.MTU),
+        up=bool(device.flags & _IFF_UP and device.flags & _IFF_LOWER_UP) and not gone,
+        gone=gone,
+    )

@@ -12,13 +12,15 @@ import fcntl
 import hashlib
 import os
 import struct
-from contextlib import suppress
-from pathlib import Path
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Final
 
 from gdp.errors import LocalError
 from gdp.names import Name
+from gdp.ports.netlink import LinkAttribute, RefusedError
 from gdp.ports.sockets import AS_ROOT
+from gdp.ports.tunnel.devices import bring_up, refusal_text, set_mtu
 
 __all__ = ["TapDevice", "relay_alias", "tap_name"]
 
@@ -63,7 +65,9 @@ class TapDevice:
         self._fd = _open(ifname)
         try:
             self.set_carrier(on=False)
-            self._configure(mtu=mtu, ifalias=alias, txqlen=_QUEUE_FRAMES, state="up")
+            with self._configuring():
+                numbers = (LinkAttribute.MTU, mtu), (LinkAttribute.TXQLEN, _QUEUE_FRAMES)
+                self._ifindex = bring_up(ifname, alias, *numbers)
         except BaseException:
             self.close()
             raise
@@ -102,22 +106,16 @@ class TapDevice:
     def set_mtu(self, mtu: int) -> None:
         """Change the MTU. Raises ``LocalError``: the system refuses."""
         if mtu != self._mtu:
-            self._configure(mtu=mtu)
+            with self._configuring():
+                set_mtu(self._ifindex, mtu)
             self._mtu = mtu
 
-    def _configure(self, **settings: object) -> None:
-        from pyroute2 import IPRoute
-        from pyroute2.netlink.exceptions import NetlinkError
-
-        quiet = Path(f"/proc/sys/net/ipv6/conf/{self.ifname}/disable_ipv6")
-        with suppress(OSError):  # absent or read-only in some containers; the cost is only a few dropped frames
-            quiet.write_text("1")
+    @contextmanager
+    def _configuring(self) -> Iterator[None]:
         try:
-            with IPRoute() as links:
-                (index,) = links.link_lookup(ifname=self.ifname)
-                links.link("set", index=index, **settings)
-        except (NetlinkError, OSError, ValueError) as error:
-            raise LocalError(f"{self.ifname}: the TAP device cannot be configured: {error}") from error
+            yield
+        except RefusedError as error:
+            raise LocalError(f"{self.ifname}: the TAP device cannot be configured: {refusal_text(error)}") from error
 
 
 def _open(ifname: str) -> int:

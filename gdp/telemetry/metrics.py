@@ -16,8 +16,9 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.registry import Collector
 
 from gdp.errors import DropReason, LocalError
+from gdp.http_server import HttpServer
 from gdp.names import NAME_BYTES, Name
-from gdp.telemetry.scraping import ScrapeServer
+from gdp.telemetry.scraping import scrape_server
 from gdp.telemetry.sources import (
     Counts,
     EntryCounts,
@@ -41,7 +42,7 @@ class Metrics(Collector):
         self._sources = sources
         self._registry = CollectorRegistry(auto_describe=False)
         self._registry.register(self)
-        self._server: ScrapeServer | None = None
+        self._server: HttpServer | None = None
 
     def describe(self) -> list[Metric]:
         """Return nothing, so that registration reads no source."""
@@ -98,7 +99,7 @@ class Metrics(Collector):
         if self._server is not None:
             raise LocalError("metrics are served already")
         try:
-            self._server = ScrapeServer(port, lambda: generate_latest(self._registry), self._sources.health)
+            self._server = scrape_server(port, lambda: generate_latest(self._registry), self._sources.health)
         except OSError as error:
             raise LocalError(f"metrics port {port}: {error.strerror}") from error
         return self._server.port

@@ -18,9 +18,9 @@ from collections.abc import Iterable
 from typing import Final
 
 from gdp.ports.kernel.syscall import BpfError, attached
-from gdp.ports.netlink import CLSACT_EGRESS, ROOT, TRAFFIC_GROUP, LinkAttribute, NetlinkSocket, listen, nested
+from gdp.ports.netlink import CLSACT_EGRESS, ROOT, LinkAttribute, NetlinkSocket, nested
 
-__all__ = ["QueueWatch", "TxDrops", "peer_is_bare"]
+__all__ = ["TxDrops", "peer_is_bare"]
 
 _INFO_KIND: Final = 1  # IFLA_INFO_KIND
 _TCX_EGRESS: Final = 47
@@ -30,7 +30,6 @@ _NUMBER: Final = struct.Struct("=i")
 _STATS2, _STATS_QUEUE = 7, 3  # TCA_STATS2, TCA_STATS_QUEUE
 _QUEUE_DROPS_AT: Final = 8
 _TX_DROPPED_AT: Final = 7 * 8
-_READ_BYTES: Final = 1 << 16
 
 
 def peer_is_bare(ask: NetlinkSocket, ifindex: int) -> bool:
@@ -68,31 +67,6 @@ def _has_driver_xdp(ask: NetlinkSocket, facts: dict[int, bytes]) -> bool:
     peer = ask.link(there, namespace)
     modes = nested(peer.get(LinkAttribute.XDP, b"")).get(_XDP_ATTACHED, b"\0")
     return not peer or modes[0] not in _PASSED_BY_NO_PEER
-
-
-class QueueWatch:
-    """Monitor of queues and filters; readable when those of this namespace's devices change."""
-
-    def __init__(self) -> None:
-        self._socket = listen(TRAFFIC_GROUP)
-
-    def fileno(self) -> int:
-        """Return the descriptor to wait on; it is readable when there are notifications."""
-        return self._socket.fileno()
-
-    def discard_events(self) -> None:
-        """Discard the notifications; the caller queries the present state."""
-        while True:
-            try:
-                self._socket.recv(_READ_BYTES)
-            except BlockingIOError:
-                return
-            except OSError:  # ENOBUFS: notifications were lost, which is a change too
-                continue
-
-    def close(self) -> None:
-        """Close the socket."""
-        self._socket.close()
 
 
 class TxDrops:

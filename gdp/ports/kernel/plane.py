@@ -19,10 +19,10 @@ from typing import Final
 from gdp.errors import DropReason, LocalError
 from gdp.ports.kernel.abi import ENTRIES_DEFAULT, PortFlag
 from gdp.ports.kernel.attach import Attachment, FilterAttachment, LinkAttachment, has_links
-from gdp.ports.kernel.device import QueueWatch, TxDrops, peer_is_bare
+from gdp.ports.kernel.device import TxDrops, peer_is_bare
 from gdp.ports.kernel.loaded_program import LoadedProgram
 from gdp.ports.kernel.map_sync import EntryCounts, MapSync
-from gdp.ports.netlink import NetlinkSocket
+from gdp.ports.netlink import TRAFFIC_GROUP, NetlinkSocket, Notifications
 from gdp.ports.plane import Counters, Port, ReceivedFrame
 from gdp.ports.raw import RawPlane
 from gdp.switch.table import Table
@@ -66,7 +66,7 @@ class KernelPlane(RawPlane):
         with ExitStack() as opened:
             self._loaded = opened.enter_context(closing(LoadedProgram(entries_max, leased=clsact or not has_links())))
             self._questions = opened.enter_context(closing(NetlinkSocket()))
-            self._queues = opened.enter_context(closing(QueueWatch()))
+            self._queues = opened.enter_context(closing(Notifications(TRAFFIC_GROUP)))
             self._mirror = MapSync(table, *self._loaded.of_entries)
             super().__init__(ifnames, table, bypass_qdisc=bypass_qdisc)
             opened.pop_all()  # from now on ``close`` closes them
@@ -183,7 +183,7 @@ class KernelPlane(RawPlane):
 
     def _review_queues(self) -> None:
         """Check again on which ports redirected frames may bypass the egress path."""
-        self._queues.discard_events()
+        self._queues.has_news()
         for port in self._ports.values():
             self._tell_kernel(port)
 

@@ -31,7 +31,7 @@ from typing import Final
 
 from gdp.errors import LocalError
 from gdp.ports.confine.system import prctl
-from gdp.ports.netlink import LINK_GROUP, READ_BYTES, RefusedError, listen
+from gdp.ports.netlink import LINK_GROUP, Notifications, RefusedError
 from gdp.ports.readiness import readable
 from gdp.ports.sockets import AS_ROOT
 from gdp.ports.tunnel.control import ControlLostError
@@ -293,7 +293,7 @@ class _Keeper:
 
     def _probe(self, program: str) -> int:
         """Return the flags with which this version of the program opens TUN devices."""
-        with contextlib.closing(listen(LINK_GROUP)) as news:
+        with contextlib.closing(Notifications(LINK_GROUP)) as news:
             child = self._spawn(program, {})
             try:
                 end_s = time.monotonic() + _START_S
@@ -302,8 +302,7 @@ class _Keeper:
                         child.read()
                         raise LocalError(f"{_PROGRAM} does not start: {child.reason}")
                     self.owner.wait(child.pidfd, news.fileno(), timeout_s=end_s - time.monotonic())
-                    with contextlib.suppress(BlockingIOError):
-                        news.recv(READ_BYTES)
+                    news.has_news()
             finally:
                 child.end()
                 socket_path(self._ifname).unlink(missing_ok=True)

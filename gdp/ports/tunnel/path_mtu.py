@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ipaddress
 import socket
-import struct
 import sys
 from collections.abc import Iterable
 from contextlib import closing
@@ -16,7 +15,7 @@ from typing import Final, NamedTuple
 
 from gdp.control.endpoints import Endpoint
 from gdp.errors import LocalError
-from gdp.ports.netlink import LinkAttribute, NetlinkSocket, RefusedError, attribute, nested
+from gdp.ports.netlink import NUMBER, ROUTE, LinkAttribute, NetlinkSocket, RefusedError, Rtm, attribute, nested
 
 __all__ = ["Route", "RouteMonitor", "route_mtu", "route_to", "tunnel_mtu"]
 
@@ -31,9 +30,6 @@ _INNER_BYTES: Final = _IPV6_BYTES + _UDP_BYTES + _VXLAN_BYTES + _ETHERNET_BYTES
 _IPV6_MTU_MIN: Final = 1280  # RFC 8200, section 5: below it, Linux removes IPv6 from a device
 _OUTER_MTU_MAX: Final = 9_000  # jumbo frames; the loopback device has 65,536
 
-_RTM_GETROUTE, _RTM_NEWROUTE = 26, 24
-_ROUTE: Final = struct.Struct("=BBBBBBBBI")
-_NUMBER: Final = struct.Struct("=I")
 _RTA_DST, _RTA_OIF, _RTA_GATEWAY, _RTA_PREFSRC, _RTA_METRICS, _RTA_MARK = 1, 4, 5, 7, 8, 16
 _RTAX_MTU: Final = 2
 
@@ -58,21 +54,21 @@ def route_to(netlink: NetlinkSocket, endpoint: Endpoint, fwmark: int = 0) -> Rou
     """Return the route to an endpoint; None if there is none now."""
     address = ipaddress.ip_address(endpoint.address)
     family = socket.AF_INET if address.version == 4 else socket.AF_INET6
-    body = _ROUTE.pack(family, address.max_prefixlen, 0, 0, 0, 0, 0, 0, 0) + attribute(_RTA_DST, address.packed)
+    body = ROUTE.pack(family, address.max_prefixlen, 0, 0, 0, 0, 0, 0, 0) + attribute(_RTA_DST, address.packed)
     if fwmark:
-        body += attribute(_RTA_MARK, _NUMBER.pack(fwmark))
+        body += attribute(_RTA_MARK, NUMBER.pack(fwmark))
     if isinstance(address, ipaddress.IPv6Address) and address.scope_id:
         try:
-            body += attribute(_RTA_OIF, _NUMBER.pack(socket.if_nametoindex(address.scope_id)))
+            body += attribute(_RTA_OIF, NUMBER.pack(socket.if_nametoindex(address.scope_id)))
         except OSError:
             return None
     try:
-        replies = netlink.question(_RTM_GETROUTE, body)
+        replies = netlink.question(Rtm.GETROUTE, body)
     except RefusedError:  # unreachable, prohibited, or no such network
         return None
     for reply in replies:
-        if reply.kind == _RTM_NEWROUTE:
-            return _route(netlink, nested(reply.body[_ROUTE.size :]))
+        if reply.kind == Rtm.NEWROUTE:
+            return _route(netlink, nested(reply.body[ROUTE.size :]))
     return None
 
 

@@ -16,7 +16,7 @@ from contextlib import closing
 from typing import Final
 
 from gdp.errors import LocalError
-from gdp.ports.netlink import ROOT, NetlinkSocket, RefusedError, attribute
+from gdp.ports.netlink import NUMBER, ROOT, TRAFFIC, Change, NetlinkSocket, RefusedError, Rtm, attribute
 from gdp.ports.tunnel.devices import find_device, refusal_text, set_queue_length
 
 __all__ = ["limit_rate"]
@@ -26,10 +26,6 @@ _FRAME_BYTES: Final = 1_500
 _BURST_S: Final = 0.02
 _BURST_MIN_BYTES: Final = 16 << 10
 _QUEUE_MIN_FRAMES: Final = 16
-_RTM_NEWQDISC: Final = 36
-_CREATE_OR_REPLACE: Final = 0x400 | 0x100  # NLM_F_CREATE, NLM_F_REPLACE
-_TRAFFIC: Final = struct.Struct("=BxxxiIII")
-_NUMBER: Final = struct.Struct("=I")
 _RATE: Final = struct.Struct("=BBHhHI")
 _KIND, _OPTIONS = 1, 2  # TCA_KIND, TCA_OPTIONS
 _PARAMETERS, _BURST = 1, 6  # TCA_TBF_PARMS, TCA_TBF_BURST
@@ -52,8 +48,8 @@ def limit_rate(ifname: str, bytes_per_s: int) -> None:
     frames = max(int(bytes_per_s * _QUEUE_S) // _FRAME_BYTES, _QUEUE_MIN_FRAMES)
     burst = max(int(bytes_per_s * _BURST_S), _BURST_MIN_BYTES)
     rate = _RATE.pack(0, _ETHERNET, 0, 0, 0, bytes_per_s)
-    parameters = rate + bytes(_RATE.size) + _NUMBER.pack(frames * _FRAME_BYTES) + bytes(2 * _NUMBER.size)
-    options = attribute(_PARAMETERS, parameters) + attribute(_BURST, _NUMBER.pack(burst))
+    parameters = rate + bytes(_RATE.size) + NUMBER.pack(frames * _FRAME_BYTES) + bytes(2 * NUMBER.size)
+    options = attribute(_PARAMETERS, parameters) + attribute(_BURST, NUMBER.pack(burst))
     with closing(NetlinkSocket()) as netlink:
         try:
             set_queue_length(device.ifindex, frames)
@@ -61,7 +57,7 @@ def limit_rate(ifname: str, bytes_per_s: int) -> None:
                 (b"tbf\0", _BUCKET, ROOT, attribute(_OPTIONS, options)),
                 (b"pfifo_fast\0", _BANDS, _BUCKET_CLASS, b""),
             ):
-                body = _TRAFFIC.pack(socket.AF_UNSPEC, device.ifindex, handle, parent, 0)
-                netlink.change(_RTM_NEWQDISC, body + attribute(_KIND, kind) + facts, _CREATE_OR_REPLACE)
+                body = TRAFFIC.pack(socket.AF_UNSPEC, device.ifindex, handle, parent, 0)
+                netlink.change(Rtm.NEWQDISC, body + attribute(_KIND, kind) + facts, Change.CREATE | Change.REPLACE)
         except RefusedError as error:
             raise LocalError(f"rate of {ifname}: {refusal_text(error)}") from error

@@ -27,28 +27,34 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from gdp.errors import LocalError
-from gdp.ports.netlink import LINK_GROUP, READ_BYTES, DeviceInfo, NetlinkSocket, RefusedError, attribute, listen, nested
+from gdp.ports.netlink import (
+    ADDRESS_GROUPS,
+    LINK_GROUP,
+    NUMBER,
+    ROUTE,
+    ROUTE_GROUPS,
+    Change,
+    NetlinkSocket,
+    Notifications,
+    RefusedError,
+    Rtm,
+    attribute,
+    nested,
+)
 from gdp.ports.tunnel.devices import refusal_text
 
-__all__ = ["ADDRESS_GROUPS", "PROTOCOL", "ROUTE_GROUPS", "UplinkRoutes", "mark_of", "remove_leftovers"]
+__all__ = ["PROTOCOL", "UplinkRoutes", "mark_of", "remove_leftovers"]
 
 log = logging.getLogger(__name__)
 
 PROTOCOL: Final = 71  # of routes and rules; free in iproute2's rt_protos
-ADDRESS_GROUPS: Final = 0x10 | 0x100  # RTMGRP_IPV4_IFADDR, RTMGRP_IPV6_IFADDR
-ROUTE_GROUPS: Final = 0x40 | 0x400  # RTMGRP_IPV4_ROUTE, RTMGRP_IPV6_ROUTE
-_RULE_GROUPS: Final = 0x80 | 1 << 18  # RTMGRP_IPV4_RULE; RTNLGRP_IPV6_RULE is 19
+_GROUPS: Final = LINK_GROUP | ADDRESS_GROUPS | ROUTE_GROUPS | 0x80 | 1 << 18  # RTMGRP_IPV4_RULE; IPV6_RULE is 19
 _PRIORITY: Final = 5_000
 # above the tables of the system; with bit 0x10000 it is no mark of Tailscale, 0x40000 or 0x80000 of 0xff0000
 _MARK: Final = 0x40010000
 _MARK_BITS: Final = 0x3FFE1FFF  # follow from the name; the bits of Kubernetes (0xc000) and CNI (0x2000) stay 0
 
-_RTM_NEWROUTE, _RTM_DELROUTE, _RTM_GETROUTE = 24, 25, 26
-_RTM_NEWRULE, _RTM_DELRULE, _RTM_GETRULE = 32, 33, 34
-_CREATE, _EXCLUSIVE = 0x400, 0x200  # NLM_F_CREATE, NLM_F_EXCL
-_ROUTE: Final = struct.Struct("=BBBBBBBBI")  # struct rtmsg, struct fib_rule_hdr
 _NEXT_HOP: Final = struct.Struct("=HBBi")
-_NUMBER: Final = struct.Struct("=I")
 _TABLE_MAIN: Final = 254
 _UNICAST: Final = 1
 _ONLINK: Final = 4  # RTNH_F_ONLINK
@@ -83,8 +89,8 @@ class _Route(NamedTuple):
 
     def body(self, table: int) -> bytes:
         """Return the bytes of a request after the netlink header."""
-        head = _ROUTE.pack(self.family, self.length, 0, self.tos, 0, PROTOCOL, self.scope, _UNICAST, self.flags)
-        named = attribute(_RTA_TABLE, _NUMBER.pack(table)) + attribute(_RTA_OIF, _NUMBER.pack(self.ifindex))
+        head = ROUTE.pack(self.family, self.length, 0, self.tos, 0, PROTOCOL, self.scope, _UNICAST, self.flags)
+        named = attribute(_RTA_TABLE, NUMBER.pack(table)) + attribute(_RTA_OIF, NUMBER.pack(self.ifindex))
         return head + named + b"".join(attribute(kind, value) for kind, value in self.attributes)
 
 
@@ -123,7 +129,7 @@ class UplinkRoutes:
         with ExitStack() as opened:
             self._netlink = NetlinkSocket()
             opened.callback(self._netlink.close)
-            self._news = opened.enter_context(listen(LINK_GROUP | ADDRESS_GROUPS | ROUTE_GROUPS | _RULE_GROUPS))
+            self._news = opened.enter_context(closing(Notifications(_GROUPS)))
             _remove_all(self._netlink, mark)
             opened.callback(_remove_all, self._netlink, mark)
             if any(_routes(self._netlink, family, mark) for family in _FAMILIES):
@@ -157,18 +163,18 @@ class UplinkRoutes:
         Raises:
             LocalError: this user may not change routes, or the kernel does not answer.
         """
-        self._read_news()
+        self._news.has_news()
         try:
-            links = self._netlink.link_named(self._uplink)
-            ifindex = DeviceInfo.from_body(links[0].body).ifindex if links else 0
+            device = self._netlink.link_named(self._uplink)
+            ifindex = 0 if device is None else device.ifindex
             for family in _FAMILIES:
                 self._reconcile_rules(family)
                 wanted = _routes(self._netlink, family, _TABLE_MAIN, ifindex) if ifindex else []
                 present = _routes(self._netlink, family, self._mark)
                 for route in sorted(set(present) - set(wanted), key=_gateways_first):
-                    self._change(_RTM_DELROUTE, route.body(self._mark), 0)
+                    self._change(Rtm.DELROUTE, route.body(self._mark))
                 for route in sorted(set(wanted) - set(present), key=_gateways_first, reverse=True):
-                    self._change(_RTM_NEWROUTE, route.body(self._mark), _CREATE | _EXCLUSIVE)
+                    self._change(Rtm.NEWROUTE, route.body(self._mark), Change.CREATE | Change.EXCLUSIVE)
         except RefusedError as error:
             raise LocalError(f"uplink {self._uplink}: rules of routing: {refusal_text(error)}") from error
 
@@ -176,26 +182,16 @@ class UplinkRoutes:
         """Remove the rules, the routes and both sockets."""
         self._opened.close()
 
-    def _read_news(self) -> None:
-        while True:
-            try:
-                self._news.recv(READ_BYTES)
-            except BlockingIOError:
-                return
-            except OSError as error:  # some were lost; everything is read anyway
-                if error.errno != errno.ENOBUFS:
-                    raise
-
     def _reconcile_rules(self, family: int) -> None:
         wanted = {_rule(family, self._mark, action) for action in (_TO_TABLE, _UNREACHABLE)}
         for rule in wanted - set(_rules(self._netlink, family, self._mark)):
             try:
-                self._netlink.change(_RTM_NEWRULE, rule, _CREATE | _EXCLUSIVE)
+                self._netlink.change(Rtm.NEWRULE, rule, Change.CREATE | Change.EXCLUSIVE)
             except RefusedError as error:
                 if error.number not in (errno.EEXIST, *_NO_FAMILY):
                     raise
 
-    def _change(self, kind: int, body: bytes, flags: int) -> None:
+    def _change(self, kind: Rtm, body: bytes, flags: int = 0) -> None:
         """Add or remove a route. A refusal is a race with another change, of which an event follows."""
         try:
             self._netlink.change(kind, body, flags)
@@ -214,14 +210,14 @@ def _remove_all(netlink: NetlinkSocket, mark: int) -> None:
     try:
         for family in _FAMILIES:
             for rule in _rules(netlink, family, mark):
-                _change_unless_gone(netlink, _RTM_DELRULE, rule)
+                _change_unless_gone(netlink, Rtm.DELRULE, rule)
             for route in sorted(_routes(netlink, family, mark, protocol=PROTOCOL), key=_gateways_first):
-                _change_unless_gone(netlink, _RTM_DELROUTE, route.body(mark))
+                _change_unless_gone(netlink, Rtm.DELROUTE, route.body(mark))
     except RefusedError as error:
         raise LocalError(f"rules of routing of an uplink: {refusal_text(error)}") from error
 
 
-def _change_unless_gone(netlink: NetlinkSocket, kind: int, body: bytes) -> None:
+def _change_unless_gone(netlink: NetlinkSocket, kind: Rtm, body: bytes) -> None:
     try:
         netlink.change(kind, body)
     except RefusedError as error:
@@ -232,25 +228,25 @@ def _change_unless_gone(netlink: NetlinkSocket, kind: int, body: bytes) -> None:
 def _rule(family: int, mark: int, action: int) -> bytes:
     """Return the body of a request about one of our rules."""
     priority = _PRIORITY + (action == _UNREACHABLE)
-    body = _ROUTE.pack(family, 0, 0, 0, 0, 0, 0, action, 0) + attribute(_FRA_PRIORITY, _NUMBER.pack(priority))
-    body += attribute(_FRA_FWMARK, _NUMBER.pack(mark)) + attribute(_FRA_FWMASK, _NUMBER.pack(0xFFFFFFFF))
+    body = ROUTE.pack(family, 0, 0, 0, 0, 0, 0, action, 0) + attribute(_FRA_PRIORITY, NUMBER.pack(priority))
+    body += attribute(_FRA_FWMARK, NUMBER.pack(mark)) + attribute(_FRA_FWMASK, NUMBER.pack(0xFFFFFFFF))
     body += attribute(_FRA_PROTOCOL, bytes([PROTOCOL]))
-    return body + (attribute(_FRA_TABLE, _NUMBER.pack(mark)) if action == _TO_TABLE else b"")
+    return body + (attribute(_FRA_TABLE, NUMBER.pack(mark)) if action == _TO_TABLE else b"")
 
 
 def _rules(netlink: NetlinkSocket, family: int, mark: int) -> list[bytes]:
     """Return the present ones of our two rules of a mark."""
     try:
-        found = netlink.dump(_RTM_GETRULE, _ROUTE.pack(family, 0, 0, 0, 0, 0, 0, 0, 0))
+        found = netlink.dump(Rtm.GETRULE, ROUTE.pack(family, 0, 0, 0, 0, 0, 0, 0, 0))
     except RefusedError as error:
         if error.number in _NO_FAMILY:
             return []
         raise
     rules = []
     for message in found:
-        if message.kind != _RTM_NEWRULE:
+        if message.kind != Rtm.NEWRULE:
             continue
-        values, action = nested(message.body[_ROUTE.size :]), _ROUTE.unpack_from(message.body)[7]
+        values, action = nested(message.body[ROUTE.size :]), ROUTE.unpack_from(message.body)[7]
         is_ours = values.get(_FRA_PROTOCOL) == bytes([PROTOCOL]) and _number(values, _FRA_FWMARK) == mark
         is_ours = is_ours and _number(values, _FRA_PRIORITY) == _PRIORITY + (action == _UNREACHABLE)
         if is_ours and (action == _UNREACHABLE or _number(values, _FRA_TABLE) == mark):
@@ -263,17 +259,17 @@ def _routes(
 ) -> list[_Route]:
     """Return the unicast routes of a table, through one device or any, of one protocol or any."""
     try:
-        found = netlink.dump(_RTM_GETROUTE, _ROUTE.pack(family, 0, 0, 0, 0, 0, 0, 0, 0))
+        found = netlink.dump(Rtm.GETROUTE, ROUTE.pack(family, 0, 0, 0, 0, 0, 0, 0, 0))
     except RefusedError as error:
         if error.number in _NO_FAMILY:
             return []
         raise
     routes = []
     for message in found:
-        if message.kind != _RTM_NEWROUTE:
+        if message.kind != Rtm.NEWROUTE:
             continue
-        _, length, _, tos, short, its_protocol, scope, type_, flags = _ROUTE.unpack_from(message.body)
-        values = nested(message.body[_ROUTE.size :])
+        _, length, _, tos, short, its_protocol, scope, type_, flags = ROUTE.unpack_from(message.body)
+        values = nested(message.body[ROUTE.size :])
         is_wanted = type_ == _UNICAST and not flags & _CLONED and protocol in (None, its_protocol)
         if not is_wanted or (_number(values, _RTA_TABLE) or short) != table:
             continue
@@ -295,7 +291,7 @@ def _hops(values: dict[int, bytes], flags: int) -> list[tuple[dict[int, bytes], 
     while at + _NEXT_HOP.size <= len(data):
         length, hop_flags, _, ifindex = _NEXT_HOP.unpack_from(data, at)
         own = nested(data[at + _NEXT_HOP.size : at + length])
-        found.setdefault(ifindex, ({**values, **own, _RTA_OIF: _NUMBER.pack(ifindex)}, hop_flags))
+        found.setdefault(ifindex, ({**values, **own, _RTA_OIF: NUMBER.pack(ifindex)}, hop_flags))
         at += max(length, _NEXT_HOP.size) + 3 & ~3
     return list(found.values())
 

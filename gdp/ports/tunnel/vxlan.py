@@ -12,7 +12,7 @@ import struct
 from typing import Final
 
 from gdp.errors import LocalError
-from gdp.ports.netlink import LinkAttribute, RefusedError, attribute
+from gdp.ports.netlink import NUMBER, LinkAttribute, RefusedError, attribute
 from gdp.ports.tunnel.devices import (
     add_device,
     find_device,
@@ -31,7 +31,6 @@ VXLAN_PORT: Final = 24_789  # not 4789, where other programs on this host may re
 _ID, _LINK, _LEARNING, _PORT = 1, 3, 7, 15
 _REMOTE6, _LOCAL6 = 16, 17
 _ZERO_CSUM6_TX, _ZERO_CSUM6_RX = 19, 20
-_NUMBER: Final = struct.Struct("=I")
 
 
 def make_vxlan(*, ifname: str, vni: int, local: str, remote: str, underlay: str, mtu: int, alias: str) -> None:
@@ -51,14 +50,14 @@ def make_vxlan(*, ifname: str, vni: int, local: str, remote: str, underlay: str,
     tunnel = find_device(underlay)
     if tunnel is None:
         raise LocalError(f"tunnel {ifname}: there is no device {underlay}")
-    data = attribute(_ID, _NUMBER.pack(vni)) + attribute(_LINK, _NUMBER.pack(tunnel.ifindex))
+    data = attribute(_ID, NUMBER.pack(vni)) + attribute(_LINK, NUMBER.pack(tunnel.ifindex))
     data += attribute(_LOCAL6, ipaddress.IPv6Address(local).packed)
     data += attribute(_REMOTE6, ipaddress.IPv6Address(remote).packed)
     data += attribute(_PORT, struct.pack("!H", VXLAN_PORT)) + attribute(_LEARNING, b"\0")
     data += attribute(_ZERO_CSUM6_TX, b"\1") + attribute(_ZERO_CSUM6_RX, b"\1")
     remove_own_device(ifname, alias)
     try:
-        add_device(ifname, "vxlan", data, attribute(LinkAttribute.MTU, _NUMBER.pack(mtu)))
+        add_device(ifname, "vxlan", data, attribute(LinkAttribute.MTU, NUMBER.pack(mtu)))
         made = find_device(ifname)
         if made is None:
             raise LocalError(f"tunnel {ifname}: another program removed the device")

@@ -14,13 +14,13 @@ import logging
 import select
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from typing import Final, Literal
 
 from gdp.control.endpoints import Endpoint
 from gdp.errors import LocalError
-from gdp.ports.netlink import LINK_GROUP, READ_BYTES, RefusedError, listen
+from gdp.ports.netlink import ADDRESS_GROUPS, LINK_GROUP, ROUTE_GROUPS, Notifications, RefusedError
 from gdp.ports.tunnel.control import (
     Change,
     ControlLostError,
@@ -42,7 +42,7 @@ from gdp.ports.tunnel.keeper_process import KeeperProcess
 from gdp.ports.tunnel.kernel_control import KernelControl
 from gdp.ports.tunnel.path_mtu import RouteMonitor
 from gdp.ports.tunnel.uapi import UserspaceControl
-from gdp.ports.tunnel.uplink_routes import ADDRESS_GROUPS, ROUTE_GROUPS, mark_of
+from gdp.ports.tunnel.uplink_routes import mark_of
 
 __all__ = ["Backend", "PeerState", "WireGuardDevice", "open_wireguard"]
 
@@ -104,7 +104,7 @@ class WireGuardDevice:
         with ExitStack() as opened:
             self._routes = RouteMonitor(fwmark)
             opened.callback(self._routes.close)
-            self._news = opened.enter_context(listen(LINK_GROUP | ADDRESS_GROUPS | ROUTE_GROUPS))
+            self._news = opened.enter_context(closing(Notifications(LINK_GROUP | ADDRESS_GROUPS | ROUTE_GROUPS)))
             self._epoll = opened.enter_context(select.epoll())
             self._epoll.register(keeper, select.EPOLLIN)
             self._epoll.register(self._news, select.EPOLLIN)
@@ -260,7 +260,7 @@ class WireGuardDevice:
                 log.warning("tunnel device ifname=%s: %s", self.ifname, report.text)
             else:
                 log.warning("wireguard-go ended ifname=%s reason=%s", self.ifname, report.text)
-        if self._has_news():
+        if self._news.has_news():
             self.peers()
             self._follow_routes()
         return is_new
@@ -343,18 +343,6 @@ class WireGuardDevice:
             raise LocalError(f"tunnel {self.ifname}: {refusal_text(error)}") from error
 
     # roaming
-
-    def _has_news(self) -> bool:
-        """Read the notifications of the kernel; return whether there were any."""
-        has_news = False
-        while True:
-            try:
-                self._news.recv(READ_BYTES)
-            except BlockingIOError:
-                return has_news
-            except OSError:  # ENOBUFS: some were lost, which is a change as well
-                pass
-            has_news = True
 
     def _follow_routes(self) -> None:
         """Let the device use its present addresses, if the route to a peer changed."""
