@@ -3,7 +3,6 @@
     sudo .venv/bin/python scripts/bench/security.py revocation            # the whole; docs/benchmarks/security.json
     .venv/bin/python scripts/bench/security.py revocation --part kept     # 10^5 revocations in one process; no root
     sudo .venv/bin/python scripts/bench/security.py revocation --part closed --rounds 3 --no-save
-    .venv/bin/python scripts/bench/security.py rotation                   # messages lost while epochs change; no root
     sudo .venv/bin/python scripts/bench/security.py flood                 # by strangers and by members; an hour
 
 Each subcommand is a module in this folder with ``add_arguments(parser)`` and ``run(options, held)``; ``held`` are its
@@ -22,12 +21,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
-import security_amplification
 import security_flood
-import security_insiders
-import security_replays
 import security_revocation
-import security_rotation
 from machine import MachineState, machine_state
 from preconditions import require_trust, require_writable
 from skeleton import add_allow_load, clean_exit
@@ -35,11 +30,7 @@ from skeleton import add_allow_load, clean_exit
 OUTPUT: Final = Path(__file__).resolve().parents[2] / "docs" / "benchmarks" / "security.json"
 COMMANDS: Final[Mapping[str, ModuleType]] = {
     "revocation": security_revocation,
-    "rotation": security_rotation,
     "flood": security_flood,
-    "amplification": security_amplification,
-    "replays": security_replays,
-    "insiders": security_insiders,
 }
 
 
