@@ -26,7 +26,7 @@ needs_wireguard = pytest.mark.skipif(
         ["forwarding.py", "--quick", "--no-save"],
         pytest.param(["messages.py", "--quick", "--mtu", "9000", "--offloads", "off"], marks=soak),
         pytest.param(["first_topic.py", "--rounds", "1", "--no-save"], marks=[soak, needs_ros2, needs_wireguard]),
-        ["uplink.py", "--quick", "--no-save", "--no-tcp", "--fifo", "bdp", "--only", "line", "gdp"],
+        ["uplink.py", "--quick", "--no-save", "--no-tcp", "--fifo", "bdp", "--only", "gdp"],
         pytest.param(["reduce.py", "--quick"], marks=needs_pillow),
         pytest.param(["ros.py", "--quick", "--no-save", "--mtu", "9000"], marks=[soak, needs_ros2]),
         pytest.param(["services.py", "--quick", "--no-save"], marks=[soak, needs_ros2]),

@@ -1,4 +1,4 @@
-"""Relay of a thin link between namespaces: which frames cross it; its times are measured by the bench ``uplink``."""
+"""Relay of a thin link between namespaces: which frames cross it; the bench ``uplink`` reports how late it was."""
 
 from __future__ import annotations
 

@@ -1,13 +1,11 @@
 """Security bench: cost of single measures and resistance to attacks, one subcommand for each question.
 
     sudo .venv/bin/python scripts/bench/security.py revocation            # the whole; docs/benchmarks/security.json
-    .venv/bin/python scripts/bench/security.py revocation --part kept     # 10^5 revocations in one process; no root
-    sudo .venv/bin/python scripts/bench/security.py revocation --part closed --rounds 3 --no-save
-    sudo .venv/bin/python scripts/bench/security.py flood                 # by strangers and by members; an hour
+    sudo .venv/bin/python scripts/bench/security.py revocation --rounds 1 --no-save
+    sudo .venv/bin/python scripts/bench/security.py flood                 # by strangers; half an hour
 
-Each subcommand is a module in this folder with ``add_arguments(parser)`` and ``run(options, held)``; ``held`` are its
-figures of earlier runs. ``run`` returns its figures, which are stored under the subcommand's name, and whether every
-target was met.
+Each subcommand is a module in this folder with ``add_arguments(parser)`` and ``run(options)``. ``run`` returns its
+figures, which are stored under the subcommand's name, and whether every target was met.
 """
 
 from __future__ import annotations
@@ -70,7 +68,7 @@ def main() -> None:
         if not options.no_save:
             require_writable(options.json.parent)
             require_trust(state, allow_load=options.allow_load)
-        figures, has_met = COMMANDS[options.command].run(options, held(options.json).get(options.command, {}))
+        figures, has_met = COMMANDS[options.command].run(options)
     if not options.no_save:
         save(options.json, options.command, figures, state)
     sys.exit(options.strict and not has_met)

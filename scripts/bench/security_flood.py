@@ -1,4 +1,4 @@
-"""Flood bench: effect of a flood by a stranger on a link, or by a member, on real nodes.
+"""Flood bench: effect of a stranger's flood of hellos on real nodes.
 
 Three switches in a row, each a process in a namespace of its own. A topic goes from a member at the first to a member
 at the last one. A stranger on the link between the first and the middle one replays hellos to the middle one, from
@@ -6,14 +6,9 @@ at the last one. A stranger on the link between the first and the middle one rep
 (``recorded``), or have a member's certificate and a wrong signature (``wrong``). Broadcast data, which no switch reads,
 is the control (``noise``): it disturbs only the machine, on which the flood takes a core.
 
-A fourth switch at the middle one is hostile (``faults.hostile``): it sends frames to unknown ``names``, valid
-``joins``, ``revocations`` of its own. A proxy at the middle one reads the topic, publishes another, and is hostile in
-turn. It sends ``reports`` that everything lacks, and first ``parts`` of large messages, one after the other.
-
-The rate is ten times what this machine verifies in a second. Parts are a member's right to send; their rate is ten
-times that of the good topic's frames. Each flood is compared with a calm phase before it. At the end of each phase the
-first switch is killed and started again. The figure is the time until it is a neighbour of the middle one. Memory is
-that of the target of the flood: the middle switch, the publisher (``reports``), the reader (``parts``).
+The rate is ten times what this machine verifies in a second. Each flood is compared with a calm phase before it. At
+the end of each phase the first switch is killed and started again. The figure is the time until it is a neighbour of
+the middle one. Memory is that of the middle switch.
 
     sudo .venv/bin/python scripts/bench/security.py flood                        # an hour
     sudo .venv/bin/python scripts/bench/security.py flood --planes kernel --kinds fresh --seconds 5 --rounds 1 --no-save
@@ -23,10 +18,8 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import re
 import secrets
-import signal
 import statistics
 import struct
 import time
@@ -64,22 +57,15 @@ __all__ = ["add_arguments", "run"]
 GOAL_MEMORY_MIB: Final = 16.0
 GOAL_GOODPUT: Final = 0.9
 TIMES: Final = 10  # multiple of the rate that a core verifies
-STRANGE: Final = ("fresh", "recorded", "wrong", "noise")
-OF_SWITCH: Final = ("names", "joins", "revocations")
-OF_PROXY: Final = ("reports", "parts")
-KINDS: Final = (*STRANGE, *OF_SWITCH, *OF_PROXY)
+KINDS: Final = ("fresh", "recorded", "wrong", "noise")
 SETTLE_S: Final = 6.0
-FLOW: Final = Flow("/flood/good", "p", ("r", "g", "m"), reliable=False, hz=200.0, size=1_000)
-OWN: Final = Flow("/flood/own", "g", ("v",), hz=1.0)
+FLOW: Final = Flow("/flood/good", "p", ("r",), reliable=False, hz=200.0, size=1_000)
 _FRAMES: Final = 2_000
-_LOST: Final = re.compile(r"neighbour lost port=(?![hg]\b)")
+_LOST: Final = re.compile(r"neighbour lost port=")
 _RESTART_S: Final = 12.0
-_HOSTILE_READY_S: Final = 60.0
 _MTU: Final = 1_500
 _VICTIM: Final = "s0"
 _NEAR: Final = "s1"
-_HOSTILE: Final = dict.fromkeys(OF_SWITCH, "switch h") | dict.fromkeys(OF_PROXY, "member g")
-_AIMED_AT: Final = {"reports": ("member p", _NEAR), "parts": ("member v", "s2")}  # and by which link
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,10 +77,10 @@ class Phase:
         core: share of a core that the switch in the middle took.
         restart_s: from the kill of a neighbour until it is a neighbour again.
         lost: neighbours that any switch lost.
-        memory_mib: resident memory, at the end, of the node that the flood aims at.
+        memory_mib: resident memory, at the end, of the middle switch.
         backlog_drops: frames of any link that this machine lost before any switch saw them: all namespaces share the
             queue of their processor (``net.core.netdev_max_backlog``). Where there are some, losses prove nothing.
-        reached: frames a second that came into that node by the link on which the flood comes.
+        reached: frames a second that came into it by the link on which the flood comes.
         waited: seconds for which switches were ready to run and had no core, of each second, summed over all. Nothing
             that a switch does about a flood makes that less; the control shows how much of it is the machine's.
     """
@@ -110,12 +96,12 @@ class Phase:
 
 
 def plan() -> Plan:
-    """Return three switches in a row with a member at each end, and a switch and a proxy at the middle one."""
+    """Return three switches in a row with a member at each end."""
     topology, members = make_topology(
-        {"home": (_VICTIM, _NEAR, "s2", "h")}, {}, [f"{_NEAR}-{_VICTIM}", f"{_VICTIM}-s2", f"h-{_VICTIM}"], (_VICTIM,),
-        {"p": _NEAR, "r": "s2", "v": "s2", "m": "h", "g": _VICTIM},
+        {"home": (_VICTIM, _NEAR, "s2")}, {}, [f"{_NEAR}-{_VICTIM}", f"{_VICTIM}-s2"], (_VICTIM,),
+        {"p": _NEAR, "r": "s2"},
     )  # fmt: skip
-    return Plan(topology, members, flows=(FLOW, OWN))
+    return Plan(topology, members, flows=(FLOW,))
 
 
 def verifications_hz() -> float:
@@ -173,8 +159,8 @@ def backlog_drops() -> int:
 
 
 def lost(overlay: Overlay) -> int:
-    """Return how often any switch has lost a neighbour so far, except those that may be hostile."""
-    texts = [text for node in overlay.plan.switches if node != "h" for _, text in overlay.logs(f"switch {node}")]
+    """Return how often any switch has lost a neighbour so far."""
+    texts = [text for node in overlay.plan.switches for _, text in overlay.logs(f"switch {node}")]
     return sum(len(_LOST.findall(text)) for text in texts)
 
 
@@ -207,20 +193,18 @@ def restart_s(overlay: Overlay) -> float:
     return took_s
 
 
-def phase(overlay: Overlay, kind: str, seconds: float) -> Phase:
+def phase(overlay: Overlay, seconds: float) -> Phase:
     """Run one phase, with a flood or without."""
     pid = overlay.pid(f"switch {_VICTIM}")
-    aimed_at, link = _AIMED_AT.get(kind, (f"switch {_VICTIM}", "h" if kind in OF_SWITCH else _NEAR))
-    node = aimed_at.split()[1]
-    before_reached = overlay.received(node, [link])[link]
+    before_reached = overlay.received(_VICTIM, [_NEAR])[_NEAR]
     counted(overlay)
     before_s, before_lost, begun_s = processor_s(pid), lost(overlay), time.monotonic()
     before_drops, before_waited_s = backlog_drops(), waited_s(overlay)
     time.sleep(seconds)
     took_s = time.monotonic() - begun_s
     core, waited = (processor_s(pid) - before_s) / took_s, (waited_s(overlay) - before_waited_s) / took_s
-    memory = resident_bytes(overlay.pid(aimed_at)) / (1 << 20)
-    reached = (overlay.received(node, [link])[link] - before_reached) / took_s
+    memory = resident_bytes(pid) / (1 << 20)
+    reached = (overlay.received(_VICTIM, [_NEAR])[_NEAR] - before_reached) / took_s
     published, delivered = counted(overlay)
     time.sleep(1.0)  # a switch logs what it lost each half second
     losses = lost(overlay) - before_lost
@@ -241,11 +225,10 @@ def measure(
         for number in range(rounds):
             for kind in kinds:
                 progress(f"{plane}, {kind}, round {number + 1}")
-                calm = phase(overlay, kind, seconds)
+                calm = phase(overlay, seconds)
                 time.sleep(SETTLE_S)
-                of_kind = TIMES * FLOW.hz if kind == "parts" else rate
-                with _flooding(run, overlay, kind, of_kind, seconds + 1 + _RESTART_S, spoof=spoof) as flood:
-                    flooded = phase(overlay, kind, seconds)
+                with _flooding(run, overlay, kind, rate, seconds + 1 + _RESTART_S, spoof=spoof) as flood:
+                    flooded = phase(overlay, seconds)
                     said = flood.read(_RESTART_S + 30)
                     progress(f"{float(str(said['sent'])) / float(str(said['seconds'])):,.0f} frames a second")
                     found[kind].append({"calm": calm, "flooded": flooded})
@@ -255,36 +238,16 @@ def measure(
 
 @contextmanager
 def _flooding(run: Run, overlay: Overlay, kind: str, rate: float, seconds: float, *, spoof: bool) -> Iterator[Started]:
-    """Run a flood; a hostile member replaces the honest one of its name, which then returns."""
-    if kind not in _HOSTILE:
-        path = run.directory / f"{kind}.frames"
-        path.write_bytes(b"".join(struct.pack("!I", len(frame)) + frame for frame in hellos(kind, overlay)))
-        orders: dict[str, object] = {
-            "iface": _VICTIM, "frames": str(path), "rate": rate, "seconds": seconds,
-            "source": _address_of(overlay) if spoof else "",
-        }  # fmt: skip
-        argv = ["-m", "faults.hello_flood", json.dumps(orders)]
-        with overlay.start_other(_NEAR, f"flood {kind}", argv) as flood:
-            flood.read(30)
-            yield flood
-        return
-    who = _HOSTILE[kind]
-    role, _, node = who.partition(" ")
-    orders = {"what": kind, "frames": _FRAMES, "rate": rate, "seconds": seconds}
-    if role == "switch":
-        orders["config"] = str(overlay.directory / f"switch-{node}.yaml")
-    else:
-        orders |= {"config": str(overlay.directory / f"end-{node}.yaml"), "reads": FLOW.topic, "publishes": OWN.topic}
-    overlay.kill(who)
-    try:
-        argv = ["-m", "faults.hostile", json.dumps(orders)]
-        with overlay.start_other(node, f"flood {kind}", argv) as flood:
-            flood.read(_HOSTILE_READY_S)
-            os.kill(flood.pid, signal.SIGUSR1)
-            yield flood
-    finally:
-        overlay.restart(who)
-        overlay.await_ready(who)
+    """Run a flood."""
+    path = run.directory / f"{kind}.frames"
+    path.write_bytes(b"".join(struct.pack("!I", len(frame)) + frame for frame in hellos(kind, overlay)))
+    orders = {
+        "iface": _VICTIM, "frames": str(path), "rate": rate, "seconds": seconds,
+        "source": _address_of(overlay) if spoof else "",
+    }  # fmt: skip
+    with overlay.start_other(_NEAR, f"flood {kind}", ["-m", "faults.hello_flood", json.dumps(orders)]) as flood:
+        flood.read(30)
+        yield flood
 
 
 def _address_of(overlay: Overlay) -> str:
@@ -309,7 +272,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--spoof", action="store_true", help="under the address of the neighbour on that link")
 
 
-def run(options: argparse.Namespace, _: object) -> tuple[dict[str, object], bool]:
+def run(options: argparse.Namespace) -> tuple[dict[str, object], bool]:
     """Measure every plane with every kind of flood; return the figures, and whether the targets were met."""
     runs = RunRegistry()
     runs.sweep()
