@@ -147,10 +147,6 @@ class Overlay:
         argv = ["-m", *argv] if clock is None else ["-m", "faults.clock", str(clock.path), *argv]
         self._processes[who] = self._lab.start(node, f"{role} {incarnation_id}", argv)
 
-    def start_other(self, node: str, what: str, arguments: Sequence[str]) -> Started:
-        """Start a Python process that is not of the plan on a machine."""
-        return self._lab.start(node, what, arguments)
-
     def await_ready(self, who: str) -> None:
         """Return when a started process reports that it is ready.
 
