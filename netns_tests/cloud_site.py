@@ -31,9 +31,9 @@ from gdp.nodes.control_protocol import Command
 from netns_tests.datacenter.debian_root import cache_folder
 from netns_tests.datacenter.ec2 import UBUNTU
 from netns_tests.datacenter.router import CALLER
-from netns_tests.local_site import until
 from tests.pages import ROOT
 from tests.script_packages import PYTHON_PATH
+from tests.waiting import until
 
 __all__ = ["CloudSite", "launch_file", "start_echo", "wheelhouse"]
 

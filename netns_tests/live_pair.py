@@ -19,7 +19,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -46,7 +46,7 @@ from tests.proxy.endpoints.ros1_net import need_ros1
 from tests.proxy.endpoints.ros2_net import DOMAIN, Peer
 from tests.script_packages import PYTHON_PATH
 
-__all__ = ["PATIENCE_S", "Crossing", "Pair", "Proxy", "pair_of", "until"]
+__all__ = ["PATIENCE_S", "Crossing", "Pair", "Proxy", "pair_of"]
 
 PATIENCE_S: Final = 30.0
 _MASTER: Final = "http://127.0.0.1:11311"
@@ -75,14 +75,6 @@ _TOPOLOGY: Final = Topology(
         *(Attachment("a" if label == "a" else "b", "proxy", f"to_{label}") for label in _GRAPHS),
     ),
 )
-
-
-def until(is_met: Callable[[], object], what: str, patience_s: float = PATIENCE_S) -> None:
-    """Poll until a condition holds that causes no event."""
-    end_s = time.monotonic() + patience_s
-    while not is_met():
-        assert time.monotonic() < end_s, f"{what}: not within {patience_s:g} s"
-        time.sleep(0.02)
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import select
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -25,18 +24,10 @@ from gdp.stores.keyring import CARD, DELEGATIONS, ROOT_CERTIFICATE
 from gdp.trust.right import Right
 from tests.pages import ROOT
 
-__all__ = ["PATIENCE_S", "Domain", "leftovers", "machine_of", "plain_gateway", "spec", "ticking", "until"]
+__all__ = ["PATIENCE_S", "Domain", "leftovers", "machine_of", "plain_gateway", "spec", "ticking"]
 
 PATIENCE_S: Final = 30.0
 _TICKS: Final = "import time\nprint('ready')\nwhile True:\n    time.sleep(0.01)\n    print('tick')"
-
-
-def until(is_met: Callable[[], object], what: str) -> None:
-    """Poll until a condition holds that causes no event."""
-    end_s = time.monotonic() + PATIENCE_S
-    while not is_met():
-        assert time.monotonic() < end_s, f"{what}: not within {PATIENCE_S:g} s"
-        time.sleep(0.01)
 
 
 def spec(name: str, region: str = "local-a", hardware: Hardware | None = None) -> MachineSpec:

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from gdp.ports.tap import tap_name
 from gdp.stores.issue import make_domain, make_node
 from gdp.stores.keyring import load_card
 from netns_tests.spaces import Space
+from tests.waiting import until
 
 PORT = 443
 BORDER_ADDRESS, MEMBER_ADDRESS, LATER_ADDRESS = "192.0.2.1", "192.0.2.2", "192.0.2.3"
@@ -148,7 +149,7 @@ class RelayLab:
     def start_relays(self) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
         """Start both relays; return border's and member's when frames may pass."""
         processes = self.start_relay(self.border), self.start_relay(self.member)
-        wait_for(self.is_up)
+        until(self.is_up)
         return processes
 
     def start_switch(self, node: Node, **more: object) -> subprocess.Popen[bytes]:
@@ -186,15 +187,6 @@ class RelayLab:
     def is_joined(self) -> bool:
         """Return whether both switches see each other."""
         return self.neighbours(self.border) == self.neighbours(self.member) == 1
-
-
-def wait_for(holds: Callable[[], bool], patience_s: float = _PATIENCE_S) -> float:
-    """Return the seconds until something holds, asked again and again, because another process causes it."""
-    begun_s = time.monotonic()
-    while not holds():
-        assert time.monotonic() - begun_s < patience_s, "it did not come true"
-        select.select([], [], [], 0.01)
-    return time.monotonic() - begun_s
 
 
 @contextmanager

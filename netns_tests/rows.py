@@ -8,7 +8,6 @@
 from __future__ import annotations
 
 import socket
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
 
@@ -21,7 +20,8 @@ from gdp.ports.netdev import NetdevPlane
 from gdp.ports.raw import RawPlane
 from gdp.switch.table import NOWHERE, Table
 from netns_tests.spaces import Space
-from netns_tests.test_planes import LOOK_S, PATIENCE_S, far_end
+from netns_tests.test_planes import LOOK_S, far_end
+from tests.waiting import until
 
 __all__ = ["FORGOTTEN", "KINDS", "NOWHERE_NAME", "UNKNOWN", "B", "Row", "frame", "mac_of", "waiting"]
 
@@ -102,12 +102,13 @@ class Row:
 
     def until(self, done: Callable[[], bool]) -> None:
         """Poll all planes until a condition holds."""
-        deadline_s = time.monotonic() + PATIENCE_S
-        while not done():
-            assert time.monotonic() < deadline_s, f"it did not come about: {self.sums()}"
+
+        def look() -> None:
             self.poll()
             self.punted += len(self.planes[-1].poll(LOOK_S / 10))
             self.delivered += waiting(self.b)
+
+        until(done, self.sums, meanwhile=look)
 
     def drops(self) -> dict[DropReason, int]:
         """Return the drops of all planes, by reason."""

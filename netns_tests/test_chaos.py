@@ -21,9 +21,9 @@ from topologies import make_topology
 from gdp.host.netns_files import processes_inside
 from gdp.host.processes import Process
 from gdp.host.run_registry import RunRegistry
-from netns_tests.live_pair import until
 from tests.pages import ROOT
 from tests.script_packages import PYTHON_PATH
+from tests.waiting import until
 
 pytestmark = [pytest.mark.netns, pytest.mark.nightly]
 

@@ -24,6 +24,7 @@ from internet.access import Access
 from internet.host import Host
 from internet.laboratory import Laboratory
 from tests.pages import ROOT
+from tests.waiting import until
 
 pytestmark = [
     pytest.mark.netns,
@@ -103,11 +104,15 @@ class Sites:
         )
 
     def _wait_for(self, is_true: Callable[[], bool], what: str) -> None:
-        end_s = time.monotonic() + PATIENCE_S
-        while not is_true():
-            assert time.monotonic() < end_s, f"{what}: {[self.status(label).get('links') for label in self.hosts]}"
+        def are_alive() -> bool:
             assert all(child.poll() is None for child in self._children), "a node ended"
-            time.sleep(0.1)
+            return True
+
+        until(
+            lambda: are_alive() and is_true(),
+            lambda: f"{what}: {[self.status(label).get('links') for label in self.hosts]}",
+            PATIENCE_S,
+        )
 
     def close(self) -> None:
         """End the nodes."""

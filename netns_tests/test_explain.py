@@ -20,9 +20,10 @@ from gdp.crypto.certificates import Role
 from gdp.diagnosis.answer import Answer, Cause
 from gdp.diagnosis.diagnosis import diagnose
 from gdp.host.ros_processes import ros_processes
-from netns_tests.live_pair import Crossing, Pair, pair_of, until
+from netns_tests.live_pair import Crossing, Pair, pair_of
 from tests.proxy.endpoints.ros2_net import Peer, needs
 from tests.script_packages import PYTHON_PATH
+from tests.waiting import until
 
 needs("std_msgs", "std_srvs")
 if shutil.which("nsenter") is None or shutil.which("setpriv") is None:
@@ -42,6 +43,7 @@ CROSSINGS = (
 _NODE = """
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
+from tests.waiting import until
 def beat(topic, hz):
     out = talk(String, topic)
     kept.append(node.create_timer(1 / hz, lambda: out.publish(String(data='beat'))))

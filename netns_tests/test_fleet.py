@@ -11,8 +11,9 @@ from collections.abc import Iterator, Mapping
 import pytest
 
 from gdp.metadata import Metadata
-from netns_tests.live_pair import Crossing, Pair, pair_of, until
+from netns_tests.live_pair import Crossing, Pair, pair_of
 from tests.proxy.endpoints.ros2_net import Peer, needs
+from tests.waiting import until
 
 needs("std_msgs")
 if shutil.which("nsenter") is None or shutil.which("setpriv") is None:
@@ -24,6 +25,7 @@ STRING = "std_msgs/msg/String"
 PREFIX = "robot1"
 _NODE = """
 from std_msgs.msg import String
+from tests.waiting import until
 heard = {}
 def read(topic):
     found = heard[topic] = []

@@ -23,6 +23,7 @@ from netns_tests.local_site import PATIENCE_S
 from netns_tests.spaces import Space
 from tests.pages import ROOT
 from tests.script_packages import PYTHON_PATH
+from tests.waiting import until
 
 pytestmark = pytest.mark.netns
 pytest.importorskip("rclpy", reason="needs the extra ros2")
@@ -77,10 +78,7 @@ class Fog:
         return [each.name for each in self.living() if each.is_serving]
 
     def until(self, is_met: Callable[[], object], what: str) -> None:
-        end_s = time.monotonic() + _MACHINES_S
-        while not is_met():
-            assert time.monotonic() < end_s, f"{what}: {self.log()}"
-            time.sleep(0.1)
+        until(is_met, lambda: f"{what}: {self.log()}", _MACHINES_S)
 
 
 @pytest.fixture

@@ -8,8 +8,7 @@ import select
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -22,6 +21,7 @@ from internet.access import Access
 from internet.host import Host
 from internet.laboratory import Laboratory
 from netns_tests.traces import traced
+from tests.waiting import until
 
 pytestmark = pytest.mark.netns
 
@@ -71,14 +71,6 @@ def switch_name(directory: Path) -> str:
     return load_card(directory / "switch" / CARD).name.to_text()
 
 
-def eventually(found: Callable[[], bool], logs: Path) -> None:
-    """Wait until something holds."""
-    end_s = time.monotonic() + PATIENCE_S
-    while not found():
-        assert time.monotonic() < end_s, "".join(each.read_text() for each in logs.glob("*.log"))[-4_000:]
-        time.sleep(0.1)
-
-
 def test_machines_behind_nats_join_with_tokens_and_a_removed_one_has_no_tunnel(
     laboratory: Laboratory, tmp_path: Path
 ) -> None:
@@ -86,20 +78,24 @@ def test_machines_behind_nats_join_with_tokens_and_a_removed_one_has_no_tunnel(
     robot = laboratory.add_host("robot", laboratory.add_site("home", Access.SYMMETRIC))
     arm = laboratory.add_host("arm", laboratory.add_site("hall", Access.PORT_RESTRICTED))
     address, lab = border.lease().address.partition("/")[0], tmp_path / "lab"
+
+    def said() -> str:
+        return "".join(each.read_text() for each in tmp_path.glob("*.log"))[-4_000:]
+
     with contextlib.ExitStack() as stack:
         words = ("domain", "create", "lab", "--public", address, "--directory", str(lab), "--no-systemd")
         created = stack.enter_context(running(border, tmp_path, *words))
         assert created.stdout is not None
         assert select.select([created.stdout], [], [], PATIENCE_S)[0]
         tokens = [created.stdout.readline(), run("domain", "token", "lab", "--directory", str(lab), "--role", "leaf")]
-        eventually(lambda: "listening on TCP port" in (tmp_path / "border.log").read_text(), tmp_path)
+        until(lambda: "listening on TCP port" in (tmp_path / "border.log").read_text(), said, PATIENCE_S)
         for host, line in zip((robot, arm), tokens, strict=True):
             home = str(tmp_path / host.label)
             line_words = (*line.split()[1:], "--label", host.label, "--directory", home, "--no-systemd")
             stack.enter_context(running(host, tmp_path, *line_words))
-        eventually(lambda: up(lab) == {"robot", "arm"}, tmp_path)
-        eventually(lambda: "border" in up(tmp_path / "robot"), tmp_path)
-        eventually(lambda: "tunnels are up: border" in (tmp_path / "robot.log").read_text(), tmp_path)
+        until(lambda: up(lab) == {"robot", "arm"}, said, PATIENCE_S)
+        until(lambda: "border" in up(tmp_path / "robot"), said, PATIENCE_S)
+        until(lambda: "tunnels are up: border" in (tmp_path / "robot.log").read_text(), said, PATIENCE_S)
         rows = {
             each["label"]: each for each in json.loads(run("domain", "ls", "lab", "--directory", str(lab), "--json"))
         }
@@ -111,4 +107,4 @@ def test_machines_behind_nats_join_with_tokens_and_a_removed_one_has_no_tunnel(
             lab
         )
         run("domain", "remove", "lab", "robot", "--directory", str(lab))
-        eventually(lambda: {each["label"] for each in links(lab)} == {"arm"}, tmp_path)
+        until(lambda: {each["label"] for each in links(lab)} == {"arm"}, said, PATIENCE_S)

@@ -10,8 +10,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from netns_tests.live_pair import Crossing, Pair, pair_of, until
+from netns_tests.live_pair import Crossing, Pair, pair_of
 from tests.proxy.endpoints.ros2_net import Peer, needs
+from tests.waiting import until
 
 needs("std_msgs", "nav_msgs", "sensor_msgs", "geometry_msgs", "std_srvs", "test_msgs")
 if shutil.which("nsenter") is None or shutil.which("setpriv") is None:
@@ -46,6 +47,7 @@ from std_srvs.srv import SetBool
 from test_msgs.action import Fibonacci
 from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from tests.waiting import until
 def read(kind, topic, depth=10, durability='volatile'):
     if topic in reads: node.destroy_subscription(reads.pop(topic))
     found = heard[topic] = []

@@ -7,8 +7,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from netns_tests.live_pair import Crossing, Pair, Proxy, pair_of, until
+from netns_tests.live_pair import Crossing, Pair, Proxy, pair_of
 from tests.proxy.endpoints.ros2_net import Peer, needs
+from tests.waiting import until
 
 needs("std_msgs", "sensor_msgs", "geometry_msgs", "std_srvs", "diagnostic_msgs")
 if shutil.which("nsenter") is None or shutil.which("setpriv") is None:
@@ -37,6 +38,7 @@ from sensor_msgs.msg import Image
 from std_srvs.srv import SetBool
 from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
+from tests.waiting import until
 def read(kind, topic, **more):
     heard[topic] = []
     qos = QoSProfile(depth=100, **more)

@@ -36,10 +36,10 @@ from netns_tests.local_site import (
     plain_gateway,
     spec,
     ticking,
-    until,
 )
 from netns_tests.spaces import Space
 from tests.pages import ROOT
+from tests.waiting import until
 
 pytestmark = pytest.mark.netns
 _ETHERTYPE = 0x88B6  # IEEE 802 local experimental 2

@@ -47,6 +47,7 @@ from gdp.trust.right import Right
 from netns_tests.spaces import Space
 from netns_tests.test_planes import BURST, changes, far_end, poll_until
 from tests.fixtures_forwarding import frame
+from tests.waiting import until
 
 pytestmark = pytest.mark.netns
 
@@ -95,13 +96,14 @@ class Lab:
 
     def until(self, done: Callable[[], bool]) -> None:
         """Step everything until a condition holds."""
-        deadline_s = time.monotonic() + PATIENCE_S
-        while not done():
+
+        def step() -> None:
             now_s = time.monotonic()
-            assert now_s < deadline_s, "it did not come about"
             for runtime in self._runtimes[:-1]:
                 runtime.step(now_s)
             self._runtimes[-1].step(now_s + STEP_S)
+
+        until(done, meanwhile=step)
 
     def publish(self, message: bytes) -> None:
         """Publish now."""

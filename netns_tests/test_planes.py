@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import socket
-import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import chain
@@ -46,6 +45,7 @@ from tests.fixtures_forwarding import (
     frame,
     leaves,
 )
+from tests.waiting import until
 
 pytestmark = pytest.mark.netns
 
@@ -131,10 +131,7 @@ def numbered(count: int) -> list[bytes]:
 def poll_until(plane: Plane, done: Callable[[], bool]) -> list[ReceivedFrame]:
     """Poll until a condition holds; return the punted frames."""
     arrivals: list[ReceivedFrame] = []
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not done():
-        assert time.monotonic() < deadline_s, "it did not come about"
-        arrivals += plane.poll(LOOK_S)
+    until(done, meanwhile=lambda: arrivals.extend(plane.poll(LOOK_S)))
     return arrivals
 
 

@@ -29,9 +29,9 @@ from netns_tests.relay_lab import (
     Node,
     RelayLab,
     relay_lab,
-    wait_for,
 )
 from netns_tests.spaces import Space
+from tests.waiting import until
 
 pytestmark = [
     pytest.mark.netns,
@@ -57,6 +57,7 @@ with gdp.open("server") as server:
 
 _PROBE = """
 from http.client import HTTPConnection
+from tests.waiting import until
 asking = HTTPConnection("127.0.0.1", 9107)
 asking.request("GET", "/readyz")
 answer = asking.getresponse()
@@ -113,16 +114,16 @@ def test_a_killed_relay_leaves_nothing_and_heals_when_it_starts_again(lab: Relay
     border, member = lab.start_relays()
     for node in (lab.border, lab.member):
         lab.start_switch(node)
-    wait_for(lab.is_joined)
+    until(lab.is_joined)
     lab.border.kill(border)
     assert lab.border.devices() == {"lo", "eth0"}, "a device that outlives its relay"
-    wait_for(lambda: lab.neighbours(lab.member) == 0)
+    until(lambda: lab.neighbours(lab.member) == 0)
     lab.start_relay(lab.border)
-    wait_for(lab.is_joined)
+    until(lab.is_joined)
     lab.member.kill(member)
     assert lab.member.devices() == {"lo", "eth0"}
     lab.start_relay(lab.member)
-    wait_for(lab.is_joined)
+    until(lab.is_joined)
 
 
 def test_a_relay_answers_probes_and_is_ready_once_it_has_its_border(lab: RelayLab) -> None:
@@ -135,9 +136,9 @@ def test_a_relay_answers_probes_and_is_ready_once_it_has_its_border(lab: RelayLa
 
     lab.start_relay(lab.member, metrics={"port": 9107})
     assert not is_ready()
-    wait_for(lambda: "no connection to border" in lab.member.run(sys.executable, "-c", _PROBE).stdout)
+    until(lambda: "no connection to border" in lab.member.run(sys.executable, "-c", _PROBE).stdout)
     lab.start_relay(lab.border)
-    wait_for(is_ready)
+    until(is_ready)
 
 
 def test_a_change_of_address_is_followed_without_waiting_for_a_timeout(lab: RelayLab) -> None:
@@ -145,11 +146,11 @@ def test_a_change_of_address_is_followed_without_waiting_for_a_timeout(lab: Rela
     lab.start_relay(lab.member, dead_ms=HEAL_S * 1_000)
     for node in (lab.border, lab.member):
         lab.start_switch(node)
-    wait_for(lab.is_joined)
+    until(lab.is_joined)
     lab.member.ip("addr", "del", f"{MEMBER_ADDRESS}/24", "dev", "eth0")
     lab.member.ip("addr", "add", f"{LATER_ADDRESS}/24", "dev", "eth0")
-    took_s = wait_for(lambda: lab.relay_status(lab.border)["server"]["clients"][0]["address"] == LATER_ADDRESS)
-    wait_for(lab.is_joined)
+    took_s = until(lambda: lab.relay_status(lab.border)["server"]["clients"][0]["address"] == LATER_ADDRESS)
+    until(lab.is_joined)
     print(f"address change: {took_s * 1e3:.0f} ms")
     assert took_s < HEAL_S
 
@@ -157,7 +158,7 @@ def test_a_change_of_address_is_followed_without_waiting_for_a_timeout(lab: Rela
 def test_a_relay_on_standby_waits_for_a_tunnel_and_then_connects(lab: RelayLab) -> None:
     lab.start_relay(lab.border)
     lab.start_relay(lab.member, standby=True)
-    wait_for(lab.is_up)
+    until(lab.is_up)
     assert "relay needed: no tunnel" in lab.member.log("gdp.cli.relay")
 
 
@@ -169,16 +170,16 @@ def test_where_udp_becomes_blocked_frames_go_through_tls(lab: RelayLab) -> None:
     lab.start_relay(lab.member, standby=True, switch_socket="member-switch.sock")
     for node, listen in ((lab.border, 51_820), (lab.member, 0)):
         lab.start_switch(node, links={"listen": listen, "peers": f"{node.label}-peers", "backend": "wireguard-go"})
-    wait_for(lab.tunnel_is_up)
+    until(lab.tunnel_is_up)
     rules = "table inet blocked { chain out { type filter hook output priority 0; meta l4proto udp drop; }; }"
     done = lab.member.run("nft", rules)
     assert done.returncode == 0, done.stderr
-    took_s = wait_for(lambda: not lab.tunnel_is_up() and lab.is_joined())
+    took_s = until(lambda: not lab.tunnel_is_up() and lab.is_joined())
     print(f"UDP blocked: joined through TLS after {took_s:.1f} s")
     (row,) = lab.member.status(lab.home / "member-switch.sock")["relay"]
     assert (row["peer"], row["via"], row["up"]) == (lab.border.name.to_text(), "tls (slower)", True)
     lab.member.run("nft", "delete", "table", "inet", "blocked")
-    wait_for(lab.tunnel_is_up)
+    until(lab.tunnel_is_up)
     assert lab.is_up(), "the relay stays until the tunnel has been stable"
 
 
@@ -188,7 +189,7 @@ def test_an_endpoint_may_be_a_host_name(lab: RelayLab) -> None:
     guest = Node(lab.home, "member", lab.border.pid)  # in the namespace of the border, where this name leads to it
     try:
         guest.start("gdp.cli.relay", lab.relay_config(lab.member, borders=[border]))
-        wait_for(lab.is_up)
+        until(lab.is_up)
     finally:
         guest.end()
 
@@ -198,7 +199,7 @@ def test_a_port_that_the_configuration_names_is_not_added_twice(lab: RelayLab) -
     lab.start_switch(lab.border)
     ports = [{"iface": lab.member_device, "optional": True, "cost": 100}]
     lab.start_switch(lab.member, ports=ports)
-    wait_for(lab.is_joined)
+    until(lab.is_joined)
     assert lab.member.status(lab.home / "member-switch.sock")["ports"] == 1
 
 
@@ -207,7 +208,7 @@ def test_a_path_that_goes_silent_takes_the_carrier_away(lab: RelayLab) -> None:
     lab.border.ip("link", "set", "eth0", "down")
     lab.border.ip("link", "set", "eth0", "up")
     lab.member.ip("neigh", "replace", BORDER_ADDRESS, "lladdr", "02:00:00:00:00:99", "dev", "eth0")
-    wait_for(lambda: not lab.is_up(), HEAL_S)
+    until(lambda: not lab.is_up(), patience_s=HEAL_S)
     (device,) = (each for each in lab.member.links() if each["ifname"] == lab.member_device)
     assert "LOWER_UP" not in device["flags"]
 
@@ -217,11 +218,11 @@ def test_a_member_is_revoked_while_it_is_connected(lab: RelayLab) -> None:
     revocations.mkdir()
     lab.start_relay(lab.border, revocations="revoked")
     lab.start_relay(lab.member)
-    wait_for(lab.is_up)
+    until(lab.is_up)
     authority, found = load_domain(lab.domain), load_identity(lab.member.identity, time.time()).member
     wire = Revocation.make(authority.key, authority.root.signer, found.fingerprint, found.not_after_unix_s)
     (revocations / "member.revocation").write_bytes(wire)
-    wait_for(lambda: not lab.is_up(), HEAL_S)
+    until(lambda: not lab.is_up(), patience_s=HEAL_S)
     assert "no longer valid" in lab.relay_status(lab.member)["borders"][0]["reason"]
 
 
@@ -229,7 +230,7 @@ def test_a_client_that_the_border_does_not_relay_for_shows_why(lab: RelayLab) ->
     lab.start_relay(lab.border, server={"port": PORT, "allow": ["another"]})
     lab.start_relay(lab.member)
     reason = "the border does not relay for member (relay allow)"
-    wait_for(lambda: lab.relay_status(lab.member)["borders"][0]["reason"] == reason)
+    until(lambda: lab.relay_status(lab.member)["borders"][0]["reason"] == reason)
     assert lab.relay_status(lab.border)["server"]["last_refusal"] == reason
     assert lab.border.devices() == {"lo", "eth0"}
 
@@ -239,7 +240,7 @@ def test_idle_strangers_do_not_keep_a_member_out(lab: RelayLab) -> None:
     strangers = [socket.create_connection((BORDER_ADDRESS, PORT)) for _ in range(100)]
     try:
         lab.start_relay(lab.member)
-        wait_for(lab.is_up)
+        until(lab.is_up)
     finally:
         for each in strangers:
             each.close()

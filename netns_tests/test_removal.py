@@ -7,7 +7,6 @@ import os
 import shutil
 import threading
 import time
-from collections.abc import Callable
 
 import pytest
 
@@ -15,6 +14,7 @@ import gdp
 from gdp.trust.right import Right
 from internet.laboratory import Laboratory
 from internet_demo.stage import Stage
+from tests.waiting import until
 
 pytestmark = [
     pytest.mark.netns,
@@ -66,14 +66,6 @@ class Flow:
                 self.arrivals.append(time.monotonic())
 
 
-def eventually(found: Callable[[], object], timeout_s: float = PATIENCE_S) -> None:
-    """Wait until something holds."""
-    end_s = time.monotonic() + timeout_s
-    while not found():
-        assert time.monotonic() < end_s
-        time.sleep(0.02)
-
-
 def test_a_removed_machine_has_no_tunnel_and_no_frame_passes_a_second_later(laboratory: Laboratory) -> None:
     with Stage(laboratory, 0.0) as stage, contextlib.ExitStack() as stack:
         tokens = [stage.create_domain()]
@@ -88,12 +80,12 @@ def test_a_removed_machine_has_no_tunnel_and_no_frame_passes_a_second_later(labo
         flow = Flow(*sessions)
         stack.callback(flow.stop)
         border = stage.machines["cloud-b"]
-        eventually(lambda: any(each.is_direct for each in stage.links(stage.machines["robot"])))
-        eventually(lambda: len(flow.arrivals) > 100)
+        until(lambda: any(each.is_direct for each in stage.links(stage.machines["robot"])))
+        until(lambda: len(flow.arrivals) > 100)
         stage.remove("robot")
         removed_s = time.monotonic()
-        eventually(lambda: "robot" not in {each.peer for each in stage.links(border)}, CLOSES_S)
+        until(lambda: "robot" not in {each.peer for each in stage.links(border)}, patience_s=CLOSES_S)
         time.sleep(2 * CLOSES_S)
         assert max(flow.arrivals) < removed_s + CLOSES_S
         assert "robot" not in {each.peer for each in (*stage.links(border), *stage.links(stage.machines["cloud-a"]))}
-        eventually(lambda: not stage.links(stage.machines["robot"]))
+        until(lambda: not stage.links(stage.machines["robot"]))

@@ -42,12 +42,12 @@ from netns_tests.local_site import (
     plain_gateway,
     spec,
     ticking,
-    until,
 )
 from netns_tests.spaces import Space
 from netns_tests.test_fog import Fog, left_of
 from netns_tests.test_uplink import BYTES, OVERHEAD_BYTES, PARTS, REQUESTS, tell
 from tests.pages import ROOT
+from tests.waiting import until
 
 pytestmark = pytest.mark.netns
 needs_ros2 = pytest.mark.skipif(find_spec("rclpy") is None, reason="rclpy is not installed: scripts/setup.sh --ros2")

@@ -5,8 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -18,6 +17,7 @@ from netns_tests.datacenter.debian_root import debian_root, why_not
 from netns_tests.datacenter.machine import BootedMachine
 from netns_tests.datacenter.router import Router
 from tests.pages import ROOT
+from tests.waiting import until
 
 pytestmark = [pytest.mark.netns, pytest.mark.skipif(bool(why_not()), reason=why_not() or "it can")]
 
@@ -45,16 +45,9 @@ import sys
 sys.path.insert(0, "/usr/lib/gdp-ros/packages")
 {first}
 from {module} import main
+from tests.waiting import until
 main()
 """
-
-
-def until(is_met: Callable[[], bool], what: str, patience_s: float) -> None:
-    """Ask the machine until a condition holds, which causes no event outside it."""
-    end_s = time.monotonic() + patience_s
-    while not is_met():
-        assert time.monotonic() < end_s, f"{what}: not within {patience_s:g} s"
-        time.sleep(0.1)
 
 
 def gdp(*words: str, cwd: Path) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import base64
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import datetime, timedelta, timezone
@@ -23,6 +22,7 @@ from gdp.host.run_registry import Run
 from netns_tests.datacenter.machine import BootedMachine
 from netns_tests.datacenter.metadata_service import InstanceDocument, MetadataService
 from netns_tests.datacenter.router import Admitted, Router
+from tests.waiting import until
 
 if TYPE_CHECKING:
     from moto.ec2.models import EC2Backend
@@ -94,11 +94,8 @@ class DataCenter:
 
     def until(self, is_met: Callable[[], object], what: str, patience_s: float) -> None:
         """Poll until a condition holds that causes no event; the error has the consoles of all machines."""
-        end_s = time.monotonic() + patience_s
-        while not is_met():
-            said = "\n".join(f"--- {name}\n{each.console[-6000:]}" for name, each in self.machines.items())
-            assert time.monotonic() < end_s, f"{what}: not within {patience_s:g} s\n{said}"
-            time.sleep(0.05)
+        consoles = (f"--- {name}\n{each.console[-6000:]}" for name, each in self.machines.items())
+        until(is_met, lambda: "\n".join([what, *consoles]), patience_s)
 
 
 @contextmanager

@@ -99,13 +99,11 @@ class Plane:
     Args:
         name: the plane.
         processes: frames go through the process, not only through the kernel.
-        names: table entries that each switch can hold in addition to those of the two endpoints.
     """
 
-    def __init__(self, name: str, *, processes: bool, names: int = 0) -> None:
+    def __init__(self, name: str, *, processes: bool) -> None:
         self.name = name
         self.processes = processes
-        self._names = names
         self._workers: list[Started] = []
 
     def wire(self, chain: Chain, size: int) -> Wire:
@@ -123,7 +121,7 @@ class Plane:
                     "left": f"{left} {chain.mac(left, node).hex()}",
                     "right": f"{right} {chain.mac(right, node).hex()}",
                 }
-                worker = chain.worker(node, "switch", plane=self.name, ways=ways, names=self._names)
+                worker = chain.worker(node, "switch", plane=self.name, ways=ways)
                 self._workers.append(undo.enter_context(worker))
             for worker in self._workers:
                 worker.read(_READY_S)

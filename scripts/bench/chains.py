@@ -1,4 +1,4 @@
-"""Chain of namespaces for the forwarding and scale benches: a source, some switches, a sink, each in its own.
+"""Chain of namespaces for the forwarding bench: a source, some switches, a sink, each in its own.
 
 I/O. ``gdp.simulation`` makes and removes the namespaces. ``baselines.py`` defines the switches.
 ::
@@ -106,7 +106,6 @@ class Chain(Lab):
         switches: Sequence[Started],
         rate: float | None,
         seconds: float,
-        spread: tuple[int, int] = (0, 0),
     ) -> Try:
         """Send for a while, at ``rate`` frames/s or flat out, and count.
 
@@ -115,16 +114,13 @@ class Chain(Lab):
             switches: the processes whose time counts.
             rate: None for flat out.
             seconds: for how long.
-            spread: send to so many names, out of so many of a large table; (0, 0) sends to the sink's own.
 
         Raises:
             FailedError: a process of the bench ended.
         """
         self._sink.ask(do="count", ethertype=wire.ethertype)
         spent_s = soft_interrupts_s() + sum(thread_s(each.pid) for each in switches)
-        sent = figures_of(
-            self._source.ask(do="send", frame=wire.out.hex(), rate=rate, seconds=seconds, names=spread[0], of=spread[1])
-        )
+        sent = figures_of(self._source.ask(do="send", frame=wire.out.hex(), rate=rate, seconds=seconds))
         got = figures_of(self._sink.ask(expected=sent["sent"]))
         spent_s = soft_interrupts_s() + sum(thread_s(each.pid) for each in switches) - spent_s
         return Try(

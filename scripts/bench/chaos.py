@@ -45,7 +45,7 @@ from faults.overlay import Overlay
 from faults.plan import Plan
 from faults.schedule import STORE, Fault, FaultKind, broken_by, make_schedule
 from faults.store import StoreCluster, has_server
-from peers.process import FailedError
+from peers.process import FailedError, until
 from report import percentile, print_table, progress
 from skeleton import Options, clean_exit, command_line, new_run
 from topologies import ends_of
@@ -105,11 +105,12 @@ class Chaos:
         Raises:
             FailedError: not in time.
         """
-        end_s = time.monotonic() + SETTLE_S
-        while missing := self._unreachable():
-            if time.monotonic() > end_s:
-                raise FailedError(f"before any fault, nothing came: {', '.join(missing)}")
-            self._watch(time.monotonic() + LOOK_S)
+        until(
+            lambda: not self._unreachable(),
+            lambda: f"before any fault: {', '.join(self._unreachable())}",
+            SETTLE_S,
+            lambda: self._watch(time.monotonic() + LOOK_S),
+        )
 
     def run(self) -> None:
         """Apply the faults, each at its time, and observe for a while after the last.

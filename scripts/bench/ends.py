@@ -15,7 +15,7 @@ import socket
 import struct
 import time
 from array import array
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import closing
 from itertools import repeat
 from typing import Final, NamedTuple
@@ -24,7 +24,7 @@ from gdp.frame.codec import ETHER_BYTES
 from gdp.ports.mmsg import SLOTS, MmsgPool, make_batch
 from gdp.ports.sockets import kernel_drops
 
-__all__ = ["Counted", "Sent", "answer_pings", "count_frames", "open_end", "ping", "send", "spread_frames"]
+__all__ = ["Counted", "Sent", "answer_pings", "count_frames", "open_end", "ping", "send"]
 
 _SOL_PACKET, _QDISC_BYPASS = 263, 20
 _SO_ATTACH_FILTER, _SO_SNDBUFFORCE, _SO_RCVBUFFORCE = 26, 32, 33
@@ -82,55 +82,31 @@ def open_end(ifname: str, ethertype: int, *, cut_bytes: int = 0) -> socket.socke
     return opened
 
 
-def _batches(frames: list[bytes]) -> list[MmsgPool]:
-    """Return full batches that go through the frames in turn."""
-    many = frames * (-(-SLOTS // len(frames)))
-    filled = []
-    for at in range(0, len(many) // SLOTS * SLOTS, SLOTS):
-        batch = make_batch(len(frames[0]))
-        batch.fill([frame[ETHER_BYTES:] for frame in many[at : at + SLOTS]])
-        filled.append(batch)
-    return filled
-
-
-def send(ifname: str, frames: list[bytes], rate: float | None, seconds: float) -> Sent:
-    """Send frames in turn, at ``rate`` frames/s or flat out.
-
-    Args:
-        ifname: the device.
-        frames: of one length, whole, with one Ethernet header; as many as a power of two.
-        rate: None for flat out.
-        seconds: for how long.
-    """
-    batches, head, drops = _batches(frames), frames[0][:ETHER_BYTES], [0] * 64
+def send(ifname: str, frame: bytes, rate: float | None, seconds: float) -> Sent:
+    """Send a whole frame again and again, at ``rate`` frames/s (None: flat out)."""
+    batch, head, drops = make_batch(len(frame)), frame[:ETHER_BYTES], [0] * 64
+    batch.fill([frame[ETHER_BYTES:]] * SLOTS)
     with open_end(ifname, 0) as sock:
         cpu_s, start_s = time.process_time(), time.monotonic()
         if rate is None:
-            sent = _flat_out(sock, batches, head, drops, start_s + seconds)
+            sent = 0
+            while time.monotonic() < start_s + seconds:
+                sent += batch.forward(sock, 0, SLOTS, head, drops)
         else:
-            sent = _paced(sock, batches, head, drops, rate, int(rate * seconds))
+            sent = _paced(sock, batch, head, drops, rate, int(rate * seconds))
         return Sent(sent, sum(drops), start_s, time.monotonic(), time.process_time() - cpu_s)
 
 
-def _flat_out(sock: socket.socket, batches: list[MmsgPool], head: bytes, drops: list[int], until_s: float) -> int:
-    sent = 0
-    while time.monotonic() < until_s:
-        for batch in batches:
-            sent += batch.forward(sock, 0, SLOTS, head, drops)
-    return sent
-
-
-def _paced(sock: socket.socket, batches: list[MmsgPool], head: bytes, drops: list[int], rate: float, total: int) -> int:
+def _paced(sock: socket.socket, batch: MmsgPool, head: bytes, drops: list[int], rate: float, total: int) -> int:
     burst = max(1, min(SLOTS, int(rate / 1000)))
-    offered, sent, turn, start_s = 0, 0, 0, time.monotonic()
+    offered, sent, start_s = 0, 0, time.monotonic()
     while offered < total:
         behind = (time.monotonic() - start_s) * rate - offered
         if behind < burst:
             time.sleep((burst - behind) / rate)
             continue
-        sent += batches[turn % len(batches)].forward(sock, 0, burst, head, drops)
+        sent += batch.forward(sock, 0, burst, head, drops)
         offered += burst
-        turn += 1
     return sent
 
 
@@ -221,8 +197,3 @@ def answer_pings(
             send_frame(frame)
             answered += 1
     return answered
-
-
-def spread_frames(frame: bytes, at: int, names: Iterable[bytes]) -> list[bytes]:
-    """Return the frame once for each name, with that name at offset ``at``."""
-    return [frame[:at] + name + frame[at + len(name) :] for name in names]

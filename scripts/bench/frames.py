@@ -1,12 +1,10 @@
 """Prepared frames of the benches: GDP frames, and IPv4 frames of the same length.
 
-Sans-I/O. The source and the sink are names with entries at every switch; ``table_name`` counts through the names of
-a large table.
+Sans-I/O. The source and the sink are names with entries at every switch.
 """
 
 from __future__ import annotations
 
-import hashlib
 import ipaddress
 import struct
 from dataclasses import dataclass
@@ -16,7 +14,7 @@ from gdp.frame.codec import DESTINATION_AT, ETHER_BYTES, HEADER_BYTES, OVERHEAD_
 from gdp.frame.kinds import ETHERTYPE, Kind
 from gdp.limits import HOPS_MAX
 
-__all__ = ["NAME_AT", "SINK", "SOURCE", "Wire", "gdp_frame", "ip_frame", "spread_names", "table_key", "table_name"]
+__all__ = ["NAME_AT", "SINK", "SOURCE", "Wire", "gdp_frame", "ip_frame"]
 
 SOURCE, SINK = bytes([0xA0]) * 32, bytes([0xB0]) * 32
 NAME_AT: Final = ETHER_BYTES + DESTINATION_AT
@@ -68,18 +66,3 @@ def ip_checksum(header: bytes) -> int:
     while total >> 16:
         total = (total & 0xFFFF) + (total >> 16)
     return ~total & 0xFFFF
-
-
-def table_name(number: int) -> bytes:
-    """Return the name of one entry of a large table; like a real name it does not resemble its neighbours."""
-    return hashlib.sha256(number.to_bytes(8, "big")).digest()
-
-
-def table_key(number: int) -> bytes:
-    """Return the key of one entry: alternately a destination, or destination and source."""
-    return table_name(number) + (SOURCE if number % 2 else b"")
-
-
-def spread_names(names: int, of: int) -> list[bytes]:
-    """Return ``names`` names, evenly out of the first ``of`` of a large table."""
-    return [table_name(at * of // names) for at in range(names)]

@@ -32,7 +32,6 @@ __all__ = [
     "MachineState",
     "git",
     "machine_state",
-    "map_bytes",
     "offload_text",
     "offloads",
     "processor_s",
@@ -176,20 +175,6 @@ def resident_bytes(pid: int | None = None) -> int:
     """
     pages = Path(f"/proc/{pid or 'self'}/statm").read_text(encoding="ascii").split()[1]
     return int(pages) * os.sysconf("SC_PAGE_SIZE")
-
-
-def map_bytes(pid: int | None = None) -> int:
-    """Return the kernel memory of all eBPF maps that a process holds open; 0 without any.
-
-    Source: Linux, kernel/bpf/syscall.c, ``bpf_map_show_fdinfo``.
-    """
-    total = 0
-    for path in Path(f"/proc/{pid or 'self'}/fdinfo").iterdir():
-        with suppress(FileNotFoundError):  # the descriptor of this very listing
-            lines = path.read_text(encoding="ascii").splitlines()
-            facts = dict(line.split(":", 1) for line in lines if ":" in line)
-            total += int(facts["memlock"]) if "map_type" in facts else 0
-    return total
 
 
 def processor_s(pid: int) -> float:

@@ -1,26 +1,18 @@
-"""Member of the overlay on its plane, as the endpoint processes of benches use it; and a timer that wakes one.
-
-I/O. Source of the timer: timerfd_create(2). CLOCK_MONOTONIC is one clock for all namespaces of a machine.
-"""
+"""Member of the overlay on its plane, as the endpoint processes of benches use it. I/O."""
 
 from __future__ import annotations
 
-import ctypes
-import json
-import os
 import secrets
-import struct
-import sys
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from gdp.client.participant import Participant, Topic
 from gdp.client.publisher import Publisher
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
-from gdp.errors import DropReason, LocalError
+from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.nodes.config import RibConfig
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
@@ -28,44 +20,9 @@ from gdp.nodes.runtime import Runtime
 from gdp.ports.raw import RawPlane
 from gdp.stores.keyring import load_delegations
 
-__all__ = ["End", "Timer", "run_role"]
+__all__ = ["End"]
 
 PATIENCE_S: Final = 20.0
-_LIBRARY: Final = ctypes.CDLL(None, use_errno=True)
-_ABSOLUTE: Final = 1  # TFD_TIMER_ABSTIME
-_SPEC: Final = struct.Struct("@qqqq")  # interval, first; each in seconds and nanoseconds
-
-
-def _checked(result: int) -> int:
-    if result < 0:
-        number = ctypes.get_errno()
-        raise OSError(number, os.strerror(number))
-    return result
-
-
-class Timer:
-    """Timer whose descriptor becomes readable at every tick.
-
-    Raises:
-        OSError: the kernel refuses.
-    """
-
-    def __init__(self, first_ns: int, every_s: float) -> None:
-        self._fd = _checked(_LIBRARY.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC))
-        spec = _SPEC.pack(0, round(every_s * 1e9), *divmod(first_ns, 1_000_000_000))
-        _checked(_LIBRARY.timerfd_settime(self._fd, _ABSOLUTE, spec, None))
-
-    def fileno(self) -> int:
-        """Return its descriptor."""
-        return self._fd
-
-    def passed(self) -> int:
-        """Return how many ticks were due since the last call."""
-        return int.from_bytes(os.read(self._fd, 8), sys.byteorder)
-
-    def close(self) -> None:
-        """Stop it."""
-        os.close(self._fd)
 
 
 class End:
@@ -122,20 +79,8 @@ class End:
         if not self.runtime.run(lambda: all(each.readers for each in wanted), latest_s):
             raise TimeoutError("no reader: the overlay did not come up")
 
-    def drops(self) -> dict[str, int]:
-        """Return what this process dropped, by reason."""
-        of_member, of_plane = self.member.drops(), self.plane.counters.drops
-        found = {reason.label: of_member.get(reason, 0) + of_plane[reason] for reason in DropReason}
-        return {label: count for label, count in found.items() if count}
-
     def leave(self) -> None:
         """Withdraw and close."""
         self.member.leave()
         while self.runtime.send():
             continue
-
-
-def run_role(roles: Mapping[str, Callable[[End, Mapping[str, Any]], None]]) -> None:
-    """Run the role of the first argument, with the settings of the second."""
-    settings = json.loads(sys.argv[2])
-    roles[sys.argv[1]](End(Path(settings["config"]), settings["spin_s"]), settings)

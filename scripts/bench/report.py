@@ -150,55 +150,24 @@ class Rounds:
         return _target(what, asked, at_most, self.column(contender, case, column), self._why_not(contender, case))
 
     def ratio(
-        self,
-        what: str,
-        one: str,
-        other: str,
-        case: str,
-        column: str,
-        asked: float | None,
-        *,
-        other_case: str | None = None,
-        at_most: bool = False,
+        self, what: str, one: str, other: str, case: str, column: str, asked: float | None, *, at_most: bool = False
     ) -> Target:
-        """Return a bound on ``one / other``, round by round.
-
-        Args:
-            other_case: the other's case, where it is not the same.
-        """
-        values = self._pairwise(one, other, case, column, other_case, lambda a, b: a / b if b else None)
-        return _target(what, asked, at_most, values, self._why_none(one, other, case, other_case))
+        """Return a bound on ``one / other``, round by round."""
+        values = self._pairwise(one, other, case, column, lambda a, b: a / b if b else None)
+        return _target(what, asked, at_most, values, self._why_not(one, case) or self._why_not(other, case))
 
     def difference(
-        self,
-        what: str,
-        one: str,
-        other: str,
-        case: str,
-        column: str,
-        asked: float | None,
-        *,
-        other_case: str | None = None,
-        at_most: bool = True,
+        self, what: str, one: str, other: str, case: str, column: str, asked: float | None, *, at_most: bool = True
     ) -> Target:
         """Return a bound on ``one - other``, round by round."""
-        values = self._pairwise(one, other, case, column, other_case, lambda a, b: a - b)
-        return _target(what, asked, at_most, values, self._why_none(one, other, case, other_case))
+        values = self._pairwise(one, other, case, column, lambda a, b: a - b)
+        return _target(what, asked, at_most, values, self._why_not(one, case) or self._why_not(other, case))
 
     def _pairwise(
-        self,
-        one: str,
-        other: str,
-        case: str,
-        column: str,
-        other_case: str | None,
-        of: Callable[[float, float], float | None],
+        self, one: str, other: str, case: str, column: str, of: Callable[[float, float], float | None]
     ) -> list[float | None]:
-        pairs = zip(self.column(one, case, column), self.column(other, other_case or case, column), strict=False)
+        pairs = zip(self.column(one, case, column), self.column(other, case, column), strict=False)
         return [None if a is None or b is None else of(a, b) for a, b in pairs]
-
-    def _why_none(self, one: str, other: str, case: str, other_case: str | None) -> str:
-        return self._why_not(one, case) or self._why_not(other, other_case or case)
 
     def _why_not(self, contender: str, case: str) -> str:
         if contender in self.reasons:

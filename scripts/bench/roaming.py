@@ -12,19 +12,16 @@ takes several programs.
 
 from __future__ import annotations
 
-import struct
-import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from itertools import pairwise
 from typing import Final
 
-from peers.process import FailedError
+from numbered_flow import NumberedFlow
+from peers.process import until
 from report import Rounds, percentile, progress
 from skeleton import Options, Outcome, command_line, new_run, run_bench
 
-import gdp
 from gdp.host.run_registry import RunRegistry
 from gdp.trust.right import Right
 from internet.access import Access
@@ -34,68 +31,11 @@ from internet.overlay import Overlay
 from internet.site import Site
 
 TOPIC: Final = "flow"
-HZ: Final = 100.0
 TARGET_MS: Final = 300.0
 SETTLE_S: Final = 3.0
-STEADY_S: Final = 0.5
 PATIENCE_S: Final = 30.0
 COLUMN, P99, LOST, DOUBLED = "silence, ms", "p99, ms", "lost", "doubled"
 COMMANDS: Final = "commands, ms"
-_NUMBER: Final = struct.Struct("!q92x")
-
-
-class Flow:
-    """A publisher and a reader in this process, each a thread, until ``close``."""
-
-    def __init__(self, publisher: gdp.Publisher, subscription: gdp.Subscription) -> None:
-        self._publisher, self._subscription = publisher, subscription
-        self._is_over = threading.Event()
-        self.arrivals: list[tuple[float, int]] = []  # monotonic second, number
-        self.published = 0
-        self._threads = [threading.Thread(target=work, daemon=True) for work in (self._publish, self._read)]
-        for thread in self._threads:
-            thread.start()
-
-    def _publish(self) -> None:
-        due_s = time.monotonic()
-        while not self._is_over.wait(max(due_s - time.monotonic(), 0.0)):
-            self._publisher.put(_NUMBER.pack(self.published))
-            self.published += 1
-            due_s += 1 / HZ
-
-    def _read(self) -> None:
-        while not self._is_over.is_set() or len(self.arrivals) < self.published:
-            try:
-                message = self._subscription.receive(timeout_s=1.0)
-            except gdp.SessionError:  # nothing came
-                if self._is_over.is_set():
-                    return
-                continue
-            self.arrivals.append((time.monotonic(), _NUMBER.unpack(message.payload)[0]))
-
-    def silence_s(self, since_s: float) -> float:
-        """Wait until the flow has been back for ``STEADY_S``; return the longest gap since a moment.
-
-        Raises:
-            FailedError: it does not come back.
-        """
-        end_s = since_s + PATIENCE_S
-        while time.monotonic() < end_s:
-            time.sleep(0.05)
-            times = [at_s for at_s, _ in self.arrivals[-int(PATIENCE_S * HZ) :]]
-            before = [at_s for at_s in times if at_s < since_s][-1:]
-            marks = [*(before or [since_s]), *(at_s for at_s in times if at_s >= since_s)]
-            now_s = time.monotonic()
-            late = [mark for mark in marks if mark >= now_s - STEADY_S]
-            if now_s - since_s > 2 * STEADY_S and len(late) > 0.8 * STEADY_S * HZ:
-                return max(b - a for a, b in pairwise(marks))
-        raise FailedError("the flow did not come back")
-
-    def close(self) -> None:
-        """Stop publishing, and read what is on its way."""
-        self._is_over.set()
-        for thread in self._threads:
-            thread.join(PATIENCE_S)
 
 
 def measure(options: Options, runs: RunRegistry) -> Outcome:
@@ -117,25 +57,24 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
                 since_s = time.monotonic()
                 act()
                 over.add("through tunnels", what, COMMANDS, (time.monotonic() - since_s) * 1e3)
-                silences.append(flow.silence_s(since_s) * 1e3)
+                silences.append(flow.silence_until_steady_ms(since_s, PATIENCE_S))
                 over.add("through tunnels", what, COLUMN, silences[-1])
                 progress(f"{what}, {number + 1}: {silences[-1]:.0f} ms")
             over.add("through tunnels", what, P99, percentile(silences, 0.99))
         flow.close()
-    numbers = [number for _, number in flow.arrivals]
-    over.add("through tunnels", "whole run", LOST, flow.published - len(set(numbers)))
-    over.add("through tunnels", "whole run", DOUBLED, len(numbers) - len(set(numbers)))
+    over.add("through tunnels", "whole run", LOST, flow.lost)
+    over.add("through tunnels", "whole run", DOUBLED, flow.doubled)
     targets = [
         over.target(f"{what}: p99, ms", "through tunnels", what, P99, TARGET_MS, at_most=True)
         for what in over.cases()[:-1]
     ]
     for column in (LOST, DOUBLED):
         targets.append(over.target(f"messages {column}", "through tunnels", "whole run", column, 0.0, at_most=True))
-    settings = {"rounds": options.rounds, "messages": flow.published, "direct": "no" if options.no_direct else "yes"}
+    settings = {"rounds": options.rounds, "messages": len(flow.sent_s), "direct": "no" if options.no_direct else "yes"}
     return Outcome("roaming", "Silence when a robot's address changes", over, targets, settings)
 
 
-def _start(overlay: Overlay, stack: ExitStack, hosts: tuple[Host, Host, Host], *, has_direct: bool) -> Flow:
+def _start(overlay: Overlay, stack: ExitStack, hosts: tuple[Host, Host, Host], *, has_direct: bool) -> NumberedFlow:
     border, robot, server = hosts
     overlay.add_switch(border, is_border=True)
     for host in (robot, server):
@@ -150,12 +89,9 @@ def _start(overlay: Overlay, stack: ExitStack, hosts: tuple[Host, Host, Host], *
     subscription = reader.subscribe(TOPIC)
     publisher = sender.publisher(TOPIC)
     publisher.wait_for_readers(timeout_s=PATIENCE_S)
-    end_s = time.monotonic() + PATIENCE_S
-    while has_direct and not overlay.tunnels(robot).get("server", {}).get("up"):
-        if time.monotonic() > end_s:
-            raise FailedError("no direct tunnel came up")
-        time.sleep(0.2)
-    return Flow(publisher, subscription)
+    if has_direct:
+        until(lambda: overlay.tunnels(robot).get("server", {}).get("up"), lambda: "a direct tunnel", PATIENCE_S)
+    return NumberedFlow(publisher, subscription)
 
 
 def _events(robot: Host, homes: list[Site]) -> dict[str, Callable[[], object]]:

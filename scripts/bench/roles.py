@@ -1,4 +1,4 @@
-"""Processes of the forwarding and scale benches, each in a namespace of its own: ``switch`` and ``end``.
+"""Processes of the forwarding bench, each in a namespace of its own: ``switch`` and ``end``.
 
 Started by ``chains.py``. Each reads commands as JSON lines on stdin and answers every one with a JSON line.
 """
@@ -9,20 +9,22 @@ import gc
 import json
 import os
 import sys
-from contextlib import ExitStack
-from typing import Any
+from contextlib import closing
+from typing import Any, Final
 
-from ends import answer_pings, count_frames, ping, send, spread_frames
-from frames import NAME_AT, SINK, SOURCE, spread_names
+from ends import answer_pings, count_frames, ping, send
+from frames import SINK, SOURCE
 from peers.jsonl import order_waits, read_order, say
-from table_fill import ENTRY_LEASE_S, fill
 
 from gdp.errors import LocalError
 from gdp.ports.netdev import NetdevPlane
 from gdp.switch.table import Table
 
+_ENTRIES_MAX: Final = 1_024
+_LEASE_S: Final = 1e9
 
-def make_plane(kind: str, ifnames: list[str], table: Table, entries_max: int) -> NetdevPlane:
+
+def make_plane(kind: str, ifnames: list[str], table: Table) -> NetdevPlane:
     """Return a plane by its name in the benches.
 
     Raises:
@@ -38,46 +40,33 @@ def make_plane(kind: str, ifnames: list[str], table: Table, entries_max: int) ->
         return RawPlane(ifnames, table)
     from gdp.ports.kernel.plane import KernelPlane
 
-    return KernelPlane(ifnames, table, entries_max=entries_max, peer=kind == "kernel")
+    return KernelPlane(ifnames, table, entries_max=_ENTRIES_MAX, peer=kind == "kernel")
 
 
-def switch(plane: str, ways: dict[str, str], names: int = 0, **_: Any) -> None:
+def switch(plane: str, ways: dict[str, str], **_: Any) -> None:
     """Forward by a static table until stdin closes.
 
     Args:
         plane: which one.
         ways: the devices towards the source ("left") and the sink ("right"), each "device neighbour's-MAC" in hex.
-        names: entries in addition to those two; all lead to the right.
     """
     left, right = (ways[side].split() for side in ("left", "right"))
-    entries_max = max(names + 2, 1_024)
-    table = Table(entries_max)
+    table = Table(_ENTRIES_MAX)
     try:
-        made = make_plane(plane, [left[0], right[0]], table, entries_max)
+        made = make_plane(plane, [left[0], right[0]], table)
     except LocalError as error:
         say(refused_because=str(error))
         return
     own = {port.ifname: port for port in made.ports.values()}
-    hops = {
-        name: ((own[ifname].index, bytes.fromhex(mac) + own[ifname].mac),)
-        for name, (ifname, mac) in ((SINK, right), (SOURCE, left))
-    }
-    for name, hop in hops.items():
-        table.install(name, hop, ENTRY_LEASE_S)
-
-    def asked() -> None:
-        with ExitStack() as undo:
-            undo.callback(made.close)
-            read_order()
-            undo.pop_all()
-        say(**fill(table, names, hops[SINK]))
-
-    made.watch(sys.stdin, asked)
+    for name, (ifname, mac) in ((SINK, right), (SOURCE, left)):
+        table.install(name, ((own[ifname].index, bytes.fromhex(mac) + own[ifname].mac),), _LEASE_S)
+    made.watch(sys.stdin, sys.exit)
     gc.collect()
     gc.freeze()
     say(event="ready")
-    while True:
-        made.poll(None)
+    with closing(made):
+        while True:
+            made.poll(None)
 
 
 def end(ifname: str, **_: Any) -> None:
@@ -90,9 +79,7 @@ def end(ifname: str, **_: Any) -> None:
         ethertype = order.get("ethertype", 0)
         frame = bytes.fromhex(order.get("frame", ""))
         if order["do"] == "send":
-            names = spread_names(order["names"], order["of"]) if order["names"] else []
-            frames = spread_frames(frame, NAME_AT, names) if names else [frame]
-            say(**send(ifname, frames, order["rate"], order["seconds"])._asdict())
+            say(**send(ifname, frame, order["rate"], order["seconds"])._asdict())
         elif order["do"] == "count":
             say(**count_frames(ifname, ethertype, ready, expected)._asdict())
         elif order["do"] == "ping":

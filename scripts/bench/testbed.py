@@ -6,8 +6,6 @@ lab. ``run.end()`` removes namespaces and processes of a lab.
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
@@ -17,7 +15,6 @@ from typing import TypeVar
 import yaml
 from peers.process import FailedError, Started
 from shared_memory import SharedMemory
-from topologies import MIDDLE
 
 from gdp.host import netns_files
 from gdp.host.run_registry import Run
@@ -29,7 +26,6 @@ from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC
 from gdp.trust.right import Right
 from ring.cores import MachineCores
 from ring.credentials import OverlayCredentials
-from ring.plan import METRICS_PORTS
 
 T = TypeVar("T")
 
@@ -38,7 +34,6 @@ class Lab:
     """Machines of a topology, each in a namespace.
 
     Args:
-        priorities: SCHED_FIFO priority by the first word of a process's name; empty: the ordinary scheduler.
         own_shared_memory: these machines have a ``/dev/shm`` each; the others see the one of the host.
         cores: bound of processor time by machine; None: the machines share all cores.
 
@@ -51,7 +46,6 @@ class Lab:
         run: Run,
         topology: Topology,
         *,
-        priorities: Mapping[str, int] | None = None,
         own_shared_memory: Sequence[str] = (),
         cores: Mapping[str, int] | None = None,
     ) -> None:
@@ -59,7 +53,6 @@ class Lab:
         self.directory = run.directory
         self.topology = topology
         self.namespaces = Namespaces(topology, run)
-        self._priorities = priorities or {}
         self._memories = {node: SharedMemory(run, node) for node in own_shared_memory}
         self._cores = MachineCores(run, dict(cores)) if cores else None
 
@@ -90,8 +83,6 @@ class Lab:
 
         command = partial(self.command, node, environment=environment)
         started = Started(self.run, f"{what} at {node}", command, arguments, has_orders=has_orders)
-        if (priority := self._priorities.get(what)) is not None:
-            os.sched_setscheduler(started.pid, os.SCHED_FIFO, os.sched_param(priority))
         if self._cores is not None:
             self._cores.add(node, started.pid)
         return started
@@ -105,7 +96,6 @@ class OverlayNodes:
             member is joined to its switch by a link.
         plane: as ``gdp-switch --data-plane``; any but ``auto`` must be the one that the switch takes.
         label: of the folder with keys; one lab may have several in turn.
-        metrics: every node serves them, at the ports of the ring.
         overlay: the lab's topology without what is no part of the overlay; None: all of it is.
 
     Raises:
@@ -120,7 +110,6 @@ class OverlayNodes:
         plane: str,
         ready_s: float = 20.0,
         label: str = "keys",
-        metrics: bool = False,
         overlay: Topology | None = None,
     ) -> None:
         self.lab = lab
@@ -128,7 +117,7 @@ class OverlayNodes:
         number = sum(1 for _ in lab.directory.glob(f"{label}-*"))
         self.files = lab.directory / f"{label}-{number}"
         self.files.mkdir(mode=0o700)
-        self._credentials = credentials = OverlayCredentials(self._topology, self.files, metrics=metrics)
+        self._credentials = credentials = OverlayCredentials(self._topology, self.files, metrics=False)
         self._switch_nodes = tuple(switches)
         self.planes: set[str] = set()
         self.undo = ExitStack()
@@ -148,12 +137,6 @@ class OverlayNodes:
                 rib = ["-m", "gdp.cli.rib", "--json", "--config", str(credentials.rib(at))]
                 undo.enter_context(lab.start(at.switch, "rib", rib)).read(ready_s)
             self.undo = undo.pop_all()
-
-    def metrics_urls(self) -> dict[str, list[str]]:
-        """Return the addresses of the nodes' metrics by machine; to be read from within the machine."""
-        ribs = {at.switch for at in self._topology.attached("rib")}
-        roles = {node: ["switch", *(["rib"] if node in ribs else [])] for node in self._switch_nodes}
-        return {node: [f"http://127.0.0.1:{METRICS_PORTS[role]}" for role in each] for node, each in roles.items()}
 
     def close(self) -> None:
         """End all processes, the last one first."""
@@ -196,37 +179,3 @@ class OverlayNodes:
         path = self.files / name
         path.write_text(yaml.safe_dump(dict(content), sort_keys=False), encoding="utf-8")
         return path
-
-
-class MemberRow:
-    """Switches and RIB with members that one endpoint module runs; a context manager that ends them."""
-
-    def __init__(
-        self,
-        lab: Lab,
-        endpoint: str,
-        topics: Mapping[str, Mapping[Right, Iterable[str]]],
-        *,
-        plane: str,
-        switches: Sequence[str] = MIDDLE,
-    ) -> None:
-        self._lab = lab
-        self._endpoint = endpoint
-        self._nodes = OverlayNodes(lab, switches, plane=plane)
-        self._configs = {node: self._nodes.admit_member(node, own) for node, own in topics.items()}
-
-    def __enter__(self) -> MemberRow:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._nodes.close()
-
-    @property
-    def switches(self) -> Sequence[Started]:
-        """Return the switch processes."""
-        return self._nodes.switches
-
-    def endpoint(self, node: str, role: str, **settings: str | float) -> Started:
-        """Start a role of the endpoint module at a member."""
-        orders = json.dumps({"config": str(self._configs[node]), **settings})
-        return self._lab.start(node, role, ["-m", self._endpoint, role, orders])

@@ -3,7 +3,6 @@
 Robot and cloud are in namespaces; a relay between them has a rate or a recording, a round trip, loss and a drop-tail
 FIFO in each direction. On the same link and seed, one after the other:
 
-    line                     the link itself: what datagrams find, compared with what was asked
     gdp                      sessions of the library over two switches; urgent streams have that priority
     zenoh-tls-drop, -block   Zenoh over mutual TLS; congestion control as rmw_zenoh sets it, or blocking
     zenoh-quic-drop, -block  the same over QUIC
@@ -34,7 +33,7 @@ from preconditions import DATA, RefusedError
 from report import Rounds, Target, progress
 from skeleton import Options, Outcome, Recorder, Trial, command_line, new_run, run_bench
 from testbed import Lab
-from thin_link import accuracy, score
+from thin_link import score
 from thin_link.conditions import FIFOS, LOSSES, Conditions
 from thin_link.line import ADDRESSES, CLOUD, ROBOT, Used, open_line, thin_link_lab
 from thin_link.score import LINK_COLUMNS, STREAM_COLUMNS, Report, link_figures, merged, stream_figures, whole_share
@@ -45,7 +44,6 @@ from gdp.errors import LocalError
 from gdp.host.run_registry import RunRegistry
 
 OURS: Final = "gdp"
-LINE: Final = "line"
 TCP: Final = "tcp"
 ZENOH: Final = "zenoh-"
 GRID: Final = (  # rate, round trip in ms, loss, FIFO
@@ -157,12 +155,9 @@ def measure_tcp(lab: Lab, link: Conditions, options: Options) -> dict[str, float
 
 
 def trials_of(lab: Lab, link: Conditions, options: Options, over: Rounds) -> list[Trial]:
-    """Return the trials of one link: the link itself, TCP alone, then every system."""
-    chosen = options.only or [LINE, TCP, *SYSTEMS]
+    """Return the trials of one link: TCP alone, then every system."""
+    chosen = options.only or [TCP, *SYSTEMS]
     case, trials = case_of(link, "link"), []
-    if LINE in chosen and not link.up.opportunities_ms:  # what a recording asks for depends on the moment
-        work = partial(accuracy.measure_line, lab, link, min(options.seconds, 5.0))
-        trials.append(Trial(case_of(link, LINE), LINE, accuracy.COLUMNS, lambda _: work()))
     if TCP in chosen and options.tcp:
         columns = (score.TCP_ALONE, score.RELAY_LATE)
         trials.append(Trial(case, TCP, columns, lambda _: measure_tcp(lab, link, options)))
@@ -256,7 +251,7 @@ def arguments() -> argparse.ArgumentParser:
     parser = command_line(
         __doc__, rounds=1, seconds=6.0, quick={"rounds": 1, "seconds": 2.0}, has_record=True, has_plot=True
     )
-    parser.add_argument("--only", nargs="+", choices=[LINE, TCP, *SYSTEMS], help="these rows")
+    parser.add_argument("--only", nargs="+", choices=[TCP, *SYSTEMS], help="these rows")
     parser.add_argument("--rates", nargs="+", help="Mbit/s, or names of recordings; 1, 5, 20 and 100 are of interest")
     parser.add_argument("--rtt", nargs="+", type=float, help=f"ms, such as {RTTS_MS}")
     parser.add_argument("--loss", nargs="+", choices=list(LOSSES), help="of frames, %%; burst: 2 %% in runs of 8")

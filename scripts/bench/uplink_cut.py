@@ -15,19 +15,16 @@ limit: twice the longest delay of the quiet seconds before the cuts, and at leas
 
 from __future__ import annotations
 
-import struct
-import threading
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack
-from itertools import pairwise
 from typing import Final, Literal
 
-from peers.process import FailedError
+from numbered_flow import NumberedFlow
+from peers.process import until
 from report import Rounds, percentile, progress
 from skeleton import Options, Outcome, command_line, new_run, run_bench
 
-import gdp
 from gdp.host.run_registry import RunRegistry
 from gdp.trust.right import Right
 from internet.access import Access
@@ -36,67 +33,13 @@ from internet.overlay import Overlay
 
 UPLINKS: Final = ("wlan0", "wwan0")
 TOPICS: Final[dict[str, Literal[1, 2]]] = {"one": 1, "two": 2}  # by the number of paths
-HZ: Final = 100.0
 TARGET_MS: Final = 300.0
 LIMIT_MIN_MS: Final = 100.0
 CUT_S: Final = 2.0
 SETTLE_S: Final = 6.0
 PATIENCE_S: Final = 60.0
 LATE, SILENCE, P99, LOST, DOUBLED = "late", "silence, ms", "p99, ms", "lost", "doubled"
-_NUMBER: Final = struct.Struct("!q92x")
 _CASES: Final = {1: "paths: 1", 2: "paths: 2"}
-
-
-class Flow:
-    """A publisher and a reader in this process, each a thread, until ``close``.
-
-    Attributes:
-        sent_s: monotonic second of each message, by number.
-        arrivals: monotonic second and number.
-    """
-
-    def __init__(self, publisher: gdp.Publisher, subscription: gdp.Subscription) -> None:
-        self._publisher, self._subscription = publisher, subscription
-        self._is_over = threading.Event()
-        self.sent_s: list[float] = []
-        self.arrivals: list[tuple[float, int]] = []
-        self._threads = [threading.Thread(target=work, daemon=True) for work in (self._publish, self._read)]
-        for thread in self._threads:
-            thread.start()
-
-    def _publish(self) -> None:
-        due_s = time.monotonic()
-        while not self._is_over.wait(max(due_s - time.monotonic(), 0.0)):
-            self.sent_s.append(time.monotonic())
-            self._publisher.put(_NUMBER.pack(len(self.sent_s) - 1))
-            due_s += 1 / HZ
-
-    def _read(self) -> None:
-        while not self._is_over.is_set() or len(self.arrivals) < len(self.sent_s):
-            try:
-                message = self._subscription.receive(timeout_s=1.0)
-            except gdp.SessionError:  # nothing came
-                if self._is_over.is_set():
-                    return
-                continue
-            self.arrivals.append((time.monotonic(), _NUMBER.unpack(message.payload)[0]))
-
-    def delays_ms(self, from_s: float, to_s: float) -> list[float]:
-        """Return the delay of each message that was published in an interval; an absent one has that until now."""
-        now_s, sent = time.monotonic(), list(self.sent_s)
-        came = {number: at_s for at_s, number in reversed(list(self.arrivals))}
-        return [(came.get(number, now_s) - at_s) * 1e3 for number, at_s in enumerate(sent) if from_s <= at_s < to_s]
-
-    def silence_ms(self, from_s: float, to_s: float) -> float:
-        """Return the longest time between two arrivals in an interval, its ends included."""
-        marks = [from_s, *(at_s for at_s, _ in list(self.arrivals) if from_s <= at_s < to_s), to_s]
-        return max(after - before for before, after in pairwise(marks)) * 1e3
-
-    def close(self) -> None:
-        """Stop publishing, and read what is on its way."""
-        self._is_over.set()
-        for thread in self._threads:
-            thread.join(PATIENCE_S)
 
 
 def measure(options: Options, runs: RunRegistry) -> Outcome:
@@ -128,10 +71,9 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
                 progress(f"cut {number + 1}, {_CASES[paths]}: {late} late, {silences[paths][-1]:.0f} ms")
         for paths, flow in flows.items():
             flow.close()
-            numbers = [number for _, number in flow.arrivals]
             over.add("tunnels", _CASES[paths], P99, percentile(silences[paths], 0.99))
-            over.add("tunnels", _CASES[paths], LOST, len(flow.sent_s) - len(set(numbers)))
-            over.add("tunnels", _CASES[paths], DOUBLED, len(numbers) - len(set(numbers)))
+            over.add("tunnels", _CASES[paths], LOST, flow.lost)
+            over.add("tunnels", _CASES[paths], DOUBLED, flow.doubled)
     one, two = _CASES[1], _CASES[2]
     targets = [
         over.target("messages late after a cut, paths: 2", "tunnels", two, LATE, 0.0, at_most=True),
@@ -150,7 +92,7 @@ def measure(options: Options, runs: RunRegistry) -> Outcome:
     return Outcome("uplink_cut", "A cut of one of two uplinks", over, targets, settings)
 
 
-def start(laboratory: Laboratory, stack: ExitStack) -> dict[int, Flow]:
+def start(laboratory: Laboratory, stack: ExitStack) -> dict[int, NumberedFlow]:
     """Start everything; return the two flows by their number of paths, once both have what they asked for.
 
     Raises:
@@ -175,17 +117,13 @@ def start(laboratory: Laboratory, stack: ExitStack) -> dict[int, Flow]:
     sender, reader = (
         stack.enter_context(overlay.open_session(host, node)) for host, node in zip((robot, server), nodes, strict=True)
     )
-    flows: dict[int, Flow] = {}
+    flows: dict[int, NumberedFlow] = {}
     for topic, paths in TOPICS.items():
         subscription = reader.subscribe(topic, paths=paths)
         publisher = sender.publisher(topic, paths=paths)
         publisher.wait_for_readers(timeout_s=PATIENCE_S)
-        flows[paths] = Flow(publisher, subscription)
-    end_s = time.monotonic() + PATIENCE_S
-    while not _has_pair(overlay.status(server)):
-        if time.monotonic() > end_s:
-            raise FailedError("no second path came up")
-        time.sleep(0.2)
+        flows[paths] = NumberedFlow(publisher, subscription)
+    until(lambda: _has_pair(overlay.status(server)), lambda: "a second path", PATIENCE_S)
     return flows
 
 

@@ -1,11 +1,10 @@
-"""Endpoint processes of the uplink bench: traffic of robot and cloud over one system, TCP, WireGuard, and probes.
+"""Endpoint processes of the uplink bench: traffic of robot and cloud over one system, TCP and WireGuard.
 
 Processes of their own, started by ``uplink.py``::
 
     robot, cloud             the traffic over ``system``: gdp, zenoh or cyclone
     tcp-send, tcp-read       one TCP flow (CUBIC) from the robot to the cloud
     wireguard                a WireGuard device at either, until standard input ends
-    probe-send, probe-read   datagrams at a stated rate, and the moments at which the kernel received them
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ import json
 import os
 import selectors
 import socket
-import struct
 import sys
 import time
 from collections import Counter
@@ -30,17 +28,9 @@ from thin_link.traffic import Direction, streams
 from gdp.control.endpoints import Endpoint
 from gdp.ports.tunnel.wireguard import open_wireguard
 
-__all__ = ["PROBE_BYTES", "PROBE_PORT"]
-
-PROBE_PORT: Final = 7_001
-PROBE_BYTES: Final = 1_472  # of a datagram that fills 1,500 bytes
 _PATIENCE_S: Final = 30.0
 _POLL_S: Final = 0.02
 _CHUNK: Final = 1 << 16
-_RECEIVE_BUFFER_FORCE, _TIMESTAMP_NS = 33, 35
-_BUFFER_BYTES: Final = 16 << 20
-_PROBE: Final = struct.Struct("!IQ")
-_STAMP: Final = struct.Struct("=qq")
 _WIREGUARD_PORT: Final = 51_820
 _ALIAS: Final = "gdp-bench uplink"
 
@@ -138,55 +128,12 @@ def wireguard(settings: Settings) -> None:
     device.close()
 
 
-def probe_send(settings: Settings) -> None:
-    """Send ``count`` full datagrams ``every_ns`` apart, or at once where that is 0; report the moments."""
-    count, every_ns, sent_ns = int(settings["count"]), int(settings["every_ns"]), list[int]()
-    padding = bytes(PROBE_BYTES - _PROBE.size)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, 32, _BUFFER_BYTES)  # SO_SNDBUFFORCE
-        probe.connect((settings["address"], PROBE_PORT))
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
-        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # the relay of the link has the last core
-        start_ns = time.monotonic_ns()
-        for number in range(count):
-            if (pause_ns := start_ns + number * every_ns - time.monotonic_ns()) > 0:
-                time.sleep(pause_ns / 1e9)
-            now_ns = time.time_ns()
-            probe.send(_PROBE.pack(number, now_ns) + padding)
-            sent_ns.append(now_ns)
-    say(sent_ns=sent_ns)
-
-
-def probe_read(settings: Settings) -> None:
-    """Read datagrams until none came for ``silence_s``; report number and age of each, and when it arrived."""
-    found: list[tuple[int, int, int]] = []
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, _RECEIVE_BUFFER_FORCE, _BUFFER_BYTES)
-        probe.setsockopt(socket.SOL_SOCKET, _TIMESTAMP_NS, 1)
-        probe.bind((settings["address"], PROBE_PORT))
-        say(event="ready")
-        probe.settimeout(_PATIENCE_S)
-        while True:
-            try:
-                datagram, stamps, _, _ = probe.recvmsg(2_048, 64)
-            except TimeoutError:
-                break
-            probe.settimeout(float(settings["silence_s"]))
-            seconds, nanoseconds = _STAMP.unpack_from(stamps[0][2])
-            number, sent_ns = _PROBE.unpack_from(datagram)
-            arrived_ns = seconds * 1_000_000_000 + nanoseconds
-            found.append((number, arrived_ns - sent_ns, arrived_ns))
-    say(arrived=found)
-
-
 _ROLES: Final[Mapping[str, Callable[[Settings], None]]] = {
     "robot": lambda settings: traffic(settings, "up"),
     "cloud": lambda settings: traffic(settings, "down"),
     "tcp-send": tcp_send,
     "tcp-read": tcp_read,
     "wireguard": wireguard,
-    "probe-send": probe_send,
-    "probe-read": probe_read,
 }
 
 if __name__ == "__main__":

@@ -8,8 +8,7 @@
 The audit checks each distribution that the running interpreter finds. The lock must pin it here, in that version, and
 its files must be those that its RECORD states. ``--archives`` compares downloaded archives with the lock's hashes. A
 virtual environment brings pip, setuptools and wheel: they are compared where the lock pins them. Exit: 0 nothing found,
-1 something, 2 wrong usage.
-
+1 something, 2 wrong usage. ``pip-audit`` reads no advisories from files, and asks a service for each package.
 """
 
 from __future__ import annotations

@@ -7,6 +7,8 @@ Components and hashes come from the lock. Licences and the graph of dependencies
 installed, for the packages that are installed in the pinned version. The same inputs give the same bytes: the serial
 number is derived from the content, and a time stands in it only where SOURCE_DATE_EPOCH gives one.
 
+``cyclonedx-bom`` lists the pins of a lock with their hashes, but neither licences nor dependencies.
+
 Source: https://cyclonedx.org/docs/1.6/json/; package URLs: https://github.com/package-url/purl-spec.
 """
 

@@ -318,8 +318,8 @@ def test_y08_a_client_of_a_door_hears_of_a_message_that_cannot_be_written_and_ge
         message,
         readers,
         subscribe,
-        until,
     )
+    from tests.waiting import until
 
     encode = FoxgloveSession.encode
     monkeypatch.setattr(

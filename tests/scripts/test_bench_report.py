@@ -16,7 +16,7 @@ from gdp.names import NAME_BYTES
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "scripts" / "bench"))
 
-from frames import NAME_AT, SINK, SOURCE, gdp_frame, ip_checksum, ip_frame, spread_names, table_key, table_name
+from frames import NAME_AT, SINK, SOURCE, gdp_frame, ip_checksum, ip_frame
 from machine import machine_state, offload_text
 from rate_search import LATE_MAX_S, LOSS_MAX, Try, highest
 from report import Rounds, Spread, number_text, percentile, write_json
@@ -180,12 +180,3 @@ def test_an_ip_header_sums_up_to_nothing() -> None:
     frame = ip_frame(MACS, 128, "10.99.4.2", "10.99.1.1")
     assert ip_checksum(frame[14:34]) == 0
     assert struct.unpack_from("!H", frame, 16)[0] == 128 - ETHER_BYTES
-
-
-def test_the_names_that_frames_go_to_are_keys_of_the_table() -> None:
-    keys = {table_key(number) for number in range(5_000)}
-    names = spread_names(64, 5_000)
-    assert len(set(names)) == 64
-    assert all(name in keys or name + SOURCE in keys for name in names)
-    assert {len(key) for key in keys} == {NAME_BYTES, 2 * NAME_BYTES}
-    assert table_name(1) != table_name(2)

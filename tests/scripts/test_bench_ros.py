@@ -1,4 +1,4 @@
-"""Sans-I/O parts of the benches with real ROS nodes: names, cases, targets, sizes of the tasks."""
+"""Sans-I/O parts of the benches with real ROS nodes: names, cases and targets."""
 
 from __future__ import annotations
 
@@ -9,10 +9,8 @@ import pytest
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "scripts" / "bench"))
 
-import fogros
 import ros
 import services
-from fogros_tasks import IMAGE, NUMBERS, TASKS, Part, Task
 from report import Rounds
 from ros_row import LEFT, RIGHT, Carried
 from ros_stage import DIRECT, Bench, Options, parse
@@ -30,7 +28,7 @@ def options(monkeypatch: pytest.MonkeyPatch) -> Options:
 
 
 def benches(options: Options) -> list[Bench]:
-    return [ros.bench_of(options), services.bench_of(options), fogros.bench_of(options)]
+    return [ros.bench_of(options), services.bench_of(options)]
 
 
 def test_what_is_carried_is_named_once_and_has_a_source_at_an_end(options: Options) -> None:
@@ -46,12 +44,6 @@ def test_the_proxies_carry_all_that_nodes_of_the_overlay_use(options: Options) -
         {topic for kind, each in ros.ENCODINGS.items() for encoding in each for topic in ros.topics_of(kind, encoding)},
         {services.service_of(encoding) for each in services.ENCODINGS.values() for encoding in each}
         | {services.service_of("cdr", services.SESSION)},
-        {
-            fogros.prefix_of(task, encoding) + part.topic
-            for task in TASKS
-            for encoding in fogros.ENCODINGS
-            for part in (*task.parts, task.answer)
-        },
     ]
     assert carried == used
 
@@ -96,18 +88,3 @@ def test_a_quick_run_is_quick_in_its_first_round_too(options: Options) -> None:
     assert ros.first_s(options) == ros.LONG_S
     options.quick = True
     assert ros.first_s(options) == options.seconds
-
-
-@pytest.mark.parametrize(
-    ("task", "octets"),
-    [(TASKS[0], 640 * 480 * 5), (TASKS[1], 119_265 + 8_575 + 8 * 23), (TASKS[2], 516 * 386 * 5)],
-    ids=[task.name for task in TASKS],
-)
-def test_a_task_is_as_large_as_its_sources_say(task: Task, octets: int) -> None:
-    assert sum(map(data_bytes, task.parts)) == octets
-
-
-def data_bytes(part: Part) -> int:
-    if part.type_name == IMAGE:
-        return part.width * part.height * part.pixel
-    return 8 * part.count if part.type_name == NUMBERS else part.count

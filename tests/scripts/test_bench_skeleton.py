@@ -1,14 +1,12 @@
-"""Skeleton of the benches: records, exit status, processes that take commands, the one domain that signs."""
+"""Skeleton of the benches: records, exit status, processes that take commands."""
 
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
-from domain import BenchDomain
 from machine import machine_state
 from peers.process import FailedError, Started, figures_of, floats_of
 from report import Rounds, markdown_table, write_json
@@ -100,14 +98,6 @@ def test_a_report_without_the_list_is_refused() -> None:
     assert floats_of({"rtt_us": [1, 2.5]}, "rtt_us") == [1.0, 2.5]
     with pytest.raises(FailedError, match="rtt_us"):
         floats_of({"event": "over"}, "rtt_us")
-
-
-def test_every_advertisement_of_the_domain_is_accepted() -> None:
-    domain = BenchDomain(time.time(), proxies=2)
-    verifier = domain.verifier()
-    for number in range(3):
-        verified = verifier.verify(domain.advertisement(number), time.time())
-        assert verified.subject.name == domain.subject(number).name
 
 
 def test_a_table_in_markdown_aligns_its_last_columns_to_the_right() -> None:

@@ -260,7 +260,7 @@ def test_an_answer_is_due_for_each_request_that_was() -> None:
 
 def test_the_share_of_a_system_is_that_of_the_link_without_the_tcp_flow() -> None:
     flow = Flow(0.9, 0.3, 0.25, 0.0, 1e6, (7_500, 15_000, 7_500))
-    used = Used(flow, flow, 0.2, 0.1)
+    used = Used(flow, flow, 0.2)
     found = link_figures(Conditions.of("10", 60, "0", "bdp", seed=1), used, used)
     assert found[score.SHARE_BOTH] == pytest.approx(0.6)
     assert found[score.TCP_BOTH] == 0.3

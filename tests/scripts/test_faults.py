@@ -11,10 +11,9 @@ from faults.accounts import Books, Timeline
 from faults.disk import snapshot_faults
 from faults.network import VICTIM, random_network
 from faults.oracle import Broken, Oracle
-from faults.plan import Churn, Flow, Plan, Service
+from faults.plan import Flow, Plan, Service
 from faults.records import Kind, Record, RecordReader, RecordWriter
 from faults.schedule import STRUCTURAL, Fault, FaultKind, broken_by, make_schedule
-from faults.slope import growth_of
 from faults.store import critical_lines
 from topologies import make_topology
 
@@ -241,16 +240,6 @@ def test_a_call_without_an_answer_or_with_two_is_found() -> None:
     assert of(Kind.CALLED, Kind.ANSWERED, Kind.FAILED)
 
 
-def test_what_rises_after_the_warm_up_is_not_flat() -> None:
-    rising = growth_of([float(n) for n in range(50)])
-    assert rising.rise == pytest.approx(29.0)
-    assert not rising.is_flat(0.02, 1.0)
-
-
-def test_what_rises_only_while_it_warms_up_is_flat() -> None:
-    assert growth_of([*(float(n) for n in range(20)), *([20.0, 20.5] * 15)]).is_flat(0.0, 0.0)
-
-
 def test_records_come_back_as_they_were_written_also_from_a_file_that_grows(tmp_path: Path) -> None:
     writer, reader = RecordWriter(tmp_path / "records"), RecordReader(tmp_path / "records")
     one, other = (Record(Kind.DELIVERED, 1, 2, 3, number, 5) for number in (4, 1 << 40))
@@ -260,10 +249,3 @@ def test_records_come_back_as_they_were_written_also_from_a_file_that_grows(tmp_
     writer.add(Kind(other.kind), *other[1:])
     writer.flush()
     assert list(reader.read()) == [other]
-
-
-def test_what_churns_has_the_channel_of_its_flow_or_one_of_its_own() -> None:
-    plan = square()
-    churning = Plan(plan.topology, plan.members, flows=plan.flows, churn=(Churn("/t", "R"), Churn("/u", "P", True)))
-    assert [channel for channel, _ in churning.churns("R")] == [0]
-    assert [channel for channel, _ in churning.churns("P")] == [1]

@@ -7,7 +7,8 @@ import os
 import pytest
 from faults.network import random_network
 from faults.schedule import make_schedule
-from faults.simulated import SIMULATED, SimulatedChaos
+
+from tests.scripts.simulated_chaos import SIMULATED, SimulatedChaos
 
 FIRST, COUNT = 1, 2 * int(os.environ.get("GDP_DRAWS", "1"))
 SWITCHES, RATE, SECONDS = 12, 0.25, 40.0

@@ -14,9 +14,7 @@ import struct
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
 from functools import partial
-from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
@@ -194,34 +192,6 @@ class Serving:
                 print(f"not answered: {error}", file=sys.stderr, flush=True)
 
 
-class Churning:
-    """Topic that is subscribed or published, and left, repeatedly."""
-
-    def __init__(self, station: End, settings: dict[str, Any], begin: Callable[[dict[str, Any]], None]) -> None:
-        self._station, self._reported_counts, self._begin = station, settings, begin
-        self._name = station.name_of(settings["name"])
-        self._every_s = 1.0 / float(settings["hz"])
-        self.due_s = time.monotonic() + random.random() * self._every_s
-        self._is_taken_up = False
-
-    def next_s(self) -> float:
-        """Return the next deadline, in monotonic seconds."""
-        return self.due_s
-
-    def go_on(self, now_s: float) -> None:
-        """Apply the changes that are due."""
-        if now_s < self.due_s:
-            return
-        self.due_s = max(self.due_s + self._every_s, now_s)
-        if not self._is_taken_up:
-            self._begin(self._reported_counts)
-        elif self._reported_counts["publishes"]:
-            self._station.member.withdraw(self._name)
-        else:
-            self._station.member.unsubscribe(self._name)
-        self._is_taken_up = not self._is_taken_up
-
-
 def main() -> None:
     """Run as a member until ended."""
     settings: dict[str, Any] = json.loads(sys.argv[1])
@@ -239,16 +209,7 @@ def main() -> None:
         takers[station.name_of(each["name"])] = caller
     who = settings["index"], incarnation_id
     sources = [Source(station, each, tokens[each["channel"]], who, out) for each in settings["publish"]]
-    spare, churned = iter(settings["spare"]), count(1)
-
-    def begin_churn(each: dict[str, Any]) -> None:
-        if each["publishes"]:
-            head = _HEAD.pack(tokens[each["channel"]], each["channel"], who[0], incarnation_id, next(churned))
-            station.advertise(each["name"], reliable=True).publish(head)
-        else:
-            takers[station.subscribe(each["name"])] = Reading(each["channel"], tokens[each["channel"]], out)
-
-    churn = [Churning(station, each, begin_churn) for each in settings["churn"]]
+    spare = iter(settings["spare"])
 
     def begin_spare(*_: object) -> None:
         """Start the next spare flow."""
@@ -259,7 +220,6 @@ def main() -> None:
         else:
             takers[station.subscribe(each["name"])] = Reading(each["channel"], token, out)
 
-    actives: list[Caller | Churning] = [*remote_clients, *churn]
     signal.signal(signal.SIGUSR1, begin_spare)
     tune_memory()
     with station.runtime.signals():
@@ -268,14 +228,14 @@ def main() -> None:
             now_s = time.monotonic()
             for source in sources:
                 source.go_on(now_s)
-            for active in actives:
-                active.go_on(now_s)
+            for caller in remote_clients:
+                caller.go_on(now_s)
             for name, taker in takers.items():
                 if isinstance(taker, Reading):
                     taker.look(station, name, now_s)
             station.member.flush(now_s)
             out.flush()
-            due = [each.due_s for each in sources] + [each.next_s() for each in actives]
+            due = [each.due_s for each in sources] + [each.next_s() for each in remote_clients]
             station.runtime.step(min([*due, now_s + _LOOK_S]))
             now_s = time.monotonic()
             for message in station.member.poll_messages():

@@ -26,7 +26,7 @@ from testbed import Lab
 from faults.clock import Clock
 from faults.disk import Disk
 from faults.link_faults import FrameFaults, LinkFaults
-from faults.plan import Churn, Flow, Plan, Service
+from faults.plan import Flow, Plan, Service
 from faults.records import Record, RecordReader
 from faults.store import StoreCluster
 from gdp.host.processes import Process, end_all
@@ -53,7 +53,6 @@ class Overlay:
         plan: the nodes.
         plane: as ``gdp-switch --data-plane``.
         has_clocks: processes may have their wall clock stepped.
-        churn_hz: how often members start or leave a churning topic, a second.
         more: further keys of the file of every switch and RIB, by role.
         has_disk: RIBs keep snapshots on a small disk.
         in_store: switches whose RIBs share a cluster of servers; they keep no snapshots.
@@ -70,7 +69,6 @@ class Overlay:
         *,
         plane: str = "auto",
         has_clocks: bool = False,
-        churn_hz: float = 10.0,
         more: Mapping[str, Mapping[str, object]] | None = None,
         has_disk: bool = False,
         in_store: Sequence[str] = (),
@@ -81,7 +79,6 @@ class Overlay:
         self._run = run
         self._plane = plane
         self._more = more or {}
-        self._churn_hz = churn_hz
         self._at = {mover: plan.home(mover) for mover in (*plan.homes, *plan.members)}
         self._incarnation_ids: dict[str, int] = {}
         self._processes: dict[str, Started] = {}
@@ -149,10 +146,6 @@ class Overlay:
         clock = self._clocks.get(who)
         argv = ["-m", *argv] if clock is None else ["-m", "faults.clock", str(clock.path), *argv]
         self._processes[who] = self._lab.start(node, f"{role} {incarnation_id}", argv)
-
-    def start_other(self, node: str, what: str, arguments: Sequence[str]) -> Started:
-        """Start a Python process that is not of the plan on a machine."""
-        return self._lab.start(node, what, arguments)
 
     def await_ready(self, who: str) -> None:
         """Return when a started process reports that it is ready.
@@ -333,7 +326,7 @@ class Overlay:
 
     def _settings(self, member: str, incarnation_id: int) -> dict[str, object]:
         """Return the settings of a member process: its identity, and its flows and services."""
-        parts = ("publish", "read", "serve", "call", "spare", "churn")
+        parts = ("publish", "read", "serve", "call", "spare")
         settings: dict[str, list[dict[str, object]]] = {part: [] for part in parts}
         for channel, what in self.plan.channels(member):
             if isinstance(what, Service):
@@ -343,9 +336,6 @@ class Overlay:
                 settings["publish" if member == what.publisher else "read"].append(_flow_part(channel, what))
         for channel, flow in self.plan.spares(member):
             settings["spare"].append({**_flow_part(channel, flow), "publishes": member == flow.publisher})
-        for channel, churn in self.plan.churns(member):
-            part = {"channel": channel, "name": churn.topic, "hz": self._churn_hz, "publishes": churn.publishes}
-            settings["churn"].append(part)
         return {
             "config": str(self.directory / f"end-{member}.yaml"),
             "records": str(self._record_file(member, incarnation_id)),
@@ -358,8 +348,8 @@ class Overlay:
     def _record_file(self, member: str, incarnation_id: int) -> Path:
         return self.directory / f"{member}-{incarnation_id}.records"
 
-    def _parts(self, member: str) -> list[tuple[int, Flow | Service | Churn]]:
-        return [*self.plan.channels(member), *self.plan.spares(member), *self.plan.churns(member)]
+    def _parts(self, member: str) -> list[tuple[int, Flow | Service]]:
+        return [*self.plan.channels(member), *self.plan.spares(member)]
 
     def _token(self, channel: int) -> bytes:
         """Return the prefix of every message of a channel, which no other channel has."""
@@ -374,8 +364,7 @@ class Overlay:
                 right = Right.SERVE if member in what.servers else Right.CALL
                 metadata = Metadata({"kind": "service", "name": what.name})
             else:
-                publishes = what.publishes if isinstance(what, Churn) else member == what.publisher
-                right = Right.PUBLISH if publishes else Right.READ
+                right = Right.PUBLISH if member == what.publisher else Right.READ
                 metadata = Metadata({"kind": "topic", "name": what.topic})
             install_delegation(identity, delegate(owner, identity / CARD, metadata, [right]))
         own = self.plan.topology.domain_of(member).label

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from gdp.simulation.topology import Topology
 
-__all__ = ["Churn", "Flow", "Plan", "Service"]
+__all__ = ["Flow", "Plan", "Service"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,15 +38,6 @@ class Service:
 
 
 @dataclass(frozen=True, slots=True)
-class Churn:
-    """Topic that a member reads (or publishes) at intervals: it starts and ends repeatedly."""
-
-    topic: str
-    member: str
-    publishes: bool = False
-
-
-@dataclass(frozen=True, slots=True)
 class Plan:
     """One run without its faults.
 
@@ -56,7 +47,6 @@ class Plan:
         homes: of members (and switches) whose link moves: the possible switches, the first at the start.
         flows, services: traffic between members; the index in the tuple is the channel.
         spare: flows that begin one by one, when publisher and readers get a signal; their channels come after those.
-        churn: topics that come and go; a channel for each topic, that of its flow where it has one.
     """
 
     topology: Topology
@@ -65,7 +55,6 @@ class Plan:
     flows: tuple[Flow, ...] = ()
     services: tuple[Service, ...] = ()
     spare: tuple[Flow, ...] = ()
-    churn: tuple[Churn, ...] = ()
 
     @property
     def switches(self) -> tuple[str, ...]:
@@ -96,14 +85,3 @@ class Plan:
         for channel, flow in enumerate(self.spare, len(self.flows) + len(self.services)):
             if member == flow.publisher or member in flow.readers:
                 yield channel, flow
-
-    def churns(self, member: str) -> Iterable[tuple[int, Churn]]:
-        """Yield the churning topics of a member, with their channels."""
-        topics = [flow.topic for flow in self.flows]
-        after = len(self.flows) + len(self.services) + len(self.spare)
-        topics += [""] * (after - len(topics))
-        for each in self.churn:
-            if each.topic not in topics:
-                topics.append(each.topic)
-            if each.member == member:
-                yield topics.index(each.topic), each

@@ -10,7 +10,6 @@ import os
 import shutil
 import signal
 import subprocess
-import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import partial
@@ -19,7 +18,7 @@ from typing import Final
 
 import yaml
 from devices import add_address, add_bridge, set_up
-from peers.process import FailedError
+from peers.process import FailedError, until
 from pyroute2 import IPRoute
 from redis import Redis
 from redis.exceptions import RedisError
@@ -40,7 +39,6 @@ _OF_RIBS: Final = "10.255.77.{}"
 _START_S: Final = 120.0
 _ANSWER_S: Final = 0.3
 _WHOLE_S: Final = 20.0
-_LOOK_S: Final = 0.05
 _CRITICAL: Final = "== CRITICAL =="  # of a server that lost data and continues
 
 
@@ -114,11 +112,7 @@ class StoreCluster:
         argv = [*self._entering(), self._program, "server.conf"]
         if subprocess.run(argv, cwd=folder, check=False, stdout=subprocess.DEVNULL).returncode:
             raise FailedError(f"server {number} of the store does not start again")
-        end_s = time.monotonic() + _WHOLE_S
-        while self._role(number) is None:
-            if time.monotonic() > end_s:
-                raise FailedError(f"server {number} of the store does not answer")
-            time.sleep(_LOOK_S)
+        until(lambda: self._role(number) is not None, lambda: f"an answer of server {number} of the store", _WHOLE_S)
         self._run.note_process(self._pid(number))
 
     def thaw(self, fault: str) -> None:
@@ -137,11 +131,7 @@ class StoreCluster:
                 os.kill(self._pid(number), signal.SIGKILL)
 
     def _take(self, fault: str, number: signal.Signals, *, is_primary: bool, choice: int) -> str:
-        end_s = time.monotonic() + _WHOLE_S
-        while not (fit := self._fit(is_primary=is_primary)):
-            if time.monotonic() > end_s:
-                raise FailedError(f"the store is not whole {_WHOLE_S:g} s after its last fault")
-            time.sleep(_LOOK_S)
+        fit = until(lambda: self._fit(is_primary=is_primary), lambda: "a whole store after a fault", _WHOLE_S)
         server = self._away[fault] = fit[choice % len(fit)]
         os.kill(self._pid(server), number)
         return f"server {server}"

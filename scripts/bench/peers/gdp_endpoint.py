@@ -20,7 +20,6 @@ from typing import Final, Protocol, get_args
 from member_endpoint import End
 
 import gdp
-from gdp.client.publisher import Publisher
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.nodes.memory_tuning import tune_memory
@@ -96,49 +95,6 @@ class LibraryEndpoint:
     def resent(self, topic: str) -> int:
         """Return how many parts of a published topic were sent again."""
         return self._publishers[topic].resent
-
-
-class InternalEndpoint:
-    """Member on its plane, as the library contains one."""
-
-    def __init__(self, config: Path, spin_s: float) -> None:
-        self._end = End(config, spin_s)
-        self._publishers: dict[str, Publisher] = {}
-        self._labels: dict[bytes, str] = {}
-        self._arrived = deque[tuple[str, bytes]]()
-
-    def advertise(self, topic: str) -> Callable[[bytes], None]:
-        """Publish a topic, reliably; return what sends a message."""
-        publisher = self._publishers[topic] = self._end.advertise(topic, reliable=True)
-
-        def send(message: bytes) -> None:
-            publisher.publish(message)
-            self._end.member.flush(time.monotonic())
-            self._end.runtime.send()
-
-        return send
-
-    def subscribe(self, topic: str) -> None:
-        """Read a topic."""
-        self._labels[self._end.subscribe(topic)] = topic
-
-    def wait_for_readers(self, deadline_s: float) -> None:
-        """Wait until each published topic is read; raises ``TimeoutError``."""
-        self._end.wait_for_readers(self._publishers.values(), deadline_s)
-
-    def receive(self, deadline_s: float) -> tuple[str, bytes] | None:
-        """Return the next message with its topic; None when the monotonic second passed."""
-        while not self._arrived:
-            if time.monotonic() >= deadline_s:
-                return None
-            self._end.runtime.step(deadline_s)
-            for each in self._end.member.poll_messages():
-                self._arrived.append((self._labels[each.topic], each.delivered.message))
-        return self._arrived.popleft()
-
-    def resent(self, topic: str) -> int:
-        """Return how many parts of a published topic were sent again."""
-        return self._publishers[topic].repairs
 
 
 class UnicastEndpoint:

@@ -16,17 +16,20 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Final
+from typing import Final, TypeVar
 
 from gdp.host.processes import Process, end_all
 from gdp.host.run_registry import Run
 
-__all__ = ["FailedError", "Started", "figures_of", "floats_of"]
+__all__ = ["FailedError", "Started", "figures_of", "floats_of", "until"]
 
 _BENCH: Final = Path(__file__).resolve().parents[1]
 _REASON_CHARS: Final = 200
 _CLOSE_S: Final = 5.0
 _ANSWER_S: Final = 600.0
+_PAUSE_S: Final = 0.05
+
+T = TypeVar("T")
 
 
 class FailedError(Exception):
@@ -142,6 +145,29 @@ class Started:
         lines = self._log.read_text(encoding="utf-8", errors="replace").split("\n")
         said = [line.strip() for line in lines if line.strip()]
         return said[-1][-_REASON_CHARS:] if said else "without a word"
+
+
+def until(
+    found: Callable[[], T], what: Callable[[], str], patience_s: float, meanwhile: Callable[[], object] | None = None
+) -> T:
+    """Return what a function finds once that is true; nothing here is notified of it.
+
+    Args:
+        what: says what is missing.
+        meanwhile: is called between two looks, and waits a moment; None: a pause.
+
+    Raises:
+        FailedError: not in time.
+    """
+    end_s = time.monotonic() + patience_s
+    while not (value := found()):
+        if time.monotonic() > end_s:
+            raise FailedError(f"{what()}: not within {patience_s:g} s")
+        if meanwhile is None:
+            time.sleep(_PAUSE_S)
+        else:
+            meanwhile()
+    return value
 
 
 def figures_of(said: Mapping[str, object]) -> dict[str, float]:

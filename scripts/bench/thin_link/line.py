@@ -58,7 +58,6 @@ class Used:
     up: Flow
     down: Flow
     late_ms: float
-    cpu_share: float
 
 
 class Line:
@@ -86,10 +85,8 @@ class Line:
         for what in ("oversized", "refused", "kernel_drops"):
             if count := after[what] - (0 if what == "kernel_drops" else before[what]):
                 raise FailedError(f"the relay of the link had {count} frames {what}")
-        span_s = (after["now_ns"] - before["now_ns"]) / 1e9
-        cpu_share = (after["cpu_s"] - before["cpu_s"]) / span_s
         up, down = (_flow(before[side], after[side]) for side in ("up", "down"))
-        return Used(up, down, after["late_us"] / 1e3, cpu_share)
+        return Used(up, down, after["late_us"] / 1e3)
 
     def _ask(self, **order: bool) -> dict[str, Any]:
         try:

@@ -160,12 +160,10 @@ class _Relay:
                 "depth_bytes": way.channel.take_depths(),
             }
         say(
-            now_ns=now_ns,
             oversized=self._oversized,
             refused=sum(self._drops),
             kernel_drops=sum(_kernel_drops(way.source) for way in self._ways),
             late_us=self._late_us(0.99),
-            cpu_s=time.process_time(),
             **sides,
         )
         self._late = [0] * (_BUCKETS + 1)

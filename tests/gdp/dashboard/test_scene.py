@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from synthetic_nodes import SyntheticNetwork
-
 from gdp.dashboard.graph import merge_readings
 from gdp.dashboard.readings import Reading
 from gdp.dashboard.scene import Scene
 from gdp.dashboard.series import SAMPLES, SeriesStore
+from tests.gdp.dashboard.synthetic_nodes import SyntheticNetwork
 
 
 def switch(node: str, *links: dict[str, object], **more: object) -> Reading:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from synthetic_nodes import SyntheticNetwork, serve_network
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin
@@ -25,6 +24,7 @@ from gdp.names import Name
 from gdp.nodes.control_client import control_path
 from gdp.nodes.control_protocol import Response, encode_response
 from gdp.nodes.control_socket import CONTROL_SOCKET
+from tests.gdp.dashboard.synthetic_nodes import SyntheticNetwork, serve_network
 
 
 @contextmanager

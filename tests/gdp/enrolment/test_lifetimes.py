@@ -24,8 +24,9 @@ from gdp.stores.files import read_public
 from gdp.stores.keyring import load_delegations, load_identity
 from gdp.trust.adcert import AdCertCache, Chain
 from tests.gdp.enrolment.lab import Lab, running_lab
-from tests.gdp.enrolment.test_members import _state, eventually, running
+from tests.gdp.enrolment.test_members import _state, running
 from tests.gdp.sharing.machines import STRING
+from tests.waiting import until
 
 DAY_S = 86_400.0
 LIFE_S = 4 * DAY_S
@@ -75,7 +76,7 @@ def lab(tmp_path: Path, clock: Clock) -> Iterator[Lab]:
         run("import", "/chatter", "--from", "robot", "--directory", str(tmp_path / "server"))
         for label in MACHINES:
             stack.enter_context(running(Agent(tmp_path / label, poll_s=0.1, clock=clock)))
-        eventually(lambda: all(_state(tmp_path / label) == "connected" for label in MACHINES))
+        until(lambda: all(_state(tmp_path / label) == "connected" for label in MACHINES))
         for label in ("robot", "server"):
             exchange = MemberExchange(tmp_path / label, fetches=False, clock=clock)
             stack.callback(exchange.close)

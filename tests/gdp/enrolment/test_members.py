@@ -6,7 +6,7 @@ import asyncio
 import json
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -31,6 +31,7 @@ from gdp.trust.mail import Mail
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
 from tests.gdp.enrolment.lab import Lab, running_lab
+from tests.waiting import until
 
 PATIENCE_S = 20.0
 
@@ -54,14 +55,6 @@ def running(agent: Agent) -> Iterator[Agent]:
         agent.stop()
         thread.join(PATIENCE_S)
         assert not thread.is_alive()
-
-
-def eventually(found: Callable[[], bool]) -> None:
-    """Wait until something holds."""
-    end_s = time.monotonic() + PATIENCE_S
-    while not found():
-        assert time.monotonic() < end_s
-        time.sleep(0.02)
 
 
 def _state(folder: Path) -> str:
@@ -134,13 +127,13 @@ def test_a_mail_whose_content_was_changed_is_refused(lab: Lab) -> None:
 
 def test_the_agent_says_that_it_is_connected(lab: Lab) -> None:
     with running(Agent(lab.folder / "bob", poll_s=0.2)), DomainClient.open(lab.folder / "ada") as ada:
-        eventually(lambda: ada.find("bob").is_online)
-        eventually(lambda: _state(lab.folder / "bob") == "connected")
+        until(lambda: ada.find("bob").is_online)
+        until(lambda: _state(lab.folder / "bob") == "connected")
 
 
 def test_the_agent_of_a_border_works_as_any_other(lab: Lab) -> None:
     with running(Agent(lab.files.directory, poll_s=0.2)):
-        eventually(lambda: _state(lab.files.directory) == "connected")
+        until(lambda: _state(lab.files.directory) == "connected")
     assert list(lab.files.config.peers.glob("*.endpoints"))
 
 
@@ -152,8 +145,8 @@ def test_the_agent_installs_a_delegation_of_the_domains_owner(lab: Lab) -> None:
         given = delegate(lab.files.config.owner, bob.proxy, name, [Right.READ])
         owner.send(bob.name, DELEGATION_KIND, given.to_wire())
         folder = lab.folder / "bob/proxy/delegations"
-        eventually((folder / f"{given.name.to_text()}.delegation").exists)
-        eventually(lambda: not list((lab.folder / "bob/inbox").glob("*.mail")))
+        until((folder / f"{given.name.to_text()}.delegation").exists)
+        until(lambda: not list((lab.folder / "bob/inbox").glob("*.mail")))
 
 
 def test_the_agent_keeps_a_delegation_of_a_foreign_owner_for_a_person(lab: Lab, tmp_path: Path) -> None:
@@ -165,7 +158,7 @@ def test_the_agent_keeps_a_delegation_of_a_foreign_owner_for_a_person(lab: Lab, 
         given = delegate(tmp_path / "owner", lab.folder / "bob/proxy" / CARD, name, [Right.READ])
         ada.send(ada.find("bob").name, DELEGATION_KIND, given.to_wire())
         inbox = lab.folder / "bob/inbox"
-        eventually(lambda: bool(list(inbox.glob("*.mail"))))
+        until(lambda: bool(list(inbox.glob("*.mail"))))
     assert not (lab.folder / f"bob/proxy/delegations/{given.name.to_text()}.delegation").exists()
 
 
@@ -175,8 +168,8 @@ def test_the_agent_renews_memberships_in_time(lab: Lab, monkeypatch: pytest.Monk
     node = lab.folder / "ada/proxy"
     before = load_identity(node, time.time())
     with running(Agent(lab.folder / "ada", poll_s=0.2)):
-        eventually(lambda: load_identity(node, time.time()).member.fingerprint != before.member.fingerprint)
-        eventually(lambda: _state(lab.folder / "ada") == "connected")
+        until(lambda: load_identity(node, time.time()).member.fingerprint != before.member.fingerprint)
+        until(lambda: _state(lab.folder / "ada") == "connected")
     assert load_identity(node, time.time()).name == before.name
 
 
@@ -188,9 +181,9 @@ def test_a_member_follows_where_the_relays_of_the_domain_are(tmp_path: Path, mon
         path = tmp_path / "robot/relay.yaml"
         path.write_text(f"{path.read_text()}mtu: 1280\n")
         with running(Agent(tmp_path / "robot", poll_s=0.2)):
-            eventually(lambda: _state(tmp_path / "robot") == "connected")
+            until(lambda: _state(tmp_path / "robot") == "connected")
             relays[:] = ["192.0.2.7:443", "[2001:db8::7]:443"]
-            eventually(lambda: "192.0.2.7" in path.read_text())
+            until(lambda: "192.0.2.7" in path.read_text())
         relay = RelayConfig.load(path)
     assert [each.endpoints for each in relay.borders] == [tuple(relays)]
     assert relay.mtu == 1280
@@ -215,7 +208,7 @@ def test_the_agent_goes_on_while_no_server_answers(tmp_path: Path) -> None:
         lab.join("eve")
     agent = Agent(tmp_path / "eve", jitter=lambda: 0.0)
     with running(agent):
-        eventually(lambda: _state(tmp_path / "eve") == "unreachable")
+        until(lambda: _state(tmp_path / "eve") == "unreachable")
 
 
 def test_two_machines_with_one_identity_are_noticed(lab: Lab) -> None:
@@ -228,7 +221,7 @@ def test_two_machines_with_one_identity_are_noticed(lab: Lab) -> None:
         return machine is not None and machine.has_double
 
     with running(first), running(second):
-        eventually(is_noticed)
+        until(is_noticed)
 
 
 def test_a_removed_machine_is_revoked_and_its_tunnel_closed(lab: Lab) -> None:

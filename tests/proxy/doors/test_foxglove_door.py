@@ -37,6 +37,7 @@ from tests.proxy.bridge import known
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
 from tests.proxy.doors.rights import Everything
 from tests.proxy.endpoints.fake import FakeEndpoint, FakeGraph
+from tests.waiting import until
 
 PATIENCE_S = 20.0
 
@@ -111,14 +112,6 @@ def message(client: ClientConnection) -> tuple[int, bytes]:
     opcode, number, _ = struct.unpack_from("<BIQ", data)
     assert opcode == 1
     return number, data[13:]
-
-
-def until(is_so: Callable[[], bool]) -> None:
-    """Wait for something that another thread does."""
-    end_s = time.monotonic() + PATIENCE_S
-    while not is_so():
-        assert time.monotonic() < end_s
-        time.sleep(0.002)
 
 
 def taken(door: DoorEndpoint, events: list[Event]) -> list[Event]:

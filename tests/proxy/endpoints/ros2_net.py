@@ -27,6 +27,7 @@ from proxy.endpoints.endpoint import (
     proxy_node_name,
 )
 from proxy.endpoints.ros2 import Ros2Endpoint
+from tests.waiting import until
 
 DOMAIN = 100 + os.getpid() % 100
 NODE = proxy_node_name("0123456789abcdef" * 4)
@@ -96,18 +97,17 @@ class Ears:
 
     def until(self, is_met: Callable[[], object], what: str = "") -> None:
         """Poll events until a condition holds."""
-        end = time.monotonic() + PATIENCE_S
-        while not is_met():
-            assert time.monotonic() < end, f"{what} did not happen; {self.events[-5:]}"
-            select.select([self.endpoint], [], [], 0.02)
-            self.events += self.endpoint.poll_events()
+        until(is_met, lambda: f"{what}; {self.events[-5:]}", PATIENCE_S, meanwhile=lambda: self._poll(0.02))
+
+    def _poll(self, seconds: float) -> None:
+        select.select([self.endpoint], [], [], seconds)
+        self.events += self.endpoint.poll_events()
 
     def for_s(self, seconds: float) -> None:
         """Poll events for a time: for events that must not happen."""
         end = time.monotonic() + seconds
         while (rest := end - time.monotonic()) > 0:
-            select.select([self.endpoint], [], [], rest)
-            self.events += self.endpoint.poll_events()
+            self._poll(rest)
 
     def of(self, kind: type[_Found], handle: int) -> list[_Found]:
         """Return the events of a kind of a handle so far."""

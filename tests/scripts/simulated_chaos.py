@@ -13,14 +13,14 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
-from peers.process import FailedError
-from topologies import ends_of
-
 from faults.accounts import Books
 from faults.continuity import Continuity
 from faults.plan import Flow, Plan
 from faults.records import Kind, Record
 from faults.schedule import Fault, FaultKind, broken_by
+from peers.process import FailedError
+from topologies import ends_of
+
 from gdp.client.participant import Participant
 from gdp.client.publisher import Publisher
 from gdp.message.loss import LossReason

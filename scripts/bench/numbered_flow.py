@@ -1,0 +1,102 @@
+"""Flow of numbered messages through real nodes: when each was published and when it came, and what is missing.
+
+I/O. A publisher and a reader of the library in this process, each in a thread. Moments are monotonic seconds.
+"""
+
+from __future__ import annotations
+
+import struct
+import threading
+import time
+from itertools import pairwise
+from typing import Final
+
+from peers.process import FailedError
+
+import gdp
+
+__all__ = ["HZ", "NumberedFlow"]
+
+HZ: Final = 100.0
+_STEADY_S: Final = 0.5
+_PATIENCE_S: Final = 60.0
+_NUMBER: Final = struct.Struct("!q92x")
+
+
+class NumberedFlow:
+    """A flow of 100 bytes, ``HZ`` times a second, until ``close``.
+
+    Attributes:
+        sent_s: moment of each message, by number.
+        arrivals: moment and number.
+    """
+
+    def __init__(self, publisher: gdp.Publisher, subscription: gdp.Subscription) -> None:
+        self._publisher, self._subscription = publisher, subscription
+        self._is_over = threading.Event()
+        self.sent_s: list[float] = []
+        self.arrivals: list[tuple[float, int]] = []
+        self._threads = [threading.Thread(target=work, daemon=True) for work in (self._publish, self._read)]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def lost(self) -> int:
+        """Return how many messages did not come."""
+        return len(self.sent_s) - len({number for _, number in self.arrivals})
+
+    @property
+    def doubled(self) -> int:
+        """Return how many arrivals were of a message that had come."""
+        return len(self.arrivals) - len({number for _, number in self.arrivals})
+
+    def _publish(self) -> None:
+        due_s = time.monotonic()
+        while not self._is_over.wait(max(due_s - time.monotonic(), 0.0)):
+            self.sent_s.append(time.monotonic())
+            self._publisher.put(_NUMBER.pack(len(self.sent_s) - 1))
+            due_s += 1 / HZ
+
+    def _read(self) -> None:
+        while not self._is_over.is_set() or len(self.arrivals) < len(self.sent_s):
+            try:
+                message = self._subscription.receive(timeout_s=1.0)
+            except gdp.SessionError:  # nothing came
+                if self._is_over.is_set():
+                    return
+                continue
+            self.arrivals.append((time.monotonic(), _NUMBER.unpack(message.payload)[0]))
+
+    def delays_ms(self, from_s: float, to_s: float) -> list[float]:
+        """Return the delay of each message that was published in an interval; an absent one has that until now."""
+        now_s, sent = time.monotonic(), list(self.sent_s)
+        came = {number: at_s for at_s, number in reversed(list(self.arrivals))}
+        return [(came.get(number, now_s) - at_s) * 1e3 for number, at_s in enumerate(sent) if from_s <= at_s < to_s]
+
+    def silence_ms(self, from_s: float, to_s: float) -> float:
+        """Return the longest time between two arrivals in an interval, its ends included."""
+        marks = [from_s, *(at_s for at_s, _ in list(self.arrivals) if from_s <= at_s < to_s), to_s]
+        return max(after - before for before, after in pairwise(marks)) * 1e3
+
+    def silence_until_steady_ms(self, since_s: float, patience_s: float) -> float:
+        """Wait until the flow has been back for half a second; return the longest gap since a moment.
+
+        Raises:
+            FailedError: it does not come back.
+        """
+        while time.monotonic() < since_s + patience_s:
+            time.sleep(0.05)
+            times = [at_s for at_s, _ in self.arrivals[-int(patience_s * HZ) :]]
+            before = [at_s for at_s in times if at_s < since_s][-1:]
+            marks = [*(before or [since_s]), *(at_s for at_s in times if at_s >= since_s)]
+            now_s = time.monotonic()
+            late = [mark for mark in marks if mark >= now_s - _STEADY_S]
+            if now_s - since_s > 2 * _STEADY_S and len(late) > 0.8 * _STEADY_S * HZ:
+                return max(b - a for a, b in pairwise(marks)) * 1e3
+        raise FailedError("the flow did not come back")
+
+    def close(self) -> None:
+        """Stop publishing, and read what is on its way."""
+        self._is_over.set()
+        for thread in self._threads:
+            thread.join(_PATIENCE_S)

@@ -1,0 +1,35 @@
+"""One wait for what causes no event here: a condition is asked again and again until it holds."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+__all__ = ["PATIENCE_S", "until"]
+
+PATIENCE_S = 60.0
+_PAUSE_S = 0.02
+
+
+def until(
+    is_met: Callable[[], object],
+    what: object | Callable[[], object] = "it did not come about",
+    patience_s: float = PATIENCE_S,
+    *,
+    meanwhile: Callable[[], object] | None = None,
+) -> float:
+    """Return the seconds until a condition holds; fail when it does not in time.
+
+    Args:
+        what: is expected, or a function that says what there is instead.
+        meanwhile: is called between two looks, and should wait a moment; None: a pause of 20 ms.
+    """
+    begun_s = time.monotonic()
+    while not is_met():
+        if time.monotonic() > begun_s + patience_s:
+            raise AssertionError(f"{what() if callable(what) else what}: not within {patience_s:g} s")
+        if meanwhile is None:
+            time.sleep(_PAUSE_S)
+        else:
+            meanwhile()
+    return time.monotonic() - begun_s
