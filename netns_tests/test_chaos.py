@@ -30,24 +30,9 @@ pytestmark = [pytest.mark.netns, pytest.mark.nightly]
 _START_S = 200.0
 
 
-def bench(name: str, *options: str, patience_s: float) -> subprocess.CompletedProcess[str]:
-    """Run a bench to its end."""
-    return subprocess.run(argv_of(name, options), capture_output=True, text=True, timeout=patience_s, check=False)
-
-
 def argv_of(name: str, options: Sequence[str]) -> list[str]:
     """Return the command line of a bench."""
     return [sys.executable, str(ROOT / "scripts" / "bench" / name), *options]
-
-
-def test_nothing_grows_in_memory_while_readers_and_publishers_come_and_go() -> None:
-    ran = bench("soak.py", "--only", "memory", "--cycles", "150", "--publishers", "60", patience_s=_START_S)
-    assert ran.returncode == 0, ran.stdout + ran.stderr
-
-
-def test_nothing_grows_in_real_processes_while_readers_and_publishers_come_and_go() -> None:
-    ran = bench("soak.py", "--only", "real", "--seconds", "15", patience_s=_START_S)
-    assert ran.returncode == 0, ran.stdout + ran.stderr
 
 
 def test_a_killed_run_is_taken_down_by_the_next() -> None:

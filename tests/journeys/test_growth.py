@@ -14,7 +14,7 @@ from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import chain
 from gdp.trust.right import Right
 
-pytestmark = pytest.mark.soak
+pytestmark = pytest.mark.nightly
 
 CYCLES, SAMPLES = 600, 50
 WARM_UP = 0.4  # share of the samples
