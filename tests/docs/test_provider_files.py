@@ -1,4 +1,4 @@
-"""Complete files of each provider, as the page on clusters shows them: they load, and a launch can be tried with them."""
+"""Complete files of each provider on the page of clusters: they load, and a launch can be tried with them."""
 
 from __future__ import annotations
 
