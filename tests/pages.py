@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-_ALONE = ("README.md", "CHANGELOG.md", "SECURITY.md", "docs/model/README.md", "gdp/frame/spec.md")
-KINDS = ("tutorials", "how-to", "reference", "explanation")
+_ALONE = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md", "docs/model/README.md", "gdp/frame/spec.md")
+KINDS = ("tutorials", "how-to", "reference", "explanation", "contributing")
 PAGES = (
     *(ROOT / path for path in _ALONE),
     *sorted((ROOT / "docs").glob("*.md")),

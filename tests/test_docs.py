@@ -33,7 +33,7 @@ from tests.pages import PAGES, ROOT, Block, anchors, blocks, blocks_between, cla
 README = ROOT / "README.md"
 TWO_MACHINES = ROOT / "docs/tutorials/two-machines.md"
 CONFIGURATION = ROOT / "docs/reference/configuration.md"
-CREDENTIALS = ROOT / "docs/how-to/issue-and-revoke.md"
+CREDENTIALS = ROOT / "docs/how-to/keys.md"
 FOG = ROOT / "docs/reference/fog-yaml.md"
 PROVIDERS = ROOT / "docs/reference/providers.md"
 

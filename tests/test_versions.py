@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 import sys
 from collections.abc import Iterator
 from importlib import metadata
@@ -12,6 +13,7 @@ import pytest
 
 import gdp
 from gdp.cli.version import versioned
+from tests.pages import ROOT
 
 _SCRIPTS = metadata.distribution("gdp-ros").entry_points.select(group="console_scripts")
 _COMMANDS = {each.name: each.value for each in _SCRIPTS}
@@ -53,3 +55,21 @@ def test_the_library_has_the_version_of_its_distribution() -> None:
 def test_everything_that_the_library_exports_can_be_imported() -> None:
     for name in gdp.__all__:
         assert getattr(gdp, name) is not None
+
+
+def test_every_file_that_states_the_version_has_that_of_the_distribution() -> None:
+    stated = {
+        "CHANGELOG.md": r"^## \[(\d[^]]*)\] - \d{4}-\d\d-\d\d$",
+        "CITATION.cff": r"^version: (\S+)$",
+        "debian/changelog": r"^gdp-ros \((\S+)\)",
+        "pyproject.toml": r'^version = "(\S+)"$',
+        "ros2/gdp_proxy/package.xml": r"<version>(\S+)</version>",
+    }
+    for name, pattern in stated.items():
+        newest, *_ = re.findall(pattern, (ROOT / name).read_text(), re.MULTILINE)
+        assert newest == metadata.version("gdp-ros"), name
+
+
+def test_the_changelog_has_the_kinds_of_changes_of_keep_a_changelog() -> None:
+    kinds = set(re.findall(r"^### (.+)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE))
+    assert kinds <= {"Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"}

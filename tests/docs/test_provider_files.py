@@ -1,4 +1,4 @@
-"""Complete files of each provider, as their page shows them: they load, and a launch can be tried with them."""
+"""Complete files of each provider on the page of clusters: they load, and a launch can be tried with them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gdp.cli.gdp import main as gdp
 from tests.fog.test_site import border
 from tests.pages import ROOT, Block, blocks
 
-_PAGE = ROOT / "docs/how-to/provider-files.md"
+_PAGE = ROOT / "docs/how-to/clusters.md"
 _BORDER = "/var/lib/gdp/lab"
 _FILES = {block.title: block for block in blocks(_PAGE) if block.language == "yaml"}
 Write = Callable[[str], Path]
