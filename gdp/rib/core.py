@@ -25,7 +25,6 @@ from gdp.control.relay import Relay
 from gdp.control.replica import Digest, Entry, Fetch, Inventory, Key, Replicas
 from gdp.control.waiting import Wait, WaitReason
 from gdp.crypto.certificates import Membership, Role
-from gdp.crypto.fields import Fields, check_sequence
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.diagnosis.facts import RibFacts, RouteFact
@@ -39,7 +38,6 @@ from gdp.limits import (
     NEGATIVE_LEASE_S,
     RIB_NAMES_PER_SENDER,
     RIB_WATCHES_MAX,
-    WITHDRAWAL_MAX_BYTES,
 )
 from gdp.names import Name
 from gdp.rib.digest_tree import DigestTree
@@ -61,6 +59,7 @@ from gdp.trust.audit import Action
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.verifier import AdvertisementVerifier
+from gdp.trust.withdrawal import Withdrawal
 
 __all__ = ["OutgoingStatement", "RibCore", "RibSettings"]
 
@@ -445,20 +444,20 @@ class RibCore:
             expires_s=now.mono_s + min(advertisement.lease_s, left_s),
         )
 
-    def _take_withdrawal(self, withdrawal: Statement, member: Membership, now: Timestamps) -> None:
-        fields = _withdrawal(withdrawal, now)
-        name, advertiser, sequence = fields.name("n"), withdrawal.signer, fields.uint("s")
+    def _take_withdrawal(self, statement: Statement, member: Membership, now: Timestamps) -> None:
+        withdrawal = Withdrawal.from_statement(statement, now.unix_s)
+        name, advertiser, sequence = withdrawal.name, statement.signer, withdrawal.sequence
         known = self._store.get(name, advertiser)
         if not isinstance(known, Route) or sequence < known.sequence:
             raise StatementError(DropReason.STALE, "nothing to withdraw")
         pending_advertisement = UnverifiedAdvertisement.from_statement(parse(known.advertisement))
-        withdrawal.verify(self._policy.verify_membership(pending_advertisement.membership, now.unix_s).key)
-        self._withdraw(known, sequence, withdrawal.wire, pending_advertisement.membership)
+        statement.verify(self._policy.verify_membership(pending_advertisement.membership, now.unix_s).key)
+        self._withdraw(known, sequence, statement.wire, pending_advertisement.membership)
         self._acknowledge(name, advertiser, None, sequence, member.name)
         self._tell_gone(known, now.mono_s, by=member.name)
         self._replicate(name, advertiser)
         if known.is_global and not self._upstream.has(member.name):
-            self._forward_upstream(known, withdrawal.wire, sequence, now.mono_s)
+            self._forward_upstream(known, statement.wire, sequence, now.mono_s)
 
     def _withdraw(self, route: Route, sequence: int, proof: bytes, membership: bytes) -> None:
         gone = Withdrawn(route.sender, max(sequence, route.sequence), route.valid_until_unix_s, proof, membership)
@@ -975,23 +974,23 @@ class RibCore:
         is_same = isinstance(known, Route) and known.advertisement == advertisement.wire
         return is_same and isinstance(known, Route) and (known.is_from_upstream or expires_s > known.expires_s)
 
-    def _take_withdrawn_entry(self, entry: Entry, withdrawal: Statement, now: Timestamps) -> None:
-        fields = _withdrawal(withdrawal, now)
-        name, sequence = fields.name("n"), fields.uint("s")
-        known = self._store.get(name, withdrawal.signer)
+    def _take_withdrawn_entry(self, entry: Entry, statement: Statement, now: Timestamps) -> None:
+        withdrawal = Withdrawal.from_statement(statement, now.unix_s)
+        name, sequence = withdrawal.name, withdrawal.sequence
+        known = self._store.get(name, statement.signer)
         if known is not None and _rank(known) >= 2 * sequence + 1:
             return
-        member = self._sender(entry.membership, withdrawal, now)
-        withdrawal.verify(member.key)
+        member = self._sender(entry.membership, statement, now)
+        statement.verify(member.key)
         until_unix_s = min(entry.until_unix_s, member.not_after_unix_s + int(CLOCK_SKEW_S))
         if known is not None:  # a peer must not shorten the lease of a known entry
             until_unix_s = max(until_unix_s, known.valid_until_unix_s)
         if until_unix_s <= now.unix_s:
             return  # expired here already
         if known is None:
-            self._check_quota(entry.sender, withdrawal.signer)
-        gone = Withdrawn(entry.sender, sequence, until_unix_s, withdrawal.wire, entry.membership)
-        route = self._store.withdraw(name, withdrawal.signer, gone)
+            self._check_quota(entry.sender, statement.signer)
+        gone = Withdrawn(entry.sender, sequence, until_unix_s, statement.wire, entry.membership)
+        route = self._store.withdraw(name, statement.signer, gone)
         if route is not None:
             self._tell_gone(route, now.mono_s, by=entry.sender)
 
@@ -1025,15 +1024,6 @@ def _revocable(statement: Statement) -> list[tuple[bytes, bytes]]:
         found += [(link.fingerprint, key) for key in dict.fromkeys((body.subject.owner_key, issuer_key))]
         issuer_key = link.delegate_key
     return found
-
-
-def _withdrawal(statement: Statement, now: Timestamps) -> Fields:
-    """Return the fields of a withdrawal. Raises ``StatementError``: MALFORMED, or TOO_BIG to be forwarded."""
-    fields = statement.expect(StatementType.WITHDRAW)
-    if len(statement.wire) > WITHDRAWAL_MAX_BYTES:
-        raise StatementError(DropReason.TOO_BIG, "a withdrawal")
-    check_sequence(fields.uint("s"), now.unix_s)
-    return fields
 
 
 def _rank(known: Route | Withdrawn) -> int:

@@ -25,6 +25,7 @@ from gdp.trust.advertisement import UnverifiedAdvertisement, sign_advertisement
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
+from gdp.trust.withdrawal import Withdrawal
 from tests.gdp.trust.world import (
     CAMERA,
     CLOUD,
@@ -111,7 +112,8 @@ def negative_upstream(to: RibCore, now: Timestamps = START) -> list[OutgoingStat
 
 
 def withdrawal(sequence: int, by: Identity = ROBOT, key: Identity | None = None) -> bytes:
-    return sign(StatementType.WITHDRAW, {"n": NAME, "s": sequence}, by.name, (key or by).key)
+    body = {"n": NAME, "right": Right.PUBLISH.value, "s": sequence}
+    return sign(StatementType.WITHDRAW, body, by.name, (key or by).key)
 
 
 def local_advertisement(sequence: int = 1) -> bytes:
@@ -291,7 +293,7 @@ def test_advertising_and_withdrawing_in_turn_does_not_pass_the_quota() -> None:
     for number in range(10):
         own = Subject.of(Metadata({"kind": "topic", "name": f"/own{number}"}), ROBOT.key.public.compressed)
         tell(at_rib, advertisement(subject=own, chain=[]))
-        tell(at_rib, sign(StatementType.WITHDRAW, {"n": own.name, "s": 2}, ROBOT.name, ROBOT.key))
+        tell(at_rib, Withdrawal(own.name, Right.PUBLISH, 2).to_wire(ROBOT))
     assert at_rib.refusals == {DropReason.QUOTA: 7, DropReason.STALE: 7}  # a node may have as many as are free
 
 

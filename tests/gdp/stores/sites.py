@@ -19,7 +19,7 @@ from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.keys import SigningKey
-from gdp.crypto.statements import StatementType, parse, sign
+from gdp.crypto.statements import StatementType, parse
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
 from gdp.metadata import Metadata
@@ -36,6 +36,7 @@ from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
 from gdp.trust.verifier import AdvertisementVerifier
+from gdp.trust.withdrawal import Withdrawal
 
 EVIDENCE_S = 3_600  # for which advertisements can be proven: the RtCert ends before the memberships
 START_CLUSTER = Path(__file__).parents[3] / "scripts" / "start_cluster.sh"
@@ -80,8 +81,7 @@ class Site:
         return self.relayed(wire)
 
     def withdrawal(self, name: str, sequence: int) -> bytes:
-        body = {"n": self.subject(name).name, "s": sequence}
-        return self.relayed(sign(StatementType.WITHDRAW, body, self.robot.name, self.robot.key))
+        return self.relayed(Withdrawal(self.subject(name).name, Right.PUBLISH, sequence).to_wire(self.robot))
 
     def relayed(self, statement: bytes) -> bytes:
         return Relay(statement, (), self.switch.membership).to_wire(self.switch.name, self.switch.key)
