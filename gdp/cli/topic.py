@@ -33,7 +33,7 @@ _HEAD: Final = ("NAME", "TYPE", "DIRECTION", "MSG/S", "RATE", "SIZE", "PUBLISHER
 
 
 class _Topics(ExtendedGroup):
-    extensions: ClassVar[Mapping[str, str]] = dict.fromkeys(("hz", "bw", "echo"), "proxy.cli.topic")
+    extensions: ClassVar[Mapping[str, str]] = dict.fromkeys(("hz", "bw", "echo"), "topic")
 
 
 app = typer.Typer(cls=_Topics, no_args_is_help=True, help="List, measure and read topics.")
