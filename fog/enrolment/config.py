@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from gdp.nodes.schema import Section
+from gdp.config.schema import Section
 
 __all__ = ["EnrolmentConfig", "host_and_port", "listening_place", "reachable_place"]
 

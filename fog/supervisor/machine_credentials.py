@@ -21,8 +21,8 @@ from fog.site import Site
 from fog.supervisor.event_log import EventLog
 from fog.supervisor.journal import Journal
 from fog.supervisor.record import Outcome, Record
+from gdp.config.config import SwitchConfig
 from gdp.errors import LocalError
-from gdp.nodes.config import SwitchConfig
 from gdp.stores.issue import DAY_S
 from gdp.stores.keyring import load_domain
 from gdp.trust.enrolment import TOKEN_BYTES, Ticket

@@ -26,9 +26,9 @@ from gdp.cli.node import (
     set_up_logging,
 )
 from gdp.cli.version import HELP, Version
+from gdp.config.config import RibConfig
 from gdp.crypto.certificates import Role
 from gdp.names import Name
-from gdp.nodes.config import RibConfig
 from gdp.nodes.membership import load_member
 from gdp.nodes.rib import run_rib
 from gdp.nodes.uplink import wait_for_device

@@ -19,6 +19,8 @@ from itertools import chain
 from pathlib import Path
 from typing import Final
 
+from gdp.config.config import SwitchConfig
+from gdp.config.relay_config import RelayConfig
 from gdp.control.endpoint_record import EndpointRecord
 from gdp.crypto.certificates import Membership, Root, Unverified
 from gdp.crypto.fields import Fields
@@ -31,13 +33,11 @@ from gdp.enrolment.wire import INSTANCE_BYTES, EnrolmentError, UnreachableError
 from gdp.errors import GdpError, LocalError, RemoteError
 from gdp.host_port import split_host_port
 from gdp.names import Name
-from gdp.nodes.config import SwitchConfig
 from gdp.nodes.control_client import NotRunningError, ask_node, find_control_socket
 from gdp.nodes.control_protocol import Command
 from gdp.nodes.endpoint_files import RECORD_SUFFIX, own_record
 from gdp.nodes.membership import load_policy
 from gdp.nodes.relay import relay_control_path
-from gdp.nodes.relay_config import RelayConfig
 from gdp.stores.files import public, read_public, write_all
 from gdp.stores.issue import install_delegation
 from gdp.stores.keyring import (

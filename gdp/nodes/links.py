@@ -15,13 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from gdp.config.config import LinksConfig
 from gdp.control.endpoint_record import EndpointRecord
 from gdp.control.tunnel_plan import Dialer, RebindSchedule, TunnelId, planned_tunnels
 from gdp.crypto.certificates import Membership
 from gdp.crypto.identity import Identity
 from gdp.errors import GdpError, LocalError
 from gdp.names import Name
-from gdp.nodes.config import LinksConfig
 from gdp.nodes.endpoint_files import record_files
 from gdp.nodes.own_endpoints import OwnEndpoints
 from gdp.nodes.runtime import Runtime

@@ -10,11 +10,11 @@ import time
 from collections.abc import Iterable, Sequence
 from typing import Final
 
+from gdp.config.config import LinksConfig
 from gdp.control.endpoint_record import CANDIDATES_MAX, Candidate, CandidateType, EndpointRecord
 from gdp.control.endpoints import Endpoint
 from gdp.crypto.identity import Identity
 from gdp.errors import DropReason, LocalError, StatementError
-from gdp.nodes.config import LinksConfig
 from gdp.nodes.endpoint_files import own_record, public_candidates
 from gdp.nodes.tunnels import Tunnels
 from gdp.ports.address_monitor import AddressMonitor

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from gdp.config.relay_config import RelayConfig
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import DROP_COUNTERS, DropReason
@@ -26,7 +27,6 @@ from gdp.nodes.credentials import Credentials
 from gdp.nodes.membership import load_member
 from gdp.nodes.metrics import serve_metrics
 from gdp.nodes.node_log import LOOK_S
-from gdp.nodes.relay_config import RelayConfig
 from gdp.nodes.relay_context import RelayContext
 from gdp.nodes.relay_dialer import BorderDialer
 from gdp.nodes.relay_loop import RelayLoop

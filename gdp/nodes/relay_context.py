@@ -10,10 +10,10 @@ import ssl
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gdp.config.relay_config import RelayConfig
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import parse
 from gdp.errors import RemoteError
-from gdp.nodes.relay_config import RelayConfig
 from gdp.nodes.relay_loop import RelayLoop
 from gdp.nodes.relay_tls import tls_context
 from gdp.ports.tap import relay_alias

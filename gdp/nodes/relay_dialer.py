@@ -18,11 +18,11 @@ import threading
 import time
 from typing import Final, NamedTuple
 
+from gdp.config.relay_config import RelayBorder
 from gdp.crypto.certificates import Membership
 from gdp.errors import LocalError, StatementError
 from gdp.host_port import split_host_port
 from gdp.names import Name
-from gdp.nodes.relay_config import RelayBorder
 from gdp.nodes.relay_context import RelayContext
 from gdp.nodes.relay_link import RelayLink, RelayPort, prepare_socket
 from gdp.nodes.relay_server import port_status

@@ -14,10 +14,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
+from gdp.config.relay_config import RelayConfig, RelayServer
 from gdp.crypto.certificates import Membership
 from gdp.errors import LocalError, StatementError
 from gdp.names import Name
-from gdp.nodes.relay_config import RelayConfig, RelayServer
 from gdp.nodes.relay_context import RelayContext
 from gdp.nodes.relay_hello import HELLO_S, HelloWait, hand_over
 from gdp.nodes.relay_link import RelayLink, RelayPort, prepare_socket

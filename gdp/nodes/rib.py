@@ -11,12 +11,12 @@ from collections.abc import Callable
 
 from gdp.client.attachment import attachment_waits
 from gdp.client.rib_host import RibHost
+from gdp.config.config import RibConfig
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.host.service_notifier import service_notifier
 from gdp.names import Name
 from gdp.nodes.audit import audit_folder, keep_audit
-from gdp.nodes.config import RibConfig
 from gdp.nodes.control_client import control_path
 from gdp.nodes.control_socket import ControlHandlers
 from gdp.nodes.control_status import node_status

@@ -19,10 +19,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
+from gdp.config.config import ClusterConfig, RibConfig, SwitchConfig
+from gdp.config.relay_config import RelayConfig
 from gdp.nodes.audit import audit_folder
-from gdp.nodes.config import ClusterConfig, RibConfig, SwitchConfig
 from gdp.nodes.credentials import watched_folders
-from gdp.nodes.relay_config import RelayConfig
 from gdp.nodes.single_instance import lock_directory
 from gdp.ports.sandbox import Capability, Needs, confine
 

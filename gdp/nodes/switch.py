@@ -10,13 +10,13 @@ import logging
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
+from gdp.config.config import SwitchConfig
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import LocalError, StatementError
 from gdp.host.service_notifier import service_notifier
 from gdp.nodes.audit import keep_audit
-from gdp.nodes.config import SwitchConfig
 from gdp.nodes.control_client import control_path
 from gdp.nodes.control_socket import ControlHandlers
 from gdp.nodes.control_status import node_status

@@ -15,6 +15,7 @@ from functools import partial
 from types import MappingProxyType
 from typing import Final
 
+from gdp.config.config import LinksConfig
 from gdp.control.endpoint_record import UPLINKS_MAX, EndpointRecord
 from gdp.control.endpoints import Endpoint, inner_address, tunnel_vni
 from gdp.control.tunnel_plan import UNDERLAY_PREFIXES, TunnelId, tunnel_ifname, underlay_ifname
@@ -23,7 +24,6 @@ from gdp.crypto.tunnel_key import TunnelKey
 from gdp.errors import LocalError
 from gdp.limits import COST_AUTO
 from gdp.names import Name
-from gdp.nodes.config import LinksConfig
 from gdp.nodes.runtime import Runtime
 from gdp.ports.tunnel.outside_filter import OutsideFilter
 from gdp.ports.tunnel.path_mtu import route_mtu, tunnel_mtu

@@ -10,9 +10,9 @@ import logging
 import time
 from collections.abc import Iterable, Iterator
 
+from gdp.config.config import UplinkPlane
 from gdp.errors import LocalError
 from gdp.extras import require_extra
-from gdp.nodes.config import UplinkPlane
 from gdp.nodes.single_instance import own_devices
 from gdp.ports.netdev import NetdevPlane, NoDeviceError
 from gdp.ports.raw import RawPlane

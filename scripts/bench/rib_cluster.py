@@ -29,10 +29,10 @@ from domain import BenchDomain
 from report import Rounds, percentile, progress
 from skeleton import Options, Outcome, command_line, run_bench
 
+from gdp.config.config import ClusterConfig
 from gdp.errors import LocalError, StoreError
 from gdp.host.run_registry import RunRegistry
 from gdp.names import Name
-from gdp.nodes.config import ClusterConfig
 from gdp.rib.route import Route
 from gdp.sansio import Timestamps
 from gdp.stores.cluster import ClusterStore, load_functions

@@ -11,10 +11,10 @@ from typing import cast
 import pytest
 import yaml
 
+from gdp.config.relay_config import RelayConfig
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.nodes import relay_server as relay_server_module
-from gdp.nodes.relay_config import RelayConfig
 from gdp.nodes.relay_context import RelayContext
 from gdp.nodes.relay_link import RelayLink, RelayPort, prepare_socket
 from gdp.nodes.relay_loop import RelayLoop

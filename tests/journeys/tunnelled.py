@@ -17,10 +17,10 @@ from types import SimpleNamespace
 from typing import Final, cast
 from unittest import mock
 
+from gdp.config.config import LinksConfig
 from gdp.control.endpoints import Endpoint
 from gdp.control.tunnel_plan import TunnelId, tunnel_ifname
 from gdp.crypto.tunnel_key import TunnelKey
-from gdp.nodes.config import LinksConfig
 from gdp.nodes.endpoint_files import RECORD_SUFFIX, own_record, public_candidates
 from gdp.nodes.links import LINKS_LOOK_S, TunnelLinks
 from gdp.nodes.runtime import Runtime

@@ -24,6 +24,7 @@ from member_endpoint import End
 from peers.jsonl import say
 
 from gdp.client.writer_proxy import WriterProxyState
+from gdp.config.config import SwitchConfig
 from gdp.control.fragments import ControlFragmenter
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
@@ -33,7 +34,6 @@ from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import HOPS_MAX, NACKS_PER_REPORT
 from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
-from gdp.nodes.config import SwitchConfig
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
 from gdp.nodes.runtime import Runtime
 from gdp.ports.mmsg import make_batch

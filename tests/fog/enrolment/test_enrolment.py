@@ -17,13 +17,13 @@ from fog.enrolment.robot_config import add_rules, reload_proxy, remove_rules
 from fog.host.bundle import install
 from fog.host.enrolment import enrol
 from fog.site import open_site
+from gdp.config.config import RibConfig, SwitchConfig
+from gdp.config.drop_in import drop_in_directory
 from gdp.crypto.certificates import Role
 from gdp.crypto.statements import parse
 from gdp.errors import ConfigError, LocalError
-from gdp.nodes.config import RibConfig, SwitchConfig
 from gdp.nodes.control_socket import ControlHandlers, serve_control_in_thread
 from gdp.nodes.delegation_store import DelegationStore
-from gdp.nodes.drop_in import drop_in_directory
 from gdp.nodes.membership import load_member
 from gdp.stores.keyring import load_identity, load_owner
 from gdp.trust.revocation import Revocation

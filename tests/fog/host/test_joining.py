@@ -13,10 +13,10 @@ import pytest
 from fog.enrolment.bootstrap import joining_boot
 from fog.host.bundle import JOIN_FILE, install
 from fog.host.joining import join
+from gdp.config.config import SwitchConfig
+from gdp.config.relay_config import RelayConfig
 from gdp.enrolment.wire import EnrolmentError, UnreachableError
 from gdp.errors import LocalError
-from gdp.nodes.config import SwitchConfig
-from gdp.nodes.relay_config import RelayConfig
 from gdp.trust.join_token import JoinToken
 from proxy.config.config import ProxyConfig
 from tests.fog.enrolment.desk import CLUSTER

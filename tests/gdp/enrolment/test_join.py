@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from gdp.config.config import SwitchConfig
+from gdp.config.relay_config import RelayConfig
 from gdp.control.endpoint_record import CandidateType, EndpointRecord
 from gdp.crypto.certificates import Role
 from gdp.enrolment.member_files import MemberFiles
-from gdp.nodes.config import SwitchConfig
 from gdp.nodes.membership import load_policy
-from gdp.nodes.relay_config import RelayConfig
 from gdp.stores.keyring import load_identity
 from tests.gdp.enrolment.lab import Lab, running_lab
 

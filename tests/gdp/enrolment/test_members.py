@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from gdp.config.relay_config import RelayConfig
 from gdp.crypto.statements import parse
 from gdp.enrolment import agent as agent_module
 from gdp.enrolment import desk as desk_module
@@ -24,7 +25,6 @@ from gdp.enrolment.wire import EnrolmentError, Refusal
 from gdp.errors import LocalError, StatementError
 from gdp.metadata import Metadata
 from gdp.names import Name
-from gdp.nodes.relay_config import RelayConfig
 from gdp.stores.issue import delegate
 from gdp.stores.keyring import CARD, load_identity
 from gdp.trust.mail import Mail

@@ -9,6 +9,7 @@ from unittest.mock import MagicMock
 
 import pytest
 
+from gdp.config.config import LinksConfig
 from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
 from gdp.control.endpoints import Endpoint
 from gdp.control.settings import NodeSettings
@@ -17,7 +18,6 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.tunnel_key import TunnelKey
 from gdp.names import Name
 from gdp.nodes import tunnels as tunnels_module
-from gdp.nodes.config import LinksConfig
 from gdp.nodes.links import LINKS_LOOK_S, TunnelLinks
 from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table

@@ -9,12 +9,12 @@ from typing import cast
 
 import pytest
 
+from gdp.config.config import LinksConfig
 from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
 from gdp.control.endpoints import Endpoint
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.tunnel_key import TunnelKey
-from gdp.nodes.config import LinksConfig
 from gdp.nodes.links import TunnelLinks
 from gdp.nodes.runtime import Runtime
 from gdp.switch.core import SwitchCore

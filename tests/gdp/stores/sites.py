@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gdp.config.config import ClusterConfig
 from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.query import Query, Response
 from gdp.control.relay import Relay
@@ -24,7 +25,6 @@ from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
 from gdp.metadata import Metadata
 from gdp.names import Name
-from gdp.nodes.config import ClusterConfig
 from gdp.rib.core import OutgoingStatement, RibCore, RibSettings
 from gdp.rib.store import MemoryStore, Store
 from gdp.sansio import Timestamps

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from gdp.config.config import RibConfig, SwitchConfig
+from gdp.config.machine_file import read_sections
 from gdp.errors import ConfigError
-from gdp.nodes.config import RibConfig, SwitchConfig
-from gdp.nodes.machine_file import read_sections
 
 
 @pytest.fixture

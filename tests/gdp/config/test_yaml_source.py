@@ -8,8 +8,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from gdp.config.yaml_source import Plain, YamlSource, read_yaml
 from gdp.errors import ConfigError
-from gdp.nodes.yaml_source import Plain, YamlSource, read_yaml
 
 
 def read(folder: Path, text: str) -> YamlSource:

@@ -7,12 +7,12 @@ from typing import ClassVar
 
 import pytest
 
+from gdp.config.config import PortConfig, RibConfig, SwitchConfig
+from gdp.config.schema import Section, load
+from gdp.config.yaml_source import ConfigFileError
 from gdp.errors import ConfigError
 from gdp.limits import COST_AUTO, COST_DEFAULT, DEAD_S, HELLO_S, RIB_NAMES_PER_SENDER
 from gdp.names import Name
-from gdp.nodes.config import PortConfig, RibConfig, SwitchConfig
-from gdp.nodes.schema import Section, load
-from gdp.nodes.yaml_source import ConfigFileError
 
 SWITCH = """\
 identity: id

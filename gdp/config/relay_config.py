@@ -10,9 +10,9 @@ from typing import Annotated, Final
 
 from pydantic import Field, IPvAnyAddress, field_validator, model_validator
 
+from gdp.config.config import ServerText
+from gdp.config.schema import Directory, Domain, Metrics, NewFile, RequiredName, Section, Unique, load
 from gdp.names import Name
-from gdp.nodes.config import ServerText
-from gdp.nodes.schema import Directory, Domain, Metrics, NewFile, RequiredName, Section, Unique, load
 from gdp.relay.framing import MTU_MAX, MTU_MIN
 
 __all__ = ["RelayBorder", "RelayConfig", "RelayServer"]

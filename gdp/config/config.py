@@ -19,6 +19,18 @@ from pydantic import (
     model_validator,
 )
 
+from gdp.config.schema import (
+    Directory,
+    Domain,
+    ExistingFile,
+    Ifname,
+    Metrics,
+    NewFile,
+    RequiredName,
+    Section,
+    Unique,
+    load,
+)
 from gdp.control.endpoint_record import UPLINKS_MAX
 from gdp.control.endpoints import Endpoint
 from gdp.control.hello import INTERVAL_MAX_MS, Timing
@@ -41,18 +53,6 @@ from gdp.limits import (
     RIB_WATCHES_MAX,
     SCAPY_KEEPALIVE_MS,
     TABLE_MAX,
-)
-from gdp.nodes.schema import (
-    Directory,
-    Domain,
-    ExistingFile,
-    Ifname,
-    Metrics,
-    NewFile,
-    RequiredName,
-    Section,
-    Unique,
-    load,
 )
 from gdp.ports.kernel.abi import ENTRIES_DEFAULT
 from gdp.stores.cluster_address import ClusterAddress

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from gdp.config.found_config import find_switch_config
 from gdp.errors import LocalError
-from gdp.nodes.found_config import find_switch_config
 
 
 def _made(*parts: str | Path) -> Path:

@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from gdp.nodes.yaml_source import KeyPath, Mark, Plain, YamlSource, read_yaml
+from gdp.config.yaml_source import KeyPath, Mark, Plain, YamlSource, read_yaml
 
 __all__ = ["MACHINE_FILE", "NODE_SECTIONS", "read_sections", "section_source"]
 

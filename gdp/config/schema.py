@@ -1,6 +1,6 @@
 """Common schema of configuration files: strict fields, paths relative to the file, errors with their position in it.
 
-I/O; loading reads files and changes nothing. ``gdp/nodes/config.py`` and ``proxy/config/config.py`` state the keys.
+I/O; loading reads files and changes nothing. ``gdp/config/config.py`` and ``proxy/config/config.py`` state the keys.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ import orjson
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, ValidationInfo
 from pydantic_core import ErrorDetails
 
+from gdp.config.machine_file import section_source
+from gdp.config.yaml_source import ConfigFileError, KeyPath, YamlSource, read_yaml
 from gdp.errors import ConfigError, LocalError
 from gdp.names import Name
-from gdp.nodes.machine_file import section_source
-from gdp.nodes.yaml_source import ConfigFileError, KeyPath, YamlSource, read_yaml
 
 __all__ = [
     "Directory",
