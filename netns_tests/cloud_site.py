@@ -27,7 +27,7 @@ from fog.supervisor.record import Record
 from gdp.errors import GdpError
 from gdp.host.run_registry import Run
 from gdp.nodes.control_client import ask_node, find_control_socket
-from gdp.nodes.control_protocol import Command
+from gdp.state.control_protocol import Command
 from netns_tests.datacenter.debian_root import cache_folder
 from netns_tests.datacenter.ec2 import UBUNTU
 from netns_tests.datacenter.router import CALLER

@@ -21,7 +21,7 @@ from fog.enrolment.members import Authority, metadata_of
 from gdp.config.drop_in import drop_in_directory, locked, read_drop_in, write_drop_in
 from gdp.errors import GdpError, LocalError
 from gdp.nodes.control_client import NotRunningError, ask_node, find_control_socket
-from gdp.nodes.control_protocol import Command
+from gdp.state.control_protocol import Command
 from gdp.stores.keyring import load_public_key
 from proxy.config import matching
 from proxy.config.config import ProxyConfig

@@ -19,8 +19,8 @@ from gdp.cli.topic import Host, KnownName, Sockets, none_runs
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.nodes.control_client import NotRunningError, ask_node, find_control_socket
-from gdp.nodes.control_protocol import Command
 from gdp.nodes.running_nodes import RunningNode, find_running_nodes, read_topics
+from gdp.state.control_protocol import Command
 
 __all__ = ["app"]
 

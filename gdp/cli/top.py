@@ -21,7 +21,7 @@ from gdp.cli.output import show
 from gdp.cli.topic import Host, JsonLines, Sockets, answers_of
 from gdp.nodes.running_nodes import find_running_nodes, read_topics
 from gdp.nodes.topic_rates import RatedRow, rated_rows
-from gdp.nodes.topic_rows import Direction
+from gdp.state.topic_rows import Direction
 
 if TYPE_CHECKING:
     from rich.table import Table

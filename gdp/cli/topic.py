@@ -22,8 +22,8 @@ from gdp.nodes.delegation_store import DelegationStore
 from gdp.nodes.membership import load_member
 from gdp.nodes.running_nodes import Found, NodeTopics, RunningNode, find_running_nodes, read_topics
 from gdp.nodes.topic_rates import RatedRow, known_names, rated_rows
-from gdp.nodes.topic_rows import Direction, held_row
 from gdp.session.settings import settings_of
+from gdp.state.topic_rows import Direction, held_row
 
 __all__ = ["Host", "JsonLines", "KnownName", "Sockets", "answers_of", "app", "none_runs"]
 

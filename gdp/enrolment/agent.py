@@ -34,10 +34,10 @@ from gdp.errors import GdpError, LocalError, RemoteError
 from gdp.host_port import split_host_port
 from gdp.names import Name
 from gdp.nodes.control_client import NotRunningError, ask_node, find_control_socket
-from gdp.nodes.control_protocol import Command
 from gdp.nodes.endpoint_files import RECORD_SUFFIX, own_record
 from gdp.nodes.membership import load_policy
 from gdp.nodes.relay import relay_control_path
+from gdp.state.control_protocol import Command
 from gdp.stores.files import public, read_public, write_all
 from gdp.stores.issue import install_delegation
 from gdp.stores.keyring import (

@@ -14,7 +14,9 @@ from typing import Final
 
 from gdp.errors import LocalError
 from gdp.names import Name
-from gdp.nodes.control_protocol import (
+from gdp.nodes.control_socket import CONTROL_SOCKET, connect_control
+from gdp.nodes.single_instance import lock_directories, lock_directory
+from gdp.state.control_protocol import (
     RESPONSE_MAX_BYTES,
     Command,
     ControlRequestError,
@@ -24,8 +26,6 @@ from gdp.nodes.control_protocol import (
     decode_response,
     encode_request,
 )
-from gdp.nodes.control_socket import CONTROL_SOCKET, connect_control
-from gdp.nodes.single_instance import lock_directories, lock_directory
 from gdp.stores.keyring import CARD, load_card
 
 __all__ = [

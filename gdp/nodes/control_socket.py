@@ -24,22 +24,22 @@ from typing import Final
 
 from gdp.errors import GdpError, LocalError
 from gdp.names import Name
-from gdp.nodes.control_protocol import (
+from gdp.ports.readiness import readable
+from gdp.state.control_protocol import (
     LINE_MAX_BYTES,
     Command,
     ControlRequestError,
     LineBuffer,
+    Respond,
     Response,
     decode_request,
     encode_response,
 )
-from gdp.ports.readiness import readable
 
 __all__ = [
     "CONTROL_SOCKET",
     "ControlHandlers",
     "ControlServer",
-    "Respond",
     "connect_control",
     "serve_control_in_thread",
 ]
@@ -54,9 +54,6 @@ _IDLE_S: Final = 10.0  # a connection without a request closes in favour of a ne
 _RECEIVE_BYTES: Final = 4_096
 _PROBE_S: Final = 0.5
 _TIMEVAL: Final = struct.Struct("@ll")
-
-
-Respond = Callable[[Response], None]
 
 
 def _ask_nothing(_arguments: Mapping[str, object], _respond: Respond) -> None:

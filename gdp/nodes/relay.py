@@ -22,7 +22,6 @@ from gdp.host.service_notifier import service_notifier
 from gdp.names import Name
 from gdp.nodes.control_client import control_path
 from gdp.nodes.control_socket import ControlHandlers, ControlServer
-from gdp.nodes.control_status import node_status
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.membership import load_member
 from gdp.nodes.metrics import serve_metrics
@@ -39,6 +38,7 @@ from gdp.nodes.switch_watch import SwitchWatch
 from gdp.ports.address_monitor import AddressMonitor
 from gdp.ports.tap import TapDevice, tap_name
 from gdp.relay.connection import ConnectionCounters
+from gdp.state.control_status import node_status
 from gdp.telemetry.health import Health
 from gdp.telemetry.sources import Sources
 

@@ -14,8 +14,8 @@ from typing import Final
 from gdp.errors import GdpError
 from gdp.names import Name
 from gdp.nodes.control_client import NotRunningError, ask_node, control_sockets
-from gdp.nodes.control_protocol import Command, Response
-from gdp.nodes.topic_rows import TopicRow, rows_from_fields
+from gdp.state.control_protocol import Command, Response
+from gdp.state.topic_rows import TopicRow, rows_from_fields
 
 __all__ = ["Found", "NodeTopics", "RunningNode", "find_running_nodes", "read_topics"]
 

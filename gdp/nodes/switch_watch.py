@@ -12,7 +12,7 @@ from typing import Final
 
 from gdp.errors import GdpError
 from gdp.nodes.control_client import ask_node
-from gdp.nodes.control_protocol import Command
+from gdp.state.control_protocol import Command
 
 __all__ = ["SwitchWatch", "peers_up"]
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 from gdp.names import Name
 from gdp.nodes.running_nodes import NodeTopics, RunningNode
-from gdp.nodes.topic_rows import Direction, TopicRow
+from gdp.state.topic_rows import Direction, TopicRow
 
 __all__ = ["RatedRow", "known_names", "rated_rows"]
 

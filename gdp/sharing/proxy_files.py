@@ -16,8 +16,8 @@ from gdp.config.yaml_source import Plain, YamlSource, read_yaml
 from gdp.errors import ConfigError, LocalError
 from gdp.names import Name
 from gdp.nodes.control_client import NotRunningError, ask_node, find_control_socket
-from gdp.nodes.control_protocol import Command
 from gdp.ros_names import is_name, matches
+from gdp.state.control_protocol import Command
 
 __all__ = ["ProxyFiles", "Side", "StatedRule", "Undelegated", "fits"]
 

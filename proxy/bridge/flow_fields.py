@@ -5,7 +5,7 @@ Sans-I/O.
 
 from __future__ import annotations
 
-from gdp.nodes.snapshot import short_id
+from gdp.state.snapshot import short_id
 from proxy.bridge.desired_flows import FlowSpec
 from proxy.bridge.imported_service import ImportedService
 

@@ -10,7 +10,7 @@ from functools import partial
 
 from gdp.client.participant import Participant, Topic
 from gdp.message.loss import LossReason
-from gdp.nodes.topic_rows import Direction, TopicRow, held_row
+from gdp.state.topic_rows import Direction, TopicRow, held_row
 from proxy.bridge.bridge import Flow
 from proxy.bridge.desired_flows import FlowSpec
 from proxy.bridge.exposed_service import ExposedService

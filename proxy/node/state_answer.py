@@ -1,6 +1,6 @@
 """Answer of a proxy to the diagnostic request ``state``: its flows of one name.
 
-I/O through the bridge, which it only reads. ``gdp/nodes/state_answers.py`` says who gets an answer.
+I/O through the bridge, which it only reads. ``gdp/state/state_answers.py`` says who gets an answer.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from gdp.control.diagnostics import Question
 from gdp.crypto.identity import Identity
 from gdp.diagnosis.facts import ProxyFacts, WaitFact
 from gdp.names import ZERO, Name
-from gdp.nodes.state_answers import answer_state
 from gdp.sansio import Timestamps
+from gdp.state.state_answers import answer_state
 from gdp.trust.domain import Policy
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.context import BridgeContext

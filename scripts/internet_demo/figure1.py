@@ -23,7 +23,7 @@ import yaml
 
 from gdp.errors import LocalError
 from gdp.nodes.control_client import ask_node, find_control_socket
-from gdp.nodes.control_protocol import Command
+from gdp.state.control_protocol import Command
 from internet.access import Access
 from internet.host import Host
 from internet.laboratory import Laboratory

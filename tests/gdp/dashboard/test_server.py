@@ -23,8 +23,8 @@ from gdp.dashboard.server import DashboardServer
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.nodes.control_client import control_path
-from gdp.nodes.control_protocol import Response, encode_response
 from gdp.nodes.control_socket import CONTROL_SOCKET
+from gdp.state.control_protocol import Response, encode_response
 
 
 @contextmanager

@@ -11,7 +11,6 @@ import pytest
 
 from gdp.errors import LocalError
 from gdp.nodes.control_client import NotRunningError, ask_node, find_control_socket, request_control
-from gdp.nodes.control_protocol import LINE_MAX_BYTES, Command, Response, decode_response
 from gdp.nodes.control_socket import (
     CONTROL_SOCKET,
     ControlHandlers,
@@ -19,6 +18,7 @@ from gdp.nodes.control_socket import (
     connect_control,
     serve_control_in_thread,
 )
+from gdp.state.control_protocol import LINE_MAX_BYTES, Command, Response, decode_response
 
 WAIT_S = 5.0
 

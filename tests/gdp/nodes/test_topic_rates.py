@@ -9,10 +9,10 @@ import pytest
 
 from gdp.errors import RemoteError
 from gdp.names import Name
-from gdp.nodes.control_protocol import Response, encode_response
 from gdp.nodes.running_nodes import NodeTopics, RunningNode
 from gdp.nodes.topic_rates import rated_rows
-from gdp.nodes.topic_rows import ROWS_MAX, Direction, TopicRow, rows_from_fields, rows_to_fields
+from gdp.state.control_protocol import Response, encode_response
+from gdp.state.topic_rows import ROWS_MAX, Direction, TopicRow, rows_from_fields, rows_to_fields
 
 NAME = Name(bytes(range(32)))
 PROXY = RunningNode(Path("/p.sock"), "proxy", Name(b"p" * 32))

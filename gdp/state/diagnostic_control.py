@@ -14,9 +14,8 @@ from gdp.control.diagnostics import Diagnostics, Reply
 from gdp.errors import LocalError
 from gdp.limits import DIAGNOSTIC_REPLY_MAX_BYTES, HOPS_MAX
 from gdp.names import ZERO, Name
-from gdp.nodes.control_protocol import Response
-from gdp.nodes.control_socket import Respond
 from gdp.sansio import Timestamps
+from gdp.state.control_protocol import Respond, Response
 from gdp.trust.domain import Policy
 
 __all__ = ["DiagnosticCommands", "Row", "TableSource", "as_json"]

@@ -12,9 +12,9 @@ from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.neighbour import Neighbour, NeighbourState
 from gdp.errors import DropReason
 from gdp.names import Name
-from gdp.nodes.diagnostic_control import Row, TableSource
 from gdp.ports.plane import Plane
 from gdp.sansio import Timestamps
+from gdp.state.diagnostic_control import Row, TableSource
 from gdp.trust.domain import Policy
 
 __all__ = ["common_tables", "domain_label", "seconds_left"]

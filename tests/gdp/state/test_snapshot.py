@@ -7,7 +7,8 @@ from typing import Any
 
 from gdp.control.link_state import Scope
 from gdp.nodes.port_counters import PortCounters
-from gdp.nodes.snapshot import (
+from gdp.simulation.simulation import Simulation
+from gdp.state.snapshot import (
     ID_CHARS,
     member_snapshot,
     node_snapshot,
@@ -16,7 +17,6 @@ from gdp.nodes.snapshot import (
     switch_snapshot,
     topology_snapshot,
 )
-from gdp.simulation.simulation import Simulation
 from gdp.telemetry.sources import Sources
 from gdp.trust.right import Right
 from tests.journeys.flows import ROBOT, SERVER, Flow, flowing, ring

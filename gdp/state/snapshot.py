@@ -21,8 +21,8 @@ from gdp.control.link_state import Scope
 from gdp.crypto.identity import Identity
 from gdp.errors import DropReason
 from gdp.names import Name
-from gdp.nodes.link_rows import link_status
 from gdp.rib.core import RibCore
+from gdp.state.link_rows import link_status
 from gdp.switch.core import SwitchCore
 from gdp.telemetry.sources import LinkRow, Sources
 

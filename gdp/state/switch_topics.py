@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 
 from gdp.names import NAME_BYTES, Name
-from gdp.nodes.topic_rows import Direction, TopicRow
+from gdp.state.topic_rows import Direction, TopicRow
 from gdp.switch.local_advertisements import LocalAdvertisement
 from gdp.trust.right import Right
 

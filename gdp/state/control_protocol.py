@@ -21,7 +21,7 @@ the reply has come, so that responses may overtake each other.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
@@ -36,6 +36,7 @@ __all__ = [
     "ControlRequestError",
     "LineBuffer",
     "Request",
+    "Respond",
     "Response",
     "decode_request",
     "decode_response",
@@ -102,6 +103,9 @@ class Response:
     def is_ok(self) -> bool:
         """Return whether the node executed the command."""
         return not self.error
+
+
+Respond = Callable[[Response], None]
 
 
 class LineBuffer:

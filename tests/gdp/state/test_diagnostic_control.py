@@ -10,12 +10,12 @@ import pytest
 from gdp.control.diagnostics import Question
 from gdp.errors import LocalError
 from gdp.nodes.control_client import NodeConnection
-from gdp.nodes.control_protocol import Response
-from gdp.nodes.control_socket import CONTROL_SOCKET, ControlHandlers, Respond, serve_control_in_thread
-from gdp.nodes.diagnostic_control import DiagnosticCommands, as_json
+from gdp.nodes.control_socket import CONTROL_SOCKET, ControlHandlers, serve_control_in_thread
 from gdp.sansio import Timestamps
 from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from gdp.state.control_protocol import Respond, Response
+from gdp.state.diagnostic_control import DiagnosticCommands, as_json
 
 ROWS = [{"number": number, "name": bytes([number % 256]) * 32, "none": None} for number in range(450)]
 

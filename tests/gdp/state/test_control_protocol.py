@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from gdp.errors import LocalError
 from gdp.names import Name
-from gdp.nodes.control_protocol import (
+from gdp.state.control_protocol import (
     LINE_MAX_BYTES,
     RESPONSE_MAX_BYTES,
     Command,

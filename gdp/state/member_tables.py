@@ -11,11 +11,11 @@ from itertools import chain
 from gdp.client.participant import Participant
 from gdp.client.rib_host import RibHost
 from gdp.names import Name
-from gdp.nodes.diagnostic_control import Row, TableSource
-from gdp.nodes.tables import common_tables, domain_label, seconds_left
 from gdp.ports.plane import Plane
 from gdp.rib.store import MemoryStore, Store
 from gdp.sansio import Timestamps
+from gdp.state.diagnostic_control import Row, TableSource
+from gdp.state.tables import common_tables, domain_label, seconds_left
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 

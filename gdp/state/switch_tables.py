@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 
 from gdp.names import NAME_BYTES, Name
-from gdp.nodes.diagnostic_control import Row, TableSource
-from gdp.nodes.tables import common_tables, domain_label, seconds_left
 from gdp.ports.plane import MAC_BYTES, Plane
 from gdp.sansio import Timestamps
+from gdp.state.diagnostic_control import Row, TableSource
+from gdp.state.tables import common_tables, domain_label, seconds_left
 from gdp.switch.core import SwitchCore
 from gdp.switch.trees import Downstream
 from gdp.trust.domain import Policy

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from gdp.nodes.link_rows import LinkRows, link_status
 from gdp.ports.plane import Port
+from gdp.state.link_rows import LinkRows, link_status
 from gdp.telemetry.sources import LinkRow
 from tests.gdp.control.members import at
 from tests.gdp.control.test_keepalive import B, Pair, up
