@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from gdp.errors import GdpError
-from gdp.nodes.control_client import ask_node, find_control_socket
+from gdp.management.control_client import ask_node, find_control_socket
 from gdp.state.control_protocol import Command
 from gdp.stores.keyring import CARD, load_card
 from internet.access import Access

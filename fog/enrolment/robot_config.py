@@ -20,7 +20,7 @@ from fog.enrolment.bootstrap import robot_rule
 from fog.enrolment.members import Authority, metadata_of
 from gdp.config.drop_in import drop_in_directory, locked, read_drop_in, write_drop_in
 from gdp.errors import GdpError, LocalError
-from gdp.nodes.control_client import NotRunningError, ask_node, find_control_socket
+from gdp.management.control_client import NotRunningError, ask_node, find_control_socket
 from gdp.state.control_protocol import Command
 from gdp.stores.keyring import load_public_key
 from proxy.config import matching

@@ -34,7 +34,7 @@ from fog.topology import Gateway
 from gdp.errors import StoreError
 from gdp.host.processes import Process
 from gdp.host.service_notifier import service_notifier
-from gdp.nodes.control_socket import CONTROL_SOCKET, ControlHandlers, serve_control_in_thread
+from gdp.management.control_socket import CONTROL_SOCKET, ControlHandlers, serve_control_in_thread
 
 __all__ = ["supervise"]
 

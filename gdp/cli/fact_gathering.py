@@ -17,7 +17,7 @@ from gdp.diagnosis.survey import ROLES, Survey
 from gdp.errors import LocalError
 from gdp.host.ros_processes import ros_processes
 from gdp.limits import DIAGNOSTIC_REPLY_MAX_BYTES
-from gdp.nodes.control_client import NodeConnection, NotRunningError, find_control_socket
+from gdp.management.control_client import NodeConnection, NotRunningError, find_control_socket
 from gdp.state.state_answers import ASK
 from gdp.stores.keyring import CARD, load_card
 

@@ -19,8 +19,8 @@ import typer
 from gdp.cli.columns import bits, columns, short_count
 from gdp.cli.output import show
 from gdp.cli.topic import Host, JsonLines, Sockets, answers_of
-from gdp.nodes.running_nodes import find_running_nodes, read_topics
-from gdp.nodes.topic_rates import RatedRow, rated_rows
+from gdp.management.running_nodes import find_running_nodes, read_topics
+from gdp.management.topic_rates import RatedRow, rated_rows
 from gdp.state.topic_rows import Direction
 
 if TYPE_CHECKING:

@@ -17,11 +17,11 @@ from gdp.cli.completion import complete_node
 from gdp.cli.extension import ANY_ARGUMENTS, ExtendedGroup, placeholder
 from gdp.cli.output import show
 from gdp.crypto.certificates import Role
+from gdp.management.running_nodes import Found, NodeTopics, RunningNode, find_running_nodes, read_topics
+from gdp.management.topic_rates import RatedRow, known_names, rated_rows
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.nodes.membership import load_member
-from gdp.nodes.running_nodes import Found, NodeTopics, RunningNode, find_running_nodes, read_topics
-from gdp.nodes.topic_rates import RatedRow, known_names, rated_rows
 from gdp.session.settings import settings_of
 from gdp.state.topic_rows import Direction, held_row
 

@@ -19,9 +19,10 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import DROP_COUNTERS, DropReason
 from gdp.host.service_notifier import service_notifier
+from gdp.management.control_client import control_path
+from gdp.management.control_socket import ControlHandlers, ControlServer
+from gdp.management.switch_watch import SwitchWatch
 from gdp.names import Name
-from gdp.nodes.control_client import control_path
-from gdp.nodes.control_socket import ControlHandlers, ControlServer
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.membership import load_member
 from gdp.nodes.metrics import serve_metrics
@@ -34,7 +35,6 @@ from gdp.nodes.relay_server import BorderServer, listen_tls
 from gdp.nodes.rights import confine_relay
 from gdp.nodes.runtime import now
 from gdp.nodes.single_instance import run_alone
-from gdp.nodes.switch_watch import SwitchWatch
 from gdp.ports.address_monitor import AddressMonitor
 from gdp.ports.tap import TapDevice, tap_name
 from gdp.relay.connection import ConnectionCounters

@@ -15,10 +15,10 @@ from gdp.config.config import RibConfig
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.host.service_notifier import service_notifier
+from gdp.management.control_client import control_path
+from gdp.management.control_socket import ControlHandlers
 from gdp.names import Name
 from gdp.nodes.audit import audit_folder, keep_audit
-from gdp.nodes.control_client import control_path
-from gdp.nodes.control_socket import ControlHandlers
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.decision_log import log_decisions
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms

@@ -18,8 +18,8 @@ from pathlib import Path
 from types import FrameType
 
 from gdp.limits import COST_DEFAULT
+from gdp.management.control_socket import ControlHandlers, ControlServer
 from gdp.nodes.busy_poll import BusyPoll
-from gdp.nodes.control_socket import ControlHandlers, ControlServer
 from gdp.nodes.memory_tuning import tune_memory
 from gdp.ports.plane import HasFileno, Plane
 from gdp.sansio import ProtocolCore, ReceivedFrame, Timestamps

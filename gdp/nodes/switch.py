@@ -16,9 +16,9 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import LocalError, StatementError
 from gdp.host.service_notifier import service_notifier
+from gdp.management.control_client import control_path
+from gdp.management.control_socket import ControlHandlers
 from gdp.nodes.audit import keep_audit
-from gdp.nodes.control_client import control_path
-from gdp.nodes.control_socket import ControlHandlers
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.data_plane import Chosen, choose_plane
 from gdp.nodes.decision_log import log_decisions

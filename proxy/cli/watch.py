@@ -19,7 +19,7 @@ import typer
 
 from gdp.cli import options
 from gdp.errors import GdpError, LocalError
-from gdp.nodes.control_client import NotRunningError, ask_node, find_control_socket
+from gdp.management.control_client import NotRunningError, ask_node, find_control_socket
 from gdp.ros_names import covers, is_name, is_pattern
 from gdp.sharing.proxy_files import ProxyFiles
 from gdp.state.control_protocol import Command

@@ -22,10 +22,10 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import GdpError, LocalError
 from gdp.host.service_notifier import service_notifier
+from gdp.management.control_client import control_path
+from gdp.management.control_socket import ControlHandlers
 from gdp.message.loss import by_label
 from gdp.names import Name
-from gdp.nodes.control_client import control_path
-from gdp.nodes.control_socket import ControlHandlers
 from gdp.nodes.credentials import Credentials, watched_folders
 from gdp.nodes.decision_log import log_decisions
 from gdp.nodes.delegation_store import DelegationStore

@@ -48,8 +48,8 @@ from synthetic_nodes import SyntheticNetwork, serve_network
 from testbed import OverlayNodes
 
 from gdp.host.run_registry import RunRegistry
+from gdp.management.control_client import control_path
 from gdp.nodes.busy_poll import SPIN_US
-from gdp.nodes.control_client import control_path
 from gdp.stores.keyring import CARD, load_card
 from gdp.trust.right import Right
 from tests.browser import console_errors, open_browser

@@ -18,7 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from gdp.nodes.control_socket import CONTROL_SOCKET, ControlHandlers, ControlServer
+from gdp.management.control_socket import CONTROL_SOCKET, ControlHandlers, ControlServer
 from gdp.state.snapshot import ID_CHARS
 
 __all__ = ["SyntheticNetwork", "serve_network"]

@@ -22,7 +22,7 @@ from typing import Any, Final, NamedTuple
 import yaml
 
 from gdp.errors import LocalError
-from gdp.nodes.control_client import ask_node, find_control_socket
+from gdp.management.control_client import ask_node, find_control_socket
 from gdp.state.control_protocol import Command
 from internet.access import Access
 from internet.host import Host

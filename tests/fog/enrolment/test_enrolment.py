@@ -22,7 +22,7 @@ from gdp.config.drop_in import drop_in_directory
 from gdp.crypto.certificates import Role
 from gdp.crypto.statements import parse
 from gdp.errors import ConfigError, LocalError
-from gdp.nodes.control_socket import ControlHandlers, serve_control_in_thread
+from gdp.management.control_socket import ControlHandlers, serve_control_in_thread
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.nodes.membership import load_member
 from gdp.stores.keyring import load_identity, load_owner

@@ -12,7 +12,7 @@ import pytest
 from synthetic_nodes import SyntheticNetwork, serve_network
 
 from gdp.dashboard.server import POLL_S, DashboardServer
-from gdp.nodes.control_socket import CONTROL_SOCKET, ControlHandlers, serve_control_in_thread
+from gdp.management.control_socket import CONTROL_SOCKET, ControlHandlers, serve_control_in_thread
 from tests.browser import console_errors, needs_browser, open_browser, save_picture
 from tests.gdp.dashboard.test_server import running
 

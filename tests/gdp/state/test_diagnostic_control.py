@@ -9,8 +9,8 @@ import pytest
 
 from gdp.control.diagnostics import Question
 from gdp.errors import LocalError
-from gdp.nodes.control_client import NodeConnection
-from gdp.nodes.control_socket import CONTROL_SOCKET, ControlHandlers, serve_control_in_thread
+from gdp.management.control_client import NodeConnection
+from gdp.management.control_socket import CONTROL_SOCKET, ControlHandlers, serve_control_in_thread
 from gdp.sansio import Timestamps
 from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import GdpError
-from gdp.nodes.control_client import ask_node
+from gdp.management.control_client import ask_node
 from gdp.state.control_protocol import Command
 
 __all__ = ["SwitchWatch", "peers_up"]

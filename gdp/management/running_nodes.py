@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import GdpError
+from gdp.management.control_client import NotRunningError, ask_node, control_sockets
 from gdp.names import Name
-from gdp.nodes.control_client import NotRunningError, ask_node, control_sockets
 from gdp.state.control_protocol import Command, Response
 from gdp.state.topic_rows import TopicRow, rows_from_fields
 

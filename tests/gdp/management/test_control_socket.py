@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from gdp.errors import LocalError
-from gdp.nodes.control_client import NotRunningError, ask_node, find_control_socket, request_control
-from gdp.nodes.control_socket import (
+from gdp.management.control_client import NotRunningError, ask_node, find_control_socket, request_control
+from gdp.management.control_socket import (
     CONTROL_SOCKET,
     ControlHandlers,
     ControlServer,

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
+from gdp.management.running_nodes import NodeTopics, RunningNode
 from gdp.names import Name
-from gdp.nodes.running_nodes import NodeTopics, RunningNode
 from gdp.state.topic_rows import Direction, TopicRow
 
 __all__ = ["RatedRow", "known_names", "rated_rows"]

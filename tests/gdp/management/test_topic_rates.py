@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from gdp.errors import RemoteError
+from gdp.management.running_nodes import NodeTopics, RunningNode
+from gdp.management.topic_rates import rated_rows
 from gdp.names import Name
-from gdp.nodes.running_nodes import NodeTopics, RunningNode
-from gdp.nodes.topic_rates import rated_rows
 from gdp.state.control_protocol import Response, encode_response
 from gdp.state.topic_rows import ROWS_MAX, Direction, TopicRow, rows_from_fields, rows_to_fields
 
