@@ -23,8 +23,8 @@ from gdp.nodes.credentials import Credentials
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S
-from gdp.nodes.runtime import Runtime
 from gdp.ports.raw import RawPlane
+from gdp.runtime.runtime import Runtime
 from gdp.stores.keyring import DELEGATIONS, ROOT_CERTIFICATE
 from gdp.trust.right import Right
 

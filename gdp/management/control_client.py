@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import LocalError
+from gdp.host.single_instance import lock_directories, lock_directory
 from gdp.management.control_socket import CONTROL_SOCKET, connect_control
 from gdp.names import Name
-from gdp.nodes.single_instance import lock_directories, lock_directory
 from gdp.state.control_protocol import (
     RESPONSE_MAX_BYTES,
     Command,

@@ -24,9 +24,9 @@ from gdp.errors import GdpError, LocalError
 from gdp.names import Name
 from gdp.nodes.endpoint_files import record_files
 from gdp.nodes.own_endpoints import OwnEndpoints
-from gdp.nodes.runtime import Runtime
 from gdp.nodes.tunnels import Tunnel, Tunnels
 from gdp.ports.tunnel.wireguard import WireGuardDevice
+from gdp.runtime.runtime import Runtime
 from gdp.sansio import Timestamps
 from gdp.stores.files import read_public
 from gdp.switch.core import SwitchCore

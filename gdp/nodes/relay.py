@@ -19,6 +19,7 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import DROP_COUNTERS, DropReason
 from gdp.host.service_notifier import service_notifier
+from gdp.host.single_instance import run_alone
 from gdp.management.control_client import control_path
 from gdp.management.control_socket import ControlHandlers, ControlServer
 from gdp.management.switch_watch import SwitchWatch
@@ -33,11 +34,10 @@ from gdp.nodes.relay_loop import RelayLoop
 from gdp.nodes.relay_ports import VIA
 from gdp.nodes.relay_server import BorderServer, listen_tls
 from gdp.nodes.rights import confine_relay
-from gdp.nodes.runtime import now
-from gdp.nodes.single_instance import run_alone
 from gdp.ports.address_monitor import AddressMonitor
 from gdp.ports.tap import TapDevice, tap_name
 from gdp.relay.connection import ConnectionCounters
+from gdp.runtime.runtime import now
 from gdp.state.control_status import node_status
 from gdp.telemetry.health import Health
 from gdp.telemetry.sources import Sources

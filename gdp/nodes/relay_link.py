@@ -17,9 +17,9 @@ from collections.abc import Callable
 from typing import Final
 
 from gdp.nodes.relay_loop import RelayLoop
-from gdp.nodes.runtime import now
 from gdp.ports.tap import TapDevice
 from gdp.relay.connection import ConnectionCounters, ConnectionState, RelayConnection
+from gdp.runtime.runtime import now
 
 __all__ = ["RelayLink", "RelayPort", "prepare_socket"]
 

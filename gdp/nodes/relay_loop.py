@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Final, Protocol
 
-from gdp.nodes.memory_tuning import tune_memory
+from gdp.runtime.memory_tuning import tune_memory
 
 __all__ = ["RelayLoop", "Timed"]
 

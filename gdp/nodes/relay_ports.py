@@ -13,9 +13,9 @@ from typing import Final
 
 from gdp.errors import LocalError
 from gdp.names import Name
-from gdp.nodes.runtime import Runtime
 from gdp.ports.netlink import LINK_GROUP, READ_BYTES, DeviceInfo, LinkAttribute, NetlinkSocket, listen
 from gdp.ports.tap import relay_alias
+from gdp.runtime.runtime import Runtime
 from gdp.sansio import Timestamps
 from gdp.switch.core import SwitchCore
 

@@ -13,7 +13,7 @@ from typing import Final
 
 from gdp.crypto.statements import parse
 from gdp.errors import RemoteError
-from gdp.nodes.runtime import Runtime, now
+from gdp.runtime.runtime import Runtime, now
 from gdp.sansio import Timestamps
 from gdp.stores.revocation_file import SLICE, RevocationFile
 from gdp.trust.revocations import Revocations

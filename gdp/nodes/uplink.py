@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 from gdp.config.config import UplinkPlane
 from gdp.errors import LocalError
 from gdp.extras import require_extra
-from gdp.nodes.single_instance import own_devices
+from gdp.host.single_instance import own_devices
 from gdp.ports.netdev import NetdevPlane, NoDeviceError
 from gdp.ports.raw import RawPlane
 from gdp.ports.readiness import readable

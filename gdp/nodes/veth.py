@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gdp.errors import LocalError
+from gdp.host.single_instance import own_devices
 from gdp.names import Name
-from gdp.nodes.single_instance import own_devices
 from gdp.ports.sockets import AS_ROOT
 
 if TYPE_CHECKING:

@@ -25,7 +25,7 @@ from typing import Final, Protocol, TypeVar
 
 from gdp.client.publisher import Publisher
 from gdp.errors import GdpError
-from gdp.nodes.runtime import Runtime
+from gdp.runtime.runtime import Runtime
 from gdp.session.core import SessionCore
 from gdp.session.errors import ClosedError
 

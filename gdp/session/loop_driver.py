@@ -12,8 +12,8 @@ from collections.abc import Callable
 from typing import Final
 
 from gdp.client.publisher import Publisher
-from gdp.nodes.runtime import Runtime
 from gdp.ports.netdev import NetdevPlane
+from gdp.runtime.runtime import Runtime
 from gdp.session.core import SessionCore
 from gdp.session.errors import ClosedError
 

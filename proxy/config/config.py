@@ -25,7 +25,7 @@ from gdp.config.config import LeaseSeconds, UplinkPlane
 from gdp.config.schema import Directory, Domain, Ifname, Metrics, NewFile, Section, load
 from gdp.errors import LocalError
 from gdp.limits import ADVERTISEMENT_LEASE_S
-from gdp.nodes.busy_poll import SPIN_MAX_US, SPIN_US
+from gdp.runtime.busy_poll import SPIN_MAX_US, SPIN_US
 from proxy.config.drop_ins import DROP_INS, DropIns, add_drop_in_patterns, add_drop_in_rules
 from proxy.config.graph import RosGraphConfig
 from proxy.config.matching import Fault, clashes

@@ -49,7 +49,7 @@ from testbed import OverlayNodes
 
 from gdp.host.run_registry import RunRegistry
 from gdp.management.control_client import control_path
-from gdp.nodes.busy_poll import SPIN_US
+from gdp.runtime.busy_poll import SPIN_US
 from gdp.stores.keyring import CARD, load_card
 from gdp.trust.right import Right
 from tests.browser import console_errors, open_browser

@@ -13,7 +13,7 @@ from peers.exchange import PATIENCE_S, exchange
 from peers.gdp_endpoint import PONG, GdpWay, InternalEndpoint, _pong, _serializer, ping_topic
 from peers.jsonl import EndSettings, read_order, say
 
-from gdp.nodes.memory_tuning import tune_memory
+from gdp.runtime.memory_tuning import tune_memory
 
 ENCODING: Final = "cdr"
 

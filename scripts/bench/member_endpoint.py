@@ -24,8 +24,8 @@ from gdp.crypto.certificates import Role
 from gdp.errors import DropReason, LocalError
 from gdp.names import Name
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
-from gdp.nodes.runtime import Runtime
 from gdp.ports.raw import RawPlane
+from gdp.runtime.runtime import Runtime
 from gdp.stores.keyring import load_delegations
 
 __all__ = ["End", "Timer", "run_role"]

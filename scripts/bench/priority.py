@@ -35,7 +35,7 @@ from testbed import Lab, MemberRow
 from topologies import MIDDLE, flat_topology
 
 from gdp.host.run_registry import Run, RunRegistry
-from gdp.nodes.busy_poll import SPIN_US
+from gdp.runtime.busy_poll import SPIN_US
 from gdp.trust.right import Right
 
 MTU: Final = 1_500

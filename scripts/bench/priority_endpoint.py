@@ -16,7 +16,7 @@ from member_endpoint import PATIENCE_S, End, Timer, run_role
 from peers.jsonl import say
 
 from gdp.client.publisher import Publisher
-from gdp.nodes.memory_tuning import tune_memory
+from gdp.runtime.memory_tuning import tune_memory
 
 __all__ = ["CONTROL", "IMAGES", "TICK_S"]
 

@@ -39,8 +39,8 @@ from topologies import flat_topology
 from tunnel_endpoint import IMAGES, PING, PONG
 
 from gdp.host.run_registry import Run, RunRegistry
-from gdp.nodes.busy_poll import SPIN_US
 from gdp.ports.tunnel.uapi import socket_path
+from gdp.runtime.busy_poll import SPIN_US
 from gdp.trust.right import Right
 
 PLANES: Final = ("kernel", "raw")

@@ -27,10 +27,10 @@ from member_endpoint import PATIENCE_S, End, run_role
 from peers.jsonl import say
 
 from gdp.control.endpoints import Endpoint
-from gdp.nodes.memory_tuning import tune_memory
 from gdp.ports.tunnel.path_mtu import route_mtu, tunnel_mtu
 from gdp.ports.tunnel.vxlan import make_vxlan
 from gdp.ports.tunnel.wireguard import open_wireguard
+from gdp.runtime.memory_tuning import tune_memory
 
 __all__ = ["IMAGES", "IMAGE_BYTES", "PING", "PONG"]
 

@@ -23,8 +23,8 @@ from gdp.control.tunnel_plan import TunnelId, tunnel_ifname
 from gdp.crypto.tunnel_key import TunnelKey
 from gdp.nodes.endpoint_files import RECORD_SUFFIX, own_record, public_candidates
 from gdp.nodes.links import LINKS_LOOK_S, TunnelLinks
-from gdp.nodes.runtime import Runtime
 from gdp.ports.tunnel.wireguard import PeerState, WireGuardDevice
+from gdp.runtime.runtime import Runtime
 from gdp.simulation.network import SimLink
 from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Topology

@@ -35,10 +35,10 @@ from gdp.frame.kinds import Flag, Kind
 from gdp.limits import HOPS_MAX, NACKS_PER_REPORT
 from gdp.message.acknack import AckNack, AckNackFlag, MissingRange
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
-from gdp.nodes.runtime import Runtime
 from gdp.ports.mmsg import make_batch
 from gdp.ports.raw import RawPlane
 from gdp.ports.sockets import attach_drop_all_filter, open_port
+from gdp.runtime.runtime import Runtime
 from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table
 from gdp.trust.revocation import Revocation

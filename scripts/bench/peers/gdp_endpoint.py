@@ -23,7 +23,7 @@ import gdp
 from gdp.client.publisher import Publisher
 from gdp.errors import LocalError
 from gdp.names import Name
-from gdp.nodes.memory_tuning import tune_memory
+from gdp.runtime.memory_tuning import tune_memory
 from peers.exchange import IMAGE, PATIENCE_S, answer_to, exchange
 from peers.jsonl import EndSettings, say
 from proxy.serial.channel import Channel

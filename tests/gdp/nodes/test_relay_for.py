@@ -16,7 +16,7 @@ from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.tunnel_key import TunnelKey
 from gdp.nodes.links import TunnelLinks
-from gdp.nodes.runtime import Runtime
+from gdp.runtime.runtime import Runtime
 from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table
 from tests.gdp.control.members import POLICY, UNIX_S, Nonces, at, node

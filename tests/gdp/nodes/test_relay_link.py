@@ -14,9 +14,9 @@ import pytest
 from gdp.frame.kinds import Flag
 from gdp.nodes.relay_link import RelayLink, RelayPort, prepare_socket
 from gdp.nodes.relay_loop import RelayLoop
-from gdp.nodes.runtime import now
 from gdp.ports.tap import TapDevice
 from gdp.relay.connection import ConnectionState, RelayConnection
+from gdp.runtime.runtime import now
 from tests.gdp.relay.ends import SETTINGS, Ends, ends_now
 from tests.gdp.relay.test_frame_queue import frame, numbers
 

@@ -11,9 +11,9 @@ import pytest
 from gdp.control.settings import NodeSettings
 from gdp.control.tunnel_plan import TunnelId
 from gdp.names import Name
-from gdp.nodes.runtime import Runtime
 from gdp.nodes.tunnels import Tunnel, Tunnels
 from gdp.ports.tunnel.wireguard import PeerState, WireGuardDevice
+from gdp.runtime.runtime import Runtime
 from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table
 from tests.gdp.control.members import POLICY, Nonces, at, node

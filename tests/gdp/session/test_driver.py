@@ -14,8 +14,8 @@ import pytest
 
 import gdp
 from gdp.client.publisher import Publisher
-from gdp.nodes.runtime import Runtime
 from gdp.ports.plane import HasFileno
+from gdp.runtime.runtime import Runtime
 from gdp.session.core import SessionCore
 from gdp.session.driver import ThreadDriver
 

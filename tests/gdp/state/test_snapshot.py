@@ -6,7 +6,7 @@ import json
 from typing import Any
 
 from gdp.control.link_state import Scope
-from gdp.nodes.port_counters import PortCounters
+from gdp.ports.port_counters import PortCounters
 from gdp.simulation.simulation import Simulation
 from gdp.state.snapshot import (
     ID_CHARS,

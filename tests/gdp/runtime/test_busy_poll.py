@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gdp.nodes.busy_poll import BusyPoll
+from gdp.runtime.busy_poll import BusyPoll
 
 
 def test_at_first_no_thread_polls() -> None:

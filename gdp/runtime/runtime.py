@@ -19,9 +19,9 @@ from types import FrameType
 
 from gdp.limits import COST_DEFAULT
 from gdp.management.control_socket import ControlHandlers, ControlServer
-from gdp.nodes.busy_poll import BusyPoll
-from gdp.nodes.memory_tuning import tune_memory
 from gdp.ports.plane import HasFileno, Plane
+from gdp.runtime.busy_poll import BusyPoll
+from gdp.runtime.memory_tuning import tune_memory
 from gdp.sansio import ProtocolCore, ReceivedFrame, Timestamps
 
 __all__ = ["DRAIN_MAX_S", "Runtime", "now"]

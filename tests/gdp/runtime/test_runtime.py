@@ -6,8 +6,8 @@ import time
 from types import SimpleNamespace
 from typing import Any, cast
 
-from gdp.nodes.runtime import Runtime
 from gdp.ports.plane import Plane
+from gdp.runtime.runtime import Runtime
 from gdp.sansio import ProtocolCore, ReceivedFrame
 
 

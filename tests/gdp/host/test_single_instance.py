@@ -14,15 +14,15 @@ from pathlib import Path
 import pytest
 
 from gdp.errors import LocalError
+from gdp.host import single_instance
+from gdp.host.single_instance import own_devices, run_alone
 from gdp.names import Name
-from gdp.nodes import single_instance
-from gdp.nodes.single_instance import own_devices, run_alone
 
 NAME = Name(hashlib.sha256(b"one of each").digest())
 _HOLD = """
 import sys
 from gdp.names import Name
-from gdp.nodes import single_instance
+from gdp.host import single_instance
 from pathlib import Path
 single_instance._ROOT_DIRECTORY = Path(sys.argv[2])
 single_instance.lock_directory = lambda: single_instance._ROOT_DIRECTORY
