@@ -32,9 +32,9 @@ from gdp.enrolment.member_setup import RELAY_FILE, record_file_name, update_rela
 from gdp.enrolment.wire import INSTANCE_BYTES, EnrolmentError, UnreachableError
 from gdp.errors import GdpError, LocalError, RemoteError
 from gdp.host_port import split_host_port
+from gdp.links.endpoint_files import RECORD_SUFFIX, own_record
 from gdp.management.control_client import NotRunningError, ask_node, find_control_socket
 from gdp.names import Name
-from gdp.nodes.endpoint_files import RECORD_SUFFIX, own_record
 from gdp.nodes.membership import load_policy
 from gdp.nodes.relay import relay_control_path
 from gdp.state.control_protocol import Command

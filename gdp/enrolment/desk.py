@@ -38,8 +38,8 @@ from gdp.enrolment.wire import (
     verify_member_proof,
 )
 from gdp.errors import LocalError, RemoteError, StatementError, StoreError
+from gdp.links.endpoint_files import own_record, public_candidates
 from gdp.names import Name
-from gdp.nodes.endpoint_files import own_record, public_candidates
 from gdp.stores.audit_log import AuditLog
 from gdp.stores.files import public, read_public, write_all
 from gdp.stores.issue import admit, renew

@@ -26,7 +26,7 @@ from gdp.enrolment.member_setup import MachinePlan, record_file_name, write_conf
 from gdp.enrolment.wire import INSTANCE_BYTES, EnrolmentError, UnreachableError
 from gdp.errors import LocalError, RemoteError
 from gdp.host_port import split_host_port
-from gdp.nodes.endpoint_files import own_record
+from gdp.links.endpoint_files import own_record
 from gdp.stores.files import public, read_public, write_all
 from gdp.stores.issue import install_membership, make_node_keys
 from gdp.stores.keyring import CARD, OWNER_PUBLIC

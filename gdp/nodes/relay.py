@@ -20,6 +20,11 @@ from gdp.crypto.identity import Identity
 from gdp.errors import DROP_COUNTERS, DropReason
 from gdp.host.service_notifier import service_notifier
 from gdp.host.single_instance import run_alone
+from gdp.links.relay_context import RelayContext
+from gdp.links.relay_dialer import BorderDialer
+from gdp.links.relay_loop import RelayLoop
+from gdp.links.relay_ports import VIA
+from gdp.links.relay_server import BorderServer, listen_tls
 from gdp.management.control_client import control_path
 from gdp.management.control_socket import ControlHandlers, ControlServer
 from gdp.management.switch_watch import SwitchWatch
@@ -28,11 +33,6 @@ from gdp.nodes.credentials import Credentials
 from gdp.nodes.membership import load_member
 from gdp.nodes.metrics import serve_metrics
 from gdp.nodes.node_log import LOOK_S
-from gdp.nodes.relay_context import RelayContext
-from gdp.nodes.relay_dialer import BorderDialer
-from gdp.nodes.relay_loop import RelayLoop
-from gdp.nodes.relay_ports import VIA
-from gdp.nodes.relay_server import BorderServer, listen_tls
 from gdp.nodes.rights import confine_relay
 from gdp.ports.address_monitor import AddressMonitor
 from gdp.ports.tap import TapDevice, tap_name

@@ -16,6 +16,7 @@ from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.host.service_notifier import service_notifier
 from gdp.host.single_instance import run_alone
+from gdp.links.uplink import load_plane, open_uplink
 from gdp.management.control_client import control_path
 from gdp.management.control_socket import ControlHandlers
 from gdp.names import Name
@@ -28,7 +29,6 @@ from gdp.nodes.port_rows import port_rows
 from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.nodes.rib_upkeep import MemoryUpkeep, Upkeep
 from gdp.nodes.rights import confine_rib
-from gdp.nodes.uplink import load_plane, open_uplink
 from gdp.ports.plane import Plane
 from gdp.rib.core import RibCore, RibSettings
 from gdp.runtime.runtime import DRAIN_MAX_S, Runtime, now

@@ -17,23 +17,23 @@ from gdp.crypto.identity import Identity
 from gdp.errors import LocalError, StatementError
 from gdp.host.service_notifier import service_notifier
 from gdp.host.single_instance import own_devices, run_alone
+from gdp.links.links import LINKS_LOOK_S, TunnelLinks
+from gdp.links.relay_ports import RELAY_LOOK_S, RelayPorts
+from gdp.links.tunnels import open_underlays
+from gdp.links.uplink import refuse_loopback
+from gdp.links.veth import attach_pairs, switch_end
 from gdp.management.control_client import control_path
 from gdp.management.control_socket import ControlHandlers
 from gdp.nodes.audit import keep_audit
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.data_plane import Chosen, choose_plane
 from gdp.nodes.decision_log import log_decisions
-from gdp.nodes.links import LINKS_LOOK_S, TunnelLinks
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.metrics import serve_metrics
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
 from gdp.nodes.port_rows import port_rows
-from gdp.nodes.relay_ports import RELAY_LOOK_S, RelayPorts
 from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.nodes.rights import confine_switch
-from gdp.nodes.tunnels import open_underlays
-from gdp.nodes.uplink import refuse_loopback
-from gdp.nodes.veth import attach_pairs, switch_end
 from gdp.ports.plane import MAC_BYTES, Plane
 from gdp.ports.port_counters import PortCounters
 from gdp.ports.rtnetlink import LinkMonitor

@@ -13,7 +13,7 @@ import typer
 
 from gdp.cli.node import AwaitIface, Format, Json, Level, LogFormat, LogLevel, Verbose, failing_clearly, set_up_logging
 from gdp.cli.version import HELP, Version
-from gdp.nodes.uplink import wait_for_device
+from gdp.links.uplink import wait_for_device
 from proxy.cli.node_options import Delegations, DoorNode, Iface, Listen
 
 __all__ = ["main"]

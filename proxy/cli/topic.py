@@ -258,7 +258,7 @@ class _Hint:
 def _readable(
     node: Path, iface: str | None, delegations: Path | None, name: str, type_name: str, await_s: float
 ) -> Access:
-    from gdp.nodes.uplink import wait_for_device
+    from gdp.links.uplink import wait_for_device
     from proxy.tools.member import Wanted, find_access
 
     access = find_access(node, iface, delegations, Wanted(name, type_name, Right.READ))

@@ -23,6 +23,7 @@ from gdp.crypto.identity import Identity
 from gdp.errors import GdpError, LocalError
 from gdp.host.service_notifier import service_notifier
 from gdp.host.single_instance import run_alone
+from gdp.links.uplink import open_uplink
 from gdp.management.control_client import control_path
 from gdp.management.control_socket import ControlHandlers
 from gdp.message.loss import by_label
@@ -35,7 +36,6 @@ from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
 from gdp.nodes.port_rows import port_rows
 from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.nodes.rights import confine_proxy
-from gdp.nodes.uplink import open_uplink
 from gdp.ports.plane import Plane
 from gdp.runtime.runtime import Runtime, now
 from gdp.state.control_status import node_status

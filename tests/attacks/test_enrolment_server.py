@@ -26,7 +26,7 @@ from gdp.enrolment.registry import Registry
 from gdp.enrolment.removal import remove_machine
 from gdp.enrolment.wire import EnrolmentError, Refusal, prove_member
 from gdp.errors import StoreError
-from gdp.nodes.endpoint_files import own_record
+from gdp.links.endpoint_files import own_record
 from gdp.stores.files import public, write_all
 from gdp.stores.keyring import load_domain
 from gdp.trust.enrolment import apply

@@ -14,12 +14,12 @@ import yaml
 from gdp.config.relay_config import RelayConfig
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
-from gdp.nodes import relay_server as relay_server_module
-from gdp.nodes.relay_context import RelayContext
-from gdp.nodes.relay_link import RelayLink, RelayPort, prepare_socket
-from gdp.nodes.relay_loop import RelayLoop
-from gdp.nodes.relay_server import BorderServer, listen_tls
-from gdp.nodes.relay_tls import tls_context
+from gdp.links import relay_server as relay_server_module
+from gdp.links.relay_context import RelayContext
+from gdp.links.relay_link import RelayLink, RelayPort, prepare_socket
+from gdp.links.relay_loop import RelayLoop
+from gdp.links.relay_server import BorderServer, listen_tls
+from gdp.links.relay_tls import tls_context
 from gdp.ports.tap import TapDevice
 from gdp.relay.admission import verified_border
 from gdp.relay.connection import ConnectionSettings, RelayConnection

@@ -16,9 +16,9 @@ from gdp.control.settings import NodeSettings
 from gdp.control.tunnel_plan import REBIND_MAX_S, REBIND_S, TunnelId
 from gdp.crypto.identity import Identity
 from gdp.crypto.tunnel_key import TunnelKey
+from gdp.links import tunnels as tunnels_module
+from gdp.links.links import LINKS_LOOK_S, TunnelLinks
 from gdp.names import Name
-from gdp.nodes import tunnels as tunnels_module
-from gdp.nodes.links import LINKS_LOOK_S, TunnelLinks
 from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table
 from tests.gdp.control.members import POLICY, UNIX_S, Nonces, at, node

@@ -15,7 +15,7 @@ from gdp.control.endpoints import Endpoint
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.tunnel_key import TunnelKey
-from gdp.nodes.links import TunnelLinks
+from gdp.links.links import TunnelLinks
 from gdp.runtime.runtime import Runtime
 from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table

@@ -15,8 +15,8 @@ from gdp.control.endpoint_record import CANDIDATES_MAX, Candidate, CandidateType
 from gdp.control.endpoints import Endpoint
 from gdp.crypto.identity import Identity
 from gdp.errors import DropReason, LocalError, StatementError
-from gdp.nodes.endpoint_files import own_record, public_candidates
-from gdp.nodes.tunnels import Tunnels
+from gdp.links.endpoint_files import own_record, public_candidates
+from gdp.links.tunnels import Tunnels
 from gdp.ports.address_monitor import AddressMonitor
 from gdp.ports.host_addresses import host_addresses
 from gdp.sansio import Timestamps

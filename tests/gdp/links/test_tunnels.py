@@ -10,8 +10,8 @@ import pytest
 
 from gdp.control.settings import NodeSettings
 from gdp.control.tunnel_plan import TunnelId
+from gdp.links.tunnels import Tunnel, Tunnels
 from gdp.names import Name
-from gdp.nodes.tunnels import Tunnel, Tunnels
 from gdp.ports.tunnel.wireguard import PeerState, WireGuardDevice
 from gdp.runtime.runtime import Runtime
 from gdp.switch.core import SwitchCore

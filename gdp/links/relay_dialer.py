@@ -22,10 +22,10 @@ from gdp.config.relay_config import RelayBorder
 from gdp.crypto.certificates import Membership
 from gdp.errors import LocalError, StatementError
 from gdp.host_port import split_host_port
+from gdp.links.relay_context import RelayContext
+from gdp.links.relay_link import RelayLink, RelayPort, prepare_socket
+from gdp.links.relay_server import port_status
 from gdp.names import Name
-from gdp.nodes.relay_context import RelayContext
-from gdp.nodes.relay_link import RelayLink, RelayPort, prepare_socket
-from gdp.nodes.relay_server import port_status
 from gdp.ports.address_monitor import source_address
 from gdp.ports.tap import TapDevice, tap_name
 from gdp.relay.admission import verified_border

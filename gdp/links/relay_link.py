@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from gdp.nodes.relay_loop import RelayLoop
+from gdp.links.relay_loop import RelayLoop
 from gdp.ports.tap import TapDevice
 from gdp.relay.connection import ConnectionCounters, ConnectionState, RelayConnection
 from gdp.runtime.runtime import now

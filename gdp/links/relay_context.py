@@ -14,8 +14,8 @@ from gdp.config.relay_config import RelayConfig
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import parse
 from gdp.errors import RemoteError
-from gdp.nodes.relay_loop import RelayLoop
-from gdp.nodes.relay_tls import tls_context
+from gdp.links.relay_loop import RelayLoop
+from gdp.links.relay_tls import tls_context
 from gdp.ports.tap import relay_alias
 from gdp.relay.connection import ConnectionSettings
 from gdp.sansio import Timestamps

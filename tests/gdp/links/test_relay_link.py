@@ -12,8 +12,8 @@ from typing import cast
 import pytest
 
 from gdp.frame.kinds import Flag
-from gdp.nodes.relay_link import RelayLink, RelayPort, prepare_socket
-from gdp.nodes.relay_loop import RelayLoop
+from gdp.links.relay_link import RelayLink, RelayPort, prepare_socket
+from gdp.links.relay_loop import RelayLoop
 from gdp.ports.tap import TapDevice
 from gdp.relay.connection import ConnectionState, RelayConnection
 from gdp.runtime.runtime import now

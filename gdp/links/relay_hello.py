@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from gdp.nodes.relay_loop import RelayLoop
+from gdp.links.relay_loop import RelayLoop
 from gdp.relay.client_hello import ENROLMENT_ALPN, HELLO_MAX_BYTES, read_client_hello
 
 __all__ = ["HELLO_S", "HelloWait", "hand_over"]

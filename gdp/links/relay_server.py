@@ -17,11 +17,11 @@ from typing import Final
 from gdp.config.relay_config import RelayConfig, RelayServer
 from gdp.crypto.certificates import Membership
 from gdp.errors import LocalError, StatementError
+from gdp.links.relay_context import RelayContext
+from gdp.links.relay_hello import HELLO_S, HelloWait, hand_over
+from gdp.links.relay_link import RelayLink, RelayPort, prepare_socket
+from gdp.links.relay_loop import RelayLoop
 from gdp.names import Name
-from gdp.nodes.relay_context import RelayContext
-from gdp.nodes.relay_hello import HELLO_S, HelloWait, hand_over
-from gdp.nodes.relay_link import RelayLink, RelayPort, prepare_socket
-from gdp.nodes.relay_loop import RelayLoop
 from gdp.ports.client_network import client_network
 from gdp.ports.listening import listen_tcp
 from gdp.ports.sockets import AS_ROOT

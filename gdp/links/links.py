@@ -21,10 +21,10 @@ from gdp.control.tunnel_plan import Dialer, RebindSchedule, TunnelId, planned_tu
 from gdp.crypto.certificates import Membership
 from gdp.crypto.identity import Identity
 from gdp.errors import GdpError, LocalError
+from gdp.links.endpoint_files import record_files
+from gdp.links.own_endpoints import OwnEndpoints
+from gdp.links.tunnels import Tunnel, Tunnels
 from gdp.names import Name
-from gdp.nodes.endpoint_files import record_files
-from gdp.nodes.own_endpoints import OwnEndpoints
-from gdp.nodes.tunnels import Tunnel, Tunnels
 from gdp.ports.tunnel.wireguard import WireGuardDevice
 from gdp.runtime.runtime import Runtime
 from gdp.sansio import Timestamps

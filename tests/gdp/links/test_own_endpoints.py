@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
 from gdp.control.endpoints import Endpoint
+from gdp.links.own_endpoints import listed_candidates
 from gdp.names import Name
-from gdp.nodes.own_endpoints import listed_candidates
 from gdp.switch.direct_tunnels import slots_between
 
 PORT = 51_820

@@ -13,8 +13,8 @@ import pytest
 
 from gdp.enrolment.channel import client_context
 from gdp.enrolment.server import bind_handover
-from gdp.nodes.relay_hello import HelloWait, hand_over
-from gdp.nodes.relay_loop import RelayLoop
+from gdp.links.relay_hello import HelloWait, hand_over
+from gdp.links.relay_loop import RelayLoop
 
 
 class Port:
