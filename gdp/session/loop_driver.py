@@ -14,8 +14,8 @@ from typing import Final
 from gdp.client.publisher import Publisher
 from gdp.ports.netdev import NetdevPlane
 from gdp.runtime.runtime import Runtime
-from gdp.session.core import SessionCore
-from gdp.session.errors import ClosedError
+from gdp.session.protocol.core import SessionCore
+from gdp.session.protocol.errors import ClosedError
 
 __all__ = ["LoopDriver"]
 

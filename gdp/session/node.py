@@ -28,8 +28,8 @@ from gdp.nodes.node_log import LOOK_S, NodeLog
 from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.ports.netdev import NetdevPlane
 from gdp.runtime.runtime import Runtime
-from gdp.session.core import SessionCore
-from gdp.session.errors import SessionError
+from gdp.session.protocol.core import SessionCore
+from gdp.session.protocol.errors import SessionError
 from gdp.session.settings import SessionConfig
 
 __all__ = ["SessionNode", "open_node"]

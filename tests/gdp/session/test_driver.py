@@ -16,8 +16,8 @@ import gdp
 from gdp.client.publisher import Publisher
 from gdp.ports.plane import HasFileno
 from gdp.runtime.runtime import Runtime
-from gdp.session.core import SessionCore
 from gdp.session.driver import ThreadDriver
+from gdp.session.protocol.core import SessionCore
 
 PATIENCE_S = 20.0
 

@@ -18,11 +18,11 @@ from gdp.errors import LocalError, RemoteError
 from gdp.metadata import Metadata
 from gdp.names import NAME_BYTES, Name
 from gdp.service.replication import Mode, Replication
-from gdp.session.client_core import Call, ClientCore
-from gdp.session.errors import DelegationError
-from gdp.session.messages import DelegatedName, Message, NameLike, describe
-from gdp.session.server_core import ServerCore
-from gdp.session.wire import read_message
+from gdp.session.protocol.client_core import Call, ClientCore
+from gdp.session.protocol.errors import DelegationError
+from gdp.session.protocol.messages import DelegatedName, Message, NameLike, describe
+from gdp.session.protocol.server_core import ServerCore
+from gdp.session.protocol.wire import read_message
 from gdp.trust.right import Right
 
 __all__ = ["QUEUE_MAX_BYTES", "QUEUE_MESSAGES", "Inbox", "SessionCore", "replication_of"]

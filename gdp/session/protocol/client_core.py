@@ -16,9 +16,9 @@ from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.service.dispatch import Ask, Dispatch, End, Failure, Stop
 from gdp.service.replication import Replication
-from gdp.session.errors import CallError, CallTimeoutError, NoServerError, SessionError
-from gdp.session.messages import Response
-from gdp.session.wire import LEAVING, PATIENCE_MAX_MS, SERVING, RequestFrame, StopFrame, read_response
+from gdp.session.protocol.errors import CallError, CallTimeoutError, NoServerError, SessionError
+from gdp.session.protocol.messages import Response
+from gdp.session.protocol.wire import LEAVING, PATIENCE_MAX_MS, SERVING, RequestFrame, StopFrame, read_response
 
 __all__ = ["Call", "ClientCore"]
 

@@ -13,12 +13,12 @@ from gdp.errors import LocalError
 from gdp.message.loss import LossReason
 from gdp.names import Name
 from gdp.service.replication import Replication
-from gdp.session.client_core import Call
-from gdp.session.core import Inbox, SessionCore, replication_of
-from gdp.session.errors import AttachError, ClosedError, SessionTimeoutError
-from gdp.session.messages import DelegatedName, NameLike
-from gdp.session.server_core import ServerCore
-from gdp.session.wire import PAYLOAD_MAX_BYTES
+from gdp.session.protocol.client_core import Call
+from gdp.session.protocol.core import Inbox, SessionCore, replication_of
+from gdp.session.protocol.errors import AttachError, ClosedError, SessionTimeoutError
+from gdp.session.protocol.messages import DelegatedName, NameLike
+from gdp.session.protocol.server_core import ServerCore
+from gdp.session.protocol.wire import PAYLOAD_MAX_BYTES
 from gdp.trust.right import Right
 
 __all__ = ["BasePublisher", "BaseServer", "BaseSession", "BaseSubscription", "Node", "Opened"]

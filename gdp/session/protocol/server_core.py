@@ -14,7 +14,15 @@ from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
 from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.service.serving import Asked, Serving, Turn
-from gdp.session.wire import LEAVING, PAYLOAD_MAX_BYTES, SERVING, RequestFrame, ResponseFrame, StopFrame, read_request
+from gdp.session.protocol.wire import (
+    LEAVING,
+    PAYLOAD_MAX_BYTES,
+    SERVING,
+    RequestFrame,
+    ResponseFrame,
+    StopFrame,
+    read_request,
+)
 
 __all__ = ["ServerCore"]
 
