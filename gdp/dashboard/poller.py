@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from gdp.dashboard.readings import Fields, Reading, text_of
+from gdp.dashboard.core.readings import Fields, Reading, text_of
 from gdp.errors import GdpError
 from gdp.management.control_client import control_sockets, find_control_socket
 from gdp.management.control_socket import CONTROL_SOCKET, connect_control

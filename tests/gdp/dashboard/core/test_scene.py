@@ -7,10 +7,10 @@ from typing import Any
 
 from synthetic_nodes import SyntheticNetwork
 
-from gdp.dashboard.graph import merge_readings
-from gdp.dashboard.readings import Reading
-from gdp.dashboard.scene import Scene
-from gdp.dashboard.series import SAMPLES, SeriesStore
+from gdp.dashboard.core.graph import merge_readings
+from gdp.dashboard.core.readings import Reading
+from gdp.dashboard.core.scene import Scene
+from gdp.dashboard.core.series import SAMPLES, SeriesStore
 
 
 def switch(node: str, *links: dict[str, object], **more: object) -> Reading:
