@@ -19,9 +19,10 @@ from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.trust.right import Right
-from proxy.bridge.bridge_election import SIGN, BridgeElection, presence_of, sign
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.desired_flows import ConfigProblem, DeniedName, FlowSpec, denied, exposed, imported
+from proxy.bridge.core.bridge_election import SIGN, BridgeElection, presence_of, sign
+from proxy.bridge.core.desired_flows import ConfigProblem, DeniedName, FlowSpec, denied, exposed, imported
+from proxy.bridge.core.topic_stats import TopicStats
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.exposed_service import ExposedService
 from proxy.bridge.exposed_topic import ExposedTopic
@@ -32,7 +33,6 @@ from proxy.bridge.liveliness import NameLiveliness
 from proxy.bridge.readiness import ReadinessProbe
 from proxy.bridge.sent_stats import SentStats
 from proxy.bridge.status_topic import StatusTopic, open_status_topics
-from proxy.bridge.topic_stats import TopicStats
 from proxy.config.rule import Rule
 from proxy.config.status_topic import StatusTopicConfig
 from proxy.endpoints.endpoint import Endpoint, EndpointError, Event, Graph, GraphEntity, Role, proxy_node_name

@@ -10,7 +10,7 @@ from typing import Final
 
 from gdp.names import Name
 from gdp.service.serving import Asked, Serving
-from proxy.bridge.action_interface import RESULT
+from proxy.bridge.core.action_interface import RESULT
 from proxy.bridge.goal_calls import GoalCalls
 from proxy.endpoints.endpoint import Endpoint
 from proxy.wire.service import Stop

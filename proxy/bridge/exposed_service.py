@@ -25,16 +25,16 @@ from gdp.service.replication_messages import FollowerMessage
 from gdp.service.server_window import ServerWindow
 from gdp.service.serving import Asked, Serving
 from gdp.trust.advertisement import paths_value, session_value
-from proxy.bridge.action_interface import CANCEL, GOAL, PROFILES, RESULT, ActionInterface
-from proxy.bridge.bridge_election import presence_of, sign
 from proxy.bridge.call_tracer import CallKey
 from proxy.bridge.cancellation import TRIGGER, Cancellation
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.desired_flows import FlowSpec
+from proxy.bridge.core.action_interface import CANCEL, GOAL, PROFILES, RESULT, ActionInterface
+from proxy.bridge.core.bridge_election import presence_of, sign
+from proxy.bridge.core.desired_flows import FlowSpec
+from proxy.bridge.core.goals import cancel_of, goal_of
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault
 from proxy.bridge.goal_calls import GoalCalls
-from proxy.bridge.goals import cancel_of, goal_of
 from proxy.bridge.liveliness import Party
 from proxy.bridge.ordered_server import OrderedServer
 from proxy.bridge.remote_clients import ClientLiveness, RemoteClients

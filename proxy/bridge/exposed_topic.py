@@ -14,15 +14,15 @@ from gdp.client.send_options import is_urgent
 from gdp.errors import LocalError
 from gdp.message.loss import LossReason
 from gdp.trust.advertisement import paths_value
-from proxy.bridge.adaptation import adaptation_of
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.desired_flows import FlowSpec
-from proxy.bridge.encoder import MessageEncoder, compressor_of, description_of
+from proxy.bridge.core.adaptation import adaptation_of
+from proxy.bridge.core.desired_flows import FlowSpec
+from proxy.bridge.core.encoder import MessageEncoder, compressor_of, description_of
+from proxy.bridge.core.stream_qos import Change, LiveQos, RecordedQos, StreamQos
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault
 from proxy.bridge.liveliness import Party
 from proxy.bridge.rate_limit import RateLimiter
-from proxy.bridge.stream_qos import Change, LiveQos, RecordedQos, StreamQos
 from proxy.endpoints.endpoint import EndpointError, Event, GraphEntity, MessageReceived, TypeResolved
 from proxy.serial.channel import Channel
 from proxy.wire.message import RosMessage

@@ -26,13 +26,13 @@ from gdp.service.replication import ALL, Mode
 from gdp.service.replication_messages import INCARNATION_BITS
 from gdp.service.sequencer import Sequencer
 from gdp.trust.advertisement import paths_value, session_value
-from proxy.bridge.action_interface import CANCEL, GOAL, RESULT, ActionInterface
 from proxy.bridge.call_tracer import CallKey
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.desired_flows import FlowSpec
+from proxy.bridge.core.action_interface import CANCEL, GOAL, RESULT, ActionInterface
+from proxy.bridge.core.desired_flows import FlowSpec
+from proxy.bridge.core.goals import Goals, goal_of, says_yes
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault
-from proxy.bridge.goals import Goals, goal_of, says_yes
 from proxy.bridge.liveliness import Party
 from proxy.bridge.request_sender import RequestSender
 from proxy.bridge.server_discovery import SERVER_GONE, Response, ServerCalls, ServerDiscovery

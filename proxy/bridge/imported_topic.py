@@ -16,16 +16,16 @@ from gdp.errors import LocalError
 from gdp.message.loss import Losses
 from gdp.trust.advertisement import paths_value
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.decoder import MessageDecoder
+from proxy.bridge.core.decoder import MessageDecoder
+from proxy.bridge.core.desired_flows import FlowSpec
+from proxy.bridge.core.expander import MessageExpander
+from proxy.bridge.core.topic_stats import SAMPLES_MAX, TopicStats
 from proxy.bridge.decoder_cache import DecoderCache
-from proxy.bridge.desired_flows import FlowSpec
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
-from proxy.bridge.expander import MessageExpander
 from proxy.bridge.faults import Fault
 from proxy.bridge.liveliness import Party
 from proxy.bridge.local_output import ChannelPublishers, LocalOutput, MergedPublisher
 from proxy.bridge.rate_limit import RateLimiter
-from proxy.bridge.topic_stats import SAMPLES_MAX, TopicStats
 from proxy.endpoints.endpoint import EndpointError, Event, GraphEntity
 from proxy.endpoints.qos import unmatched
 from proxy.reduce.picture import LibraryError

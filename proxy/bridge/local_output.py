@@ -13,8 +13,8 @@ from dataclasses import replace
 from typing import Final, Protocol
 
 from gdp.errors import LocalError
-from proxy.bridge.decoder import MessageDecoder
-from proxy.bridge.desired_flows import FlowSpec
+from proxy.bridge.core.decoder import MessageDecoder
+from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher, EventHandler
 from proxy.bridge.faults import Fault
 from proxy.endpoints.endpoint import GraphEntity

@@ -12,11 +12,11 @@ from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.service.dispatch import Ask, Dispatch, End
 from gdp.service.replication_messages import ReplicaCommand
-from proxy.bridge.action_interface import CANCEL, RESULT
 from proxy.bridge.broadcast_queue import BroadcastQueue, Effect, wire_of
 from proxy.bridge.call_tracer import CallKey
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.goals import Goals
+from proxy.bridge.core.action_interface import CANCEL, RESULT
+from proxy.bridge.core.goals import Goals
 from proxy.bridge.server_discovery import ServerCalls
 
 __all__ = ["RequestSender"]

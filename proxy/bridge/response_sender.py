@@ -12,7 +12,7 @@ from gdp.names import Name
 from gdp.service.serving import Asked, Serving
 from proxy.bridge.call_tracer import CallKey
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.desired_flows import FlowSpec
+from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.faults import Fault
 from proxy.serial.serializer import Serializer
 from proxy.wire.service import Answer, Exchange, News, Outcome, too_large

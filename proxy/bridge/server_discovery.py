@@ -12,13 +12,13 @@ from gdp.errors import GdpError, LocalError
 from gdp.names import Name
 from gdp.service.dispatch import Dispatch
 from gdp.service.sequencer import Sequencer
-from proxy.bridge.action_interface import ActionInterface
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.desired_flows import FlowSpec
+from proxy.bridge.core.action_interface import ActionInterface
+from proxy.bridge.core.desired_flows import FlowSpec
+from proxy.bridge.core.goals import Goals
+from proxy.bridge.core.remote_server import RemoteServer
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault
-from proxy.bridge.goals import Goals
-from proxy.bridge.remote_server import RemoteServer
 from proxy.wire.service import Exchange
 
 __all__ = ["SERVER_GONE", "Response", "ServerCalls", "ServerDiscovery"]

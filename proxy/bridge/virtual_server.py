@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
-from proxy.bridge.action_interface import PROFILES
+from proxy.bridge.core.action_interface import PROFILES
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher, EventHandler
 from proxy.bridge.local_responses import LocalResponses
 from proxy.wire.service import Exchange

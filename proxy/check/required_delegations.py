@@ -15,7 +15,7 @@ from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.trust.delegation import Delegation
 from gdp.trust.right import Right
-from proxy.bridge.desired_flows import FlowSpec, exposed, imported
+from proxy.bridge.core.desired_flows import FlowSpec, exposed, imported
 from proxy.config import matching
 from proxy.config.config import ProxyConfig
 from proxy.config.rule import Rule

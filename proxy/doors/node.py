@@ -23,8 +23,8 @@ from gdp.nodes.delegation_store import DelegationStore
 from gdp.session.settings import SessionConfig, settings_of
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.flow_fields import flow_fields
-from proxy.bridge.topic_rows import flow_rows
+from proxy.bridge.core.flow_fields import flow_fields
+from proxy.bridge.core.topic_rows import flow_rows
 from proxy.config.config import ProxyConfig
 from proxy.doors.hub import Rights
 from proxy.doors.rules import DoorRules, rules_of

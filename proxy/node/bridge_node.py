@@ -19,11 +19,11 @@ from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
 from proxy.bridge.bridge import Bridge, FlowChange
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.desired_flows import FlowSpec
-from proxy.bridge.flow_fields import flow_fields
+from proxy.bridge.core.desired_flows import FlowSpec
+from proxy.bridge.core.flow_fields import flow_fields
+from proxy.bridge.core.topic_rows import flow_rows
+from proxy.bridge.core.topic_stats import percentile
 from proxy.bridge.topic_counts import topic_counts
-from proxy.bridge.topic_rows import flow_rows
-from proxy.bridge.topic_stats import percentile
 from proxy.config.config import ProxyConfig
 from proxy.endpoints.endpoint import proxy_node_name
 from proxy.endpoints.live import open_endpoints

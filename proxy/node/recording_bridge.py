@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from gdp.nodes.delegation_store import DelegationStore
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.topic_rows import flow_rows
+from proxy.bridge.core.topic_rows import flow_rows
 from proxy.config.config import ProxyConfig
 from proxy.config.recorded import RecordedRules
 from proxy.node.node import ProxyNode, open_topics

@@ -22,7 +22,7 @@ from gdp.stores.keyring import CARD
 from gdp.trust.right import Right
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.topic_rows import flow_rows
+from proxy.bridge.core.topic_rows import flow_rows
 from proxy.config.config import ProxyConfig
 from proxy.config.rule import Rule
 from proxy.doors.node import door_config

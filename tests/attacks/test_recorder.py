@@ -14,9 +14,9 @@ from gdp.client.participant import Message, Participant, Topic
 from gdp.message.loss import Losses
 from gdp.names import Name
 from proxy.bridge.context import BridgeContext
+from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.counters import Traffic
 from proxy.bridge.decoder_cache import DecoderCache
-from proxy.bridge.desired_flows import FlowSpec
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault, Faults
 from proxy.bridge.imported_topic import ImportedTopic

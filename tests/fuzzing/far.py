@@ -18,15 +18,15 @@ from gdp.control.boundary import ErrorBoundary
 from gdp.errors import DropReason, GdpError, LocalError, RemoteError
 from gdp.message.loss import Losses
 from gdp.names import Name
-from proxy.bridge.action_interface import ActionInterface
 from proxy.bridge.context import BridgeContext
+from proxy.bridge.core.action_interface import ActionInterface
+from proxy.bridge.core.desired_flows import FlowSpec
+from proxy.bridge.core.remote_server import RemoteServer
 from proxy.bridge.counters import Traffic
-from proxy.bridge.desired_flows import FlowSpec
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault, Faults
 from proxy.bridge.imported_topic import ImportedTopic
 from proxy.bridge.remote_clients import RemoteClients
-from proxy.bridge.remote_server import RemoteServer
 from proxy.config.rule import Rule
 from proxy.doors.rosbridge_json import RosbridgeCodec
 from proxy.endpoints.endpoint import Endpoint

@@ -121,7 +121,7 @@ def test_a_cloud_crosses_thinned(sites: Sites) -> None:
 def test_a_publisher_without_the_library_says_so_and_sends_images_as_they_are(
     sites: Sites, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("proxy.bridge.encoder.HAS_LIBRARY", False)
+    monkeypatch.setattr("proxy.bridge.core.encoder.HAS_LIBRARY", False)
     robot, _, talker, ear = flowing(sites, ", image: jpeg, encoding: cdr", CAMERA)
     raw = image("mono8", SHADE.shape, SHADE)
     talker.publish(raw)

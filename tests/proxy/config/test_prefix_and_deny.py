@@ -10,7 +10,7 @@ from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.ros_names import covers
 from gdp.trust.right import Right
-from proxy.bridge.desired_flows import DeniedName, denied, exposed, imported
+from proxy.bridge.core.desired_flows import DeniedName, denied, exposed, imported
 from proxy.check.explain import explain
 from proxy.config.config import ProxyConfig
 from proxy.endpoints.endpoint import GraphEntity, Role

@@ -21,7 +21,7 @@ from typing import Final
 
 from gdp.errors import DropReason, RemoteError
 from gdp.names import Name
-from proxy.bridge.action_interface import CANCEL
+from proxy.bridge.core.action_interface import CANCEL
 
 __all__ = ["Goals", "cancel_of", "goal_of", "says_yes"]
 

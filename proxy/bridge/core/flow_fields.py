@@ -6,7 +6,7 @@ Sans-I/O.
 from __future__ import annotations
 
 from gdp.state.snapshot import short_id
-from proxy.bridge.desired_flows import FlowSpec
+from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.imported_service import ImportedService
 
 __all__ = ["flow_fields"]

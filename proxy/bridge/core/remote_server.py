@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from gdp.errors import LocalError
-from proxy.bridge.action_interface import ActionInterface
-from proxy.bridge.decoder import MessageDecoder
+from proxy.bridge.core.action_interface import ActionInterface
+from proxy.bridge.core.decoder import MessageDecoder
 from proxy.endpoints.endpoint import Endpoint
 from proxy.serial.channel import Channel
 from proxy.serial.converter import translated_channel

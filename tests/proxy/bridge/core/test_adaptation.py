@@ -10,7 +10,7 @@ import pytest
 
 from gdp.client.publisher import Publisher
 from gdp.message.loss import Losses, LossReason, LostRange
-from proxy.bridge.adaptation import Adaptation, adaptation_of
+from proxy.bridge.core.adaptation import Adaptation, adaptation_of
 from proxy.reduce.adaptive import AdaptBounds
 from proxy.reduce.picture import HAS_LIBRARY
 from tests.proxy.bridge.known import STRING, string

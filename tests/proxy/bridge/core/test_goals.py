@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from gdp.errors import RemoteError
 from gdp.names import Name
-from proxy.bridge.action_interface import CANCEL, GOAL, RESULT
-from proxy.bridge.goals import GOAL_KEPT_MAX_BYTES, HEARTBEATS_MAX, Goals, cancel_of, goal_of, says_yes
+from proxy.bridge.core.action_interface import CANCEL, GOAL, RESULT
+from proxy.bridge.core.goals import GOAL_KEPT_MAX_BYTES, HEARTBEATS_MAX, Goals, cancel_of, goal_of, says_yes
 
 CDR = b"\0\1\0\0"
 A, B = (Name(bytes([number]) * 32) for number in (1, 2))

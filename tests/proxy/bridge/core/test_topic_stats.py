@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from proxy.bridge.topic_stats import TopicStats, percentile
+from proxy.bridge.core.topic_stats import TopicStats, percentile
 
 
 def test_topic_stats_report_the_usual_path_and_all_paths_that_were_seen() -> None:

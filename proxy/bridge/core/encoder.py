@@ -1,7 +1,7 @@
 """Message encoder: from a local message to a body for the overlay, reduced as the rule states.
 
 Sans-I/O. Order of the steps: region and voxels (the message stays of its kind), picture file, encoding, compression.
-``proxy.bridge.decoder`` and ``proxy.bridge.expander`` undo the last three.
+``proxy.bridge.core.decoder`` and ``proxy.bridge.core.expander`` undo the last three.
 """
 
 from __future__ import annotations

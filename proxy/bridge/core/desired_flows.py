@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.ros_names import Kind
-from proxy.bridge.action_interface import action_of, is_part
+from proxy.bridge.core.action_interface import action_of, is_part
 from proxy.bridge.faults import Fault
 from proxy.config import matching
 from proxy.config.matching import choose

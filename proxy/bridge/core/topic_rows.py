@@ -12,7 +12,7 @@ from gdp.client.participant import Participant, Topic
 from gdp.message.loss import LossReason
 from gdp.state.topic_rows import Direction, TopicRow, held_row
 from proxy.bridge.bridge import Flow
-from proxy.bridge.desired_flows import FlowSpec
+from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.exposed_service import ExposedService
 from proxy.bridge.exposed_topic import ExposedTopic
 from proxy.bridge.imported_service import ImportedService
