@@ -22,7 +22,7 @@ from fog.child_environment import child_environment
 from gdp.errors import LocalError
 from gdp.ports.readiness import readable
 from proxy.bridge.core.action_interface import action_of, is_part
-from proxy.endpoints.endpoint import Graph, Role
+from proxy.endpoints.core.endpoint import Graph, Role
 from proxy.endpoints.ros2 import Ros2Endpoint
 
 __all__ = ["main", "offers"]

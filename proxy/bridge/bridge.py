@@ -35,7 +35,7 @@ from proxy.bridge.sent_stats import SentStats
 from proxy.bridge.status_topic import StatusTopic, open_status_topics
 from proxy.config.rule import Rule
 from proxy.config.status_topic import StatusTopicConfig
-from proxy.endpoints.endpoint import Endpoint, EndpointError, Event, Graph, GraphEntity, Role, proxy_node_name
+from proxy.endpoints.core.endpoint import Endpoint, EndpointError, Event, Graph, GraphEntity, Role, proxy_node_name
 
 __all__ = ["Bridge", "BridgeRules", "FlowChange"]
 

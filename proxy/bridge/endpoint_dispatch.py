@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from proxy.bridge.context import BridgeContext
-from proxy.endpoints.endpoint import Endpoint, EndpointError, Event, GraphChanged
+from proxy.endpoints.core.endpoint import Endpoint, EndpointError, Event, GraphChanged
 from proxy.serial.channel import Channel, Qos
 from proxy.serial.service import Service
 

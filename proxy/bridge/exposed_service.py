@@ -41,7 +41,7 @@ from proxy.bridge.remote_clients import ClientLiveness, RemoteClients
 from proxy.bridge.response_sender import ResponseSender
 from proxy.bridge.undescribed_requests import UndescribedRequests
 from proxy.config.rule import CALL_MAX_S
-from proxy.endpoints.endpoint import (
+from proxy.endpoints.core.endpoint import (
     CallFailed,
     EndpointError,
     Event,

@@ -23,7 +23,7 @@ from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault
 from proxy.bridge.liveliness import Party
 from proxy.bridge.rate_limit import RateLimiter
-from proxy.endpoints.endpoint import EndpointError, Event, GraphEntity, MessageReceived, TypeResolved
+from proxy.endpoints.core.endpoint import EndpointError, Event, GraphEntity, MessageReceived, TypeResolved
 from proxy.serial.channel import Channel
 from proxy.wire.message import RosMessage
 

@@ -37,7 +37,7 @@ from proxy.bridge.liveliness import Party
 from proxy.bridge.request_sender import RequestSender
 from proxy.bridge.server_discovery import SERVER_GONE, Response, ServerCalls, ServerDiscovery
 from proxy.bridge.virtual_server import VirtualServer
-from proxy.endpoints.endpoint import EndpointError, Event, RequestReceived
+from proxy.endpoints.core.endpoint import EndpointError, Event, RequestReceived
 from proxy.serial.empty import NoAnswer
 from proxy.serial.serializer import Serializer
 from proxy.wire.replication import follower_message, is_word

@@ -26,8 +26,8 @@ from proxy.bridge.faults import Fault
 from proxy.bridge.liveliness import Party
 from proxy.bridge.local_output import ChannelPublishers, LocalOutput, MergedPublisher
 from proxy.bridge.rate_limit import RateLimiter
-from proxy.endpoints.endpoint import EndpointError, Event, GraphEntity
-from proxy.endpoints.qos import unmatched
+from proxy.endpoints.core.endpoint import EndpointError, Event, GraphEntity
+from proxy.endpoints.core.qos import unmatched
 from proxy.reduce.picture import LibraryError
 from proxy.serial.schema import DefinitionError
 from proxy.wire.message import RosMessage, TopicDescription

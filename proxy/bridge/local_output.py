@@ -17,8 +17,8 @@ from proxy.bridge.core.decoder import MessageDecoder
 from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher, EventHandler
 from proxy.bridge.faults import Fault
-from proxy.endpoints.endpoint import GraphEntity
-from proxy.endpoints.qos import default, offer
+from proxy.endpoints.core.endpoint import GraphEntity
+from proxy.endpoints.core.qos import default, offer
 from proxy.serial.channel import Channel, Qos
 from proxy.serial.serializer import Encoding
 from proxy.wire.message import CHANNELS_MAX

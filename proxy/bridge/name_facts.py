@@ -23,8 +23,8 @@ from proxy.bridge.context import BridgeContext
 from proxy.bridge.exposed_topic import ExposedTopic
 from proxy.bridge.imported_topic import ImportedTopic
 from proxy.config.rule import Rule
-from proxy.endpoints.endpoint import GraphEntity, Role
-from proxy.endpoints.qos import unmatched
+from proxy.endpoints.core.endpoint import GraphEntity, Role
+from proxy.endpoints.core.qos import unmatched
 
 __all__ = ["proxy_facts"]
 

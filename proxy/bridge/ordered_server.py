@@ -14,7 +14,7 @@ from gdp.service.follower import Apply, Doing, Effect, Fetch, Follower, Load, Re
 from gdp.service.replication_messages import FollowerMessage, SequencerMessage
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher, EventHandler
 from proxy.bridge.state_parameter import GET, SET, read_request, state_in, was_set, write_request
-from proxy.endpoints.endpoint import CallFailed, GraphEntity, ResponseReceived
+from proxy.endpoints.core.endpoint import CallFailed, GraphEntity, ResponseReceived
 from proxy.wire.replication import STATE_MAX_BYTES
 
 __all__ = ["OrderedServer"]

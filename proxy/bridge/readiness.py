@@ -11,7 +11,7 @@ from typing import Final
 from proxy.bridge.cancellation import NO_FIELDS, TRIGGER
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.config.readiness import Readiness
-from proxy.endpoints.endpoint import CallFailed, EndpointError, Event, MessageReceived, ResponseReceived
+from proxy.endpoints.core.endpoint import CallFailed, EndpointError, Event, MessageReceived, ResponseReceived
 from proxy.serial.channel import RosVersion
 
 __all__ = ["ReadinessProbe", "Thresholds"]

@@ -16,8 +16,8 @@ from gdp.errors import LocalError
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.liveliness import LivelinessTracker, NameLiveliness
 from proxy.config.status_topic import StatusTopicConfig
-from proxy.endpoints.endpoint import EndpointError, Event
-from proxy.endpoints.qos import default
+from proxy.endpoints.core.endpoint import EndpointError, Event
+from proxy.endpoints.core.qos import default
 from proxy.serial.channel import RosVersion
 
 __all__ = ["StatusTopic", "open_status_topics", "string_message"]

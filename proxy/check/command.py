@@ -21,7 +21,7 @@ from proxy.check.graph_snapshot import read_graphs
 from proxy.check.table import table
 from proxy.config.config import ProxyConfig
 from proxy.config.rule import Rule
-from proxy.endpoints.endpoint import Graph
+from proxy.endpoints.core.endpoint import Graph
 from proxy.node.node import open_topics
 
 __all__ = ["check_proxy"]

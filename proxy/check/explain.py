@@ -17,7 +17,7 @@ from gdp.trust.right import Right
 from proxy.check.finding import Direction, Finding, Match
 from proxy.config.matching import choose, imported
 from proxy.config.rule import SALT, Rule
-from proxy.endpoints.endpoint import Graph, GraphEntity, Role
+from proxy.endpoints.core.endpoint import Graph, GraphEntity, Role
 from proxy.serial.channel import Qos
 
 __all__ = ["Delegated", "explain"]

@@ -19,7 +19,7 @@ from proxy.bridge.core.desired_flows import FlowSpec, exposed, imported
 from proxy.config import matching
 from proxy.config.config import ProxyConfig
 from proxy.config.rule import Rule
-from proxy.endpoints.endpoint import Graph
+from proxy.endpoints.core.endpoint import Graph
 
 __all__ = ["Machine", "RequiredDelegation", "needs", "unmet"]
 

@@ -28,7 +28,7 @@ from gdp.trust.node_descriptor import NodeDescriptor
 from proxy.check.graph_snapshot import read_graphs
 from proxy.check.required_delegations import Machine, RequiredDelegation, needs, unmet
 from proxy.config.config import ProxyConfig
-from proxy.endpoints.endpoint import Graph
+from proxy.endpoints.core.endpoint import Graph
 
 __all__ = ["app", "main"]
 

@@ -13,7 +13,7 @@ from itertools import count
 from typing import Final, Protocol, TypeAlias
 
 from proxy.doors.client_queue import ClientQueue, Pending
-from proxy.endpoints.endpoint import (
+from proxy.endpoints.core.endpoint import (
     Event,
     Graph,
     GraphChanged,
@@ -23,7 +23,7 @@ from proxy.endpoints.endpoint import (
     Role,
     TypeResolved,
 )
-from proxy.endpoints.qos import DEPTH_MAX, default, depth_of
+from proxy.endpoints.core.qos import DEPTH_MAX, default, depth_of
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
 

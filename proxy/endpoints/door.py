@@ -26,7 +26,7 @@ from gdp.ports.listening import listen_tcp
 from proxy.doors.client_queue import DATA_MAX_BYTES, DATA_MAX_MESSAGES, ClientQueue, Pending
 from proxy.doors.hub import Hub, Rights, Session
 from proxy.doors.types import known_channel
-from proxy.endpoints.endpoint import Event, Graph, MessageReceived
+from proxy.endpoints.core.endpoint import Event, Graph, MessageReceived
 from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.serial.service import Service
 

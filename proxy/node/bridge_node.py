@@ -25,7 +25,7 @@ from proxy.bridge.core.topic_rows import flow_rows
 from proxy.bridge.core.topic_stats import percentile
 from proxy.bridge.topic_counts import topic_counts
 from proxy.config.config import ProxyConfig
-from proxy.endpoints.endpoint import proxy_node_name
+from proxy.endpoints.core.endpoint import proxy_node_name
 from proxy.endpoints.live import open_endpoints
 from proxy.node.goodbye import say_goodbye
 from proxy.node.node import ProxyNode, run_node

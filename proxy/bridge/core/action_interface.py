@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from proxy.endpoints.endpoint import Endpoint, GraphEntity
-from proxy.endpoints.qos import default
+from proxy.endpoints.core.endpoint import Endpoint, GraphEntity
+from proxy.endpoints.core.qos import default
 from proxy.serial.serializer import Encoding
 from proxy.wire.service import Exchange
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from proxy.endpoints.endpoint import Graph, Role
+from proxy.endpoints.core.endpoint import Graph, Role
 from proxy.serial.channel import Channel, RosVersion
 
 __all__ = ["SIGN", "BridgeElection", "presence_of", "sign"]

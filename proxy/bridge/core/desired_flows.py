@@ -16,7 +16,7 @@ from proxy.bridge.faults import Fault
 from proxy.config import matching
 from proxy.config.matching import choose
 from proxy.config.rule import Rule
-from proxy.endpoints.endpoint import Graph, GraphEntity, Role
+from proxy.endpoints.core.endpoint import Graph, GraphEntity, Role
 
 __all__ = ["ConfigProblem", "DeniedName", "FlowSpec", "denied", "exposed", "imported"]
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from gdp.errors import LocalError
 from proxy.bridge.core.action_interface import ActionInterface
 from proxy.bridge.core.decoder import MessageDecoder
-from proxy.endpoints.endpoint import Endpoint
+from proxy.endpoints.core.endpoint import Endpoint
 from proxy.serial.channel import Channel
 from proxy.serial.converter import translated_channel
 from proxy.serial.serializer import Encoding

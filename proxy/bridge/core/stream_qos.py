@@ -12,8 +12,8 @@ from typing import Protocol
 
 from gdp.client.send_options import SendOptions
 from proxy.config.rule import Rule
-from proxy.endpoints.endpoint import GraphEntity
-from proxy.endpoints.qos import DEPTH_MAX, deadline_s, default, kept, request
+from proxy.endpoints.core.endpoint import GraphEntity
+from proxy.endpoints.core.qos import DEPTH_MAX, deadline_s, default, kept, request
 from proxy.serial.channel import Channel, Qos
 
 __all__ = ["Change", "LiveQos", "RecordedQos", "StreamQos"]

@@ -25,6 +25,7 @@ from rospy.impl import masterslave, tcpros_base
 from rospy.impl.registration import RegManager, get_registration_listeners, get_service_manager, get_topic_manager
 
 from gdp.errors import LocalError, RemoteError
+from proxy.endpoints.core.reconnect import MissingConnections
 from proxy.endpoints.ros1.ipc import Frame, IpcLink, Kind, LinkEndedError
 from proxy.endpoints.ros1.master import GraphSnapshot, LocalEnd, Master, MasterError, MasterWatch
 from proxy.endpoints.ros1.raw import (
@@ -35,7 +36,6 @@ from proxy.endpoints.ros1.raw import (
     ros1_name,
     ros2_name,
 )
-from proxy.endpoints.ros1.reconnect import MissingConnections
 from proxy.endpoints.ros1.services import Client, Server, tickets
 from proxy.endpoints.ros1.topics import Publisher, Subscriber
 from proxy.serial.channel import Channel

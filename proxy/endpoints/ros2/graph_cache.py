@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
-from proxy.endpoints.endpoint import Graph, GraphEntity, Role
+from proxy.endpoints.core.endpoint import Graph, GraphEntity, Role
 from proxy.endpoints.ros2.qos import from_profile
 from proxy.endpoints.ros2.session import Session, TopicEnd
 

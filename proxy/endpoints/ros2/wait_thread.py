@@ -14,7 +14,7 @@ from contextlib import ExitStack
 from threading import Lock, Thread
 from typing import Final
 
-from proxy.endpoints.endpoint import EndpointError, Event, Graph, GraphChanged, MessageReceived, Role, TypeResolved
+from proxy.endpoints.core.endpoint import EndpointError, Event, Graph, GraphChanged, MessageReceived, Role, TypeResolved
 from proxy.endpoints.ros2.entities import ClientEntity, Kind, PublisherEntity, Source, SubscriptionEntity
 from proxy.endpoints.ros2.graph_cache import LOOK_EVERY_S, GraphCache
 from proxy.endpoints.ros2.qos import incompatibility

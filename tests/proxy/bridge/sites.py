@@ -28,7 +28,7 @@ from proxy.bridge.context import BridgeContext
 from proxy.bridge.counters import Traffic
 from proxy.bridge.faults import Faults
 from proxy.config.config import ProxyConfig, Rule
-from proxy.endpoints.endpoint import proxy_node_name
+from proxy.endpoints.core.endpoint import proxy_node_name
 from proxy.serial.channel import Qos, RosVersion
 from tests.proxy.bridge import known
 from tests.proxy.endpoints.fake import FakeEndpoint, FakeGraph

@@ -10,7 +10,7 @@ import pytest
 from proxy.bridge.liveliness import LivelinessTracker, NameLiveliness, Party, names_from_fields
 from proxy.bridge.status_topic import StatusTopic, string_message
 from proxy.config.status_topic import StatusTopicConfig
-from proxy.endpoints.qos import default
+from proxy.endpoints.core.qos import default
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, STRING, string, switched, text_of
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites

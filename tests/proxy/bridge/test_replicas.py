@@ -14,7 +14,7 @@ from gdp.client.delivery import Delivered
 from gdp.client.participant import Message
 from gdp.service.dispatch import Dispatch
 from proxy.bridge.imported_service import ImportedService
-from proxy.endpoints.qos import default
+from proxy.endpoints.core.qos import default
 from proxy.serial.channel import RosVersion
 from proxy.wire.service import Answer, Outcome
 from tests.proxy.bridge.clients import Client, LocalServer

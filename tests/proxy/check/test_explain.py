@@ -20,7 +20,7 @@ from gdp.trust.right import Right
 from proxy.check.explain import explain
 from proxy.check.finding import Finding, Match
 from proxy.check.table import table
-from proxy.endpoints.endpoint import GraphEntity, Role, proxy_node_name
+from proxy.endpoints.core.endpoint import GraphEntity, Role, proxy_node_name
 from proxy.serial.channel import Qos
 from tests.proxy.rule_files import OWNER, furnish, proxy, rules
 

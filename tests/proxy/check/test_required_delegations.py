@@ -10,7 +10,7 @@ from gdp.metadata import Metadata
 from gdp.trust.right import Right
 from proxy.check.required_delegations import Machine, RequiredDelegation, needs, unmet
 from proxy.config.config import ProxyConfig
-from proxy.endpoints.endpoint import GraphEntity, Role
+from proxy.endpoints.core.endpoint import GraphEntity, Role
 from tests.proxy.rule_files import OTHER, OWNER, furnish, proxy, rules
 
 ROS = "ros: {endpoint: ros2, domain: 0}\n"

@@ -13,7 +13,7 @@ from gdp.trust.right import Right
 from proxy.bridge.core.desired_flows import DeniedName, denied, exposed, imported
 from proxy.check.explain import explain
 from proxy.config.config import ProxyConfig
-from proxy.endpoints.endpoint import GraphEntity, Role
+from proxy.endpoints.core.endpoint import GraphEntity, Role
 from tests.proxy.check.test_explain import Given
 from tests.proxy.rule_files import FIRST_LINE, OWNER, furnish, proxy, refusals, rules
 

@@ -16,7 +16,7 @@ from proxy.bridge.context import BridgeContext
 from proxy.bridge.counters import Traffic
 from proxy.bridge.faults import Faults
 from proxy.config.recorded import RecordedRules
-from proxy.endpoints.endpoint import GraphChanged, MessageReceived, TypeResolved
+from proxy.endpoints.core.endpoint import GraphChanged, MessageReceived, TypeResolved
 from proxy.recordings.endpoint import RecordingEndpoint, ReplayEndpoint
 from proxy.recordings.reader import BagReader
 from proxy.recordings.writer import BagWriter

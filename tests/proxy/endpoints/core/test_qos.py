@@ -7,7 +7,7 @@ from itertools import product
 
 import pytest
 
-from proxy.endpoints.qos import DEPTH_MAX, deadline_s, default, depth_of, kept, offer, request, unmatched
+from proxy.endpoints.core.qos import DEPTH_MAX, deadline_s, default, depth_of, kept, offer, request, unmatched
 from proxy.serial.channel import NEVER, Qos
 
 LATCHED = default(latched=True, depth=5)
