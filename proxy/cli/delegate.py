@@ -25,8 +25,8 @@ from gdp.stores.keyring import CARD, OWNER_PUBLIC, load_card, load_delegations, 
 from gdp.trust.adcert import AdCertCache, Chain
 from gdp.trust.delegation import Delegation
 from gdp.trust.node_descriptor import NodeDescriptor
+from proxy.check.core.required_delegations import Machine, RequiredDelegation, needs, unmet
 from proxy.check.graph_snapshot import read_graphs
-from proxy.check.required_delegations import Machine, RequiredDelegation, needs, unmet
 from proxy.config.config import ProxyConfig
 from proxy.endpoints.core.endpoint import Graph
 

@@ -11,7 +11,7 @@ from gdp.names import Name
 from gdp.ros_names import covers
 from gdp.trust.right import Right
 from proxy.bridge.core.desired_flows import DeniedName, denied, exposed, imported
-from proxy.check.explain import explain
+from proxy.check.core.explain import explain
 from proxy.config.config import ProxyConfig
 from proxy.endpoints.core.endpoint import GraphEntity, Role
 from tests.proxy.check.test_explain import Given

@@ -14,7 +14,7 @@ from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.ros_names import Kind
 from gdp.trust.right import Right
-from proxy.check.finding import Direction, Finding, Match
+from proxy.check.core.finding import Direction, Finding, Match
 from proxy.config.matching import choose, imported
 from proxy.config.rule import SALT, Rule
 from proxy.endpoints.core.endpoint import Graph, GraphEntity, Role

@@ -8,7 +8,7 @@ import pytest
 
 from gdp.metadata import Metadata
 from gdp.trust.right import Right
-from proxy.check.required_delegations import Machine, RequiredDelegation, needs, unmet
+from proxy.check.core.required_delegations import Machine, RequiredDelegation, needs, unmet
 from proxy.config.config import ProxyConfig
 from proxy.endpoints.core.endpoint import GraphEntity, Role
 from tests.proxy.rule_files import OTHER, OWNER, furnish, proxy, rules

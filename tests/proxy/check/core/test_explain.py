@@ -17,8 +17,8 @@ from gdp.cli import gdp
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.trust.right import Right
-from proxy.check.explain import explain
-from proxy.check.finding import Finding, Match
+from proxy.check.core.explain import explain
+from proxy.check.core.finding import Finding, Match
 from proxy.check.table import table
 from proxy.endpoints.core.endpoint import GraphEntity, Role, proxy_node_name
 from proxy.serial.channel import Qos
