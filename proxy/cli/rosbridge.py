@@ -53,9 +53,9 @@ def rosbridge(
     del version  # its callback ends the command
     set_up_logging(verbose=verbose, level=log_level, form=log_format)
     with failing_clearly():
-        from proxy.doors.node import door_config, run_door
         from proxy.doors.rosbridge_session import RosbridgeSession
         from proxy.endpoints.door import DoorEndpoint, DoorSettings
+        from proxy.node.door import door_config, run_door
 
         config, _ = door_config(node, iface, delegations)
         settings = DoorSettings(label="rosbridge", listen=listen, origins=tuple(origin))

@@ -79,7 +79,7 @@ def call(
     with failing_clearly(), ending_quietly():
         from gdp.links.uplink import wait_for_device
         from proxy.endpoints.probe import Probe
-        from proxy.tools.member import NoAnswerError, Wanted, find_access, run_probe
+        from proxy.node.tool_member import NoAnswerError, Wanted, find_access, run_probe
         from proxy.tools.message_text import MessageText, request_tree
 
         tree = request_tree(request)

@@ -25,9 +25,9 @@ from proxy.bridge.context import BridgeContext
 from proxy.bridge.core.topic_rows import flow_rows
 from proxy.config.config import ProxyConfig
 from proxy.config.rule import Rule
-from proxy.doors.node import door_config
 from proxy.doors.rules import DoorRules, rules_of
 from proxy.endpoints.probe import Probe
+from proxy.node.door import door_config
 from proxy.node.goodbye import say_goodbye
 from proxy.node.node import run_node
 
