@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from fog.software.wheels import build_wheel, wheels
+from fog.supervisor.core.record import Record
 from fog.supervisor.journal import Journal
-from fog.supervisor.record import Record
 from gdp.errors import GdpError
 from gdp.host.run_registry import Run
 from gdp.management.control_client import ask_node, find_control_socket

@@ -96,7 +96,7 @@ def end_cluster(site: Site, journal: Journal, name: str, why: str, *, as_json: b
         left = journal.machines(name, gone=False)
         _remove_members(site, name, [each.name for each in left], now_s)
         for record in left:
-            from fog.supervisor.record import Outcome
+            from fog.supervisor.core.record import Outcome
 
             journal.put(record.ended(record.ending or Outcome.RELEASED, why, now_s), now_s, "released", why)
     for entry in journal.events(name, after=last):

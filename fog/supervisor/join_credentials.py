@@ -14,10 +14,10 @@ from fog.enrolment.credentials import IssuedCredentials
 from fog.enrolment.domain_members import DomainMembers
 from fog.machine import MachineBundle
 from fog.site import Site
+from fog.supervisor.core.record import Record
 from fog.supervisor.event_log import EventLog
 from fog.supervisor.journal import Journal
 from fog.supervisor.machine_credentials import Release, end_of_credentials
-from fog.supervisor.record import Record
 from gdp.errors import GdpError, StoreError
 
 __all__ = ["JoinCredentials"]

@@ -20,13 +20,13 @@ from fog.plan.choice import Choice
 from fog.providers.provider import GatewayProvider, Provider
 from fog.site import Site
 from fog.supervisor.actions import ActionRunner
+from fog.supervisor.core.reconcile import Action, Drain, Launch
+from fog.supervisor.core.record import Outcome, Record
 from fog.supervisor.event_log import EventLog
 from fog.supervisor.final_logs import decode_logs, encode_logs
 from fog.supervisor.journal import FINAL_LOGS, Journal
 from fog.supervisor.machine_credentials import CredentialIssuer
 from fog.supervisor.placement import place, stopgap
-from fog.supervisor.reconcile import Action, Drain, Launch
-from fog.supervisor.record import Outcome, Record
 from gdp.errors import LocalError
 
 __all__ = ["ATTACH", "DETACH", "MachineActions"]

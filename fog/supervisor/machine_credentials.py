@@ -18,9 +18,9 @@ from fog.enrolment.robot_config import reload
 from fog.enrolment.tickets import News, Report, Tickets
 from fog.machine import MachineBundle
 from fog.site import Site
+from fog.supervisor.core.record import Outcome, Record
 from fog.supervisor.event_log import EventLog
 from fog.supervisor.journal import Journal
-from fog.supervisor.record import Outcome, Record
 from gdp.config.config import SwitchConfig
 from gdp.errors import LocalError
 from gdp.stores.issue import DAY_S

@@ -24,9 +24,9 @@ from fog.enrolment.tickets import Tickets
 from fog.site import Site, topology_now
 from fog.software.server import SoftwareServer
 from fog.supervisor.background import held
+from fog.supervisor.core.reconcile import Timeouts
 from fog.supervisor.infrastructure import command_of, open_provider, set_up
 from fog.supervisor.journal import Journal
-from fog.supervisor.reconcile import Timeouts
 from fog.supervisor.snapshot import supervisor_snapshot
 from fog.supervisor.supervisor import Supervisor
 from fog.supervisor.watch import Watch

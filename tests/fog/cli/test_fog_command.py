@@ -19,8 +19,8 @@ from fog.cli.views import stage
 from fog.cluster import ClusterPlan
 from fog.enrolment.members import metadata_of
 from fog.site import open_site
+from fog.supervisor.core.record import Outcome
 from fog.supervisor.journal import FINAL_LOGS, Journal
-from fog.supervisor.record import Outcome
 from gdp.stores.keyring import OWNER_SALT, load_salt
 from tests.fog.supervisor.machines import record, serving
 from tests.fog.supervisor.test_journal import PLAN

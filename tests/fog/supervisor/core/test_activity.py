@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fog.supervisor.activity import Activity
+from fog.supervisor.core.activity import Activity
 
 
 def test_a_cluster_is_idle_since_its_last_request() -> None:

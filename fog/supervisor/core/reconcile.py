@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from fog.cluster import MachineRequest
-from fog.supervisor.record import Outcome, Record
+from fog.supervisor.core.record import Outcome, Record
 
 __all__ = ["Action", "Drain", "Launch", "Release", "Timeouts", "decide"]
 

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import pytest
 
-from fog.supervisor.gateway_election import elect, excused_names
-from fog.supervisor.reconcile import Release, Timeouts, decide
-from fog.supervisor.record import Outcome, Record
+from fog.supervisor.core.gateway_election import elect, excused_names
+from fog.supervisor.core.reconcile import Release, Timeouts, decide
+from fog.supervisor.core.record import Outcome, Record
 from tests.fog.supervisor.machines import NOW_S, SPOT, offer, record, serving
 
 PATIENCE = Timeouts()

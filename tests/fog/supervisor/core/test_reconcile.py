@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from fog.cluster import MachineRequest
 from fog.hardware import Hardware
 from fog.machine import Machine, MachineState
-from fog.supervisor.reconcile import Drain, Launch, Release, Timeouts, decide
-from fog.supervisor.record import Outcome, update_record
+from fog.supervisor.core.reconcile import Drain, Launch, Release, Timeouts, decide
+from fog.supervisor.core.record import Outcome, update_record
 from tests.fog.supervisor.machines import NOW_S, SPOT, World, record, serving
 
 PATIENCE = Timeouts()

@@ -12,8 +12,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from fog.supervisor.reconcile import Timeouts
-from fog.supervisor.record import Record
+from fog.supervisor.core.reconcile import Timeouts
+from fog.supervisor.core.record import Record
 
 __all__ = ["Election", "elect", "excused_names"]
 

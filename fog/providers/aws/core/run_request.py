@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, cast
 
 from fog.machine import MachineSpec
 from fog.providers.aws.config import AwsConfig
-from fog.providers.aws.instances import tags_of
+from fog.providers.aws.core.instances import tags_of
 
 if TYPE_CHECKING:
     from types_boto3_ec2.literals import InstanceTypeType, ResourceTypeType
