@@ -12,7 +12,7 @@ import time
 from collections import OrderedDict
 from typing import Final, TypeVar
 
-from fog.enrolment.credentials import IssuedCredentials
+from fog.credentials import IssuedCredentials
 from fog.enrolment.members import Authority
 from fog.enrolment.tickets import Kept, Tickets
 from gdp.crypto.certificates import Membership, Role

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Final
 
 from fog.cluster import ExportedInterface
-from fog.enrolment.credentials import IssuedCredentials
+from fog.credentials import IssuedCredentials
 from gdp.crypto.certificates import Role
 from gdp.crypto.kem import KemPrivateKey
 from gdp.errors import StoreError

@@ -9,8 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from fog.cluster import CloudNode, ClusterPlan
+from fog.credentials import IssuedCredentials
 from fog.enrolment.bootstrap import joining_boot, machine_label
-from fog.enrolment.credentials import IssuedCredentials
 from fog.enrolment.domain_members import DomainMembers
 from fog.machine import MachineBundle
 from fog.site import Site

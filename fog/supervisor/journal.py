@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from fog.cluster import ClusterPlan, MachineRequest
-from fog.enrolment.credentials import IssuedCredentials
+from fog.credentials import IssuedCredentials
 from fog.hardware import Hardware
 from fog.machine import MachineSpec, MachineState
 from fog.offer import Offer

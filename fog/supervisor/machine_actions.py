@@ -11,8 +11,8 @@ from functools import partial
 from typing import Final
 
 from fog.cluster import CloudNode, ClusterPlan, MachineRequest
+from fog.credentials import IssuedCredentials
 from fog.enrolment.bootstrap import node_names
-from fog.enrolment.credentials import IssuedCredentials
 from fog.latency.known import Latencies
 from fog.machine import Machine, MachineSpec, MachineState
 from fog.offer import Offer

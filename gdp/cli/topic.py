@@ -12,7 +12,6 @@ from typing import Annotated, ClassVar, Final, Optional
 
 import typer
 
-from gdp.cli.columns import bits, columns, short_count
 from gdp.cli.completion import complete_node
 from gdp.cli.extension import ANY_ARGUMENTS, ExtendedGroup, placeholder
 from gdp.cli.output import show
@@ -23,6 +22,7 @@ from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.nodes.membership import load_member
 from gdp.session.settings import settings_of
+from gdp.state.columns import bits, columns, short_count
 from gdp.state.topic_rows import Direction, held_row
 
 __all__ = ["Host", "JsonLines", "KnownName", "Sockets", "answers_of", "app", "none_runs"]

@@ -29,7 +29,6 @@ from gdp.enrolment.channel import Channel, connect_any
 from gdp.enrolment.domain_client import ReceivedMail, delete_mail, fetch_mail, read_inbox
 from gdp.enrolment.member_files import MemberFiles
 from gdp.enrolment.member_setup import RELAY_FILE, record_file_name, update_relays
-from gdp.enrolment.wire import INSTANCE_BYTES, EnrolmentError, UnreachableError
 from gdp.errors import GdpError, LocalError, RemoteError
 from gdp.host_port import split_host_port
 from gdp.links.endpoint_files import RECORD_SUFFIX, own_record
@@ -56,6 +55,7 @@ from gdp.stores.keyring import (
 from gdp.trust.delegation import Delegation
 from gdp.trust.domain import Policy
 from gdp.trust.enrolment import MEMBERS_MAX
+from gdp.trust.enrolment_wire import INSTANCE_BYTES, EnrolmentError, UnreachableError
 from gdp.trust.join_token import SERVERS_MAX
 
 __all__ = ["DELEGATION_KIND", "Agent", "MailHandler", "load_identity_at_any_time", "reload_node"]

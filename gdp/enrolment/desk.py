@@ -28,15 +28,6 @@ from gdp.crypto.x509_profile import SubjectInfo, read_request
 from gdp.enrolment.domain_files import DomainFiles
 from gdp.enrolment.member_setup import record_file_name
 from gdp.enrolment.registry import MachineRow, Registry, TokenRow
-from gdp.enrolment.wire import (
-    INSTANCE_BYTES,
-    NONCE_BYTES,
-    VERSION,
-    EnrolmentError,
-    Refusal,
-    read_message,
-    verify_member_proof,
-)
 from gdp.errors import LocalError, RemoteError, StatementError, StoreError
 from gdp.links.endpoint_files import own_record, public_candidates
 from gdp.names import Name
@@ -47,6 +38,15 @@ from gdp.stores.keyring import NODE_CERTIFICATE, OWNER_PUBLIC, ROOT_CERTIFICATE,
 from gdp.trust.audit import Action, AuditTrail
 from gdp.trust.domain import Policy
 from gdp.trust.enrolment import MEMBERS_MAX, Application, token_id
+from gdp.trust.enrolment_wire import (
+    INSTANCE_BYTES,
+    NONCE_BYTES,
+    VERSION,
+    EnrolmentError,
+    Refusal,
+    read_message,
+    verify_member_proof,
+)
 from gdp.trust.join_token import JOIN_ID_BYTES, JoinRole, join_proof
 from gdp.trust.mail import Mail
 from gdp.trust.node_descriptor import NodeDescriptor

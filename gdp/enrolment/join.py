@@ -23,7 +23,6 @@ from gdp.crypto.keys import PublicKey
 from gdp.enrolment.channel import Channel, connect_any
 from gdp.enrolment.draft import draft_of, publish_draft, reserve_space
 from gdp.enrolment.member_setup import MachinePlan, record_file_name, write_configuration
-from gdp.enrolment.wire import INSTANCE_BYTES, EnrolmentError, UnreachableError
 from gdp.errors import LocalError, RemoteError
 from gdp.host_port import split_host_port
 from gdp.links.endpoint_files import own_record
@@ -32,6 +31,7 @@ from gdp.stores.issue import install_membership, make_node_keys
 from gdp.stores.keyring import CARD, OWNER_PUBLIC
 from gdp.trust.domain import Policy
 from gdp.trust.enrolment import MEMBERS_MAX, apply
+from gdp.trust.enrolment_wire import INSTANCE_BYTES, EnrolmentError, UnreachableError
 from gdp.trust.join_token import SERVERS_MAX, JoinToken, join_id, join_key, join_proof
 
 __all__ = ["JoinRequest", "Joined", "join_domain", "prefer_server"]

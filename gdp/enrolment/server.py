@@ -25,7 +25,11 @@ from gdp.enrolment.desk import EnrolmentDesk, Session, refusal_of
 from gdp.enrolment.domain_files import HANDOVER_SOCKET, DomainFiles
 from gdp.enrolment.registry import Registry
 from gdp.enrolment.server_tls import ServerTls, make_server_tls
-from gdp.enrolment.wire import (
+from gdp.errors import DropReason, GdpError, LocalError, StatementError
+from gdp.ports.client_network import client_network
+from gdp.ports.listening import listen_tcp
+from gdp.token_bucket import TokenBucket, TokenBuckets
+from gdp.trust.enrolment_wire import (
     LENGTH_BYTES,
     NONCE_BYTES,
     REQUEST_MAX_BYTES,
@@ -36,10 +40,6 @@ from gdp.enrolment.wire import (
     message_bytes,
     read_message,
 )
-from gdp.errors import DropReason, GdpError, LocalError, StatementError
-from gdp.ports.client_network import client_network
-from gdp.ports.listening import listen_tcp
-from gdp.token_bucket import TokenBucket, TokenBuckets
 
 __all__ = ["STRANGER_S", "EnrolmentServer", "bind_handover", "bind_server", "serve_domain"]
 

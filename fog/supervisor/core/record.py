@@ -9,7 +9,7 @@ from dataclasses import KW_ONLY, dataclass, replace
 from enum import Enum
 
 from fog.cluster import MachineRequest
-from fog.enrolment.credentials import IssuedCredentials
+from fog.credentials import IssuedCredentials
 from fog.machine import Machine, MachineSpec, MachineState
 
 __all__ = ["Outcome", "Record", "cost_usd", "stage", "update_record"]

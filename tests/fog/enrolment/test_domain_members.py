@@ -13,9 +13,9 @@ import pytest
 from fog.enrolment.domain_members import DomainMembers
 from gdp.enrolment.agent import Agent
 from gdp.enrolment.join import Joined, JoinRequest, join_domain
-from gdp.enrolment.wire import EnrolmentError
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.stores.keyring import DELEGATIONS
+from gdp.trust.enrolment_wire import EnrolmentError
 from gdp.trust.join_token import JoinToken
 from gdp.trust.right import Right
 from tests.fog.enrolment.desk import MAP, PLAN

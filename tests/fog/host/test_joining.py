@@ -15,8 +15,8 @@ from fog.host.bundle import JOIN_FILE, install
 from fog.host.joining import join
 from gdp.config.config import SwitchConfig
 from gdp.config.relay_config import RelayConfig
-from gdp.enrolment.wire import EnrolmentError, UnreachableError
 from gdp.errors import LocalError
+from gdp.trust.enrolment_wire import EnrolmentError, UnreachableError
 from gdp.trust.join_token import JoinToken
 from proxy.config.config import ProxyConfig
 from tests.fog.enrolment.desk import CLUSTER

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from fog.cluster import MachineRequest
-from fog.enrolment.credentials import IssuedCredentials
+from fog.credentials import IssuedCredentials
 from fog.hardware import Hardware
 from fog.machine import Machine, MachineSpec, MachineState
 from fog.offer import Offer

@@ -17,7 +17,7 @@ from fog.machine import MachineBundle, MachineSpec
 from fog.site import Site, open_site
 from fog.supervisor.journal import Journal
 from fog.supervisor.supervisor import Supervisor
-from gdp.enrolment.wire import EnrolmentError, UnreachableError
+from gdp.trust.enrolment_wire import EnrolmentError, UnreachableError
 from gdp.trust.join_token import JoinToken
 from tests.fog.supervisor.test_supervisor import PLAN, Memory, work
 from tests.fog.test_site import WHEEL

@@ -21,12 +21,12 @@ from gdp.enrolment.agent import DELEGATION_KIND, Agent
 from gdp.enrolment.desk import EnrolmentDesk
 from gdp.enrolment.domain_client import DomainClient
 from gdp.enrolment.removal import remove_machine
-from gdp.enrolment.wire import EnrolmentError, Refusal
 from gdp.errors import LocalError, StatementError
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.stores.issue import delegate
 from gdp.stores.keyring import CARD, load_identity
+from gdp.trust.enrolment_wire import EnrolmentError, Refusal
 from gdp.trust.mail import Mail
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
