@@ -164,7 +164,7 @@ def _unconcerned_us(revoked: Revocations, unix_s: float) -> float:
 def _on_disk(revoked: Revocations, authority: CertificateAuthority, unix_s: float) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         upkeep, now = RevocationUpkeep(Path(folder), revoked), Timestamps(0.0, unix_s)
-        upkeep.load(now)
+        upkeep.restore(now)
         revoked.changes = set(revoked.keys())
         upkeep.start()
         begun_s = time.perf_counter()
