@@ -124,7 +124,7 @@ class Bridge:
 
     def __init__(
         self,
-        site: BridgeContext,
+        context: BridgeContext,
         config: BridgeRules,
         endpoints: Sequence[Endpoint],
         held: DelegationStore,
@@ -132,10 +132,10 @@ class Bridge:
         look_s: float = 0.0,
         status_topic: StatusTopicConfig | None = None,
     ) -> None:
-        self._site = site
+        self._context = context
         self._config = config
         self._held = held
-        self._me = proxy_node_name(site.member.name.to_text())
+        self._me = proxy_node_name(context.member.name.to_text())
         self._seats = [EndpointDispatcher(endpoint) for endpoint in endpoints]
         self._flows: dict[_Key, tuple[FlowSpec, Flow]] = {}
         self._inbound: dict[Name, Flow] = {}  # the flow that receives the overlay's messages of a name
@@ -222,7 +222,7 @@ class Bridge:
 
     def publishers_of(self, name: Name) -> list[Name]:
         """Return the remote publishers of a topic that is read here, as far as they have introduced themselves."""
-        return [each.publisher for each in self._site.member.writer_proxies_of(name)]
+        return [each.publisher for each in self._context.member.writer_proxies_of(name)]
 
     @property
     def undelegated(self) -> list[FlowSpec]:
@@ -268,10 +268,10 @@ class Bridge:
         """Process events of endpoints and messages of the overlay, and run due timers."""
         self._now_s = now_s
         for seat in self._seats:
-            if seat.deliver(self._site, now_s):
+            if seat.deliver(self._context, now_s):
                 self._is_stale = True
                 self._failed.clear()
-        for message in self._site.member.poll_messages():
+        for message in self._context.member.poll_messages():
             self._receive(message, now_s)
         for key, probe in self._probes.items():
             probe.handle_timer(now_s)
@@ -281,21 +281,21 @@ class Bridge:
         if self._is_stale or (self._since and now_s >= self._tick_at_s):
             self._refresh(now_s)
         for seat in self._seats:
-            seat.deliver_faults(self._site, now_s)
+            seat.deliver_faults(self._context, now_s)
         self._close_finished(now_s)
         is_tick = now_s >= self._tick_at_s
         for flow, local in self._timed.items():
             due_s = flow.get_timer()
             if is_tick:
-                self._site.contain(local, b"", now_s, flow.tick, now_s)
+                self._context.contain(local, b"", now_s, flow.tick, now_s)
             elif due_s is not None and due_s <= now_s:
-                self._site.contain(local, b"", now_s, flow.handle_timer, now_s)
+                self._context.contain(local, b"", now_s, flow.handle_timer, now_s)
         for topic in self._status_topics:
             if topic.is_due(now_s):
                 topic.update(self.liveliness(now_s), now_s)
         if is_tick:
             self._tick_at_s = now_s + TICK_S
-            self._site.traffic.dropped = sum(seat.endpoint.dropped for seat in self._seats)
+            self._context.traffic.dropped = sum(seat.endpoint.dropped for seat in self._seats)
 
     def poll_changes(self) -> list[FlowChange]:
         """Return the flows that began or ended since the last call, in order; the oldest are forgotten first."""
@@ -342,7 +342,7 @@ class Bridge:
     @property
     def is_finished(self) -> bool:
         """Return whether readers have confirmed the last messages of all flows that ended."""
-        return all(self._site.member.is_acknowledged(name) for name in self._finishing)
+        return all(self._context.member.is_acknowledged(name) for name in self._finishing)
 
     def close(self) -> None:
         """End every flow; endpoints stay open."""
@@ -475,13 +475,13 @@ class Bridge:
         log.debug("flow begun name=%s exposed=%s", flow_spec.name.short, flow_spec.is_exposed)
 
     def _make(self, seat: EndpointDispatcher, flow_spec: FlowSpec, topic: Topic, view: _View) -> Flow:
-        site = self._site
+        context = self._context
         if flow_spec.rule.kind != "topic":
             kind = ExposedService if flow_spec.is_exposed else ImportedService
-            return kind(site, seat, flow_spec, topic, secrets.randbits(63))
+            return kind(context, seat, flow_spec, topic, secrets.randbits(63))
         if flow_spec.is_exposed:
-            return ExposedTopic(site, seat, flow_spec, topic, view.ends(Role.PUBLISHES, flow_spec))
-        return ImportedTopic(site, seat, flow_spec, topic)
+            return ExposedTopic(context, seat, flow_spec, topic, view.ends(Role.PUBLISHES, flow_spec))
+        return ImportedTopic(context, seat, flow_spec, topic)
 
     def _may_finish(self, key: _Key) -> bool:
         """Return whether the rule and the delegation of a flow still apply: it ends because its local node has gone."""
@@ -514,15 +514,15 @@ class Bridge:
 
     def _close_finished(self, now_s: float) -> None:
         for name, each in list(self._finishing.items()):
-            if now_s >= each.ends_s or self._site.member.is_acknowledged(name):
+            if now_s >= each.ends_s or self._context.member.is_acknowledged(name):
                 self._close_finishing(name)
 
     def _close_finishing(self, name: Name) -> None:
         flow_spec, flow, _ = self._finishing.pop(name)
-        if not self._site.member.is_acknowledged(name):
-            count = self._site.member.unacknowledged(name)
+        if not self._context.member.is_acknowledged(name):
+            count = self._context.member.unacknowledged(name)
             detail = f"{count} messages were not confirmed after their {flow_spec.rule.kind} had ended here"
-            self._site.faults.report(flow_spec.local, Fault.TOO_FAST, detail)
+            self._context.faults.report(flow_spec.local, Fault.TOO_FAST, detail)
         self._close(flow_spec, flow)
 
     def _close(self, flow_spec: FlowSpec, flow: Flow) -> None:
@@ -543,9 +543,9 @@ class Bridge:
         now = set(complaints)
         for complaint in self._complaints - now:
             if complaint.fault is not Fault.UNKNOWN_TYPE and complaint.fault is not Fault.NO_DELEGATION:
-                self._site.faults.clear(complaint.local, complaint.fault)
+                self._context.faults.clear(complaint.local, complaint.fault)
         for complaint in now - self._complaints:
-            self._site.faults.report(complaint.local, complaint.fault, complaint.detail)
+            self._context.faults.report(complaint.local, complaint.fault, complaint.detail)
         self._complaints = now
 
 

@@ -58,10 +58,10 @@ def run(path: Path, settings: ProxyConfig, *, json: bool) -> None:
             held = DelegationStore(settings.delegations, node.identity)
             tracer = open_tracer(settings.traces, node.identity.name, node.identity.label)
             look_s = 0.0 if all(end.exclusive for end in settings.ros) else _LOOK_S
-            site = BridgeContext(node.member, node.traffic, node.faults, tracer)
-            bridge = Bridge(site, settings, endpoints, held, look_s=look_s, status_topic=settings.status)
+            context = BridgeContext(node.member, node.traffic, node.faults, tracer)
+            bridge = Bridge(context, settings, endpoints, held, look_s=look_s, status_topic=settings.status)
             domains = tuple(end.domain_id for end in settings.ros if end.endpoint != "ros1")
-            answer_for_proxy(bridge, site, node.identity, node.policy, node.node_log.wait_facts, domains)
+            answer_for_proxy(bridge, context, node.identity, node.policy, node.node_log.wait_facts, domains)
             node.drains = True
             node.on_reload = lambda: _reload(path, settings, node, bridge)
             has_names = settings.metrics is not None and settings.metrics.topic_names

@@ -27,7 +27,7 @@ _ASKED_MAX_CHARS: Final = 256
 
 def answer_for_proxy(
     bridge: Bridge,
-    site: BridgeContext,
+    context: BridgeContext,
     identity: Identity,
     policy: Policy,
     waits: Callable[[float], tuple[WaitFact, ...]],
@@ -37,7 +37,7 @@ def answer_for_proxy(
 
     The body may have the ROS name that the asker typed (``q``). A member of another domain must state the 256-bit name.
     """
-    member, begun_s = site.member, time.monotonic()
+    member, begun_s = context.member, time.monotonic()
 
     def gather(question: Question, now: Timestamps) -> ProxyFacts:
         asked = question.body.text("q", _ASKED_MAX_CHARS) if "q" in question.body else ""
@@ -45,7 +45,7 @@ def answer_for_proxy(
             asked = question.name.to_text() if question.name != ZERO else ""
         return proxy_facts(
             bridge,
-            site,
+            context,
             identity,
             asked,
             now,

@@ -57,10 +57,10 @@ class Recorder:
         member = SimpleNamespace(losses_of=lambda _: Losses())
         rule = SimpleNamespace(name="/chatter", max_hz=None, max_bytes=1 << 20)
         self.endpoint = RecordingEndpoint(cast(BagWriter, self.sink), [("/chatter", "a/msg/B")])
-        site = BridgeContext(cast(Participant, member), Traffic(), self.faults)
+        context = BridgeContext(cast(Participant, member), Traffic(), self.faults)
         flow_spec = FlowSpec(False, "/chatter", "a/msg/B", TOPIC, cast(Rule, rule))
         self.flow = ImportedTopic(
-            site, EndpointDispatcher(self.endpoint), flow_spec, cast(Topic, SimpleNamespace(name=TOPIC))
+            context, EndpointDispatcher(self.endpoint), flow_spec, cast(Topic, SimpleNamespace(name=TOPIC))
         )
 
     @property

@@ -215,7 +215,7 @@ class Stage:
         waits = attachment_waits(machine.member.attachment, now.mono_s)
         known = proxy_facts(
             machine.bridge,
-            machine.site,
+            machine.context,
             identity,
             asked,
             now._replace(unix_s=now.unix_s + self.offsets_s.get(machine.label, 0.0)),

@@ -93,7 +93,7 @@ def test_a_topic_that_adapts_crosses_whole_on_a_wide_path(sites: Sites) -> None:
     sites.every(0.05, 60, lambda number: talker.publish(string(str(number))))
     sites.run(4)
     assert ear.texts == [str(number) for number in range(60)]
-    assert robot.site.traffic.thinned == 0
+    assert robot.context.traffic.thinned == 0
 
 
 @pytest.mark.skipif(not HAS_LIBRARY, reason="Pillow is not installed")
@@ -102,7 +102,7 @@ def test_the_rate_that_a_publisher_states_decides_about_quality_and_rate(
 ) -> None:
     robot, _, talker, ear = flowing(sites, ", image: jpeg, adapt: true, encoding: cdr, reliable: false", CAMERA)
     raw = image("mono8", NOISE.shape, NOISE)
-    traffic = robot.site.traffic
+    traffic = robot.context.traffic
     sites.every(0.05, 40, lambda _: talker.publish(raw))
     sites.run(3)
     wide, traffic.bytes_out = traffic.bytes_out / len(ear.heard), 0
