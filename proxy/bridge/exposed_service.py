@@ -78,13 +78,18 @@ class ExposedService:
     """
 
     def __init__(
-        self, context: BridgeContext, seat: EndpointDispatcher, flow_spec: FlowSpec, topic: Topic, random_start: int
+        self,
+        context: BridgeContext,
+        dispatcher: EndpointDispatcher,
+        flow_spec: FlowSpec,
+        topic: Topic,
+        random_start: int,
     ) -> None:
         self._context = context
-        self._seat = seat
+        self._dispatcher = dispatcher
         self._flow_spec = flow_spec
         self._topic = topic
-        self._serving = _serving_of(flow_spec, seat.endpoint.ros, random_start)
+        self._serving = _serving_of(flow_spec, dispatcher.endpoint.ros, random_start)
         self._goals = GoalCalls()
         self.requests = 0
         self.request_bytes = 0
@@ -93,16 +98,16 @@ class ExposedService:
         self._is_finished = False
         self._liveness = ClientLiveness()
         self._early = UndescribedRequests()
-        endpoint, rule = seat.endpoint, flow_spec.rule
+        endpoint, rule = dispatcher.endpoint, flow_spec.rule
         parts = ActionInterface.of(rule.kind, flow_spec.local, flow_spec.type_name)
         self._exchange = replace(parts.known(endpoint, rule.encoding), is_ordered=rule.is_ordered)
         self._remote_clients = RemoteClients(self._exchange, endpoint.ros)
-        self._mark = seat.advertise(self, sign(presence_of(flow_spec.local), endpoint.ros))
-        self._servers = [seat.create_client(self, *part) for part in parts.services]
-        self._stopper = None if rule.stop is None else seat.create_client(self, rule.stop, TRIGGER)
+        self._mark = dispatcher.advertise(self, sign(presence_of(flow_spec.local), endpoint.ros))
+        self._servers = [dispatcher.create_client(self, *part) for part in parts.services]
+        self._stopper = None if rule.stop is None else dispatcher.create_client(self, rule.stop, TRIGGER)
         self._kept = None if not rule.is_ordered else self._keep(random_start)
         self._topics = [
-            seat.subscribe(self, *part, profile) for part, profile in zip(parts.topics, PROFILES, strict=False)
+            dispatcher.subscribe(self, *part, profile) for part, profile in zip(parts.topics, PROFILES, strict=False)
         ]
         self._publisher = context.member.serve(
             topic,
@@ -236,7 +241,7 @@ class ExposedService:
         stopper = [] if self._stopper is None else [self._stopper]
         kept = [] if self._kept is None else self._kept.handles
         for handle in [self._mark, *self._servers, *stopper, *kept, *self._topics]:
-            self._seat.close(handle)
+            self._dispatcher.close(handle)
         self._publisher.describe(replace(self._exchange, is_leaving=True).to_wire())
         self._context.member.flush(now_s)
 
@@ -315,11 +320,11 @@ class ExposedService:
     def _keep(self, number: int) -> OrderedServer:
         rule, what = self._flow_spec.rule, self._flow_spec.local
         return OrderedServer(
-            seat=self._seat,
+            dispatcher=self._dispatcher,
             owner=self,
             node=rule.state_node,
             number=number,
-            give=lambda number, raw: self._seat.endpoint.call(self._servers[0], number, raw),
+            give=lambda number, raw: self._dispatcher.endpoint.call(self._servers[0], number, raw),
             tell=self._tell,
             complain=lambda reason: self._context.faults.report(what, Fault.REFUSED, reason),
         )
@@ -348,7 +353,7 @@ class ExposedService:
 
     def _give(self, now_s: float) -> None:
         """Pass the next requests in order to the local server."""
-        call, what = self._seat.endpoint.call, self._flow_spec.local
+        call, what = self._dispatcher.endpoint.call, self._flow_spec.local
         for turn in self._serving.poll_turns(now_s):
             given = self._servers[turn.asked.part], turn.number, turn.request
             if not self._context.contain(what, turn.asked.client, now_s, call, *given):

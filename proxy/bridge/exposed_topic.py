@@ -49,16 +49,18 @@ class ExposedTopic:
     def __init__(
         self,
         context: BridgeContext,
-        seat: EndpointDispatcher,
+        dispatcher: EndpointDispatcher,
         flow_spec: FlowSpec,
         topic: Topic,
         ends: Sequence[GraphEntity],
     ) -> None:
         self._context = context
-        self._seat = seat
+        self._dispatcher = dispatcher
         self._flow_spec = flow_spec
         self._topic = topic
-        self._qos: StreamQos = LiveQos(flow_spec.rule, ends) if seat.endpoint.is_live else RecordedQos(flow_spec.rule)
+        self._qos: StreamQos = (
+            LiveQos(flow_spec.rule, ends) if dispatcher.endpoint.is_live else RecordedQos(flow_spec.rule)
+        )
         self.publisher: Publisher | None = None
         self.published = Counter[int]()
         self.published_bytes = Counter[int]()
@@ -74,7 +76,7 @@ class ExposedTopic:
         self.handle = self._subscribe()
         try:
             # Remote readers may come before a message.
-            self._describe((seat.endpoint.channel(flow_spec.local, flow_spec.type_name),))
+            self._describe((dispatcher.endpoint.channel(flow_spec.local, flow_spec.type_name),))
         except LocalError:
             self.publisher = None  # the first message brings its definition
 
@@ -85,7 +87,7 @@ class ExposedTopic:
         if change is Change.NONE:
             return
         if change is Change.SUBSCRIPTION:
-            self._seat.close(self.handle)
+            self._dispatcher.close(self.handle)
             self.handle = self._subscribe()
         if self._channels:
             self._describe(self._channels)
@@ -105,7 +107,7 @@ class ExposedTopic:
 
     def finish(self, now_s: float) -> None:
         """Publish nothing from now on."""
-        self._seat.close(self.handle)
+        self._dispatcher.close(self.handle)
         self._context.member.flush(now_s)
 
     def close(self, now_s: float) -> None:
@@ -135,7 +137,7 @@ class ExposedTopic:
             self._context.member.renew(topic)
 
     def _subscribe(self) -> int:
-        return self._seat.subscribe(self, self._flow_spec.local, self._flow_spec.type_name, self._qos.request)
+        return self._dispatcher.subscribe(self, self._flow_spec.local, self._flow_spec.type_name, self._qos.request)
 
     def _describe(self, channels: Sequence[Channel]) -> None:
         rule = self._flow_spec.rule

@@ -75,10 +75,15 @@ class ImportedService:
     """
 
     def __init__(
-        self, context: BridgeContext, seat: EndpointDispatcher, flow_spec: FlowSpec, topic: Topic, random_start: int
+        self,
+        context: BridgeContext,
+        dispatcher: EndpointDispatcher,
+        flow_spec: FlowSpec,
+        topic: Topic,
+        random_start: int,
     ) -> None:
         self._context = context
-        self._seat = seat
+        self._dispatcher = dispatcher
         self._flow_spec = flow_spec
         self._topic = topic
         self._parts = ActionInterface.of(flow_spec.rule.kind, flow_spec.local, flow_spec.type_name)
@@ -116,13 +121,15 @@ class ImportedService:
             options=flow_spec.rule.send_options(),
             is_session=session_value(flow_spec.rule.sign),
         )
-        self._virtual_server = VirtualServer(seat, self, is_paced=flow_spec.has_short_queues(seat.endpoint.ros))
+        self._virtual_server = VirtualServer(
+            dispatcher, self, is_paced=flow_spec.has_short_queues(dispatcher.endpoint.ros)
+        )
         self._sender = RequestSender(
             context=context, service=topic.name, calls=self._calls, goals=self._goals, publisher=self._publisher
         )
         self._discovery = ServerDiscovery(
             context=context,
-            seat=seat,
+            dispatcher=dispatcher,
             flow_spec=flow_spec,
             service=topic.name,
             parts=self._parts,
@@ -234,7 +241,7 @@ class ImportedService:
     def _description(self) -> bytes:
         """Return this machine's description of the service; empty where only the remote side has one."""
         try:
-            exchange = self._parts.known(self._seat.endpoint, self._flow_spec.rule.encoding)
+            exchange = self._parts.known(self._dispatcher.endpoint, self._flow_spec.rule.encoding)
         except LocalError:
             return b""
         return exchange.to_wire()

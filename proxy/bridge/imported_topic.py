@@ -58,7 +58,9 @@ class ImportedTopic:
         LocalError: this graph does not accept a publisher of it.
     """
 
-    def __init__(self, context: BridgeContext, seat: EndpointDispatcher, flow_spec: FlowSpec, topic: Topic) -> None:
+    def __init__(
+        self, context: BridgeContext, dispatcher: EndpointDispatcher, flow_spec: FlowSpec, topic: Topic
+    ) -> None:
         self._context = context
         self._flow_spec = flow_spec
         self._topic = topic
@@ -70,13 +72,13 @@ class ImportedTopic:
         self._pace = RateLimiter(flow_spec.rule.max_hz)
         self.thinned = 0
         self.last_s: float | None = None
-        samples = _SAMPLES_MAX if seat.endpoint.is_live else SAMPLES_MAX
+        samples = _SAMPLES_MAX if dispatcher.endpoint.is_live else SAMPLES_MAX
         self.stats = TopicStats(
             topic=flow_spec.local, type_name=flow_spec.type_name, latencies_ms=deque(maxlen=samples)
         )
-        kind = MergedPublisher if seat.endpoint.is_live else ChannelPublishers
+        kind = MergedPublisher if dispatcher.endpoint.is_live else ChannelPublishers
         self._heard_s: dict[bytes, float] = {}  # when each publisher's last message came, the latest last
-        self._output: LocalOutput = kind(seat, self, flow_spec)
+        self._output: LocalOutput = kind(dispatcher, self, flow_spec)
 
     def follow(self, ends: Sequence[GraphEntity]) -> None:
         """Update the local readers."""

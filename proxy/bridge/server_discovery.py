@@ -45,7 +45,7 @@ class ServerDiscovery:
         self,
         *,
         context: BridgeContext,
-        seat: EndpointDispatcher,
+        dispatcher: EndpointDispatcher,
         flow_spec: FlowSpec,
         service: Name,
         parts: ActionInterface,
@@ -55,7 +55,7 @@ class ServerDiscovery:
         closed: Callable[[str], None],
     ) -> None:
         self._context = context
-        self._endpoint = seat.endpoint
+        self._endpoint = dispatcher.endpoint
         self._flow_spec = flow_spec
         self._service = service
         self._parts = parts

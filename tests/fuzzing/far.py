@@ -140,9 +140,9 @@ def _receive(data: bytes) -> object:
         member = SimpleNamespace(losses_of=lambda _: Losses())
         rule = SimpleNamespace(name="/t", max_hz=None, max_bytes=1 << 20, wants_latched=None)
         context = BridgeContext(cast(Participant, member), Traffic(), _Quiet(), boundary=_Reraising())
-        seat = EndpointDispatcher(cast(Endpoint, _Endpoint(is_live=is_live)))
+        dispatcher = EndpointDispatcher(cast(Endpoint, _Endpoint(is_live=is_live)))
         flow_spec = FlowSpec(False, "/t", _type_of(described), _NAME, cast(Rule, rule))
-        flow = ImportedTopic(context, seat, flow_spec, cast(Topic, SimpleNamespace(name=_NAME)))
+        flow = ImportedTopic(context, dispatcher, flow_spec, cast(Topic, SimpleNamespace(name=_NAME)))
         for number in range(2):
             delivered = Delivered(b"p" * 32, 1, number, wire, 1, 1)
             fields: dict[str, Any] = {"topic": _NAME, "description": description, "delivered": delivered}
