@@ -206,25 +206,27 @@ class Subscriptions:
         route = self._routes.get((header.source, header.incarnation))
         return None if route is None else (route.subscription, self._private_writer_proxy(route, now_s))
 
-    def receive_response(self, answer: Response, now: Timestamps) -> StreamChanges:
+    def receive_response(self, response: Response, now: Timestamps) -> StreamChanges:
         """Process a switch's response about a party: its advertisement, or its end.
 
         Raises:
             StatementError: the advertisement is invalid or about something else, or the end is of an older one.
         """
-        subscription, change = self._by_name.get(answer.name), StreamChanges([], [], [])
-        if subscription is None or answer.advertiser == self._reader.name:
+        subscription, change = self._by_name.get(response.name), StreamChanges([], [], [])
+        if subscription is None or response.advertiser == self._reader.name:
             return change
-        writer_proxy = subscription.writer_proxies.get(answer.advertiser)
-        if not answer.advertisement:
-            if writer_proxy is not None and writer_proxy.advertisement_sequence > answer.sequence:
+        writer_proxy = subscription.writer_proxies.get(response.advertiser)
+        if not response.advertisement:
+            if writer_proxy is not None and writer_proxy.advertisement_sequence > response.sequence:
                 raise StatementError(DropReason.STALE, "gone, of an earlier advertisement")
             return (
-                change if writer_proxy is None else StreamChanges([], self._detach(subscription, answer.advertiser), [])
+                change
+                if writer_proxy is None
+                else StreamChanges([], self._detach(subscription, response.advertiser), [])
             )
-        advertisement = self._verifier.verify(answer.advertisement, now.unix_s)
+        advertisement = self._verifier.verify(response.advertisement, now.unix_s)
         is_heard = HEARS[subscription.right] is advertisement.right
-        if not is_heard or advertisement.name != answer.name or advertisement.node != answer.advertiser:
+        if not is_heard or advertisement.name != response.name or advertisement.node != response.advertiser:
             raise StatementError(DropReason.WRONG_NAME, "an advertisement about something else")
         self._reader.control_keys.shared(advertisement.exchange)  # or it is refused before anything changes
         if writer_proxy is not None:
@@ -236,7 +238,7 @@ class Subscriptions:
                 return change
             if is_restarted:
                 writer_proxy.finish()
-            rest = [Message(answer.name, each, writer_proxy.description) for each in writer_proxy.poll_delivered()]
+            rest = [Message(response.name, each, writer_proxy.description) for each in writer_proxy.poll_delivered()]
             change = StreamChanges([], self._detach(subscription, advertisement.node), rest)
         return change._replace(opened=self._open(subscription, advertisement, now.mono_s))
 

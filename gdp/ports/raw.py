@@ -73,7 +73,7 @@ def _shape(size: int) -> struct.Struct:
     return struct.Struct(f"{MAC_BYTES}x{MAC_BYTES}s{ETHER_BYTES - 2 * MAC_BYTES}x{size}s")
 
 
-def _lane_of(frame: bytes) -> TrafficClass:
+def _traffic_class_of(frame: bytes) -> TrafficClass:
     if frame[KIND_AT] >= CONTROL_FROM:
         return TrafficClass.CONTROL
     return TrafficClass.URGENT if frame[FLAGS_AT] & _URGENT else TrafficClass.ORDINARY
@@ -122,7 +122,7 @@ class RawPlane(NetdevPlane):
         tell_neighbours(opened, traffic_class, self._neighbours.get(port.index, ()))
 
     def set_neighbours(self, port: int, macs: Collection[bytes]) -> None:
-        """Store the addresses of a port's neighbours: their frames get lanes ahead of strangers'."""
+        """Store the addresses of a port's neighbours: their frames get a class ahead of strangers'."""
         before, after = self._neighbours.get(port, frozenset()), frozenset(macs)
         self._neighbours[port] = after
         steps = (
@@ -208,7 +208,7 @@ class RawPlane(NetdevPlane):
         counters.drops[DropReason.TOO_BIG] += len(frames) - len(fitting)
         if not fitting:
             return 0
-        sink = self._sockets_by_class[_lane_of(fitting[0])][port]
+        sink = self._sockets_by_class[_traffic_class_of(fitting[0])][port]
         macs, left = destination_mac + facts.mac, 0
         if len(fitting) == 1:
             left = put_one(sink, fitting[0], macs, counters.drops)

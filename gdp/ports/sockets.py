@@ -10,9 +10,9 @@ multicast, an echo of our own sending, and a broadcast data frame (which every s
 again).
 
 A port may have a socket for each *traffic class*, so that no frame queues after less important ones. The
-lanes in order are: control frames of neighbours, their hellos, urgent frames, ordinary frames, and control frames of
+classes in order are: control frames of neighbours, their hellos, urgent frames, ordinary frames, and control frames of
 strangers. A flood of one class fills only the queue of that class. A neighbour is identified by its address, which the
-filters get with each change. Frames that leave by the lanes of neighbours and of urgent frames carry a priority. Every
+filters get with each change. Frames of neighbours and urgent ones carry a priority. Every
 queueing discipline with bands honours it (``pfifo_fast``, ``prio``, and the access categories of Wi-Fi).
 """
 
@@ -104,7 +104,7 @@ _HELLO_ONLY: Final = ((_JUMP_EQUAL, 1, 0, Kind.HELLO), _LEAVE)
 class TrafficClass(Enum):
     """Traffic class of a socket: filter steps of (code, jump if true, jump if false, value).
 
-    In the lanes of ``_BY_ADDRESS`` the sender's address decides what follows.
+    In the classes of ``_BY_ADDRESS`` the sender's address decides what follows.
     """
 
     ALL = (

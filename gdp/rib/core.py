@@ -565,7 +565,7 @@ class RibCore:
             self._holders.add(route.name, to, now_s + lease_s)
         except StatementError:
             lease_s = min(lease_s, _UNREPORTED_S)
-        answer = Response(
+        response = Response(
             name=route.name,
             advertiser=route.advertiser,
             advertisement=route.advertisement,
@@ -574,7 +574,7 @@ class RibCore:
             lease_s=lease_s,
         )
         self.answers += 1
-        self._send(answer, to.name, (route.name, route.advertiser))
+        self._send(response, to.name, (route.name, route.advertiser))
 
     def _answer_none(self, name: Name, to: Name, *, is_unknown: bool) -> None:
         """Answer that no node advertises a name, or, if the tier above could not be asked, that it is not known."""
@@ -590,8 +590,8 @@ class RibCore:
         own = self._policy.own
         self._send(Response(name=name, advertiser=name, advertisement=b"", domain=own, transit=(), lease_s=lease_s), to)
 
-    def _send(self, answer: Response, to: Name, about: Key | None = None) -> None:
-        wire = answer.to_wire(self._identity.name, self._identity.key, self._identity.membership)
+    def _send(self, response: Response, to: Name, about: Key | None = None) -> None:
+        wire = response.to_wire(self._identity.name, self._identity.key, self._identity.membership)
         self._outgoing_statements.append(OutgoingStatement(to, Kind.RIB_ANSWER, wire, about))
 
     def _concerns(self, name: Name, now_s: float) -> bool:
@@ -735,27 +735,27 @@ class RibCore:
 
     def _take_answer_from_above(self, statement: Statement, now: Timestamps) -> None:
         fields = statement.fields
-        answer = Response.from_fields(fields)
-        if answer.name == statement.signer and not self._upstream.has(statement.signer):
+        response = Response.from_fields(fields)
+        if response.name == statement.signer and not self._upstream.has(statement.signer):
             self._take_sign_of_life(statement, now)
             return
         member = self._upper_member(statement, now)
-        if answer.is_negative or answer.is_unknown:
-            record = self._upstream_queries.not_known if answer.is_unknown else self._upstream_queries.answered
-            askers = record(answer.name, now.mono_s)
-            if answer.is_unknown:
-                self._serve_stale(answer.name, now.mono_s + WATCH_AGAIN_S, now)
-            if not self._store.routes(answer.name):
+        if response.is_negative or response.is_unknown:
+            record = self._upstream_queries.not_known if response.is_unknown else self._upstream_queries.answered
+            askers = record(response.name, now.mono_s)
+            if response.is_unknown:
+                self._serve_stale(response.name, now.mono_s + WATCH_AGAIN_S, now)
+            if not self._store.routes(response.name):
                 for asker in askers:
-                    self._answer_none(answer.name, asker.name, is_unknown=answer.is_unknown)
+                    self._answer_none(response.name, asker.name, is_unknown=response.is_unknown)
             return
-        known = self._store.get(answer.name, answer.advertiser)
-        if not answer.advertisement:
-            if isinstance(known, Route) and known.is_from_upstream and known.sequence <= answer.sequence:
-                self._store.withdraw(answer.name, answer.advertiser)
+        known = self._store.get(response.name, response.advertiser)
+        if not response.advertisement:
+            if isinstance(known, Route) and known.is_from_upstream and known.sequence <= response.sequence:
+                self._store.withdraw(response.name, response.advertiser)
                 self._tell_gone(known, now.mono_s)
             return
-        self._learn_from_upstream(answer, member, known, now)
+        self._learn_from_upstream(response, member, known, now)
 
     def _take_sign_of_life(self, statement: Statement, now: Timestamps) -> None:
         """Take the answer of a RIB below to a probe."""
@@ -764,28 +764,28 @@ class RibCore:
         self._lower.record_alive(member.name, now.mono_s)
 
     def _learn_from_upstream(
-        self, answer: Response, member: Membership, known: Route | Withdrawn | None, now: Timestamps
+        self, response: Response, member: Membership, known: Route | Withdrawn | None, now: Timestamps
     ) -> None:
-        advertisement = self._verifier.verify(answer.advertisement, now.unix_s)
-        if advertisement.name != answer.name or advertisement.node != answer.advertiser:
+        advertisement = self._verifier.verify(response.advertisement, now.unix_s)
+        if advertisement.name != response.name or advertisement.node != response.advertiser:
             raise StatementError(DropReason.WRONG_NAME, "an answer about something else than its advertisement")
         is_from_below = (
             isinstance(known, Route) and not known.is_from_upstream and known.advertisement == advertisement.wire
         )
-        if answer.domain == self._policy.own or is_from_below:
+        if response.domain == self._policy.own or is_from_below:
             return  # our own, or of a tier below, returned from above
         if isinstance(known, Route) and advertisement.sequence < known.sequence:
             raise StatementError(DropReason.STALE, "the tier above is behind")
         route = replace(
-            self._route(advertisement, answer.transit, member, now),
-            domain=answer.domain,
+            self._route(advertisement, response.transit, member, now),
+            domain=response.domain,
             is_from_upstream=True,
-            expires_s=now.mono_s + answer.lease_s,
+            expires_s=now.mono_s + response.lease_s,
         )
         self._store.put(route)
         if isinstance(known, Route) and not known.is_from_upstream:
             self._replicate(route.name, route.advertiser)  # a peer has the old location
-        askers = self._upstream_queries.answered(answer.name, now.mono_s, answer.lease_s)
+        askers = self._upstream_queries.answered(response.name, now.mono_s, response.lease_s)
         self._tell(route, known, now.mono_s, askers)
 
     # -- revocations

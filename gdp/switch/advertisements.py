@@ -121,8 +121,8 @@ class AdvertisementHandler:
             self._held.record_advertisement(advertisement, at)
             if is_first:
                 self._resolver.watch(advertisement.name, now.mono_s)
-            for place in cache.of(advertisement.name, now.mono_s):
-                self._locations.send_to_reader(at, advertisement.right, place, now.mono_s)
+            for location in cache.of(advertisement.name, now.mono_s):
+                self._locations.send_to_reader(at, advertisement.right, location, now.mono_s)
         is_alone = (
             self._rib_client.rib is None and advertisement.previous != ZERO
         )  # no RIB sends an AdvertiseAck to a node that has moved

@@ -92,7 +92,7 @@ def answer_from_upstream(
 ) -> list[OutgoingStatement]:
     node = parse(pending_advertisement).signer if pending_advertisement else ROBOT.name
     gone = 0 if pending_advertisement else UnverifiedAdvertisement.from_statement(parse(advertisement())).sequence
-    answer = Response(
+    response = Response(
         name=NAME,
         advertiser=node,
         advertisement=pending_advertisement,
@@ -101,13 +101,15 @@ def answer_from_upstream(
         lease_s=30.0,
         sequence=gone,
     )
-    to.receive(answer.to_wire(by.name, by.key, by.membership), by.name, now)
+    to.receive(response.to_wire(by.name, by.key, by.membership), by.name, now)
     return to.statements_to_send()
 
 
 def negative_upstream(to: RibCore, now: Timestamps = START) -> list[OutgoingStatement]:
-    answer = Response(name=NAME, advertiser=NAME, advertisement=b"", domain=CLOUD.root.domain, transit=(), lease_s=2.0)
-    to.receive(answer.to_wire(UPPER.name, UPPER.key, UPPER.membership), UPPER.name, now)
+    response = Response(
+        name=NAME, advertiser=NAME, advertisement=b"", domain=CLOUD.root.domain, transit=(), lease_s=2.0
+    )
+    to.receive(response.to_wire(UPPER.name, UPPER.key, UPPER.membership), UPPER.name, now)
     return to.statements_to_send()
 
 
@@ -550,8 +552,10 @@ def test_a_tier_above_that_is_silent_is_asked_again_and_then_the_answer_is_unkno
 
 
 def unknown_upstream(to: RibCore, now: Timestamps = START) -> list[OutgoingStatement]:
-    answer = Response(name=NAME, advertiser=NAME, advertisement=b"", domain=CLOUD.root.domain, transit=(), lease_s=0.0)
-    to.receive(answer.to_wire(UPPER.name, UPPER.key, UPPER.membership), UPPER.name, now)
+    response = Response(
+        name=NAME, advertiser=NAME, advertisement=b"", domain=CLOUD.root.domain, transit=(), lease_s=0.0
+    )
+    to.receive(response.to_wire(UPPER.name, UPPER.key, UPPER.membership), UPPER.name, now)
     return to.statements_to_send()
 
 
@@ -580,10 +584,10 @@ LOWER = NodeKeys.generate(Role.RIB, "lower").join(CLOUD, DAY)
 
 def sign_of_life(to: RibCore, now_s: float) -> None:
     """Let the RIB below answer a probe."""
-    answer = Response(
+    response = Response(
         name=LOWER.name, advertiser=LOWER.name, advertisement=b"", domain=CLOUD.root.domain, transit=(), lease_s=0.5
     )
-    to.receive(answer.to_wire(LOWER.name, LOWER.key, LOWER.membership), LOWER.name, at(now_s))
+    to.receive(response.to_wire(LOWER.name, LOWER.key, LOWER.membership), LOWER.name, at(now_s))
 
 
 @pytest.mark.parametrize("lives", [True, False])
