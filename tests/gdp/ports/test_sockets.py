@@ -137,7 +137,7 @@ class Recorder:
         self.options[level, option] = value
 
 
-@pytest.mark.parametrize("lane", TrafficClass)
+@pytest.mark.parametrize("traffic_class", TrafficClass)
 def test_the_kernel_is_given_the_whole_filter(traffic_class: TrafficClass) -> None:
     asked = Recorder()
     attach_ethertype_filter(asked, traffic_class)  # type: ignore[arg-type]

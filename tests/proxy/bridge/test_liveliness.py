@@ -94,8 +94,8 @@ def test_the_status_text_is_a_string_of_either_ros(ros: int) -> None:
 
 def test_the_status_topic_is_latched_and_follows_what_changes(sites: Sites) -> None:
     robot, server = sites.add(ROBOT, expose=[CHATTER]), sites.add(SERVER, imports=[CHATTER])
-    (seat,) = server.bridge._seats
-    server.bridge._status_topics = [StatusTopic(seat, StatusTopicConfig())]
+    (dispatcher,) = server.bridge._dispatchers
+    server.bridge._status_topics = [StatusTopic(dispatcher, StatusTopicConfig())]
     Ear(server.graph, "/chatter")
     robot.graph.publish("/talker", "/chatter", STRING)
     assert sites.run(3, robot.is_read)
