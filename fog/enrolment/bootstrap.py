@@ -30,7 +30,7 @@ from fog.machine import MachineBundle, Program
 from gdp.crypto.certificates import Role
 from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.stores.keyring import DELEGATIONS
-from gdp.trust.enrolment import Seat, Ticket
+from gdp.trust.bootstrap_ticket import Seat, Ticket
 from gdp.trust.join_token import JoinToken
 
 __all__ = ["PROXY", "SWITCH", "RobotDevices", "gateway_boot", "joining_boot", "machine_boot", "machine_label"]

@@ -23,7 +23,7 @@ from typing import Final
 from fog.enrolment.responder import Responder
 from gdp.errors import GdpError, LocalError, StatementError
 from gdp.ports.listening import listen_tcp
-from gdp.trust.enrolment import REQUEST_MAX_BYTES, request_head
+from gdp.trust.bootstrap_ticket import REQUEST_MAX_BYTES, request_head
 
 __all__ = ["ACCEPTS_PER_S", "CONNECTIONS_MAX", "CONNECTION_S", "Listener", "bind_tcp", "bind_unix"]
 

@@ -26,7 +26,7 @@ from gdp.stores.files import public, read_public, write_all
 from gdp.stores.issue import DAY_S, admit, delegate, make_node
 from gdp.stores.keyring import CARD, OWNER_PUBLIC, load_domain, save_delegation
 from gdp.trust.audit import Action
-from gdp.trust.enrolment import Application, Granted
+from gdp.trust.bootstrap_ticket import Application, Granted
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
 

@@ -22,7 +22,7 @@ from gdp.errors import DropReason, StatementError
 from gdp.stores.audit_log import AuditLog
 from gdp.stores.keyring import ROOT_CERTIFICATE, load_root
 from gdp.trust.audit import Action, AuditTrail
-from gdp.trust.enrolment import (
+from gdp.trust.bootstrap_ticket import (
     REFUSED,
     Application,
     EnrolmentResponse,

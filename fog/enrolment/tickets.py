@@ -29,7 +29,7 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.kem import KemPrivateKey
 from gdp.errors import StoreError
 from gdp.stores.files import private, read_private, write_all
-from gdp.trust.enrolment import Seat, Ticket, token_id
+from gdp.trust.bootstrap_ticket import Seat, Ticket, token_id
 
 __all__ = ["Kept", "News", "PlannedSeat", "Report", "Tickets"]
 

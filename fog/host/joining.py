@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from fog.host.bundle import JOIN_FILE, MEMBER_FOLDER
-from gdp.enrolment.join import JoinRequest, join_domain
+from gdp.enrolment.domain_join import JoinRequest, join_domain
 from gdp.enrolment.member_files import MEMBER_FILE
 from gdp.errors import LocalError
 from gdp.stores.files import read_private

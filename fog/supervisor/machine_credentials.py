@@ -25,7 +25,7 @@ from gdp.config.config import SwitchConfig
 from gdp.errors import LocalError
 from gdp.stores.issue import DAY_S
 from gdp.stores.keyring import load_domain
-from gdp.trust.enrolment import TOKEN_BYTES, Ticket
+from gdp.trust.bootstrap_ticket import TOKEN_BYTES, Ticket
 
 __all__ = ["CredentialIssuer", "MachineCredentials", "Release", "end_of_credentials"]
 

@@ -19,8 +19,8 @@ from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.fragments import ControlFragmenter, ControlReassembler
 from gdp.control.join import Join
 from gdp.control.join_refresh import JoinRefresh
-from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.neighbour import Neighbour
+from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.control.presence import Presence
 from gdp.control.revocation_sync import RevocationSync
 from gdp.control.settings import NodeSettings

@@ -36,8 +36,8 @@ from gdp.stores.files import public, read_public, write_all
 from gdp.stores.issue import admit, renew
 from gdp.stores.keyring import NODE_CERTIFICATE, OWNER_PUBLIC, ROOT_CERTIFICATE, load_identity, load_root
 from gdp.trust.audit import Action, AuditTrail
+from gdp.trust.bootstrap_ticket import MEMBERS_MAX, Application, token_id
 from gdp.trust.domain import Policy
-from gdp.trust.enrolment import MEMBERS_MAX, Application, token_id
 from gdp.trust.enrolment_wire import (
     INSTANCE_BYTES,
     NONCE_BYTES,

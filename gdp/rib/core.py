@@ -21,8 +21,8 @@ from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.boundary import ErrorBoundary
 from gdp.control.presence import IdentityChecks, Presence
 from gdp.control.query import Query, Response
-from gdp.control.relay import Relay
-from gdp.control.replica import Digest, Entry, Fetch, Inventory, Key, Replicas
+from gdp.control.relayed_statement import RelayedStatement
+from gdp.control.rib_replication import Digest, Entry, Fetch, Inventory, Key, Replicas
 from gdp.control.waiting import Wait, WaitReason
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.identity import Identity
@@ -322,13 +322,13 @@ class RibCore:
     # -- advertisements
 
     def _take_relay(self, statement: Statement, now: Timestamps) -> None:
-        relay = Relay.from_fields(statement.fields)
-        member = self._sender(relay.membership, statement, now)
+        relayed = RelayedStatement.from_fields(statement.fields)
+        member = self._sender(relayed.membership, statement, now)
         if not (member.role.is_switch or member.role is Role.RIB):
             raise StatementError(DropReason.WRONG_DOMAIN, "relays are switches or RIBs")
         statement.verify(member.key)
         self._lower.record_alive(member.name, now.mono_s)
-        passed_on = parse(relay.statement)
+        passed_on = parse(relayed.statement)
         if passed_on.type is StatementType.REVOKE:
             self._handle_revocation(passed_on, member.name, now)
             return
@@ -342,7 +342,7 @@ class RibCore:
             advertisement = self._verifier.verify_statement(passed_on, now.unix_s)
             if member.role.is_switch and advertisement.switch != member.name:
                 raise StatementError(DropReason.NOT_DELEGATED, "the RtCert names another switch than the relay")
-            if relay.domain is not None and not self._policy.trusts(relay.domain):
+            if relayed.domain is not None and not self._policy.trusts(relayed.domain):
                 raise StatementError(DropReason.WRONG_DOMAIN, "an advertisement of a domain that is not trusted")
             if member.domain != self._policy.own and not advertisement.is_global:
                 raise StatementError(DropReason.WRONG_DOMAIN, "a local name of another domain")
@@ -350,16 +350,16 @@ class RibCore:
             if advertisement.right is Right.ATTACH and self.identities.is_refused_above(
                 advertisement.node, advertisement.incarnation, now.mono_s
             ):
-                route = self._route(advertisement, relay.transit, member, now)
-                self._forward_upstream(route, relay.statement, route.sequence, now.mono_s)
+                route = self._route(advertisement, relayed.transit, member, now)
+                self._forward_upstream(route, relayed.statement, route.sequence, now.mono_s)
                 raise StatementError(DropReason.IN_USE, "another node with this identity, says the tier above")
             known = self._check_news(advertisement, member)
         except StatementError as error:
             self._refuse(passed_on, member, error, now.mono_s)
             raise
-        route = self._route(advertisement, relay.transit, member, now)
-        if relay.domain is not None and member.role is Role.RIB:
-            route = replace(route, domain=relay.domain)
+        route = self._route(advertisement, relayed.transit, member, now)
+        if relayed.domain is not None and member.role is Role.RIB:
+            route = replace(route, domain=relayed.domain)
         self._store.put(route)
         self._former.note_accepted(route)
         self.accepted += 1
@@ -369,7 +369,7 @@ class RibCore:
         self._tell(route, known, now.mono_s)
         self._replicate(route.name, route.advertiser)
         if advertisement.is_global and not self._upstream.has(member.name):
-            self._forward_upstream(route, relay.statement, route.sequence, now.mono_s)
+            self._forward_upstream(route, relayed.statement, route.sequence, now.mono_s)
 
     def _check_identity(self, advertisement: Advertisement, now: Timestamps) -> None:
         """Reject a node's own name in another incarnation while the older node lives at another switch.
@@ -482,9 +482,9 @@ class RibCore:
     def _send_up(self, passed: Passed) -> None:
         upper = self._upstream.rib
         assert upper is not None
-        relay = Relay(passed.statement, passed.transit, self._identity.membership, passed.domain)
+        relayed = RelayedStatement(passed.statement, passed.transit, self._identity.membership, passed.domain)
         self._outgoing_statements.append(
-            OutgoingStatement(upper, Kind.RIB_REQUEST, relay.to_wire(self._identity.name, self._identity.key))
+            OutgoingStatement(upper, Kind.RIB_REQUEST, relayed.to_wire(self._identity.name, self._identity.key))
         )
 
     def _refuse(self, passed_on: Statement, member: Membership, error: StatementError, now_s: float) -> None:
@@ -854,7 +854,9 @@ class RibCore:
     def _send_revocations(self, wires: Iterable[bytes], to: Iterable[Name], kind: Kind = Kind.RIB_ANSWER) -> None:
         names = list(to)
         for wire in wires if names else ():
-            relay = Relay(wire, (), self._identity.membership).to_wire(self._identity.name, self._identity.key)
+            relay = RelayedStatement(wire, (), self._identity.membership).to_wire(
+                self._identity.name, self._identity.key
+            )
             self._outgoing_statements += [OutgoingStatement(name, kind, relay) for name in names]
 
     # -- endpoints of switches

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from gdp.control.replica import (
+from gdp.control.rib_replication import (
     FETCH_KEYS_MAX,
     FETCH_PREFIXES_MAX,
     HASH_BYTES,

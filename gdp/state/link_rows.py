@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from gdp.control.neighbor_discovery import HelloProtocol
+from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.ports.plane import Port
 from gdp.sansio import Timestamps
 from gdp.telemetry.sources import LinkRow

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
-from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.neighbour import Neighbour, NeighbourState
+from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.errors import DropReason
 from gdp.names import Name
 from gdp.ports.plane import Plane

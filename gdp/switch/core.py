@@ -25,8 +25,8 @@ from gdp.control.hello_port import HelloPort
 from gdp.control.join import Join
 from gdp.control.join_refresh import JoinRefresh
 from gdp.control.link_state import LinkState, Scope
-from gdp.control.neighbor_discovery import Change, HelloProtocol
 from gdp.control.neighbour import Neighbour, NeighbourState
+from gdp.control.neighbour_discovery import Change, HelloProtocol
 from gdp.control.revocation_sync import RevocationSync
 from gdp.control.settings import NodeSettings
 from gdp.control.waiting import Wait, WaitReason, port_waits, stranger_waits

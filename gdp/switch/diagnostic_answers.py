@@ -9,8 +9,8 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from gdp.control.diagnostics import Diagnostics, Question
-from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.neighbour import Neighbour
+from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.names import NAME_BYTES, ZERO, Name
 from gdp.sansio import Timestamps
 from gdp.switch.local_advertisements import LocalAdvertisements

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from gdp.control.join import Join
 from gdp.control.query import Response
-from gdp.control.relay import Relay
+from gdp.control.relayed_statement import RelayedStatement
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.errors import DropReason, StatementError
 from gdp.names import Name
@@ -42,15 +42,15 @@ class Evidence:
 
     def from_relay(self, statement: Statement, now: Timestamps) -> Location:
         """Return the location that a switch reports of a node that is attached to it."""
-        relay = Relay.from_fields(statement.expect(StatementType.RELAY))
-        member = self._policy.verify_membership(relay.membership, now.unix_s)
+        relayed = RelayedStatement.from_fields(statement.expect(StatementType.RELAY))
+        member = self._policy.verify_membership(relayed.membership, now.unix_s)
         if member.name != statement.signer or not member.role.is_switch:
             raise StatementError(DropReason.BAD_CERTIFICATE, "a relay that is not from a switch")
         statement.verify(member.key)
-        advertisement = self._verifier.verify_statement(parse(relay.statement), now.unix_s)
+        advertisement = self._verifier.verify_statement(parse(relayed.statement), now.unix_s)
         if advertisement.switch != member.name:
             raise StatementError(DropReason.NOT_DELEGATED, "the RtCert names another switch")
-        return _place(advertisement, member.domain, frozenset(relay.transit), advertisement.lease_s, now)
+        return _place(advertisement, member.domain, frozenset(relayed.transit), advertisement.lease_s, now)
 
     def of_join(self, join: Join, now: Timestamps) -> Advertisement:
         """Return the reader's advertisement of a join with a lease; the publisher's proves where the join leads."""

@@ -11,7 +11,7 @@ from typing import Final
 from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.neighbour import Neighbour
 from gdp.control.query import Query, Response
-from gdp.control.relay import relayed
+from gdp.control.relayed_statement import relayed
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType
 from gdp.errors import DropReason, StatementError

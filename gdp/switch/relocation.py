@@ -23,7 +23,7 @@ from typing import Final
 
 from gdp.control.neighbour import Neighbour
 from gdp.control.query import Query
-from gdp.control.relay import relayed
+from gdp.control.relayed_statement import relayed
 from gdp.crypto.identity import Identity
 from gdp.frame.kinds import Kind
 from gdp.names import ZERO, Name

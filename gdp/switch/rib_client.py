@@ -25,7 +25,7 @@ from gdp.control.endpoint_query import EndpointResponse
 from gdp.control.link_state import AttachedRib
 from gdp.control.presence import Presence
 from gdp.control.query import Query, Response
-from gdp.control.relay import Relay, relayed
+from gdp.control.relayed_statement import RelayedStatement, relayed
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, parse
@@ -259,7 +259,7 @@ class RibClient:
         Raises:
             StatementError: the sender is no RIB that received a query, or the statement is another one.
         """
-        relay = Relay.from_fields(statement.expect(StatementType.RELAY))
+        relay = RelayedStatement.from_fields(statement.expect(StatementType.RELAY))
         member = self._policy.verify_membership(relay.membership, now.unix_s)
         if member.role is not Role.RIB:
             raise StatementError(DropReason.WRONG_DOMAIN, "a revocation that no RIB passed on")

@@ -18,7 +18,7 @@ from domain import BenchDomain
 from machine import resident_bytes
 
 from gdp.control.query import Query
-from gdp.control.relay import Relay
+from gdp.control.relayed_statement import RelayedStatement
 from gdp.crypto.certificates import Role
 from gdp.errors import LocalError
 from gdp.rib.core import RibCore, RibSettings
@@ -47,7 +47,9 @@ def measure(names: int) -> Load:
     domain = BenchDomain(unix_s)
     switch = domain.switch
     wires = [
-        Relay(domain.advertisement(number, sequence=number + 1), (), switch.membership).to_wire(switch.name, switch.key)
+        RelayedStatement(domain.advertisement(number, sequence=number + 1), (), switch.membership).to_wire(
+            switch.name, switch.key
+        )
         for number in range(names)
     ]
     now = Timestamps(1_000.0, unix_s)

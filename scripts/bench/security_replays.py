@@ -53,7 +53,7 @@ from gdp.client.rib_host import RibHost
 from gdp.client.writer_proxy import WriterProxy
 from gdp.control.boundary import ErrorBoundary
 from gdp.control.neighbour import NeighbourState
-from gdp.control.replica import Entry
+from gdp.control.rib_replication import Entry
 from gdp.frame.codec import ETHER_BYTES, decode
 from gdp.frame.kinds import Kind
 from gdp.message.heartbeat import Heartbeat

@@ -28,7 +28,7 @@ from gdp.errors import StoreError
 from gdp.links.endpoint_files import own_record
 from gdp.stores.files import public, write_all
 from gdp.stores.keyring import load_domain
-from gdp.trust.enrolment import apply
+from gdp.trust.bootstrap_ticket import apply
 from gdp.trust.enrolment_wire import EnrolmentError, Refusal, prove_member
 from gdp.trust.join_token import JoinRole, JoinToken, join_id, join_key, join_proof
 from gdp.trust.mail import Mail

@@ -35,7 +35,7 @@ from gdp.crypto.keys import PublicKey, SigningKey, SoftwareKey
 from gdp.errors import LocalError, StatementError
 from gdp.stores.audit_log import verify_audit
 from gdp.stores.keyring import load_domain, load_owner
-from gdp.trust.enrolment import (
+from gdp.trust.bootstrap_ticket import (
     HEAD_BYTES,
     REFUSED,
     REQUEST_MAX_BYTES,

@@ -22,7 +22,7 @@ from gdp.control.keepalive import PAYLOAD_BYTES, seal_keepalive
 from gdp.control.link_quality import LinkReport
 from gdp.control.link_state import COST_MAX, LINKS_MAX, MEMBERS_MAX, RIBS_MAX
 from gdp.control.query import TRANSIT_MAX
-from gdp.control.replica import ENTRIES_MAX, FETCH_KEYS_MAX, FETCH_PREFIXES_MAX, INVENTORY_MAX
+from gdp.control.rib_replication import ENTRIES_MAX, FETCH_KEYS_MAX, FETCH_PREFIXES_MAX, INVENTORY_MAX
 from gdp.crypto.envelope import Sealer
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import StatementType, parse, sign

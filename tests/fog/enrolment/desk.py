@@ -22,7 +22,7 @@ from fog.host.enrolment import enrol
 from fog.machine import MachineBundle
 from gdp.crypto.identity import NodeKeys
 from gdp.stores.issue import make_domain, make_owner
-from gdp.trust.enrolment import (
+from gdp.trust.bootstrap_ticket import (
     ANSWER_HEAD_BYTES,
     ANSWER_SECRET_BYTES,
     TOKEN_BYTES,

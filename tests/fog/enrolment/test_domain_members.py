@@ -12,7 +12,7 @@ import pytest
 
 from fog.enrolment.domain_members import DomainMembers
 from gdp.enrolment.agent import Agent
-from gdp.enrolment.join import Joined, JoinRequest, join_domain
+from gdp.enrolment.domain_join import Joined, JoinRequest, join_domain
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.stores.keyring import DELEGATIONS
 from gdp.trust.enrolment_wire import EnrolmentError

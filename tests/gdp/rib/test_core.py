@@ -8,7 +8,7 @@ import pytest
 
 from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.query import Query, Response
-from gdp.control.relay import Relay
+from gdp.control.relayed_statement import RelayedStatement
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.statements import StatementType, parse, sign
@@ -63,7 +63,7 @@ def rib(upper: Name | None = None, **settings: object) -> RibCore:
 
 
 def relay(statement: bytes, by: Identity = SWITCH) -> bytes:
-    return Relay(statement, (SCHOOL.root.domain,), by.membership).to_wire(by.name, by.key)
+    return RelayedStatement(statement, (SCHOOL.root.domain,), by.membership).to_wire(by.name, by.key)
 
 
 def tell(to: RibCore, statement: bytes, by: Identity = SWITCH, now: Timestamps = START) -> list[OutgoingStatement]:
@@ -269,14 +269,14 @@ def test_a_relay_under_anothers_name_is_refused() -> None:
 
 def test_a_relay_under_anothers_certificate_is_refused() -> None:
     at_rib = rib()
-    wire = Relay(advertisement(), (), OTHER_SWITCH.membership).to_wire(SWITCH.name, SWITCH.key)
+    wire = RelayedStatement(advertisement(), (), OTHER_SWITCH.membership).to_wire(SWITCH.name, SWITCH.key)
     at_rib.receive(wire, SWITCH.name, at(0.0))
     assert (at_rib.statements_to_send(), at_rib.refusals) == ([], {DropReason.BAD_CERTIFICATE: 1})
 
 
 def test_a_relay_signed_by_another_key_gets_no_answer_and_leaves_nothing() -> None:
     at_rib = rib()
-    wire = Relay(advertisement(), (), SWITCH.membership).to_wire(SWITCH.name, ROBOT.key)
+    wire = RelayedStatement(advertisement(), (), SWITCH.membership).to_wire(SWITCH.name, ROBOT.key)
     at_rib.receive(wire, SWITCH.name, at(0.0))
     assert (at_rib.statements_to_send(), at_rib.names, at_rib.refusals) == ([], 0, {DropReason.BAD_SIGNATURE: 1})
 
@@ -485,7 +485,11 @@ def test_a_switch_hears_from_above_that_its_node_has_moved_to_another_domain() -
 
 def test_a_global_name_climbs() -> None:
     letters = tell(rib(UPPER.name), advertisement())
-    passed = [Relay.from_fields(parse(each.statement).fields).statement for each in letters if each.to == UPPER.name]
+    passed = [
+        RelayedStatement.from_fields(parse(each.statement).fields).statement
+        for each in letters
+        if each.to == UPPER.name
+    ]
     assert [parse(each).signer for each in passed] == [ROBOT.name]
 
 

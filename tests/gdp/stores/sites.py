@@ -15,7 +15,7 @@ from pathlib import Path
 from gdp.config.config import ClusterConfig
 from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.query import Query, Response
-from gdp.control.relay import Relay
+from gdp.control.relayed_statement import RelayedStatement
 from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
@@ -84,7 +84,7 @@ class Site:
         return self.relayed(Withdrawal(self.subject(name).name, Right.PUBLISH, sequence).to_wire(self.robot))
 
     def relayed(self, statement: bytes) -> bytes:
-        return Relay(statement, (), self.switch.membership).to_wire(self.switch.name, self.switch.key)
+        return RelayedStatement(statement, (), self.switch.membership).to_wire(self.switch.name, self.switch.key)
 
     def query(self, name: str, watch_s: float = 0.0) -> bytes:
         query = Query(self.subject(name).name, watch_s)

@@ -23,7 +23,7 @@ import yaml
 from redis._parsers.base import BaseParser
 
 from gdp.config.config import ClusterConfig
-from gdp.control.replica import Entry, Key
+from gdp.control.rib_replication import Entry, Key
 from gdp.crypto.validity import Validity
 from gdp.errors import DropReason, StoreError
 from gdp.limits import CLOCK_SKEW_S

@@ -29,8 +29,8 @@ from gdp.links.endpoint_files import own_record
 from gdp.stores.files import public, read_public, write_all
 from gdp.stores.issue import install_membership, make_node_keys
 from gdp.stores.keyring import CARD, OWNER_PUBLIC
+from gdp.trust.bootstrap_ticket import MEMBERS_MAX, apply
 from gdp.trust.domain import Policy
-from gdp.trust.enrolment import MEMBERS_MAX, apply
 from gdp.trust.enrolment_wire import INSTANCE_BYTES, EnrolmentError, UnreachableError
 from gdp.trust.join_token import SERVERS_MAX, JoinToken, join_id, join_key, join_proof
 

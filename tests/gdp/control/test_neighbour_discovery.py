@@ -9,8 +9,8 @@ import pytest
 from gdp.control.hello import ECHO_BYTES, Hello
 from gdp.control.hello_port import HelloPort
 from gdp.control.join import Join
-from gdp.control.neighbor_discovery import NEIGHBOURS_MAX, PADDED_BYTES, Change, HelloProtocol
 from gdp.control.neighbour import TRANSITIONS, Neighbour, NeighbourEvent, NeighbourState
+from gdp.control.neighbour_discovery import NEIGHBOURS_MAX, PADDED_BYTES, Change, HelloProtocol
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import parse

@@ -1,4 +1,4 @@
-"""Relay: an advertisement or a revocation, forwarded by its node's switch, or by a RIB to the tier above.
+"""Relayed statement: an advertisement or a revocation, forwarded by its node's switch, or by a RIB to the tier above.
 
 Sans-I/O. A switch relays advertisements of its own domain; a RIB names the domain of each advertisement that it
 forwards to the tier above.
@@ -16,11 +16,11 @@ from gdp.crypto.keys import SigningKey
 from gdp.crypto.statements import StatementType, sign
 from gdp.names import Name
 
-__all__ = ["Relay", "relayed"]
+__all__ = ["RelayedStatement", "relayed"]
 
 
 @dataclass(frozen=True, slots=True)
-class Relay:
+class RelayedStatement:
     """An advertisement, a withdrawal or a revocation that is forwarded.
 
     Args:
@@ -46,7 +46,7 @@ class Relay:
         return sign(StatementType.RELAY, body, signer, key)
 
     @classmethod
-    def from_fields(cls, fields: Fields) -> Relay:
+    def from_fields(cls, fields: Fields) -> RelayedStatement:
         """Read a parsed statement's body; a malformed one raises ``StatementError``."""
         domain = fields.name("d") if fields.bytes_("d") else None
         return cls(fields.bytes_("q"), tuple(fields.names("x", TRANSIT_MAX)), fields.bytes_("c"), domain)
@@ -57,4 +57,4 @@ def relayed(statement: bytes, switch: Identity, transit: Iterable[Name]) -> byte
 
     ``transit`` is that of the switch's domain.
     """
-    return Relay(statement, tuple(sorted(transit)), switch.membership).to_wire(switch.name, switch.key)
+    return RelayedStatement(statement, tuple(sorted(transit)), switch.membership).to_wire(switch.name, switch.key)
