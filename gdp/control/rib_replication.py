@@ -1,7 +1,7 @@
 """Replication statements between the RIBs of one domain, so that each holds what any of them accepted.
 
 Sans-I/O. A ``Digest`` summarises by hashes what a RIB holds below a prefix of names; a ``Fetch`` requests the detail of
-prefixes, or entries; an ``Inventory`` lists names with their sequence numbers; ``Replicas`` carries the entries, which
+prefixes, or entries; an ``Inventory`` lists names with their sequence numbers; ``EntryBatch`` carries the entries, which
 prove themselves. Source: Merkle-tree anti-entropy (DeCandia et al., Dynamo, 2007, section 4.7).
 """
 
@@ -19,7 +19,7 @@ from gdp.errors import DropReason, StatementError
 from gdp.limits import CONTROL_MAX_BYTES, LEASE_MAX_S
 from gdp.names import NAME_BYTES, Name
 
-__all__ = ["Digest", "Entry", "Fetch", "Inventory", "Item", "Key", "Replicas", "batches"]
+__all__ = ["Digest", "Entry", "EntryBatch", "Fetch", "Inventory", "Item", "Key", "batches"]
 
 FANOUT: Final = 256
 HASH_BYTES: Final = 8
@@ -188,7 +188,7 @@ class Entry:
 
 
 @dataclass(frozen=True, slots=True)
-class Replicas:
+class EntryBatch:
     """Entries of one RIB for another, pushed when they are new or fetched."""
 
     entries: tuple[Entry, ...]
@@ -200,7 +200,7 @@ class Replicas:
         return sign(StatementType.REPLICAS, body, signer, key)
 
     @classmethod
-    def from_fields(cls, fields: Fields) -> Replicas:
+    def from_fields(cls, fields: Fields) -> EntryBatch:
         """Read a parsed statement's body; a malformed one raises ``StatementError``."""
         entries = tuple(Entry.from_fields(each) for each in fields.maps("e", ENTRIES_MAX))
         return cls(entries, fields.flag("z"))

@@ -22,7 +22,7 @@ from gdp.control.boundary import ErrorBoundary
 from gdp.control.presence import IdentityChecks, Presence
 from gdp.control.query import Query, Response
 from gdp.control.relayed_statement import RelayedStatement
-from gdp.control.rib_replication import Digest, Entry, Fetch, Inventory, Key, Replicas
+from gdp.control.rib_replication import Digest, Entry, EntryBatch, Fetch, Inventory, Key
 from gdp.control.waiting import Wait, WaitReason
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.identity import Identity
@@ -40,11 +40,11 @@ from gdp.limits import (
     RIB_WATCHES_MAX,
 )
 from gdp.names import Name
+from gdp.rib.anti_entropy import AntiEntropy, Message
 from gdp.rib.digest_tree import DigestTree
 from gdp.rib.endpoints import RibEndpoints
 from gdp.rib.former import FormerAdvertisers
 from gdp.rib.lower_ribs import LowerRibs
-from gdp.rib.replication import Message, Replication
 from gdp.rib.revocations import RibRevocations
 from gdp.rib.route import Route, Withdrawn
 from gdp.rib.store import Store
@@ -75,7 +75,7 @@ _PEER_MESSAGES: Final[dict[StatementType, type[Message]]] = {
     StatementType.DIGEST: Digest,
     StatementType.FETCH: Fetch,
     StatementType.INVENTORY: Inventory,
-    StatementType.REPLICAS: Replicas,
+    StatementType.REPLICAS: EntryBatch,
 }
 
 
@@ -880,10 +880,10 @@ class RibCore:
 
     # -- other RIBs of the domain
 
-    def _replication_over(self, digests: DigestTree | None) -> Replication | None:
+    def _replication_over(self, digests: DigestTree | None) -> AntiEntropy | None:
         if digests is None:
             return None
-        return Replication(self._identity, digests, self._settings.peers, self.entry_of, self._rank_of)
+        return AntiEntropy(self._identity, digests, self._settings.peers, self.entry_of, self._rank_of)
 
     def _replicate(self, name: Name, advertiser: Name) -> None:
         if self._replication is not None:

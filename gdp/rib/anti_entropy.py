@@ -1,4 +1,4 @@
-"""Replication between the RIBs of one domain: each stores what any of them accepts.
+"""Anti-entropy between the RIBs of one domain: each stores what any of them accepts.
 
 Sans-I/O; time comes in as ``now_s`` (monotonic seconds). Changes are pushed at once and unacknowledged. Once a second
 each RIB sends its peers a hash over all its entries. A RIB whose hash differs fetches the detail, level by level, and
@@ -21,18 +21,18 @@ from gdp.control.rib_replication import (
     PREFIX_MAX_BYTES,
     Digest,
     Entry,
+    EntryBatch,
     Fetch,
     Inventory,
     Item,
     Key,
-    Replicas,
     batches,
 )
 from gdp.crypto.identity import Identity
 from gdp.names import Name
 from gdp.rib.digest_tree import DigestTree
 
-__all__ = ["Replication"]
+__all__ = ["AntiEntropy"]
 
 DIGEST_S: Final = 1.0
 ANSWER_DIGEST_S: Final = 0.2  # a peer that differs also receives our hash, at most this often
@@ -41,7 +41,7 @@ COLD_S: Final = 3.0  # a RIB that just started denies no name before the first m
 PEERS_MAX: Final = 16
 QUEUE_MAX: Final = 65_536
 
-Message = Digest | Fetch | Inventory | Replicas
+Message = Digest | Fetch | Inventory | EntryBatch
 
 
 @dataclass(slots=True)
@@ -56,7 +56,7 @@ class _Peer:
         return self.until_s is None and not self.prefixes and not self.keys
 
 
-class Replication:
+class AntiEntropy:
     """One RIB's exchange with its peers.
 
     Args:
@@ -117,7 +117,7 @@ class Replication:
             self._take_inventory(message, sender, peer, now_s)
         elif isinstance(message, Fetch):
             self._serve(message, sender, now_s)
-        elif isinstance(message, Replicas):
+        elif isinstance(message, EntryBatch):
             if message.is_last:
                 self._reply_ended(sender, peer, now_s)
             return message.entries
@@ -153,7 +153,7 @@ class Replication:
         if self._news:
             found = (self._entry_of(key, now_s) for key in self._news)
             for group in batches([entry for entry in found if entry is not None]):
-                wire = self._signed(Replicas(group, is_last=False))
+                wire = self._signed(EntryBatch(group, is_last=False))
                 self._out += [(peer, wire) for peer in self._peers]
             self._news.clear()
         out, self._out = self._out, []
@@ -191,7 +191,7 @@ class Replication:
                 newer_here.append(item)
         found = (self._entry_of(item.key, now_s) for item in newer_here)
         for group in batches([entry for entry in found if entry is not None]):
-            self._out.append((sender, self._signed(Replicas(group, is_last=False))))
+            self._out.append((sender, self._signed(EntryBatch(group, is_last=False))))
         if inventory.is_last:
             self._reply_ended(sender, peer, now_s)
 
@@ -224,7 +224,7 @@ class Replication:
         pages = [tuple(items[at : at + INVENTORY_MAX]) for at in range(0, len(items), INVENTORY_MAX)]
         replies += [Inventory(page, is_last=False) for page in pages]
         found = (self._entry_of(key, now_s) for key in fetch.keys)
-        replies += [Replicas(group, is_last=False) for group in batches([each for each in found if each is not None])]
+        replies += [EntryBatch(group, is_last=False) for group in batches([each for each in found if each is not None])]
         replies.append(Inventory((), is_last=True))
         self._out += [(sender, self._signed(reply)) for reply in replies]
 
