@@ -25,9 +25,9 @@ from typing import Annotated, ClassVar, Final, Literal, TypedDict
 
 from pydantic import AfterValidator, Field, model_validator
 
-from fog.enrolment.bootstrap import RobotDevices, robot_boot
-from fog.enrolment.config import EnrolmentConfig, host_and_port
-from fog.enrolment.members import Authority
+from fog.bootstrap.bundles import RobotDevices, robot_boot
+from fog.bootstrap.config import EnrolmentConfig, host_and_port
+from fog.bootstrap.members import Authority
 from fog.host.bundle import install
 from fog.latency.config import LatencyConfig
 from fog.latency.known import Latencies

@@ -109,8 +109,8 @@ def _remove_members(site: Site, cluster: str, machines: Sequence[str], now_s: fl
     """Remove machines from the border's domain that no supervisor has removed."""
     if site.border is None or not machines:
         return
-    from fog.enrolment.bootstrap import machine_label
-    from fog.enrolment.domain_members import DomainMembers
+    from fog.bootstrap.bundles import machine_label
+    from fog.bootstrap.domain_members import DomainMembers
 
     with closing(DomainMembers(site.border)) as members:
         for each in machines:

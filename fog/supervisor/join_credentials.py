@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
+from fog.bootstrap.bundles import joining_boot, machine_label
+from fog.bootstrap.domain_members import DomainMembers
 from fog.cluster import CloudNode, ClusterPlan
 from fog.credentials import IssuedCredentials
-from fog.enrolment.bootstrap import joining_boot, machine_label
-from fog.enrolment.domain_members import DomainMembers
 from fog.machine import MachineBundle
 from fog.site import Site
 from fog.supervisor.core.record import Record

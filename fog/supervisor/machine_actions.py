@@ -10,9 +10,9 @@ from dataclasses import replace
 from functools import partial
 from typing import Final
 
+from fog.bootstrap.bundles import node_names
 from fog.cluster import CloudNode, ClusterPlan, MachineRequest
 from fog.credentials import IssuedCredentials
-from fog.enrolment.bootstrap import node_names
 from fog.latency.known import Latencies
 from fog.machine import Machine, MachineSpec, MachineState
 from fog.offer import Offer

@@ -11,11 +11,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Protocol, TypeAlias
 
+from fog.bootstrap.bundles import machine_boot, machine_seats
+from fog.bootstrap.members import revoke_credentials
+from fog.bootstrap.robot_config import reload
+from fog.bootstrap.tickets import News, Report, Tickets
 from fog.cluster import CloudNode, ClusterPlan
-from fog.enrolment.bootstrap import machine_boot, machine_seats
-from fog.enrolment.members import revoke_credentials
-from fog.enrolment.robot_config import reload
-from fog.enrolment.tickets import News, Report, Tickets
 from fog.machine import MachineBundle
 from fog.site import Site
 from fog.supervisor.core.record import Outcome, Record

@@ -17,10 +17,10 @@ from functools import partial
 from types import FrameType
 from typing import Final
 
-from fog.enrolment.domain_members import DomainMembers
-from fog.enrolment.listener import Listener, bind_tcp, bind_unix
-from fog.enrolment.responder import Responder
-from fog.enrolment.tickets import Tickets
+from fog.bootstrap.domain_members import DomainMembers
+from fog.bootstrap.listener import Listener, bind_tcp, bind_unix
+from fog.bootstrap.responder import Responder
+from fog.bootstrap.tickets import Tickets
 from fog.site import Site, topology_now
 from fog.software.server import SoftwareServer
 from fog.supervisor.background import held

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final
 from urllib.request import urlopen
 
-from fog.enrolment.robot_config import control_socket_of
+from fog.bootstrap.robot_config import control_socket_of
 from fog.scaling import CallCounts
 from gdp.errors import GdpError
 from gdp.management.control_client import ask_node, find_control_socket_of

@@ -13,10 +13,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Final, TypeAlias
 
+from fog.bootstrap.domain_members import DomainMembers
+from fog.bootstrap.members import metadata_of
+from fog.bootstrap.tickets import Tickets
 from fog.cluster import CloudNode, ClusterPlan
-from fog.enrolment.domain_members import DomainMembers
-from fog.enrolment.members import metadata_of
-from fog.enrolment.tickets import Tickets
 from fog.machine import Machine, MachineState
 from fog.providers.provider import Provider
 from fog.site import Site

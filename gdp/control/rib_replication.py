@@ -1,7 +1,7 @@
 """Replication statements between the RIBs of one domain, so that each holds what any of them accepted.
 
 Sans-I/O. A ``Digest`` summarises by hashes what a RIB holds below a prefix of names; a ``Fetch`` requests the detail of
-prefixes, or entries; an ``Inventory`` lists names with their sequence numbers; ``EntryBatch`` carries the entries, which
+prefixes, or entries; an ``Inventory`` lists names with their sequence numbers; ``EntryBatch`` has the entries, which
 prove themselves. Source: Merkle-tree anti-entropy (DeCandia et al., Dynamo, 2007, section 4.7).
 """
 

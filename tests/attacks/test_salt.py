@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from fog.bootstrap.robot_config import add_rules, remove_rules
 from fog.cluster import ExportedInterface
-from fog.enrolment.robot_config import add_rules, remove_rules
 from fog.site import open_site
 from gdp.config.drop_in import drop_in_directory
 from gdp.errors import ConfigError

@@ -13,11 +13,11 @@ from types import SimpleNamespace
 import pytest
 from typer.testing import CliRunner, Result
 
+from fog.bootstrap.members import metadata_of
 from fog.cli import launch, logs, options, status
 from fog.cli.app import app
 from fog.cli.views import stage
 from fog.cluster import ClusterPlan
-from fog.enrolment.members import metadata_of
 from fog.site import open_site
 from fog.supervisor.core.record import Outcome
 from fog.supervisor.journal import FINAL_LOGS, Journal

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from fog.enrolment.bootstrap import joining_boot
+from fog.bootstrap.bundles import joining_boot
 from fog.host.bundle import JOIN_FILE, install
 from fog.host.joining import join
 from gdp.config.config import SwitchConfig
@@ -19,7 +19,7 @@ from gdp.errors import LocalError
 from gdp.trust.enrolment_wire import EnrolmentError, UnreachableError
 from gdp.trust.join_token import JoinToken
 from proxy.config.config import ProxyConfig
-from tests.fog.enrolment.desk import CLUSTER
+from tests.fog.bootstrap.desk import CLUSTER
 from tests.gdp.enrolment.lab import Lab, running_lab
 
 

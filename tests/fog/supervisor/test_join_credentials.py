@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from fog.enrolment.domain_members import DomainMembers
+from fog.bootstrap.domain_members import DomainMembers
 from fog.host.bundle import JOIN_FILE
 from fog.machine import MachineBundle, MachineSpec
 from fog.site import Site, open_site

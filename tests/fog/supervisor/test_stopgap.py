@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from fog.enrolment.tickets import Tickets
+from fog.bootstrap.tickets import Tickets
 from fog.hardware import Hardware
 from fog.machine import MachineBundle, MachineSpec
 from fog.offer import Offer

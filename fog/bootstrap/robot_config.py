@@ -15,9 +15,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+from fog.bootstrap.bundles import robot_rule
+from fog.bootstrap.members import Authority, metadata_of
 from fog.cluster import ExportedInterface
-from fog.enrolment.bootstrap import robot_rule
-from fog.enrolment.members import Authority, metadata_of
 from gdp.config.drop_in import drop_in_directory, locked, read_drop_in, write_drop_in
 from gdp.errors import GdpError, LocalError
 from gdp.management.control_client import NotRunningError, ask_node, find_control_socket

@@ -12,9 +12,9 @@ import time
 from collections import OrderedDict
 from typing import Final, TypeVar
 
+from fog.bootstrap.members import Authority
+from fog.bootstrap.tickets import Kept, Tickets
 from fog.credentials import IssuedCredentials
-from fog.enrolment.members import Authority
-from fog.enrolment.tickets import Kept, Tickets
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.identity import node_metadata
 from gdp.crypto.x509_profile import SubjectInfo, read_request

@@ -10,12 +10,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from socket import socket as Socket  # noqa: N812 (``Desk.socket`` is the path)
 
+from fog.bootstrap.bundles import machine_boot, machine_seats
+from fog.bootstrap.listener import Listener, bind_unix
+from fog.bootstrap.members import Authority
+from fog.bootstrap.responder import Responder
+from fog.bootstrap.tickets import Tickets
 from fog.cluster import CloudNode, ClusterPlan, ExportedInterface, MachineRequest
-from fog.enrolment.bootstrap import machine_boot, machine_seats
-from fog.enrolment.listener import Listener, bind_unix
-from fog.enrolment.members import Authority
-from fog.enrolment.responder import Responder
-from fog.enrolment.tickets import Tickets
 from fog.hardware import Hardware
 from fog.host.bundle import install
 from fog.host.enrolment import enrol

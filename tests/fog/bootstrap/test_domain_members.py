@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from fog.enrolment.domain_members import DomainMembers
+from fog.bootstrap.domain_members import DomainMembers
 from gdp.enrolment.agent import Agent
 from gdp.enrolment.domain_join import Joined, JoinRequest, join_domain
 from gdp.nodes.delegation_store import DelegationStore
@@ -18,7 +18,7 @@ from gdp.stores.keyring import DELEGATIONS
 from gdp.trust.enrolment_wire import EnrolmentError
 from gdp.trust.join_token import JoinToken
 from gdp.trust.right import Right
-from tests.fog.enrolment.desk import MAP, PLAN
+from tests.fog.bootstrap.desk import MAP, PLAN
 from tests.gdp.enrolment.lab import Lab, running_lab
 
 LABEL = "c-m1"

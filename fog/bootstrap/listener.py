@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from fog.enrolment.responder import Responder
+from fog.bootstrap.responder import Responder
 from gdp.errors import GdpError, LocalError, StatementError
 from gdp.ports.listening import listen_tcp
 from gdp.trust.bootstrap_ticket import REQUEST_MAX_BYTES, request_head

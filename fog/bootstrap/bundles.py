@@ -21,9 +21,9 @@ from typing import Final
 
 import yaml
 
+from fog.bootstrap.members import Authority
+from fog.bootstrap.tickets import PlannedSeat
 from fog.cluster import CloudNode, ClusterPlan, ExportedInterface
-from fog.enrolment.members import Authority
-from fog.enrolment.tickets import PlannedSeat
 from fog.host.bundle import JOIN_FILE, MEMBER_FOLDER, TICKET_FILE
 from fog.host.joining import join_file
 from fog.machine import MachineBundle, Program

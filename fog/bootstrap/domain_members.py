@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
+from fog.bootstrap.members import metadata_of, right_of
 from fog.cluster import ExportedInterface
-from fog.enrolment.members import metadata_of, right_of
 from gdp.crypto.certificates import Role
 from gdp.enrolment.agent import DELEGATION_KIND
 from gdp.enrolment.create import make_token

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from fog.bootstrap.bundles import gateway_boot
+from fog.bootstrap.listener import bind_tcp
+from fog.bootstrap.members import Authority, metadata_of, revoke_credentials
+from fog.bootstrap.robot_config import add_rules, reload_proxy, remove_rules
 from fog.cluster import ExportedInterface
-from fog.enrolment.bootstrap import gateway_boot
-from fog.enrolment.listener import bind_tcp
-from fog.enrolment.members import Authority, metadata_of, revoke_credentials
-from fog.enrolment.robot_config import add_rules, reload_proxy, remove_rules
 from fog.host.bundle import install
 from fog.host.enrolment import enrol
 from fog.site import open_site
@@ -29,7 +29,7 @@ from gdp.stores.keyring import load_identity, load_owner
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
 from proxy.config.config import ProxyConfig
-from tests.fog.enrolment.desk import CLUSTER, MAP, PLAN, Desk, made_desk
+from tests.fog.bootstrap.desk import CLUSTER, MAP, PLAN, Desk, made_desk
 
 
 @pytest.fixture
