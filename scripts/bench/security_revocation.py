@@ -177,7 +177,7 @@ def _on_disk(revoked: Revocations, authority: CertificateAuthority, unix_s: floa
         again = Revocations({authority.root.key.compressed: authority.root.domain})
         other = RevocationUpkeep(Path(folder), again)
         begun_s = time.perf_counter()
-        other.load(now)
+        other.restore(now)
         loaded_s = time.perf_counter() - begun_s
         other.close()
         if len(again) != len(revoked):

@@ -84,7 +84,7 @@ def test_a33_an_introduction_in_another_readers_name_is_refused() -> None:
     end = live(pipe, b"a")
     insider = notes_of(pipe, b"m", victim=end.reader.name)
     stranger = reader_of(b"m")
-    forged = Introduction.make(subject_of(b"a"), key_of(b"m"), 8, 9_999, stranger.notes.public)
+    forged = Introduction.make(subject_of(b"a"), key_of(b"m"), 8, 9_999, stranger.control_keys.public)
     for wire in (None, forged):
         pipe.tell(insider.introduction(wire=wire, incarnation=8))
         pipe.tell(insider.report(LIES[0], incarnation=8))

@@ -26,7 +26,7 @@ from gdp.relay.connection import ConnectionSettings, RelayConnection
 from gdp.stores.issue import make_domain, make_node
 from gdp.stores.keyring import load_root
 from gdp.trust.domain import Policy
-from tests.gdp.nodes.test_relay_link import Device, run
+from tests.gdp.links.test_relay_link import Device, run
 from tests.gdp.relay.test_frame_queue import frame
 
 DEAD_S = 60.0  # a busy machine is no dead path
