@@ -1,4 +1,1 @@
-"""Configuration files of a node or a machine: every key, its bounds and its default, and errors with their position.
-
-I/O: it reads files.
-"""
+"""Configuration files of a node or a machine: every key, its bounds and its default. I/O: it reads files."""

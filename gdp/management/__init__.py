@@ -1,4 +1,1 @@
-"""Management plane of a machine: the control sockets of running nodes and their clients.
-
-I/O. Source: RFC 7426, section 3.4.
-"""
+"""Management plane (RFC 7426) of a machine: the control sockets of running nodes and their clients. I/O."""

@@ -1,4 +1,1 @@
-"""State of a running node as its control socket states it: requests and responses, status, tables and snapshots.
-
-Sans-I/O.
-"""
+"""State of a running node as its control socket states it: requests, responses, status and tables. Sans-I/O."""
