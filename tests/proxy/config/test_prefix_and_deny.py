@@ -14,7 +14,7 @@ from proxy.bridge.core.desired_flows import DeniedName, denied, exposed, importe
 from proxy.check.core.explain import explain
 from proxy.config.config import ProxyConfig
 from proxy.endpoints.core.endpoint import GraphEntity, Role
-from tests.proxy.check.test_explain import Given
+from tests.proxy.check.core.test_explain import Given
 from tests.proxy.rule_files import FIRST_LINE, OWNER, furnish, proxy, refusals, rules
 
 STRING = "std_msgs/msg/String"
