@@ -25,9 +25,9 @@ from typing import Annotated, ClassVar, Final, Literal, TypedDict
 
 from pydantic import AfterValidator, Field, model_validator
 
-from fog.enrolment.bootstrap import RobotDevices, robot_boot
-from fog.enrolment.config import EnrolmentConfig, host_and_port
-from fog.enrolment.members import Authority
+from fog.bootstrap.bundles import RobotDevices, robot_boot
+from fog.bootstrap.config import EnrolmentConfig, host_and_port
+from fog.bootstrap.members import Authority
 from fog.host.bundle import install
 from fog.latency.config import LatencyConfig
 from fog.latency.known import Latencies
@@ -36,13 +36,13 @@ from fog.providers.cloud_init import Setup
 from fog.providers.skypilot.config import SkyPilotConfig
 from fog.software.config import SOFTWARE_PORT, SoftwareConfig
 from fog.topology import AUTOMATIC, AUTOMATIC_REPLICA, Gateway, Topology
+from gdp.config.config import LeaseSeconds, SwitchConfig
+from gdp.config.schema import Directory, ExistingFile, Ifname, Section, Unique, load, relative
 from gdp.crypto.certificates import Role
 from gdp.enrolment.domain_files import DomainFiles
 from gdp.enrolment.member_setup import WATCH_IFACE
 from gdp.errors import LocalError
 from gdp.limits import ADVERTISEMENT_LEASE_S
-from gdp.nodes.config import LeaseSeconds, SwitchConfig
-from gdp.nodes.schema import Directory, ExistingFile, Ifname, Section, Unique, load, relative
 from gdp.stores.checkout import ignore_folder
 from gdp.stores.files import private, read_private, write_all
 from gdp.stores.issue import make_domain, make_node, make_owner

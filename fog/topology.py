@@ -21,7 +21,7 @@ from typing import Annotated, Final
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from gdp.nodes.schema import Section, Unique
+from gdp.config.schema import Section, Unique
 
 __all__ = ["AUTOMATIC", "AUTOMATIC_REPLICA", "Gateway", "Topology"]
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from gdp.service.replication import Replication
     from gdp.session.aio import AsyncPublisher, AsyncServer, AsyncSession, AsyncSubscription
     from gdp.session.aio import open_session_async as open_async
-    from gdp.session.errors import (
+    from gdp.session.protocol.errors import (
         AttachError,
         CallError,
         CallTimeoutError,
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
         SessionError,
         SessionTimeoutError,
     )
-    from gdp.session.messages import DelegatedName, Message, Request, Response
+    from gdp.session.protocol.messages import DelegatedName, Message, Request, Response
     from gdp.session.session import Publisher, Server, Session, Subscription
     from gdp.session.session import open_session as open  # noqa: A004 (gdp.open is the library's entry)
 
@@ -77,7 +77,7 @@ _MODULES = {
     "gdp.names": ("Name",),
     "gdp.service.replication": ("Replication",),
     "gdp.session.aio": ("AsyncPublisher", "AsyncServer", "AsyncSession", "AsyncSubscription"),
-    "gdp.session.errors": (
+    "gdp.session.protocol.errors": (
         "AttachError",
         "CallError",
         "CallTimeoutError",
@@ -87,7 +87,7 @@ _MODULES = {
         "SessionError",
         "SessionTimeoutError",
     ),
-    "gdp.session.messages": ("DelegatedName", "Message", "Request", "Response"),
+    "gdp.session.protocol.messages": ("DelegatedName", "Message", "Request", "Response"),
     "gdp.session.session": ("Publisher", "Server", "Session", "Subscription"),
 }
 _PLACES = {name: (module, name) for module, names in _MODULES.items() for name in names}

@@ -1,4 +1,4 @@
-"""Extras of the distribution: the error for a package that only some installations have.
+"""Packages that only some installations have: what they provide, and the error where an extra is not installed.
 
 I/O: it searches the installed packages.
 """
@@ -7,10 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from importlib.util import find_spec
+from typing import TYPE_CHECKING
 
 from gdp.errors import LocalError
 
-__all__ = ["MissingExtraError", "require_extra"]
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
+__all__ = ["MissingExtraError", "find_entry_point", "require_extra"]
 
 
 class MissingExtraError(LocalError, ImportError):
@@ -29,3 +33,11 @@ def require_extra(extra: str, modules: Iterable[str], user: str) -> None:
     missing = [module for module in modules if find_spec(module) is None]
     if missing:
         raise MissingExtraError(f"{user} needs {', '.join(missing)} (run: pip install 'gdp-ros[{extra}]')")
+
+
+def find_entry_point(group: str, name: str) -> EntryPoint | None:
+    """Return an entry point whose package is there; None: none is."""
+    from importlib.metadata import entry_points  # slow, and most commands need none
+
+    found = entry_points(group=group, name=name)
+    return next((each for each in found if find_spec(each.module.partition(".")[0]) is not None), None)

@@ -22,12 +22,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from fog.software.wheels import build_wheel, wheels
+from fog.supervisor.core.record import Record
 from fog.supervisor.journal import Journal
-from fog.supervisor.record import Record
 from gdp.errors import GdpError
 from gdp.host.run_registry import Run
-from gdp.nodes.control_client import ask_node, find_control_socket
-from gdp.nodes.control_protocol import Command
+from gdp.management.control_client import ask_node, find_control_socket
+from gdp.state.control_protocol import Command
 from netns_tests.datacenter.debian_root import cache_folder
 from netns_tests.datacenter.ec2 import UBUNTU
 from netns_tests.datacenter.router import CALLER

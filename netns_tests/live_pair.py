@@ -39,7 +39,7 @@ from gdp.stores.issue import delegate, install_delegation, make_domain, make_nod
 from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE, load_identity
 from gdp.trust.right import Right
 from netns_tests.lifetimes import LEASE_S, LEASES, Lifetime, noted
-from proxy.endpoints.endpoint import proxy_node_name
+from proxy.endpoints.core.endpoint import proxy_node_name
 from ring.plan import Credentials, rib_yaml, switch_yaml
 from tests.proxy.endpoints.dds_peers import CYCLONE
 from tests.proxy.endpoints.ros1_net import need_ros1

@@ -17,10 +17,10 @@ from typing import Any
 import yaml
 
 from gdp.crypto.certificates import Role
+from gdp.management.control_client import ask_node
 from gdp.names import Name
-from gdp.nodes.control_client import ask_node
-from gdp.nodes.control_protocol import Command
 from gdp.ports.tap import tap_name
+from gdp.state.control_protocol import Command
 from gdp.stores.issue import make_domain, make_node
 from gdp.stores.keyring import load_card
 from netns_tests.spaces import Space

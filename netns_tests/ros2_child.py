@@ -10,7 +10,7 @@ from __future__ import annotations
 import select
 import sys
 
-from proxy.endpoints.endpoint import MessageReceived
+from proxy.endpoints.core.endpoint import MessageReceived
 from proxy.endpoints.ros2 import Ros2Endpoint
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from fog.supervisor.record import Record
+from fog.supervisor.core.record import Record
 from gdp.host.run_registry import Run, RunRegistry
 from netns_tests.cloud_site import CloudSite, launch_file, start_echo, wheelhouse
 from netns_tests.datacenter.debian_root import debian_root, why_not

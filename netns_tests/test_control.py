@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from websockets.sync.client import ClientConnection, connect
 
-from gdp.nodes.control_client import find_control_socket
+from gdp.management.control_client import find_control_socket
 from netns_tests.spaces import Space
 from netns_tests.test_rights import PATIENCE_S, Commands, Node, commands
 from tests.pages import ROOT

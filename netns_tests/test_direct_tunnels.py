@@ -15,9 +15,9 @@ import pytest
 from gdp.control.endpoints import Endpoint
 from gdp.crypto.certificates import Role
 from gdp.errors import GdpError
-from gdp.nodes.control_client import ask_node
-from gdp.nodes.control_protocol import Command
-from gdp.nodes.endpoint_files import own_record, public_candidates
+from gdp.links.endpoint_files import own_record, public_candidates
+from gdp.management.control_client import ask_node
+from gdp.state.control_protocol import Command
 from gdp.stores.issue import make_domain, make_node
 from gdp.stores.keyring import load_identity
 from internet.access import Access

@@ -17,8 +17,8 @@ from typing import Any
 import pytest
 from websockets.sync.client import ClientConnection, connect
 
+from fog.supervisor.core.record import Record
 from fog.supervisor.journal import Journal
-from fog.supervisor.record import Record
 from netns_tests.local_site import PATIENCE_S
 from netns_tests.spaces import Space
 from tests.pages import ROOT

@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from gdp.errors import GdpError
-from gdp.nodes.control_client import ask_node, find_control_socket
-from gdp.nodes.control_protocol import Command
+from gdp.management.control_client import ask_node, find_control_socket
+from gdp.state.control_protocol import Command
 from gdp.stores.keyring import CARD, load_card
 from internet.access import Access
 from internet.host import Host

@@ -30,13 +30,13 @@ from gdp.frame.codec import ETHER_BYTES, decode
 from gdp.frame.kinds import Kind
 from gdp.limits import MTU_MIN_BYTES
 from gdp.metadata import Metadata
-from gdp.nodes.runtime import Runtime
 from gdp.ports.kernel.plane import KernelPlane
 from gdp.ports.plane import MAC_BYTES, Plane
 from gdp.ports.raw import RawPlane
 from gdp.ports.scapy_plane import ScapyPlane
 from gdp.rib.core import RibCore, RibSettings
 from gdp.rib.store import MemoryStore
+from gdp.runtime.runtime import Runtime
 from gdp.sansio import ProtocolCore
 from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table

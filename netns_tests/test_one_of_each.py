@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from gdp.cli.gdp import main
-from gdp.nodes.single_instance import lock_directory
+from gdp.host.single_instance import lock_directory
 from netns_tests.spaces import Space
 from netns_tests.test_pairs import devices
 

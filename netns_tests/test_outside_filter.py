@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
+from gdp.config.config import LinksConfig
 from gdp.control.tunnel_plan import underlay_ifname
 from gdp.crypto.certificates import Role
-from gdp.nodes.config import LinksConfig
-from gdp.nodes.tunnels import open_underlays
+from gdp.links.tunnels import open_underlays
 from gdp.ports.tunnel.outside_filter import OutsideFilter
 from gdp.ports.tunnel.vxlan import VXLAN_PORT, make_vxlan
 from gdp.stores.issue import make_domain, make_node

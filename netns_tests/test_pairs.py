@@ -9,9 +9,9 @@ import threading
 import pytest
 
 from gdp.errors import LocalError
+from gdp.links.uplink import wait_for_device
+from gdp.links.veth import attach_pairs
 from gdp.names import Name
-from gdp.nodes.uplink import wait_for_device
-from gdp.nodes.veth import attach_pairs
 from gdp.ports.rtnetlink import LinkMonitor
 from netns_tests.spaces import Space
 

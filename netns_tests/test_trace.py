@@ -19,7 +19,7 @@ import pytest
 
 from fog_demo.environment import standing_runs
 from gdp.host.run_registry import RunRegistry
-from gdp.nodes.control_client import NodeConnection, find_control_socket
+from gdp.management.control_client import NodeConnection, find_control_socket
 from netns_tests.test_fog_demo import command as fog_command
 from netns_tests.test_ring import command as ring_command
 from netns_tests.traces import GDP, gdp, traced

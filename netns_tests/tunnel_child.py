@@ -14,9 +14,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+from gdp.config.config import SwitchConfig
 from gdp.control.endpoints import Endpoint
 from gdp.errors import LocalError
-from gdp.nodes.config import SwitchConfig
 from gdp.nodes.rights import confine_switch
 from gdp.ports.tunnel.path_mtu import route_mtu
 from gdp.ports.tunnel.vxlan import make_vxlan, remove_link, set_link_mtu

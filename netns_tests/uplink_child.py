@@ -20,8 +20,8 @@ from gdp.client.participant import Participant, Topic
 from gdp.control.settings import NodeSettings
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.nodes.membership import incarnation, wall_clock_ms
-from gdp.nodes.runtime import Runtime
 from gdp.ports.raw import RawPlane
+from gdp.runtime.runtime import Runtime
 from gdp.stores.keyring import DELEGATIONS, load_identity, load_root
 from gdp.trust.domain import Policy
 

@@ -213,7 +213,10 @@ def undocumented(trees: dict[str, ast.Module]) -> list[Place]:
 
 
 def shared_names(trees: dict[str, ast.Module], excepted: frozenset[str]) -> list[tuple[int, str]]:
-    """Return public method names with the number of product packages that define them, most first."""
+    """Return public method names with the number of product packages that define them, most first.
+
+    The sans-I/O part of a package (``core``, ``protocol``) counts as that package.
+    """
     packages: dict[str, set[str]] = defaultdict(set)
     for path, tree in trees.items():
         if path.split("/", 1)[0] not in PRODUCT:
@@ -222,7 +225,7 @@ def shared_names(trees: dict[str, ast.Module], excepted: frozenset[str]) -> list
             method = name.rpartition(".")[2]
             is_noun = bool(_decorators(node) & {"property", "cached_property", "setter"})
             if "." in name and not is_noun and method not in excepted:
-                packages[method].add(path.rpartition("/")[0])
+                packages[method].add(path.rpartition("/")[0].removesuffix("/core").removesuffix("/protocol"))
     return sorted(((len(places), name) for name, places in packages.items()), reverse=True)
 
 

@@ -18,11 +18,11 @@ from fog.launch.load import load as load_launch_file
 from fog.site import SiteConfig
 from fog_demo import cli as demo
 from gdp.cli import gdp, relay, rib, switch
+from gdp.config.config import RibConfig, SwitchConfig
+from gdp.config.relay_config import RelayConfig
+from gdp.config.schema import Section
 from gdp.crypto.keys import SigningKey
 from gdp.errors import ConfigError
-from gdp.nodes.config import RibConfig, SwitchConfig
-from gdp.nodes.relay_config import RelayConfig
-from gdp.nodes.schema import Section
 from internet_demo import cli as internet_demo
 from proxy.cli import delegate, proxy, replay
 from proxy.config.config import ProxyConfig

@@ -96,7 +96,7 @@ def end_cluster(site: Site, journal: Journal, name: str, why: str, *, as_json: b
         left = journal.machines(name, gone=False)
         _remove_members(site, name, [each.name for each in left], now_s)
         for record in left:
-            from fog.supervisor.record import Outcome
+            from fog.supervisor.core.record import Outcome
 
             journal.put(record.ended(record.ending or Outcome.RELEASED, why, now_s), now_s, "released", why)
     for entry in journal.events(name, after=last):
@@ -109,8 +109,8 @@ def _remove_members(site: Site, cluster: str, machines: Sequence[str], now_s: fl
     """Remove machines from the border's domain that no supervisor has removed."""
     if site.border is None or not machines:
         return
-    from fog.enrolment.bootstrap import machine_label
-    from fog.enrolment.domain_members import DomainMembers
+    from fog.bootstrap.bundles import machine_label
+    from fog.bootstrap.domain_members import DomainMembers
 
     with closing(DomainMembers(site.border)) as members:
         for each in machines:

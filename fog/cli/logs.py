@@ -13,14 +13,14 @@ from typing import Annotated, Final
 
 import typer
 
+from fog.bootstrap.bundles import PROXY
 from fog.cli.options import AsJson, ClusterOption, SiteFile, State, machine_of, opened
 from fog.cli.views import print_json, stage
-from fog.enrolment.bootstrap import PROXY
 from fog.supervisor.background import LOG
+from fog.supervisor.core.record import Record
 from fog.supervisor.final_logs import MACHINE
 from fog.supervisor.infrastructure import open_provider
 from fog.supervisor.journal import Journal
-from fog.supervisor.record import Record
 from gdp.errors import LocalError
 
 __all__ = ["logs", "new_lines"]

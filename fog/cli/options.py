@@ -14,8 +14,8 @@ import typer
 
 from fog.site import Site, open_site, peek_site
 from fog.supervisor.background import ensure
+from fog.supervisor.core.record import Record
 from fog.supervisor.journal import Cluster, Journal
-from fog.supervisor.record import Record
 from gdp.cli.node import failing_clearly
 from gdp.errors import LocalError
 

@@ -31,8 +31,8 @@ from fog.cli.views import (
 )
 from fog.site import Site
 from fog.supervisor.background import pid_of
+from fog.supervisor.core.record import Record
 from fog.supervisor.journal import Cluster, Journal
-from fog.supervisor.record import Record
 from gdp.cli.console import Columns
 
 __all__ = ["cost", "ls", "status"]

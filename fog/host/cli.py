@@ -78,7 +78,7 @@ def _become_member(home: Path) -> str:
         enrol(home)
     if (home / JOIN_FILE).exists():
         from fog.host.joining import join
-        from gdp.enrolment.wire import EnrolmentError, Refusal
+        from gdp.trust.enrolment_wire import EnrolmentError, Refusal
 
         try:
             join(home)

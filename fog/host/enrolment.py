@@ -21,8 +21,7 @@ from gdp.errors import LocalError, StatementError
 from gdp.stores.files import read_private, read_public
 from gdp.stores.issue import install_delegation, install_membership, make_node_keys
 from gdp.stores.keyring import REQUEST, load_node_keys
-from gdp.trust.delegation import Delegation
-from gdp.trust.enrolment import (
+from gdp.trust.bootstrap_ticket import (
     ANSWER_HEAD_BYTES,
     ANSWER_SECRET_BYTES,
     REFUSED,
@@ -34,6 +33,7 @@ from gdp.trust.enrolment import (
     open_answer,
     seal_request,
 )
+from gdp.trust.delegation import Delegation
 
 __all__ = ["enrol"]
 

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Final
 
 from fog.host.bundle import JOIN_FILE, MEMBER_FOLDER
-from gdp.enrolment.join import JoinRequest, join_domain
+from gdp.enrolment.domain_join import JoinRequest, join_domain
 from gdp.enrolment.member_files import MEMBER_FILE
-from gdp.enrolment.wire import UnreachableError
 from gdp.errors import LocalError
 from gdp.stores.files import read_private
+from gdp.trust.enrolment_wire import UnreachableError
 from gdp.trust.join_token import JoinToken
 
 __all__ = ["join", "join_file"]

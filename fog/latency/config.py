@@ -21,7 +21,7 @@ from typing import Annotated, Final, Literal, cast
 
 from pydantic import AfterValidator, Field
 
-from gdp.nodes.schema import Section
+from gdp.config.schema import Section
 
 __all__ = ["Endpoint", "LatencyConfig"]
 

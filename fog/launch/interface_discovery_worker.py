@@ -21,8 +21,8 @@ from typing import Final, TypedDict
 from fog.child_environment import child_environment
 from gdp.errors import LocalError
 from gdp.ports.readiness import readable
-from proxy.bridge.action_interface import action_of, is_part
-from proxy.endpoints.endpoint import Graph, Role
+from proxy.bridge.core.action_interface import action_of, is_part
+from proxy.endpoints.core.endpoint import Graph, Role
 from proxy.endpoints.ros2 import Ros2Endpoint
 
 __all__ = ["main", "offers"]

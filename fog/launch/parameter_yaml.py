@@ -11,8 +11,8 @@ from typing import Final
 
 import yaml
 
+from gdp.config.yaml_source import LOADER
 from gdp.errors import LocalError
-from gdp.nodes.yaml_source import LOADER
 
 __all__ = ["BYTES_MAX", "DEPTH_MAX", "read_parameters"]
 

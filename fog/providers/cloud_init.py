@@ -33,8 +33,8 @@ from fog.providers.requirements import pinned, read_requirements
 from fog.software import fetch
 from fog.software.offer import WORKSPACE
 from fog.software.server import SOFTWARE_FILE
+from gdp.config.schema import ExistingFile, Section
 from gdp.errors import LocalError
-from gdp.nodes.schema import ExistingFile, Section
 from gdp.stores.files import read_at_most
 
 __all__ = [

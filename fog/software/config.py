@@ -9,8 +9,8 @@ from typing import Annotated, Final
 
 from pydantic import AfterValidator, Field
 
-from fog.enrolment.config import listening_place, reachable_place
-from gdp.nodes.schema import Directory, Section
+from fog.bootstrap.config import listening_place, reachable_place
+from gdp.config.schema import Directory, Section
 
 __all__ = ["SOFTWARE_PORT", "SoftwareConfig"]
 

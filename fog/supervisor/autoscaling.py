@@ -11,9 +11,9 @@ from typing import Final
 from fog.cluster import ClusterPlan, MachineRequest
 from fog.scaling import Autoscaler, CallCounts
 from fog.site import Site
+from fog.supervisor.core.record import Record
 from fog.supervisor.journal import Cluster, Journal
 from fog.supervisor.proxy_metrics import calls_of
-from fog.supervisor.record import Record
 
 __all__ = ["Autoscaling"]
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 import logging
 import time
 
+from fog.supervisor.core.record import Record
 from fog.supervisor.journal import Journal
-from fog.supervisor.record import Record
 
 __all__ = ["EventLog"]
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from fog.machine import Machine, MachineState
-from fog.supervisor.record import Record
+from fog.supervisor.core.record import Record
 
 __all__ = ["Change", "changes"]
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from typing import Final
 
-from fog.enrolment.bootstrap import PROXY, SWITCH
+from fog.bootstrap.bundles import PROXY, SWITCH
 from fog.providers.provider import Provider
 from gdp.errors import GdpError
 

@@ -11,12 +11,12 @@ from functools import partial
 
 from fog.machine import Machine, MachineState
 from fog.providers.provider import GatewayProvider
+from fog.supervisor.core.gateway_election import elect, excused_names
+from fog.supervisor.core.reconcile import Timeouts
+from fog.supervisor.core.record import Record
 from fog.supervisor.event_log import EventLog
-from fog.supervisor.gateway_election import elect, excused_names
 from fog.supervisor.journal import Journal
 from fog.supervisor.machine_actions import ATTACH, DETACH, MachineActions
-from fog.supervisor.reconcile import Timeouts
-from fog.supervisor.record import Record
 
 __all__ = ["GatewayUplinks"]
 

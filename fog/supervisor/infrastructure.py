@@ -15,8 +15,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from fog.bootstrap.bundles import gateway_boot
 from fog.cluster import CloudNode
-from fog.enrolment.bootstrap import gateway_boot
 from fog.host.status import STATUS_FILE, Status
 from fog.launch.resolve import command_line, deferred
 from fog.machine import MachineState

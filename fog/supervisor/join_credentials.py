@@ -8,16 +8,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
+from fog.bootstrap.bundles import joining_boot, machine_label
+from fog.bootstrap.domain_members import DomainMembers
 from fog.cluster import CloudNode, ClusterPlan
-from fog.enrolment.bootstrap import joining_boot, machine_label
-from fog.enrolment.credentials import IssuedCredentials
-from fog.enrolment.domain_members import DomainMembers
+from fog.credentials import IssuedCredentials
 from fog.machine import MachineBundle
 from fog.site import Site
+from fog.supervisor.core.record import Record
 from fog.supervisor.event_log import EventLog
 from fog.supervisor.journal import Journal
 from fog.supervisor.machine_credentials import Release, end_of_credentials
-from fog.supervisor.record import Record
 from gdp.errors import GdpError, StoreError
 
 __all__ = ["JoinCredentials"]

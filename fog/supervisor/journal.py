@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Final
 
 from fog.cluster import ClusterPlan, MachineRequest
-from fog.enrolment.credentials import IssuedCredentials
+from fog.credentials import IssuedCredentials
 from fog.hardware import Hardware
 from fog.machine import MachineSpec, MachineState
 from fog.offer import Offer
-from fog.supervisor.record import Outcome, Record
+from fog.supervisor.core.record import Outcome, Record
 from gdp.errors import LocalError, StoreError
 
 __all__ = ["FINAL_LOGS", "Cluster", "Entry", "Journal"]

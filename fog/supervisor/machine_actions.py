@@ -10,9 +10,9 @@ from dataclasses import replace
 from functools import partial
 from typing import Final
 
+from fog.bootstrap.bundles import node_names
 from fog.cluster import CloudNode, ClusterPlan, MachineRequest
-from fog.enrolment.bootstrap import node_names
-from fog.enrolment.credentials import IssuedCredentials
+from fog.credentials import IssuedCredentials
 from fog.latency.known import Latencies
 from fog.machine import Machine, MachineSpec, MachineState
 from fog.offer import Offer
@@ -20,13 +20,13 @@ from fog.plan.choice import Choice
 from fog.providers.provider import GatewayProvider, Provider
 from fog.site import Site
 from fog.supervisor.actions import ActionRunner
+from fog.supervisor.core.reconcile import Action, Drain, Launch
+from fog.supervisor.core.record import Outcome, Record
 from fog.supervisor.event_log import EventLog
 from fog.supervisor.final_logs import decode_logs, encode_logs
 from fog.supervisor.journal import FINAL_LOGS, Journal
 from fog.supervisor.machine_credentials import CredentialIssuer
 from fog.supervisor.placement import place, stopgap
-from fog.supervisor.reconcile import Action, Drain, Launch
-from fog.supervisor.record import Outcome, Record
 from gdp.errors import LocalError
 
 __all__ = ["ATTACH", "DETACH", "MachineActions"]

@@ -11,21 +11,21 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Protocol, TypeAlias
 
+from fog.bootstrap.bundles import machine_boot, machine_seats
+from fog.bootstrap.members import revoke_credentials
+from fog.bootstrap.robot_config import reload
+from fog.bootstrap.tickets import News, Report, Tickets
 from fog.cluster import CloudNode, ClusterPlan
-from fog.enrolment.bootstrap import machine_boot, machine_seats
-from fog.enrolment.members import revoke_credentials
-from fog.enrolment.robot_config import reload
-from fog.enrolment.tickets import News, Report, Tickets
 from fog.machine import MachineBundle
 from fog.site import Site
+from fog.supervisor.core.record import Outcome, Record
 from fog.supervisor.event_log import EventLog
 from fog.supervisor.journal import Journal
-from fog.supervisor.record import Outcome, Record
+from gdp.config.config import SwitchConfig
 from gdp.errors import LocalError
-from gdp.nodes.config import SwitchConfig
 from gdp.stores.issue import DAY_S
 from gdp.stores.keyring import load_domain
-from gdp.trust.enrolment import TOKEN_BYTES, Ticket
+from gdp.trust.bootstrap_ticket import TOKEN_BYTES, Ticket
 
 __all__ = ["CredentialIssuer", "MachineCredentials", "Release", "end_of_credentials"]
 

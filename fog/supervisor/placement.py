@@ -12,7 +12,7 @@ from typing import Final
 from fog.cluster import MachineRequest
 from fog.offer import Offer
 from fog.plan.choice import Choice, choose
-from fog.supervisor.record import Outcome, Record
+from fog.supervisor.core.record import Outcome, Record
 
 __all__ = ["held_until", "place", "stopgap", "wary_until"]
 

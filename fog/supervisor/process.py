@@ -17,16 +17,16 @@ from functools import partial
 from types import FrameType
 from typing import Final
 
-from fog.enrolment.domain_members import DomainMembers
-from fog.enrolment.listener import Listener, bind_tcp, bind_unix
-from fog.enrolment.responder import Responder
-from fog.enrolment.tickets import Tickets
+from fog.bootstrap.domain_members import DomainMembers
+from fog.bootstrap.listener import Listener, bind_tcp, bind_unix
+from fog.bootstrap.responder import Responder
+from fog.bootstrap.tickets import Tickets
 from fog.site import Site, topology_now
 from fog.software.server import SoftwareServer
 from fog.supervisor.background import held
+from fog.supervisor.core.reconcile import Timeouts
 from fog.supervisor.infrastructure import command_of, open_provider, set_up
 from fog.supervisor.journal import Journal
-from fog.supervisor.reconcile import Timeouts
 from fog.supervisor.snapshot import supervisor_snapshot
 from fog.supervisor.supervisor import Supervisor
 from fog.supervisor.watch import Watch
@@ -34,7 +34,7 @@ from fog.topology import Gateway
 from gdp.errors import StoreError
 from gdp.host.processes import Process
 from gdp.host.service_notifier import service_notifier
-from gdp.nodes.control_socket import CONTROL_SOCKET, ControlHandlers, serve_control_in_thread
+from gdp.management.control_socket import CONTROL_SOCKET, ControlHandlers, serve_control_in_thread
 
 __all__ = ["supervise"]
 

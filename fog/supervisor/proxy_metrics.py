@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Final
 from urllib.request import urlopen
 
-from fog.enrolment.robot_config import control_socket_of
+from fog.bootstrap.robot_config import control_socket_of
 from fog.scaling import CallCounts
 from gdp.errors import GdpError
+from gdp.management.control_client import ask_node, find_control_socket_of
 from gdp.names import Name
-from gdp.nodes.control_client import ask_node, find_control_socket_of
-from gdp.nodes.control_protocol import Command
+from gdp.state.control_protocol import Command
 from proxy.config.config import ProxyConfig
 
 __all__ = ["calls_of", "received_by", "sent_by"]

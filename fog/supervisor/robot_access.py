@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
+from fog.bootstrap.robot_config import add_rules, reload_proxy, remove_rules
 from fog.cluster import ClusterPlan
-from fog.enrolment.robot_config import add_rules, reload_proxy, remove_rules
 from fog.site import Site
 
 __all__ = ["RobotAccess"]

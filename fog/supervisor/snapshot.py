@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import Final
 
+from fog.supervisor.core.record import Record, stage
 from fog.supervisor.journal import Entry, Journal
-from fog.supervisor.record import Record, stage
 
 __all__ = ["supervisor_snapshot"]
 

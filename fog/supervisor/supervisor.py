@@ -13,14 +13,16 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Final, TypeAlias
 
+from fog.bootstrap.domain_members import DomainMembers
+from fog.bootstrap.members import metadata_of
+from fog.bootstrap.tickets import Tickets
 from fog.cluster import CloudNode, ClusterPlan
-from fog.enrolment.domain_members import DomainMembers
-from fog.enrolment.members import metadata_of
-from fog.enrolment.tickets import Tickets
 from fog.machine import Machine, MachineState
 from fog.providers.provider import Provider
 from fog.site import Site
 from fog.supervisor.autoscaling import Autoscaling
+from fog.supervisor.core.reconcile import Timeouts, decide
+from fog.supervisor.core.record import Record, update_record
 from fog.supervisor.event_log import EventLog
 from fog.supervisor.events import changes
 from fog.supervisor.gateway_uplinks import GatewayUplinks
@@ -28,8 +30,6 @@ from fog.supervisor.join_credentials import JoinCredentials
 from fog.supervisor.journal import Cluster, Journal
 from fog.supervisor.machine_actions import MachineActions
 from fog.supervisor.machine_credentials import CredentialIssuer, MachineCredentials
-from fog.supervisor.reconcile import Timeouts, decide
-from fog.supervisor.record import Record, update_record
 from fog.supervisor.robot_access import RobotAccess
 from fog.supervisor.usage_limits import UsageLimits
 from gdp.errors import GdpError

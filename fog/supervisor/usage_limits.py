@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from typing import Final
 
 from fog.site import Site
-from fog.supervisor.activity import Activity
+from fog.supervisor.core.activity import Activity
+from fog.supervisor.core.record import Record, cost_usd
 from fog.supervisor.journal import Cluster, Journal
 from fog.supervisor.proxy_metrics import received_by, sent_by
-from fog.supervisor.record import Record, cost_usd
 
 __all__ = ["UsageLimits"]
 

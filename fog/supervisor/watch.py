@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.client.participant import Participant
+from gdp.config.schema import Domain
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.errors import GdpError
@@ -22,9 +23,8 @@ from gdp.nodes.credentials import Credentials
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S
-from gdp.nodes.runtime import Runtime
-from gdp.nodes.schema import Domain
 from gdp.ports.raw import RawPlane
+from gdp.runtime.runtime import Runtime
 from gdp.stores.keyring import DELEGATIONS, ROOT_CERTIFICATE
 from gdp.trust.right import Right
 

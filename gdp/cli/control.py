@@ -15,8 +15,8 @@ from gdp.cli import options
 from gdp.cli.completion import complete_node
 from gdp.cli.output import show
 from gdp.errors import LocalError
-from gdp.nodes.control_client import NotRunningError, find_control_socket, request_control
-from gdp.nodes.control_protocol import Command, Response
+from gdp.management.control_client import NotRunningError, find_control_socket, request_control
+from gdp.state.control_protocol import Command, Response
 
 __all__ = ["drain", "reload", "status"]
 

@@ -16,7 +16,7 @@ from typer.core import TyperGroup
 
 from gdp.cli import options
 from gdp.cli.delegations import described, ls, show_file
-from gdp.cli.doors import run_of_proxy
+from gdp.cli.doors import rules_of_proxies
 from gdp.cli.extension import ANY_ARGUMENTS
 from gdp.cli.output import (
     epochs_from_text,
@@ -76,12 +76,7 @@ OutFile = Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="wher
 NodeDir = Annotated[Path, typer.Option("--node", metavar="DIR", help="the node's directory")]
 
 
-@app.command(_RULES, context_settings=ANY_ARGUMENTS)
-def rules(context: typer.Context) -> None:
-    """Give each proxy the delegations that the rules of its file need."""
-    run_of_proxy("delegate", context.args)
-
-
+app.command(_RULES, context_settings=ANY_ARGUMENTS)(rules_of_proxies)
 app.command("ls", no_args_is_help=True)(ls)
 app.command("show", no_args_is_help=True)(show_file)
 

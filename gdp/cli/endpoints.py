@@ -15,7 +15,7 @@ from gdp.cli import options
 from gdp.cli.output import moment, show
 from gdp.control.endpoints import Endpoint, inner_address
 from gdp.errors import LocalError
-from gdp.nodes.endpoint_files import RECORD_SUFFIX, own_record, public_candidates
+from gdp.links.endpoint_files import RECORD_SUFFIX, own_record, public_candidates
 from gdp.stores.files import public, write_all
 from gdp.stores.keyring import load_identity
 

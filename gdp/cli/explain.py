@@ -17,7 +17,7 @@ from gdp.cli.local_nodes import local_nodes, nearest
 from gdp.diagnosis.answer import Answer, Verdict
 from gdp.diagnosis.diagnosis import diagnose
 from gdp.errors import LocalError
-from gdp.nodes.running_nodes import RunningNode
+from gdp.management.running_nodes import RunningNode
 
 __all__ = ["explain"]
 

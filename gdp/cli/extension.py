@@ -1,13 +1,11 @@
-"""Group whose further commands come from the package ``proxy``, which ``gdp`` loads by name only.
+"""Group whose further commands come from other packages, through entry points of the group ``gdp.command``.
 
-I/O. Where ``proxy`` is not installed, the group's own placeholders say how to install it.
+I/O. Where such a package is not installed, the group's own placeholders say how to install it.
 """
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import typer
@@ -16,12 +14,12 @@ from typer.core import TyperGroup
 
 from gdp.cli.version import versioned
 from gdp.errors import LocalError
-from gdp.extras import MissingExtraError
+from gdp.extras import MissingExtraError, find_entry_point
 
 if TYPE_CHECKING:
     from typer import Context
 
-__all__ = ["ANY_ARGUMENTS", "ExtendedGroup", "placeholder"]
+__all__ = ["ANY_ARGUMENTS", "ExtendedGroup", "load_command", "placeholder"]
 
 ANY_ARGUMENTS = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": list[str]()}
 
@@ -31,22 +29,39 @@ def placeholder(context: typer.Context) -> None:
     raise LocalError(f"{context.command_path} needs the package proxy (run: pip install 'gdp-ros[proxy,doors]')")
 
 
+def load_command(name: str, *, user: str = "", extras: str = "proxy") -> Any:
+    """Return what an entry point of the group ``gdp.command`` refers to.
+
+    Args:
+        user: what needs it, for the error.
+        extras: of this distribution that it needs, for the error.
+
+    Raises:
+        LocalError: its package, or an extra of it, is not installed.
+    """
+    point = find_entry_point("gdp.command", name)
+    if point is None:
+        raise LocalError(f"{user or f'gdp {name}'} needs the package proxy (run: pip install 'gdp-ros[{extras}]')")
+    return point.load()
+
+
 class ExtendedGroup(TyperGroup):
-    """Group with commands of other modules.
+    """Group with commands of other packages.
 
     Attributes:
-        extensions: command to the module whose ``app`` is it, or has it.
+        extensions: command to the entry point of the application that is it, or has it.
     """
 
     extensions: ClassVar[Mapping[str, str]] = {}
 
     def get_command(self, ctx: Context, cmd_name: str) -> typer.core.TyperCommand | None:  # type: ignore[override]
-        """Return a command, those of other modules as they are there."""
-        module = self.extensions.get(cmd_name)
-        if module is None or find_spec("proxy") is None:
+        """Return a command, those of other packages as they are there."""
+        name = self.extensions.get(cmd_name)
+        point = None if name is None else find_entry_point("gdp.command", name)
+        if point is None:
             return super().get_command(ctx, cmd_name)  # type: ignore[return-value]
         try:
-            loaded: Any = versioned(importlib.import_module(module).app)
+            loaded: Any = versioned(point.load())
         except (ModuleNotFoundError, MissingExtraError):
             # an extra is not installed: the placeholder says so when it runs
             return super().get_command(ctx, cmd_name)  # type: ignore[return-value]

@@ -17,8 +17,8 @@ from gdp.diagnosis.survey import ROLES, Survey
 from gdp.errors import LocalError
 from gdp.host.ros_processes import ros_processes
 from gdp.limits import DIAGNOSTIC_REPLY_MAX_BYTES
-from gdp.nodes.control_client import NodeConnection, NotRunningError, find_control_socket
-from gdp.nodes.state_answers import ASK
+from gdp.management.control_client import NodeConnection, NotRunningError, find_control_socket
+from gdp.state.state_answers import ASK
 from gdp.stores.keyring import CARD, load_card
 
 __all__ = ["FactGathering", "LocalDirectory", "local_directory"]

@@ -62,7 +62,7 @@ _KNOWN: Final = {
 
 
 class _Commands(ExtendedGroup):
-    extensions: ClassVar[Mapping[str, str]] = {each: f"proxy.cli.{each}" for each in _DOORS}
+    extensions: ClassVar[Mapping[str, str]] = {each: each for each in _DOORS}
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)

@@ -32,7 +32,7 @@ from gdp.cli.node import set_up_logging
 from gdp.cli.output import show
 from gdp.enrolment.agent import Agent
 from gdp.enrolment.channel import connect_any
-from gdp.enrolment.join import JoinRequest, join_domain, prefer_server
+from gdp.enrolment.domain_join import JoinRequest, join_domain, prefer_server
 from gdp.enrolment.machine_programs import Machine, check_program, read_machine
 from gdp.enrolment.preflight import check_tunnels
 from gdp.enrolment.programs import missing_ros

@@ -13,9 +13,9 @@ from typing import Annotated, Optional
 import typer
 
 from gdp.errors import LocalError
+from gdp.management.control_client import NodeConnection, NotRunningError, find_control_socket
+from gdp.management.running_nodes import RunningNode, find_running_nodes
 from gdp.names import NAME_BYTES, Name
-from gdp.nodes.control_client import NodeConnection, NotRunningError, find_control_socket
-from gdp.nodes.running_nodes import RunningNode, find_running_nodes
 
 __all__ = ["Node", "connect", "find_name", "local_nodes", "names_of_machine", "nearest"]
 

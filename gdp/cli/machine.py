@@ -24,8 +24,8 @@ from gdp.enrolment.supervisor import Failures, supervise
 from gdp.enrolment.units import has_systemd, install_units, unit_texts
 from gdp.errors import GdpError
 from gdp.host.interruption import Interrupted, interruptible
-from gdp.nodes.control_client import ask_node, find_control_socket
-from gdp.nodes.control_protocol import Command
+from gdp.management.control_client import ask_node, find_control_socket
+from gdp.state.control_protocol import Command
 
 __all__ = ["AtDirectory", "NoSystemd", "Start", "directory_of", "paths_up", "run_programs", "say", "start_machine"]
 

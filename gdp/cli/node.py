@@ -18,8 +18,8 @@ import orjson
 import typer
 
 from gdp.cli.log_lines import JsonLines
+from gdp.config.config import UplinkPlane
 from gdp.errors import ConfigError, GdpError, LocalError
-from gdp.nodes.config import UplinkPlane
 
 __all__ = [
     "WRONG",

@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from typing import Final
 
 from gdp.limits import HOPS_MAX
+from gdp.management.control_client import NodeConnection
 from gdp.names import Name
-from gdp.nodes.control_client import NodeConnection
 
 __all__ = ["PathProbe"]
 

@@ -16,8 +16,8 @@ from gdp.cli.local_nodes import Node, connect, find_name
 from gdp.cli.ping_statistics import PingStatistics
 from gdp.cli.places import NOWHERE, find_places
 from gdp.errors import LocalError
+from gdp.management.control_client import NodeConnection
 from gdp.names import Name
-from gdp.nodes.control_client import NodeConnection
 from gdp.ports.readiness import readable
 
 __all__ = ["ping"]

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from gdp.errors import LocalError
+from gdp.management.control_client import NodeConnection
 from gdp.names import Name
-from gdp.nodes.control_client import NodeConnection
 
 __all__ = ["NOWHERE", "Place", "find_places"]
 

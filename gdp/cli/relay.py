@@ -25,14 +25,14 @@ from gdp.cli.node import (
 )
 from gdp.cli.output import show
 from gdp.cli.version import HELP, Version
+from gdp.config.relay_config import RelayConfig
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
-from gdp.nodes.control_client import ask_node
-from gdp.nodes.control_protocol import Command
+from gdp.management.control_client import ask_node
 from gdp.nodes.membership import load_member
 from gdp.nodes.relay import Relay, relay_control_path, run_relay
-from gdp.nodes.relay_config import RelayConfig
 from gdp.ports.tap import tap_name
+from gdp.state.control_protocol import Command
 
 __all__ = ["main"]
 

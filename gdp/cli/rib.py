@@ -26,12 +26,12 @@ from gdp.cli.node import (
     set_up_logging,
 )
 from gdp.cli.version import HELP, Version
+from gdp.config.config import RibConfig
 from gdp.crypto.certificates import Role
+from gdp.links.uplink import wait_for_device
 from gdp.names import Name
-from gdp.nodes.config import RibConfig
 from gdp.nodes.membership import load_member
 from gdp.nodes.rib import run_rib
-from gdp.nodes.uplink import wait_for_device
 
 __all__ = ["main"]
 

@@ -17,10 +17,10 @@ from gdp.cli.completion import complete_node
 from gdp.cli.output import moment, show
 from gdp.cli.topic import Host, KnownName, Sockets, none_runs
 from gdp.errors import LocalError
+from gdp.management.control_client import NotRunningError, ask_node, find_control_socket
+from gdp.management.running_nodes import RunningNode, find_running_nodes, read_topics
 from gdp.names import Name
-from gdp.nodes.control_client import NotRunningError, ask_node, find_control_socket
-from gdp.nodes.control_protocol import Command
-from gdp.nodes.running_nodes import RunningNode, find_running_nodes, read_topics
+from gdp.state.control_protocol import Command
 
 __all__ = ["app"]
 

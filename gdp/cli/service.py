@@ -33,7 +33,7 @@ _ETC: Final = Path("/etc/gdp")
 
 
 class _Services(ExtendedGroup):
-    extensions: ClassVar[Mapping[str, str]] = {"call": "proxy.cli.service"}
+    extensions: ClassVar[Mapping[str, str]] = {"call": "service"}
 
 
 app = typer.Typer(

@@ -16,8 +16,8 @@ from gdp.cli import options
 from gdp.cli.local_nodes import connect, local_nodes
 from gdp.cli.tables import print_table, select_columns
 from gdp.errors import LocalError
-from gdp.nodes.control_client import NodeConnection, NotRunningError
-from gdp.nodes.running_nodes import RunningNode
+from gdp.management.control_client import NodeConnection, NotRunningError
+from gdp.management.running_nodes import RunningNode
 
 __all__ = ["Table", "show_table"]
 

@@ -30,12 +30,12 @@ from gdp.cli.node import (
     set_up_logging,
 )
 from gdp.cli.version import HELP, Version
+from gdp.config.config import DataPlane, SwitchConfig
+from gdp.config.found_config import find_switch_config
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.enrolment.addresses import default_directory
 from gdp.errors import LocalError
-from gdp.nodes.config import DataPlane, SwitchConfig
-from gdp.nodes.found_config import find_switch_config
 from gdp.nodes.membership import load_member
 from gdp.nodes.switch import run_switch
 

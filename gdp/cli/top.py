@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from gdp.cli.columns import bits, columns, short_count
 from gdp.cli.output import show
 from gdp.cli.topic import Host, JsonLines, Sockets, answers_of
-from gdp.nodes.running_nodes import find_running_nodes, read_topics
-from gdp.nodes.topic_rates import RatedRow, rated_rows
-from gdp.nodes.topic_rows import Direction
+from gdp.management.running_nodes import find_running_nodes, read_topics
+from gdp.management.topic_rates import RatedRow, rated_rows
+from gdp.state.columns import bits, columns, short_count
+from gdp.state.topic_rows import Direction
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -12,18 +12,18 @@ from typing import Annotated, ClassVar, Final, Optional
 
 import typer
 
-from gdp.cli.columns import bits, columns, short_count
 from gdp.cli.completion import complete_node
 from gdp.cli.extension import ANY_ARGUMENTS, ExtendedGroup, placeholder
 from gdp.cli.output import show
 from gdp.crypto.certificates import Role
+from gdp.management.running_nodes import Found, NodeTopics, RunningNode, find_running_nodes, read_topics
+from gdp.management.topic_rates import RatedRow, known_names, rated_rows
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.nodes.membership import load_member
-from gdp.nodes.running_nodes import Found, NodeTopics, RunningNode, find_running_nodes, read_topics
-from gdp.nodes.topic_rates import RatedRow, known_names, rated_rows
-from gdp.nodes.topic_rows import Direction, held_row
 from gdp.session.settings import settings_of
+from gdp.state.columns import bits, columns, short_count
+from gdp.state.topic_rows import Direction, held_row
 
 __all__ = ["Host", "JsonLines", "KnownName", "Sockets", "answers_of", "app", "none_runs"]
 
@@ -33,7 +33,7 @@ _HEAD: Final = ("NAME", "TYPE", "DIRECTION", "MSG/S", "RATE", "SIZE", "PUBLISHER
 
 
 class _Topics(ExtendedGroup):
-    extensions: ClassVar[Mapping[str, str]] = dict.fromkeys(("hz", "bw", "echo"), "proxy.cli.topic")
+    extensions: ClassVar[Mapping[str, str]] = dict.fromkeys(("hz", "bw", "echo"), "topic")
 
 
 app = typer.Typer(cls=_Topics, no_args_is_help=True, help="List, measure and read topics.")

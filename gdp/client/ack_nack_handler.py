@@ -47,7 +47,7 @@ class AckNackHandler:
         self._heartbeats = heartbeats
         self.last_sent_s = float("-inf")
 
-    def handle_acknack(self, name: bytes, report: AckNack, *, is_new: bool, now_s: float, trip_s: float = 0.0) -> None:
+    def handle_acknack(self, name: bytes, acknack: AckNack, *, is_new: bool, now_s: float, trip_s: float = 0.0) -> None:
         """Process a report that was opened.
 
         Args:
@@ -55,31 +55,31 @@ class AckNackHandler:
             trip_s: round trip of its path; 0: not known.
         """
         queue, ledger = self._queue, self._queue.ledger
-        reader, sequence = self._readers[name], min(report.sequence, ledger.last + 1)
+        reader, sequence = self._readers[name], min(acknack.sequence, ledger.last + 1)
         if is_new:
             self._drop(name)
             reader.sequence = sequence or queue.first_waiting
-        if AckNackFlag.BYE in report.flags:
+        if AckNackFlag.BYE in acknack.flags:
             self.forget(name)
             if not self._readers.all():
                 ledger.give_up(max(sequence, reader.sequence), ledger.last, LossReason.NO_READER)
             return
-        report = self._translate(report)
-        if AckNackFlag.NEW in report.flags:
-            self._start(name, report, now_s)
+        acknack = self._translate(acknack)
+        if AckNackFlag.NEW in acknack.flags:
+            self._start(name, acknack, now_s)
             return
         reader.start = None
         if queue.is_acknowledged:
-            self._acknowledge(name, report, is_new=is_new, now_s=now_s, trip_s=trip_s)
+            self._acknowledge(name, acknack, is_new=is_new, now_s=now_s, trip_s=trip_s)
         if not self._window.is_suspended(name):
             reader.behind_s = None
         if is_new or sequence > reader.sequence:
             reader.advanced_s = now_s
-        reader.sequence, reader.lost = max(reader.sequence, sequence), max(reader.lost, report.lost)
+        reader.sequence, reader.lost = max(reader.sequence, sequence), max(reader.lost, acknack.lost)
         (sent, _), (sequence, _) = queue.sent, queue.sequences
         is_stuck = now_s - reader.advanced_s >= _STUCK_S
         is_settled = queue.is_acknowledged or is_stuck or now_s - self.last_sent_s > _SETTLED_S
-        if report.sequence < sequence and is_settled and (report.next_number >= sent or not queue.is_acknowledged):
+        if acknack.sequence < sequence and is_settled and (acknack.next_number >= sent or not queue.is_acknowledged):
             self._heartbeats.is_reminder_wanted = True  # it does not know what it has lost behind its last message
 
     def handle_timer(self, now_s: float) -> None:
@@ -174,15 +174,15 @@ class AckNackHandler:
             reader.behind_s = None
         self._heartbeats.wanted = True
 
-    def _translate(self, report: AckNack) -> AckNack:
+    def _translate(self, acknack: AckNack) -> AckNack:
         """Return a report under the present numbers; a Heartbeat announces them to a reader that does not know them."""
         for move in self._queue.moves:
-            if move.is_before(report.next_number):
-                report = report._replace(next_number=move.new_number(report.next_number), next_part=0, missing=())
+            if move.is_before(acknack.next_number):
+                acknack = acknack._replace(next_number=move.new_number(acknack.next_number), next_part=0, missing=())
                 self._heartbeats.is_reminder_wanted = True
-        return report
+        return acknack
 
-    def _start(self, name: bytes, report: AckNack, now_s: float) -> None:
+    def _start(self, name: bytes, acknack: AckNack, now_s: float) -> None:
         """Choose the first message of a new reader; a repeated request gets the same response."""
         reader, queue = self._readers[name], self._queue
         if name not in self._heartbeats.starts and not self._heartbeats.is_full:
@@ -190,42 +190,42 @@ class AckNackHandler:
             oldest = self._window.oldest
             is_gone = oldest is not None and reader.start is not None and reader.start.number < oldest
             if reader.start is None or is_gone or not queue.is_acknowledged:
-                number = self._first_of(report)
+                number = self._first_of(acknack)
                 begin = queue.ledger.begin_of(number, queue.first_waiting)
                 if reader.start is not None:  # it is a reader since then: what it did not get since is lost
                     begin = min(reader.start.sequence, begin)
                 reader.start = StreamStart(reader.incarnation, number, begin, reader.confirmed)
-                reader.sequence = min(report.sequence, queue.ledger.last + 1) or begin
+                reader.sequence = min(acknack.sequence, queue.ledger.last + 1) or begin
                 if queue.is_acknowledged and now_s >= reader.out_until_s:
                     self._window.add_reader(name, number, now_s)
-                    if number < queue.next_number and report.next_number and self._window.readers > 1:
+                    if number < queue.next_number and acknack.next_number and self._window.readers > 1:
                         self._window.suspend(name)  # the others must not wait for what it missed
                         reader.behind_s = now_s
             self._heartbeats.starts[name] = reader.start
         self._heartbeats.wanted = True
 
-    def _first_of(self, report: AckNack) -> int:
+    def _first_of(self, acknack: AckNack) -> int:
         """Return the message number at which a reader begins: where it was before, or with the next message."""
         queue = self._queue
-        if report.next_number and queue.is_acknowledged:
-            return min(max(report.next_number, queue.oldest), queue.next_number)
+        if acknack.next_number and queue.is_acknowledged:
+            return min(max(acknack.next_number, queue.oldest), queue.next_number)
         if not queue.depth:
             return queue.next_number
         return max(queue.oldest, queue.next_number + queue.deferred - queue.depth)
 
-    def _acknowledge(self, name: bytes, report: AckNack, *, is_new: bool, now_s: float, trip_s: float) -> None:
+    def _acknowledge(self, name: bytes, acknack: AckNack, *, is_new: bool, now_s: float, trip_s: float) -> None:
         reader, window, queue = self._readers[name], self._window, self._queue
-        self.lose_ended(window.poll_cancelled(report))
+        self.lose_ended(window.poll_cancelled(acknack))
         oldest = queue.oldest
         if not (window.has_reader(name) or window.is_suspended(name)) and now_s >= reader.out_until_s:
             # it lagged; what a forgotten reader lacked was given up before
-            if not is_new and report.next_number < oldest:
+            if not is_new and acknack.next_number < oldest:
                 end = queue.ledger.begin_of(oldest, queue.first_waiting)
-                queue.ledger.give_up(report.sequence, end - 1)
-            window.add_reader(name, min(max(report.next_number, oldest), queue.next_number), now_s)
+                queue.ledger.give_up(acknack.sequence, end - 1)
+            window.add_reader(name, min(max(acknack.next_number, oldest), queue.next_number), now_s)
         if window.has_reader(name) or window.is_suspended(name):
-            window.handle_acknack(name, report, now_s, trip_s)
-        lacks_from = report.missing[0].number if report.missing and not is_new else report.next_number
+            window.handle_acknack(name, acknack, now_s, trip_s)
+        lacks_from = acknack.missing[0].number if acknack.missing and not is_new else acknack.next_number
         is_gone = lacks_from < oldest
-        if is_gone or (window.is_suspended(name) and not report.missing):
+        if is_gone or (window.is_suspended(name) and not acknack.missing):
             self._heartbeats.is_reminder_wanted = True  # it requests what is gone, or does not know what it lacks

@@ -58,7 +58,7 @@ class AckNackSealer:
         self._incarnation = incarnation
         self._introduces = introduces
         self._secrets = secrets
-        self._shared = reader.notes.shared(exchange)
+        self._shared = reader.control_keys.shared(exchange)
         self._sealers: dict[int, ControlSealer] = {}
         self._tried = 0
         self._epoch_at = -1  # number of the message that had this epoch
@@ -84,24 +84,24 @@ class AckNackSealer:
         if self.epoch not in secrets:
             self.epoch = max(secrets)
 
-    def seal(self, report: AckNack) -> bytes:
+    def seal(self, acknack: AckNack) -> bytes:
         """Return the frame of a report."""
-        return self.sealer(self.epoch).seal(report.to_wire())
+        return self.sealer(self.epoch).seal(acknack.to_wire())
 
-    def seal_first(self, report: AckNack) -> list[bytes]:
+    def seal_first(self, acknack: AckNack) -> list[bytes]:
         """Return the frames of an introduction and a report to a writer that has not responded yet."""
         self.epoch = self._epoch_to_try()
-        return [*self._introduction(self.epoch), self.seal(report)]
+        return [*self._introduction(self.epoch), self.seal(acknack)]
 
-    def seal_all(self, report: AckNack, now_s: float) -> list[bytes]:
+    def seal_all(self, acknack: AckNack, now_s: float) -> list[bytes]:
         """Return the frames of a report; to a silent writer also an introduction, in turn under every epoch."""
-        frames = [self.seal(report)]
+        frames = [self.seal(acknack)]
         if now_s - self._silent_s >= _SILENT_S:
             self._silent_s = now_s
             epoch = self._epoch_to_try()
             frames += self._introduction(epoch)
             if epoch != self.epoch:
-                frames.append(self.sealer(epoch).seal(report.to_wire()))
+                frames.append(self.sealer(epoch).seal(acknack.to_wire()))
         return frames
 
     def sealer(self, epoch: int) -> ControlSealer:

@@ -19,8 +19,8 @@ from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.fragments import ControlFragmenter, ControlReassembler
 from gdp.control.join import Join
 from gdp.control.join_refresh import JoinRefresh
-from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.neighbour import Neighbour
+from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.control.presence import Presence
 from gdp.control.revocation_sync import RevocationSync
 from gdp.control.settings import NodeSettings
@@ -28,7 +28,7 @@ from gdp.control.waiting import Wait, WaitReason, port_waits, stranger_waits
 from gdp.crypto.certificates import Role
 from gdp.crypto.fields import check_sequence
 from gdp.crypto.identity import Identity
-from gdp.crypto.statements import Statement, StatementType, parse, sign
+from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
 from gdp.errors import DropReason, FrameError, StatementError
@@ -42,6 +42,7 @@ from gdp.trust.revocation import Revocation
 from gdp.trust.revocations import hash_of
 from gdp.trust.right import HEARS, Right
 from gdp.trust.rtcert import RtCert
+from gdp.trust.withdrawal import Withdrawal
 
 __all__ = ["Attachment", "PendingAdvertisement", "attachment_waits"]
 
@@ -203,9 +204,7 @@ class Attachment:
     def withdraw(self, name: Name, right: Right) -> None:
         """Stop advertising a name, and send the withdrawal."""
         if self._advertisements.pop((name, right), None) is not None and self._switch is not None:
-            body = {"n": name, "right": right.value, "s": self._next_sequence()}
-            wire = sign(StatementType.WITHDRAW, body, self._identity.name, self._identity.key)
-            self._say(Kind.WITHDRAW, wire)
+            self._say(Kind.WITHDRAW, Withdrawal(name, right, self._next_sequence()).to_wire(self._identity))
 
     def withdraw_all(self) -> None:
         """Leave: withdraw every advertisement."""

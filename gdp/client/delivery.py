@@ -85,16 +85,16 @@ class DeliveryQueue:
                 self.losses.add(lost)
             self.sequence = sequence
 
-    def deliver(self, joined: ReassembledMessage) -> None:
+    def deliver(self, reassembled: ReassembledMessage) -> None:
         """Queue the messages of a number, and count what lies before them as lost; a malformed one is dropped."""
-        sequence, messages = int.from_bytes(joined.head, "big"), [joined.message]
-        self.delivered_bytes += len(joined.message)
-        if len(joined.head) < SEQUENCE_BYTES or sequence > NUMBER_MAX:
+        sequence, messages = int.from_bytes(reassembled.head, "big"), [reassembled.message]
+        self.delivered_bytes += len(reassembled.message)
+        if len(reassembled.head) < SEQUENCE_BYTES or sequence > NUMBER_MAX:
             self._drops[DropReason.MALFORMED] += 1
             return
-        if joined.flags & _BUNDLE:
+        if reassembled.flags & _BUNDLE:
             try:
-                messages = unpack(joined.message)
+                messages = unpack(reassembled.message)
             except RemoteError as error:
                 self._drops[error.reason] += 1
                 return
@@ -102,7 +102,7 @@ class DeliveryQueue:
         self.lose_until(sequence, otherwise)
         self.sequence = max(self.sequence, sequence + len(messages))
         self.delivered += len(messages)
-        number, way = joined.number, (joined.parts, joined.hops)
+        number, way = reassembled.number, (reassembled.parts, reassembled.hops)
         for place, message in enumerate(messages):
             at = place, sequence + place
             self._queue.append(Delivered(self._publisher, self._incarnation, number, message, *way, *at))

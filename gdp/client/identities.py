@@ -24,7 +24,7 @@ class WriterIdentity:
     Args:
         signer: None: streams of this identity are under session secrets, and not signed.
         random_bytes: the system's randomness, called for each message that is sealed.
-        notes: keys for the control datagrams of readers.
+        control_keys: keys for the control datagrams of readers.
         copies: budget of the copies that all its publishers send against loss.
         parity: budget of the parity frames that they send.
     """
@@ -33,7 +33,7 @@ class WriterIdentity:
     incarnation: int
     signer: Signer | None
     random_bytes: Callable[[int], bytes]
-    notes: ControlKeys
+    control_keys: ControlKeys
     copies: CopyBudget = field(default_factory=CopyBudget, compare=False)
     parity: CopyBudget = field(default_factory=parity_budget, compare=False)
 
@@ -49,6 +49,6 @@ class ReaderIdentity:
 
     name: Name
     incarnation: int
-    notes: ControlKeys = field(compare=False)
+    control_keys: ControlKeys = field(compare=False)
     introduction: Callable[[], bytes] = field(compare=False)
     note_numbers: Iterator[int] = field(default_factory=lambda: count(1), compare=False)

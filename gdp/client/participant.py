@@ -65,15 +65,15 @@ class Participant:
     def __init__(self, identity: Identity, policy: Policy, settings: NodeSettings) -> None:
         self._identity = identity
         self._verifier = AdvertisementVerifier(policy)
-        notes = ControlKeys(ExchangeKey.from_random(settings.random_bytes(EXCHANGE_KEY_BYTES)))
-        source = WriterIdentity(identity.name, settings.incarnation, identity.key, settings.random_bytes, notes)
+        control_keys = ControlKeys(ExchangeKey.from_random(settings.random_bytes(EXCHANGE_KEY_BYTES)))
+        source = WriterIdentity(identity.name, settings.incarnation, identity.key, settings.random_bytes, control_keys)
         self._publications = Publications(source, self._party_of)
-        self._turns = self._publications.turns
+        self._scheduler = self._publications.scheduler
         self._writer_proxies_due = TimerQueue[WriterProxy]()
         self._reporting: dict[WriterProxy, None] = {}  # writer proxies whose report may be due
         self._introduced = (-1, b"")  # since when, and the introduction
         reader = ReaderIdentity(
-            identity.name, settings.incarnation, notes, self._introduction
+            identity.name, settings.incarnation, control_keys, self._introduction
         )  # one, for all its writer proxies
         self._subscriptions = Subscriptions(reader, self._verifier)
         self._messages: list[Message] = []
@@ -84,7 +84,7 @@ class Participant:
         self.boundary = ErrorBoundary()
         self._drops: Counter[DropReason] = Counter()
         self._source = source
-        self.attachment = Attachment(identity, policy, settings, notes.public)
+        self.attachment = Attachment(identity, policy, settings, control_keys.public)
         self.attachment.advertisement(identity.subject, Right.ATTACH, (), is_global=True)
         self.diagnostics = Diagnostics(
             identity, policy, self.attachment.fragmenter, settings.first_sequence,
@@ -425,7 +425,7 @@ class Participant:
         for writer_proxy in self._reporting:
             self._report(writer_proxy, now_s)
         self._reporting.clear()
-        for frames in self._turns.poll_turn(now_s):
+        for frames in self._scheduler.poll_turn(now_s):
             self.attachment.send(frames)
 
     def _report(self, writer_proxy: WriterProxy, now_s: float) -> None:
@@ -457,7 +457,7 @@ class Participant:
         """
         out = self.attachment.frames_to_send()
         self._publications.release_requests(now_s)
-        if not out and (self._turns or self._reporting):
+        if not out and (self._scheduler or self._reporting):
             self.flush(now_s)
             out = self.attachment.frames_to_send()
         return out
@@ -568,7 +568,7 @@ class Participant:
         started, source = self.attachment.started, self._source
         if self._introduced[0] != started:
             wire = Introduction.make(
-                self._identity.subject, self._identity.key, source.incarnation, started, source.notes.public
+                self._identity.subject, self._identity.key, source.incarnation, started, source.control_keys.public
             )
             self._introduced = started, wire
         return self._introduced[1]

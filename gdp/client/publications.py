@@ -49,7 +49,7 @@ class Publications:
         self._sequence_registry = SequenceRegistry()
         self._timers = TimerQueue[Publisher]()
         self._reader_paths = ReaderPaths()
-        self.turns = SendScheduler(self._timers.reschedule)
+        self.scheduler = SendScheduler(self._timers.reschedule)
         self._drops: Counter[DropReason] = Counter()  # of closed publishers
         self._losses: Counter[LossReason] = Counter()
 
@@ -114,7 +114,7 @@ class Publications:
             options=options,
             fastest_governs=patience is CALLS,
         )
-        publisher.published = self.turns.add
+        publisher.published = self.scheduler.add
         self._publishers[name] = publisher
         return publisher
 
@@ -135,7 +135,7 @@ class Publications:
             writer=self._source,
             secrets=secrets,
             sequence_registry=self._sequence_registry,
-            published=self.turns.add,
+            published=self.scheduler.add,
             urgent=urgent,
             paths=paths,
             reader_paths=self._reader_paths,
@@ -208,8 +208,8 @@ class Publications:
         topic = topic_of(header, frame)
         publisher = self._publishers.get(topic) or self._stream(topic, header.source, now_s)  # type: ignore[call-overload]
         publisher.receive_acknack(header, frame, now_s, waited_s)
-        self.turns.add(publisher)
-        self.turns.resume()  # the path may carry frames of other publishers, too
+        self.scheduler.add(publisher)
+        self.scheduler.resume()  # the path may carry frames of other publishers, too
 
     def receive_join(self, join: Join, now_s: float) -> None:
         """Note that a tree is installed, and its MTU."""
@@ -221,7 +221,7 @@ class Publications:
             mtu, is_split = path.receive_mtu(join.mtu, now_s), False
             for each in (publisher, *self._private.get(join.topic, ())):
                 is_split |= each.tree_stands(mtu)
-                self.turns.add(each)
+                self.scheduler.add(each)
             if is_split:
                 path.count()
 
@@ -229,26 +229,26 @@ class Publications:
         """Process the timers that are due."""
         for publisher in self._timers.poll_due(now_s):
             publisher.handle_timer(now_s)
-            self.turns.add(publisher)
+            self.scheduler.add(publisher)
         for streams in self._private.values():
             streams.forget_idle(now_s)
         if self._reader_paths.handle_timer(now_s):
-            self.turns.resume()
+            self.scheduler.resume()
         self.release_requests(now_s)
 
     def frames_leave(self, now_s: float) -> None:
         """Count the frames polled last, which left at ``now_s``."""
-        self.turns.count_sent()
+        self.scheduler.count_sent()
         self._reader_paths.frames_leave(now_s)
 
     def attachment_changed(self, now_s: float) -> None:
         """Measure all paths again: frames leave by another switch."""
         self._reader_paths.attachment_changed(now_s)
-        self.turns.resume()
+        self.scheduler.resume()
 
     def next_due(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
-        times = [self._timers.next_due(), self._reader_paths.get_timer(), self.turns.next_due()]
+        times = [self._timers.next_due(), self._reader_paths.get_timer(), self.scheduler.next_due()]
         times += [requests.get_timer() for requests in self._requests.values()]
         return min((time for time in times if time is not None), default=None)
 

@@ -60,7 +60,7 @@ class _Incarnation:
         self._topic = topic
         self._source = source
         self._incarnation = incarnation
-        self._shared = source.notes.shared(exchange)
+        self._shared = source.control_keys.shared(exchange)
         self._numbers = ControlReplayWindow()
         self._openers: dict[bytes, ControlOpener] = {}  # by topic secret
 
@@ -236,7 +236,7 @@ class ReaderProxies:
             return
         key = seal_key(secret, Kind.INTRODUCTION, header.source, header.incarnation, source.name)
         body = ControlOpener(key, self._topic, source.incarnation).open(header, frame)
-        introduction = source.notes.introduced(body, Name(header.source), header.incarnation)
+        introduction = source.control_keys.introduced(body, Name(header.source), header.incarnation)
         if reading is not None and introduction.started <= reading.incarnation_id.started:
             raise StatementError(DropReason.STALE, "an introduction of an earlier life")
         self.record_key(header.source, header.incarnation, introduction.started, introduction.exchange)
@@ -263,8 +263,8 @@ class ReaderProxies:
         )
         if incarnation_id is None:
             raise FrameError(DropReason.UNKNOWN_SENDER, "a note of a life that did not introduce itself")
-        report = AckNack.from_wire(incarnation_id.open(header, frame, secret, now_s))
-        is_new = AckNackFlag.NEW in report.flags
+        acknack = AckNack.from_wire(incarnation_id.open(header, frame, secret, now_s))
+        is_new = AckNackFlag.NEW in acknack.flags
         if not may_begin and (is_new or not is_current):
             raise EnvelopeError(DropReason.UNKNOWN_EPOCH, "a new reader under an epoch that is over")
         if name not in self._readers and len(self._readers) >= READERS_MAX:
@@ -272,12 +272,12 @@ class ReaderProxies:
         if reading is not None and is_current:
             reading.heard_s = now_s
             self.resume(name, now_s)
-            return report, False
+            return acknack, False
         if reading is not None and (not is_new or incarnation_id.started <= reading.incarnation_id.started):
             raise FrameError(DropReason.UNKNOWN_SENDER, "a report of a life that never began, or is over")
         self._incarnation_ids.move_to_end((name, header.incarnation))
         self.admit(name, header.incarnation, now_s)
-        return report, True
+        return acknack, True
 
     def _reading_of(self, name: bytes) -> ReaderProxy | None:
         return self._readers.get(name) or self._suspended.get(name)

@@ -127,12 +127,12 @@ class Redundancy:
                     return
                 waiting.append((now_s + offset_s, frame))
 
-    def handle_report(self, reader: bytes, report: AckNack, *, is_new: bool) -> None:
+    def handle_report(self, reader: bytes, acknack: AckNack, *, is_new: bool) -> None:
         """Process a reader's report; ``is_new``: the reader, or this incarnation of it, was unknown before."""
         if is_new:
             self._reported.forget(reader)
-        elif self.is_enabled and report.next_number:
-            self._reported.handle_report(reader, report.next_number, report.next_part, report.frames)
+        elif self.is_enabled and acknack.next_number:
+            self._reported.handle_report(reader, acknack.next_number, acknack.next_part, acknack.frames)
 
     def poll_copies(self, now_s: float) -> list[bytes]:
         """Remove and return the copies that are due."""

@@ -46,19 +46,19 @@ class ReorderingBuffer:
         """Return the numbers that wait, lowest first."""
         return sorted(self._waiting)
 
-    def put(self, joined: ReassembledMessage) -> bool:
+    def put(self, reassembled: ReassembledMessage) -> bool:
         """Add a message; return False if the budget is exhausted."""
-        if not self._budget.reserve(self._publisher, len(joined.message) + _OVERHEAD_BYTES):
+        if not self._budget.reserve(self._publisher, len(reassembled.message) + _OVERHEAD_BYTES):
             return False
-        self._waiting[joined.number] = joined
+        self._waiting[reassembled.number] = reassembled
         return True
 
     def consecutive(self) -> Iterator[ReassembledMessage]:
         """Remove and yield the messages from ``expected`` on, up to the next gap."""
         while self.expected in self._waiting:
-            joined = self._pop(self.expected)
+            reassembled = self._pop(self.expected)
             self.expected += 1
-            yield joined
+            yield reassembled
 
     def skip_to(self, number: int) -> Iterator[ReassembledMessage]:
         """Advance to a number; remove and yield what waited before it."""
@@ -78,13 +78,13 @@ class ReorderingBuffer:
         early = {number: self._pop(number) for number in list(self._waiting) if move.is_before(number)}
         for number in [number for number in self._waiting if number < self.expected]:
             self._pop(number)  # it was delivered under its old number
-        return [joined._replace(number=move.new_number(old)) for old, joined in early.items()]
+        return [reassembled._replace(number=move.new_number(old)) for old, reassembled in early.items()]
 
     def poll_all(self) -> list[ReassembledMessage]:
         """Remove and return what waits, in order."""
         return [self._pop(number) for number in self.numbers]
 
     def _pop(self, number: int) -> ReassembledMessage:
-        joined = self._waiting.pop(number)
-        self._budget.release(self._publisher, len(joined.message) + _OVERHEAD_BYTES)
-        return joined
+        reassembled = self._waiting.pop(number)
+        self._budget.release(self._publisher, len(reassembled.message) + _OVERHEAD_BYTES)
+        return reassembled

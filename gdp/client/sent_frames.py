@@ -141,23 +141,23 @@ class SentFrames:
         if path is not None:
             path.handle_hops(hops, now_s)
 
-    def handle_report(self, name: bytes, report: AckNack, now_s: float, waited_s: float = 0.0) -> None:
+    def handle_report(self, name: bytes, acknack: AckNack, now_s: float, waited_s: float = 0.0) -> None:
         """Confirm on the reader's path what a report shows, which came ``waited_s`` before."""
         reader, path = self._readers.get(name), self._paths.get(name)
         if path is not None:
-            if reader is not None and report.received:
-                self._confirm(reader, path, report, now_s, waited_s)
+            if reader is not None and acknack.received:
+                self._confirm(reader, path, acknack, now_s, waited_s)
                 self._forget_places()
             path.handle_heard()
 
-    def _confirm(self, reader: _Reader, path: ReaderPath, report: AckNack, now_s: float, waited_s: float) -> None:
+    def _confirm(self, reader: _Reader, path: ReaderPath, acknack: AckNack, now_s: float, waited_s: float) -> None:
         while reader.flights and not path.controller.is_under_way(reader.flights[0].number):
             reader.resolved, reader.partial = reader.flights.popleft().end, 0  # it was given up with a silence
-        came = (report.received - reader.received) & _COUNT_MASK if reader.received >= 0 else 0
+        came = (acknack.received - reader.received) & _COUNT_MASK if reader.received >= 0 else 0
         has_begun = reader.received < 0 or came > _COUNT_MASK // 2
-        newest = report.newest, report.newest_part
+        newest = acknack.newest, acknack.newest_part
         (place, is_repair), is_newer = self._find(*newest), newest != reader.newest
-        reader.received, reader.newest = report.received, newest
+        reader.received, reader.newest = acknack.received, newest
         if not is_newer:
             self._confirm_repairs(reader, path, 0 if has_begun else came, place, now_s)
         if not is_newer or place <= reader.resolved:  # what came now was given up before
@@ -168,17 +168,17 @@ class SentFrames:
             reader.resolved = flight.end
             numbers.append(flight.number)
         if has_begun:
-            reader.unseen, reader.lost = (place - report.received) & _COUNT_MASK, 0
-        held_s = None if is_repair else report.held_us / 1e6 + waited_s
+            reader.unseen, reader.lost = (place - acknack.received) & _COUNT_MASK, 0
+        held_s = None if is_repair else acknack.held_us / 1e6 + waited_s
         if not numbers:
             if reader.flights and reader.flights[0].end - reader.flights[0].frames < place:  # a part of it came
                 path.handle_part(reader.flights[0].number, held_s, now_s)
             return
-        lost = (place - reader.unseen - report.received) & _COUNT_MASK
+        lost = (place - reader.unseen - acknack.received) & _COUNT_MASK
         lost = 0 if lost > _COUNT_MASK // 2 else lost
         new_lost, reader.lost = max(lost - reader.lost, 0), max(lost, reader.lost)
         lost = min(new_lost, reader.resolved - before - 1) if self._counts_losses else 0
-        path.handle_held(report.held_us / 1e6)
+        path.handle_held(acknack.held_us / 1e6)
         path.acknowledged(numbers, max(lost, 0), held_s, now_s)
 
     def _confirm_repairs(self, reader: _Reader, path: ReaderPath, came: int, place: int, now_s: float) -> None:

@@ -156,7 +156,7 @@ class Subscriptions:
         self._verifier = verifier
         self._budget = ReassemblyQuota()
         self._by_name: dict[Name, Subscription] = {}
-        self._ways: dict[tuple[bytes, int], _UnicastRoute] = {}  # by writer and incarnation, as in frame headers
+        self._routes: dict[tuple[bytes, int], _UnicastRoute] = {}  # by writer and incarnation, as in frame headers
         self._ended: Lru[Ended] = Lru(ENDED_MAX)
         self.drops: Counter[DropReason] = Counter()  # of closed writer proxies, and of advertisements
         self._past_losses: Counter[LossReason] = Counter()  # on names that are no longer read
@@ -203,30 +203,32 @@ class Subscriptions:
             return None if writer_proxy is None else (subscription, writer_proxy)
         if header.destination != self._reader.name:
             return None
-        way = self._ways.get((header.source, header.incarnation))
-        return None if way is None else (way.subscription, self._private_writer_proxy(way, now_s))
+        route = self._routes.get((header.source, header.incarnation))
+        return None if route is None else (route.subscription, self._private_writer_proxy(route, now_s))
 
-    def receive_response(self, answer: Response, now: Timestamps) -> StreamChanges:
+    def receive_response(self, response: Response, now: Timestamps) -> StreamChanges:
         """Process a switch's response about a party: its advertisement, or its end.
 
         Raises:
             StatementError: the advertisement is invalid or about something else, or the end is of an older one.
         """
-        subscription, change = self._by_name.get(answer.name), StreamChanges([], [], [])
-        if subscription is None or answer.advertiser == self._reader.name:
+        subscription, change = self._by_name.get(response.name), StreamChanges([], [], [])
+        if subscription is None or response.advertiser == self._reader.name:
             return change
-        writer_proxy = subscription.writer_proxies.get(answer.advertiser)
-        if not answer.advertisement:
-            if writer_proxy is not None and writer_proxy.advertisement_sequence > answer.sequence:
+        writer_proxy = subscription.writer_proxies.get(response.advertiser)
+        if not response.advertisement:
+            if writer_proxy is not None and writer_proxy.advertisement_sequence > response.sequence:
                 raise StatementError(DropReason.STALE, "gone, of an earlier advertisement")
             return (
-                change if writer_proxy is None else StreamChanges([], self._detach(subscription, answer.advertiser), [])
+                change
+                if writer_proxy is None
+                else StreamChanges([], self._detach(subscription, response.advertiser), [])
             )
-        advertisement = self._verifier.verify(answer.advertisement, now.unix_s)
+        advertisement = self._verifier.verify(response.advertisement, now.unix_s)
         is_heard = HEARS[subscription.right] is advertisement.right
-        if not is_heard or advertisement.name != answer.name or advertisement.node != answer.advertiser:
+        if not is_heard or advertisement.name != response.name or advertisement.node != response.advertiser:
             raise StatementError(DropReason.WRONG_NAME, "an advertisement about something else")
-        self._reader.notes.shared(advertisement.exchange)  # or it is refused before anything changes
+        self._reader.control_keys.shared(advertisement.exchange)  # or it is refused before anything changes
         if writer_proxy is not None:
             if advertisement.sequence <= writer_proxy.advertisement_sequence:
                 return change
@@ -236,7 +238,7 @@ class Subscriptions:
                 return change
             if is_restarted:
                 writer_proxy.finish()
-            rest = [Message(answer.name, each, writer_proxy.description) for each in writer_proxy.poll_delivered()]
+            rest = [Message(response.name, each, writer_proxy.description) for each in writer_proxy.poll_delivered()]
             change = StreamChanges([], self._detach(subscription, advertisement.node), rest)
         return change._replace(opened=self._open(subscription, advertisement, now.mono_s))
 
@@ -299,20 +301,20 @@ class Subscriptions:
         if subscription.right is not Right.READ:
             stream = self._stream_from(subscription, writer_proxy)
             verifier = None if subscription.has_session(writer_proxy) else advertisement.member.key
-            self._ways[party, private_incarnation(stream)] = _UnicastRoute(subscription, party, stream, verifier)
+            self._routes[party, private_incarnation(stream)] = _UnicastRoute(subscription, party, stream, verifier)
         return [writer_proxy]
 
-    def _private_writer_proxy(self, way: _UnicastRoute, now_s: float) -> UnicastReceiver:
+    def _private_writer_proxy(self, route: _UnicastRoute, now_s: float) -> UnicastReceiver:
         """Return the receiver of a party's unicast stream to us."""
-        subscription, writer = way.subscription, way.writer
+        subscription, writer = route.subscription, route.writer
         writer_proxy = subscription.private.get(writer)
         if writer_proxy is None:
-            public, ended = subscription.writer_proxies[writer], self._ended.get(way.stream) or _NOWHERE
+            public, ended = subscription.writer_proxies[writer], self._ended.get(route.stream) or _NOWHERE
             writer_proxy = subscription.private[writer] = UnicastReceiver(
-                name=way.stream,
+                name=route.stream,
                 reader=self._reader,
                 public=public,
-                verifier=way.verifier,
+                verifier=route.verifier,
                 secrets=subscription.topic.secrets,
                 budget=self._budget,
                 now_s=now_s,
@@ -350,7 +352,7 @@ class Subscriptions:
         writer_proxy = subscription.writer_proxies.pop(party)
         subscription.past_losses.update(writer_proxy.losses)
         self._remember(subscription.topic.name + _key(party, writer_proxy.incarnation), writer_proxy)
-        self._ways.pop((party, private_incarnation(self._stream_from(subscription, writer_proxy))), None)
+        self._routes.pop((party, private_incarnation(self._stream_from(subscription, writer_proxy))), None)
         private = subscription.private.pop(party, None)
         if private is None:
             return [writer_proxy]

@@ -125,7 +125,7 @@ class UnicastStream(Publisher):
         source = replace(writer, incarnation=private_incarnation(name))
         self._shared: bytes | None = None  # with the reader, if a session secret authenticates the stream
         if party.is_session:
-            self._shared = writer.notes.shared(party.exchange)
+            self._shared = writer.control_keys.shared(party.exchange)
             source, secrets = replace(source, signer=None), _session_secrets(self._shared, secrets, name)
         super().__init__(
             topic=name,
@@ -198,7 +198,7 @@ class UnicastReceiver(WriterProxy):
         self._public = public
         self._shared: bytes | None = None  # with the writer, if a session secret authenticates the stream
         if verifier is None:
-            self._shared = reader.notes.shared(public.exchange)
+            self._shared = reader.control_keys.shared(public.exchange)
             secrets = _session_secrets(self._shared, secrets, name)
         super().__init__(
             topic=name,

@@ -257,8 +257,8 @@ class WriterProxy:
         if self.state is WriterProxyState.LIVE:
             delivery = self._delivery
             delivery.skipped = LossReason.PUBLISHER_RESTARTED
-            for joined in self._order.poll_all():
-                delivery.deliver(joined)
+            for reassembled in self._order.poll_all():
+                delivery.deliver(reassembled)
             delivery.lose_until(delivery.known, LossReason.PUBLISHER_RESTARTED)
 
     def refuse(self, reason: DropReason) -> None:
@@ -275,9 +275,9 @@ class WriterProxy:
         if header.kind == Kind.HEARTBEAT and header.number <= self._before.status:
             self._status.drop_copy(header, DropReason.REPLAYED, now_s)
         elif header.kind == Kind.HEARTBEAT:
-            joined = self._status.add(header, frame, now_s)
-            if joined is not None:
-                self._handle_status(joined, header.epoch, now_s)
+            reassembled = self._status.add(header, frame, now_s)
+            if reassembled is not None:
+                self._handle_status(reassembled, header.epoch, now_s)
         elif header.kind == Kind.PARITY:
             self._handle_parity(header, frame, now_s)
         else:
@@ -349,12 +349,12 @@ class WriterProxy:
         part, sequence = self._data.progress(expected), self._delivery.sequence
         share = self._copies.poll_share() if isinstance(self._copies, StripedPaths) else 0
         newest, newest_part, came_s = self._newest
-        report = AckNack(
+        acknack = AckNack(
             AckNackFlag.NONE, expected, part, missing or late, sequence, self.lost, share,
             self._received, newest, max(newest_part, 0), max(round((now_s - came_s) * 1e6), 0),
             (self._data.frames - self._recovery.recovered) & FRAMES_MASK,
         )  # fmt: skip
-        return self._over_paths(self._sealer.seal_all(report, now_s))
+        return self._over_paths(self._sealer.seal_all(acknack, now_s))
 
     def poll_delivered(self) -> list[Delivered]:
         """Remove and return the messages that are ready, in order."""
@@ -369,8 +369,8 @@ class WriterProxy:
         self._late.close()
         self._schedule.due_s = self._gap_until_s = float("inf")
         self._held.clear()
-        report = AckNack(AckNackFlag.BYE, self._order.expected, 0, (), self._delivery.sequence, self.lost)
-        return self._over_paths([self._sealer.seal(report)])
+        acknack = AckNack(AckNackFlag.BYE, self._order.expected, 0, (), self._delivery.sequence, self.lost)
+        return self._over_paths([self._sealer.seal(acknack)])
 
     def renew(self, secrets: Secrets) -> None:
         """Replace the topic's secrets; an epoch that is still among them opens as before."""
@@ -434,7 +434,7 @@ class WriterProxy:
         striped = self._copies if isinstance(self._copies, StripedPaths) else None
         is_done = reassembler.window.is_finished(header.number)
         seen, highest, refused = reassembler.new_parts, reassembler.highest, reassembler.drops[DropReason.MEMORY_FULL]
-        joined = reassembler.add(header, frame, now_s)
+        reassembled = reassembler.add(header, frame, now_s)
         is_first = reassembler.new_parts > seen
         if striped is not None and header.parts >= STRIPES_FROM_PARTS and not is_done and (is_first or not header.part):
             second = int(header.hops_left & SECOND_PATH > 0)
@@ -447,23 +447,23 @@ class WriterProxy:
                 self._recovery.recovered += 1
             else:
                 self._received += 1
-            if joined is None:
+            if reassembled is None:
                 self._recovery.keep(header, frame, now_s)
             self._note_newest(header.number, header.part, came_s)
             if self.state is WriterProxyState.LIVE:
                 self._schedule.handle_part(header, highest, expected, now_s)
-                if joined is None and not self._is_reliable:
+                if reassembled is None and not self._is_reliable:
                     self._late.handle_part(header, now_s)
-        if joined is not None:
+        if reassembled is not None:
             self._recovery.forget(header.number)
             if self.state is WriterProxyState.LIVE and not self._is_reliable:
-                self._late.handle_complete(joined.number, header.part, now_s)
+                self._late.handle_complete(reassembled.number, header.part, now_s)
             if striped is not None:
-                striped.handle_complete(joined.number)
+                striped.handle_complete(reassembled.number)
                 if striped.has_news:
                     self._schedule.due_s = min(self._schedule.due_s, now_s + REPORT_DELAY_S)
-            self._sealer.handle_message(joined.number, header.epoch, now_s)
-            self._arrange(joined, now_s)
+            self._sealer.handle_message(reassembled.number, header.epoch, now_s)
+            self._arrange(reassembled, now_s)
         elif (
             reassembler.drops[DropReason.MEMORY_FULL] > refused and self.state is WriterProxyState.LIVE and self._order
         ):
@@ -472,26 +472,26 @@ class WriterProxy:
             self._skip_to(self._order.numbers[0])
             self._deliver(now_s)
 
-    def _arrange(self, joined: ReassembledMessage, now_s: float) -> None:
+    def _arrange(self, reassembled: ReassembledMessage, now_s: float) -> None:
         """Order a complete message, and deliver the consecutive ones."""
         order, delivery = self._order, self._delivery
-        skips = not self._is_reliable and self._lag_s() <= 0 and joined.number < self._late.hold((), now_s)
-        if self.state is WriterProxyState.LIVE and (skips or joined.number == order.expected):
-            if joined.number > order.expected:
-                self._skip_to(joined.number)
-            delivery.deliver(joined)
-            order.expected = joined.number + 1
+        skips = not self._is_reliable and self._lag_s() <= 0 and reassembled.number < self._late.hold((), now_s)
+        if self.state is WriterProxyState.LIVE and (skips or reassembled.number == order.expected):
+            if reassembled.number > order.expected:
+                self._skip_to(reassembled.number)
+            delivery.deliver(reassembled)
+            order.expected = reassembled.number + 1
             self._deliver(now_s)
-        elif order.put(joined):
-            delivery.record_published(min(int.from_bytes(joined.head, "big"), NUMBER_MAX) + 1)
+        elif order.put(reassembled):
+            delivery.record_published(min(int.from_bytes(reassembled.head, "big"), NUMBER_MAX) + 1)
             if not self._is_reliable:
                 self._deliver(now_s)
         elif self.state is WriterProxyState.NEW:
             self._data.drops[DropReason.MEMORY_FULL] += 1
         else:
             delivery.skipped = LossReason.READER_MEMORY
-            self._skip_to(joined.number)
-            delivery.deliver(joined)
+            self._skip_to(reassembled.number)
+            delivery.deliver(reassembled)
             order.expected += 1
             self._deliver(now_s)
 
@@ -518,22 +518,22 @@ class WriterProxy:
             missing += [MissingRange(number, *each) for each in ranges]
         return tuple(missing), due_s
 
-    def _handle_status(self, joined: ReassembledMessage, epoch: int, now_s: float) -> None:
+    def _handle_status(self, reassembled: ReassembledMessage, epoch: int, now_s: float) -> None:
         try:
-            status = Heartbeat.from_wire(joined.message)
+            status = Heartbeat.from_wire(reassembled.message)
         except RemoteError as error:
             self._status.drops[error.reason] += 1
             return
-        self._set_reliable(joined.flags)
-        is_newest = joined.number == self._status.window.top
+        self._set_reliable(reassembled.flags)
+        is_newest = reassembled.number == self._status.window.top
         self._sealer.handle_status(epoch, now_s, is_newest=is_newest)
         if self.state is WriterProxyState.NEW:
             start = status.starts.get(self._reader.name)
             if start is None or start.incarnation != self._reader.incarnation:
                 return
-            self._begin(status, start, is_latched=bool(joined.flags & _LATCHED))
-        if status.description and joined.number > self._described:
-            self.description, self._described = status.description, joined.number
+            self._begin(status, start, is_latched=bool(reassembled.flags & _LATCHED))
+        if status.description and reassembled.number > self._described:
+            self.description, self._described = status.description, reassembled.number
         order, delivery = self._order, self._delivery
         if is_newest:
             delivery.gone = status.gone
@@ -599,14 +599,14 @@ class WriterProxy:
             self._skip_to(move.first)
         moved = self._order.renumber(move)
         self._data.forget(self._order.expected)
-        for joined in moved:
-            if joined.number not in self._order and self._order.put(joined):
-                self._data.skip(joined.number)
+        for reassembled in moved:
+            if reassembled.number not in self._order and self._order.put(reassembled):
+                self._data.skip(reassembled.number)
 
     def _skip_to(self, number: int) -> None:
         """Accept that missing messages before ``number`` will not come."""
-        for joined in self._order.skip_to(number):
-            self._delivery.deliver(joined)
+        for reassembled in self._order.skip_to(number):
+            self._delivery.deliver(reassembled)
         self._data.forget(number)
         self._late.forget(number)
         self._recovery.forget_below(number)
@@ -616,8 +616,8 @@ class WriterProxy:
         gap_until_s, self._gap_until_s = self._gap_until_s, float("inf")
         if self.state is WriterProxyState.NEW or not order:
             return
-        for joined in order.consecutive():
-            self._delivery.deliver(joined)
+        for reassembled in order.consecutive():
+            self._delivery.deliver(reassembled)
         if not order or self._is_reliable:
             return
         lag_s, free_to = self._lag_s(), self._late.hold(order.numbers, now_s)

@@ -23,8 +23,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.neighbour import Neighbour
+from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.control.revoked import IDS_MAX, Lacking, Revoked
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType

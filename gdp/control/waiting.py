@@ -12,8 +12,8 @@ from enum import Enum
 from typing import Final
 
 from gdp.control.hello_port import HelloPort
-from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.neighbour import NeighbourState
+from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.crypto.certificates import Role
 from gdp.diagnosis.facts import WaitFact
 from gdp.errors import DropReason

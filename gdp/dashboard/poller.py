@@ -15,11 +15,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from gdp.dashboard.readings import Fields, Reading, text_of
+from gdp.dashboard.core.readings import Fields, Reading, text_of
 from gdp.errors import GdpError
-from gdp.nodes.control_client import control_sockets, find_control_socket
-from gdp.nodes.control_protocol import RESPONSE_MAX_BYTES, Command, Request, decode_response, encode_request
-from gdp.nodes.control_socket import CONTROL_SOCKET, connect_control
+from gdp.management.control_client import control_sockets, find_control_socket
+from gdp.management.control_socket import CONTROL_SOCKET, connect_control
+from gdp.state.control_protocol import RESPONSE_MAX_BYTES, Command, Request, decode_response, encode_request
 
 __all__ = ["Poller", "found_sockets", "supervisor_state"]
 

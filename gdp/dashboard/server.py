@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Final
 
 import orjson
 
+from gdp.dashboard.core.scene import Scene
 from gdp.dashboard.poller import Poller
-from gdp.dashboard.scene import Scene
 from gdp.errors import LocalError
 from gdp.extras import require_extra
 

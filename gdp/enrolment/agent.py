@@ -19,6 +19,8 @@ from itertools import chain
 from pathlib import Path
 from typing import Final
 
+from gdp.config.config import SwitchConfig
+from gdp.config.relay_config import RelayConfig
 from gdp.control.endpoint_record import EndpointRecord
 from gdp.crypto.certificates import Membership, Root, Unverified
 from gdp.crypto.fields import Fields
@@ -27,17 +29,14 @@ from gdp.enrolment.channel import Channel, connect_any
 from gdp.enrolment.domain_client import ReceivedMail, delete_mail, fetch_mail, read_inbox
 from gdp.enrolment.member_files import MemberFiles
 from gdp.enrolment.member_setup import RELAY_FILE, record_file_name, update_relays
-from gdp.enrolment.wire import INSTANCE_BYTES, EnrolmentError, UnreachableError
 from gdp.errors import GdpError, LocalError, RemoteError
 from gdp.host_port import split_host_port
+from gdp.links.endpoint_files import RECORD_SUFFIX, own_record
+from gdp.management.control_client import NotRunningError, ask_node, find_control_socket
 from gdp.names import Name
-from gdp.nodes.config import SwitchConfig
-from gdp.nodes.control_client import NotRunningError, ask_node, find_control_socket
-from gdp.nodes.control_protocol import Command
-from gdp.nodes.endpoint_files import RECORD_SUFFIX, own_record
 from gdp.nodes.membership import load_policy
 from gdp.nodes.relay import relay_control_path
-from gdp.nodes.relay_config import RelayConfig
+from gdp.state.control_protocol import Command
 from gdp.stores.files import public, read_public, write_all
 from gdp.stores.issue import install_delegation
 from gdp.stores.keyring import (
@@ -53,9 +52,10 @@ from gdp.stores.keyring import (
     parsed,
     save_identity,
 )
+from gdp.trust.bootstrap_ticket import MEMBERS_MAX
 from gdp.trust.delegation import Delegation
 from gdp.trust.domain import Policy
-from gdp.trust.enrolment import MEMBERS_MAX
+from gdp.trust.enrolment_wire import INSTANCE_BYTES, EnrolmentError, UnreachableError
 from gdp.trust.join_token import SERVERS_MAX
 
 __all__ = ["DELEGATION_KIND", "Agent", "MailHandler", "load_identity_at_any_time", "reload_node"]

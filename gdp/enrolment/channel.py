@@ -17,7 +17,10 @@ from gdp.crypto.certificates import Root
 from gdp.crypto.fields import Fields
 from gdp.crypto.identity import Identity
 from gdp.crypto.server_certificate import channel_binding, verify_server_certificate
-from gdp.enrolment.wire import (
+from gdp.errors import StatementError
+from gdp.host_port import split_host_port
+from gdp.relay.client_hello import ENROLMENT_ALPN
+from gdp.trust.enrolment_wire import (
     CLOCKS_APART_MAX_S,
     LENGTH_BYTES,
     NONCE_BYTES,
@@ -30,9 +33,6 @@ from gdp.enrolment.wire import (
     prove_member,
     read_message,
 )
-from gdp.errors import StatementError
-from gdp.host_port import split_host_port
-from gdp.relay.client_hello import ENROLMENT_ALPN
 from gdp.trust.join_token import fingerprint_of
 
 __all__ = ["CONNECT_S", "Channel", "client_context", "connect", "connect_any"]

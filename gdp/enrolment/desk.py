@@ -28,7 +28,17 @@ from gdp.crypto.x509_profile import SubjectInfo, read_request
 from gdp.enrolment.domain_files import DomainFiles
 from gdp.enrolment.member_setup import record_file_name
 from gdp.enrolment.registry import MachineRow, Registry, TokenRow
-from gdp.enrolment.wire import (
+from gdp.errors import LocalError, RemoteError, StatementError, StoreError
+from gdp.links.endpoint_files import own_record, public_candidates
+from gdp.names import Name
+from gdp.stores.audit_log import AuditLog
+from gdp.stores.files import public, read_public, write_all
+from gdp.stores.issue import admit, renew
+from gdp.stores.keyring import NODE_CERTIFICATE, OWNER_PUBLIC, ROOT_CERTIFICATE, load_identity, load_root
+from gdp.trust.audit import Action, AuditTrail
+from gdp.trust.bootstrap_ticket import MEMBERS_MAX, Application, token_id
+from gdp.trust.domain import Policy
+from gdp.trust.enrolment_wire import (
     INSTANCE_BYTES,
     NONCE_BYTES,
     VERSION,
@@ -37,22 +47,12 @@ from gdp.enrolment.wire import (
     read_message,
     verify_member_proof,
 )
-from gdp.errors import LocalError, RemoteError, StatementError, StoreError
-from gdp.names import Name
-from gdp.nodes.endpoint_files import own_record, public_candidates
-from gdp.stores.audit_log import AuditLog
-from gdp.stores.files import public, read_public, write_all
-from gdp.stores.issue import admit, renew
-from gdp.stores.keyring import NODE_CERTIFICATE, OWNER_PUBLIC, ROOT_CERTIFICATE, load_identity, load_root
-from gdp.trust.audit import Action, AuditTrail
-from gdp.trust.domain import Policy
-from gdp.trust.enrolment import MEMBERS_MAX, Application, token_id
 from gdp.trust.join_token import JOIN_ID_BYTES, JoinRole, join_proof
 from gdp.trust.mail import Mail
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.revocation import Revocation
 
-__all__ = ["PAGE", "EnrolmentDesk", "Session", "refusal_of"]
+__all__ = ["PAGE", "EnrolmentDesk", "MemberConnection", "refusal_of"]
 
 log = logging.getLogger(__name__)
 
@@ -63,7 +63,7 @@ _WHAT: Final = "enrolment"
 
 
 @dataclass(frozen=True, slots=True)
-class Session:
+class MemberConnection:
     """An authenticated connection of a member.
 
     Args:
@@ -154,7 +154,7 @@ class EnrolmentDesk:
             self._border, self._border_certificate = own_record(identity, 1, candidates), certificate
         return self._border
 
-    def identify(self, fields: Fields, binding: bytes, nonce: bytes, unix_s: float) -> Session:
+    def identify(self, fields: Fields, binding: bytes, nonce: bytes, unix_s: float) -> MemberConnection:
         """Return the session of a member that proves its key; its membership may have expired, to be renewed.
 
         Raises:
@@ -170,9 +170,9 @@ class EnrolmentDesk:
             raise EnrolmentError(Refusal.NO_MEMBER, f"this machine {gone} the domain; join again with a new token")
         stranger.verify(self.root, min(unix_s, stranger.validity.not_after_unix_s))
         verify_member_proof(stranger.key, fields.bytes_("signature", SIGNATURE_BYTES), binding, nonce, instance)
-        return Session(stranger.subject.name, machine.id, instance)
+        return MemberConnection(stranger.subject.name, machine.id, instance)
 
-    def install(self, session: Session, fields: Fields, unix_s: float) -> None:
+    def install(self, session: MemberConnection, fields: Fields, unix_s: float) -> None:
         """Store a machine's node descriptors, and open the border for its switch.
 
         Raises:
@@ -203,7 +203,7 @@ class EnrolmentDesk:
                 (self._config.peers / file).unlink(missing_ok=True)
                 raise
 
-    def renew(self, session: Session, fields: Fields, unix_s: float) -> dict[str, object]:
+    def renew(self, session: MemberConnection, fields: Fields, unix_s: float) -> dict[str, object]:
         """Return new memberships of a machine's nodes; one that has just begun is returned as it is.
 
         Raises:
@@ -228,7 +228,7 @@ class EnrolmentDesk:
         self._registry.renewed(new)
         return {"ok": True, "members": wires}
 
-    def nodes(self, session: Session, fields: Fields, is_online: Callable[[int], bool]) -> dict[str, object]:
+    def nodes(self, session: MemberConnection, fields: Fields, is_online: Callable[[int], bool]) -> dict[str, object]:
         """Return one page of the directory of machines."""
         self._member(session.machine)
         machines = self._registry.machines(after=fields.text("after", 64), limit=PAGE)
@@ -244,7 +244,7 @@ class EnrolmentDesk:
         ]
         return {"ok": True, "nodes": listed}
 
-    def send(self, session: Session, fields: Fields, unix_s: float) -> Name:
+    def send(self, session: MemberConnection, fields: Fields, unix_s: float) -> Name:
         """Store a mail and return its recipient.
 
         Raises:
@@ -259,14 +259,14 @@ class EnrolmentDesk:
         self._registry.add_mail(mail.to, session.name, mail.wire)
         return mail.to
 
-    def mail_page(self, session: Session, fields: Fields) -> dict[str, object]:
+    def mail_page(self, session: MemberConnection, fields: Fields) -> dict[str, object]:
         """Return a page of the member's mail; what it fetched before is deleted."""
         self._member(session.machine)
         since = fields.uint("since", (1 << 63) - 1)
         mail = self._registry.mail_of(session.name, since, PAGE)
         return {"ok": True, "mail": [{"n": each.id, "m": each.wire} for each in mail]}
 
-    def status(self, session: Session, unix_s: float) -> tuple[dict[str, object], bytes]:
+    def status(self, session: MemberConnection, unix_s: float) -> tuple[dict[str, object], bytes]:
         """Return what a poll answers, and a digest by which the member knows it again.
 
         Raises:
@@ -278,7 +278,7 @@ class EnrolmentDesk:
         digest = hashlib.sha256(encode(news)).digest()
         return {"ok": True, **news, "digest": digest, "mail": self._registry.has_mail(session.name)}, digest
 
-    def has_double(self, session: Session) -> None:
+    def has_double(self, session: MemberConnection) -> None:
         """Note that another machine runs with this member's identity."""
         self._registry.set_double(session.machine)
         self.refused("two machines with one identity", session.name)

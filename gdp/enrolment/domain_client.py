@@ -30,13 +30,13 @@ from gdp.crypto.identity import Identity
 from gdp.crypto.statements import parse
 from gdp.enrolment.channel import Channel, connect_any
 from gdp.enrolment.member_files import MemberFiles
-from gdp.enrolment.wire import INSTANCE_BYTES
 from gdp.errors import GdpError, LocalError, StatementError
 from gdp.names import Name
 from gdp.nodes.membership import load_policy
 from gdp.stores.files import NewFile, private, read_private, write_all
 from gdp.stores.keyring import load_identity
 from gdp.trust.domain import Policy
+from gdp.trust.enrolment_wire import INSTANCE_BYTES
 from gdp.trust.mail import Mail
 from gdp.trust.node_descriptor import NodeDescriptor
 

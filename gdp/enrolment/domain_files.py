@@ -15,10 +15,10 @@ from typing import Annotated, Final
 
 from pydantic import AfterValidator, Field
 
+from gdp.config.schema import Directory, ExistingFile, Section, Unique, load
 from gdp.control.endpoints import Endpoint
 from gdp.errors import LocalError
 from gdp.host_port import checked_host_port
-from gdp.nodes.schema import Directory, ExistingFile, Section, Unique, load
 from gdp.trust.join_token import SERVERS_MAX
 
 __all__ = ["DOMAIN_FILE", "HANDOVER_SOCKET", "MEMBER_DAYS", "DomainConfig", "DomainFiles"]

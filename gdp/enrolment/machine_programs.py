@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from gdp.config.machine_file import MACHINE_FILE, NODE_SECTIONS, read_sections, section_source
+from gdp.config.yaml_source import read_yaml
 from gdp.enrolment.member_files import MEMBER_FILE, MemberFiles
 from gdp.enrolment.programs import MachineProgram, node_program, programs_of
 from gdp.errors import LocalError
-from gdp.nodes.machine_file import MACHINE_FILE, NODE_SECTIONS, read_sections, section_source
-from gdp.nodes.yaml_source import read_yaml
 
 __all__ = ["FOG_FILE", "Machine", "check_program", "configured_identity", "read_machine"]
 

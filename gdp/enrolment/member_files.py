@@ -21,10 +21,10 @@ from typing import Annotated, Final
 
 from pydantic import AfterValidator, Field
 
-from gdp.enrolment.wire import EnrolmentError
+from gdp.config.schema import Directory, Domain, Section, Unique, load
 from gdp.host_port import checked_host_port
-from gdp.nodes.schema import Directory, Domain, Section, Unique, load
 from gdp.stores.keyring import load_root
+from gdp.trust.enrolment_wire import EnrolmentError
 from gdp.trust.join_token import SERVERS_MAX, fingerprint_of
 
 __all__ = ["MEMBER_FILE", "MemberConfig", "MemberFiles"]

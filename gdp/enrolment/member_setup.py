@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
+from gdp.config.config import LISTEN_DEFAULT
 from gdp.enrolment.member_files import MEMBER_FILE
+from gdp.links.endpoint_files import RECORD_SUFFIX
 from gdp.names import Name
-from gdp.nodes.config import LISTEN_DEFAULT
-from gdp.nodes.endpoint_files import RECORD_SUFFIX
 from gdp.stores.files import public, read_public, write_all
 from gdp.stores.keyring import DELEGATIONS
 

@@ -14,6 +14,8 @@ from typing import Final
 
 from gdp.enrolment.member_files import MemberFiles
 from gdp.enrolment.member_setup import RELAY_FILE
+from gdp.errors import LocalError
+from gdp.extras import find_entry_point
 
 __all__ = ["MachineProgram", "missing_ros", "node_program", "programs_of"]
 
@@ -23,13 +25,6 @@ _ROS_VARIABLES: Final = (
     "PYTHONPATH", "LD_LIBRARY_PATH", "AMENT_PREFIX_PATH", "ROS_DISTRO", "ROS_DOMAIN_ID", "RMW_IMPLEMENTATION",
     "ROS_LOCALHOST_ONLY", "ROS_AUTOMATIC_DISCOVERY_RANGE", "CYCLONEDDS_URI",
 )  # fmt: skip
-_MODULES: Final = {
-    "switch": "gdp.cli.switch",
-    "relay": "gdp.cli.relay",
-    "rib": "gdp.cli.rib",
-    "proxy": "proxy.cli.proxy",
-    "fog": "fog.cli.app",
-}
 _TITLES: Final = {
     "switch": "GDP switch: forwards frames by 256-bit names",
     "relay": "GDP relay: carries frames through TLS where UDP is blocked",
@@ -84,7 +79,7 @@ def programs_of(files: MemberFiles) -> list[MachineProgram]:
         title, bind = "GDP enrolment server of a domain", ("CAP_NET_BIND_SERVICE",)
         found.append(MachineProgram(name="enrolment", title=title, argv=argv, capabilities=bind))
     if files.config.proxy is not None and not missing_ros():
-        argv = _module("proxy.cli.proxy", "--config", directory / "proxy.yaml", "--await-iface", _AWAIT_S)
+        argv = _module(_module_of("gdp-proxy"), "--config", directory / "proxy.yaml", "--await-iface", _AWAIT_S)
         found.append(
             MachineProgram(
                 name="proxy",
@@ -119,7 +114,7 @@ def node_program(name: str, config: Path) -> MachineProgram:
 
 def missing_ros() -> str:
     """Return why no proxy can run here; empty: one can."""
-    if importlib.util.find_spec("proxy") is None:
+    if find_entry_point("console_scripts", "gdp-proxy") is None:
         return "the package of the proxy is not installed"
     if all(importlib.util.find_spec(each) is None for each in _ROS):
         return "neither rclpy nor cyclonedds is installed: pip install 'gdp-ros[dds]', then run gdp up again"
@@ -132,8 +127,17 @@ def _ros_environment() -> tuple[tuple[str, str], ...]:
 
 def _command(name: str, *words: str | Path) -> tuple[str, ...]:
     """Return a node's command line: its script next to the interpreter, or its module where no script is installed."""
-    script = Path(sys.executable).with_name(name if name == "fog" else f"gdp-{name}")
-    return (str(script), *map(str, words)) if script.is_file() else _module(_MODULES[name], *words)
+    command = name if name == "fog" else f"gdp-{name}"
+    script = Path(sys.executable).with_name(command)
+    return (str(script), *map(str, words)) if script.is_file() else _module(_module_of(command), *words)
+
+
+def _module_of(script: str) -> str:
+    """Return the module of a script of this distribution."""
+    point = find_entry_point("console_scripts", script)
+    if point is None:
+        raise LocalError(f"the package of {script} is not installed (run: pip install gdp-ros)")
+    return point.module
 
 
 def _module(module: str, *words: str | Path) -> tuple[str, ...]:

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Final
 
 from gdp.crypto.certificates import Membership
-from gdp.enrolment.wire import EnrolmentError, Refusal
 from gdp.errors import LocalError, StoreError
 from gdp.names import Name
 from gdp.stores.files import write_all
+from gdp.trust.enrolment_wire import EnrolmentError, Refusal
 
 __all__ = ["MAILBOX_MAX", "MAILBOX_MAX_BYTES", "MachineRow", "Registry", "StoredMail", "TokenRow"]
 

@@ -21,11 +21,15 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 from gdp.crypto.fields import Fields
-from gdp.enrolment.desk import EnrolmentDesk, Session, refusal_of
+from gdp.enrolment.desk import EnrolmentDesk, MemberConnection, refusal_of
 from gdp.enrolment.domain_files import HANDOVER_SOCKET, DomainFiles
 from gdp.enrolment.registry import Registry
 from gdp.enrolment.server_tls import ServerTls, make_server_tls
-from gdp.enrolment.wire import (
+from gdp.errors import DropReason, GdpError, LocalError, StatementError
+from gdp.ports.client_network import client_network
+from gdp.ports.listening import listen_tcp
+from gdp.token_bucket import TokenBucket, TokenBuckets
+from gdp.trust.enrolment_wire import (
     LENGTH_BYTES,
     NONCE_BYTES,
     REQUEST_MAX_BYTES,
@@ -36,10 +40,6 @@ from gdp.enrolment.wire import (
     message_bytes,
     read_message,
 )
-from gdp.errors import DropReason, GdpError, LocalError, StatementError
-from gdp.ports.client_network import client_network
-from gdp.ports.listening import listen_tcp
-from gdp.token_bucket import TokenBucket, TokenBuckets
 
 __all__ = ["STRANGER_S", "EnrolmentServer", "bind_handover", "bind_server", "serve_domain"]
 
@@ -94,7 +94,7 @@ class _Connection:
     task: asyncio.Task[None] = field(init=False)
     peer: socket.socket
     host: bytes  # as of ``client_network``
-    session: Session | None = None
+    session: MemberConnection | None = None
     is_attended: bool = False
     nonce: bytes = field(default_factory=lambda: os.urandom(NONCE_BYTES))
 
@@ -295,7 +295,7 @@ class EnrolmentServer:
                 return await self._work(desk.mail_page, session, fields)
         raise StatementError(DropReason.MALFORMED, f"{operation!r} is no request")
 
-    def _admit(self, connection: _Connection, session: Session) -> None:
+    def _admit(self, connection: _Connection, session: MemberConnection) -> None:
         """Count a connection as a member's, no longer as a stranger's."""
         is_new = session.machine not in self._members
         if is_new and len(self._members) >= _MEMBERS_MAX:
@@ -312,7 +312,7 @@ class EnrolmentServer:
         current = next(reversed(self._polling[machine]), None) if machine in self._polling else None
         return any(each.session is not None and each.session.instance == current for each in connections)
 
-    async def _poll(self, connection: _Connection, session: Session, fields: Fields) -> Mapping[str, object]:
+    async def _poll(self, connection: _Connection, session: MemberConnection, fields: Fields) -> Mapping[str, object]:
         """Answer once something differs from what the member knows, or after the time that it asks for."""
         await self._refuse_double(connection, session)
         known = fields.bytes_("digest")
@@ -336,7 +336,7 @@ class EnrolmentServer:
             if not events:
                 self._news.pop(bytes(session.name), None)
 
-    async def _refuse_double(self, connection: _Connection, session: Session) -> None:
+    async def _refuse_double(self, connection: _Connection, session: MemberConnection) -> None:
         """Refuse an agent that comes back after another one replaced it: two machines run with one identity."""
         instances = self._polling[session.machine]
         newest = next(reversed(instances), None)

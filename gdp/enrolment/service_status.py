@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from gdp.config.machine_file import NODE_SECTIONS, section_source
+from gdp.config.yaml_source import read_yaml
 from gdp.enrolment.machine_programs import configured_identity
 from gdp.enrolment.units import UNIT_FOLDER, installed_units, systemctl
 from gdp.errors import GdpError, LocalError
-from gdp.nodes.control_client import ask_node, control_path, find_control_socket_of
-from gdp.nodes.control_protocol import Command
-from gdp.nodes.machine_file import NODE_SECTIONS, section_source
-from gdp.nodes.yaml_source import read_yaml
+from gdp.management.control_client import ask_node, control_path, find_control_socket_of
+from gdp.state.control_protocol import Command
 from gdp.stores.keyring import CARD, load_card
 
 __all__ = ["UnitState", "known_units", "unit_state"]

@@ -180,9 +180,9 @@ class SendWindow:
         self._forget(number)
         return True
 
-    def poll_cancelled(self, report: AckNack) -> list[int]:
+    def poll_cancelled(self, acknack: AckNack) -> list[int]:
         """Remove and return the cancelled messages of which a reader requests something."""
-        lacked = self._cancelled & {each.number for each in report.missing} if self._cancelled else set()
+        lacked = self._cancelled & {each.number for each in acknack.missing} if self._cancelled else set()
         for number in lacked:
             self._forget(number)
         return sorted(lacked)
@@ -242,32 +242,32 @@ class SendWindow:
         """Return the monotonic second at which a reader that lags behind another becomes slow, or None."""
         return self._readers.next_slow()
 
-    def handle_acknack(self, reader: bytes, report: AckNack, now_s: float, trip_s: float = 0.0) -> None:
+    def handle_acknack(self, reader: bytes, acknack: AckNack, now_s: float, trip_s: float = 0.0) -> None:
         """Process the report of a known reader: release what all have, and queue repairs.
 
         Args:
             trip_s: round trip of its path; 0: not known. Repairs give none here, so it may be known there alone.
         """
         self._now_s = now_s
-        message = self._cache.messages.get(report.next_number)
-        position = message.position(report.next_part) if message else self._cache.begin_of(report.next_number)
+        message = self._cache.messages.get(acknack.next_number)
+        position = message.position(acknack.next_part) if message else self._cache.begin_of(acknack.next_number)
         suspended = self._readers.suspended.get(reader)
         if suspended is not None:
             if self._readers.active and position < self._acked_at():  # the others must not wait for it
-                suspended.next_number = max(suspended.next_number, report.next_number)
-                self._request_repairs(reader, report, now_s, trip_s)
+                suspended.next_number = max(suspended.next_number, acknack.next_number)
+                self._request_repairs(reader, acknack, now_s, trip_s)
                 self._release_acknowledged()
                 return
             suspended.acked_at = min(position, self._sent_at)
             self.resume(reader, now_s)
         state = self._readers.active[reader]
-        state.next_number = max(state.next_number, report.next_number)
+        state.next_number = max(state.next_number, acknack.next_number)
         self._skip_received()
         before = self._acked_at()
         self._readers.acknowledge(state, min(position, self._sent_at), now_s)
         acked_at = self._acked_at()
         self._flow.handle_acknowledged(acked_at - before, acked_at, now_s)
-        self._request_repairs(reader, report, now_s, trip_s)
+        self._request_repairs(reader, acknack, now_s, trip_s)
         self._release_acknowledged()
 
     @property
@@ -361,12 +361,12 @@ class SendWindow:
         is_spare = is_spare and oldest is not None and oldest < readers.least_active()
         return self._budget_bytes if readers.suspended and is_spare else 2 * self._budget_bytes
 
-    def _request_repairs(self, reader: bytes, report: AckNack, now_s: float, trip_s: float) -> None:
+    def _request_repairs(self, reader: bytes, acknack: AckNack, now_s: float, trip_s: float) -> None:
         """Queue the fragments that a reader lacks."""
         position = self._readers.active.get(reader) or self._readers.suspended[reader]
         is_late = self.governing not in (None, reader)
         (self._late_repairs if is_late else self._repairs).request(
-            report.missing,
+            acknack.missing,
             position.allowance,
             self._cache.messages,
             sent_at=self._sent_at,

@@ -15,7 +15,7 @@ from typing import Final
 
 from gdp.errors import DropReason, LocalError
 from gdp.nodes.node_log import LOOK_S
-from gdp.nodes.runtime import Runtime, now
+from gdp.runtime.runtime import Runtime, now
 from gdp.sansio import Timestamps
 from gdp.stores.audit_log import AuditLog
 from gdp.trust.audit import Action, AuditTrail

@@ -12,10 +12,10 @@ import os
 from pathlib import Path
 from typing import Final
 
+from gdp.config.schema import Domain
 from gdp.crypto.certificates import Membership
 from gdp.crypto.identity import Identity
 from gdp.errors import LocalError
-from gdp.nodes.schema import Domain
 from gdp.sansio import Timestamps
 from gdp.stores.files import read_public
 from gdp.stores.keyring import NODE_CERTIFICATE, ROOT_CERTIFICATE, load_root, parsed

@@ -13,8 +13,8 @@ from typing import Final
 from gdp.errors import DropReason
 from gdp.names import NAME_BYTES, Name
 from gdp.nodes.node_log import LOOK_S
-from gdp.nodes.runtime import Runtime
 from gdp.ports.plane import Port
+from gdp.runtime.runtime import Runtime
 from gdp.sansio import Timestamps
 from gdp.switch.table import Hops, Table
 

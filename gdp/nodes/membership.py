@@ -14,10 +14,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
+from gdp.config.schema import Directory, Domain
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import LocalError
-from gdp.nodes.schema import Directory, Domain
 from gdp.stores.keyring import load_identity, load_root, storage
 from gdp.trust.domain import Policy
 

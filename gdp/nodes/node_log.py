@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from gdp.control.boundary import ErrorBoundary
-from gdp.control.neighbor_discovery import HelloProtocol
+from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.control.waiting import Wait, WaitLog, WaitReason, wait_fact
 from gdp.diagnosis.facts import WaitFact
 from gdp.errors import DropReason

@@ -14,31 +14,31 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from gdp.config.relay_config import RelayConfig
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import DROP_COUNTERS, DropReason
 from gdp.host.service_notifier import service_notifier
+from gdp.host.single_instance import run_alone
+from gdp.links.relay_context import RelayContext
+from gdp.links.relay_dialer import BorderDialer
+from gdp.links.relay_loop import RelayLoop
+from gdp.links.relay_ports import VIA
+from gdp.links.relay_server import BorderServer, listen_tls
+from gdp.management.control_client import control_path
+from gdp.management.control_socket import ControlHandlers, ControlServer
+from gdp.management.switch_watch import SwitchWatch
 from gdp.names import Name
-from gdp.nodes.control_client import control_path
-from gdp.nodes.control_socket import ControlHandlers, ControlServer
-from gdp.nodes.control_status import node_status
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.membership import load_member
 from gdp.nodes.metrics import serve_metrics
 from gdp.nodes.node_log import LOOK_S
-from gdp.nodes.relay_config import RelayConfig
-from gdp.nodes.relay_context import RelayContext
-from gdp.nodes.relay_dialer import BorderDialer
-from gdp.nodes.relay_loop import RelayLoop
-from gdp.nodes.relay_ports import VIA
-from gdp.nodes.relay_server import BorderServer, listen_tls
 from gdp.nodes.rights import confine_relay
-from gdp.nodes.runtime import now
-from gdp.nodes.single_instance import run_alone
-from gdp.nodes.switch_watch import SwitchWatch
 from gdp.ports.host_addresses import AddressMonitor
 from gdp.ports.tap import TapDevice, tap_name
 from gdp.relay.connection import ConnectionCounters
+from gdp.runtime.runtime import now
+from gdp.state.control_status import node_status
 from gdp.telemetry.health import Health
 from gdp.telemetry.sources import Sources
 

@@ -13,7 +13,7 @@ from typing import Final
 
 from gdp.crypto.statements import parse
 from gdp.errors import RemoteError
-from gdp.nodes.runtime import Runtime, now
+from gdp.runtime.runtime import Runtime, now
 from gdp.sansio import Timestamps
 from gdp.stores.revocation_file import SLICE, RevocationFile
 from gdp.trust.revocations import Revocations
@@ -32,7 +32,7 @@ def load_revocations(folder: Path | None, revoked: Revocations, stack: ExitStack
         LocalError: others may write to the folder.
     """
     upkeep = RevocationUpkeep(folder, revoked)
-    upkeep.load(now())
+    upkeep.restore(now())
     stack.callback(upkeep.close)
     return upkeep
 
@@ -51,7 +51,7 @@ class RevocationUpkeep:
         self._file = None if folder is None else RevocationFile(folder)
         self._revoked = revoked
 
-    def load(self, at: Timestamps) -> None:
+    def restore(self, at: Timestamps) -> None:
         """Restore the revocations of earlier runs, each statement verified."""
         if self._file is None:
             return

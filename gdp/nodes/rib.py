@@ -11,34 +11,34 @@ from collections.abc import Callable
 
 from gdp.client.attachment import attachment_waits
 from gdp.client.rib_host import RibHost
+from gdp.config.config import RibConfig
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.host.service_notifier import service_notifier
+from gdp.host.single_instance import run_alone
+from gdp.links.uplink import load_plane, open_uplink
+from gdp.management.control_client import control_path
+from gdp.management.control_socket import ControlHandlers
 from gdp.names import Name
 from gdp.nodes.audit import audit_folder, keep_audit
-from gdp.nodes.config import RibConfig
-from gdp.nodes.control_client import control_path
-from gdp.nodes.control_socket import ControlHandlers
-from gdp.nodes.control_status import node_status
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.decision_log import log_decisions
-from gdp.nodes.diagnostic_control import DiagnosticCommands
-from gdp.nodes.link_rows import LinkRows
-from gdp.nodes.member_tables import rib_tables
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
-from gdp.nodes.name_lookup import rib_lookup
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
 from gdp.nodes.port_rows import port_rows
 from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.nodes.rib_upkeep import MemoryUpkeep, Upkeep
 from gdp.nodes.rights import confine_rib
-from gdp.nodes.runtime import DRAIN_MAX_S, Runtime, now
-from gdp.nodes.single_instance import run_alone
-from gdp.nodes.snapshot import node_snapshot, rib_snapshot
-from gdp.nodes.state_answers import answer_for_rib
-from gdp.nodes.uplink import load_plane, open_uplink
 from gdp.ports.plane import Plane
 from gdp.rib.core import RibCore, RibSettings
+from gdp.runtime.runtime import DRAIN_MAX_S, Runtime, now
+from gdp.state.control_status import node_status
+from gdp.state.diagnostic_control import DiagnosticCommands
+from gdp.state.link_rows import LinkRows
+from gdp.state.member_tables import rib_tables
+from gdp.state.name_lookup import rib_lookup
+from gdp.state.snapshot import node_snapshot, rib_snapshot
+from gdp.state.state_answers import answer_for_rib
 from gdp.stores.audit_log import AuditLog
 from gdp.telemetry.sources import Sources, count_list
 from gdp.trust.domain import Policy

@@ -19,11 +19,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
+from gdp.config.config import ClusterConfig, RibConfig, SwitchConfig
+from gdp.config.relay_config import RelayConfig
+from gdp.host.single_instance import lock_directory
 from gdp.nodes.audit import audit_folder
-from gdp.nodes.config import ClusterConfig, RibConfig, SwitchConfig
 from gdp.nodes.credentials import watched_folders
-from gdp.nodes.relay_config import RelayConfig
-from gdp.nodes.single_instance import lock_directory
 from gdp.ports.sandbox import Capability, Needs, confine
 
 __all__ = ["confine_proxy", "confine_relay", "confine_rib", "confine_switch"]

@@ -10,44 +10,44 @@ import logging
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
+from gdp.config.config import SwitchConfig
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import LocalError, StatementError
 from gdp.host.service_notifier import service_notifier
+from gdp.host.single_instance import own_devices, run_alone
+from gdp.links.links import LINKS_LOOK_S, TunnelLinks
+from gdp.links.relay_ports import RELAY_LOOK_S, RelayPorts
+from gdp.links.tunnels import open_underlays
+from gdp.links.uplink import refuse_loopback
+from gdp.links.veth import attach_pairs, switch_end
+from gdp.management.control_client import control_path
+from gdp.management.control_socket import ControlHandlers
 from gdp.nodes.audit import keep_audit
-from gdp.nodes.config import SwitchConfig
-from gdp.nodes.control_client import control_path
-from gdp.nodes.control_socket import ControlHandlers
-from gdp.nodes.control_status import node_status
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.data_plane import Chosen, choose_plane
 from gdp.nodes.decision_log import log_decisions
-from gdp.nodes.diagnostic_control import DiagnosticCommands
-from gdp.nodes.link_rows import LinkRows, link_status
-from gdp.nodes.links import LINKS_LOOK_S, TunnelLinks
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.metrics import serve_metrics
-from gdp.nodes.name_lookup import SwitchLookups
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
-from gdp.nodes.port_counters import PortCounters
 from gdp.nodes.port_rows import port_rows
-from gdp.nodes.relay_ports import RELAY_LOOK_S, RelayPorts
 from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.nodes.rights import confine_switch
-from gdp.nodes.runtime import DRAIN_MAX_S, Runtime, now
-from gdp.nodes.single_instance import own_devices, run_alone
-from gdp.nodes.snapshot import node_snapshot, switch_snapshot, topology_snapshot
-from gdp.nodes.state_answers import answer_for_switch
-from gdp.nodes.switch_tables import SwitchTables
-from gdp.nodes.switch_topics import switch_rows
-from gdp.nodes.topic_rows import rows_to_fields
-from gdp.nodes.tunnels import open_underlays
-from gdp.nodes.uplink import refuse_loopback
-from gdp.nodes.veth import attach_pairs, switch_end
 from gdp.ports.plane import MAC_BYTES, Plane
+from gdp.ports.port_counters import PortCounters
 from gdp.ports.rtnetlink import LinkMonitor
 from gdp.ports.tunnel.wireguard import WireGuardDevice
+from gdp.runtime.runtime import DRAIN_MAX_S, Runtime, now
+from gdp.state.control_status import node_status
+from gdp.state.diagnostic_control import DiagnosticCommands
+from gdp.state.link_rows import LinkRows, link_status
+from gdp.state.name_lookup import SwitchLookups
+from gdp.state.snapshot import node_snapshot, switch_snapshot, topology_snapshot
+from gdp.state.state_answers import answer_for_switch
+from gdp.state.switch_tables import SwitchTables
+from gdp.state.switch_topics import switch_rows
+from gdp.state.topic_rows import rows_to_fields
 from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table
 from gdp.telemetry.sources import Sources, count_list

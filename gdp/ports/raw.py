@@ -4,7 +4,7 @@ I/O; without Scapy, and with the struct codec's offsets only.
 Source: docs/explanation/design.md, section 7.
 One pass over the batch decides the ordinary frames here. ``gdp.switch.forwarder.decide`` decides all others, and
 fixtures hold the two decisions equal. Consecutive frames of a batch with the same hops leave in one call, a *run*. Each
-traffic class (lane) of a port has its own socket, and the first one is served first. A port accepts a limited number of
+traffic class of a port has its own socket, and the first one is served first. A port accepts a limited number of
 hellos and of strangers' frames per second. The kernel keeps the others, and drops them when the socket is full::
 
     receive | A A A A B B A |    decide      runs: A A A A | B B | A      forward, forward, forward
@@ -57,7 +57,7 @@ _GLANCE: Final = struct.Struct("!HxBxxH24x64s")
 _FIRST: Final = VERSION << 8
 _FIRST_CONTROL: Final = _FIRST | CONTROL_FROM
 _URGENT: Final = int(Flag.URGENT)
-_LANES: Final = (
+_CLASSES: Final = (
     TrafficClass.CONTROL,
     TrafficClass.HELLO,
     TrafficClass.URGENT,
@@ -73,7 +73,7 @@ def _shape(size: int) -> struct.Struct:
     return struct.Struct(f"{MAC_BYTES}x{MAC_BYTES}s{ETHER_BYTES - 2 * MAC_BYTES}x{size}s")
 
 
-def _lane_of(frame: bytes) -> TrafficClass:
+def _traffic_class_of(frame: bytes) -> TrafficClass:
     if frame[KIND_AT] >= CONTROL_FROM:
         return TrafficClass.CONTROL
     return TrafficClass.URGENT if frame[FLAGS_AT] & _URGENT else TrafficClass.ORDINARY
@@ -91,7 +91,9 @@ class RawPlane(NetdevPlane):
 
     def __init__(self, ifnames: Sequence[str] = (), table: Table | None = None, *, bypass_qdisc: bool = False) -> None:
         self._bypass_qdisc = bypass_qdisc
-        self._lanes: dict[TrafficClass, dict[int, socket.socket]] = {lane: {} for lane in _LANES}  # by port
+        self._sockets_by_class: dict[TrafficClass, dict[int, socket.socket]] = {
+            traffic_class: {} for traffic_class in _CLASSES
+        }  # by port
         self._batch: MmsgPool = make_batch(OVERHEAD_BYTES)
         self._neighbours: dict[int, frozenset[bytes]] = {}  # addresses, by port
         self._resting: dict[int, tuple[socket.socket, float]] = {}  # sockets that pause until then, by file descriptor
@@ -100,27 +102,27 @@ class RawPlane(NetdevPlane):
     def _open(self, port: Port) -> None:
         self._widen(port)
         try:
-            for rank, lane in enumerate(_LANES):
-                self._open_lane(port, lane, rank)
+            for rank, traffic_class in enumerate(_CLASSES):
+                self._open_traffic_class(port, traffic_class, rank)
         except LocalError:
             self._shut(port.index)
             raise
 
-    def _open_lane(self, port: Port, lane: TrafficClass, rank: int) -> None:
-        sockets = self._lanes[lane]
-        opened = sockets[port.index] = open_port(port.ifname, lane, bypass_qdisc=self._bypass_qdisc)
+    def _open_traffic_class(self, port: Port, traffic_class: TrafficClass, rank: int) -> None:
+        sockets = self._sockets_by_class[traffic_class]
+        opened = sockets[port.index] = open_port(port.ifname, traffic_class, bypass_qdisc=self._bypass_qdisc)
         if self._entries is None:
             keep_arrival_times(opened)
             ready = partial(self._punt_all, port.index, opened)
         else:
             ready = partial(self._forward_all, self._entries, self._sides, port.index, opened, sockets)
-        if lane in (TrafficClass.HELLO, TrafficClass.GUEST):
+        if traffic_class in (TrafficClass.HELLO, TrafficClass.GUEST):
             ready = partial(self._take_some, opened, TokenBucket(*_GREETINGS), ready)
         self.watch(opened, ready, rank=rank)
-        tell_neighbours(opened, lane, self._neighbours.get(port.index, ()))
+        tell_neighbours(opened, traffic_class, self._neighbours.get(port.index, ()))
 
     def set_neighbours(self, port: int, macs: Collection[bytes]) -> None:
-        """Store the addresses of a port's neighbours: their frames get lanes ahead of strangers'."""
+        """Store the addresses of a port's neighbours: their frames get a class ahead of strangers'."""
         before, after = self._neighbours.get(port, frozenset()), frozenset(macs)
         self._neighbours[port] = after
         steps = (
@@ -129,10 +131,10 @@ class RawPlane(NetdevPlane):
             (TrafficClass.HELLO, after),
             (TrafficClass.GUEST, after),
         )
-        for lane, known in steps:  # in this order, so that each frame always has a lane
-            opened = self._lanes[lane].get(port)
+        for traffic_class, known in steps:  # in this order, so that each frame always has a traffic class
+            opened = self._sockets_by_class[traffic_class].get(port)
             if opened is not None:
-                tell_neighbours(opened, lane, known)
+                tell_neighbours(opened, traffic_class, known)
 
     def poll(self, timeout_s: float | None) -> list[ReceivedFrame]:
         """End the pauses of sockets that are due; then as ``Plane.poll``."""
@@ -170,8 +172,8 @@ class RawPlane(NetdevPlane):
             self._batch = make_batch(port.mtu + ETHER_BYTES)
 
     def _shut(self, index: int) -> None:
-        self._finish([sockets[index] for sockets in self._lanes.values() if index in sockets])
-        for sockets in self._lanes.values():
+        self._finish([sockets[index] for sockets in self._sockets_by_class.values() if index in sockets])
+        for sockets in self._sockets_by_class.values():
             opened = sockets.pop(index, None)
             if opened is not None:
                 self._end_rest(opened.fileno())
@@ -191,10 +193,10 @@ class RawPlane(NetdevPlane):
         self._audit()
 
     def _is_open(self, index: int) -> bool:
-        return index in self._lanes[TrafficClass.ORDINARY]
+        return index in self._sockets_by_class[TrafficClass.ORDINARY]
 
     def _kernel_drops(self) -> int:
-        return sum(kernel_drops(opened) for sockets in self._lanes.values() for opened in sockets.values())
+        return sum(kernel_drops(opened) for sockets in self._sockets_by_class.values() for opened in sockets.values())
 
     def transmit(self, port: int, destination_mac: bytes, frames: Sequence[bytes]) -> int:
         """Send frames to one neighbour; return how many were sent, as ``Plane.transmit``."""
@@ -206,7 +208,7 @@ class RawPlane(NetdevPlane):
         counters.drops[DropReason.TOO_BIG] += len(frames) - len(fitting)
         if not fitting:
             return 0
-        sink = self._lanes[_lane_of(fitting[0])][port]
+        sink = self._sockets_by_class[_traffic_class_of(fitting[0])][port]
         macs, left = destination_mac + facts.mac, 0
         if len(fitting) == 1:
             left = put_one(sink, fitting[0], macs, counters.drops)

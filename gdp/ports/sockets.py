@@ -9,10 +9,10 @@ forwarded nor counted: a frame to another station (``PACKET_OTHERHOST``, seen on
 multicast, an echo of our own sending, and a broadcast data frame (which every switch on a shared link would forward
 again).
 
-A port may have a socket for each *lane* (``TrafficClass``), so that no frame queues after less important ones. The
-lanes in order are: control frames of neighbours, their hellos, urgent frames, ordinary frames, and control frames of
-strangers. A flood on one lane fills only the queue of that lane. A neighbour is identified by its address, which the
-filters get with each change. Frames that leave by the lanes of neighbours and of urgent frames carry a priority. Every
+A port may have a socket for each *traffic class*, so that no frame queues after less important ones. The
+classes in order are: control frames of neighbours, their hellos, urgent frames, ordinary frames, and control frames of
+strangers. A flood of one class fills only the queue of that class. A neighbour is identified by its address, which the
+filters get with each change. Frames of neighbours and urgent ones carry a priority. Every
 queueing discipline with bands honours it (``pfifo_fast``, ``prio``, and the access categories of Wi-Fi).
 """
 
@@ -80,7 +80,7 @@ _PRIORITY: Final = 6  # TC_PRIO_INTERACTIVE: the first band; 7 would need CAP_NE
 _KIND: Final = (_LOAD_BYTE, 0, 0, ETHER_BYTES + KIND_AT)
 _FLAGS: Final = (_LOAD_BYTE, 0, 0, ETHER_BYTES + FLAGS_AT)
 _TYPE: Final = (_LOAD_BYTE, 0, 0, _PACKET_TYPE)
-_LANED_BYTES: Final = ETHER_BYTES + FLAGS_AT + 1  # the bytes that determine a frame's lane
+_CLASSED_BYTES: Final = ETHER_BYTES + FLAGS_AT + 1  # the bytes that determine a frame's class
 _LENGTH: Final = (_LOAD_LENGTH, 0, 0, 0)
 _TAKE: Final = (_RETURN, 0, 0, _WHOLE)
 _LEAVE: Final = (_RETURN, 0, 0, 0)
@@ -91,7 +91,7 @@ _CONTROL_ONLY: Final = (
     (_JUMP_EQUAL, 1, 0, socket.PACKET_BROADCAST),
     _LEAVE,
     _LENGTH,
-    (_JUMP_GREATER_EQUAL, 1, 0, _LANED_BYTES),
+    (_JUMP_GREATER_EQUAL, 1, 0, _CLASSED_BYTES),
     _LEAVE,
     _KIND,
     (_JUMP_GREATER_EQUAL, 1, 0, CONTROL_FROM),
@@ -102,9 +102,9 @@ _HELLO_ONLY: Final = ((_JUMP_EQUAL, 1, 0, Kind.HELLO), _LEAVE)
 
 
 class TrafficClass(Enum):
-    """Traffic class of a socket (lane): filter steps of (code, jump if true, jump if false, value).
+    """Traffic class of a socket: filter steps of (code, jump if true, jump if false, value).
 
-    In the lanes of ``_BY_ADDRESS`` the sender's address decides what follows.
+    In the classes of ``_BY_ADDRESS`` the sender's address decides what follows.
     """
 
     ALL = (
@@ -133,7 +133,7 @@ class TrafficClass(Enum):
         _TYPE,
         (_JUMP_EQUAL, 0, 7, socket.PACKET_HOST),
         _LENGTH,
-        (_JUMP_GREATER_EQUAL, 0, 4, _LANED_BYTES),  # the plane counts shorter ones
+        (_JUMP_GREATER_EQUAL, 0, 4, _CLASSED_BYTES),  # the plane counts shorter ones
         _KIND,
         (_JUMP_GREATER_EQUAL, 3, 0, CONTROL_FROM),
         _FLAGS,
@@ -150,16 +150,16 @@ _BY_ADDRESS: Final = {
 }
 
 
-def steps_of(lane: TrafficClass, neighbours: Iterable[bytes] = ()) -> tuple[_Step, ...]:
-    """Return the filter of a lane.
+def steps_of(traffic_class: TrafficClass, neighbours: Iterable[bytes] = ()) -> tuple[_Step, ...]:
+    """Return the filter of a traffic class.
 
     Args:
         neighbours: addresses, 6 bytes each; each one adds five steps.
     """
-    steps: tuple[_Step, ...] = lane.value
-    if lane not in _BY_ADDRESS:
+    steps: tuple[_Step, ...] = traffic_class.value
+    if traffic_class not in _BY_ADDRESS:
         return steps
-    neighbours_own, others = _BY_ADDRESS[lane]
+    neighbours_own, others = _BY_ADDRESS[traffic_class]
     for mac in sorted(neighbours):
         steps += (
             (_LOAD_WORD, 0, 0, _SOURCE_AT),
@@ -171,16 +171,18 @@ def steps_of(lane: TrafficClass, neighbours: Iterable[bytes] = ()) -> tuple[_Ste
     return (*steps, others)
 
 
-def tell_neighbours(opened: socket.socket, lane: TrafficClass, neighbours: Iterable[bytes]) -> None:
+def tell_neighbours(opened: socket.socket, traffic_class: TrafficClass, neighbours: Iterable[bytes]) -> None:
     """Set the addresses of a port's neighbours in the filter of a socket."""
-    _filter(opened, steps_of(lane, neighbours))
+    _filter(opened, steps_of(traffic_class, neighbours))
 
 
-def open_port(ifname: str, lane: TrafficClass = TrafficClass.ALL, *, bypass_qdisc: bool = False) -> socket.socket:
+def open_port(
+    ifname: str, traffic_class: TrafficClass = TrafficClass.ALL, *, bypass_qdisc: bool = False
+) -> socket.socket:
     """Open a non-blocking socket for our EtherType on one device.
 
     Args:
-        lane: which of our frames it accepts.
+        traffic_class: which of our frames it accepts.
         bypass_qdisc: pass frames to the driver without traffic control; faster, but shaping (tc) is skipped too.
 
     Raises:
@@ -191,12 +193,12 @@ def open_port(ifname: str, lane: TrafficClass = TrafficClass.ALL, *, bypass_qdis
     except PermissionError as error:
         raise LocalError(NO_RAW_SOCKETS) from error
     try:
-        attach_ethertype_filter(opened, lane)
-        if lane in (TrafficClass.CONTROL, TrafficClass.HELLO, TrafficClass.URGENT):
+        attach_ethertype_filter(opened, traffic_class)
+        if traffic_class in (TrafficClass.CONTROL, TrafficClass.HELLO, TrafficClass.URGENT):
             opened.setsockopt(socket.SOL_SOCKET, socket.SO_PRIORITY, _PRIORITY)
         if bypass_qdisc:
             opened.setsockopt(_SOL_PACKET, _PACKET_QDISC_BYPASS, 1)
-        if lane in (TrafficClass.HELLO, TrafficClass.GUEST):
+        if traffic_class in (TrafficClass.HELLO, TrafficClass.GUEST):
             opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _GREETING_BUFFER_BYTES)
         else:
             large_buffers(opened)
@@ -208,9 +210,9 @@ def open_port(ifname: str, lane: TrafficClass = TrafficClass.ALL, *, bypass_qdis
     return opened
 
 
-def attach_ethertype_filter(opened: socket.socket, lane: TrafficClass = TrafficClass.ALL) -> None:
-    """Attach the filter of a lane, which the head of this module describes."""
-    _filter(opened, steps_of(lane))
+def attach_ethertype_filter(opened: socket.socket, traffic_class: TrafficClass = TrafficClass.ALL) -> None:
+    """Attach the filter of a traffic class, which the head of this module describes."""
+    _filter(opened, steps_of(traffic_class))
     try:
         opened.setsockopt(_SOL_PACKET, _PACKET_IGNORE_OUTGOING, 1)
     except OSError as error:

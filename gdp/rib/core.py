@@ -21,11 +21,10 @@ from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.boundary import ErrorBoundary
 from gdp.control.presence import IdentityChecks, Presence
 from gdp.control.query import Query, Response
-from gdp.control.relay import Relay
-from gdp.control.replica import Digest, Entry, Fetch, Inventory, Key, Replicas
+from gdp.control.relayed_statement import RelayedStatement
+from gdp.control.rib_replication import Digest, Entry, EntryBatch, Fetch, Inventory, Key
 from gdp.control.waiting import Wait, WaitReason
 from gdp.crypto.certificates import Membership, Role
-from gdp.crypto.fields import Fields, check_sequence
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.diagnosis.facts import RibFacts, RouteFact
@@ -39,14 +38,13 @@ from gdp.limits import (
     NEGATIVE_LEASE_S,
     RIB_NAMES_PER_SENDER,
     RIB_WATCHES_MAX,
-    WITHDRAWAL_MAX_BYTES,
 )
 from gdp.names import Name
+from gdp.rib.anti_entropy import AntiEntropy, Message
 from gdp.rib.digest_tree import DigestTree
 from gdp.rib.endpoints import RibEndpoints
 from gdp.rib.former import FormerAdvertisers
 from gdp.rib.lower_ribs import LowerRibs
-from gdp.rib.replication import Message, Replication
 from gdp.rib.revocations import RibRevocations
 from gdp.rib.route import Route, Withdrawn
 from gdp.rib.store import Store
@@ -61,6 +59,7 @@ from gdp.trust.audit import Action
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.verifier import AdvertisementVerifier
+from gdp.trust.withdrawal import Withdrawal
 
 __all__ = ["OutgoingStatement", "RibCore", "RibSettings"]
 
@@ -76,7 +75,7 @@ _PEER_MESSAGES: Final[dict[StatementType, type[Message]]] = {
     StatementType.DIGEST: Digest,
     StatementType.FETCH: Fetch,
     StatementType.INVENTORY: Inventory,
-    StatementType.REPLICAS: Replicas,
+    StatementType.REPLICAS: EntryBatch,
 }
 
 
@@ -323,13 +322,13 @@ class RibCore:
     # -- advertisements
 
     def _take_relay(self, statement: Statement, now: Timestamps) -> None:
-        relay = Relay.from_fields(statement.fields)
-        member = self._sender(relay.membership, statement, now)
+        relayed = RelayedStatement.from_fields(statement.fields)
+        member = self._sender(relayed.membership, statement, now)
         if not (member.role.is_switch or member.role is Role.RIB):
             raise StatementError(DropReason.WRONG_DOMAIN, "relays are switches or RIBs")
         statement.verify(member.key)
         self._lower.record_alive(member.name, now.mono_s)
-        passed_on = parse(relay.statement)
+        passed_on = parse(relayed.statement)
         if passed_on.type is StatementType.REVOKE:
             self._handle_revocation(passed_on, member.name, now)
             return
@@ -343,7 +342,7 @@ class RibCore:
             advertisement = self._verifier.verify_statement(passed_on, now.unix_s)
             if member.role.is_switch and advertisement.switch != member.name:
                 raise StatementError(DropReason.NOT_DELEGATED, "the RtCert names another switch than the relay")
-            if relay.domain is not None and not self._policy.trusts(relay.domain):
+            if relayed.domain is not None and not self._policy.trusts(relayed.domain):
                 raise StatementError(DropReason.WRONG_DOMAIN, "an advertisement of a domain that is not trusted")
             if member.domain != self._policy.own and not advertisement.is_global:
                 raise StatementError(DropReason.WRONG_DOMAIN, "a local name of another domain")
@@ -351,16 +350,16 @@ class RibCore:
             if advertisement.right is Right.ATTACH and self.identities.is_refused_above(
                 advertisement.node, advertisement.incarnation, now.mono_s
             ):
-                route = self._route(advertisement, relay.transit, member, now)
-                self._forward_upstream(route, relay.statement, route.sequence, now.mono_s)
+                route = self._route(advertisement, relayed.transit, member, now)
+                self._forward_upstream(route, relayed.statement, route.sequence, now.mono_s)
                 raise StatementError(DropReason.IN_USE, "another node with this identity, says the tier above")
             known = self._check_news(advertisement, member)
         except StatementError as error:
             self._refuse(passed_on, member, error, now.mono_s)
             raise
-        route = self._route(advertisement, relay.transit, member, now)
-        if relay.domain is not None and member.role is Role.RIB:
-            route = replace(route, domain=relay.domain)
+        route = self._route(advertisement, relayed.transit, member, now)
+        if relayed.domain is not None and member.role is Role.RIB:
+            route = replace(route, domain=relayed.domain)
         self._store.put(route)
         self._former.note_accepted(route)
         self.accepted += 1
@@ -370,7 +369,7 @@ class RibCore:
         self._tell(route, known, now.mono_s)
         self._replicate(route.name, route.advertiser)
         if advertisement.is_global and not self._upstream.has(member.name):
-            self._forward_upstream(route, relay.statement, route.sequence, now.mono_s)
+            self._forward_upstream(route, relayed.statement, route.sequence, now.mono_s)
 
     def _check_identity(self, advertisement: Advertisement, now: Timestamps) -> None:
         """Reject a node's own name in another incarnation while the older node lives at another switch.
@@ -445,20 +444,20 @@ class RibCore:
             expires_s=now.mono_s + min(advertisement.lease_s, left_s),
         )
 
-    def _take_withdrawal(self, withdrawal: Statement, member: Membership, now: Timestamps) -> None:
-        fields = _withdrawal(withdrawal, now)
-        name, advertiser, sequence = fields.name("n"), withdrawal.signer, fields.uint("s")
+    def _take_withdrawal(self, statement: Statement, member: Membership, now: Timestamps) -> None:
+        withdrawal = Withdrawal.from_statement(statement, now.unix_s)
+        name, advertiser, sequence = withdrawal.name, statement.signer, withdrawal.sequence
         known = self._store.get(name, advertiser)
         if not isinstance(known, Route) or sequence < known.sequence:
             raise StatementError(DropReason.STALE, "nothing to withdraw")
         pending_advertisement = UnverifiedAdvertisement.from_statement(parse(known.advertisement))
-        withdrawal.verify(self._policy.verify_membership(pending_advertisement.membership, now.unix_s).key)
-        self._withdraw(known, sequence, withdrawal.wire, pending_advertisement.membership)
+        statement.verify(self._policy.verify_membership(pending_advertisement.membership, now.unix_s).key)
+        self._withdraw(known, sequence, statement.wire, pending_advertisement.membership)
         self._acknowledge(name, advertiser, None, sequence, member.name)
         self._tell_gone(known, now.mono_s, by=member.name)
         self._replicate(name, advertiser)
         if known.is_global and not self._upstream.has(member.name):
-            self._forward_upstream(known, withdrawal.wire, sequence, now.mono_s)
+            self._forward_upstream(known, statement.wire, sequence, now.mono_s)
 
     def _withdraw(self, route: Route, sequence: int, proof: bytes, membership: bytes) -> None:
         gone = Withdrawn(route.sender, max(sequence, route.sequence), route.valid_until_unix_s, proof, membership)
@@ -483,9 +482,9 @@ class RibCore:
     def _send_up(self, passed: Passed) -> None:
         upper = self._upstream.rib
         assert upper is not None
-        relay = Relay(passed.statement, passed.transit, self._identity.membership, passed.domain)
+        relayed = RelayedStatement(passed.statement, passed.transit, self._identity.membership, passed.domain)
         self._outgoing_statements.append(
-            OutgoingStatement(upper, Kind.RIB_REQUEST, relay.to_wire(self._identity.name, self._identity.key))
+            OutgoingStatement(upper, Kind.RIB_REQUEST, relayed.to_wire(self._identity.name, self._identity.key))
         )
 
     def _refuse(self, passed_on: Statement, member: Membership, error: StatementError, now_s: float) -> None:
@@ -566,7 +565,7 @@ class RibCore:
             self._holders.add(route.name, to, now_s + lease_s)
         except StatementError:
             lease_s = min(lease_s, _UNREPORTED_S)
-        answer = Response(
+        response = Response(
             name=route.name,
             advertiser=route.advertiser,
             advertisement=route.advertisement,
@@ -575,7 +574,7 @@ class RibCore:
             lease_s=lease_s,
         )
         self.answers += 1
-        self._send(answer, to.name, (route.name, route.advertiser))
+        self._send(response, to.name, (route.name, route.advertiser))
 
     def _answer_none(self, name: Name, to: Name, *, is_unknown: bool) -> None:
         """Answer that no node advertises a name, or, if the tier above could not be asked, that it is not known."""
@@ -591,8 +590,8 @@ class RibCore:
         own = self._policy.own
         self._send(Response(name=name, advertiser=name, advertisement=b"", domain=own, transit=(), lease_s=lease_s), to)
 
-    def _send(self, answer: Response, to: Name, about: Key | None = None) -> None:
-        wire = answer.to_wire(self._identity.name, self._identity.key, self._identity.membership)
+    def _send(self, response: Response, to: Name, about: Key | None = None) -> None:
+        wire = response.to_wire(self._identity.name, self._identity.key, self._identity.membership)
         self._outgoing_statements.append(OutgoingStatement(to, Kind.RIB_ANSWER, wire, about))
 
     def _concerns(self, name: Name, now_s: float) -> bool:
@@ -736,27 +735,27 @@ class RibCore:
 
     def _take_answer_from_above(self, statement: Statement, now: Timestamps) -> None:
         fields = statement.fields
-        answer = Response.from_fields(fields)
-        if answer.name == statement.signer and not self._upstream.has(statement.signer):
+        response = Response.from_fields(fields)
+        if response.name == statement.signer and not self._upstream.has(statement.signer):
             self._take_sign_of_life(statement, now)
             return
         member = self._upper_member(statement, now)
-        if answer.is_negative or answer.is_unknown:
-            record = self._upstream_queries.not_known if answer.is_unknown else self._upstream_queries.answered
-            askers = record(answer.name, now.mono_s)
-            if answer.is_unknown:
-                self._serve_stale(answer.name, now.mono_s + WATCH_AGAIN_S, now)
-            if not self._store.routes(answer.name):
+        if response.is_negative or response.is_unknown:
+            record = self._upstream_queries.not_known if response.is_unknown else self._upstream_queries.answered
+            askers = record(response.name, now.mono_s)
+            if response.is_unknown:
+                self._serve_stale(response.name, now.mono_s + WATCH_AGAIN_S, now)
+            if not self._store.routes(response.name):
                 for asker in askers:
-                    self._answer_none(answer.name, asker.name, is_unknown=answer.is_unknown)
+                    self._answer_none(response.name, asker.name, is_unknown=response.is_unknown)
             return
-        known = self._store.get(answer.name, answer.advertiser)
-        if not answer.advertisement:
-            if isinstance(known, Route) and known.is_from_upstream and known.sequence <= answer.sequence:
-                self._store.withdraw(answer.name, answer.advertiser)
+        known = self._store.get(response.name, response.advertiser)
+        if not response.advertisement:
+            if isinstance(known, Route) and known.is_from_upstream and known.sequence <= response.sequence:
+                self._store.withdraw(response.name, response.advertiser)
                 self._tell_gone(known, now.mono_s)
             return
-        self._learn_from_upstream(answer, member, known, now)
+        self._learn_from_upstream(response, member, known, now)
 
     def _take_sign_of_life(self, statement: Statement, now: Timestamps) -> None:
         """Take the answer of a RIB below to a probe."""
@@ -765,28 +764,28 @@ class RibCore:
         self._lower.record_alive(member.name, now.mono_s)
 
     def _learn_from_upstream(
-        self, answer: Response, member: Membership, known: Route | Withdrawn | None, now: Timestamps
+        self, response: Response, member: Membership, known: Route | Withdrawn | None, now: Timestamps
     ) -> None:
-        advertisement = self._verifier.verify(answer.advertisement, now.unix_s)
-        if advertisement.name != answer.name or advertisement.node != answer.advertiser:
+        advertisement = self._verifier.verify(response.advertisement, now.unix_s)
+        if advertisement.name != response.name or advertisement.node != response.advertiser:
             raise StatementError(DropReason.WRONG_NAME, "an answer about something else than its advertisement")
         is_from_below = (
             isinstance(known, Route) and not known.is_from_upstream and known.advertisement == advertisement.wire
         )
-        if answer.domain == self._policy.own or is_from_below:
+        if response.domain == self._policy.own or is_from_below:
             return  # our own, or of a tier below, returned from above
         if isinstance(known, Route) and advertisement.sequence < known.sequence:
             raise StatementError(DropReason.STALE, "the tier above is behind")
         route = replace(
-            self._route(advertisement, answer.transit, member, now),
-            domain=answer.domain,
+            self._route(advertisement, response.transit, member, now),
+            domain=response.domain,
             is_from_upstream=True,
-            expires_s=now.mono_s + answer.lease_s,
+            expires_s=now.mono_s + response.lease_s,
         )
         self._store.put(route)
         if isinstance(known, Route) and not known.is_from_upstream:
             self._replicate(route.name, route.advertiser)  # a peer has the old location
-        askers = self._upstream_queries.answered(answer.name, now.mono_s, answer.lease_s)
+        askers = self._upstream_queries.answered(response.name, now.mono_s, response.lease_s)
         self._tell(route, known, now.mono_s, askers)
 
     # -- revocations
@@ -855,7 +854,9 @@ class RibCore:
     def _send_revocations(self, wires: Iterable[bytes], to: Iterable[Name], kind: Kind = Kind.RIB_ANSWER) -> None:
         names = list(to)
         for wire in wires if names else ():
-            relay = Relay(wire, (), self._identity.membership).to_wire(self._identity.name, self._identity.key)
+            relay = RelayedStatement(wire, (), self._identity.membership).to_wire(
+                self._identity.name, self._identity.key
+            )
             self._outgoing_statements += [OutgoingStatement(name, kind, relay) for name in names]
 
     # -- endpoints of switches
@@ -879,10 +880,10 @@ class RibCore:
 
     # -- other RIBs of the domain
 
-    def _replication_over(self, digests: DigestTree | None) -> Replication | None:
+    def _replication_over(self, digests: DigestTree | None) -> AntiEntropy | None:
         if digests is None:
             return None
-        return Replication(self._identity, digests, self._settings.peers, self.entry_of, self._rank_of)
+        return AntiEntropy(self._identity, digests, self._settings.peers, self.entry_of, self._rank_of)
 
     def _replicate(self, name: Name, advertiser: Name) -> None:
         if self._replication is not None:
@@ -975,23 +976,23 @@ class RibCore:
         is_same = isinstance(known, Route) and known.advertisement == advertisement.wire
         return is_same and isinstance(known, Route) and (known.is_from_upstream or expires_s > known.expires_s)
 
-    def _take_withdrawn_entry(self, entry: Entry, withdrawal: Statement, now: Timestamps) -> None:
-        fields = _withdrawal(withdrawal, now)
-        name, sequence = fields.name("n"), fields.uint("s")
-        known = self._store.get(name, withdrawal.signer)
+    def _take_withdrawn_entry(self, entry: Entry, statement: Statement, now: Timestamps) -> None:
+        withdrawal = Withdrawal.from_statement(statement, now.unix_s)
+        name, sequence = withdrawal.name, withdrawal.sequence
+        known = self._store.get(name, statement.signer)
         if known is not None and _rank(known) >= 2 * sequence + 1:
             return
-        member = self._sender(entry.membership, withdrawal, now)
-        withdrawal.verify(member.key)
+        member = self._sender(entry.membership, statement, now)
+        statement.verify(member.key)
         until_unix_s = min(entry.until_unix_s, member.not_after_unix_s + int(CLOCK_SKEW_S))
         if known is not None:  # a peer must not shorten the lease of a known entry
             until_unix_s = max(until_unix_s, known.valid_until_unix_s)
         if until_unix_s <= now.unix_s:
             return  # expired here already
         if known is None:
-            self._check_quota(entry.sender, withdrawal.signer)
-        gone = Withdrawn(entry.sender, sequence, until_unix_s, withdrawal.wire, entry.membership)
-        route = self._store.withdraw(name, withdrawal.signer, gone)
+            self._check_quota(entry.sender, statement.signer)
+        gone = Withdrawn(entry.sender, sequence, until_unix_s, statement.wire, entry.membership)
+        route = self._store.withdraw(name, statement.signer, gone)
         if route is not None:
             self._tell_gone(route, now.mono_s, by=entry.sender)
 
@@ -1025,15 +1026,6 @@ def _revocable(statement: Statement) -> list[tuple[bytes, bytes]]:
         found += [(link.fingerprint, key) for key in dict.fromkeys((body.subject.owner_key, issuer_key))]
         issuer_key = link.delegate_key
     return found
-
-
-def _withdrawal(statement: Statement, now: Timestamps) -> Fields:
-    """Return the fields of a withdrawal. Raises ``StatementError``: MALFORMED, or TOO_BIG to be forwarded."""
-    fields = statement.expect(StatementType.WITHDRAW)
-    if len(statement.wire) > WITHDRAWAL_MAX_BYTES:
-        raise StatementError(DropReason.TOO_BIG, "a withdrawal")
-    check_sequence(fields.uint("s"), now.unix_s)
-    return fields
 
 
 def _rank(known: Route | Withdrawn) -> int:

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from hashlib import blake2b
 from typing import Final
 
-from gdp.control.replica import FANOUT, HASH_BYTES, Item, Key
+from gdp.control.rib_replication import FANOUT, HASH_BYTES, Item, Key
 from gdp.names import Name
 
 __all__ = ["DigestTree"]

@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 
 from gdp.control.endpoint_query import EndpointQuery, EndpointResponse, batches
 from gdp.control.endpoint_record import EndpointRecord
-from gdp.control.relay import Relay
+from gdp.control.relayed_statement import RelayedStatement
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.fields import check_sequence
 from gdp.crypto.identity import Identity
@@ -113,9 +113,9 @@ class RibEndpoints:
             raise
         self._respond(statement.signer)
         if kept.member.domain == self._policy.own:
-            relay = Relay(statement.wire, (), self._identity.membership)
+            relayed = RelayedStatement(statement.wire, (), self._identity.membership)
             for peer in self._peers():
-                wire = relay.to_wire(self._identity.name, self._identity.key)
+                wire = relayed.to_wire(self._identity.name, self._identity.key)
                 self._out.append(_Outgoing(peer, Kind.RIB_REQUEST, wire))
 
     def receive_relayed(self, statement: Statement, member: Membership, now: Timestamps) -> None:

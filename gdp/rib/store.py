@@ -9,7 +9,7 @@ import heapq
 from collections.abc import Collection, Iterator
 from typing import Protocol
 
-from gdp.control.replica import Key
+from gdp.control.rib_replication import Key
 from gdp.names import Name
 from gdp.rib.digest_tree import DigestTree
 from gdp.rib.route import Route, Withdrawn

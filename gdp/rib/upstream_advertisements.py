@@ -11,7 +11,7 @@ import heapq
 from dataclasses import dataclass
 from typing import Final
 
-from gdp.control.replica import Key
+from gdp.control.rib_replication import Key
 from gdp.names import Name
 
 __all__ = ["Passed", "UpstreamAdvertisements"]

@@ -25,9 +25,9 @@ from typing import Final, Protocol, TypeVar
 
 from gdp.client.publisher import Publisher
 from gdp.errors import GdpError
-from gdp.nodes.runtime import Runtime
-from gdp.session.core import SessionCore
-from gdp.session.errors import ClosedError
+from gdp.runtime.runtime import Runtime
+from gdp.session.protocol.core import SessionCore
+from gdp.session.protocol.errors import ClosedError
 
 __all__ = ["Driver", "ThreadDriver"]
 

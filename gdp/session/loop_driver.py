@@ -12,10 +12,10 @@ from collections.abc import Callable
 from typing import Final
 
 from gdp.client.publisher import Publisher
-from gdp.nodes.runtime import Runtime
 from gdp.ports.netdev import NetdevPlane
-from gdp.session.core import SessionCore
-from gdp.session.errors import ClosedError
+from gdp.runtime.runtime import Runtime
+from gdp.session.protocol.core import SessionCore
+from gdp.session.protocol.errors import ClosedError
 
 __all__ = ["LoopDriver"]
 

@@ -18,18 +18,18 @@ from gdp.client.participant import Participant
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
+from gdp.host.single_instance import run_alone
+from gdp.links.uplink import open_uplink
 from gdp.names import Name
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog
 from gdp.nodes.revocation_upkeep import load_revocations
-from gdp.nodes.runtime import Runtime
-from gdp.nodes.single_instance import run_alone
-from gdp.nodes.uplink import open_uplink
 from gdp.ports.netdev import NetdevPlane
-from gdp.session.core import SessionCore
-from gdp.session.errors import SessionError
+from gdp.runtime.runtime import Runtime
+from gdp.session.protocol.core import SessionCore
+from gdp.session.protocol.errors import SessionError
 from gdp.session.settings import SessionConfig
 
 __all__ = ["SessionNode", "open_node"]

@@ -19,15 +19,15 @@ from gdp.client.participant import Topic
 from gdp.client.send_options import Priority, SendOptions, is_urgent
 from gdp.errors import LocalError
 from gdp.service.replication import Replication
-from gdp.session.core import QUEUE_MESSAGES
 from gdp.session.driver import Driver, ThreadDriver
-from gdp.session.errors import ClosedError, SessionTimeoutError
-from gdp.session.messages import Message, NameLike, Request, Response
 from gdp.session.node import SessionNode, open_node
-from gdp.session.opened import BasePublisher, BaseServer, BaseSession, BaseSubscription
-from gdp.session.server_core import ServerCore
+from gdp.session.protocol.core import QUEUE_MESSAGES
+from gdp.session.protocol.errors import ClosedError, SessionTimeoutError
+from gdp.session.protocol.messages import Message, NameLike, Request, Response
+from gdp.session.protocol.opened import BasePublisher, BaseServer, BaseSession, BaseSubscription
+from gdp.session.protocol.server_core import ServerCore
+from gdp.session.protocol.wire import message_to_wire
 from gdp.session.settings import settings_of
-from gdp.session.wire import message_to_wire
 from gdp.trust.advertisement import paths_value, session_value
 from gdp.trust.right import Right
 

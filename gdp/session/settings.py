@@ -15,11 +15,11 @@ from typing import ClassVar, Final
 import orjson
 from pydantic import Field, ValidationError
 
+from gdp.config.config import LeaseSeconds
+from gdp.config.schema import Directory, Domain, Ifname, Section, load
 from gdp.errors import LocalError
 from gdp.limits import ADVERTISEMENT_LEASE_S
-from gdp.nodes.busy_poll import SPIN_MAX_US, SPIN_US
-from gdp.nodes.config import LeaseSeconds
-from gdp.nodes.schema import Directory, Domain, Ifname, Section, load
+from gdp.runtime.busy_poll import SPIN_MAX_US, SPIN_US
 from gdp.stores.keyring import DELEGATIONS, NODE_CERTIFICATE, ROOT_CERTIFICATE
 
 __all__ = ["SessionConfig", "settings_of"]

@@ -12,10 +12,10 @@ from enum import Enum
 from pathlib import Path
 from typing import Protocol
 
+from gdp.config.yaml_source import read_yaml
 from gdp.crypto.certificates import Role, Root
 from gdp.errors import LocalError, StatementError
 from gdp.names import Name
-from gdp.nodes.yaml_source import read_yaml
 from gdp.trust.node_descriptor import NodeDescriptor
 
 __all__ = ["Exchange", "Mail", "MailKind", "load_groups", "proxies_of", "resolve_recipients"]

@@ -13,11 +13,11 @@ from typing import Final
 
 from pydantic import ValidationError
 
+from gdp.config.schema import Section
 from gdp.errors import LocalError
 from gdp.limits import CLOCK_SKEW_S
 from gdp.metadata import Metadata
 from gdp.names import Name
-from gdp.nodes.schema import Section
 from gdp.sharing.state import links_of
 from gdp.stores.files import private, read_private, write_all
 from gdp.stores.issue import DAY_S, delegate

@@ -13,12 +13,12 @@ from typing import Final, TypeVar
 
 from gdp.enrolment.domain_client import DomainClient, delete_mail, read_inbox
 from gdp.enrolment.member_files import MemberFiles
-from gdp.enrolment.wire import UnreachableError
 from gdp.errors import GdpError
 from gdp.names import Name
 from gdp.nodes.membership import load_policy
 from gdp.sharing.exchange import Mail, MailKind
 from gdp.stores.keyring import CARD, load_card
+from gdp.trust.enrolment_wire import UnreachableError
 from gdp.trust.node_descriptor import NodeDescriptor
 
 __all__ = ["MemberExchange"]

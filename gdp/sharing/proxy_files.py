@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
+from gdp.config.drop_in import drop_in_directory, read_drop_in, write_drop_in
+from gdp.config.yaml_source import Plain, YamlSource, read_yaml
 from gdp.errors import ConfigError, LocalError
+from gdp.management.control_client import NotRunningError, ask_node, find_control_socket
 from gdp.names import Name
-from gdp.nodes.control_client import NotRunningError, ask_node, find_control_socket
-from gdp.nodes.control_protocol import Command
-from gdp.nodes.drop_in import drop_in_directory, read_drop_in, write_drop_in
-from gdp.nodes.yaml_source import Plain, YamlSource, read_yaml
 from gdp.ros_names import is_name, matches
+from gdp.state.control_protocol import Command
 
 __all__ = ["ProxyFiles", "Side", "StatedRule", "Undelegated", "fits"]
 

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+from gdp.config.config import SwitchConfig
 from gdp.errors import LocalError
-from gdp.nodes.config import SwitchConfig
-from gdp.nodes.control_client import NotRunningError, ask_node, find_control_socket
-from gdp.nodes.control_protocol import Command
+from gdp.management.control_client import NotRunningError, ask_node, find_control_socket
+from gdp.state.control_protocol import Command
 from gdp.stores.files import public, write_all
 
 __all__ = ["publish_revocations"]

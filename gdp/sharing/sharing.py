@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, TypeAlias
 
+from gdp.config.drop_in import locked, read_drop_in
 from gdp.crypto.statements import parse
 from gdp.errors import DropReason, GdpError, LocalError, StatementError
 from gdp.metadata import Metadata
-from gdp.nodes.drop_in import locked, read_drop_in
 from gdp.sharing.exchange import Exchange, Mail, MailKind, load_groups, resolve_recipients
 from gdp.sharing.grants import GIVING, TAKING, Grants, described
 from gdp.sharing.issued import IssuedDelegation, IssuedStore

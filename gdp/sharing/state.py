@@ -16,11 +16,11 @@ from typing import Final, Literal
 
 from pydantic import Field, ValidationError
 
+from gdp.config.schema import Section
 from gdp.crypto.keys import PublicKey
 from gdp.crypto.statements import parse
 from gdp.errors import LocalError, StatementError
 from gdp.names import Name
-from gdp.nodes.schema import Section
 from gdp.ros_names import Kind
 from gdp.sharing.proxy_files import Side, fits
 from gdp.stores.files import private, public, read_private, write_all

@@ -19,7 +19,7 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Final
 
-from gdp.control.replica import Key
+from gdp.control.rib_replication import Key
 from gdp.crypto import cbor
 from gdp.crypto.fields import Fields
 from gdp.crypto.statements import parse

@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from gdp.control.replica import Entry, Key
+from gdp.control.rib_replication import Entry, Key
 from gdp.crypto import cbor
 from gdp.crypto.fields import Fields
 from gdp.errors import RemoteError

@@ -15,12 +15,11 @@ from typing import Final
 
 from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.neighbour import Neighbour
-from gdp.crypto.fields import check_sequence
 from gdp.crypto.identity import Identity
-from gdp.crypto.statements import Statement, StatementType
+from gdp.crypto.statements import Statement
 from gdp.errors import DropReason, StatementError
 from gdp.frame.kinds import Kind
-from gdp.limits import ADVERTISEMENTS_WINDOW, WITHDRAWAL_MAX_BYTES
+from gdp.limits import ADVERTISEMENTS_WINDOW
 from gdp.message.replay import ReplayWindow
 from gdp.names import ZERO, Name
 from gdp.sansio import Timestamps
@@ -37,6 +36,7 @@ from gdp.trust.advertisement import Advertisement, UnverifiedAdvertisement
 from gdp.trust.audit import Action
 from gdp.trust.right import HEARS, Right
 from gdp.trust.verifier import AdvertisementVerifier
+from gdp.trust.withdrawal import Withdrawal
 
 __all__ = ["AdvertisementHandler"]
 
@@ -121,8 +121,8 @@ class AdvertisementHandler:
             self._held.record_advertisement(advertisement, at)
             if is_first:
                 self._resolver.watch(advertisement.name, now.mono_s)
-            for place in cache.of(advertisement.name, now.mono_s):
-                self._locations.send_to_reader(at, advertisement.right, place, now.mono_s)
+            for location in cache.of(advertisement.name, now.mono_s):
+                self._locations.send_to_reader(at, advertisement.right, location, now.mono_s)
         is_alone = (
             self._rib_client.rib is None and advertisement.previous != ZERO
         )  # no RIB sends an AdvertiseAck to a node that has moved
@@ -202,17 +202,13 @@ class AdvertisementHandler:
         Raises:
             StatementError: it is not valid, or is older than the present advertisement.
         """
-        fields = statement.expect(StatementType.WITHDRAW)
+        withdrawal = Withdrawal.from_statement(statement, now.unix_s)
         if statement.signer != neighbour.name:
             raise StatementError(DropReason.UNKNOWN_SENDER, "a withdrawal that its maker did not bring")
-        if len(statement.wire) > WITHDRAWAL_MAX_BYTES:
-            raise StatementError(DropReason.TOO_BIG, "a withdrawal")
-        check_sequence(fields.uint("s"), now.unix_s)
         statement.verify(neighbour.key)
-        name = fields.name("n")
-        if fields.uint("s") <= self._sequence_of(name, neighbour):
+        name, right = withdrawal.name, withdrawal.right
+        if withdrawal.sequence <= self._sequence_of(name, neighbour):
             raise StatementError(DropReason.STALE, "a withdrawal of what was advertised again")
-        right = Right.from_wire(fields.text("right"))
         if right in HEARS and self._multicast.remove_reader(name, (neighbour.port, neighbour.mac)):
             self._resolver.unwatch(name)
         if right is not Right.READ and self._attached.remove(name, neighbour.name) is not None:

@@ -38,10 +38,10 @@ class Backups:
             return None
         if tree.is_backup or tree.upstream is None or tree.switch == self._me or tree.guide is not None:
             return None
-        way = self._paths.to_switch(tree.switch, tree.domain, tree.allowed)
-        if way is None or way.alternate is None:
+        path = self._paths.to_switch(tree.switch, tree.domain, tree.allowed)
+        if path is None or path.alternate is None:
             return None
-        neighbour = self._outbox.neighbour(way.alternate)
+        neighbour = self._outbox.neighbour(path.alternate)
         if neighbour is None or (at := (neighbour.port, neighbour.mac)) == tree.upstream or at in tree.branches:
             return None
         return at, neighbour.name
@@ -57,13 +57,13 @@ class Backups:
         for at, branch in tree.branches.items():
             if branch.backup_for is None or branch.is_active:
                 continue
-            way = self._paths.to_switch(branch.backup_for, self._own, frozenset({self._own}))
-            neighbour = None if way is None else self._outbox.neighbour(way.first)
-            if way is None or neighbour is None:
+            path = self._paths.to_switch(branch.backup_for, self._own, frozenset({self._own}))
+            neighbour = None if path is None else self._outbox.neighbour(path.first)
+            if path is None or neighbour is None:
                 continue
             protected = neighbour.port, neighbour.mac
             other = tree.branches.get(protected)
             if other is None or not other.is_active or other.mtu > branch.mtu:
                 continue
-            found[protected] = min(found.get(protected, (way.distance, at)), (way.distance, at))
+            found[protected] = min(found.get(protected, (path.distance, at)), (path.distance, at))
         return {protected: at for protected, (_, at) in found.items()}

@@ -25,8 +25,8 @@ from gdp.control.hello_port import HelloPort
 from gdp.control.join import Join
 from gdp.control.join_refresh import JoinRefresh
 from gdp.control.link_state import LinkState, Scope
-from gdp.control.neighbor_discovery import Change, HelloProtocol
 from gdp.control.neighbour import Neighbour, NeighbourState
+from gdp.control.neighbour_discovery import Change, HelloProtocol
 from gdp.control.revocation_sync import RevocationSync
 from gdp.control.settings import NodeSettings
 from gdp.control.waiting import Wait, WaitReason, port_waits, stranger_waits
@@ -572,8 +572,8 @@ class SwitchCore:
                 elif header.kind == Kind.RIB_ANSWER:
                     self.rib_client.receive(statement, now, is_fresh=opened.is_fresh)
                 else:
-                    place = self._evidence.from_relay(statement, now)
-                    self._locations.receive_relocation(place, statement.wire, now.mono_s)
+                    location = self._evidence.from_relay(statement, now)
+                    self._locations.receive_relocation(location, statement.wire, now.mono_s)
         elif header.kind == Kind.ECHO_REQUEST:
             back = header._replace(
                 kind=Kind.ECHO_REPLY, hops_left=HOPS_MAX, destination=header.source, source=self.name,
@@ -624,10 +624,10 @@ class SwitchCore:
     def _redirected(self, statement: Statement, now: Timestamps) -> None:
         """Handle a redirect: a neighbour that received our frames for a node reports where that node is now."""
         if statement.type is StatementType.RELAY:
-            place = self._evidence.from_relay(statement, now)
+            location = self._evidence.from_relay(statement, now)
         else:
-            place = self.rib_client.verify_answer(statement, now)
-        self._locations.receive_redirect(place, statement.wire, now.mono_s)
+            location = self.rib_client.verify_answer(statement, now)
+        self._locations.receive_redirect(location, statement.wire, now.mono_s)
 
     # -- trees
 

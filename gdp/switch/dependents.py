@@ -45,9 +45,9 @@ class JoinedBranch(NamedTuple):
 class Dependents(Holdings[AttachedAdvertisement | KnownLocation | JoinedBranch]):
     """The index of one switch."""
 
-    def __init__(self, attached: LocalAdvertisements, places: NameCache, multicast: MulticastTrees) -> None:
+    def __init__(self, attached: LocalAdvertisements, cache: NameCache, multicast: MulticastTrees) -> None:
         self._attached = attached
-        self._places = places
+        self._cache = cache
         self._multicast = multicast
         super().__init__(self._has)
 
@@ -55,10 +55,10 @@ class Dependents(Holdings[AttachedAdvertisement | KnownLocation | JoinedBranch])
         """Record the advertisement of an attached node."""
         self.record(AttachedAdvertisement(advertisement.name, advertisement.node, at), advertisement)
 
-    def note_place(self, place: Location) -> None:
+    def note_place(self, location: Location) -> None:
         """Record a location that a RIB or a switch proved."""
-        if place.proof is not None:
-            self.record(KnownLocation(place.name, place.advertiser), place.proof)
+        if location.proof is not None:
+            self.record(KnownLocation(location.name, location.advertiser), location.proof)
 
     def note_branch(self, topic: Name, publisher: Name, at: Downstream, evidence: Advertisement) -> None:
         """Record the reader's advertisement that a join from downstream carried."""
@@ -69,6 +69,6 @@ class Dependents(Holdings[AttachedAdvertisement | KnownLocation | JoinedBranch])
             is_reader = self._multicast.advertisement_of(holder.name, holder.at) is not None
             return is_reader or self._attached.get(holder.name, holder.node) is not None
         if isinstance(holder, KnownLocation):
-            return self._places.get(holder.name, holder.advertiser) is not None
+            return self._cache.get(holder.name, holder.advertiser) is not None
         tree = self._multicast.trees.get(holder.topic, holder.publisher)
         return tree is not None and holder.at in tree.branches

@@ -9,8 +9,8 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from gdp.control.diagnostics import Diagnostics, Question
-from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.neighbour import Neighbour
+from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.names import NAME_BYTES, ZERO, Name
 from gdp.sansio import Timestamps
 from gdp.switch.local_advertisements import LocalAdvertisements
@@ -87,7 +87,7 @@ class DiagnosticAnswers:
         """Return who advertises a name, for a node that is attached here; None: the RIB is being queried."""
         if not question.is_neighbour:
             return {"places": []}
-        places: dict[Name, Mapping[str, object]] = {
+        locations: dict[Name, Mapping[str, object]] = {
             each.advertisement.node: {
                 "node": each.advertisement.node,
                 "right": each.advertisement.right.value,
@@ -96,21 +96,21 @@ class DiagnosticAnswers:
             for each in self._attached.named(question.name)
         }
         if self._paths.is_switch(question.name) or self._paths.is_rib(question.name) or question.name == self._me:
-            places[question.name] = {"node": question.name, "right": Right.ATTACH.value}  # link states name it
+            locations[question.name] = {"node": question.name, "right": Right.ATTACH.value}  # link states name it
         found = self._resolver.find(question.name, now.mono_s)
         if found is None:
             self._wake()
-            if not places:
+            if not locations:
                 return None
-        for place in found or ():
+        for location in found or ():
             known = {
-                "node": place.advertiser,
-                "right": place.right.value,
-                "switch": place.switch,
-                "domain": place.domain,
+                "node": location.advertiser,
+                "right": location.right.value,
+                "switch": location.switch,
+                "domain": location.domain,
             }
-            places.setdefault(place.advertiser, known)
-        return {"places": [places[node] for node in sorted(places)]}
+            locations.setdefault(location.advertiser, known)
+        return {"places": [locations[node] for node in sorted(locations)]}
 
     def _link(self, port: int, mac: bytes) -> dict[str, object]:
         """Return the link to a neighbour: its device, and who is at the other end, as far as known."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from gdp.control.join import Join
 from gdp.control.query import Response
-from gdp.control.relay import Relay
+from gdp.control.relayed_statement import RelayedStatement
 from gdp.crypto.statements import Statement, StatementType, parse
 from gdp.errors import DropReason, StatementError
 from gdp.names import Name
@@ -33,24 +33,24 @@ class Evidence:
         self._policy = policy
         self._verifier = verifier
 
-    def from_answer(self, answer: Response, now: Timestamps) -> Location:
+    def from_answer(self, response: Response, now: Timestamps) -> Location:
         """Return the location in a response whose signature was verified."""
-        advertisement = self._verifier.verify(answer.advertisement, now.unix_s)
-        if advertisement.name != answer.name or advertisement.node != answer.advertiser:
+        advertisement = self._verifier.verify(response.advertisement, now.unix_s)
+        if advertisement.name != response.name or advertisement.node != response.advertiser:
             raise StatementError(DropReason.WRONG_NAME, "an answer about something else than its advertisement")
-        return _place(advertisement, answer.domain, frozenset(answer.transit), answer.lease_s, now)
+        return _place(advertisement, response.domain, frozenset(response.transit), response.lease_s, now)
 
     def from_relay(self, statement: Statement, now: Timestamps) -> Location:
         """Return the location that a switch reports of a node that is attached to it."""
-        relay = Relay.from_fields(statement.expect(StatementType.RELAY))
-        member = self._policy.verify_membership(relay.membership, now.unix_s)
+        relayed = RelayedStatement.from_fields(statement.expect(StatementType.RELAY))
+        member = self._policy.verify_membership(relayed.membership, now.unix_s)
         if member.name != statement.signer or not member.role.is_switch:
             raise StatementError(DropReason.BAD_CERTIFICATE, "a relay that is not from a switch")
         statement.verify(member.key)
-        advertisement = self._verifier.verify_statement(parse(relay.statement), now.unix_s)
+        advertisement = self._verifier.verify_statement(parse(relayed.statement), now.unix_s)
         if advertisement.switch != member.name:
             raise StatementError(DropReason.NOT_DELEGATED, "the RtCert names another switch")
-        return _place(advertisement, member.domain, frozenset(relay.transit), advertisement.lease_s, now)
+        return _place(advertisement, member.domain, frozenset(relayed.transit), advertisement.lease_s, now)
 
     def of_join(self, join: Join, now: Timestamps) -> Advertisement:
         """Return the reader's advertisement of a join with a lease; the publisher's proves where the join leads."""
@@ -65,12 +65,12 @@ class Evidence:
             raise StatementError(DropReason.NOT_DELEGATED, "two paths that reader and publisher do not both ask for")
         return reader
 
-    def still_holds(self, place: Location, now: Timestamps) -> bool:
+    def still_holds(self, location: Location, now: Timestamps) -> bool:
         """Return whether the proofs of a location are valid; a location without proofs is."""
-        if place.proof is None:
+        if location.proof is None:
             return True
         try:
-            self._verifier.recheck(place.proof, now.unix_s)
+            self._verifier.recheck(location.proof, now.unix_s)
         except StatementError:
             return False
         return True

@@ -17,8 +17,8 @@ from typing import Final
 from gdp.control.hello import DIGEST_BYTES, INCARNATION_BYTES
 from gdp.control.hello_port import HelloPort
 from gdp.control.link_state import Adjacency, AttachedRib, LinkState, Scope
-from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.neighbour import Neighbour
+from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.crypto.certificates import Role
 from gdp.crypto.fields import check_sequence
 from gdp.crypto.identity import Identity

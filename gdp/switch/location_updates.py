@@ -11,7 +11,7 @@ from typing import Final
 from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.neighbour import Neighbour
 from gdp.control.query import Query, Response
-from gdp.control.relay import relayed
+from gdp.control.relayed_statement import relayed
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType
 from gdp.errors import DropReason, StatementError
@@ -64,64 +64,64 @@ class LocationUpdates:
         """Return the known location of one advertiser of a name, or None."""
         return self._resolver.cache.get(name, advertiser)
 
-    def is_newer(self, place: Location) -> bool:
+    def is_newer(self, location: Location) -> bool:
         """Return whether a location is newer than what is known of its advertiser, here or elsewhere."""
-        attachment = self._attached.get(place.name, place.advertiser)
-        known = self.get(place.name, place.advertiser)
+        attachment = self._attached.get(location.name, location.advertiser)
+        known = self.get(location.name, location.advertiser)
         newest = max(
             -1 if attachment is None else attachment.advertisement.sequence, -1 if known is None else known.sequence
         )
-        return place.sequence > newest
+        return location.sequence > newest
 
-    def receive(self, place: Location, statement: bytes, now_s: float) -> None:
+    def receive(self, location: Location, statement: bytes, now_s: float) -> None:
         """Store where an advertiser is, and update everything that depends on it.
 
         Args:
             statement: the proof of it.
         """
-        is_ours = place.switch == self._identity.name
-        attachment = self._attached.get(place.name, place.advertiser)
-        was_here = self._relocations.was_here(place.name, place.advertiser, now_s)
-        if attachment is not None and attachment.advertisement.sequence < place.sequence and not is_ours:
-            self._attached.remove(place.name, place.advertiser)  # it has moved to another switch
+        is_ours = location.switch == self._identity.name
+        attachment = self._attached.get(location.name, location.advertiser)
+        was_here = self._relocations.was_here(location.name, location.advertiser, now_s)
+        if attachment is not None and attachment.advertisement.sequence < location.sequence and not is_ours:
+            self._attached.remove(location.name, location.advertiser)  # it has moved to another switch
             self._relocations.departed(attachment.advertisement, now_s)
-            self._unicast.remove(place.name)
+            self._unicast.remove(location.name)
             was_here = True
-        before = self.get(place.name, place.advertiser)
-        if before is not None and before.sequence > place.sequence:
+        before = self.get(location.name, location.advertiser)
+        if before is not None and before.sequence > location.sequence:
             # the sender's information is older
-            place = replace(before, expires_s=max(before.expires_s, place.expires_s))
-        self._held.note_place(place)
-        self._resolver.receive_location(place, now_s, is_ours=is_ours, has_left=is_ours and attachment is None)
-        if before is None or (before.switch, before.domain) != (place.switch, place.domain):
-            self._unicast.remove(place.name)
-            self._unicast.remove(place.advertiser)
-            self._multicast.publisher_moved(place, now_s)
+            location = replace(before, expires_s=max(before.expires_s, location.expires_s))
+        self._held.note_place(location)
+        self._resolver.receive_location(location, now_s, is_ours=is_ours, has_left=is_ours and attachment is None)
+        if before is None or (before.switch, before.domain) != (location.switch, location.domain):
+            self._unicast.remove(location.name)
+            self._unicast.remove(location.advertiser)
+            self._multicast.publisher_moved(location, now_s)
             if was_here and not is_ours:
-                self._relocations.moved(place, statement, now_s)
-        self._multicast.publisher_found(place, now_s)
-        if before is None or before.advertisement != place.advertisement:
-            for at, right in self._multicast.readers(place.name):
-                self.send_to_reader(at, right, place, now_s)
-        for name in (place.name, place.advertiser):
+                self._relocations.moved(location, statement, now_s)
+        self._multicast.publisher_found(location, now_s)
+        if before is None or before.advertisement != location.advertisement:
+            for at, right in self._multicast.readers(location.name):
+                self.send_to_reader(at, right, location, now_s)
+        for name in (location.name, location.advertiser):
             self._unicast.release(name, now_s)
 
-    def receive_relocation(self, place: Location, statement: bytes, now_s: float) -> None:
+    def receive_relocation(self, location: Location, statement: bytes, now_s: float) -> None:
         """Handle the new location of a node that was attached here; send its new switch the names that it reads."""
-        if place.right in HEARS and self._multicast.reader_moved(place):
-            self._resolver.unwatch(place.name)
-        self.acknowledge_relocation(place, now_s)
-        if place.right is not Right.READ and self.is_newer(place):
-            self.receive(place, statement, now_s)
+        if location.right in HEARS and self._multicast.reader_moved(location):
+            self._resolver.unwatch(location.name)
+        self.acknowledge_relocation(location, now_s)
+        if location.right is not Right.READ and self.is_newer(location):
+            self.receive(location, statement, now_s)
 
-    def receive_redirect(self, place: Location, statement: bytes, now_s: float) -> None:
+    def receive_redirect(self, location: Location, statement: bytes, now_s: float) -> None:
         """Handle the location of a node to which we sent frames by a neighbour that no longer has it."""
-        if self.is_newer(place):
-            is_known = self.get(place.name, place.advertiser) is not None
-            has_moved = is_known or self._multicast.trees.get(place.name, place.advertiser) is not None
-            self.receive(place, statement, now_s)
+        if self.is_newer(location):
+            is_known = self.get(location.name, location.advertiser) is not None
+            has_moved = is_known or self._multicast.trees.get(location.name, location.advertiser) is not None
+            self.receive(location, statement, now_s)
             if has_moved:
-                self._relocations.moved(place, statement, now_s)
+                self._relocations.moved(location, statement, now_s)
 
     def answer_query(self, neighbour: Neighbour, statement: Statement, now_s: float) -> None:
         """Reply to a neighbour that receives our frames for a node with that node's location.
@@ -136,40 +136,40 @@ class LocationUpdates:
         for known in self.proofs_of(query.name, now_s):
             self._outbox.send_to_neighbour(neighbour, Kind.REDIRECT, known)
 
-    def receive_removal(self, answer: Response, now_s: float) -> None:
+    def receive_removal(self, response: Response, now_s: float) -> None:
         """Remove an advertiser that has withdrawn.
 
         Raises:
             StatementError: STALE, the known advertisement is newer.
         """
-        known = self.get(answer.name, answer.advertiser)
-        if known is not None and known.sequence > answer.sequence:
+        known = self.get(response.name, response.advertiser)
+        if known is not None and known.sequence > response.sequence:
             raise StatementError(DropReason.STALE, "a removal of an earlier advertisement")
-        self._resolver.receive_removal(answer.name, answer.advertiser, now_s)
-        self._multicast.publisher_gone(answer.name, answer.advertiser)
-        self._unicast.remove(answer.name)
-        wire = answer.to_wire(self._identity.name, self._identity.key, self._identity.membership)
-        for at, _ in self._multicast.readers(answer.name):
+        self._resolver.receive_removal(response.name, response.advertiser, now_s)
+        self._multicast.publisher_gone(response.name, response.advertiser)
+        self._unicast.remove(response.name)
+        wire = response.to_wire(self._identity.name, self._identity.key, self._identity.membership)
+        for at, _ in self._multicast.readers(response.name):
             self._outbox.say_at(*at, Kind.ADVERTISE_ACK, wire)
 
     def expire(self, now_s: float) -> None:
         """Remove locations that no RIB has confirmed for a lease, and frames that waited too long."""
-        for place in self._resolver.expire(now_s):
-            self._multicast.publisher_gone(place.name, place.advertiser)
+        for location in self._resolver.expire(now_s):
+            self._multicast.publisher_gone(location.name, location.advertiser)
 
-    def send_to_reader(self, at: Downstream, right: Right, place: Location, now_s: float) -> None:
+    def send_to_reader(self, at: Downstream, right: Right, location: Location, now_s: float) -> None:
         """Send an advertiser's advertisement to an attached node that reads it by ``right``; the node verifies it."""
-        if HEARS[right] is place.right:
-            self._outbox.say_at(*at, Kind.ADVERTISE_ACK, self._as_answer(place, now_s))
+        if HEARS[right] is location.right:
+            self._outbox.say_at(*at, Kind.ADVERTISE_ACK, self._as_answer(location, now_s))
 
     def acknowledge_relocation(self, moved: Location, now_s: float) -> None:
         """Send a node's new switch an acknowledgement, and the locations of the advertisers that the node reads."""
         identity = self._identity
         ack = AdvertiseAck(moved.name, moved.advertiser, None, moved.sequence)
         statements = [ack.to_wire(identity.name, identity.key, identity.membership)]
-        for place in self._resolver.cache.of(moved.name, now_s):
-            if HEARS.get(moved.right) is place.right:
-                statements.append(self._as_answer(place, now_s))
+        for location in self._resolver.cache.of(moved.name, now_s):
+            if HEARS.get(moved.right) is location.right:
+                statements.append(self._as_answer(location, now_s))
         for statement in statements:
             frames = self._outbox.remote_frames(Kind.RIB_ANSWER, statement, moved.switch)
             self._unicast.send(frames, moved.switch, identity.name, now_s)
@@ -181,17 +181,17 @@ class LocationUpdates:
             return [relayed(attachment.advertisement.wire, self._identity, self._policy.transit)]
         cache = self._resolver.cache
         node = cache.of_node(name, now_s)
-        places = cache.of(name, now_s) + ([] if node is None else [node])
-        return [self._as_answer(place, now_s) for place in places[:PROOFS_MAX]]
+        locations = cache.of(name, now_s) + ([] if node is None else [node])
+        return [self._as_answer(location, now_s) for location in locations[:PROOFS_MAX]]
 
-    def _as_answer(self, place: Location, now_s: float) -> bytes:
-        lease_s = max(place.expires_s - now_s, 0.0)
-        answer = Response(
-            name=place.name,
-            advertiser=place.advertiser,
-            advertisement=place.advertisement,
-            domain=place.domain,
-            transit=tuple(sorted(place.transit)),
+    def _as_answer(self, location: Location, now_s: float) -> bytes:
+        lease_s = max(location.expires_s - now_s, 0.0)
+        response = Response(
+            name=location.name,
+            advertiser=location.advertiser,
+            advertisement=location.advertisement,
+            domain=location.domain,
+            transit=tuple(sorted(location.transit)),
             lease_s=lease_s,
         )
-        return answer.to_wire(self._identity.name, self._identity.key, self._identity.membership)
+        return response.to_wire(self._identity.name, self._identity.key, self._identity.membership)

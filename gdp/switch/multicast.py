@@ -130,7 +130,7 @@ class MulticastTrees:
         reader = self._readers.get(topic, {}).get(at)
         return None if reader is None else reader.advertisement
 
-    def add_reader(self, advertisement: Advertisement, at: Downstream, places: list[Location], now_s: float) -> bool:
+    def add_reader(self, advertisement: Advertisement, at: Downstream, locations: list[Location], now_s: float) -> bool:
         """Add the verified advertisement of an attached reader; return whether it is the name's first here.
 
         Raises:
@@ -142,8 +142,8 @@ class MulticastTrees:
         readers = self._readers.setdefault(advertisement.name, {})
         readers[at] = _Reader(advertisement, now_s + advertisement.lease_s)
         self._readers_end_s = min(self._readers_end_s, now_s + advertisement.lease_s)
-        for place in places:
-            self.publisher_found(place, now_s)
+        for location in locations:
+            self.publisher_found(location, now_s)
         return is_first
 
     def remove_reader(self, topic: Name, at: Downstream) -> bool:
@@ -158,21 +158,24 @@ class MulticastTrees:
         self._readers.pop(topic, None)
         return True
 
-    def publisher_found(self, place: Location, now_s: float) -> None:
+    def publisher_found(self, location: Location, now_s: float) -> None:
         """Join a publisher of a topic that has readers here, or follow it."""
-        for at, reader in self._readers.get(place.name, {}).items():
-            if reader.advertisement.node == place.advertiser or HEARS[reader.advertisement.right] is not place.right:
+        for at, reader in self._readers.get(location.name, {}).items():
+            if (
+                reader.advertisement.node == location.advertiser
+                or HEARS[reader.advertisement.right] is not location.right
+            ):
                 continue  # a publisher does not receive its own messages
-            allowed = (self._policy.transit & place.transit) | {self._policy.own, place.domain}
-            tree = self._tree(place.name, place.advertiser, allowed)
-            if place.sequence >= tree.version:
-                self._place_at(tree, place.switch, place.domain, place.sequence, place.advertisement)
+            allowed = (self._policy.transit & location.transit) | {self._policy.own, location.domain}
+            tree = self._tree(location.name, location.advertiser, allowed)
+            if location.sequence >= tree.version:
+                self._place_at(tree, location.switch, location.domain, location.sequence, location.advertisement)
                 tree.allowed = allowed
             branch = Branch(
                 expires_s=reader.expires_s,
                 mtu=self._outbox.mtu_of(at[0]),
                 evidence=reader.advertisement.wire,
-                wants_pair=reader.advertisement.paths > 1 and place.proof is not None and place.proof.paths > 1,
+                wants_pair=reader.advertisement.paths > 1 and location.proof is not None and location.proof.paths > 1,
             )
             if not self._put_branch(tree, at, branch):
                 self.drops[DropReason.QUOTA] += 1
@@ -189,11 +192,11 @@ class MulticastTrees:
             tree.renew_at_s = now_s
             self._route_pair(tree, now_s)
 
-    def publisher_moved(self, place: Location, now_s: float) -> None:
+    def publisher_moved(self, location: Location, now_s: float) -> None:
         """Reroute a publisher's tree to its new location, if it passes here and its readers allow the path there."""
-        for tree in self.trees.both(place.name, place.advertiser):
-            if place.sequence >= tree.version and place.domain in tree.allowed:
-                self._place_at(tree, place.switch, place.domain, place.sequence, place.advertisement)
+        for tree in self.trees.both(location.name, location.advertiser):
+            if location.sequence >= tree.version and location.domain in tree.allowed:
+                self._place_at(tree, location.switch, location.domain, location.sequence, location.advertisement)
                 self._route_pair(tree, now_s)
                 if tree.branches and not self._follow(tree, now_s):
                     self._restate(tree)
@@ -210,11 +213,11 @@ class MulticastTrees:
             for at in self._readers.get(topic, {}):
                 self._cut(tree, at)
 
-    def reader_moved(self, place: Location) -> bool:
+    def reader_moved(self, location: Location) -> bool:
         """Remove a reader that is attached elsewhere now; return whether the topic has none left here."""
-        for at, reader in list(self._readers.get(place.name, {}).items()):
-            if reader.advertisement.node == place.advertiser and reader.advertisement.sequence < place.sequence:
-                return self.remove_reader(place.name, at)
+        for at, reader in list(self._readers.get(location.name, {}).items()):
+            if reader.advertisement.node == location.advertiser and reader.advertisement.sequence < location.sequence:
+                return self.remove_reader(location.name, at)
         return False
 
     def join(self, join: Join, neighbour: Neighbour, now_s: float) -> bool:
@@ -585,8 +588,8 @@ class MulticastTrees:
                 return neighbour.port, neighbour.mac, neighbour.name
             if tree.path == 2:
                 return None  # the reader's switch chooses another route; the first tree carries every message
-        way = self._paths.to_switch(tree.switch, tree.domain, tree.allowed)
-        neighbour = None if way is None else self._outbox.neighbour(way.first)
+        path = self._paths.to_switch(tree.switch, tree.domain, tree.allowed)
+        neighbour = None if path is None else self._outbox.neighbour(path.first)
         return None if neighbour is None else (neighbour.port, neighbour.mac, neighbour.name)
 
     def _follow(self, tree: Tree, now_s: float) -> bool:

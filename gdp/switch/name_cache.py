@@ -52,55 +52,55 @@ class NameCache:
     def __init__(self, lease_s: float = ADVERTISEMENT_LEASE_S) -> None:
         self._lease_s = lease_s
         self._confirm_s = lease_s / 2
-        self._places: dict[Name, dict[Name, Location]] = {}
+        self._locations: dict[Name, dict[Name, Location]] = {}
         self._names_of: dict[Name, set[Name]] = {}  # what each advertiser advertises, of ``_places``
         self._negative: dict[Name, float] = {}
         self._expire_at_s = float("inf")  # no lease ends before
         self.serves_stale = False
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self._locations)
 
     def of(self, name: Name, now_s: float) -> list[Location]:
         """Return the known locations of a name."""
-        known = self._places.get(name)
-        return [] if known is None else [place for place in known.values() if self._ends_s(place) > now_s]
+        known = self._locations.get(name)
+        return [] if known is None else [location for location in known.values() if self._ends_s(location) > now_s]
 
     def get(self, name: Name, advertiser: Name) -> Location | None:
         """Return the location of one advertiser of a name, or None."""
-        return self._places.get(name, {}).get(advertiser)
+        return self._locations.get(name, {}).get(advertiser)
 
     def of_node(self, node: Name, now_s: float) -> Location | None:
         """Return the newest location of any name that a node advertises, where the node is attached, or None."""
-        known = (self._places[name][node] for name in self._names_of.get(node, ()))
-        held = [place for place in known if self._ends_s(place) > now_s]
-        return max(held, key=lambda place: place.sequence, default=None)
+        known = (self._locations[name][node] for name in self._names_of.get(node, ()))
+        held = [location for location in known if self._ends_s(location) > now_s]
+        return max(held, key=lambda location: location.sequence, default=None)
 
     def all(self) -> list[Location]:
         """Return every location."""
-        return [place for known in self._places.values() for place in known.values()]
+        return [location for known in self._locations.values() for location in known.values()]
 
     def is_negative(self, name: Name, now_s: float) -> bool:
         """Return whether the RIB recently sent a negative response for the name."""
         return self._negative.get(name, 0.0) > now_s
 
-    def put(self, place: Location) -> Location | None:
+    def put(self, location: Location) -> Location | None:
         """Store a location; return what was known of this advertiser before."""
-        self._negative.pop(place.name, None)
-        known = self._places.setdefault(place.name, {})
-        before = known.get(place.advertiser)
-        known[place.advertiser] = place
-        self._names_of.setdefault(place.advertiser, set()).add(place.name)
-        self._expire_at_s = min(self._expire_at_s, self._ends_s(place))
+        self._negative.pop(location.name, None)
+        known = self._locations.setdefault(location.name, {})
+        before = known.get(location.advertiser)
+        known[location.advertiser] = location
+        self._names_of.setdefault(location.advertiser, set()).add(location.name)
+        self._expire_at_s = min(self._expire_at_s, self._ends_s(location))
         return before
 
     def remove(self, name: Name, advertiser: Name) -> None:
         """Remove one advertiser of a name; nothing happens where it is not known."""
-        known = self._places.get(name, {})
+        known = self._locations.get(name, {})
         if known.pop(advertiser, None) is None:
             return
         if not known:
-            del self._places[name]
+            del self._locations[name]
         names = self._names_of[advertiser]
         names.discard(name)
         if not names:
@@ -108,16 +108,16 @@ class NameCache:
 
     def put_negative(self, name: Name, now_s: float) -> None:
         """Replace the entries of a name by a negative entry, for ``NEGATIVE_LEASE_S``."""
-        for advertiser in list(self._places.get(name, ())):
+        for advertiser in list(self._locations.get(name, ())):
             self.remove(name, advertiser)
         self._negative[name] = now_s + NEGATIVE_LEASE_S
         self._expire_at_s = min(self._expire_at_s, now_s + NEGATIVE_LEASE_S)
 
     def extend(self, name: Name, now_s: float) -> None:
         """Give the entries of a name another lease, up to the end of their proofs: the RIB does not know the name."""
-        for advertiser, place in self._places.get(name, {}).items():
-            until_s = max(place.expires_s, min(now_s + self._lease_s, place.stale_until_s))
-            self._places[name][advertiser] = replace(place, expires_s=until_s)
+        for advertiser, location in self._locations.get(name, {}).items():
+            until_s = max(location.expires_s, min(now_s + self._lease_s, location.stale_until_s))
+            self._locations[name][advertiser] = replace(location, expires_s=until_s)
 
     def serve_stale(self, stale: bool, now_s: float) -> None:
         """Begin or end to serve entries beyond their leases.
@@ -128,19 +128,19 @@ class NameCache:
             return
         self.serves_stale = stale
         if not stale:
-            for known in self._places.values():
-                for advertiser, place in known.items():
-                    if place.expires_s < now_s + self._confirm_s < place.stale_until_s:
-                        known[advertiser] = replace(place, expires_s=now_s + self._confirm_s)
+            for known in self._locations.values():
+                for advertiser, location in known.items():
+                    if location.expires_s < now_s + self._confirm_s < location.stale_until_s:
+                        known[advertiser] = replace(location, expires_s=now_s + self._confirm_s)
         self._look_ahead()
 
     def expire(self, now_s: float) -> list[Location]:
         """Remove entries whose leases have ended; return the locations among them."""
         if now_s < self._expire_at_s:
             return []
-        gone = [place for place in self.all() if self._ends_s(place) <= now_s]
-        for place in gone:
-            self.remove(place.name, place.advertiser)
+        gone = [location for location in self.all() if self._ends_s(location) <= now_s]
+        for location in gone:
+            self.remove(location.name, location.advertiser)
         for name in [name for name, until_s in self._negative.items() if until_s <= now_s]:
             del self._negative[name]
         self._look_ahead()
@@ -151,8 +151,8 @@ class NameCache:
         return None if self._expire_at_s == float("inf") else self._expire_at_s
 
     def _look_ahead(self) -> None:
-        ends = [self._ends_s(place) for known in self._places.values() for place in known.values()]
+        ends = [self._ends_s(location) for known in self._locations.values() for location in known.values()]
         self._expire_at_s = min([*ends, *self._negative.values()], default=float("inf"))
 
-    def _ends_s(self, place: Location) -> float:
-        return max(place.expires_s, place.stale_until_s) if self.serves_stale else place.expires_s
+    def _ends_s(self, location: Location) -> float:
+        return max(location.expires_s, location.stale_until_s) if self.serves_stale else location.expires_s

@@ -25,17 +25,17 @@ def location_facts(
 ) -> tuple[LocationFact, ...]:
     """Return the known advertisers of a name, and whether a path that the policies allow leads to their switches."""
     found = []
-    for place in cache.of(name, now_s)[:_LOCATIONS_MAX]:
-        allowed = (policy.transit & place.transit) | {policy.own, place.domain}
-        is_here = place.switch == me
+    for location in cache.of(name, now_s)[:_LOCATIONS_MAX]:
+        allowed = (policy.transit & location.transit) | {policy.own, location.domain}
+        is_here = location.switch == me
         found.append(
             LocationFact(
-                advertiser=place.advertiser.to_text(),
-                right=place.right.value,
-                switch=place.switch.to_text(),
-                domain=place.domain.to_text(),
-                is_reachable=is_here or paths.to_switch(place.switch, place.domain, allowed) is not None,
-                is_trusted=policy.trusts(place.domain),
+                advertiser=location.advertiser.to_text(),
+                right=location.right.value,
+                switch=location.switch.to_text(),
+                domain=location.domain.to_text(),
+                is_reachable=is_here or paths.to_switch(location.switch, location.domain, allowed) is not None,
+                is_trusted=policy.trusts(location.domain),
             )
         )
     return tuple(found)

@@ -102,10 +102,10 @@ class NameResolver:
             owner: as ``owner_of``, whose query rate applies; empty: this switch itself, without a limit.
         """
         known = self.cache.of(name, now_s)
-        accepting = [place for place in known if place.right in _ACCEPTS_FRAMES]
+        accepting = [location for location in known if location.right in _ACCEPTS_FRAMES]
         if not known and (node := self.cache.of_node(name, now_s)) is not None:
             accepting = [node]
-        elsewhere = [place for place in accepting if place.switch != self._me]
+        elsewhere = [location for location in accepting if location.switch != self._me]
         if elsewhere:
             self._queries.use(name, now_s)
             return Resolution(elsewhere)
@@ -174,7 +174,9 @@ class NameResolver:
 
     # -- receive a response
 
-    def receive_location(self, place: Location, now_s: float, *, is_ours: bool = False, has_left: bool = False) -> None:
+    def receive_location(
+        self, location: Location, now_s: float, *, is_ours: bool = False, has_left: bool = False
+    ) -> None:
         """Store a verified location.
 
         Args:
@@ -183,10 +185,10 @@ class NameResolver:
             has_left: its advertiser was attached here and is not any more. The RIB does not know that yet, so the query
                 stays open.
         """
-        before = self.cache.put(place)
-        is_repeated = before is not None and before.advertisement == place.advertisement
+        before = self.cache.put(location)
+        is_repeated = before is not None and before.advertisement == location.advertisement
         if not has_left and (not is_ours or is_repeated):
-            self._queries.receive_answer(place.name, now_s)
+            self._queries.receive_answer(location.name, now_s)
 
     def receive_removal(self, name: Name, advertiser: Name, now_s: float) -> None:
         """Remove one advertiser of a name: it has withdrawn, or its proofs are no longer valid."""

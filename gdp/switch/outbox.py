@@ -6,8 +6,8 @@ Sans-I/O.
 from __future__ import annotations
 
 from gdp.control.fragments import ControlFragmenter
-from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.neighbour import Neighbour
+from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.names import Name
 from gdp.sansio import OutgoingFrames
 from gdp.switch.table import Hop, ProtectedHop

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from gdp.control.neighbor_discovery import HelloProtocol
+from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.crypto.certificates import Role
 from gdp.names import Name
 from gdp.switch.flooding import Flooding

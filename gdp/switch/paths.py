@@ -90,7 +90,7 @@ class Paths:
             self._alternates[key] = self._alternate(way, switch, domain, allowed)
         return way._replace(alternate=self._alternates[key])
 
-    def _alternate(self, way: Path, switch: Name, domain: Name, allowed: frozenset[Name]) -> Name | None:
+    def _alternate(self, path: Path, switch: Name, domain: Name, allowed: frozenset[Name]) -> Name | None:
         """Return the best neighbour whose own shortest path does not lead back here: RFC 5286, inequality 1.
 
         Only a neighbour of our domain qualifies, because the path choice of other domains is unknown. A leaf is none.
@@ -100,7 +100,7 @@ class Paths:
             return None
         found: list[tuple[int, Name]] = []
         for neighbour, edge in self._graph.adj[self._me].items():
-            if neighbour == way.first or self._domains.get(neighbour) != self._domain:
+            if neighbour == path.first or self._domains.get(neighbour) != self._domain:
                 continue
             if neighbour in self._leaves and neighbour != switch:
                 continue
@@ -108,7 +108,7 @@ class Paths:
             back = self._distance(neighbour, self._me, self._domain, allowed)
             if onwards is None or back is None:
                 continue
-            if self._me in self._leaves or onwards < back + way.distance:
+            if self._me in self._leaves or onwards < back + path.distance:
                 found.append((edge["weight"] + onwards, neighbour))
         return min(found, default=(0, None))[1]
 

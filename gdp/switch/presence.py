@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Final
 
-from gdp.control.neighbor_discovery import HelloProtocol
+from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.control.presence import Presence
 from gdp.crypto.identity import Identity
 from gdp.frame.kinds import Kind

@@ -23,7 +23,7 @@ from typing import Final
 
 from gdp.control.neighbour import Neighbour
 from gdp.control.query import Query
-from gdp.control.relay import relayed
+from gdp.control.relayed_statement import relayed
 from gdp.crypto.identity import Identity
 from gdp.frame.kinds import Kind
 from gdp.names import ZERO, Name
@@ -114,14 +114,14 @@ class Relocations:
         """Return whether a switch was recently notified as a former one, so that its response counts."""
         return self._former.get(switch, 0.0) > now_s
 
-    def moved(self, place: Location, statement: bytes, now_s: float) -> None:
+    def moved(self, location: Location, statement: bytes, now_s: float) -> None:
         """Record the new location of a node; redirect the switches that take its topic from here."""
         until_s = now_s + GRACE_S
-        _remember(self._moved, (place.name, place.advertiser), _Moved(statement, until_s))
+        _remember(self._moved, (location.name, location.advertiser), _Moved(statement, until_s))
         if len(self._moved_names) > 2 * _REMEMBERED_MAX:
             self._moved_names = {name: end_s for name, end_s in self._moved_names.items() if end_s > now_s}
-        self._moved_names[place.name] = until_s
-        for at in self._multicast.below(place.name, place.advertiser):
+        self._moved_names[location.name] = until_s
+        for at in self._multicast.below(location.name, location.advertiser):
             self._outbox.say_at(*at, Kind.REDIRECT, statement)
 
     def frame_came(self, destination: Name, neighbour: Neighbour, now_s: float) -> None:

@@ -17,8 +17,8 @@ from __future__ import annotations
 import heapq
 from typing import Final
 
-from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.neighbour import Neighbour
+from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.control.revocation_sync import RevocationSync
 from gdp.crypto.statements import Statement, parse
 from gdp.errors import StatementError

@@ -25,7 +25,7 @@ from gdp.control.endpoint_query import EndpointResponse
 from gdp.control.link_state import AttachedRib
 from gdp.control.presence import Presence
 from gdp.control.query import Query, Response
-from gdp.control.relay import Relay, relayed
+from gdp.control.relayed_statement import RelayedStatement, relayed
 from gdp.crypto.certificates import Membership, Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import Statement, StatementType, parse
@@ -243,15 +243,15 @@ class RibClient:
             self._endpoints.receive(EndpointResponse.from_fields(fields), now)
             return
         statement.expect(StatementType.ANSWER)
-        answer = Response.from_fields(fields)
-        if answer.is_negative:
-            self._receive_negative(answer.name, member, now.mono_s)
-        elif answer.is_unknown:
-            self._receive_unknown(answer.name, member.name, now.mono_s)
-        elif not answer.advertisement:
-            self._locations.receive_removal(answer, now.mono_s)
+        response = Response.from_fields(fields)
+        if response.is_negative:
+            self._receive_negative(response.name, member, now.mono_s)
+        elif response.is_unknown:
+            self._receive_unknown(response.name, member.name, now.mono_s)
+        elif not response.advertisement:
+            self._locations.receive_removal(response, now.mono_s)
         else:
-            self._found(answer, member, statement.wire, now)
+            self._found(response, member, statement.wire, now)
 
     def revocation_in(self, statement: Statement, now: Timestamps) -> tuple[Statement, Name]:
         """Return the revocation, to be verified, that a RIB forwarded, and the RIB.
@@ -259,7 +259,7 @@ class RibClient:
         Raises:
             StatementError: the sender is no RIB that received a query, or the statement is another one.
         """
-        relay = Relay.from_fields(statement.expect(StatementType.RELAY))
+        relay = RelayedStatement.from_fields(statement.expect(StatementType.RELAY))
         member = self._policy.verify_membership(relay.membership, now.unix_s)
         if member.role is not Role.RIB:
             raise StatementError(DropReason.WRONG_DOMAIN, "a revocation that no RIB passed on")
@@ -282,10 +282,10 @@ class RibClient:
         if member.name != statement.signer or not (member.role.is_switch or member.role is Role.RIB):
             raise StatementError(DropReason.BAD_CERTIFICATE, "an answer from a node without the right to give it")
         statement.verify(member.key)
-        answer = Response.from_fields(fields)
-        if not answer.advertisement:
+        response = Response.from_fields(fields)
+        if not response.advertisement:
             raise StatementError(DropReason.MALFORMED, "a redirect to nowhere")
-        return self._evidence.from_answer(answer, now)
+        return self._evidence.from_answer(response, now)
 
     def _was_asked(self, member: Membership, now_s: float) -> bool:
         if member.role is Role.RIB:
@@ -298,12 +298,12 @@ class RibClient:
         if rib == self.rib:
             self._resolver.serve_stale(now_s, stale=False)
 
-    def _found(self, answer: Response, member: Membership, wire: bytes, now: Timestamps) -> None:
+    def _found(self, response: Response, member: Membership, wire: bytes, now: Timestamps) -> None:
         try:
-            place = self._evidence.from_answer(answer, now)
+            place = self._evidence.from_answer(response, now)
         except StatementError:
             # it is of no use here, but still counts as a response
-            self._receive_negative(answer.name, member, now.mono_s)
+            self._receive_negative(response.name, member, now.mono_s)
             raise
         self._locations.receive(replace(place, source=self._source(member.name)), wire, now.mono_s)
 

@@ -273,26 +273,26 @@ class Unicast:
             self._install_way(destination, source_key, best[1], source, self._until_s(best[0], now_s), now_s)
 
     @staticmethod
-    def _until_s(place: Location, now_s: float) -> float:
+    def _until_s(location: Location, now_s: float) -> float:
         """Return how long an entry stands for a location; a stale one is checked again soon."""
-        return max(place.expires_s, now_s + STALE_S)
+        return max(location.expires_s, now_s + STALE_S)
 
     def _install_way(
         self,
         destination: Name,
         source_key: bytes,
-        way: Path | None,
+        path: Path | None,
         source: Name,
         expires_s: float,
         now_s: float,
         otherwise: DropReason = DropReason.NO_ROUTE,
     ) -> None:
         """Install a path; where there is none, a negative entry with the reason ``otherwise``."""
-        neighbour = None if way is None else self._outbox.neighbour(way.first)
+        neighbour = None if path is None else self._outbox.neighbour(path.first)
         if neighbour is None:
             self._install_negative(destination, source, otherwise, now_s)
         else:
-            hop = self._outbox.protected_hop(neighbour, None if way is None else way.alternate)
+            hop = self._outbox.protected_hop(neighbour, None if path is None else path.alternate)
             self._install(destination, source_key, hop, source, expires_s)
 
     def _install(

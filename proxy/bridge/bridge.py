@@ -19,9 +19,10 @@ from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.trust.right import Right
-from proxy.bridge.bridge_election import SIGN, BridgeElection, presence_of, sign
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.desired_flows import ConfigProblem, DeniedName, FlowSpec, denied, exposed, imported
+from proxy.bridge.core.bridge_election import SIGN, BridgeElection, presence_of, sign
+from proxy.bridge.core.desired_flows import ConfigProblem, DeniedName, FlowSpec, denied, exposed, imported
+from proxy.bridge.core.topic_stats import TopicStats
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.exposed_service import ExposedService
 from proxy.bridge.exposed_topic import ExposedTopic
@@ -32,10 +33,9 @@ from proxy.bridge.liveliness import NameLiveliness
 from proxy.bridge.readiness import ReadinessProbe
 from proxy.bridge.sent_stats import SentStats
 from proxy.bridge.status_topic import StatusTopic, open_status_topics
-from proxy.bridge.topic_stats import TopicStats
 from proxy.config.rule import Rule
 from proxy.config.status_topic import StatusTopicConfig
-from proxy.endpoints.endpoint import Endpoint, EndpointError, Event, Graph, GraphEntity, Role, proxy_node_name
+from proxy.endpoints.core.endpoint import Endpoint, EndpointError, Event, Graph, GraphEntity, Role, proxy_node_name
 
 __all__ = ["Bridge", "BridgeRules", "FlowChange"]
 
@@ -80,7 +80,7 @@ class _Finishing(NamedTuple):
 
 
 class _Key(NamedTuple):
-    seat: int
+    dispatcher: int
     is_exposed: bool
     kind: str
     local: str
@@ -124,7 +124,7 @@ class Bridge:
 
     def __init__(
         self,
-        site: BridgeContext,
+        context: BridgeContext,
         config: BridgeRules,
         endpoints: Sequence[Endpoint],
         held: DelegationStore,
@@ -132,11 +132,11 @@ class Bridge:
         look_s: float = 0.0,
         status_topic: StatusTopicConfig | None = None,
     ) -> None:
-        self._site = site
+        self._context = context
         self._config = config
         self._held = held
-        self._me = proxy_node_name(site.member.name.to_text())
-        self._seats = [EndpointDispatcher(endpoint) for endpoint in endpoints]
+        self._me = proxy_node_name(context.member.name.to_text())
+        self._dispatchers = [EndpointDispatcher(endpoint) for endpoint in endpoints]
         self._flows: dict[_Key, tuple[FlowSpec, Flow]] = {}
         self._inbound: dict[Name, Flow] = {}  # the flow that receives the overlay's messages of a name
         self._finishing: dict[Name, _Finishing] = {}
@@ -155,15 +155,17 @@ class Bridge:
         self._tick_at_s = 0.0
         self._now_s = 0.0
         self.unknown_names = 0
-        live = [seat for seat in self._seats if seat.endpoint.is_live and status_topic is not None]
+        live = [
+            dispatcher for dispatcher in self._dispatchers if dispatcher.endpoint.is_live and status_topic is not None
+        ]
         self._status_topics: list[StatusTopic] = [] if status_topic is None else open_status_topics(live, status_topic)
-        for seat in self._seats:
-            if not seat.endpoint.is_live:
+        for dispatcher in self._dispatchers:
+            if not dispatcher.endpoint.is_live:
                 continue  # no other proxy takes part in a recording
             try:
-                seat.advertise(_Signboard(), sign(SIGN, seat.endpoint.ros))
+                dispatcher.advertise(_Signboard(), sign(SIGN, dispatcher.endpoint.ros))
             except LocalError as error:
-                log.warning("no sign for other proxies endpoint=%s reason=%s", seat.endpoint.label, error)
+                log.warning("no sign for other proxies endpoint=%s reason=%s", dispatcher.endpoint.label, error)
 
     @property
     def flows(self) -> list[tuple[FlowSpec, Flow]]:
@@ -187,7 +189,7 @@ class Bridge:
 
     def graphs(self) -> list[Graph]:
         """Return the entities of each graph, in the order of the configuration."""
-        return [seat.endpoint.graph() for seat in self._seats]
+        return [dispatcher.endpoint.graph() for dispatcher in self._dispatchers]
 
     def flow_of(self, rule: Rule, local: str, name: Name) -> tuple[Flow, float] | None:
         """Return the flow of a local name under a rule, and when it began, monotonic seconds; None: there is none."""
@@ -199,7 +201,7 @@ class Bridge:
     @property
     def labels(self) -> list[str]:
         """Return the display names of the graphs."""
-        return [seat.endpoint.label for seat in self._seats]
+        return [dispatcher.endpoint.label for dispatcher in self._dispatchers]
 
     @property
     def stats(self) -> list[TopicStats]:
@@ -222,7 +224,7 @@ class Bridge:
 
     def publishers_of(self, name: Name) -> list[Name]:
         """Return the remote publishers of a topic that is read here, as far as they have introduced themselves."""
-        return [each.publisher for each in self._site.member.writer_proxies_of(name)]
+        return [each.publisher for each in self._context.member.writer_proxies_of(name)]
 
     @property
     def undelegated(self) -> list[FlowSpec]:
@@ -233,8 +235,8 @@ class Bridge:
     def denied(self) -> list[DeniedName]:
         """Return the local names that rules are about, and that ``deny`` keeps local."""
         found = list[DeniedName]()
-        for at, seat in enumerate(self._seats):
-            graph = seat.endpoint.graph()
+        for at, dispatcher in enumerate(self._dispatchers):
+            graph = dispatcher.endpoint.graph()
             for rules, is_exposed in ((self._config.expose, True), (self._config.imports, False)):
                 here = [rule for rule in rules if self._config.endpoint_of(rule) == at]
                 found += denied(here, graph, is_exposed=is_exposed)
@@ -267,11 +269,11 @@ class Bridge:
     def work(self, now_s: float) -> None:
         """Process events of endpoints and messages of the overlay, and run due timers."""
         self._now_s = now_s
-        for seat in self._seats:
-            if seat.deliver(self._site, now_s):
+        for dispatcher in self._dispatchers:
+            if dispatcher.deliver(self._context, now_s):
                 self._is_stale = True
                 self._failed.clear()
-        for message in self._site.member.poll_messages():
+        for message in self._context.member.poll_messages():
             self._receive(message, now_s)
         for key, probe in self._probes.items():
             probe.handle_timer(now_s)
@@ -280,22 +282,22 @@ class Bridge:
                 log.info("server ready=%s kind=%s reason=%s", probe.is_ready, key.kind, probe.reason or "probe passed")
         if self._is_stale or (self._since and now_s >= self._tick_at_s):
             self._refresh(now_s)
-        for seat in self._seats:
-            seat.deliver_faults(self._site, now_s)
+        for dispatcher in self._dispatchers:
+            dispatcher.deliver_faults(self._context, now_s)
         self._close_finished(now_s)
         is_tick = now_s >= self._tick_at_s
         for flow, local in self._timed.items():
             due_s = flow.get_timer()
             if is_tick:
-                self._site.contain(local, b"", now_s, flow.tick, now_s)
+                self._context.contain(local, b"", now_s, flow.tick, now_s)
             elif due_s is not None and due_s <= now_s:
-                self._site.contain(local, b"", now_s, flow.handle_timer, now_s)
+                self._context.contain(local, b"", now_s, flow.handle_timer, now_s)
         for topic in self._status_topics:
             if topic.is_due(now_s):
                 topic.update(self.liveliness(now_s), now_s)
         if is_tick:
             self._tick_at_s = now_s + TICK_S
-            self._site.traffic.dropped = sum(seat.endpoint.dropped for seat in self._seats)
+            self._context.traffic.dropped = sum(dispatcher.endpoint.dropped for dispatcher in self._dispatchers)
 
     def poll_changes(self) -> list[FlowChange]:
         """Return the flows that began or ended since the last call, in order; the oldest are forgotten first."""
@@ -342,7 +344,7 @@ class Bridge:
     @property
     def is_finished(self) -> bool:
         """Return whether readers have confirmed the last messages of all flows that ended."""
-        return all(self._site.member.is_acknowledged(name) for name in self._finishing)
+        return all(self._context.member.is_acknowledged(name) for name in self._finishing)
 
     def close(self) -> None:
         """End every flow; endpoints stay open."""
@@ -369,8 +371,8 @@ class Bridge:
         self._is_stale = False
         complaints = list[ConfigProblem]()
         wished, shown = set[_Key](), set[_Key]()
-        for at, seat in enumerate(self._seats):
-            view = _View(seat.endpoint.graph(), self._me)
+        for at, dispatcher in enumerate(self._dispatchers):
+            view = _View(dispatcher.endpoint.graph(), self._me)
             for flow_spec in self._flow_specs(at, view.graph, complaints):
                 key = _Key(at, flow_spec.is_exposed, flow_spec.rule.kind, flow_spec.local, flow_spec.name)
                 shown.add(key)
@@ -419,7 +421,7 @@ class Bridge:
             return True
         if probe is None:
             try:
-                probe = self._probes[key] = ReadinessProbe(self._seats[key.seat], settings, now_s)
+                probe = self._probes[key] = ReadinessProbe(self._dispatchers[key.dispatcher], settings, now_s)
             except LocalError as error:
                 self._failed[key] = ConfigProblem(flow_spec.local, Fault.UNKNOWN_TYPE, f"readiness: {error}")
                 return False
@@ -461,7 +463,7 @@ class Bridge:
         if flow_spec.name in self._finishing:
             self._close_finishing(flow_spec.name)
         try:
-            flow = self._make(self._seats[key.seat], flow_spec, topic, view)
+            flow = self._make(self._dispatchers[key.dispatcher], flow_spec, topic, view)
         except LocalError as error:
             self._failed[key] = ConfigProblem(flow_spec.local, Fault.UNKNOWN_TYPE, str(error))
             return
@@ -474,14 +476,14 @@ class Bridge:
         self._changes.append(FlowChange(flow_spec, is_begun=True))
         log.debug("flow begun name=%s exposed=%s", flow_spec.name.short, flow_spec.is_exposed)
 
-    def _make(self, seat: EndpointDispatcher, flow_spec: FlowSpec, topic: Topic, view: _View) -> Flow:
-        site = self._site
+    def _make(self, dispatcher: EndpointDispatcher, flow_spec: FlowSpec, topic: Topic, view: _View) -> Flow:
+        context = self._context
         if flow_spec.rule.kind != "topic":
             kind = ExposedService if flow_spec.is_exposed else ImportedService
-            return kind(site, seat, flow_spec, topic, secrets.randbits(63))
+            return kind(context, dispatcher, flow_spec, topic, secrets.randbits(63))
         if flow_spec.is_exposed:
-            return ExposedTopic(site, seat, flow_spec, topic, view.ends(Role.PUBLISHES, flow_spec))
-        return ImportedTopic(site, seat, flow_spec, topic)
+            return ExposedTopic(context, dispatcher, flow_spec, topic, view.ends(Role.PUBLISHES, flow_spec))
+        return ImportedTopic(context, dispatcher, flow_spec, topic)
 
     def _may_finish(self, key: _Key) -> bool:
         """Return whether the rule and the delegation of a flow still apply: it ends because its local node has gone."""
@@ -514,15 +516,15 @@ class Bridge:
 
     def _close_finished(self, now_s: float) -> None:
         for name, each in list(self._finishing.items()):
-            if now_s >= each.ends_s or self._site.member.is_acknowledged(name):
+            if now_s >= each.ends_s or self._context.member.is_acknowledged(name):
                 self._close_finishing(name)
 
     def _close_finishing(self, name: Name) -> None:
         flow_spec, flow, _ = self._finishing.pop(name)
-        if not self._site.member.is_acknowledged(name):
-            count = self._site.member.unacknowledged(name)
+        if not self._context.member.is_acknowledged(name):
+            count = self._context.member.unacknowledged(name)
             detail = f"{count} messages were not confirmed after their {flow_spec.rule.kind} had ended here"
-            self._site.faults.report(flow_spec.local, Fault.TOO_FAST, detail)
+            self._context.faults.report(flow_spec.local, Fault.TOO_FAST, detail)
         self._close(flow_spec, flow)
 
     def _close(self, flow_spec: FlowSpec, flow: Flow) -> None:
@@ -543,9 +545,9 @@ class Bridge:
         now = set(complaints)
         for complaint in self._complaints - now:
             if complaint.fault is not Fault.UNKNOWN_TYPE and complaint.fault is not Fault.NO_DELEGATION:
-                self._site.faults.clear(complaint.local, complaint.fault)
+                self._context.faults.clear(complaint.local, complaint.fault)
         for complaint in now - self._complaints:
-            self._site.faults.report(complaint.local, complaint.fault, complaint.detail)
+            self._context.faults.report(complaint.local, complaint.fault, complaint.detail)
         self._complaints = now
 
 

@@ -10,9 +10,9 @@ from typing import Final
 
 from gdp.names import Name
 from gdp.service.serving import Asked, Serving
-from proxy.bridge.action_interface import RESULT
+from proxy.bridge.core.action_interface import RESULT
 from proxy.bridge.goal_calls import GoalCalls
-from proxy.endpoints.endpoint import Endpoint
+from proxy.endpoints.core.endpoint import Endpoint
 from proxy.wire.service import Stop
 
 __all__ = ["NO_FIELDS", "TRIGGER", "Cancellation"]

@@ -17,7 +17,7 @@ from gdp.names import Name
 from proxy.bridge.call_tracer import CallTracer, NoTracer
 from proxy.bridge.counters import Traffic
 from proxy.bridge.faults import Fault, Faults
-from proxy.endpoints.endpoint import EndpointError
+from proxy.endpoints.core.endpoint import EndpointError
 
 __all__ = ["BridgeContext"]
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from proxy.bridge.context import BridgeContext
-from proxy.endpoints.endpoint import Endpoint, EndpointError, Event, GraphChanged
+from proxy.endpoints.core.endpoint import Endpoint, EndpointError, Event, GraphChanged
 from proxy.serial.channel import Channel, Qos
 from proxy.serial.service import Service
 
@@ -30,7 +30,7 @@ class EndpointDispatcher:
         self._owners: dict[int, tuple[str, EventHandler]] = {}  # with the local name
         self._faulted: list[EndpointError] = []
 
-    def deliver(self, site: BridgeContext, now_s: float) -> bool:
+    def deliver(self, context: BridgeContext, now_s: float) -> bool:
         """Deliver all events except faults, each within the error boundary; return whether the graph changed."""
         is_changed = False
         for event in self.endpoint.poll_events():
@@ -39,14 +39,14 @@ class EndpointDispatcher:
             elif isinstance(event, EndpointError):
                 self._faulted.append(event)
             else:
-                self._deliver(event, site, now_s)
+                self._deliver(event, context, now_s)
         return is_changed
 
-    def deliver_faults(self, site: BridgeContext, now_s: float) -> None:
+    def deliver_faults(self, context: BridgeContext, now_s: float) -> None:
         """Deliver faults after the graph in which they arose was processed; handles that gave way have no owner."""
         faulted, self._faulted = self._faulted, []
         for event in faulted:
-            self._deliver(event, site, now_s)
+            self._deliver(event, context, now_s)
 
     def subscribe(self, owner: EventHandler, topic: str, type_name: str, qos: Qos | None) -> int:
         """Subscribe to a topic, as ``Endpoint.subscribe``."""
@@ -73,7 +73,7 @@ class EndpointDispatcher:
         self._owners[handle] = name, owner
         return handle
 
-    def _deliver(self, event: Event, site: BridgeContext, now_s: float) -> None:
+    def _deliver(self, event: Event, context: BridgeContext, now_s: float) -> None:
         if not isinstance(event, GraphChanged) and (found := self._owners.get(event.handle)) is not None:
             name, owner = found
-            site.contain(name, b"", now_s, owner.handle_event, event, now_s)
+            context.contain(name, b"", now_s, owner.handle_event, event, now_s)

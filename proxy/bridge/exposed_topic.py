@@ -14,16 +14,16 @@ from gdp.client.send_options import is_urgent
 from gdp.errors import LocalError
 from gdp.message.loss import LossReason
 from gdp.trust.advertisement import paths_value
-from proxy.bridge.adaptation import adaptation_of
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.desired_flows import FlowSpec
-from proxy.bridge.encoder import MessageEncoder, compressor_of, description_of
+from proxy.bridge.core.adaptation import adaptation_of
+from proxy.bridge.core.desired_flows import FlowSpec
+from proxy.bridge.core.encoder import MessageEncoder, compressor_of, description_of
+from proxy.bridge.core.stream_qos import Change, LiveQos, RecordedQos, StreamQos
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault
 from proxy.bridge.liveliness import Party
 from proxy.bridge.rate_limit import RateLimiter
-from proxy.bridge.stream_qos import Change, LiveQos, RecordedQos, StreamQos
-from proxy.endpoints.endpoint import EndpointError, Event, GraphEntity, MessageReceived, TypeResolved
+from proxy.endpoints.core.endpoint import EndpointError, Event, GraphEntity, MessageReceived, TypeResolved
 from proxy.serial.channel import Channel
 from proxy.wire.message import RosMessage
 
@@ -48,17 +48,19 @@ class ExposedTopic:
 
     def __init__(
         self,
-        site: BridgeContext,
-        seat: EndpointDispatcher,
+        context: BridgeContext,
+        dispatcher: EndpointDispatcher,
         flow_spec: FlowSpec,
         topic: Topic,
         ends: Sequence[GraphEntity],
     ) -> None:
-        self._site = site
-        self._seat = seat
+        self._context = context
+        self._dispatcher = dispatcher
         self._flow_spec = flow_spec
         self._topic = topic
-        self._qos: StreamQos = LiveQos(flow_spec.rule, ends) if seat.endpoint.is_live else RecordedQos(flow_spec.rule)
+        self._qos: StreamQos = (
+            LiveQos(flow_spec.rule, ends) if dispatcher.endpoint.is_live else RecordedQos(flow_spec.rule)
+        )
         self.publisher: Publisher | None = None
         self.published = Counter[int]()
         self.published_bytes = Counter[int]()
@@ -74,7 +76,7 @@ class ExposedTopic:
         self.handle = self._subscribe()
         try:
             # Remote readers may come before a message.
-            self._describe((seat.endpoint.channel(flow_spec.local, flow_spec.type_name),))
+            self._describe((dispatcher.endpoint.channel(flow_spec.local, flow_spec.type_name),))
         except LocalError:
             self.publisher = None  # the first message brings its definition
 
@@ -85,7 +87,7 @@ class ExposedTopic:
         if change is Change.NONE:
             return
         if change is Change.SUBSCRIPTION:
-            self._seat.close(self.handle)
+            self._dispatcher.close(self.handle)
             self.handle = self._subscribe()
         if self._channels:
             self._describe(self._channels)
@@ -101,18 +103,18 @@ class ExposedTopic:
         elif isinstance(event, TypeResolved):
             self._describe((event.channel, *event.others))
         elif isinstance(event, EndpointError):
-            self._site.report_error(self._flow_spec.local, event, Fault.QOS)
+            self._context.report_error(self._flow_spec.local, event, Fault.QOS)
 
     def finish(self, now_s: float) -> None:
         """Publish nothing from now on."""
-        self._seat.close(self.handle)
-        self._site.member.flush(now_s)
+        self._dispatcher.close(self.handle)
+        self._context.member.flush(now_s)
 
     def close(self, now_s: float) -> None:
         """Close the subscription and the publisher; unconfirmed messages are lost."""
         self.finish(now_s)
         if self.publisher is not None:
-            self._site.member.withdraw(self._topic.name)
+            self._context.member.withdraw(self._topic.name)
 
     def parties(self, now_s: float) -> list[Party]:
         """Return the readers that are known now."""
@@ -132,10 +134,10 @@ class ExposedTopic:
         """Replace the delegation."""
         self._topic = topic
         if self.publisher is not None:
-            self._site.member.renew(topic)
+            self._context.member.renew(topic)
 
     def _subscribe(self) -> int:
-        return self._seat.subscribe(self, self._flow_spec.local, self._flow_spec.type_name, self._qos.request)
+        return self._dispatcher.subscribe(self, self._flow_spec.local, self._flow_spec.type_name, self._qos.request)
 
     def _describe(self, channels: Sequence[Channel]) -> None:
         rule = self._flow_spec.rule
@@ -145,16 +147,16 @@ class ExposedTopic:
         opaque = {each.serializer.opaque for each in self._encoders if each.serializer.opaque}
         if opaque and rule.encoding != "cdr":
             detail = f"messages travel as bytes, unread: {', '.join(sorted(opaque))}"
-            self._site.faults.report(self._flow_spec.local, Fault.UNKNOWN_TYPE, detail)
+            self._context.faults.report(self._flow_spec.local, Fault.UNKNOWN_TYPE, detail)
         for fault, why in {each.obstacle for each in self._encoders if each.obstacle is not None}:
-            self._site.faults.report(self._flow_spec.local, fault, f"messages are not reduced: {why}")
+            self._context.faults.report(self._flow_spec.local, fault, f"messages are not reduced: {why}")
         wire = description_of(rule, described).to_wire()
         if self.publisher is not None:
             self.publisher.describe(wire)
             self.publisher.set_depth(self._qos.depth)
             self.publisher.set_options(self._qos.options)
             return
-        self.publisher = self._site.member.advertise(
+        self.publisher = self._context.member.advertise(
             self._topic,
             wire,
             reliable=self._qos.is_reliable,
@@ -166,7 +168,7 @@ class ExposedTopic:
         )
 
     def _publish(self, event: MessageReceived, now_s: float) -> None:
-        rule, publisher, traffic = self._flow_spec.rule, self.publisher, self._site.traffic
+        rule, publisher, traffic = self._flow_spec.rule, self.publisher, self._context.traffic
         if publisher is None:
             return  # the description always comes first: an earlier message belongs to a subscription that was replaced
         self.taken += 1
@@ -177,7 +179,7 @@ class ExposedTopic:
             return
         if len(event.raw) > rule.max_bytes:
             detail = f"a message of {len(event.raw)} bytes; the rule's max_bytes is {rule.max_bytes}"
-            self._site.faults.report(self._flow_spec.local, Fault.TOO_LARGE, detail)
+            self._context.faults.report(self._flow_spec.local, Fault.TOO_LARGE, detail)
             publisher.skip(LossReason.TOO_LARGE)
             return
         if not publisher.is_wanted and not self._qos.depth:
@@ -192,7 +194,7 @@ class ExposedTopic:
         if not publisher.has_space():
             if adaptation is not None:
                 adaptation.handle_refused(now_s)
-            self._site.faults.report(
+            self._context.faults.report(
                 self._flow_spec.local, Fault.TOO_FAST, "messages come faster than readers confirm them"
             )
             publisher.skip(LossReason.WINDOW_OVERFLOW)
@@ -204,7 +206,7 @@ class ExposedTopic:
         try:
             count = publisher.publish(message, now_s)
         except LocalError as error:
-            self._site.faults.report(self._flow_spec.local, Fault.TOO_LARGE, str(error))
+            self._context.faults.report(self._flow_spec.local, Fault.TOO_LARGE, str(error))
             publisher.skip(LossReason.TOO_LARGE)
             return
         if adaptation is not None and count is not None:

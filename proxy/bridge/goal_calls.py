@@ -6,7 +6,7 @@ Sans-I/O.
 from __future__ import annotations
 
 from gdp.service.serving import Asked
-from proxy.bridge.action_interface import GOAL, RESULT
+from proxy.bridge.core.action_interface import GOAL, RESULT
 
 __all__ = ["GoalCalls"]
 

@@ -26,18 +26,18 @@ from gdp.service.replication import ALL, Mode
 from gdp.service.replication_messages import INCARNATION_BITS
 from gdp.service.sequencer import Sequencer
 from gdp.trust.advertisement import paths_value, session_value
-from proxy.bridge.action_interface import CANCEL, GOAL, RESULT, ActionInterface
 from proxy.bridge.call_tracer import CallKey
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.desired_flows import FlowSpec
+from proxy.bridge.core.action_interface import CANCEL, GOAL, RESULT, ActionInterface
+from proxy.bridge.core.desired_flows import FlowSpec
+from proxy.bridge.core.goals import Goals, goal_of, says_yes
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault
-from proxy.bridge.goals import Goals, goal_of, says_yes
 from proxy.bridge.liveliness import Party
 from proxy.bridge.request_sender import RequestSender
 from proxy.bridge.server_discovery import SERVER_GONE, Response, ServerCalls, ServerDiscovery
 from proxy.bridge.virtual_server import VirtualServer
-from proxy.endpoints.endpoint import EndpointError, Event, RequestReceived
+from proxy.endpoints.core.endpoint import EndpointError, Event, RequestReceived
 from proxy.serial.empty import NoAnswer
 from proxy.serial.serializer import Serializer
 from proxy.wire.replication import follower_message, is_word
@@ -75,10 +75,15 @@ class ImportedService:
     """
 
     def __init__(
-        self, site: BridgeContext, seat: EndpointDispatcher, flow_spec: FlowSpec, topic: Topic, random_start: int
+        self,
+        context: BridgeContext,
+        dispatcher: EndpointDispatcher,
+        flow_spec: FlowSpec,
+        topic: Topic,
+        random_start: int,
     ) -> None:
-        self._site = site
-        self._seat = seat
+        self._context = context
+        self._dispatcher = dispatcher
         self._flow_spec = flow_spec
         self._topic = topic
         self._parts = ActionInterface.of(flow_spec.rule.kind, flow_spec.local, flow_spec.type_name)
@@ -107,7 +112,7 @@ class ImportedService:
         self._counted: tuple[int, ...] = (0, 0, 0)  # late, unexpected and hedged, as reported last
         self._requests: tuple[Serializer, ...] = ()
         self._no_answers: tuple[NoAnswer | None, ...] = ()  # None: the dialect has errors
-        self._publisher = site.member.call(
+        self._publisher = context.member.call(
             topic,
             self._description(),
             is_global=flow_spec.rule.is_global,
@@ -116,13 +121,15 @@ class ImportedService:
             options=flow_spec.rule.send_options(),
             is_session=session_value(flow_spec.rule.sign),
         )
-        self._virtual_server = VirtualServer(seat, self, is_paced=flow_spec.has_short_queues(seat.endpoint.ros))
+        self._virtual_server = VirtualServer(
+            dispatcher, self, is_paced=flow_spec.has_short_queues(dispatcher.endpoint.ros)
+        )
         self._sender = RequestSender(
-            site=site, service=topic.name, calls=self._calls, goals=self._goals, publisher=self._publisher
+            context=context, service=topic.name, calls=self._calls, goals=self._goals, publisher=self._publisher
         )
         self._discovery = ServerDiscovery(
-            site=site,
-            seat=seat,
+            context=context,
+            dispatcher=dispatcher,
             flow_spec=flow_spec,
             service=topic.name,
             parts=self._parts,
@@ -144,10 +151,10 @@ class ImportedService:
 
     def receive(self, message: Message, now_s: float) -> None:
         """Process a remote server's response, or a message of its action's topics."""
-        self._site.traffic.received(len(message.delivered.message))
+        self._context.traffic.received(len(message.delivered.message))
         self._now_s = now_s
         server = message.delivered.publisher
-        self._site.contain(self._flow_spec.local, server, now_s, self._receive, message, now_s)
+        self._context.contain(self._flow_spec.local, server, now_s, self._receive, message, now_s)
 
     def handle_event(self, event: Event, now_s: float) -> None:
         """Process a local client's request."""
@@ -155,7 +162,7 @@ class ImportedService:
             self._ask(event, now_s)
             self._flush(now_s)
         elif isinstance(event, EndpointError):
-            self._site.report_error(self._flow_spec.local, event, Fault.REFUSED)
+            self._context.report_error(self._flow_spec.local, event, Fault.REFUSED)
 
     def tick(self, now_s: float) -> None:
         """Open or close the virtual server as remote servers join and leave."""
@@ -165,7 +172,9 @@ class ImportedService:
         if self._sequencer is not None:
             outside = dict(self._sequencer.outside)
             for name in [name for name, reason in outside.items() if self._outside.get(name) != reason]:
-                self._site.faults.report(self._flow_spec.local, Fault.REFUSED, f"server {name.short}: {outside[name]}")
+                self._context.faults.report(
+                    self._flow_spec.local, Fault.REFUSED, f"server {name.short}: {outside[name]}"
+                )
             self._outside = outside
 
     def handle_timer(self, now_s: float) -> None:
@@ -177,7 +186,7 @@ class ImportedService:
     def parties(self, now_s: float) -> list[Party]:
         """Return the servers that are known now."""
         del now_s
-        member, name = self._site.member, self._topic.name
+        member, name = self._context.member, self._topic.name
         silent = set(member.silent_peers(name))
         names = dict.fromkeys([*member.connected_peers(name), *silent])
         return [Party("server", each.to_text(), is_silent=each in silent) for each in names]
@@ -195,12 +204,12 @@ class ImportedService:
         del now_s
         self._shut("the proxy no longer carries this service")
         self._virtual_server.close_now()
-        self._site.member.withdraw(self._topic.name)
+        self._context.member.withdraw(self._topic.name)
 
     def renew(self, topic: Topic) -> None:
         """Replace the delegation."""
         self._topic = topic
-        self._site.member.renew(topic)
+        self._context.member.renew(topic)
 
     def _receive(self, message: Message, now_s: float) -> None:
         if message.private and self._sequencer is not None and is_word(message.delivered.message):
@@ -220,7 +229,7 @@ class ImportedService:
 
     def _count(self) -> None:
         """Add the increments since the last call to the proxy's counters."""
-        traffic = self._site.traffic
+        traffic = self._context.traffic
         now = tuple(
             sum(counts) for counts in zip(*((d.late, d.unexpected, d.hedged) for d in self._calls), strict=True)
         )
@@ -232,7 +241,7 @@ class ImportedService:
     def _description(self) -> bytes:
         """Return this machine's description of the service; empty where only the remote side has one."""
         try:
-            exchange = self._parts.known(self._seat.endpoint, self._flow_spec.rule.encoding)
+            exchange = self._parts.known(self._dispatcher.endpoint, self._flow_spec.rule.encoding)
         except LocalError:
             return b""
         return exchange.to_wire()
@@ -256,7 +265,7 @@ class ImportedService:
         self.requests += 1
         self.request_bytes += len(event.raw)
         if part is None:
-            self._site.faults.report(self._flow_spec.local, Fault.NO_SERVER, SERVER_GONE)
+            self._context.faults.report(self._flow_spec.local, Fault.NO_SERVER, SERVER_GONE)
             self._virtual_server.refuse(event.handle, event.ticket, SERVER_GONE)
             return
         waiting = _Waiting(part, event.handle, event.ticket, b"", now_s)
@@ -284,7 +293,7 @@ class ImportedService:
         patience_ms = 0 if timeout_s is None else min(max(int(timeout_s * 1e3), 1), PATIENCE_MAX_MS)
         wire = Request(waiting.part, call, patience_ms, body).to_wire()
         waiting.call = call
-        self._site.tracer.begun(self._key(waiting.part, call), self._flow_spec.local)
+        self._context.tracer.begun(self._key(waiting.part, call), self._flow_spec.local)
         if self._goals is not None:
             self._sender.note_goal(waiting.part, call, waiting.goal)
             if waiting.part == GOAL:
@@ -308,17 +317,17 @@ class ImportedService:
             return  # of a server that left, or that has no valid description here: that was reported
         dispatch, key = self._calls[answer.part], self._key(answer.part, answer.call)
         if answer.outcome is Outcome.FAILED:
-            self._site.tracer.responded(key, name, answer.reason)
+            self._context.tracer.responded(key, name, answer.reason)
             dispatch.refused(answer.call, name, answer.reason, now_s)
             return
         try:
             raw = server.answers[answer.part].decode(answer.body)
         except RemoteError as error:
-            self._site.faults.report(self._flow_spec.local, Fault.MALFORMED, str(error))
-            self._site.tracer.responded(key, name, str(error))
+            self._context.faults.report(self._flow_spec.local, Fault.MALFORMED, str(error))
+            self._context.tracer.responded(key, name, str(error))
             dispatch.refused(answer.call, name, str(error), now_s)
             return
-        self._site.tracer.responded(key, name)
+        self._context.tracer.responded(key, name)
         if self._goals is None or says_yes(answer.part, raw):
             dispatch.answered(answer.call, name, (name, raw), now_s)
         else:
@@ -329,9 +338,9 @@ class ImportedService:
         self.answered_by = server
         self._forget(waiting)
         if waiting.part == 0:  # of an action the answer to its goal; results take as long as they want
-            self._site.traffic.call_ended(self._topic.name.to_text(), max(self._now_s - waiting.begun_s, 0.0))
+            self._context.traffic.call_ended(self._topic.name.to_text(), max(self._now_s - waiting.begun_s, 0.0))
         self.first_answers[server] += 1
-        self._site.tracer.answered(self._key(waiting.part, waiting.call), server)
+        self._context.tracer.answered(self._key(waiting.part, waiting.call), server)
         self._virtual_server.answer(waiting.handle, waiting.ticket, raw)
         if self._goals is None or not says_yes(waiting.part, raw):
             return
@@ -343,7 +352,7 @@ class ImportedService:
     def _failed(self, waiting: _Waiting, failure: Failure, reason: str) -> None:
         self._forget(waiting)
         self.failed += 1
-        self._site.tracer.failed(self._key(waiting.part, waiting.call), reason or failure.value)
+        self._context.tracer.failed(self._key(waiting.part, waiting.call), reason or failure.value)
         if failure is not Failure.TIMED_OUT:
             self._refuse(waiting, _FAULTS[failure], reason)
             return
@@ -352,11 +361,11 @@ class ImportedService:
         if no_answer is None or no_answer.says_reason or self._flow_spec.rule.on_timeout == "silent":
             self._refuse(waiting, Fault.TIMED_OUT, reason)
             return
-        self._site.faults.report(self._flow_spec.local, Fault.TIMED_OUT, reason)
+        self._context.faults.report(self._flow_spec.local, Fault.TIMED_OUT, reason)
         self._virtual_server.answer(waiting.handle, waiting.ticket, no_answer.to_raw(reason))
 
     def _key(self, part: int, call: int) -> CallKey:
-        return CallKey(self._topic.name, self._site.member.name, part, call)
+        return CallKey(self._topic.name, self._context.member.name, part, call)
 
     def _forget(self, waiting: _Waiting) -> None:
         is_cancelled = self._sequencer is None  # entries of a log go to all servers in any case
@@ -379,5 +388,5 @@ class ImportedService:
             self._virtual_server.publish(-1, raw)
 
     def _refuse(self, waiting: _Waiting, fault: Fault, reason: str) -> None:
-        self._site.faults.report(self._flow_spec.local, fault, reason)
+        self._context.faults.report(self._flow_spec.local, fault, reason)
         self._virtual_server.refuse(waiting.handle, waiting.ticket, reason)

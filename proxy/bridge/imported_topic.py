@@ -16,18 +16,18 @@ from gdp.errors import LocalError
 from gdp.message.loss import Losses
 from gdp.trust.advertisement import paths_value
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.decoder import MessageDecoder
+from proxy.bridge.core.decoder import MessageDecoder
+from proxy.bridge.core.desired_flows import FlowSpec
+from proxy.bridge.core.expander import MessageExpander
+from proxy.bridge.core.topic_stats import SAMPLES_MAX, TopicStats
 from proxy.bridge.decoder_cache import DecoderCache
-from proxy.bridge.desired_flows import FlowSpec
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
-from proxy.bridge.expander import MessageExpander
 from proxy.bridge.faults import Fault
 from proxy.bridge.liveliness import Party
 from proxy.bridge.local_output import ChannelPublishers, LocalOutput, MergedPublisher
 from proxy.bridge.rate_limit import RateLimiter
-from proxy.bridge.topic_stats import SAMPLES_MAX, TopicStats
-from proxy.endpoints.endpoint import EndpointError, Event, GraphEntity
-from proxy.endpoints.qos import unmatched
+from proxy.endpoints.core.endpoint import EndpointError, Event, GraphEntity
+from proxy.endpoints.core.qos import unmatched
 from proxy.reduce.picture import LibraryError
 from proxy.serial.schema import DefinitionError
 from proxy.wire.message import RosMessage, TopicDescription
@@ -58,8 +58,10 @@ class ImportedTopic:
         LocalError: this graph does not accept a publisher of it.
     """
 
-    def __init__(self, site: BridgeContext, seat: EndpointDispatcher, flow_spec: FlowSpec, topic: Topic) -> None:
-        self._site = site
+    def __init__(
+        self, context: BridgeContext, dispatcher: EndpointDispatcher, flow_spec: FlowSpec, topic: Topic
+    ) -> None:
+        self._context = context
         self._flow_spec = flow_spec
         self._topic = topic
         self._unmatched: Set[str] = frozenset()  # keys of readers whose QoS cannot be met
@@ -70,13 +72,13 @@ class ImportedTopic:
         self._pace = RateLimiter(flow_spec.rule.max_hz)
         self.thinned = 0
         self.last_s: float | None = None
-        samples = _SAMPLES_MAX if seat.endpoint.is_live else SAMPLES_MAX
+        samples = _SAMPLES_MAX if dispatcher.endpoint.is_live else SAMPLES_MAX
         self.stats = TopicStats(
             topic=flow_spec.local, type_name=flow_spec.type_name, latencies_ms=deque(maxlen=samples)
         )
-        kind = MergedPublisher if seat.endpoint.is_live else ChannelPublishers
+        kind = MergedPublisher if dispatcher.endpoint.is_live else ChannelPublishers
         self._heard_s: dict[bytes, float] = {}  # when each publisher's last message came, the latest last
-        self._output: LocalOutput = kind(seat, self, flow_spec)
+        self._output: LocalOutput = kind(dispatcher, self, flow_spec)
 
     def follow(self, ends: Sequence[GraphEntity]) -> None:
         """Update the local readers."""
@@ -84,7 +86,7 @@ class ImportedTopic:
         self._tell_unmatched(ends)
         if ends and not self._is_joined:
             self._is_joined = True
-            self._site.member.subscribe(self._topic, paths=paths_value(self._flow_spec.rule.paths))
+            self._context.member.subscribe(self._topic, paths=paths_value(self._flow_spec.rule.paths))
         elif not ends and self._is_joined:
             self._leave()
             self._output.drop_kept()
@@ -98,7 +100,7 @@ class ImportedTopic:
         self._heard_s[publisher] = now_s
         if len(self._heard_s) > _HEARD_MAX:
             del self._heard_s[next(iter(self._heard_s))]
-        if not self._site.contain(self._flow_spec.local, publisher, now_s, self._receive, message, now_s):
+        if not self._context.contain(self._flow_spec.local, publisher, now_s, self._receive, message, now_s):
             self.stats.refused += 1
 
     def _receive(self, message: Message, now_s: float) -> None:
@@ -113,7 +115,7 @@ class ImportedTopic:
         """Process an event of the local publisher."""
         del now_s
         if isinstance(event, EndpointError):
-            self._site.report_error(self._flow_spec.local, event, Fault.QOS)
+            self._context.report_error(self._flow_spec.local, event, Fault.QOS)
 
     @property
     def is_joined(self) -> bool:
@@ -122,7 +124,7 @@ class ImportedTopic:
 
     def parties(self, now_s: float) -> list[Party]:
         """Return the publishers that are known now."""
-        names = [each.publisher for each in self._site.member.writer_proxies_of(self._topic.name)]
+        names = [each.publisher for each in self._context.member.writer_proxies_of(self._topic.name)]
         self._heard_s = {name: self._heard_s[name] for name in names if name in self._heard_s}
         ago_s = {name: now_s - heard_s for name, heard_s in self._heard_s.items()}
         return [Party("publisher", name.to_text(), ago_s.get(name)) for name in names]
@@ -139,36 +141,36 @@ class ImportedTopic:
         """Replace the delegation."""
         self._topic = topic
         if self._is_joined:
-            self._site.member.renew(topic)
+            self._context.member.renew(topic)
 
     def count_losses(self) -> None:
         """Update the losses in the topic's statistics."""
         self.stats.losses = losses = Losses()
         losses.update(self._past_losses)
         if self._is_joined:
-            losses.update(self._site.member.losses_of(self._topic.name))
+            losses.update(self._context.member.losses_of(self._topic.name))
 
     def _leave(self) -> None:
         self._is_joined = False
-        self._past_losses.update(self._site.member.losses_of(self._topic.name))
-        self._site.member.unsubscribe(self._topic.name)
+        self._past_losses.update(self._context.member.losses_of(self._topic.name))
+        self._context.member.unsubscribe(self._topic.name)
 
     def _tell_unmatched(self, ends: Sequence[GraphEntity]) -> None:
         """Report once each reader whose QoS cannot be met."""
         odd = {end.key: (end.node or "a node", policy) for end in ends if end.qos and (policy := unmatched(end.qos))}
         for key in odd.keys() - self._unmatched:
             detail = "{} will get nothing: {}, which no network can promise".format(*odd[key])
-            self._site.faults.report(self._flow_spec.local, Fault.QOS, detail)
+            self._context.faults.report(self._flow_spec.local, Fault.QOS, detail)
         if self._unmatched and not odd:
-            self._site.faults.clear(self._flow_spec.local, Fault.QOS)
+            self._context.faults.clear(self._flow_spec.local, Fault.QOS)
         self._unmatched = odd.keys()
 
     def _refuse(self, fault: Fault, detail: str) -> None:
         self.stats.refused += 1
-        self._site.faults.report(self._flow_spec.local, fault, detail)
+        self._context.faults.report(self._flow_spec.local, fault, detail)
 
     def _deliver(self, message: Message, now_s: float) -> None:
-        delivered, traffic, rule = message.delivered, self._site.traffic, self._flow_spec.rule
+        delivered, traffic, rule = message.delivered, self._context.traffic, self._flow_spec.rule
         publisher = delivered.publisher
         if (publisher, message.description) not in self._sources:
             self._sources.put(publisher, message.description, None)
@@ -205,17 +207,17 @@ class ImportedTopic:
         what, sources = self._flow_spec.local, description.channels
         other = next((each.type_name for each in sources if each.type_name != self._flow_spec.type_name), None)
         if other is not None:
-            self._site.faults.report(what, Fault.OTHER_TYPE, f"the far side sends {other}")
+            self._context.faults.report(what, Fault.OTHER_TYPE, f"the far side sends {other}")
             return None
         try:
             incoming = [self._output.decoder(source, description.encoding) for source in sources]
             expanders = [MessageExpander(description, source, self._flow_spec.rule.max_bytes) for source in sources]
         except DefinitionError as error:
-            self._site.faults.report(what, Fault.OTHER_TYPE, f"the far side's definition does not fit: {error}")
+            self._context.faults.report(what, Fault.OTHER_TYPE, f"the far side's definition does not fit: {error}")
             return None
         try:
             handles = self._output.add(publisher, sources, [each.target for each in incoming])
         except LocalError as error:
-            self._site.faults.report(what, self._output.refusal, str(error))
+            self._context.faults.report(what, self._output.refusal, str(error))
             return None
         return tuple(map(_Decoded, expanders, incoming, handles))

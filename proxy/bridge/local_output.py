@@ -13,12 +13,12 @@ from dataclasses import replace
 from typing import Final, Protocol
 
 from gdp.errors import LocalError
-from proxy.bridge.decoder import MessageDecoder
-from proxy.bridge.desired_flows import FlowSpec
+from proxy.bridge.core.decoder import MessageDecoder
+from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher, EventHandler
 from proxy.bridge.faults import Fault
-from proxy.endpoints.endpoint import GraphEntity
-from proxy.endpoints.qos import default, offer
+from proxy.endpoints.core.endpoint import GraphEntity
+from proxy.endpoints.core.qos import default, offer
 from proxy.serial.channel import Channel, Qos
 from proxy.serial.serializer import Encoding
 from proxy.wire.message import CHANNELS_MAX
@@ -74,8 +74,8 @@ class MergedPublisher:
 
     refusal = Fault.UNKNOWN_TYPE
 
-    def __init__(self, seat: EndpointDispatcher, owner: EventHandler, flow_spec: FlowSpec) -> None:
-        self._seat = seat
+    def __init__(self, dispatcher: EndpointDispatcher, owner: EventHandler, flow_spec: FlowSpec) -> None:
+        self._dispatcher = dispatcher
         self._owner = owner
         self._flow_spec = flow_spec
         self._wants: tuple[Qos, ...] = ()
@@ -93,7 +93,7 @@ class MergedPublisher:
 
     def decoder(self, source: Channel, encoding: Encoding) -> MessageDecoder:
         """Return a decoder by the remote definition that converts into this machine's."""
-        return MessageDecoder.ready(source, encoding, self._known(), self._seat.endpoint.ros)
+        return MessageDecoder.ready(source, encoding, self._known(), self._dispatcher.endpoint.ros)
 
     def add(self, publisher: bytes, sources: Sequence[Channel], targets: Sequence[Channel]) -> list[int]:
         """Offer the QoS of a remote publisher; its channels share the virtual publisher."""
@@ -108,7 +108,7 @@ class MergedPublisher:
         """Publish one message by the virtual publisher, if it exists."""
         del handle
         if self._handle is not None:
-            self._seat.endpoint.publish(self._handle, raw)
+            self._dispatcher.endpoint.publish(self._handle, raw)
             self._kept.append(raw)
 
     def receive_readers(self, ends: Sequence[GraphEntity]) -> None:
@@ -126,12 +126,12 @@ class MergedPublisher:
     def close(self) -> None:
         """Close the virtual publisher."""
         if self._handle is not None:
-            self._seat.close(self._handle)
+            self._dispatcher.close(self._handle)
             self._handle = None
 
     def _known(self) -> Channel | None:
         try:
-            return self._seat.endpoint.channel(self._flow_spec.local, self._flow_spec.type_name)
+            return self._dispatcher.endpoint.channel(self._flow_spec.local, self._flow_spec.type_name)
         except LocalError:
             return None
 
@@ -143,11 +143,11 @@ class MergedPublisher:
         if self._handle is not None and self._channel is not None and _is_served(self._channel, offered):
             return
         self.close()
-        self._handle = self._seat.advertise(self._owner, offered)
+        self._handle = self._dispatcher.advertise(self._owner, offered)
         self._channel = offered
         self._kept = deque(self._kept if latched else (), maxlen=profile.depth if latched else 0)
         for raw in self._kept:
-            self._seat.endpoint.publish(self._handle, raw)
+            self._dispatcher.endpoint.publish(self._handle, raw)
 
 
 class ChannelPublishers:
@@ -156,8 +156,8 @@ class ChannelPublishers:
     refusal = Fault.REFUSED
     is_open = True
 
-    def __init__(self, seat: EndpointDispatcher, owner: EventHandler, flow_spec: FlowSpec) -> None:
-        self._seat = seat
+    def __init__(self, dispatcher: EndpointDispatcher, owner: EventHandler, flow_spec: FlowSpec) -> None:
+        self._dispatcher = dispatcher
         self._owner = owner
         self._flow_spec = flow_spec
         self._handles: dict[bytes, set[int]] = {}  # of each remote publisher
@@ -176,13 +176,13 @@ class ChannelPublishers:
         for target in targets:
             if len(known) >= CHANNELS_MAX:
                 raise LocalError(f"its publisher has described more than {CHANNELS_MAX} channels")
-            handles.append(self._seat.advertise(self._owner, replace(target, topic=self._flow_spec.local)))
+            handles.append(self._dispatcher.advertise(self._owner, replace(target, topic=self._flow_spec.local)))
             known.add(handles[-1])
         return handles
 
     def publish(self, handle: int, raw: bytes) -> None:
         """Publish one message of a channel."""
-        self._seat.endpoint.publish(handle, raw)
+        self._dispatcher.endpoint.publish(handle, raw)
 
     def receive_readers(self, ends: Sequence[GraphEntity]) -> None:
         """Ignore the readers: a recording reads everything."""
@@ -193,7 +193,7 @@ class ChannelPublishers:
     def close(self) -> None:
         """Close every channel's publisher."""
         for handle in set().union(*self._handles.values()):
-            self._seat.close(handle)
+            self._dispatcher.close(handle)
         self._handles.clear()
 
 

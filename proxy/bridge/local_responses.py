@@ -13,7 +13,7 @@ from functools import partial
 from typing import Final
 
 from gdp.token_bucket import TokenBucket
-from proxy.endpoints.endpoint import Endpoint
+from proxy.endpoints.core.endpoint import Endpoint
 
 __all__ = ["LocalResponses"]
 

@@ -23,8 +23,8 @@ from proxy.bridge.context import BridgeContext
 from proxy.bridge.exposed_topic import ExposedTopic
 from proxy.bridge.imported_topic import ImportedTopic
 from proxy.config.rule import Rule
-from proxy.endpoints.endpoint import GraphEntity, Role
-from proxy.endpoints.qos import unmatched
+from proxy.endpoints.core.endpoint import GraphEntity, Role
+from proxy.endpoints.core.qos import unmatched
 
 __all__ = ["proxy_facts"]
 
@@ -63,7 +63,7 @@ class _Meant(NamedTuple):
 
 def proxy_facts(
     bridge: Bridge,
-    site: BridgeContext,
+    context: BridgeContext,
     identity: Identity,
     asked: str,
     now: Timestamps,
@@ -81,16 +81,16 @@ def proxy_facts(
         ros_domains: of the proxy's ROS 2 graphs.
     """
     graph = [end for each in bridge.graphs() for end in each]
-    flows = [_flow_fact(bridge, site, identity, meant, graph, now) for meant in _meant(bridge, asked, graph)]
-    member, switch = identity.member, site.member.attachment.switch
+    flows = [_flow_fact(bridge, context, identity, meant, graph, now) for meant in _meant(bridge, asked, graph)]
+    member, switch = identity.member, context.member.attachment.switch
     return ProxyFacts(
         name=identity.name.to_text(),
         domain=member.domain.to_text(),
         switch="" if switch is None else switch.name.to_text(),
         unix_s=now.unix_s,
         uptime_s=round(uptime_s, 1),
-        is_attached=site.member.attachment.is_attached,
-        is_revoked=site.member.attachment.is_revoked,
+        is_attached=context.member.attachment.is_attached,
+        is_revoked=context.member.attachment.is_revoked,
         waits=waits,
         flows=tuple(flows[:_FLOWS_MAX]),
         known=tuple(_known(bridge, graph)) if with_known else (),
@@ -150,7 +150,7 @@ def _types(bridge: Bridge, rule: Rule, local: str, graph: Sequence[GraphEntity],
 
 def _flow_fact(
     bridge: Bridge,
-    site: BridgeContext,
+    context: BridgeContext,
     identity: Identity,
     meant: _Meant,
     graph: Sequence[GraphEntity],
@@ -161,7 +161,7 @@ def _flow_fact(
     role = _ROLES[rule.kind, meant.is_exposed]
     under = [end for end in graph if (end.name, end.role) == (local + _PART[rule.kind], role) and not end.is_proxy]
     ends = [end for end in under if rule.kind == "action" or end.type_name in ("", meant.type_name)]
-    faults = site.faults.of(local)
+    faults = context.faults.of(local)
     problem = next((each for each in bridge.problems if each.local == local), None)
     flow, begun_s = (None if name is None else bridge.flow_of(rule, local, name)) or (None, now.mono_s)
     known: dict[str, object] = {
@@ -188,8 +188,8 @@ def _flow_fact(
         "age_s": round(now.mono_s - begun_s, 2),
     }
     if name is not None:
-        known |= _rights(bridge, site.member, identity, name, right, now)
-        known |= _overlay(site.member, name, right, now)
+        known |= _rights(bridge, context.member, identity, name, right, now)
+        known |= _overlay(context.member, name, right, now)
     if isinstance(flow, ExposedTopic):
         known |= _exposed(flow, now)
     elif isinstance(flow, ImportedTopic):

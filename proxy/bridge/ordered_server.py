@@ -14,7 +14,7 @@ from gdp.service.follower import Apply, Doing, Effect, Fetch, Follower, Load, Re
 from gdp.service.replication_messages import FollowerMessage, SequencerMessage
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher, EventHandler
 from proxy.bridge.state_parameter import GET, SET, read_request, state_in, was_set, write_request
-from proxy.endpoints.endpoint import CallFailed, GraphEntity, ResponseReceived
+from proxy.endpoints.core.endpoint import CallFailed, GraphEntity, ResponseReceived
 from proxy.wire.replication import STATE_MAX_BYTES
 
 __all__ = ["OrderedServer"]
@@ -37,7 +37,7 @@ class OrderedServer:
     def __init__(
         self,
         *,
-        seat: EndpointDispatcher,
+        dispatcher: EndpointDispatcher,
         owner: EventHandler,
         node: str | None,
         number: int,
@@ -45,11 +45,11 @@ class OrderedServer:
         tell: Tell,
         complain: Callable[[str], None],
     ) -> None:
-        self._endpoint = seat.endpoint
+        self._endpoint = dispatcher.endpoint
         self._follower = Follower(tells=node is not None)
         self._give, self._tell, self._complain = give, tell, complain
         parts = () if node is None else tuple((f"{node}/{part}", type_name) for part, type_name in (GET, SET))
-        self.handles = [seat.create_client(owner, *part) for part in parts]
+        self.handles = [dispatcher.create_client(owner, *part) for part in parts]
         self._number = number  # of the operation under way
         self._apply: Apply | None = None
         self._given_s = -DOUBT_S

@@ -11,7 +11,7 @@ from typing import Final
 from proxy.bridge.cancellation import NO_FIELDS, TRIGGER
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.config.readiness import Readiness
-from proxy.endpoints.endpoint import CallFailed, EndpointError, Event, MessageReceived, ResponseReceived
+from proxy.endpoints.core.endpoint import CallFailed, EndpointError, Event, MessageReceived, ResponseReceived
 from proxy.serial.channel import RosVersion
 
 __all__ = ["ReadinessProbe", "Thresholds"]
@@ -46,8 +46,8 @@ class ReadinessProbe:
         LocalError: a type of the probe is not known on this machine.
     """
 
-    def __init__(self, seat: EndpointDispatcher, settings: Readiness, now_s: float) -> None:
-        self._seat = seat
+    def __init__(self, dispatcher: EndpointDispatcher, settings: Readiness, now_s: float) -> None:
+        self._dispatcher = dispatcher
         self.settings = settings
         self._thresholds = Thresholds(failures=settings.failure_threshold, successes=settings.success_threshold)
         self._asked_s = now_s
@@ -58,9 +58,9 @@ class ReadinessProbe:
         self._due_s = now_s + settings.initial_delay_s
         self.reason = "not probed yet"
         if settings.service is not None:
-            self._handle = seat.create_client(self, settings.service, TRIGGER)
+            self._handle = dispatcher.create_client(self, settings.service, TRIGGER)
         else:
-            self._handle = seat.subscribe(self, settings.topic or "", settings.type_name, None)
+            self._handle = dispatcher.subscribe(self, settings.topic or "", settings.type_name, None)
             self._due_s += settings.period_s
 
     @property
@@ -87,7 +87,7 @@ class ReadinessProbe:
             self._has_ticked = False
             self._due_s = now_s + settings.period_s
         elif self._is_asked:
-            self._seat.endpoint.drop(self._handle, self._call)
+            self._dispatcher.endpoint.drop(self._handle, self._call)
             self._is_asked = False
             self._take(is_success=False, reason=f"{settings.service}: no answer within {settings.timeout_s:g} s")
             self._due_s = now_s + max(settings.period_s - settings.timeout_s, 0.0)
@@ -96,7 +96,7 @@ class ReadinessProbe:
             self._is_asked = True
             self._due_s = now_s + settings.timeout_s
             self._asked_s = now_s
-            self._seat.endpoint.call(self._handle, self._call, NO_FIELDS[self._seat.endpoint.ros])
+            self._dispatcher.endpoint.call(self._handle, self._call, NO_FIELDS[self._dispatcher.endpoint.ros])
 
     def handle_event(self, event: Event, now_s: float) -> None:
         """Take the answer of the service, or a message of the topic."""
@@ -111,7 +111,7 @@ class ReadinessProbe:
             if isinstance(event, CallFailed):
                 self._take(is_success=False, reason=f"{name}: {event.reason}")
             else:
-                at = _SUCCESS_AT[self._seat.endpoint.ros]
+                at = _SUCCESS_AT[self._dispatcher.endpoint.ros]
                 is_success = len(event.raw) > at and event.raw[at] == 1
                 self._take(is_success=is_success, reason=f"{name} answers success: false")
         elif isinstance(event, EndpointError):
@@ -119,7 +119,7 @@ class ReadinessProbe:
 
     def close(self) -> None:
         """End the probe."""
-        self._seat.close(self._handle)
+        self._dispatcher.close(self._handle)
 
     def _take(self, *, is_success: bool, reason: str) -> None:
         self.reason = "" if is_success else reason

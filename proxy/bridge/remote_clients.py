@@ -11,7 +11,7 @@ from typing import Final
 
 from gdp.errors import DropReason, LocalError, RemoteError
 from gdp.names import Name
-from proxy.bridge.decoder import MessageDecoder
+from proxy.bridge.core.decoder import MessageDecoder
 from proxy.serial.channel import RosVersion
 from proxy.serial.schema import DefinitionError
 from proxy.wire.service import Exchange

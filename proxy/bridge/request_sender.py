@@ -12,11 +12,11 @@ from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.service.dispatch import Ask, Dispatch, End
 from gdp.service.replication_messages import ReplicaCommand
-from proxy.bridge.action_interface import CANCEL, RESULT
 from proxy.bridge.broadcast_queue import BroadcastQueue, Effect, wire_of
 from proxy.bridge.call_tracer import CallKey
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.goals import Goals
+from proxy.bridge.core.action_interface import CANCEL, RESULT
+from proxy.bridge.core.goals import Goals
 from proxy.bridge.server_discovery import ServerCalls
 
 __all__ = ["RequestSender"]
@@ -32,13 +32,13 @@ class RequestSender:
     def __init__(
         self,
         *,
-        site: BridgeContext,
+        context: BridgeContext,
         service: Name,
         calls: Sequence[ServerCalls],
         goals: Goals | None,
         publisher: Publisher,
     ) -> None:
-        self._site = site
+        self._context = context
         self._service = service
         self._calls = calls
         self._goals = goals
@@ -71,7 +71,7 @@ class RequestSender:
             while effects := dispatch.poll_effects():
                 for effect in effects:
                     if isinstance(effect, End):
-                        self._site.member.end_call(self._service, (part, effect.call))
+                        self._context.member.end_call(self._service, (part, effect.call))
                         continue
                     whom = effect.servers if isinstance(effect, Ask) else effect.server and (effect.server,)
                     if whom is None and not isinstance(effect, ReplicaCommand):
@@ -93,8 +93,8 @@ class RequestSender:
             if call is None:
                 self._publisher.publish(wire)
             else:
-                self._site.member.send_requests(self._service, wire, call)
-            self._site.traffic.sent(len(wire))
+                self._context.member.send_requests(self._service, wire, call)
+            self._context.traffic.sent(len(wire))
             self._trace(part, effect, servers)
         except LocalError as error:
             self._refuse(part, effect, servers, str(error), now_s)
@@ -108,8 +108,8 @@ class RequestSender:
             self._record_holders(part, effect.call, {server})
         try:
             for wire in (*([] if again is None else [again]), wire_of(part, effect)):
-                self._site.member.send_request(self._service, server, wire, self._key_of(part, effect))
-                self._site.traffic.sent(len(wire))
+                self._context.member.send_request(self._service, server, wire, self._key_of(part, effect))
+                self._context.traffic.sent(len(wire))
             self._trace(part, effect, [server])
         except LocalError as error:
             self._refuse(part, effect, [server], str(error), now_s)
@@ -121,10 +121,10 @@ class RequestSender:
 
     def _trace(self, part: int, effect: Effect, servers: list[Name]) -> None:
         if isinstance(effect, Ask):
-            self._site.tracer.asked(CallKey(self._service, self._site.member.name, part, effect.call), servers)
+            self._context.tracer.asked(CallKey(self._service, self._context.member.name, part, effect.call), servers)
 
     def _refuse(self, part: int, effect: Effect, servers: list[Name], reason: str, now_s: float) -> None:
-        self._site.traffic.unread += 1
+        self._context.traffic.unread += 1
         if isinstance(effect, Ask):
             for server in servers:
                 self._calls[part].refused(effect.call, server, reason, now_s)

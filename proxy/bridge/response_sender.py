@@ -12,7 +12,7 @@ from gdp.names import Name
 from gdp.service.serving import Asked, Serving
 from proxy.bridge.call_tracer import CallKey
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.desired_flows import FlowSpec
+from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.faults import Fault
 from proxy.serial.serializer import Serializer
 from proxy.wire.service import Answer, Exchange, News, Outcome, too_large
@@ -31,14 +31,14 @@ class ResponseSender:
     def __init__(
         self,
         *,
-        site: BridgeContext,
+        context: BridgeContext,
         flow_spec: FlowSpec,
         service: Name,
         exchange: Exchange,
         serving: Serving[bytes],
         publisher: Publisher,
     ) -> None:
-        self._site = site
+        self._context = context
         self._flow_spec = flow_spec
         self._service = service
         self._serving = serving
@@ -56,7 +56,7 @@ class ResponseSender:
 
     def fail(self, asked: Asked, fault: Fault, reason: str) -> None:
         """Report a fault, and send its reason in place of a response."""
-        self._site.faults.report(self._flow_spec.local, fault, reason)
+        self._context.faults.report(self._flow_spec.local, fault, reason)
         self.refuse(asked, reason)
 
     def refuse(self, asked: Asked, reason: str) -> None:
@@ -66,11 +66,11 @@ class ResponseSender:
     def send_wire(self, client: Name, wire: bytes) -> None:
         """Send bytes to one client; nothing is sent to a client that has gone."""
         try:
-            self._site.member.respond(self._service, client, wire)
+            self._context.member.respond(self._service, client, wire)
         except LocalError:
-            self._site.traffic.unread += 1  # the client is gone
+            self._context.traffic.unread += 1  # the client is gone
             return
-        self._site.traffic.sent(len(wire))
+        self._context.traffic.sent(len(wire))
 
     def publish_news(self, at: int, raw: bytes, stamp_ns: int) -> None:
         """Send a message of an action's topic to all clients.
@@ -80,27 +80,27 @@ class ResponseSender:
         """
         what, publisher, services = self._flow_spec.local, self._publisher, len(self._responses)
         if not publisher.is_wanted:
-            self._site.traffic.unread += 1
+            self._context.traffic.unread += 1
             publisher.skip(LossReason.NO_READER)
             return
         if not publisher.has_space():
-            self._site.faults.report(what, Fault.TOO_FAST, "news come faster than clients confirm them")
+            self._context.faults.report(what, Fault.TOO_FAST, "news come faster than clients confirm them")
             publisher.skip(LossReason.WINDOW_OVERFLOW)
             return
         body = self._news[at].encode(raw)
         if reason := too_large("news", len(raw), self._flow_spec.rule.max_bytes, len(body)):
-            self._site.faults.report(what, Fault.TOO_LARGE, reason)
+            self._context.faults.report(what, Fault.TOO_LARGE, reason)
             publisher.skip(LossReason.TOO_LARGE)
             return
         wire = News(services + at, stamp_ns, body).to_wire()
         publisher.publish(wire)
-        self._site.traffic.sent(len(wire))
+        self._context.traffic.sent(len(wire))
 
     def _send(self, asked: Asked, answer: Answer) -> None:
-        if asked.client == self._site.member.name:
+        if asked.client == self._context.member.name:
             return  # the proxy's own request that cancels a goal
         wire = answer.to_wire()
         self._serving.remember(asked, wire)
         self.send_wire(asked.client, wire)
         error = answer.reason if answer.outcome is Outcome.FAILED else ""
-        self._site.tracer.served(CallKey(self._service, asked.client, asked.part, asked.call), error)
+        self._context.tracer.served(CallKey(self._service, asked.client, asked.part, asked.call), error)

@@ -12,13 +12,13 @@ from gdp.errors import GdpError, LocalError
 from gdp.names import Name
 from gdp.service.dispatch import Dispatch
 from gdp.service.sequencer import Sequencer
-from proxy.bridge.action_interface import ActionInterface
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.desired_flows import FlowSpec
+from proxy.bridge.core.action_interface import ActionInterface
+from proxy.bridge.core.desired_flows import FlowSpec
+from proxy.bridge.core.goals import Goals
+from proxy.bridge.core.remote_server import RemoteServer
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault
-from proxy.bridge.goals import Goals
-from proxy.bridge.remote_server import RemoteServer
 from proxy.wire.service import Exchange
 
 __all__ = ["SERVER_GONE", "Response", "ServerCalls", "ServerDiscovery"]
@@ -44,8 +44,8 @@ class ServerDiscovery:
     def __init__(
         self,
         *,
-        site: BridgeContext,
-        seat: EndpointDispatcher,
+        context: BridgeContext,
+        dispatcher: EndpointDispatcher,
         flow_spec: FlowSpec,
         service: Name,
         parts: ActionInterface,
@@ -54,8 +54,8 @@ class ServerDiscovery:
         opened: Callable[[Exchange], None],
         closed: Callable[[str], None],
     ) -> None:
-        self._site = site
-        self._endpoint = seat.endpoint
+        self._context = context
+        self._endpoint = dispatcher.endpoint
         self._flow_spec = flow_spec
         self._service = service
         self._parts = parts
@@ -68,7 +68,7 @@ class ServerDiscovery:
 
     def update(self, now_s: float) -> None:
         """Compare the servers with those that are reachable now, and report each change to the calls."""
-        member = self._site.member
+        member = self._context.member
         # If no server keeps up, waiting for one that may recover is better than giving up.
         peers = set(member.peers(self._service) or member.connected_peers(self._service))
         writer_proxies = member.writer_proxies_of(self._service) if peers else []
@@ -111,7 +111,7 @@ class ServerDiscovery:
 
     def _add(self, name: Name, now_s: float, incarnation: int, description: bytes) -> None:
         """Add a server, unless it is quarantined."""
-        self._site.contain(self._flow_spec.local, name, now_s, self._prepare, name, incarnation, description)
+        self._context.contain(self._flow_spec.local, name, now_s, self._prepare, name, incarnation, description)
         if (server := self.servers.get(name)) is not None and server.exchange is not None:
             self._announce(name, server, now_s)
 
@@ -128,7 +128,7 @@ class ServerDiscovery:
                 self._opened(server.ours)
                 self._is_open = True
         except GdpError as error:
-            self._site.faults.report(self._flow_spec.local, Fault.OTHER_TYPE, str(error))
+            self._context.faults.report(self._flow_spec.local, Fault.OTHER_TYPE, str(error))
             return
         self.servers[name] = server
 

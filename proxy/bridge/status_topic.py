@@ -16,8 +16,8 @@ from gdp.errors import LocalError
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.liveliness import LivelinessTracker, NameLiveliness
 from proxy.config.status_topic import StatusTopicConfig
-from proxy.endpoints.endpoint import EndpointError, Event
-from proxy.endpoints.qos import default
+from proxy.endpoints.core.endpoint import EndpointError, Event
+from proxy.endpoints.core.qos import default
 from proxy.serial.channel import RosVersion
 
 __all__ = ["StatusTopic", "open_status_topics", "string_message"]
@@ -37,14 +37,14 @@ class StatusTopic:
         LocalError: the graph knows no ``std_msgs/msg/String``, or a node has the topic with another type.
     """
 
-    def __init__(self, seat: EndpointDispatcher, settings: StatusTopicConfig) -> None:
-        self._seat = seat
+    def __init__(self, dispatcher: EndpointDispatcher, settings: StatusTopicConfig) -> None:
+        self._dispatcher = dispatcher
         self._tracker = LivelinessTracker(settings.deadline_s)
         self._due_s = 0.0
         self._published = ""
-        channel = seat.endpoint.channel(settings.topic, _STRING)
+        channel = dispatcher.endpoint.channel(settings.topic, _STRING)
         qos = (default(latched=True, depth=1),)
-        self._handle = seat.advertise(self, replace(channel, topic=settings.topic, qos=qos, latched=True))
+        self._handle = dispatcher.advertise(self, replace(channel, topic=settings.topic, qos=qos, latched=True))
 
     def is_due(self, now_s: float) -> bool:
         """Return whether the names are to be observed."""
@@ -57,7 +57,7 @@ class StatusTopic:
         text = json.dumps({"names": [self._fields(each) for each in names]}, ensure_ascii=False)
         if text != self._published:
             self._published = text
-            self._seat.endpoint.publish(self._handle, string_message(text, self._seat.endpoint.ros))
+            self._dispatcher.endpoint.publish(self._handle, string_message(text, self._dispatcher.endpoint.ros))
 
     def handle_event(self, event: Event, now_s: float) -> None:
         """Report a fault of the topic."""
@@ -67,7 +67,7 @@ class StatusTopic:
 
     def close(self) -> None:
         """Close the topic."""
-        self._seat.close(self._handle)
+        self._dispatcher.close(self._handle)
 
     def _fields(self, name: NameLiveliness) -> dict[str, object]:
         """Return the JSON form without times, which change with every message."""
@@ -78,14 +78,14 @@ class StatusTopic:
         return {**name.to_fields(), "parties": parties}
 
 
-def open_status_topics(seats: Sequence[EndpointDispatcher], settings: StatusTopicConfig) -> list[StatusTopic]:
+def open_status_topics(dispatchers: Sequence[EndpointDispatcher], settings: StatusTopicConfig) -> list[StatusTopic]:
     """Open the status topic in each graph; a graph that refuses it is reported and left out."""
     opened = []
-    for seat in seats:
+    for dispatcher in dispatchers:
         try:
-            opened.append(StatusTopic(seat, settings))
+            opened.append(StatusTopic(dispatcher, settings))
         except LocalError as error:
-            log.warning("no status topic endpoint=%s reason=%s", seat.endpoint.label, error)
+            log.warning("no status topic endpoint=%s reason=%s", dispatcher.endpoint.label, error)
     return opened
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from gdp.telemetry.sources import TopicCounts
-from proxy.bridge.desired_flows import FlowSpec
+from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.exposed_topic import ExposedTopic
 from proxy.bridge.imported_topic import ImportedTopic
 

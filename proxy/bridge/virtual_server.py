@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
-from proxy.bridge.action_interface import PROFILES
+from proxy.bridge.core.action_interface import PROFILES
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher, EventHandler
 from proxy.bridge.local_responses import LocalResponses
 from proxy.wire.service import Exchange
@@ -28,10 +28,10 @@ class VirtualServer:
         is_paced: whether the local clients have short queues.
     """
 
-    def __init__(self, seat: EndpointDispatcher, owner: EventHandler, *, is_paced: bool) -> None:
-        self._seat = seat
+    def __init__(self, dispatcher: EndpointDispatcher, owner: EventHandler, *, is_paced: bool) -> None:
+        self._dispatcher = dispatcher
         self._owner = owner
-        self._responses = LocalResponses(seat.endpoint, is_paced=is_paced)
+        self._responses = LocalResponses(dispatcher.endpoint, is_paced=is_paced)
         self._services: list[int] = []  # handles
         self._topics: list[int] = []
         self._closing: list[int] = []  # handles of both
@@ -41,12 +41,12 @@ class VirtualServer:
         """Create the server and the topics of a description."""
         self._end_closing()  # two servers of one name would both be asked
         self._topics = [
-            self._seat.advertise(
+            self._dispatcher.advertise(
                 self._owner, replace(each, qos=(profile,), latched=profile.durability == "transient_local")
             )
             for each, profile in zip(exchange.topics, PROFILES, strict=False)
         ]
-        self._services = [self._seat.serve(self._owner, each) for each in exchange.services]
+        self._services = [self._dispatcher.serve(self._owner, each) for each in exchange.services]
 
     def close(self) -> None:
         """Serve no client from now on; ``flush`` ends the server when clients have received their responses."""
@@ -74,7 +74,7 @@ class VirtualServer:
     def publish(self, at: int, raw: bytes) -> None:
         """Publish a message of a topic of an action, -1: its last; dropped where the server is closed."""
         if self._topics:
-            self._seat.endpoint.publish(self._topics[at], raw)
+            self._dispatcher.endpoint.publish(self._topics[at], raw)
 
     def flush(self, now_s: float) -> None:
         """Pass on the responses whose time has come; end a closed server whose clients have had time for them."""
@@ -92,5 +92,5 @@ class VirtualServer:
     def _end_closing(self) -> None:
         self._responses.flush_all()
         for handle in self._closing:
-            self._seat.close(handle)
+            self._dispatcher.close(handle)
         self._closing, self._ends_s = [], None

@@ -15,13 +15,13 @@ from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.nodes.membership import load_member
 from gdp.trust.delegation import Delegation
-from proxy.check.explain import explain
-from proxy.check.finding import Finding
+from proxy.check.core.explain import explain
+from proxy.check.core.finding import Finding
 from proxy.check.graph_snapshot import read_graphs
 from proxy.check.table import table
 from proxy.config.config import ProxyConfig
 from proxy.config.rule import Rule
-from proxy.endpoints.endpoint import Graph
+from proxy.endpoints.core.endpoint import Graph
 from proxy.node.node import open_topics
 
 __all__ = ["check_proxy"]

@@ -11,7 +11,7 @@ from typing import Final
 
 from gdp.ports.readiness import readable
 from proxy.config.graph import RosGraphConfig
-from proxy.endpoints.endpoint import Graph, proxy_node_name
+from proxy.endpoints.core.endpoint import Graph, proxy_node_name
 from proxy.endpoints.live import open_endpoints
 
 __all__ = ["LOOK_S", "read_graphs"]

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from proxy.endpoints.endpoint import Graph, Role
+from proxy.endpoints.core.endpoint import Graph, Role
 from proxy.printable import printable
 
 __all__ = ["Offered", "Traffic", "offered_names", "suggested_file"]

@@ -11,7 +11,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from proxy.check.finding import Finding, Match
+from proxy.check.core.finding import Finding, Match
 
 __all__ = ["table"]
 

@@ -14,8 +14,8 @@ from dataclasses import replace
 from gdp.errors import LocalError
 from gdp.ports.readiness import readable
 from proxy.check.suggestion import Offered, Traffic
-from proxy.endpoints.endpoint import Endpoint, Graph, MessageReceived, Role
-from proxy.endpoints.qos import request
+from proxy.endpoints.core.endpoint import Endpoint, Graph, MessageReceived, Role
+from proxy.endpoints.core.qos import request
 
 __all__ = ["measured"]
 

@@ -16,19 +16,19 @@ from gdp.cli import delegate as group
 from gdp.cli.completion import allow_completion
 from gdp.cli.node import Json, emit, failing_clearly
 from gdp.cli.version import HELP, Version
+from gdp.config.yaml_source import read_yaml
 from gdp.crypto.keys import PublicKey
 from gdp.errors import LocalError, StatementError
 from gdp.limits import CHAIN_MAX
-from gdp.nodes.yaml_source import read_yaml
 from gdp.stores.issue import DELEGATION_DAYS, delegate
 from gdp.stores.keyring import CARD, OWNER_PUBLIC, load_card, load_delegations, load_owner, save_delegation
 from gdp.trust.adcert import AdCertCache, Chain
 from gdp.trust.delegation import Delegation
 from gdp.trust.node_descriptor import NodeDescriptor
+from proxy.check.core.required_delegations import Machine, RequiredDelegation, needs, unmet
 from proxy.check.graph_snapshot import read_graphs
-from proxy.check.required_delegations import Machine, RequiredDelegation, needs, unmet
 from proxy.config.config import ProxyConfig
-from proxy.endpoints.endpoint import Graph
+from proxy.endpoints.core.endpoint import Graph
 
 __all__ = ["app", "main"]
 

@@ -12,7 +12,7 @@ import typer
 
 from gdp.cli.node import AwaitIface, Format, Json, Level, LogFormat, LogLevel, Verbose, failing_clearly, set_up_logging
 from gdp.cli.version import HELP, Version
-from gdp.nodes.uplink import wait_for_device
+from gdp.links.uplink import wait_for_device
 from proxy.cli.node_options import Delegations, DoorNode, Iface, Listen
 
 __all__ = ["main"]
@@ -54,8 +54,8 @@ def foxglove(
     with failing_clearly():
         from proxy.doors.foxglove_protocol import SUBPROTOCOLS
         from proxy.doors.foxglove_session import FoxgloveSession
-        from proxy.doors.node import door_config, run_door
         from proxy.endpoints.door import DoorEndpoint, DoorSettings
+        from proxy.node.door import door_config, run_door
 
         config, _ = door_config(node, iface, delegations)
         settings = DoorSettings(label="foxglove", listen=listen, origins=tuple(origin), subprotocols=SUBPROTOCOLS)

@@ -28,7 +28,7 @@ from gdp.cli.node import (
     set_up_logging,
 )
 from gdp.cli.version import HELP, Version
-from gdp.nodes.uplink import wait_for_device
+from gdp.links.uplink import wait_for_device
 from proxy.config.config import ProxyConfig
 
 __all__ = ["Schema", "main", "schema_text"]

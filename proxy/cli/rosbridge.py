@@ -13,7 +13,7 @@ import typer
 
 from gdp.cli.node import AwaitIface, Format, Json, Level, LogFormat, LogLevel, Verbose, failing_clearly, set_up_logging
 from gdp.cli.version import HELP, Version
-from gdp.nodes.uplink import wait_for_device
+from gdp.links.uplink import wait_for_device
 from proxy.cli.node_options import Delegations, DoorNode, Iface, Listen
 
 __all__ = ["main"]
@@ -53,9 +53,9 @@ def rosbridge(
     del version  # its callback ends the command
     set_up_logging(verbose=verbose, level=log_level, form=log_format)
     with failing_clearly():
-        from proxy.doors.node import door_config, run_door
         from proxy.doors.rosbridge_session import RosbridgeSession
         from proxy.endpoints.door import DoorEndpoint, DoorSettings
+        from proxy.node.door import door_config, run_door
 
         config, _ = door_config(node, iface, delegations)
         settings = DoorSettings(label="rosbridge", listen=listen, origins=tuple(origin))

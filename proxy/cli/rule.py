@@ -16,9 +16,9 @@ import yaml
 
 from gdp.cli import options
 from gdp.cli.output import show
+from gdp.config.drop_in import drop_in_directory
+from gdp.config.yaml_source import LOADER, Plain, read_yaml
 from gdp.errors import GdpError, LocalError
-from gdp.nodes.drop_in import drop_in_directory
-from gdp.nodes.yaml_source import LOADER, Plain, read_yaml
 from proxy.config.rule_drop_in import RULE_LISTS, ListedRule, RuleDropIn, RuleList
 
 __all__ = ["app", "main"]

@@ -77,9 +77,9 @@ def call(
     """
     set_up_logging(verbose=verbose, quiet=True)
     with failing_clearly(), ending_quietly():
-        from gdp.nodes.uplink import wait_for_device
+        from gdp.links.uplink import wait_for_device
         from proxy.endpoints.probe import Probe
-        from proxy.tools.member import NoAnswerError, Wanted, find_access, run_probe
+        from proxy.node.tool_member import NoAnswerError, Wanted, find_access, run_probe
         from proxy.tools.message_text import MessageText, request_tree
 
         tree = request_tree(request)

@@ -57,7 +57,7 @@ def _held(context: typer.Context, incomplete: str, right: Right) -> list[str]:
     node = context.params.get("node") or os.environ.get("GDP_NODE")
     if not node:
         return []
-    from proxy.tools.member import names_held
+    from proxy.node.tool_member import names_held
 
     try:
         return sorted({name for name in names_held(Path(node), right) if name.startswith(incomplete)})
@@ -68,7 +68,7 @@ def _held(context: typer.Context, incomplete: str, right: Right) -> list[str]:
 @contextlib.contextmanager
 def ending_quietly() -> Iterator[None]:
     """End with exit code 1 where nothing came in time, and with 0 where the reader of a pipe has what it wants."""
-    from proxy.tools.member import NoAnswerError
+    from proxy.node.tool_member import NoAnswerError
 
     try:
         yield

@@ -29,8 +29,8 @@ from proxy.cli.tool_options import (
 
 if TYPE_CHECKING:
     from proxy.bridge.bridge import Bridge
+    from proxy.node.tool_member import Access, Tick
     from proxy.serial.channel import Channel
-    from proxy.tools.member import Access, Tick
     from proxy.tools.message_text import MessageText
     from proxy.tools.rates import BandwidthReport, FrequencyReport
 
@@ -258,8 +258,8 @@ class _Hint:
 def _readable(
     node: Path, iface: str | None, delegations: Path | None, name: str, type_name: str, await_s: float
 ) -> Access:
-    from gdp.nodes.uplink import wait_for_device
-    from proxy.tools.member import Wanted, find_access
+    from gdp.links.uplink import wait_for_device
+    from proxy.node.tool_member import Wanted, find_access
 
     access = find_access(node, iface, delegations, Wanted(name, type_name, Right.READ))
     wait_for_device(access.config.iface, await_s)
@@ -268,7 +268,7 @@ def _readable(
 
 def _read(access: Access, take: Callable[[Channel, bytes, float], None], tick: Tick) -> None:
     from proxy.endpoints.probe import Probe
-    from proxy.tools.member import run_probe
+    from proxy.node.tool_member import run_probe
 
     rule = access.rule
     run_probe(access, Probe((rule.local, rule.type_name), take), tick)

@@ -19,10 +19,10 @@ import typer
 
 from gdp.cli import options
 from gdp.errors import GdpError, LocalError
-from gdp.nodes.control_client import NotRunningError, ask_node, find_control_socket
-from gdp.nodes.control_protocol import Command
+from gdp.management.control_client import NotRunningError, ask_node, find_control_socket
 from gdp.ros_names import covers, is_name, is_pattern
 from gdp.sharing.proxy_files import ProxyFiles
+from gdp.state.control_protocol import Command
 from proxy.bridge.liveliness import LivelinessEvent, LivelinessTracker, NameLiveliness, names_from_fields
 
 __all__ = ["app", "main"]

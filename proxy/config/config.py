@@ -21,11 +21,8 @@ from pydantic import (
 from pydantic.config import JsonDict
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from gdp.errors import LocalError
-from gdp.limits import ADVERTISEMENT_LEASE_S
-from gdp.nodes.busy_poll import SPIN_MAX_US, SPIN_US
-from gdp.nodes.config import LeaseSeconds, UplinkPlane
-from gdp.nodes.schema import (
+from gdp.config.config import LeaseSeconds, UplinkPlane
+from gdp.config.schema import (
     ControlSocket,
     Directory,
     Domain,
@@ -38,6 +35,9 @@ from gdp.nodes.schema import (
     StateFolder,
     load,
 )
+from gdp.errors import LocalError
+from gdp.limits import ADVERTISEMENT_LEASE_S
+from gdp.runtime.busy_poll import SPIN_MAX_US, SPIN_US
 from proxy.config.drop_ins import DROP_INS, DropIns, add_drop_in_patterns, add_drop_in_rules
 from proxy.config.graph import RosGraphConfig
 from proxy.config.matching import Fault, clashes

@@ -14,10 +14,10 @@ from typing import Final
 
 from pydantic import Field, ValidationInfo
 
+from gdp.config.drop_in import drop_in_directory
+from gdp.config.schema import Section, load
+from gdp.config.yaml_source import KeyPath, YamlSource, read_yaml
 from gdp.errors import ConfigError
-from gdp.nodes.drop_in import drop_in_directory
-from gdp.nodes.schema import Section, load
-from gdp.nodes.yaml_source import KeyPath, YamlSource, read_yaml
 from proxy.config.rule import NamePatterns, Rule
 
 __all__ = ["DROP_INS", "DropIn", "DropIns", "add_drop_in_patterns", "add_drop_in_rules"]

@@ -12,8 +12,8 @@ from urllib.parse import urlsplit
 
 from pydantic import Field, ValidationInfo, field_validator
 
+from gdp.config.schema import Section
 from gdp.errors import LocalError
-from gdp.nodes.schema import Section
 from proxy.config.rule import DOMAIN_MAX, Rule
 from proxy.serial.channel import RosVersion
 

@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field
 from pydantic.config import JsonDict
 
 from gdp.client.send_options import HISTORY_BYTES_MAX, HISTORY_MESSAGES_MAX
-from gdp.nodes.schema import Section
+from gdp.config.schema import Section
 
 __all__ = ["History", "SomeHistory"]
 

@@ -10,7 +10,7 @@ from typing import Annotated, Final
 
 from pydantic import AfterValidator, Field, model_validator
 
-from gdp.nodes.schema import Section
+from gdp.config.schema import Section
 from gdp.ros_names import NAME_FORM, NAME_MAX_CHARS, TYPE_FORMS, fits_kind, is_name
 
 __all__ = ["Readiness"]

@@ -11,8 +11,8 @@ from typing import Annotated, Final, Literal
 from pydantic import BeforeValidator, Field, ValidationInfo, WithJsonSchema, model_validator
 from pydantic.config import JsonDict
 
+from gdp.config.schema import Section, relative
 from gdp.errors import LocalError
-from gdp.nodes.schema import Section, relative
 from proxy.reduce.adaptive import MIN_HZ, MIN_QUALITY
 from proxy.reduce.compression import LEVEL_MAX, check_dictionary
 from proxy.reduce.picture import QUALITY

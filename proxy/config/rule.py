@@ -23,12 +23,12 @@ from pydantic.config import JsonDict, JsonValue
 from pydantic_core import PydanticCustomError
 
 from gdp.client.send_options import DEADLINE_MAX_S, RATE_MAX_BITS_S, RATE_MIN_BITS_S, WEIGHT_MAX, Priority, SendOptions
+from gdp.config.schema import Section, relative
 from gdp.crypto.keys import PublicKey
 from gdp.errors import GdpError, LocalError
 from gdp.limits import MESSAGE_MAX_BYTES
 from gdp.metadata import Metadata
 from gdp.names import Name
-from gdp.nodes.schema import Section, relative
 from gdp.ros_names import (
     NAME_FORM,
     NAME_MAX_CHARS,

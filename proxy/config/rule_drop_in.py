@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
+from gdp.config.drop_in import drop_in_directory, locked, read_drop_in, write_drop_in
+from gdp.config.yaml_source import Plain, read_yaml
 from gdp.errors import GdpError, LocalError
-from gdp.nodes.drop_in import drop_in_directory, locked, read_drop_in, write_drop_in
-from gdp.nodes.yaml_source import Plain, read_yaml
 from gdp.sharing.proxy_files import ProxyFiles
 from proxy.config.config import ProxyConfig
 

@@ -9,7 +9,7 @@ from typing import Final
 
 from pydantic import Field, field_validator
 
-from gdp.nodes.schema import Section
+from gdp.config.schema import Section
 from gdp.ros_names import NAME_FORM, NAME_MAX_CHARS, is_name
 
 __all__ = ["StatusTopicConfig"]

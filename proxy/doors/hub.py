@@ -13,7 +13,7 @@ from itertools import count
 from typing import Final, Protocol, TypeAlias
 
 from proxy.doors.client_queue import ClientQueue, Pending
-from proxy.endpoints.endpoint import (
+from proxy.endpoints.core.endpoint import (
     Event,
     Graph,
     GraphChanged,
@@ -23,11 +23,11 @@ from proxy.endpoints.endpoint import (
     Role,
     TypeResolved,
 )
-from proxy.endpoints.qos import DEPTH_MAX, default, depth_of
+from proxy.endpoints.core.qos import DEPTH_MAX, default, depth_of
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
 
-__all__ = ["Hub", "Publication", "Rights", "Session", "TopicType"]
+__all__ = ["DoorSession", "Hub", "Publication", "Rights", "TopicType"]
 
 REPLACED_S: Final = 0.5  # a publisher that is closed and opened again within this time keeps its number
 _EARLY_MAX: Final = 64
@@ -80,7 +80,7 @@ class Publication:
         return self.channel.topic, self.channel.type_name, self.channel.definition
 
 
-class Session(Protocol):
+class DoorSession(Protocol):
     """One client's connection.
 
     Attributes:
@@ -142,7 +142,7 @@ class Session(Protocol):
 
 @dataclass(slots=True, eq=False)
 class _Call:
-    session: Session
+    session: DoorSession
     handle: int
     context: object
 
@@ -165,7 +165,7 @@ class Hub:
     rights: Callable[[], Rights]
     known: Callable[[str, str], Channel | None]
     graph: Graph = frozenset()
-    sessions: dict[int, Session] = field(default_factory=dict)
+    sessions: dict[int, DoorSession] = field(default_factory=dict)
     publications: dict[int, Publication] = field(default_factory=dict)  # by handle
     services: dict[int, Service] = field(default_factory=dict)  # by handle
     _replaced: list[Publication] = field(default_factory=list)
@@ -278,7 +278,7 @@ class Hub:
 
     # the clients' side
 
-    def open(self, session: Session) -> None:
+    def open(self, session: DoorSession) -> None:
         """Add a client; offer it everything."""
         self.sessions[session.number] = session
         for publication in self.offered:
@@ -286,15 +286,15 @@ class Hub:
         for handle, service in self.services.items():
             session.add_service(handle, service)
 
-    def end(self, session: Session) -> None:
+    def end(self, session: DoorSession) -> None:
         """Remove a client; responses to its requests are ignored."""
         del self.sessions[session.number]
         self.dropped_otherwise += session.queue.dropped
         self._calls = {ticket: call for ticket, call in self._calls.items() if call.session is not session}
         self.update_graph()
 
-    def request(self, session: Session, handle: int, context: object, raw: bytes) -> None:
-        """Pass a request to the bridge; ``Session.pass_answer`` or ``pass_refusal`` follows with the context."""
+    def request(self, session: DoorSession, handle: int, context: object, raw: bytes) -> None:
+        """Pass a request to the bridge; ``DoorSession.pass_answer`` or ``pass_refusal`` follows with the context."""
         ticket = next(self._numbers)
         self._calls[ticket] = _Call(session, handle, context)
         self.emit(RequestReceived(handle, ticket, raw))

@@ -13,7 +13,7 @@ from typing import Final, TypeAlias
 import orjson
 
 from gdp.errors import GdpError
-from proxy.doors.hub import Hub, Session
+from proxy.doors.hub import DoorSession, Hub
 from proxy.doors.parameters import GET, LIST, SET, from_value, node_and_name, to_value
 from proxy.doors.rosbridge_json import RosbridgeCodec
 from proxy.serial.service import Service
@@ -53,7 +53,7 @@ class ParameterCalls:
     def __init__(
         self,
         hub: Hub,
-        session: Session,
+        session: DoorSession,
         tell_values: Callable[[Sequence[dict[str, object]], str | None], None],
         tell_wrong: Callable[[str], None],
     ) -> None:

@@ -24,9 +24,9 @@ from gdp.extras import require_extra
 from gdp.host_port import split_host_port
 from gdp.ports.listening import listen_tcp
 from proxy.doors.client_queue import DATA_MAX_BYTES, DATA_MAX_MESSAGES, ClientQueue, Pending
-from proxy.doors.hub import Hub, Rights, Session
+from proxy.doors.hub import DoorSession, Hub, Rights
 from proxy.doors.types import known_channel
-from proxy.endpoints.endpoint import Event, Graph, MessageReceived
+from proxy.endpoints.core.endpoint import Event, Graph, MessageReceived
 from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.serial.service import Service
 
@@ -37,7 +37,7 @@ __all__ = ["DoorEndpoint", "DoorSettings", "NewSession"]
 
 log = logging.getLogger(__name__)
 
-NewSession: TypeAlias = "Callable[[Hub, int, ClientQueue], Session]"
+NewSession: TypeAlias = "Callable[[Hub, int, ClientQueue], DoorSession]"
 
 INPUT_MAX_BYTES: Final = 64 << 20  # messages of clients that wait for the bridge
 OUTPUT_MAX_BYTES: Final = 64 << 20  # messages of the bridge that wait for the server's thread
@@ -68,7 +68,7 @@ class DoorSettings:
 
 @dataclass(slots=True)
 class _Client:
-    session: Session
+    session: DoorSession
     wake: asyncio.Event = field(default_factory=asyncio.Event)
     reported: int = 0  # dropped messages that the client knows of
     reported_at_s: float = 0.0
@@ -370,7 +370,7 @@ class DoorEndpoint:
         except ConnectionClosed:
             log.debug("client gone while sending session=%d", session.number)
 
-    def _encoded(self, session: Session, item: Pending) -> str | bytes | None:
+    def _encoded(self, session: DoorSession, item: Pending) -> str | bytes | None:
         """Return what a client gets; None: its message drew an error of this program, of which the client hears."""
         try:
             return session.encode(item)

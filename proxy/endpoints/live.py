@@ -9,7 +9,7 @@ import contextlib
 from collections.abc import Iterator, Sequence
 
 from proxy.config.graph import RosGraphConfig
-from proxy.endpoints.endpoint import Endpoint
+from proxy.endpoints.core.endpoint import Endpoint
 
 __all__ = ["open_endpoint", "open_endpoints"]
 

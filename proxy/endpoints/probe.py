@@ -12,7 +12,7 @@ from itertools import count
 
 from gdp.errors import LocalError
 from proxy.doors.types import known_channel
-from proxy.endpoints.endpoint import Event, Graph, GraphEntity, RequestReceived, Role
+from proxy.endpoints.core.endpoint import Event, Graph, GraphEntity, RequestReceived, Role
 from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.serial.service import Service
 

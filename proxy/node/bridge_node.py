@@ -19,13 +19,13 @@ from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
 from proxy.bridge.bridge import Bridge, FlowChange
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.desired_flows import FlowSpec
-from proxy.bridge.flow_fields import flow_fields
+from proxy.bridge.core.desired_flows import FlowSpec
+from proxy.bridge.core.flow_fields import flow_fields
+from proxy.bridge.core.topic_rows import flow_rows
+from proxy.bridge.core.topic_stats import percentile
 from proxy.bridge.topic_counts import topic_counts
-from proxy.bridge.topic_rows import flow_rows
-from proxy.bridge.topic_stats import percentile
 from proxy.config.config import ProxyConfig
-from proxy.endpoints.endpoint import proxy_node_name
+from proxy.endpoints.core.endpoint import proxy_node_name
 from proxy.endpoints.live import open_endpoints
 from proxy.node.goodbye import say_goodbye
 from proxy.node.node import ProxyNode, run_node
@@ -58,10 +58,10 @@ def run(path: Path, settings: ProxyConfig, *, json: bool) -> None:
             held = DelegationStore(settings.delegations, node.identity)
             tracer = open_tracer(settings.traces, node.identity.name, node.identity.label)
             look_s = 0.0 if all(end.exclusive for end in settings.ros) else _LOOK_S
-            site = BridgeContext(node.member, node.traffic, node.faults, tracer)
-            bridge = Bridge(site, settings, endpoints, held, look_s=look_s, status_topic=settings.status)
+            context = BridgeContext(node.member, node.traffic, node.faults, tracer)
+            bridge = Bridge(context, settings, endpoints, held, look_s=look_s, status_topic=settings.status)
             domains = tuple(end.domain_id for end in settings.ros if end.endpoint != "ros1")
-            answer_for_proxy(bridge, site, node.identity, node.policy, node.node_log.wait_facts, domains)
+            answer_for_proxy(bridge, context, node.identity, node.policy, node.node_log.wait_facts, domains)
             node.drains = True
             node.on_reload = lambda: _reload(path, settings, node, bridge)
             has_names = settings.metrics is not None and settings.metrics.topic_names

@@ -22,28 +22,28 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import GdpError, LocalError
 from gdp.host.service_notifier import service_notifier
+from gdp.host.single_instance import run_alone
+from gdp.links.uplink import open_uplink
+from gdp.management.control_client import control_path
+from gdp.management.control_socket import ControlHandlers
 from gdp.message.loss import by_label
 from gdp.names import Name
-from gdp.nodes.control_client import control_path
-from gdp.nodes.control_socket import ControlHandlers
-from gdp.nodes.control_status import node_status
 from gdp.nodes.credentials import Credentials, watched_folders
 from gdp.nodes.decision_log import log_decisions
 from gdp.nodes.delegation_store import DelegationStore
-from gdp.nodes.diagnostic_control import DiagnosticCommands
-from gdp.nodes.link_rows import LinkRows
-from gdp.nodes.member_tables import participant_tables
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
 from gdp.nodes.port_rows import port_rows
 from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.nodes.rights import confine_proxy
-from gdp.nodes.runtime import Runtime, now
-from gdp.nodes.single_instance import run_alone
-from gdp.nodes.snapshot import member_snapshot, node_snapshot, short_id
-from gdp.nodes.topic_rows import TopicRow, rows_to_fields
-from gdp.nodes.uplink import open_uplink
 from gdp.ports.plane import Plane
+from gdp.runtime.runtime import Runtime, now
+from gdp.state.control_status import node_status
+from gdp.state.diagnostic_control import DiagnosticCommands
+from gdp.state.link_rows import LinkRows
+from gdp.state.member_tables import participant_tables
+from gdp.state.snapshot import member_snapshot, node_snapshot, short_id
+from gdp.state.topic_rows import TopicRow, rows_to_fields
 from gdp.telemetry.sources import Sources, TopicCounts, count_list
 from gdp.trust.domain import Policy
 from proxy.bridge.counters import Traffic

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final
 
 from gdp.extras import require_extra
 from gdp.names import Name
-from gdp.nodes.snapshot import short_id
+from gdp.state.snapshot import short_id
 from proxy.bridge.call_tracer import CallKey, NoTracer, trace_ids
 
 if TYPE_CHECKING:

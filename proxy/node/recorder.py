@@ -15,7 +15,7 @@ import typer
 from gdp.cli.node import emit, emit_wait
 from gdp.errors import LocalError
 from proxy.bridge.bridge import Bridge
-from proxy.bridge.topic_stats import TopicStats
+from proxy.bridge.core.topic_stats import TopicStats
 from proxy.config.config import ProxyConfig
 from proxy.config.recorded import RecordedRules
 from proxy.node.goodbye import say_goodbye

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from gdp.nodes.delegation_store import DelegationStore
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.context import BridgeContext
-from proxy.bridge.topic_rows import flow_rows
+from proxy.bridge.core.topic_rows import flow_rows
 from proxy.config.config import ProxyConfig
 from proxy.config.recorded import RecordedRules
 from proxy.node.node import ProxyNode, open_topics
@@ -36,9 +36,9 @@ def open_recording_bridge(
     """
     held = DelegationStore(settings.delegations, node.identity)
     open_topics(settings, held)
-    site = BridgeContext(node.member, node.traffic, node.faults)
-    bridge = Bridge(site, rules, [endpoint], held)
-    answer_for_proxy(bridge, site, node.identity, node.policy, node.node_log.wait_facts)
+    context = BridgeContext(node.member, node.traffic, node.faults)
+    bridge = Bridge(context, rules, [endpoint], held)
+    answer_for_proxy(bridge, context, node.identity, node.policy, node.node_log.wait_facts)
     node.topics = lambda: flow_rows(bridge.flows, bridge.held, node.member)
     node.on_reload = lambda: _renew(node, settings, rules, bridge)
     node.runtime.watch(endpoint)

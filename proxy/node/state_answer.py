@@ -1,6 +1,6 @@
 """Answer of a proxy to the diagnostic request ``state``: its flows of one name.
 
-I/O through the bridge, which it only reads. ``gdp/nodes/state_answers.py`` says who gets an answer.
+I/O through the bridge, which it only reads. ``gdp/state/state_answers.py`` says who gets an answer.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from gdp.control.diagnostics import Question
 from gdp.crypto.identity import Identity
 from gdp.diagnosis.facts import ProxyFacts, WaitFact
 from gdp.names import ZERO, Name
-from gdp.nodes.state_answers import answer_state
 from gdp.sansio import Timestamps
+from gdp.state.state_answers import answer_state
 from gdp.trust.domain import Policy
 from proxy.bridge.bridge import Bridge
 from proxy.bridge.context import BridgeContext
@@ -27,7 +27,7 @@ _ASKED_MAX_CHARS: Final = 256
 
 def answer_for_proxy(
     bridge: Bridge,
-    site: BridgeContext,
+    context: BridgeContext,
     identity: Identity,
     policy: Policy,
     waits: Callable[[float], tuple[WaitFact, ...]],
@@ -37,7 +37,7 @@ def answer_for_proxy(
 
     The body may have the ROS name that the asker typed (``q``). A member of another domain must state the 256-bit name.
     """
-    member, begun_s = site.member, time.monotonic()
+    member, begun_s = context.member, time.monotonic()
 
     def gather(question: Question, now: Timestamps) -> ProxyFacts:
         asked = question.body.text("q", _ASKED_MAX_CHARS) if "q" in question.body else ""
@@ -45,7 +45,7 @@ def answer_for_proxy(
             asked = question.name.to_text() if question.name != ZERO else ""
         return proxy_facts(
             bridge,
-            site,
+            context,
             identity,
             asked,
             now,

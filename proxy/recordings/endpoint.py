@@ -1,6 +1,6 @@
 """Endpoints of a recording: one plays its messages to a bridge, one records what a bridge publishes.
 
-I/O, through ``reader`` and ``writer``. Both implement ``proxy/endpoints/endpoint.py``, and hold topics only. A
+I/O, through ``reader`` and ``writer``. Both implement ``proxy/endpoints/core/endpoint.py``, and hold topics only. A
 recording distinguishes publishers: each has a channel. The caller owns the time: a message becomes an event when
 ``deliver`` is called with it.
 """
@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Final, NamedTuple, NoReturn
 
 from gdp.errors import LocalError
-from proxy.endpoints.endpoint import Event, Graph, GraphChanged, GraphEntity, MessageReceived, Role, TypeResolved
+from proxy.endpoints.core.endpoint import Event, Graph, GraphChanged, GraphEntity, MessageReceived, Role, TypeResolved
 from proxy.recordings.reader import BagReader
 from proxy.recordings.writer import BagWriter
 from proxy.serial.channel import Channel, Qos, RosVersion

@@ -28,7 +28,7 @@ from peers.process import FailedError
 from report import Rounds, progress
 from skeleton import Options, Outcome, command_line, new_run, run_bench
 
-from fog.supervisor.record import Record
+from fog.supervisor.core.record import Record
 from gdp.enrolment.registry import Registry
 from gdp.host.run_registry import RunRegistry
 

@@ -10,14 +10,14 @@ from typing import Final
 
 from gdp.client.participant import Participant, Topic
 from gdp.client.publisher import Publisher
+from gdp.config.config import RibConfig
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.errors import LocalError
 from gdp.names import Name
-from gdp.nodes.config import RibConfig
 from gdp.nodes.membership import incarnation, load_member, wall_clock_ms
-from gdp.nodes.runtime import Runtime
 from gdp.ports.raw import RawPlane
+from gdp.runtime.runtime import Runtime
 from gdp.stores.keyring import load_delegations
 
 __all__ = ["End"]

@@ -40,7 +40,7 @@ from report import Rounds
 from skeleton import Options, Outcome, command_line, parse, perform
 
 from gdp.host.run_registry import RunRegistry
-from gdp.nodes.busy_poll import SPIN_US
+from gdp.runtime.busy_poll import SPIN_US
 
 SIZES: Final = (100, 10_000, 921_600)
 MTUS: Final = (1_500, 9_000)

@@ -24,9 +24,9 @@ from topologies import single
 from fog.providers.local import fault_injection
 from fog.site import open_site
 from fog.supervisor.background import pid_of
+from fog.supervisor.core.record import Record
 from fog.supervisor.infrastructure import local_provider
 from fog.supervisor.journal import Journal
-from fog.supervisor.record import Record
 from fog_demo.environment import STATE, end_all_of, fog_command, standing_runs, sweep
 
 __all__ = ["DEDICATED", "ECHO", "REPLICA", "ROBOT", "Cluster"]

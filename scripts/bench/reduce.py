@@ -26,9 +26,9 @@ from rosbags.typesys import Stores, get_typestore
 from skeleton import Options, Outcome, command_line, run_bench
 
 from gdp.host.run_registry import RunRegistry
-from proxy.bridge.decoder import MessageDecoder
-from proxy.bridge.encoder import MessageEncoder, compressor_of, description_of
-from proxy.bridge.expander import MessageExpander
+from proxy.bridge.core.decoder import MessageDecoder
+from proxy.bridge.core.encoder import MessageEncoder, compressor_of, description_of
+from proxy.bridge.core.expander import MessageExpander
 from proxy.config.reduction import Compress, Region
 from proxy.config.rule import Rule
 from proxy.recordings.reader import BagReader

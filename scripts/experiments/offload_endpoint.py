@@ -108,7 +108,7 @@ class _CycloneEnd:
 
     def run(self, look: Callable[[], bool], every_s: float) -> None:
         """Work until ``look`` returns that the series is over."""
-        from proxy.endpoints.endpoint import MessageReceived
+        from proxy.endpoints.core.endpoint import MessageReceived
 
         while not look():
             select([self._endpoint], [], [], every_s)

@@ -17,8 +17,8 @@ from rich.live import Live
 from rich.text import Text
 
 from fog.cli.views import event_line, machine_fields, machines_table, stage
+from fog.supervisor.core.record import Record
 from fog.supervisor.journal import Entry
-from fog.supervisor.record import Record
 
 __all__ = ["Counts", "Display"]
 

@@ -16,9 +16,9 @@ from typing import Final
 
 from fog.providers.local.fault_injection import kill, notice
 from fog.site import Site, open_site
+from fog.supervisor.core.record import Record
 from fog.supervisor.infrastructure import local_provider
 from fog.supervisor.journal import Entry, Journal
-from fog.supervisor.record import Record
 from fog_demo.display import Counts, Display
 from fog_demo.environment import Environment
 from gdp.errors import LocalError

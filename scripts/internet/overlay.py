@@ -22,10 +22,10 @@ from gdp.control.endpoints import Endpoint
 from gdp.crypto.certificates import Role
 from gdp.errors import LocalError
 from gdp.host.processes import Process, end_all
+from gdp.links.endpoint_files import RECORD_SUFFIX, own_record, public_candidates
+from gdp.management.control_client import ask_node, find_control_socket
 from gdp.metadata import Metadata
-from gdp.nodes.control_client import ask_node, find_control_socket
-from gdp.nodes.control_protocol import Command
-from gdp.nodes.endpoint_files import RECORD_SUFFIX, own_record, public_candidates
+from gdp.state.control_protocol import Command
 from gdp.stores.files import public, write_all
 from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
 from gdp.stores.keyring import CARD, ROOT_CERTIFICATE

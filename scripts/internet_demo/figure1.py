@@ -22,8 +22,8 @@ from typing import Any, Final, NamedTuple
 import yaml
 
 from gdp.errors import LocalError
-from gdp.nodes.control_client import ask_node, find_control_socket
-from gdp.nodes.control_protocol import Command
+from gdp.management.control_client import ask_node, find_control_socket
+from gdp.state.control_protocol import Command
 from internet.access import Access
 from internet.host import Host
 from internet.laboratory import Laboratory

@@ -30,9 +30,9 @@ from gdp.enrolment.member_setup import LISTEN_PORT
 from gdp.enrolment.programs import programs_of
 from gdp.errors import GdpError, LocalError
 from gdp.host.processes import Process, end_all
+from gdp.management.control_client import ask_node, find_control_socket
 from gdp.metadata import Metadata
-from gdp.nodes.control_client import ask_node, find_control_socket
-from gdp.nodes.control_protocol import Command
+from gdp.state.control_protocol import Command
 from gdp.stores.issue import delegate, install_delegation, make_owner
 from gdp.stores.keyring import CARD, load_card
 from gdp.trust.right import Right

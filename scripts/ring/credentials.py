@@ -16,11 +16,11 @@ from typing import Final, Literal
 
 import yaml
 
+from gdp.config.config import UplinkPlane
 from gdp.crypto.certificates import Role
 from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.metadata import Metadata
 from gdp.names import Name
-from gdp.nodes.config import UplinkPlane
 from gdp.simulation.topology import Attachment, Topology
 from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
 from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE

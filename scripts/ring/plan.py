@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, TypeAlias
 
+from gdp.config.config import UplinkPlane
 from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.names import Name
-from gdp.nodes.config import UplinkPlane
 from gdp.simulation.topology import Attachment, DomainPlan, Topology
 from proxy.config.config import Encoding
 from proxy.serial.channel import Channel

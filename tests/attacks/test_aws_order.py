@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from fog.providers.aws.config import AwsConfig
+from fog.providers.aws.core.run_request import Ground, order
 from fog.providers.aws.provider import AwsProvider
-from fog.providers.aws.run_request import Ground, order
 from tests.fog.providers.test_aws import BOOT, EAST, Cloud, aws, cloud, spec
 
 __all__ = ["aws", "cloud"]

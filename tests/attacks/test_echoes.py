@@ -11,7 +11,7 @@ from gdp.errors import StatementError
 from gdp.limits import DEAD_S, HELLO_S
 from gdp.names import ZERO
 from tests.gdp.control.members import hello_protocol, node
-from tests.gdp.control.test_neighbor_discovery import A, B, forged, greet, hear, hellos
+from tests.gdp.control.test_neighbour_discovery import A, B, forged, greet, hear, hellos
 
 MALLORY = node("mallory")
 

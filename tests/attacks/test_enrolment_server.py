@@ -20,16 +20,16 @@ from gdp.crypto.statements import parse
 from gdp.enrolment import desk as desk_module
 from gdp.enrolment import server as server_module
 from gdp.enrolment.create import DomainPlan, create_domain, make_token
-from gdp.enrolment.desk import EnrolmentDesk, Session
+from gdp.enrolment.desk import EnrolmentDesk, MemberConnection
 from gdp.enrolment.domain_files import DomainFiles
 from gdp.enrolment.registry import Registry
 from gdp.enrolment.removal import remove_machine
-from gdp.enrolment.wire import EnrolmentError, Refusal, prove_member
 from gdp.errors import StoreError
-from gdp.nodes.endpoint_files import own_record
+from gdp.links.endpoint_files import own_record
 from gdp.stores.files import public, write_all
 from gdp.stores.keyring import load_domain
-from gdp.trust.enrolment import apply
+from gdp.trust.bootstrap_ticket import apply
+from gdp.trust.enrolment_wire import EnrolmentError, Refusal, prove_member
 from gdp.trust.join_token import JoinRole, JoinToken, join_id, join_key, join_proof
 from gdp.trust.mail import Mail
 from gdp.trust.revocation import Revocation
@@ -89,7 +89,7 @@ class Machine:
         members = [Membership.from_wire(each, root, NOW) for each in answer.byte_strings("members", 4)]
         self.identities = [key.admitted(each, root) for key, each in zip(self.keys, members, strict=True)]
 
-    def session(self, desk: EnrolmentDesk, unix_s: float = NOW, *, node: int = -1) -> Session:
+    def session(self, desk: EnrolmentDesk, unix_s: float = NOW, *, node: int = -1) -> MemberConnection:
         identity = self.identities[node]
         proof = prove_member(identity.key, BINDING, NONCE, INSTANCE)
         fields = {"certificate": identity.membership, "signature": proof, "instance": INSTANCE}

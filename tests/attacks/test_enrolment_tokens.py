@@ -17,10 +17,10 @@ from pathlib import Path
 import pytest
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from fog.enrolment.bootstrap import joining_boot
-from fog.enrolment.listener import CONNECTION_S, CONNECTIONS_MAX, Listener, bind_tcp
-from fog.enrolment.responder import OPENED_MAX, Responder
-from fog.enrolment.tickets import Report, Tickets
+from fog.bootstrap.bundles import joining_boot
+from fog.bootstrap.listener import CONNECTION_S, CONNECTIONS_MAX, Listener, bind_tcp
+from fog.bootstrap.responder import OPENED_MAX, Responder
+from fog.bootstrap.tickets import Report, Tickets
 from fog.host.bundle import JOIN_FILE, TICKET_FILE, install, pack
 from fog.host.enrolment import enrol
 from fog.machine import MachineBundle, MachineSpec
@@ -35,7 +35,7 @@ from gdp.crypto.keys import PublicKey, SigningKey, SoftwareKey
 from gdp.errors import LocalError, StatementError
 from gdp.stores.audit_log import verify_audit
 from gdp.stores.keyring import load_domain, load_owner
-from gdp.trust.enrolment import (
+from gdp.trust.bootstrap_ticket import (
     HEAD_BYTES,
     REFUSED,
     REQUEST_MAX_BYTES,
@@ -47,7 +47,7 @@ from gdp.trust.enrolment import (
     seal_answer,
 )
 from gdp.trust.join_token import JOIN_SECRET_BYTES, JoinRole, JoinToken
-from tests.fog.enrolment.desk import CLUSTER, Desk, Machine, made_desk
+from tests.fog.bootstrap.desk import CLUSTER, Desk, Machine, made_desk
 from tests.fog.providers.test_aws import Cloud, aws, cloud, spec
 from tests.fog.supervisor.test_supervisor import PLAN, Memory, journal, site, supervisor, work
 

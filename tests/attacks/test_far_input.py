@@ -13,8 +13,8 @@ import pytest
 
 from gdp.control.boundary import ErrorBoundary
 from gdp.errors import RemoteError
-from proxy.bridge.decoder import MessageDecoder
-from proxy.bridge.expander import MessageExpander
+from proxy.bridge.core.decoder import MessageDecoder
+from proxy.bridge.core.expander import MessageExpander
 from proxy.bridge.virtual_server import VirtualServer
 from proxy.doors.rosbridge_json import RosbridgeCodec
 from proxy.reduce.compression import BodyDecompressor

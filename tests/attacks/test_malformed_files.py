@@ -18,8 +18,8 @@ from fog.launch.cloud_node import parameter_rule, parameters_in
 from fog.launch.load import load
 from fog.providers.local.machine_file import MachineFile
 from fog.supervisor.journal import Journal
+from gdp.config.yaml_source import read_yaml
 from gdp.errors import ConfigError, GdpError, LocalError, StoreError
-from gdp.nodes.yaml_source import read_yaml
 from tests.attacks.work import lines_run
 
 DEEP = b"[" * 200_000

@@ -44,7 +44,7 @@ def notes_of(pipe: Pipe, label: bytes, *, secrets: dict[int, bytes] | None = Non
     return Notes(reader_of(label), source, TOPIC, SECRETS if secrets is None else secrets, as_name=victim)
 
 
-def by_the_secret_alone(pipe: Pipe, end: End, number: int, report: AckNack) -> bytes:
+def by_the_secret_alone(pipe: Pipe, end: End, number: int, acknack: AckNack) -> bytes:
     """Return the control datagram that proved a reader when the topic's secret alone was sufficient."""
     source, reader = pipe.source, end.reader
     key = seal_key(SECRETS[1], Kind.ACKNACK, reader.name, reader.incarnation, source.name)
@@ -59,7 +59,7 @@ def by_the_secret_alone(pipe: Pipe, end: End, number: int, report: AckNack) -> b
         destination_incarnation=source.incarnation,
         numbers=iter([number]),
     )
-    return made.seal(report.to_wire())
+    return made.seal(acknack.to_wire())
 
 
 def test_a33_a_note_in_another_readers_name_moves_nothing() -> None:
@@ -84,7 +84,7 @@ def test_a33_an_introduction_in_another_readers_name_is_refused() -> None:
     end = live(pipe, b"a")
     insider = notes_of(pipe, b"m", victim=end.reader.name)
     stranger = reader_of(b"m")
-    forged = Introduction.make(subject_of(b"a"), key_of(b"m"), 8, 9_999, stranger.notes.public)
+    forged = Introduction.make(subject_of(b"a"), key_of(b"m"), 8, 9_999, stranger.control_keys.public)
     for wire in (None, forged):
         pipe.tell(insider.introduction(wire=wire, incarnation=8))
         pipe.tell(insider.report(LIES[0], incarnation=8))

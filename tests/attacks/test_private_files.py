@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from fog.site import open_site
+from gdp.config.config import ClusterConfig
 from gdp.errors import LocalError
 from gdp.host.run_registry import RunRegistry
-from gdp.nodes.config import ClusterConfig
 from gdp.stores.files import private, read_private, write_all
 from gdp.stores.issue import make_domain
 from gdp.stores.keyring import load_domain

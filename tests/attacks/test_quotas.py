@@ -11,7 +11,7 @@ from gdp.control.fragments import ControlFragmenter
 from gdp.control.join import Join
 from gdp.control.link_state import LinkState, Scope
 from gdp.control.query import Query
-from gdp.control.relay import Relay
+from gdp.control.relayed_statement import RelayedStatement
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.subject import Subject
@@ -187,8 +187,8 @@ def test_a16_one_nodes_names_leave_capacity_for_the_other_nodes_of_its_switch() 
 
 
 def tell(at: RibCore, wire: bytes) -> None:
-    relay = Relay(wire, (SCHOOL.root.domain,), SWITCH.membership)
-    at.receive(relay.to_wire(SWITCH.name, SWITCH.key), SWITCH.name, START)
+    relayed = RelayedStatement(wire, (SCHOOL.root.domain,), SWITCH.membership)
+    at.receive(relayed.to_wire(SWITCH.name, SWITCH.key), SWITCH.name, START)
 
 
 def _subject(name: str, by: Identity = ROBOT) -> Subject:

@@ -14,9 +14,9 @@ from gdp.client.participant import Message, Participant, Topic
 from gdp.message.loss import Losses
 from gdp.names import Name
 from proxy.bridge.context import BridgeContext
+from proxy.bridge.core.desired_flows import FlowSpec
 from proxy.bridge.counters import Traffic
 from proxy.bridge.decoder_cache import DecoderCache
-from proxy.bridge.desired_flows import FlowSpec
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault, Faults
 from proxy.bridge.imported_topic import ImportedTopic
@@ -57,10 +57,10 @@ class Recorder:
         member = SimpleNamespace(losses_of=lambda _: Losses())
         rule = SimpleNamespace(name="/chatter", max_hz=None, max_bytes=1 << 20)
         self.endpoint = RecordingEndpoint(cast(BagWriter, self.sink), [("/chatter", "a/msg/B")])
-        site = BridgeContext(cast(Participant, member), Traffic(), self.faults)
+        context = BridgeContext(cast(Participant, member), Traffic(), self.faults)
         flow_spec = FlowSpec(False, "/chatter", "a/msg/B", TOPIC, cast(Rule, rule))
         self.flow = ImportedTopic(
-            site, EndpointDispatcher(self.endpoint), flow_spec, cast(Topic, SimpleNamespace(name=TOPIC))
+            context, EndpointDispatcher(self.endpoint), flow_spec, cast(Topic, SimpleNamespace(name=TOPIC))
         )
 
     @property

@@ -11,22 +11,22 @@ from typing import cast
 import pytest
 import yaml
 
+from gdp.config.relay_config import RelayConfig
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
-from gdp.nodes import relay_server as relay_server_module
-from gdp.nodes.relay_config import RelayConfig
-from gdp.nodes.relay_context import RelayContext
-from gdp.nodes.relay_link import RelayLink, RelayPort, prepare_socket
-from gdp.nodes.relay_loop import RelayLoop
-from gdp.nodes.relay_server import BorderServer, listen_tls
-from gdp.nodes.relay_tls import tls_context
+from gdp.links import relay_server as relay_server_module
+from gdp.links.relay_context import RelayContext
+from gdp.links.relay_link import RelayLink, RelayPort, prepare_socket
+from gdp.links.relay_loop import RelayLoop
+from gdp.links.relay_server import BorderServer, listen_tls
+from gdp.links.relay_tls import tls_context
 from gdp.ports.tap import TapDevice
 from gdp.relay.admission import verified_border
 from gdp.relay.connection import ConnectionSettings, RelayConnection
 from gdp.stores.issue import make_domain, make_node
 from gdp.stores.keyring import load_root
 from gdp.trust.domain import Policy
-from tests.gdp.nodes.test_relay_link import Device, run
+from tests.gdp.links.test_relay_link import Device, run
 from tests.gdp.relay.test_frame_queue import frame
 
 DEAD_S = 60.0  # a busy machine is no dead path

@@ -105,7 +105,7 @@ def test_a04_a_switch_that_restarts_does_not_believe_a_revoked_member(tmp_path: 
     world, flow = with_thief()
     switch = world.switches["nuc1"]
     upkeep = RevocationUpkeep(tmp_path, switch._policy.revoked)
-    upkeep.load(world.network.now)
+    upkeep.restore(world.network.now)
     upkeep.start()
     member = world.identities[ROBOT].member
     world.switches["nuc2"].revoke(by_root(world, "school", member.fingerprint), world.network.now)
@@ -122,7 +122,7 @@ def test_a04_a_switch_that_restarts_does_not_believe_a_revoked_member(tmp_path: 
     world.network.run(2)
     restarted = world.restart_switch("nuc1")  # neither neighbour comes back: no node can inform it
     again = RevocationUpkeep(tmp_path, restarted._policy.revoked)
-    again.load(world.network.now)
+    again.restore(world.network.now)
     again.close()
     world.network.run(5)
     assert flow.member.name not in {each.name for each in restarted.hello_protocol.all_up()}

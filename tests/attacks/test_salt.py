@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from fog.bootstrap.robot_config import add_rules, remove_rules
 from fog.cluster import ExportedInterface
-from fog.enrolment.robot_config import add_rules, remove_rules
 from fog.site import open_site
+from gdp.config.drop_in import drop_in_directory
 from gdp.errors import ConfigError
 from gdp.metadata import Metadata
-from gdp.nodes.drop_in import drop_in_directory
 from proxy.config.config import ProxyConfig
 from tests.gdp.cli.test_gdp import Run, gdp, keys
 

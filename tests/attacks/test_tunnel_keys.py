@@ -11,9 +11,9 @@ import pytest
 from gdp.control.endpoint_record import EndpointRecord
 from gdp.control.endpoints import inner_address
 from gdp.control.tunnel_plan import TunnelId
+from gdp.links import tunnels as tunnels_module
+from gdp.links.tunnels import Tunnels
 from gdp.names import Name
-from gdp.nodes import tunnels as tunnels_module
-from gdp.nodes.tunnels import Tunnels
 from tests.gdp.switch.test_direct_tunnels import A, B, C, record
 
 VICTIM, MALLORY = record(B), replace(record(C), keys=record(B).keys)

@@ -27,7 +27,7 @@ from fog.machine import MachineBundle, Program
 from fog.providers.cloud_init import HOME, Setup, cloud_config, placed
 from gdp.enrolment.programs import MachineProgram
 from gdp.enrolment.units import unit_texts
-from tests.fog.enrolment.desk import made_desk
+from tests.fog.bootstrap.desk import made_desk
 from tests.pages import ROOT
 
 UNITS = sorted((ROOT / "gdp" / "enrolment" / "service").glob("*.service"))

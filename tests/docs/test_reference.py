@@ -12,11 +12,11 @@ from pydantic import Field
 
 import docs_reference
 from fog.site import SiteConfig
+from gdp.config.config import RibConfig, SwitchConfig
+from gdp.config.relay_config import RelayConfig
+from gdp.config.schema import Section
 from gdp.crypto.statements import StatementType
 from gdp.enrolment.domain_files import DomainConfig
-from gdp.nodes.config import RibConfig, SwitchConfig
-from gdp.nodes.relay_config import RelayConfig
-from gdp.nodes.schema import Section
 from proxy.config.config import ProxyConfig
 from tests.pages import ROOT, rows
 

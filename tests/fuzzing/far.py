@@ -18,18 +18,18 @@ from gdp.control.boundary import ErrorBoundary
 from gdp.errors import DropReason, GdpError, LocalError, RemoteError
 from gdp.message.loss import Losses
 from gdp.names import Name
-from proxy.bridge.action_interface import ActionInterface
 from proxy.bridge.context import BridgeContext
+from proxy.bridge.core.action_interface import ActionInterface
+from proxy.bridge.core.desired_flows import FlowSpec
+from proxy.bridge.core.remote_server import RemoteServer
 from proxy.bridge.counters import Traffic
-from proxy.bridge.desired_flows import FlowSpec
 from proxy.bridge.endpoint_dispatch import EndpointDispatcher
 from proxy.bridge.faults import Fault, Faults
 from proxy.bridge.imported_topic import ImportedTopic
 from proxy.bridge.remote_clients import RemoteClients
-from proxy.bridge.remote_server import RemoteServer
 from proxy.config.rule import Rule
 from proxy.doors.rosbridge_json import RosbridgeCodec
-from proxy.endpoints.endpoint import Endpoint
+from proxy.endpoints.core.endpoint import Endpoint
 from proxy.reduce.compression import BodyCompressor
 from proxy.serial.channel import Channel, Qos
 from proxy.serial.empty import NoAnswer
@@ -139,10 +139,10 @@ def _receive(data: bytes) -> object:
     for is_live in (True, False):
         member = SimpleNamespace(losses_of=lambda _: Losses())
         rule = SimpleNamespace(name="/t", max_hz=None, max_bytes=1 << 20, wants_latched=None)
-        site = BridgeContext(cast(Participant, member), Traffic(), _Quiet(), boundary=_Reraising())
-        seat = EndpointDispatcher(cast(Endpoint, _Endpoint(is_live=is_live)))
+        context = BridgeContext(cast(Participant, member), Traffic(), _Quiet(), boundary=_Reraising())
+        dispatcher = EndpointDispatcher(cast(Endpoint, _Endpoint(is_live=is_live)))
         flow_spec = FlowSpec(False, "/t", _type_of(described), _NAME, cast(Rule, rule))
-        flow = ImportedTopic(site, seat, flow_spec, cast(Topic, SimpleNamespace(name=_NAME)))
+        flow = ImportedTopic(context, dispatcher, flow_spec, cast(Topic, SimpleNamespace(name=_NAME)))
         for number in range(2):
             delivered = Delivered(b"p" * 32, 1, number, wire, 1, 1)
             fields: dict[str, Any] = {"topic": _NAME, "description": description, "delivered": delivered}

@@ -15,10 +15,10 @@ from fog.host.bundle import read_programs
 from fog.launch.cloud_node import parameters_in
 from fog.providers.local.machine_file import MachineFile
 from fog.supervisor.journal import Journal
+from gdp.config.config import SwitchConfig
+from gdp.config.yaml_source import read_yaml
 from gdp.crypto.pbes2 import SECRET_LABEL, _parts, protect
 from gdp.errors import ConfigError, LocalError, RemoteError, StoreError
-from gdp.nodes.config import SwitchConfig
-from gdp.nodes.yaml_source import read_yaml
 from gdp.stores.token_uri import TokenUri
 from proxy.config.config import ProxyConfig
 from proxy.recordings.channels import offered_qos

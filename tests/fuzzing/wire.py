@@ -10,7 +10,7 @@ from typing import Final
 from gdp.control.fragments import ControlFragmenter, ControlReassembler
 from gdp.control.keepalive import open_keepalive, seal_keepalive
 from gdp.control.presence import Presence
-from gdp.control.replica import Digest, Entry, Fetch, Inventory, Item, Replicas
+from gdp.control.rib_replication import Digest, Entry, EntryBatch, Fetch, Inventory, Item
 from gdp.crypto import cbor
 from gdp.crypto.certificates import Root, Unverified
 from gdp.crypto.control_seal import ControlOpener, ControlSealer
@@ -33,8 +33,7 @@ from gdp.names import Name
 from gdp.trust.adcert import AdCert
 from gdp.trust.advertisement import UnverifiedAdvertisement
 from gdp.trust.audit import BEGIN, AuditLine
-from gdp.trust.delegation import Delegation
-from gdp.trust.enrolment import (
+from gdp.trust.bootstrap_ticket import (
     Application,
     EnrolmentResponse,
     Granted,
@@ -44,6 +43,7 @@ from gdp.trust.enrolment import (
     request_head,
     seal_request,
 )
+from gdp.trust.delegation import Delegation
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.revocation import Revocation
 from tests.fuzzing.decoder import Decoder
@@ -81,7 +81,7 @@ _READS: Final[dict[str, tuple[bytes, Callable[[Fields], object]]]] = {
         Inventory((Item(_A, _A, 1, is_withdrawn=False),), is_last=True).to_wire(_NODE.name, _NODE.key, b"cert"),
         Inventory.from_fields,
     ),
-    "replicas": (Replicas((_ENTRY,), is_last=True).to_wire(_NODE.name, _NODE.key, b"cert"), Replicas.from_fields),
+    "replicas": (EntryBatch((_ENTRY,), is_last=True).to_wire(_NODE.name, _NODE.key, b"cert"), EntryBatch.from_fields),
 }
 _STATEMENTS: Final[dict[str, tuple[bytes, Callable[[Statement], object]]]] = {
     "adcert": (adcert(), AdCert.from_statement),

@@ -22,7 +22,7 @@ from gdp.control.keepalive import PAYLOAD_BYTES, seal_keepalive
 from gdp.control.link_quality import LinkReport
 from gdp.control.link_state import COST_MAX, LINKS_MAX, MEMBERS_MAX, RIBS_MAX
 from gdp.control.query import TRANSIT_MAX
-from gdp.control.replica import ENTRIES_MAX, FETCH_KEYS_MAX, FETCH_PREFIXES_MAX, INVENTORY_MAX
+from gdp.control.rib_replication import ENTRIES_MAX, FETCH_KEYS_MAX, FETCH_PREFIXES_MAX, INVENTORY_MAX
 from gdp.crypto.envelope import Sealer
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import StatementType, parse, sign
@@ -724,12 +724,12 @@ class Forge:
             MissingRange(self._number(rng), *(rng.choice((0, 1, 1 << 17, 0xFFFF_FFFF)) for _ in range(2)))
             for _ in range(rng.choice((0, 1, NACKS_PER_REPORT)))
         )
-        report = AckNack(
+        acknack = AckNack(
             rng.choice(tuple(AckNackFlag)), self._number(rng), rng.choice((0, 1, 0xFFFF_FFFF)), missing,
             self._number(rng), self._number(rng),
         )  # fmt: skip
         writer_proxy = rng.choice(writer_proxies)
-        return [writer_proxy._sealer.seal(report)]
+        return [writer_proxy._sealer.seal(acknack)]
 
     def _status(self, rng: random.Random, persona: Persona, place: Place) -> list[bytes]:
         """Return a control datagram of a publisher or a server about its stream."""

@@ -9,7 +9,7 @@ from typing import Any, Final
 from gdp.client.reader_proxies import READERS_MAX
 from gdp.client.unicast_streams import STREAMS_MAX
 from gdp.limits import JOIN_MESSAGES_MAX, PENDING_FRAMES_MAX, REPLAY_WINDOW_MESSAGES
-from gdp.rib.replication import QUEUE_MAX
+from gdp.rib.anti_entropy import QUEUE_MAX
 from gdp.switch.name_queries import QUERIES_MAX, USED_NAMES_MAX
 
 __all__ = ["GENERAL_MAX", "LIMITS", "sizes"]

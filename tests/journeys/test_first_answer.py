@@ -16,9 +16,9 @@ from gdp.frame.kinds import CONTROL_FROM, Kind
 from gdp.message.loss import LossReason
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
 from gdp.service.replication import ALL
-from gdp.session.client_core import Call
-from gdp.session.server_core import ServerCore
-from gdp.session.wire import message_to_wire
+from gdp.session.protocol.client_core import Call
+from gdp.session.protocol.server_core import ServerCore
+from gdp.session.protocol.wire import message_to_wire
 from gdp.simulation.network import SimLink
 from gdp.trust.right import Right
 from tests.gdp.session.simulated import Simulated, world_of

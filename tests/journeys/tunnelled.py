@@ -17,14 +17,14 @@ from types import SimpleNamespace
 from typing import Final, cast
 from unittest import mock
 
+from gdp.config.config import LinksConfig
 from gdp.control.endpoints import Endpoint
 from gdp.control.tunnel_plan import TunnelId, tunnel_ifname
 from gdp.crypto.tunnel_key import TunnelKey
-from gdp.nodes.config import LinksConfig
-from gdp.nodes.endpoint_files import RECORD_SUFFIX, own_record, public_candidates
-from gdp.nodes.links import LINKS_LOOK_S, TunnelLinks
-from gdp.nodes.runtime import Runtime
+from gdp.links.endpoint_files import RECORD_SUFFIX, own_record, public_candidates
+from gdp.links.links import LINKS_LOOK_S, TunnelLinks
 from gdp.ports.tunnel.wireguard import PeerState, WireGuardDevice
+from gdp.runtime.runtime import Runtime
 from gdp.simulation.network import SimLink
 from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Topology
@@ -315,11 +315,11 @@ def tunnelled(
             monotonic=lambda: bed.network.now.mono_s, time_ns=lambda: int(bed.network.now.unix_s * 1e9)
         )
         for name in ("make_vxlan", "remove_link", "set_link_mtu"):
-            stack.enter_context(mock.patch(f"gdp.nodes.tunnels.{name}"))
-        stack.enter_context(mock.patch("gdp.nodes.tunnels.route_mtu", return_value=1_500))
-        stack.enter_context(mock.patch("gdp.nodes.tunnels.time", now))
-        stack.enter_context(mock.patch("gdp.nodes.own_endpoints.host_addresses", return_value=()))
-        stack.enter_context(mock.patch("gdp.nodes.own_endpoints.time", now))
-        stack.enter_context(mock.patch("gdp.nodes.endpoint_files.time", now))
+            stack.enter_context(mock.patch(f"gdp.links.tunnels.{name}"))
+        stack.enter_context(mock.patch("gdp.links.tunnels.route_mtu", return_value=1_500))
+        stack.enter_context(mock.patch("gdp.links.tunnels.time", now))
+        stack.enter_context(mock.patch("gdp.links.own_endpoints.host_addresses", return_value=()))
+        stack.enter_context(mock.patch("gdp.links.own_endpoints.time", now))
+        stack.enter_context(mock.patch("gdp.links.endpoint_files.time", now))
         bed.begin()
         yield bed

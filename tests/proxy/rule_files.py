@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from gdp.config.yaml_source import ConfigFileError
 from gdp.crypto.keys import SigningKey
-from gdp.nodes.yaml_source import ConfigFileError
 from proxy.config.config import ProxyConfig, Rule
 
 OWNER = SigningKey.generate()

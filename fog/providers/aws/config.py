@@ -13,7 +13,7 @@ from pathlib import Path
 from pydantic import Field
 
 from fog.providers.cloud_init import Setup
-from gdp.nodes.schema import Section
+from gdp.config.schema import Section
 
 __all__ = ["AwsConfig", "Ssh"]
 

@@ -26,7 +26,7 @@ from urllib.request import ProxyHandler, Request, build_opener
 import typer
 
 from fog.host.preemption_notice import write_notice
-from fog.providers.aws.instances import DRAIN
+from fog.providers.aws.core.instances import DRAIN
 from gdp.cli.version import HELP
 
 __all__ = ["Metadata", "Watch", "main"]

@@ -23,10 +23,10 @@ from fog.machine import Machine, MachineBundle, MachineSpec, Program
 from fog.offer import Offer
 from fog.providers.aws.clients import Clients, filters
 from fog.providers.aws.config import AwsConfig
+from fog.providers.aws.core.instances import CLUSTER, DRAIN, MACHINE, machine_of
+from fog.providers.aws.core.run_request import order
 from fog.providers.aws.errors import asking, is_code
-from fog.providers.aws.instances import CLUSTER, DRAIN, MACHINE, machine_of
 from fog.providers.aws.region import ground_of, remove_groups
-from fog.providers.aws.run_request import order
 from fog.providers.cloud_init import lines_of, user_data
 from gdp.errors import LocalError
 

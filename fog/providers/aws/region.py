@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Final
 
 from fog.providers.aws.clients import filters
 from fog.providers.aws.config import AwsConfig
+from fog.providers.aws.core.run_request import Ground
 from fog.providers.aws.errors import is_code
-from fog.providers.aws.run_request import Ground
 from gdp.errors import LocalError, StoreError
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import Annotated, Final
 from pydantic import AfterValidator, Field
 
 from fog.providers.cloud_init import Setup
-from gdp.nodes.schema import Section
+from gdp.config.schema import Section
 
 __all__ = ["SkyPilotConfig"]
 

@@ -18,6 +18,7 @@ from cyclonedds.builtin import (
 from cyclonedds.core import InstanceState, ReadCondition
 from cyclonedds.internal import SampleInfo
 
+from proxy.endpoints.core.qos import default
 from proxy.endpoints.dds.graph_cache import GraphCache, Peer
 from proxy.endpoints.dds.naming import hash_in, identity_in, named, user_data
 from proxy.endpoints.dds.node import ANY_STATE, Node, Sample
@@ -25,7 +26,6 @@ from proxy.endpoints.dds.node_info import INFO_HASH, INFO_TOPIC, INFO_TYPE, read
 from proxy.endpoints.dds.policies import Announced, announced
 from proxy.endpoints.dds.profile import requested
 from proxy.endpoints.dds.wait_thread import News
-from proxy.endpoints.qos import default
 
 __all__ = ["Discovery"]
 

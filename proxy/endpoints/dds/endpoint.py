@@ -11,13 +11,13 @@ from itertools import count
 from typing import Final, TypeVar
 
 from gdp.errors import LocalError
+from proxy.endpoints.core.endpoint import Event, Graph, GraphChanged, Role
 from proxy.endpoints.dds.discovery import Discovery
 from proxy.endpoints.dds.graph_cache import GraphCache
 from proxy.endpoints.dds.node import EntityContext, Node
 from proxy.endpoints.dds.services import Client, Server
 from proxy.endpoints.dds.topics import Publication, Subscription
 from proxy.endpoints.dds.types import hash_of, known_channel
-from proxy.endpoints.endpoint import Event, Graph, GraphChanged, Role
 from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.serial.service import Service
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from typing import Final, NamedTuple
 
-from proxy.endpoints.endpoint import Role
+from proxy.endpoints.core.endpoint import Role
 
 __all__ = ["CYCLONE", "Named", "dds_type", "hash_in", "identity", "identity_in", "named", "user_data", "vendor"]
 

@@ -19,6 +19,8 @@ from cyclonedds.pub import DataWriter, Publisher
 from cyclonedds.sub import DataReader, Subscriber
 
 from gdp.errors import LocalError
+from proxy.endpoints.core.endpoint import Event
+from proxy.endpoints.core.qos import default
 from proxy.endpoints.dds import library
 from proxy.endpoints.dds.discovery_range import with_discovery_range
 from proxy.endpoints.dds.graph_cache import GraphCache
@@ -27,8 +29,6 @@ from proxy.endpoints.dds.node_info import GID_BYTES, INFO_HASH, INFO_TOPIC, INFO
 from proxy.endpoints.dds.opaque import OpaqueTopic
 from proxy.endpoints.dds.profile import offered
 from proxy.endpoints.dds.wait_thread import News, WaitThread
-from proxy.endpoints.endpoint import Event
-from proxy.endpoints.qos import default
 
 __all__ = ["ANY_STATE", "EntityContext", "Node", "Reader", "Sample", "Writer"]
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 from gdp.errors import LocalError
+from proxy.endpoints.core.endpoint import EndpointError, MessageReceived, Role, TypeResolved
+from proxy.endpoints.core.qos import default
 from proxy.endpoints.dds import library
 from proxy.endpoints.dds.naming import dds_type, user_data
 from proxy.endpoints.dds.node import EntityContext, Sample
 from proxy.endpoints.dds.profile import offered, requested
 from proxy.endpoints.dds.types import known_channel
-from proxy.endpoints.endpoint import EndpointError, MessageReceived, Role, TypeResolved
-from proxy.endpoints.qos import default
 from proxy.serial.channel import Channel, Qos
 
 __all__ = ["Publication", "Subscription"]

@@ -22,7 +22,7 @@ from typing import Final
 import cbor2
 
 from gdp.errors import LocalError, RemoteError
-from proxy.endpoints.endpoint import (
+from proxy.endpoints.core.endpoint import (
     CallFailed,
     EndpointError,
     Event,

@@ -25,6 +25,7 @@ from rospy.impl import masterslave, tcpros_base
 from rospy.impl.registration import RegManager, get_registration_listeners, get_service_manager, get_topic_manager
 
 from gdp.errors import LocalError, RemoteError
+from proxy.endpoints.core.reconnect import MissingConnections
 from proxy.endpoints.ros1.ipc import Frame, IpcLink, Kind, LinkEndedError
 from proxy.endpoints.ros1.master import GraphSnapshot, LocalEnd, Master, MasterError, MasterWatch
 from proxy.endpoints.ros1.raw import (
@@ -35,7 +36,6 @@ from proxy.endpoints.ros1.raw import (
     ros1_name,
     ros2_name,
 )
-from proxy.endpoints.ros1.reconnect import MissingConnections
 from proxy.endpoints.ros1.services import Client, Server, tickets
 from proxy.endpoints.ros1.topics import Publisher, Subscriber
 from proxy.serial.channel import Channel
@@ -69,7 +69,7 @@ class Node:
         self._dials: dict[int, Client] = {}
         self._todo: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._refused: dict[int, str] = {}  # not on the graph, with the reason; owned by the registrar
-        self._look: GraphSnapshot | None = None
+        self._snapshot: GraphSnapshot | None = None
         self._missing = MissingConnections[LocalEnd]()  # owned by the watch
         self._stopped = threading.Event()
         self._lost = 0
@@ -167,7 +167,7 @@ class Node:
                 _channel(name, response, known.response.md5, known.response.text),
             )
             return Service(name, type_name, known.md5, *parts).to_wire()
-        for end in self._look.ends if self._look is not None else ():
+        for end in self._snapshot.ends if self._snapshot is not None else ():
             if (end.role, end.name, end.type_name) == ("serves", name, ros1_name(type_name)):
                 parts = _channel(name, request, "", ""), _channel(name, response, "", "")
                 return Service(name, type_name, end.md5, *parts).to_wire()
@@ -221,7 +221,7 @@ class Node:
         self._refused.pop(handle, None)
 
     def _against(self, subject: Publisher | Server) -> str:
-        look = self._look
+        look = self._snapshot
         if isinstance(subject, Server):
             other = look.servers.get(subject.name) if look is not None else None
             if other is not None:
@@ -239,30 +239,33 @@ class Node:
 
     # the watch
 
-    def _seen(self, look: GraphSnapshot) -> None:
+    def _seen(self, snapshot: GraphSnapshot) -> None:
         if rospy.is_shutdown():
             self._end("the node was shut down from outside")
-        if not look.is_ours_known:
+        if not snapshot.is_ours_known:
             self._end(f"the ROS 1 master at {self._master} was restarted")
-        if self._look is None or look.ends != self._look.ends:
-            self._link.send(Kind.GRAPH, payload=cbor2.dumps([_end(end) for end in look.ends]))
-        is_news = self._look is None or (look.ends, look.servers) != (self._look.ends, self._look.servers)
-        self._look = look
+        if self._snapshot is None or snapshot.ends != self._snapshot.ends:
+            self._link.send(Kind.GRAPH, payload=cbor2.dumps([_end(end) for end in snapshot.ends]))
+        is_news = self._snapshot is None or (snapshot.ends, snapshot.servers) != (
+            self._snapshot.ends,
+            self._snapshot.servers,
+        )
+        self._snapshot = snapshot
         if is_news:
             self._todo.put(self._retry)
-        self._remind(look)
+        self._remind(snapshot)
         if self._link.dropped != self._lost:
             self._lost = self._link.dropped
             self._link.send(Kind.LOST, number=self._lost)
 
-    def _remind(self, look: GraphSnapshot) -> None:
+    def _remind(self, snapshot: GraphSnapshot) -> None:
         """Announce connections again that are missing for long, see ``reconnect``."""
         peers: dict[tuple[str, str], set[str]] = {}  # connected nodes by the other end's role and topic
         for outlet in list(self._outlets.values()):
             peers.setdefault(("subscribes", outlet.topic), set()).update(outlet.peers())
         for inlet in list(self._inlets.values()):
             peers.setdefault(("publishes", inlet.topic), set()).update(inlet.peers())
-        missing = {end for end in look.ends if end.node not in peers.get((end.role, end.name), {end.node})}
+        missing = {end for end in snapshot.ends if end.node not in peers.get((end.role, end.name), {end.node})}
         for end in self._missing.due(missing, time.monotonic()):
             self._todo.put(partial(self._announce, end))
 

@@ -16,7 +16,7 @@ from typing import Final, Protocol
 import rospy
 from rospy.impl.registration import get_topic_manager
 
-from proxy.endpoints.endpoint import is_proxy_node
+from proxy.endpoints.core.endpoint import is_proxy_node
 from proxy.endpoints.ros1.ipc import IpcLink, Kind
 from proxy.endpoints.ros1.raw import KnownMessage, Raw, raw_class, ros2_name
 from proxy.serial.channel import Channel

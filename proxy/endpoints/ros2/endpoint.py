@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Final, cast
 
 from gdp.errors import LocalError
-from proxy.endpoints.endpoint import CallFailed, Event, Graph, Role
+from proxy.endpoints.core.endpoint import CallFailed, Event, Graph, Role
 from proxy.endpoints.ros2.entities import ClientEntity, PublisherEntity, ServiceEntity, SubscriptionEntity
 from proxy.endpoints.ros2.loopback_filter import LoopbackFilter
 from proxy.endpoints.ros2.qos import conflict, filled, service_profile, to_profile

@@ -14,7 +14,15 @@ from functools import partial
 from threading import Lock
 from typing import Final, Literal, Protocol, TypeAlias
 
-from proxy.endpoints.endpoint import CallFailed, Event, Graph, MessageReceived, RequestReceived, ResponseReceived, Role
+from proxy.endpoints.core.endpoint import (
+    CallFailed,
+    Event,
+    Graph,
+    MessageReceived,
+    RequestReceived,
+    ResponseReceived,
+    Role,
+)
 from proxy.endpoints.ros2.loopback_filter import LoopbackFilter
 from proxy.endpoints.ros2.session import (
     ClientHandle,

@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
-from proxy.endpoints.endpoint import Graph, GraphEntity, Role
+from proxy.endpoints.core.endpoint import Graph, GraphEntity, Role
 from proxy.endpoints.ros2.qos import from_profile
-from proxy.endpoints.ros2.session import Session, TopicEnd
+from proxy.endpoints.ros2.session import ContextNode, TopicEnd
 
 __all__ = ["LOOK_EVERY_S", "GraphCache"]
 
@@ -36,7 +36,7 @@ _SERVICES_OF_NODES: Final = frozenset(
 class GraphCache:
     """The last known graph, without the endpoint's own node and without the entities that every node has."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: ContextNode) -> None:
         self._node = session.node
         self._own = session.node.get_name()
         self._missing = session.rcl.NodeNameNonExistentError

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from proxy.endpoints.endpoint import Graph, GraphEntity, Role
+from proxy.endpoints.core.endpoint import Graph, GraphEntity, Role
 from proxy.serial.channel import Channel, Qos
 
 if TYPE_CHECKING:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ClientHandle",
+    "ContextNode",
     "Entity",
     "GuardCondition",
     "Handle",
@@ -32,7 +33,6 @@ __all__ = [
     "RequestInfo",
     "ServiceHandle",
     "ServiceType",
-    "Session",
     "SubscriptionHandle",
     "TopicEnd",
     "WaitSet",
@@ -243,7 +243,7 @@ class _Context(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Session:
+class ContextNode:
     """A node in a separate context."""
 
     node: Node
@@ -282,7 +282,7 @@ class Session:
         self.context.destroy()
 
 
-def open_session(domain: int, name: str) -> Session:
+def open_session(domain: int, name: str) -> ContextNode:
     """Join a domain as a node without parameters, log topic or type service."""
     _check_rmw()
     try:
@@ -312,7 +312,7 @@ def open_session(domain: int, name: str) -> Session:
             f"ROS 2 does not start in domain {domain}: {_first_line(error)}; is the RMW library installed that "
             "RMW_IMPLEMENTATION names? (pip install 'gdp-ros[ros2]' brings rmw_fastrtps_cpp)"
         ) from error
-    return Session(cast("Node", node), cast("_Context", context), cast("ModuleType", rclpy_implementation))
+    return ContextNode(cast("Node", node), cast("_Context", context), cast("ModuleType", rclpy_implementation))
 
 
 def _check_rmw() -> None:

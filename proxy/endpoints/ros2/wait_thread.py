@@ -14,11 +14,11 @@ from contextlib import ExitStack
 from threading import Lock, Thread
 from typing import Final
 
-from proxy.endpoints.endpoint import EndpointError, Event, Graph, GraphChanged, MessageReceived, Role, TypeResolved
+from proxy.endpoints.core.endpoint import EndpointError, Event, Graph, GraphChanged, MessageReceived, Role, TypeResolved
 from proxy.endpoints.ros2.entities import ClientEntity, Kind, PublisherEntity, Source, SubscriptionEntity
 from proxy.endpoints.ros2.graph_cache import LOOK_EVERY_S, GraphCache
 from proxy.endpoints.ros2.qos import incompatibility
-from proxy.endpoints.ros2.session import Session
+from proxy.endpoints.ros2.session import ContextNode
 
 __all__ = ["WaitThread"]
 
@@ -31,7 +31,7 @@ _HOLD_S: Final = 0.005  # rcl has no event for "this client has its server"
 class WaitThread:
     """Reads sources and queues their events."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: ContextNode) -> None:
         self._session = session
         self._survey = GraphCache(session)
         self._survey.refresh()

@@ -26,7 +26,7 @@ from gdp.client.participant import Message
 from gdp.errors import LocalError
 from gdp.message.loss import LossReason
 from gdp.names import Name
-from gdp.nodes.memory_tuning import tune_memory
+from gdp.runtime.memory_tuning import tune_memory
 from gdp.service.dispatch import Ask, Dispatch, Failure
 
 _HEAD: Final = struct.Struct("!8sHHIQ")  # token of the channel, channel, publisher, incarnation, number

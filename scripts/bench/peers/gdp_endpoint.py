@@ -22,7 +22,7 @@ from member_endpoint import End
 import gdp
 from gdp.errors import LocalError
 from gdp.names import Name
-from gdp.nodes.memory_tuning import tune_memory
+from gdp.runtime.memory_tuning import tune_memory
 from peers.exchange import IMAGE, PATIENCE_S, answer_to, exchange
 from peers.jsonl import EndSettings, say
 from proxy.serial.channel import Channel

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import gdp
-from gdp.nodes.busy_poll import SPIN_US
-from gdp.nodes.memory_tuning import tune_memory
+from gdp.runtime.busy_poll import SPIN_US
+from gdp.runtime.memory_tuning import tune_memory
 from thin_link.carrier import Arrival
 from thin_link.traffic import Stream
 

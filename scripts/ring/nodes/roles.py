@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final, NoReturn
 
-from proxy.bridge.topic_stats import percentile
+from proxy.bridge.core.topic_stats import percentile
 from ring.nodes.content import LAMP, LAMP_HZ, LAMP_TYPE, Mark, Talk, digest, lamp_says
 from ring.nodes.node import Call, Node
 from ring.nodes.orders import Order, Orders, say

@@ -13,14 +13,14 @@ from types import SimpleNamespace
 import pytest
 from typer.testing import CliRunner, Result
 
+from fog.bootstrap.members import metadata_of
 from fog.cli import launch, logs, options, status
 from fog.cli.app import app
 from fog.cli.views import stage
 from fog.cluster import ClusterPlan
-from fog.enrolment.members import metadata_of
 from fog.site import open_site
+from fog.supervisor.core.record import Outcome
 from fog.supervisor.journal import FINAL_LOGS, Journal
-from fog.supervisor.record import Outcome
 from gdp.stores.keyring import OWNER_SALT, load_salt
 from tests.fog.supervisor.machines import record, serving
 from tests.fog.supervisor.test_journal import PLAN

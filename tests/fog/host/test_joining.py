@@ -10,16 +10,16 @@ from pathlib import Path
 
 import pytest
 
-from fog.enrolment.bootstrap import joining_boot
+from fog.bootstrap.bundles import joining_boot
 from fog.host.bundle import JOIN_FILE, install
 from fog.host.joining import join
-from gdp.enrolment.wire import EnrolmentError, UnreachableError
+from gdp.config.config import SwitchConfig
+from gdp.config.relay_config import RelayConfig
 from gdp.errors import LocalError
-from gdp.nodes.config import SwitchConfig
-from gdp.nodes.relay_config import RelayConfig
+from gdp.trust.enrolment_wire import EnrolmentError, UnreachableError
 from gdp.trust.join_token import JoinToken
 from proxy.config.config import ProxyConfig
-from tests.fog.enrolment.desk import CLUSTER
+from tests.fog.bootstrap.desk import CLUSTER
 from tests.gdp.enrolment.lab import Lab, running_lab
 
 

@@ -10,7 +10,7 @@ from fog.cluster import CloudNode
 from fog.launch.interface_discovery import cache_file, kept, offered
 from fog.launch.interface_discovery_worker import offers
 from gdp.errors import LocalError
-from proxy.endpoints.endpoint import GraphEntity, Role
+from proxy.endpoints.core.endpoint import GraphEntity, Role
 
 ECHO = (CloudNode("fog_demo", "echo"),)
 

@@ -17,8 +17,8 @@ import sky
 from sky import check, core, execution
 from sky.utils import rich_utils
 
+from fog.bootstrap.bundles import joining_boot
 from fog.cluster import CloudNode, ClusterPlan, ExportedInterface, MachineRequest
-from fog.enrolment.bootstrap import joining_boot
 from fog.hardware import Hardware
 from fog.machine import MachineSpec
 from fog.offer import Offer

@@ -11,7 +11,7 @@ import yaml
 from fog.providers.aws.config import AwsConfig
 from fog.providers.cloud_init import Setup
 from fog.providers.skypilot.config import SkyPilotConfig
-from gdp.nodes.schema import Section
+from gdp.config.schema import Section
 from tests.pages import ROOT, blocks
 
 PAGE = ROOT / "docs/reference/providers.md"

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from fog.cluster import MachineRequest
-from fog.enrolment.credentials import IssuedCredentials
+from fog.credentials import IssuedCredentials
 from fog.hardware import Hardware
 from fog.machine import Machine, MachineSpec, MachineState
 from fog.offer import Offer
+from fog.supervisor.core.reconcile import Drain, Launch, Release, Timeouts, decide
+from fog.supervisor.core.record import Record, update_record
 from fog.supervisor.placement import place
-from fog.supervisor.reconcile import Drain, Launch, Release, Timeouts, decide
-from fog.supervisor.record import Record, update_record
 
 NOW_S = 1_000_000.0
 SPOT = MachineRequest(Hardware(cpus=2), is_spot=True)

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from fog.enrolment.domain_members import DomainMembers
+from fog.bootstrap.domain_members import DomainMembers
 from fog.host.bundle import JOIN_FILE
 from fog.machine import MachineBundle, MachineSpec
 from fog.site import Site, open_site
 from fog.supervisor.journal import Journal
 from fog.supervisor.supervisor import Supervisor
-from gdp.enrolment.wire import EnrolmentError, UnreachableError
+from gdp.trust.enrolment_wire import EnrolmentError, UnreachableError
 from gdp.trust.join_token import JoinToken
 from tests.fog.supervisor.test_supervisor import PLAN, Memory, work
 from tests.fog.test_site import WHEEL

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from fog.cluster import CloudNode, ClusterPlan, ExportedInterface
+from fog.supervisor.core.record import Outcome
 from fog.supervisor.journal import Journal
-from fog.supervisor.record import Outcome
 from gdp.errors import LocalError, StoreError
 from tests.fog.supervisor.machines import NOW_S, SPOT, record, serving
 

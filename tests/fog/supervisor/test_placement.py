@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from fog.hardware import Hardware
+from fog.supervisor.core.record import Outcome
 from fog.supervisor.placement import held_until, place, wary_until
-from fog.supervisor.record import Outcome
 from gdp.errors import LocalError
 from tests.fog.supervisor.machines import NOW_S, OFFERS, SPOT, offer, record, serving
 

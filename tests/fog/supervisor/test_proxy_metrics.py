@@ -10,8 +10,8 @@ import pytest
 from fog.site import Site, open_site
 from fog.supervisor.proxy_metrics import received_by, sent_by
 from gdp.crypto.certificates import Role
-from gdp.nodes.control_client import control_path
-from gdp.nodes.control_socket import ControlHandlers, serve_control_in_thread
+from gdp.management.control_client import control_path
+from gdp.management.control_socket import ControlHandlers, serve_control_in_thread
 from gdp.nodes.membership import load_member
 from gdp.telemetry.metrics import Metrics
 from gdp.telemetry.sources import Sources

@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from fog.supervisor.core.record import Outcome
 from fog.supervisor.journal import Journal
-from fog.supervisor.record import Outcome
 from fog.supervisor.snapshot import supervisor_snapshot
 from tests.fog.supervisor.machines import NOW_S, record, serving
 from tests.fog.supervisor.test_journal import PLAN

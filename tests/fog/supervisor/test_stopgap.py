@@ -9,16 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from fog.enrolment.tickets import Tickets
+from fog.bootstrap.tickets import Tickets
 from fog.hardware import Hardware
 from fog.machine import MachineBundle, MachineSpec
 from fog.offer import Offer
 from fog.scaling import policy_from_keys
 from fog.site import Site, open_site
+from fog.supervisor.core.reconcile import Drain, Launch, Timeouts, decide
+from fog.supervisor.core.record import Outcome
 from fog.supervisor.journal import Journal
 from fog.supervisor.placement import stopgap
-from fog.supervisor.reconcile import Drain, Launch, Timeouts, decide
-from fog.supervisor.record import Outcome
 from fog.supervisor.supervisor import Supervisor
 from gdp.errors import StoreError
 from tests.fog.supervisor.machines import NOW_S, OFFERS, offer, record, serving

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from fog.bootstrap.tickets import Tickets
 from fog.cluster import CloudNode, ClusterPlan, ExportedInterface
-from fog.enrolment.tickets import Tickets
 from fog.hardware import Hardware
 from fog.machine import Machine, MachineBundle, MachineSpec, MachineState
 from fog.offer import Offer

@@ -14,9 +14,9 @@ from gdp.cli import tables
 from gdp.cli.gdp import main
 from gdp.cli.path_view import path_lines
 from gdp.cli.ping_statistics import PingStatistics, quantile
-from gdp.nodes import running_nodes
-from gdp.nodes.control_protocol import Response
-from gdp.nodes.control_socket import ControlHandlers, Respond, serve_control_in_thread
+from gdp.management import running_nodes
+from gdp.management.control_socket import ControlHandlers, serve_control_in_thread
+from gdp.state.control_protocol import Respond, Response
 
 SCAN, OTHER, ROBOT = "0b" * 32, "0c" * 32, "aa" * 32
 LONG = "x" * 300

@@ -10,13 +10,13 @@ import pytest
 
 from gdp.cli import domain_machine
 from gdp.cli.gdp import main
+from gdp.config.config import RibConfig, SwitchConfig
+from gdp.config.relay_config import RelayConfig
 from gdp.enrolment.addresses import default_directory, duration_s, is_private, server_text
 from gdp.enrolment.member_files import MemberFiles
 from gdp.enrolment.programs import MachineProgram, programs_of
 from gdp.enrolment.units import install_units, remove_units, unit_texts
 from gdp.errors import LocalError
-from gdp.nodes.config import RibConfig, SwitchConfig
-from gdp.nodes.relay_config import RelayConfig
 from gdp.trust.join_token import JoinToken
 from proxy.config.config import ProxyConfig
 from tests.gdp.enrolment.lab import Lab, running_lab

@@ -9,8 +9,8 @@ from typer.testing import CliRunner
 
 from gdp.cli.gdp import main
 from gdp.cli.switch import app as switch
+from gdp.config.config import RibConfig, SwitchConfig
 from gdp.crypto.certificates import Role
-from gdp.nodes.config import RibConfig, SwitchConfig
 from gdp.nodes.membership import load_member
 
 

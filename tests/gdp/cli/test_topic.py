@@ -9,8 +9,8 @@ import pytest
 
 from gdp.cli.gdp import main
 from gdp.crypto.certificates import Role
+from gdp.management import control_client
 from gdp.metadata import Metadata
-from gdp.nodes import control_client
 from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
 from gdp.stores.keyring import CARD
 from gdp.trust.right import Right

@@ -73,13 +73,13 @@ class Notes:
         sealer = self._sealer(key, epoch, Kind.INTRODUCTION, incarnation_id)
         return sealer.seal(self._reader.introduction() if wire is None else wire)
 
-    def report(self, report: AckNack, epoch: int = 1, *, incarnation: int | None = None) -> bytes:
+    def report(self, acknack: AckNack, epoch: int = 1, *, incarnation: int | None = None) -> bytes:
         incarnation_id = self._reader.incarnation if incarnation is None else incarnation
         publisher = self._publisher
-        shared = self._reader.notes.shared(publisher.notes.public)
+        shared = self._reader.control_keys.shared(publisher.control_keys.public)
         ends = self._name, incarnation_id, publisher.name, publisher.incarnation
         key = control_key(shared, self._secrets[epoch], Kind.ACKNACK, *ends, self._topic)
-        return self._sealer(key, epoch, Kind.ACKNACK, incarnation_id).seal(report.to_wire())
+        return self._sealer(key, epoch, Kind.ACKNACK, incarnation_id).seal(acknack.to_wire())
 
     def hello(self, epoch: int = 1) -> list[bytes]:
         """Return the first frames of a reader."""

@@ -111,7 +111,7 @@ class Pipe:
             publisher=Name(b"p" * 32),
             incarnation=self.incarnation,
             writer=WRITER.public,
-            exchange=self.source.notes.public,
+            exchange=self.source.control_keys.public,
             secrets=secrets,
             budget=budget,
             now_s=self.now_s,

@@ -161,7 +161,7 @@ class SimulatedRobot:
         publisher.published = self._turns.add
         proxy = WriterProxy(
             topic=name, reader=self.reader, publisher=source.name, incarnation=1, writer=key.public,
-            exchange=source.notes.public, secrets=_SECRETS, budget=ReassemblyQuota(), now_s=0.0,
+            exchange=source.control_keys.public, secrets=_SECRETS, budget=ReassemblyQuota(), now_s=0.0,
         )  # fmt: skip
         return Topic(stream, publisher, proxy)
 

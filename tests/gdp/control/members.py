@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from gdp.control.fragments import ControlFragmenter
-from gdp.control.neighbor_discovery import HelloProtocol
+from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.control.settings import NodeSettings
 from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Role

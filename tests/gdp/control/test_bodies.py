@@ -19,7 +19,7 @@ from gdp.control.join import Join
 from gdp.control.join_refresh import JoinRefresh
 from gdp.control.link_state import Adjacency, AttachedRib, LinkState, Scope
 from gdp.control.query import Query, Response
-from gdp.control.relay import Relay
+from gdp.control.relayed_statement import RelayedStatement
 from gdp.control.revoked import Lacking, Revoked
 from gdp.crypto.statements import Fields, Statement, StatementType, parse, sign
 from gdp.errors import DropReason, StatementError
@@ -95,9 +95,9 @@ BODIES: dict[str, tuple[bytes, object, Read]] = {
     "lacking": (LACKING.to_wire(NODE.name, NODE.key), LACKING, Lacking.from_fields),
     "answer": (ANSWER.to_wire(NODE.name, NODE.key, b"cert"), ANSWER, Response.from_fields),
     "relay": (
-        Relay(b"claim", (A,), b"cert").to_wire(NODE.name, NODE.key),
-        Relay(b"claim", (A,), b"cert"),
-        Relay.from_fields,
+        RelayedStatement(b"claim", (A,), b"cert").to_wire(NODE.name, NODE.key),
+        RelayedStatement(b"claim", (A,), b"cert"),
+        RelayedStatement.from_fields,
     ),
     "advertise-ack": (
         AdvertiseAck(A, B, DropReason.STALE, 3).to_wire(NODE.name, NODE.key, b"cert"),

@@ -11,8 +11,8 @@ from gdp.control.fragments import ControlFragmenter
 from gdp.control.hello import Hello, Timing
 from gdp.control.keepalive import QUEUED_S, KeepaliveFlag, Slowness, open_keepalive
 from gdp.control.link_quality import LinkQuality
-from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.neighbour import NeighbourState
+from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.control.settings import NodeSettings
 from gdp.crypto.exchange import ExchangeKey
 from gdp.crypto.identity import Identity

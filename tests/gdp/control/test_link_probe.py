@@ -12,7 +12,7 @@ from gdp.control.fragments import ControlFragmenter
 from gdp.control.hello import Timing
 from gdp.control.link_probe import LinkProbe, patience_s
 from gdp.control.link_quality import LinkQuality
-from gdp.control.neighbor_discovery import HelloProtocol
+from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.control.settings import NodeSettings
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import parse

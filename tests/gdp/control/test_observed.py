@@ -6,8 +6,8 @@ import pytest
 
 from gdp.control.endpoints import Endpoint
 from gdp.control.hello import COOKIE_BYTES, NONCE_BYTES, OBSERVED_MAX, Hello
-from gdp.control.neighbor_discovery import HelloProtocol
 from gdp.control.neighbour import NeighbourState
+from gdp.control.neighbour_discovery import HelloProtocol
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import StatementType, parse, sign
 from gdp.errors import DropReason, StatementError

@@ -18,8 +18,8 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from gdp.nodes.control_socket import CONTROL_SOCKET, ControlHandlers, ControlServer
-from gdp.nodes.snapshot import ID_CHARS
+from gdp.management.control_socket import CONTROL_SOCKET, ControlHandlers, ControlServer
+from gdp.state.snapshot import ID_CHARS
 
 __all__ = ["SyntheticNetwork", "serve_network"]
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from gdp.dashboard.server import POLL_S, DashboardServer
-from gdp.nodes.control_socket import CONTROL_SOCKET, ControlHandlers, serve_control_in_thread
+from gdp.management.control_socket import CONTROL_SOCKET, ControlHandlers, serve_control_in_thread
 from tests.browser import console_errors, needs_browser, open_browser, save_picture
 from tests.gdp.dashboard.synthetic_nodes import SyntheticNetwork, serve_network
 from tests.gdp.dashboard.test_server import running

@@ -20,10 +20,10 @@ from websockets.typing import Origin
 from gdp.dashboard.poller import Poller, found_sockets
 from gdp.dashboard.server import DashboardServer
 from gdp.errors import LocalError
+from gdp.management.control_client import control_path
+from gdp.management.control_socket import CONTROL_SOCKET
 from gdp.names import Name
-from gdp.nodes.control_client import control_path
-from gdp.nodes.control_protocol import Response, encode_response
-from gdp.nodes.control_socket import CONTROL_SOCKET
+from gdp.state.control_protocol import Response, encode_response
 from tests.gdp.dashboard.synthetic_nodes import SyntheticNetwork, serve_network
 
 
@@ -129,7 +129,7 @@ def test_a_state_of_fog_without_a_supervisor_shows_nothing(tmp_path: Path) -> No
 
 def test_all_nodes_of_this_host_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FOG_STATE", str(tmp_path))
-    monkeypatch.setattr("gdp.nodes.control_client.lock_directories", lambda: (tmp_path,))
+    monkeypatch.setattr("gdp.management.control_client.lock_directories", lambda: (tmp_path,))
     (tmp_path / f"{control_path(Name(bytes(32))).name}").touch()
     (tmp_path / "control.sock").touch()
     assert {each.name for each in found_sockets()} == {f"{'00' * 32}.sock", "control.sock"}

@@ -12,7 +12,7 @@ from pathlib import Path
 from gdp.control.endpoints import Endpoint
 from gdp.enrolment.create import DomainPlan, create_domain, make_token
 from gdp.enrolment.domain_files import DOMAIN_FILE, DomainFiles
-from gdp.enrolment.join import Joined, JoinRequest, join_domain
+from gdp.enrolment.domain_join import Joined, JoinRequest, join_domain
 from gdp.enrolment.registry import Registry
 from gdp.enrolment.server import bind_server, serve_domain
 from gdp.trust.join_token import JoinRole, JoinToken

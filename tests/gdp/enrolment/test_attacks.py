@@ -20,10 +20,10 @@ from gdp.crypto.identity import NodeKeys
 from gdp.enrolment import server as server_module
 from gdp.enrolment.channel import client_context, connect
 from gdp.enrolment.desk import EnrolmentDesk
-from gdp.enrolment.join import Joined, JoinRequest, join_domain
-from gdp.enrolment.wire import EnrolmentError, Refusal, UnreachableError, encode_message
+from gdp.enrolment.domain_join import Joined, JoinRequest, join_domain
 from gdp.errors import LocalError
-from gdp.trust.enrolment import apply
+from gdp.trust.bootstrap_ticket import apply
+from gdp.trust.enrolment_wire import EnrolmentError, Refusal, UnreachableError, encode_message
 from gdp.trust.join_token import JoinRole, JoinToken, join_id, join_key, join_proof
 from tests.gdp.enrolment.lab import Lab, running_lab
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from gdp.config.relay_config import RelayConfig
 from gdp.crypto.statements import parse
 from gdp.enrolment import agent as agent_module
 from gdp.enrolment import desk as desk_module
@@ -20,13 +21,12 @@ from gdp.enrolment.agent import DELEGATION_KIND, Agent
 from gdp.enrolment.desk import EnrolmentDesk
 from gdp.enrolment.domain_client import DomainClient
 from gdp.enrolment.removal import remove_machine
-from gdp.enrolment.wire import EnrolmentError, Refusal
 from gdp.errors import LocalError, StatementError
 from gdp.metadata import Metadata
 from gdp.names import Name
-from gdp.nodes.relay_config import RelayConfig
 from gdp.stores.issue import delegate
 from gdp.stores.keyring import CARD, load_identity
+from gdp.trust.enrolment_wire import EnrolmentError, Refusal
 from gdp.trust.mail import Mail
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right

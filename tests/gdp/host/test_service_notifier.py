@@ -12,7 +12,7 @@ import pytest
 
 from gdp.errors import LocalError
 from gdp.host.service_notifier import ServiceNotifier
-from gdp.nodes.relay_loop import RelayLoop
+from gdp.links.relay_loop import RelayLoop
 
 
 @pytest.fixture

@@ -31,8 +31,8 @@ GONE = st.lists(LOST, max_size=GONE_MAX).map(tuple)
 
 
 @given(REPORTS)
-def test_a_report_comes_back_as_it_was(report: AckNack) -> None:
-    assert AckNack.from_wire(report.to_wire()) == report
+def test_a_report_comes_back_as_it_was(acknack: AckNack) -> None:
+    assert AckNack.from_wire(acknack.to_wire()) == acknack
 
 
 @given(U64, U64, STARTS, st.binary(max_size=100), MOVES, GONE)
@@ -58,10 +58,10 @@ def test_a_move_that_leads_back_is_malformed() -> None:
 @example(bytes(29) + b"\xff\xff")
 def test_arbitrary_bytes_are_a_report_or_a_frame_error(wire: bytes) -> None:
     try:
-        report = AckNack.from_wire(wire)
+        acknack = AckNack.from_wire(wire)
     except FrameError:
         return
-    assert report.to_wire() == wire
+    assert acknack.to_wire() == wire
 
 
 @given(st.binary(max_size=200))

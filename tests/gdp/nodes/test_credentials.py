@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from gdp.config.schema import Domain
 from gdp.crypto.certificates import Role
 from gdp.nodes.credentials import Credentials, watched_folders
 from gdp.nodes.membership import load_policy
-from gdp.nodes.schema import Domain
 from gdp.sansio import Timestamps
 from gdp.stores.files import public, write_all
 from gdp.stores.issue import make_domain, make_node, renew_node

@@ -9,14 +9,14 @@ from typing import cast
 
 import pytest
 
+from gdp.config.config import LinksConfig
 from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
 from gdp.control.endpoints import Endpoint
 from gdp.control.settings import NodeSettings
 from gdp.crypto.certificates import Role
 from gdp.crypto.tunnel_key import TunnelKey
-from gdp.nodes.config import LinksConfig
-from gdp.nodes.links import TunnelLinks
-from gdp.nodes.runtime import Runtime
+from gdp.links.links import TunnelLinks
+from gdp.runtime.runtime import Runtime
 from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table
 from tests.gdp.control.members import POLICY, UNIX_S, Nonces, at, node

@@ -32,10 +32,10 @@ KINDS = (0x00, Kind.DATA, Kind.ACKNACK, CONTROL_FROM - 1, CONTROL_FROM, Kind.HEL
 FLAGS = (Flag.NONE, Flag.LAST, Flag.URGENT, Flag.URGENT | Flag.RELIABLE, 0xFF, 0xFF & ~Flag.URGENT)
 
 
-def takes(lane: TrafficClass, packet: bytes, kind: int = TO_US, neighbours: tuple[bytes, ...] = ()) -> bool:
+def takes(traffic_class: TrafficClass, packet: bytes, kind: int = TO_US, neighbours: tuple[bytes, ...] = ()) -> bool:
     """Run a traffic class's filter on a packet, from the Ethernet header on."""
     at, value = 0, 0
-    steps = steps_of(lane, neighbours)
+    steps = steps_of(traffic_class, neighbours)
     while True:
         code, if_true, if_false, operand = steps[at]
         at += 1
@@ -137,13 +137,13 @@ class Recorder:
         self.options[level, option] = value
 
 
-@pytest.mark.parametrize("lane", TrafficClass)
-def test_the_kernel_is_given_the_whole_filter(lane: TrafficClass) -> None:
+@pytest.mark.parametrize("traffic_class", TrafficClass)
+def test_the_kernel_is_given_the_whole_filter(traffic_class: TrafficClass) -> None:
     asked = Recorder()
-    attach_ethertype_filter(asked, lane)  # type: ignore[arg-type]
+    attach_ethertype_filter(asked, traffic_class)  # type: ignore[arg-type]
     given = asked.options[socket.SOL_SOCKET, 26]
     assert isinstance(given, bytes)
-    assert struct.unpack("@HP", given)[0] == len(steps_of(lane))
+    assert struct.unpack("@HP", given)[0] == len(steps_of(traffic_class))
 
 
 def test_an_older_kernel_without_the_option_to_ignore_what_leaves_will_do() -> None:

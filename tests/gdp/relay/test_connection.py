@@ -12,7 +12,7 @@ from gdp.crypto.keys import PublicKey, SigningKey
 from gdp.crypto.validity import Validity
 from gdp.errors import LocalError
 from gdp.frame.kinds import Flag
-from gdp.nodes.relay_tls import tls_context
+from gdp.links.relay_tls import tls_context
 from gdp.relay.connection import HANDSHAKE_S, ConnectionState, RelayConnection
 from gdp.relay.framing import PREFIX, ControlMessage, ControlType
 from gdp.trust.domain import Policy

@@ -8,7 +8,7 @@ import pytest
 
 from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.query import Query, Response
-from gdp.control.relay import Relay
+from gdp.control.relayed_statement import RelayedStatement
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.statements import StatementType, parse, sign
@@ -25,6 +25,7 @@ from gdp.trust.advertisement import UnverifiedAdvertisement, sign_advertisement
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
+from gdp.trust.withdrawal import Withdrawal
 from tests.gdp.trust.world import (
     CAMERA,
     CLOUD,
@@ -62,7 +63,7 @@ def rib(upper: Name | None = None, **settings: object) -> RibCore:
 
 
 def relay(statement: bytes, by: Identity = SWITCH) -> bytes:
-    return Relay(statement, (SCHOOL.root.domain,), by.membership).to_wire(by.name, by.key)
+    return RelayedStatement(statement, (SCHOOL.root.domain,), by.membership).to_wire(by.name, by.key)
 
 
 def tell(to: RibCore, statement: bytes, by: Identity = SWITCH, now: Timestamps = START) -> list[OutgoingStatement]:
@@ -91,7 +92,7 @@ def answer_from_upstream(
 ) -> list[OutgoingStatement]:
     node = parse(pending_advertisement).signer if pending_advertisement else ROBOT.name
     gone = 0 if pending_advertisement else UnverifiedAdvertisement.from_statement(parse(advertisement())).sequence
-    answer = Response(
+    response = Response(
         name=NAME,
         advertiser=node,
         advertisement=pending_advertisement,
@@ -100,18 +101,21 @@ def answer_from_upstream(
         lease_s=30.0,
         sequence=gone,
     )
-    to.receive(answer.to_wire(by.name, by.key, by.membership), by.name, now)
+    to.receive(response.to_wire(by.name, by.key, by.membership), by.name, now)
     return to.statements_to_send()
 
 
 def negative_upstream(to: RibCore, now: Timestamps = START) -> list[OutgoingStatement]:
-    answer = Response(name=NAME, advertiser=NAME, advertisement=b"", domain=CLOUD.root.domain, transit=(), lease_s=2.0)
-    to.receive(answer.to_wire(UPPER.name, UPPER.key, UPPER.membership), UPPER.name, now)
+    response = Response(
+        name=NAME, advertiser=NAME, advertisement=b"", domain=CLOUD.root.domain, transit=(), lease_s=2.0
+    )
+    to.receive(response.to_wire(UPPER.name, UPPER.key, UPPER.membership), UPPER.name, now)
     return to.statements_to_send()
 
 
 def withdrawal(sequence: int, by: Identity = ROBOT, key: Identity | None = None) -> bytes:
-    return sign(StatementType.WITHDRAW, {"n": NAME, "s": sequence}, by.name, (key or by).key)
+    body = {"n": NAME, "right": Right.PUBLISH.value, "s": sequence}
+    return sign(StatementType.WITHDRAW, body, by.name, (key or by).key)
 
 
 def local_advertisement(sequence: int = 1) -> bytes:
@@ -265,14 +269,14 @@ def test_a_relay_under_anothers_name_is_refused() -> None:
 
 def test_a_relay_under_anothers_certificate_is_refused() -> None:
     at_rib = rib()
-    wire = Relay(advertisement(), (), OTHER_SWITCH.membership).to_wire(SWITCH.name, SWITCH.key)
+    wire = RelayedStatement(advertisement(), (), OTHER_SWITCH.membership).to_wire(SWITCH.name, SWITCH.key)
     at_rib.receive(wire, SWITCH.name, at(0.0))
     assert (at_rib.statements_to_send(), at_rib.refusals) == ([], {DropReason.BAD_CERTIFICATE: 1})
 
 
 def test_a_relay_signed_by_another_key_gets_no_answer_and_leaves_nothing() -> None:
     at_rib = rib()
-    wire = Relay(advertisement(), (), SWITCH.membership).to_wire(SWITCH.name, ROBOT.key)
+    wire = RelayedStatement(advertisement(), (), SWITCH.membership).to_wire(SWITCH.name, ROBOT.key)
     at_rib.receive(wire, SWITCH.name, at(0.0))
     assert (at_rib.statements_to_send(), at_rib.names, at_rib.refusals) == ([], 0, {DropReason.BAD_SIGNATURE: 1})
 
@@ -291,7 +295,7 @@ def test_advertising_and_withdrawing_in_turn_does_not_pass_the_quota() -> None:
     for number in range(10):
         own = Subject.of(Metadata({"kind": "topic", "name": f"/own{number}"}), ROBOT.key.public.compressed)
         tell(at_rib, advertisement(subject=own, chain=[]))
-        tell(at_rib, sign(StatementType.WITHDRAW, {"n": own.name, "s": 2}, ROBOT.name, ROBOT.key))
+        tell(at_rib, Withdrawal(own.name, Right.PUBLISH, 2).to_wire(ROBOT))
     assert at_rib.refusals == {DropReason.QUOTA: 7, DropReason.STALE: 7}  # a node may have as many as are free
 
 
@@ -481,7 +485,11 @@ def test_a_switch_hears_from_above_that_its_node_has_moved_to_another_domain() -
 
 def test_a_global_name_climbs() -> None:
     letters = tell(rib(UPPER.name), advertisement())
-    passed = [Relay.from_fields(parse(each.statement).fields).statement for each in letters if each.to == UPPER.name]
+    passed = [
+        RelayedStatement.from_fields(parse(each.statement).fields).statement
+        for each in letters
+        if each.to == UPPER.name
+    ]
     assert [parse(each).signer for each in passed] == [ROBOT.name]
 
 
@@ -548,8 +556,10 @@ def test_a_tier_above_that_is_silent_is_asked_again_and_then_the_answer_is_unkno
 
 
 def unknown_upstream(to: RibCore, now: Timestamps = START) -> list[OutgoingStatement]:
-    answer = Response(name=NAME, advertiser=NAME, advertisement=b"", domain=CLOUD.root.domain, transit=(), lease_s=0.0)
-    to.receive(answer.to_wire(UPPER.name, UPPER.key, UPPER.membership), UPPER.name, now)
+    response = Response(
+        name=NAME, advertiser=NAME, advertisement=b"", domain=CLOUD.root.domain, transit=(), lease_s=0.0
+    )
+    to.receive(response.to_wire(UPPER.name, UPPER.key, UPPER.membership), UPPER.name, now)
     return to.statements_to_send()
 
 
@@ -578,10 +588,10 @@ LOWER = NodeKeys.generate(Role.RIB, "lower").join(CLOUD, DAY)
 
 def sign_of_life(to: RibCore, now_s: float) -> None:
     """Let the RIB below answer a probe."""
-    answer = Response(
+    response = Response(
         name=LOWER.name, advertiser=LOWER.name, advertisement=b"", domain=CLOUD.root.domain, transit=(), lease_s=0.5
     )
-    to.receive(answer.to_wire(LOWER.name, LOWER.key, LOWER.membership), LOWER.name, at(now_s))
+    to.receive(response.to_wire(LOWER.name, LOWER.key, LOWER.membership), LOWER.name, at(now_s))
 
 
 @pytest.mark.parametrize("lives", [True, False])

@@ -9,7 +9,7 @@ import pytest
 from gdp.control.endpoint_query import EndpointQuery, EndpointResponse
 from gdp.control.endpoint_record import Candidate, CandidateType, EndpointRecord
 from gdp.control.endpoints import Endpoint
-from gdp.control.relay import Relay
+from gdp.control.relayed_statement import RelayedStatement
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.crypto.statements import StatementType, parse
@@ -142,7 +142,7 @@ def test_a_refusal_says_why(by: Identity, wire: bytes, reason: DropReason) -> No
 def test_a_record_that_another_replays_is_refused() -> None:
     core, wire = rib(), record().wire
     assert give(core, wire, TWO) == []
-    relayed = Relay(wire, (), TWO.membership).to_wire(TWO.name, TWO.key)
+    relayed = RelayedStatement(wire, (), TWO.membership).to_wire(TWO.name, TWO.key)
     assert give(core, relayed, TWO) == []
     assert core.endpoints == 0
     assert core.refusals == {DropReason.UNKNOWN_SENDER: 1, DropReason.WRONG_DOMAIN: 1}
@@ -235,7 +235,7 @@ def test_records_from_a_rib_of_another_domain_are_refused() -> None:
     by = FOREIGN_RIB
     wire = EndpointResponse(records=(record().wire,)).to_wire(by.name, by.key, by.membership)
     give(core, wire, by)
-    give(core, Relay(record().wire, (), by.membership).to_wire(by.name, by.key), by)
+    give(core, RelayedStatement(record().wire, (), by.membership).to_wire(by.name, by.key), by)
     assert core.endpoints == 0
     assert core.refusals[DropReason.WRONG_DOMAIN] == 2
 

@@ -8,7 +8,7 @@ from typing import TypeVar
 from gdp.client.publisher import Publisher
 from gdp.errors import LocalError
 from gdp.names import Name
-from gdp.session.core import SessionCore
+from gdp.session.protocol.core import SessionCore
 from gdp.session.session import Session
 from gdp.simulation.simulation import Simulation
 from gdp.simulation.topology import Attachment, DomainPlan, Topology

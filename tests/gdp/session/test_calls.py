@@ -12,9 +12,9 @@ from gdp.frame.codec import ETHER_BYTES, decode
 from gdp.frame.kinds import Kind
 from gdp.names import Name
 from gdp.service.replication import ALL, Mode
-from gdp.session.client_core import Call
-from gdp.session.core import replication_of
-from gdp.session.server_core import ServerCore
+from gdp.session.protocol.client_core import Call
+from gdp.session.protocol.core import replication_of
+from gdp.session.protocol.server_core import ServerCore
 from gdp.trust.right import Right
 from tests.gdp.session.simulated import Simulated, world_of
 

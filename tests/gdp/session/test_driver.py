@@ -14,10 +14,10 @@ import pytest
 
 import gdp
 from gdp.client.publisher import Publisher
-from gdp.nodes.runtime import Runtime
 from gdp.ports.plane import HasFileno
-from gdp.session.core import SessionCore
+from gdp.runtime.runtime import Runtime
 from gdp.session.driver import ThreadDriver
+from gdp.session.protocol.core import SessionCore
 
 PATIENCE_S = 20.0
 

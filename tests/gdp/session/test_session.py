@@ -10,7 +10,7 @@ from gdp.errors import LocalError
 from gdp.message.loss import LossReason
 from gdp.metadata import Metadata
 from gdp.names import Name
-from gdp.session.core import QUEUE_MAX_BYTES
+from gdp.session.protocol.core import QUEUE_MAX_BYTES
 from gdp.trust.right import Right
 from tests.gdp.session.simulated import Simulated, world_of
 
@@ -84,7 +84,7 @@ def test_a_full_queue_drops_the_oldest_and_counts_it(pair: Simulated) -> None:
 
 def test_a_queue_holds_a_bounded_number_of_bytes(pair: Simulated, monkeypatch: pytest.MonkeyPatch) -> None:
     assert QUEUE_MAX_BYTES == 64 << 20
-    monkeypatch.setattr("gdp.session.core.QUEUE_MAX_BYTES", 2_500)
+    monkeypatch.setattr("gdp.session.protocol.core.QUEUE_MAX_BYTES", 2_500)
     publisher, subscription = crossing(pair)
     for payload in (b"a" * 1_000, b"b" * 1_000, b"c" * 1_000):
         publisher.put(payload)

@@ -12,8 +12,8 @@ from typing import Final
 
 from gdp.crypto.certificates import Role
 from gdp.errors import LocalError, StoreError
+from gdp.management.control_socket import ControlHandlers, serve_control_in_thread
 from gdp.names import Name
-from gdp.nodes.control_socket import ControlHandlers, serve_control_in_thread
 from gdp.sharing.exchange import Mail
 from gdp.sharing.sharing import Sharing
 from gdp.sharing.state import AcceptedName, ExposedName

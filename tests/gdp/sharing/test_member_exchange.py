@@ -11,11 +11,11 @@ import pytest
 from gdp.cli import share
 from gdp.cli.gdp import main
 from gdp.enrolment.domain_client import DomainClient
-from gdp.enrolment.wire import UnreachableError
 from gdp.sharing.member_exchange import MemberExchange
 from gdp.sharing.sharing import Sharing
 from gdp.sharing.upkeep import ShareUpkeep
 from gdp.stores.keyring import load_delegations
+from gdp.trust.enrolment_wire import UnreachableError
 from gdp.trust.right import Right
 from tests.gdp.enrolment.lab import Lab, running_lab
 from tests.gdp.sharing.machines import STRING, importing

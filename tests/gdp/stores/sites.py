@@ -12,19 +12,19 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gdp.config.config import ClusterConfig
 from gdp.control.advertise_ack import AdvertiseAck
 from gdp.control.query import Query, Response
-from gdp.control.relay import Relay
+from gdp.control.relayed_statement import RelayedStatement
 from gdp.crypto.ca import CertificateAuthority
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
 from gdp.crypto.keys import SigningKey
-from gdp.crypto.statements import StatementType, parse, sign
+from gdp.crypto.statements import StatementType, parse
 from gdp.crypto.subject import Subject
 from gdp.crypto.validity import Validity
 from gdp.metadata import Metadata
 from gdp.names import Name
-from gdp.nodes.config import ClusterConfig
 from gdp.rib.core import OutgoingStatement, RibCore, RibSettings
 from gdp.rib.store import MemoryStore, Store
 from gdp.sansio import Timestamps
@@ -36,6 +36,7 @@ from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
 from gdp.trust.verifier import AdvertisementVerifier
+from gdp.trust.withdrawal import Withdrawal
 
 EVIDENCE_S = 3_600  # for which advertisements can be proven: the RtCert ends before the memberships
 START_CLUSTER = Path(__file__).parents[3] / "scripts" / "start_cluster.sh"
@@ -80,11 +81,10 @@ class Site:
         return self.relayed(wire)
 
     def withdrawal(self, name: str, sequence: int) -> bytes:
-        body = {"n": self.subject(name).name, "s": sequence}
-        return self.relayed(sign(StatementType.WITHDRAW, body, self.robot.name, self.robot.key))
+        return self.relayed(Withdrawal(self.subject(name).name, Right.PUBLISH, sequence).to_wire(self.robot))
 
     def relayed(self, statement: bytes) -> bytes:
-        return Relay(statement, (), self.switch.membership).to_wire(self.switch.name, self.switch.key)
+        return RelayedStatement(statement, (), self.switch.membership).to_wire(self.switch.name, self.switch.key)
 
     def query(self, name: str, watch_s: float = 0.0) -> bytes:
         query = Query(self.subject(name).name, watch_s)

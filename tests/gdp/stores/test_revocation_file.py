@@ -32,7 +32,7 @@ def of_lab(number: int) -> Statement:
 
 def begun(folder: Path, revoked: Revocations, at: Timestamps = AT) -> RevocationUpkeep:
     upkeep = RevocationUpkeep(folder, revoked)
-    upkeep.load(at)
+    upkeep.restore(at)
     upkeep.start()
     return upkeep
 
@@ -50,7 +50,7 @@ def written(folder: Path, *statements: Statement) -> Revocations:
 def read(folder: Path, at: Timestamps = AT, roots: object = ROOTS) -> Revocations:
     revoked = Revocations(roots)  # type: ignore[arg-type]
     upkeep = RevocationUpkeep(folder, revoked)
-    upkeep.load(at)
+    upkeep.restore(at)
     upkeep.close()
     return revoked
 
@@ -136,7 +136,7 @@ def test_a_folder_that_others_may_write_to_is_refused(tmp_path: Path) -> None:
 def test_without_a_folder_nothing_is_written(tmp_path: Path) -> None:
     revoked = Revocations(ROOTS)
     upkeep = RevocationUpkeep(None, revoked)
-    upkeep.load(AT)
+    upkeep.restore(AT)
     upkeep.start()
     revoked.receive_revocation(of_school(1), b"a", AT, lambda _: True)
     upkeep.work(AT)

@@ -22,12 +22,12 @@ import pytest
 import yaml
 from redis._parsers.base import BaseParser
 
-from gdp.control.replica import Entry, Key
+from gdp.config.config import ClusterConfig
+from gdp.control.rib_replication import Entry, Key
 from gdp.crypto.validity import Validity
 from gdp.errors import DropReason, StoreError
 from gdp.limits import CLOCK_SKEW_S
 from gdp.names import Name
-from gdp.nodes.config import ClusterConfig
 from gdp.nodes.rib_cluster import ClusterUpkeep
 from gdp.nodes.rib_upkeep import MemoryUpkeep
 from gdp.rib.core import RibCore, RibSettings

@@ -9,8 +9,8 @@ from tests.gdp.switch.net import AWAY, HOME, THIRD, known, link, name, paths, st
 ALL = frozenset({HOME, AWAY, THIRD})
 
 
-def first(way: Path | None) -> str | None:
-    return None if way is None else way.first.rstrip(b"-").decode()
+def first(path: Path | None) -> str | None:
+    return None if path is None else path.first.rstrip(b"-").decode()
 
 
 def test_the_cheaper_way_is_taken_though_it_is_longer() -> None:

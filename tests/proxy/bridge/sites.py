@@ -28,7 +28,7 @@ from proxy.bridge.context import BridgeContext
 from proxy.bridge.counters import Traffic
 from proxy.bridge.faults import Faults
 from proxy.config.config import ProxyConfig, Rule
-from proxy.endpoints.endpoint import proxy_node_name
+from proxy.endpoints.core.endpoint import proxy_node_name
 from proxy.serial.channel import Qos, RosVersion
 from tests.proxy.bridge import known
 from tests.proxy.endpoints.fake import FakeEndpoint, FakeGraph
@@ -66,7 +66,7 @@ class Machine:
     member: Participant
     graph: FakeGraph
     endpoints: list[FakeEndpoint]
-    site: BridgeContext
+    context: BridgeContext
     bridge: Bridge
     tick_at_s: float = 0.0
 
@@ -84,7 +84,7 @@ class Machine:
     @property
     def faults(self) -> dict[str, int]:
         """Return the faults that occurred."""
-        return {label: count for label, count in self.site.faults.counts.items() if count}
+        return {label: count for label, count in self.context.faults.counts.items() if count}
 
     @property
     def carried(self) -> set[tuple[str, bool]]:
@@ -252,9 +252,9 @@ class Sites:
     ) -> Machine:
         member = self.world.members[label]
         endpoints = [FakeEndpoint(graph, f"/{proxy_node_name(member.name.to_text())}") for graph in graphs]
-        site = BridgeContext(member, Traffic(), Faults())
-        bridge = Bridge(site, config, endpoints, self.held(member, config, holds))
-        return Machine(label, member, graphs[0], endpoints, site, bridge)
+        context = BridgeContext(member, Traffic(), Faults())
+        bridge = Bridge(context, config, endpoints, self.held(member, config, holds))
+        return Machine(label, member, graphs[0], endpoints, context, bridge)
 
     def _topic(self, member: Participant, metadata: Metadata, rights: set[Right]) -> Topic:
         reported = {key: str(value) for key, value in metadata.items() if key != "name"}

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from proxy.endpoints.qos import default
+from proxy.endpoints.core.qos import default
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import FIBONACCI
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites

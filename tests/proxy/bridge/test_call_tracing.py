@@ -184,4 +184,4 @@ def test_an_endpoint_that_is_no_url_is_refused() -> None:
 def trace(machine: Machine, exporter: InMemorySpanExporter) -> None:
     """Trace the calls of a machine that has begun."""
     tracer = OtelTracer(SimpleSpanProcessor(exporter), node=machine.member.name, label=machine.label)
-    object.__setattr__(machine.site, "tracer", tracer)
+    object.__setattr__(machine.context, "tracer", tracer)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from gdp.names import Name
 from gdp.service.serving import Asked
-from proxy.bridge.action_interface import GOAL, RESULT
+from proxy.bridge.core.action_interface import GOAL, RESULT
 from proxy.bridge.goal_calls import GoalCalls
 
 ONE, TWO = (bytes([number]) * 16 for number in (1, 2))

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from gdp.errors import LocalError
-from proxy.endpoints.qos import default
+from proxy.endpoints.core.qos import default
 from proxy.serial.channel import Channel
 from proxy.wire.message import RosMessage, TopicDescription
 from proxy.wire.service import Answer, Exchange, News, Outcome, Request

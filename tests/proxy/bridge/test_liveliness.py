@@ -10,7 +10,7 @@ import pytest
 from proxy.bridge.liveliness import LivelinessTracker, NameLiveliness, Party, names_from_fields
 from proxy.bridge.status_topic import StatusTopic, string_message
 from proxy.config.status_topic import StatusTopicConfig
-from proxy.endpoints.qos import default
+from proxy.endpoints.core.qos import default
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, STRING, string, switched, text_of
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
@@ -94,8 +94,8 @@ def test_the_status_text_is_a_string_of_either_ros(ros: int) -> None:
 
 def test_the_status_topic_is_latched_and_follows_what_changes(sites: Sites) -> None:
     robot, server = sites.add(ROBOT, expose=[CHATTER]), sites.add(SERVER, imports=[CHATTER])
-    (seat,) = server.bridge._seats
-    server.bridge._status_topics = [StatusTopic(seat, StatusTopicConfig())]
+    (dispatcher,) = server.bridge._dispatchers
+    server.bridge._status_topics = [StatusTopic(dispatcher, StatusTopicConfig())]
     Ear(server.graph, "/chatter")
     robot.graph.publish("/talker", "/chatter", STRING)
     assert sites.run(3, robot.is_read)

@@ -33,7 +33,7 @@ def streams(*machines: Machine) -> list[Machine]:
 
 def carried(*machines: Machine) -> int:
     """Return how many messages they have sent out."""
-    return sum(machine.site.traffic.messages_out for machine in machines)
+    return sum(machine.context.traffic.messages_out for machine in machines)
 
 
 def test_a_topic_both_exposed_and_imported_does_not_circulate(sites: Sites) -> None:

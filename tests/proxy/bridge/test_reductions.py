@@ -60,7 +60,7 @@ def test_compressed_messages_arrive_as_they_were_in_fewer_bytes(sites: Sites, en
         talker.publish(string(text))
     assert sites.run(2, lambda: len(ear.heard) == 3)
     assert ear.texts == texts
-    assert robot.site.traffic.bytes_out == server.site.traffic.bytes_in < 400
+    assert robot.context.traffic.bytes_out == server.context.traffic.bytes_in < 400
     assert server.faults == {}
 
 
@@ -68,7 +68,7 @@ def test_what_does_not_shrink_travels_as_it_is(sites: Sites) -> None:
     robot, _, talker, ear = flowing(sites, ", compress: {level: 1}, encoding: cdr")
     talker.publish(raw := string("0"))
     assert sites.run(2, lambda: ear.heard == [raw])
-    assert robot.site.traffic.bytes_out == 11 + len(raw)
+    assert robot.context.traffic.bytes_out == 11 + len(raw)
 
 
 def test_a_dictionary_reaches_the_reader_with_the_description(sites: Sites, tmp_path: Path) -> None:
@@ -77,7 +77,7 @@ def test_a_dictionary_reaches_the_reader_with_the_description(sites: Sites, tmp_
     text = '{"frame_id": "base_3", "x": 4711, "y": 22193521}'
     talker.publish(string(text))
     assert sites.run(2, lambda: ear.texts == [text])
-    assert robot.site.traffic.bytes_out < len(string(text))
+    assert robot.context.traffic.bytes_out < len(string(text))
 
 
 @needs_pillow
@@ -89,7 +89,7 @@ def test_an_image_is_an_image_on_both_sides_and_a_file_between(sites: Sites, far
     assert sites.run(2, lambda: len(ear.heard) == 1)
     assert pixels_of(ear.heard[0], far).tolist() == SHADE.tolist()
     assert image_of(ear.heard[0], far).header.frame_id == "lens"
-    assert robot.site.traffic.bytes_out < len(raw) / 2
+    assert robot.context.traffic.bytes_out < len(raw) / 2
     assert server.faults == {}
 
 
@@ -102,7 +102,7 @@ def test_a_jpeg_is_as_small_as_its_quality_says_and_depth_travels_as_it_is(sites
     assert sites.run(2, lambda: len(ear.heard) == 2)
     assert len(ear.heard[0]) == len(image("mono8", SHADE.shape, SHADE))
     assert ear.heard[1] == depth
-    assert robot.site.traffic.bytes_out < len(depth) + 1_000
+    assert robot.context.traffic.bytes_out < len(depth) + 1_000
 
 
 def test_a_cloud_crosses_thinned(sites: Sites) -> None:
@@ -114,14 +114,14 @@ def test_a_cloud_crosses_thinned(sites: Sites) -> None:
     assert sites.run(2, lambda: len(ear.heard) == 1)
     _, kept = cloud_of(ear.heard[0])
     assert 0 < len(kept) <= 2 * 8 * 8
-    assert robot.site.traffic.bytes_out < 16 * 1_000 / 4
+    assert robot.context.traffic.bytes_out < 16 * 1_000 / 4
 
 
 @needs_pillow
 def test_a_publisher_without_the_library_says_so_and_sends_images_as_they_are(
     sites: Sites, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("proxy.bridge.encoder.HAS_LIBRARY", False)
+    monkeypatch.setattr("proxy.bridge.core.encoder.HAS_LIBRARY", False)
     robot, _, talker, ear = flowing(sites, ", image: jpeg, encoding: cdr", CAMERA)
     raw = image("mono8", SHADE.shape, SHADE)
     talker.publish(raw)

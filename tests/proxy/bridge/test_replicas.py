@@ -14,7 +14,7 @@ from gdp.client.delivery import Delivered
 from gdp.client.participant import Message
 from gdp.service.dispatch import Dispatch
 from proxy.bridge.imported_service import ImportedService
-from proxy.endpoints.qos import default
+from proxy.endpoints.core.qos import default
 from proxy.serial.channel import RosVersion
 from proxy.wire.service import Answer, Outcome
 from tests.proxy.bridge.clients import Client, LocalServer
@@ -215,13 +215,13 @@ def test_the_only_server_still_answers_while_it_says_that_it_leaves(sites: Sites
 def test_many_calls_of_a_fast_and_a_slow_server_cost_few_words(sites: Sites) -> None:
     _, (slow, fast), client, caller = replicas(sites, 2)
     fast.answer = lambda _: switched("fast")
-    before = client.site.traffic.messages_out
+    before = client.context.traffic.messages_out
     for _ in range(50):
         caller.call(switch(on=True))
     assert sites.run(2, lambda: len(caller.outcomes) == 50)
     sites.run(0.1)
     assert slow.asked == 8  # what its queue holds; the other calls were answered before their turn came
-    assert 51 <= client.site.traffic.messages_out - before <= 58, "a stop for each eight"
+    assert 51 <= client.context.traffic.messages_out - before <= 58, "a stop for each eight"
 
 
 def actions(

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from gdp.client.send_options import SendOptions
-from proxy.endpoints.qos import default
+from proxy.endpoints.core.qos import default
 from proxy.serial.channel import Qos, RosVersion
 from tests.proxy.bridge import known
 from tests.proxy.bridge.known import STRING, string

@@ -192,7 +192,7 @@ def test_messages_without_a_far_reader_are_counted_and_not_sent(sites: Sites) ->
     sites.run(2)
     talker.publish(string("?"))
     sites.run(1)
-    assert (robot.site.traffic.unread, robot.site.traffic.messages_out) == (1, 0)
+    assert (robot.context.traffic.unread, robot.context.traffic.messages_out) == (1, 0)
 
 
 def test_each_side_may_call_the_topic_otherwise(sites: Sites) -> None:
@@ -237,7 +237,7 @@ def test_a_rate_limit_thins_evenly_and_counts(sites: Sites) -> None:
     sites.every(0.01, 200, lambda number: talker.publish(string(str(number))))
     sites.run(3)
     assert 19 <= len(ear.heard) <= 21
-    assert robot.site.traffic.thinned == 200 - len(ear.heard)
+    assert robot.context.traffic.thinned == 200 - len(ear.heard)
     numbers = [int(text) for text in ear.texts]
     assert all(4 <= after - before <= 12 for before, after in pairwise(numbers))
 
@@ -246,7 +246,7 @@ def test_a_rate_limit_lets_a_slower_topic_pass_whole(sites: Sites) -> None:
     robot, _, talker, ear = flowing(sites, f"{CHATTER}, max_hz: 10")
     sites.every(0.1, 50, lambda number: talker.publish(string(str(number))))
     sites.run(6)
-    assert (len(ear.heard), robot.site.traffic.thinned) == (50, 0)
+    assert (len(ear.heard), robot.context.traffic.thinned) == (50, 0)
 
 
 def test_the_limits_of_an_import_hold_where_it_is(sites: Sites) -> None:
@@ -262,7 +262,7 @@ def test_the_limits_of_an_import_hold_where_it_is(sites: Sites) -> None:
     assert 19 <= len(thinned.heard) <= 22
     assert len(whole.heard) == 201
     assert server.faults == {"too-large": 1}
-    assert server.site.traffic.thinned == 200 - len(thinned.heard)
+    assert server.context.traffic.thinned == 200 - len(thinned.heard)
 
 
 def test_a_message_above_the_rules_limit_is_reported_once_and_the_rest_flows(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import yaml
 
 from proxy.check.suggestion import Offered, Traffic, offered_names, suggested_file
-from proxy.endpoints.endpoint import GraphEntity, Role
+from proxy.endpoints.core.endpoint import GraphEntity, Role
 
 STRING = "std_msgs/msg/String"
 

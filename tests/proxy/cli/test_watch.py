@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from gdp.cli.gdp import main
-from gdp.nodes.control_socket import ControlHandlers, serve_control_in_thread
+from gdp.management.control_socket import ControlHandlers, serve_control_in_thread
 from proxy.bridge.liveliness import NameLiveliness, Party
 from tests.gdp.sharing.machines import Site
 

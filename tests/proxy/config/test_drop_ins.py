@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from fog.site import open_site
+from gdp.config.drop_in import drop_in_directory
 from gdp.errors import ConfigError
-from gdp.nodes.drop_in import drop_in_directory
 from proxy.config.config import ProxyConfig
 
 RULE = "- {name: %s, type: std_msgs/msg/Empty, owner: %s}\n"

@@ -10,11 +10,11 @@ from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.ros_names import covers
 from gdp.trust.right import Right
-from proxy.bridge.desired_flows import DeniedName, denied, exposed, imported
-from proxy.check.explain import explain
+from proxy.bridge.core.desired_flows import DeniedName, denied, exposed, imported
+from proxy.check.core.explain import explain
 from proxy.config.config import ProxyConfig
-from proxy.endpoints.endpoint import GraphEntity, Role
-from tests.proxy.check.test_explain import Given
+from proxy.endpoints.core.endpoint import GraphEntity, Role
+from tests.proxy.check.core.test_explain import Given
 from tests.proxy.rule_files import FIRST_LINE, OWNER, furnish, proxy, refusals, rules
 
 STRING = "std_msgs/msg/String"

@@ -20,7 +20,7 @@ from gdp.sansio import OutgoingFrames, ProtocolCore, ReceivedFrame, Timestamps
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
-from proxy.endpoints.qos import default
+from proxy.endpoints.core.qos import default
 from tests.proxy.bridge import known
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, STRING, string, switched

@@ -26,9 +26,9 @@ from gdp.diagnosis.facts import Facts, ProxyFacts, RibFacts, SwitchFacts, Unreac
 from gdp.diagnosis.fields import from_fields, to_fields
 from gdp.diagnosis.survey import ROLES, Survey
 from gdp.names import Name
-from gdp.nodes.state_answers import answer_for_rib, answer_for_switch, answer_state
 from gdp.sansio import Timestamps
 from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from gdp.state.state_answers import answer_for_rib, answer_for_switch, answer_state
 from proxy.bridge.name_facts import proxy_facts
 from proxy.serial.channel import Qos
 from tests.proxy.bridge.known import STRING, string
@@ -215,7 +215,7 @@ class Stage:
         waits = attachment_waits(machine.member.attachment, now.mono_s)
         known = proxy_facts(
             machine.bridge,
-            machine.site,
+            machine.context,
             identity,
             asked,
             now._replace(unix_s=now.unix_s + self.offsets_s.get(machine.label, 0.0)),

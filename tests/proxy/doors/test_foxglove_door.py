@@ -30,9 +30,9 @@ from proxy.doors.foxglove_session import FoxgloveSession
 from proxy.doors.hub import Rights
 from proxy.doors.rules import rules_of
 from proxy.doors.types import known_channel
+from proxy.endpoints.core.endpoint import Event, MessageReceived, RequestReceived, Role, TypeResolved
+from proxy.endpoints.core.qos import default
 from proxy.endpoints.door import DoorEndpoint, DoorSettings
-from proxy.endpoints.endpoint import Event, MessageReceived, RequestReceived, Role, TypeResolved
-from proxy.endpoints.qos import default
 from tests.proxy.bridge import known
 from tests.proxy.bridge.sites import ROBOT, SERVER, Ear, Machine, Sites
 from tests.proxy.doors.rights import Everything

@@ -14,7 +14,7 @@ from proxy.doors.hub import Hub, Rights
 from proxy.doors.parameters import GET, LIST, SET, from_value, node_and_name, to_value
 from proxy.doors.rosbridge_json import RosbridgeCodec
 from proxy.doors.rules import rules_of
-from proxy.endpoints.endpoint import Event, RequestReceived
+from proxy.endpoints.core.endpoint import Event, RequestReceived
 from proxy.serial.service import Service
 from tests.proxy.bridge import known
 from tests.proxy.doors.rights import Everything

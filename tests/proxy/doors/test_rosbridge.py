@@ -19,8 +19,8 @@ from proxy.doors.rosbridge_session import RosbridgeSession
 from proxy.doors.rules import rules_of
 from proxy.doors.throttle import Throttle
 from proxy.doors.types import known_channel
-from proxy.endpoints.endpoint import Event, MessageReceived, RequestReceived, Role, TypeResolved
-from proxy.endpoints.qos import default
+from proxy.endpoints.core.endpoint import Event, MessageReceived, RequestReceived, Role, TypeResolved
+from proxy.endpoints.core.qos import default
 from tests.proxy.bridge import known
 from tests.proxy.doors.rights import Everything
 

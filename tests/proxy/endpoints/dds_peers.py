@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from proxy.endpoints.endpoint import Event, GraphEntity, Role
+from proxy.endpoints.core.endpoint import Event, GraphEntity, Role
 
 if TYPE_CHECKING:
     from proxy.endpoints.dds import DdsEndpoint
@@ -242,8 +242,8 @@ def _rclpy_peer() -> None:
 
 
 def _dds_peer(domain: int) -> None:
+    from proxy.endpoints.core.endpoint import CallFailed, RequestReceived, ResponseReceived
     from proxy.endpoints.dds import DdsEndpoint
-    from proxy.endpoints.endpoint import CallFailed, RequestReceived, ResponseReceived
     from proxy.serial.channel import Channel
     from proxy.serial.service import Service
 

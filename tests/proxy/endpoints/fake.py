@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from itertools import count
 
 from gdp.errors import LocalError
-from proxy.endpoints.endpoint import (
+from proxy.endpoints.core.endpoint import (
     CallFailed,
     Event,
     Graph,
@@ -25,7 +25,7 @@ from proxy.endpoints.endpoint import (
     Role,
     TypeResolved,
 )
-from proxy.endpoints.qos import default, depth_of
+from proxy.endpoints.core.qos import default, depth_of
 from proxy.serial.channel import Channel, Qos, RosVersion
 from proxy.serial.service import Service
 

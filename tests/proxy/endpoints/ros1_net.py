@@ -17,7 +17,7 @@ from typing import TypeVar
 import pytest
 
 from gdp.errors import LocalError
-from proxy.endpoints.endpoint import Event
+from proxy.endpoints.core.endpoint import Event
 from proxy.endpoints.ros1 import Ros1Endpoint
 from proxy.endpoints.ros1.install import rospy_folder
 

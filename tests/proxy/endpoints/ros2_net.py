@@ -16,7 +16,7 @@ from typing import TypeVar
 
 import pytest
 
-from proxy.endpoints.endpoint import (
+from proxy.endpoints.core.endpoint import (
     CallFailed,
     EndpointError,
     Event,

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 pytest.importorskip("cyclonedds", reason="Cyclone DDS's Python binding is not installed")
 
+from proxy.endpoints.core.endpoint import Role
+from proxy.endpoints.core.qos import default
 from proxy.endpoints.dds.graph_cache import GraphCache, Peer
 from proxy.endpoints.dds.naming import Named, dds_type, hash_in, identity, identity_in, named, user_data
 from proxy.endpoints.dds.node_info import NodeInfo, read_info, write_info
-from proxy.endpoints.endpoint import Role
-from proxy.endpoints.qos import default
 
 ME = bytes(range(16))
 READER, WRITER = bytes([1] * 16), bytes([2] * 16)

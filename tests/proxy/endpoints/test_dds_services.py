@@ -13,8 +13,8 @@ import pytest
 pytest.importorskip("cyclonedds", reason="Cyclone DDS's Python binding is not installed")
 
 from gdp.errors import LocalError
+from proxy.endpoints.core.endpoint import CallFailed, Event, RequestReceived, ResponseReceived, Role
 from proxy.endpoints.dds import DdsEndpoint
-from proxy.endpoints.endpoint import CallFailed, Event, RequestReceived, ResponseReceived, Role
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
 from tests.proxy.endpoints.dds_peers import CYCLONE, Ears, Peer, peer

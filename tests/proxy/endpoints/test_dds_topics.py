@@ -12,8 +12,7 @@ pytest.importorskip("cyclonedds", reason="Cyclone DDS's Python binding is not in
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from gdp.errors import LocalError
-from proxy.endpoints.dds import DdsEndpoint
-from proxy.endpoints.endpoint import (
+from proxy.endpoints.core.endpoint import (
     EndpointError,
     Event,
     GraphChanged,
@@ -22,7 +21,8 @@ from proxy.endpoints.endpoint import (
     Role,
     TypeResolved,
 )
-from proxy.endpoints.qos import default, unmatched
+from proxy.endpoints.core.qos import default, unmatched
+from proxy.endpoints.dds import DdsEndpoint
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
 from tests.proxy.endpoints.dds_peers import CYCLONE, Ears, Peer, digest, peer

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from gdp.errors import LocalError
-from proxy.endpoints.endpoint import EndpointError, GraphChanged, MessageReceived, Role, TypeResolved
+from proxy.endpoints.core.endpoint import EndpointError, GraphChanged, MessageReceived, Role, TypeResolved
 from proxy.endpoints.ros1 import Ros1Endpoint, install
 from proxy.serial.channel import Channel, Qos
 from tests.proxy.endpoints.ros1_net import NODE, Ear, Net, ros1_net

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from proxy.endpoints.ros1.reconnect import MissingConnections
+from proxy.endpoints.core.reconnect import MissingConnections
 
 
 def test_a_connection_that_is_made_in_time_is_not_announced_again() -> None:

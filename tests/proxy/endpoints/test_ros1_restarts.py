@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import pytest
 
-from proxy.endpoints.endpoint import CallFailed, EndpointError, MessageReceived, RequestReceived, ResponseReceived
+from proxy.endpoints.core.endpoint import CallFailed, EndpointError, MessageReceived, RequestReceived, ResponseReceived
 from tests.proxy.endpoints.ros1_net import PATIENCE_S, Ear, Net, ros1_net
 from tests.proxy.endpoints.test_ros1 import LISTENER, STRING, TALKER, channel, string
 from tests.proxy.endpoints.test_ros1_services import CLIENTS, SERVER, SET_BOOL, fine, set_bool

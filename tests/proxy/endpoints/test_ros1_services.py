@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from gdp.errors import LocalError
-from proxy.endpoints.endpoint import CallFailed, EndpointError, RequestReceived, ResponseReceived, Role
+from proxy.endpoints.core.endpoint import CallFailed, EndpointError, RequestReceived, ResponseReceived, Role
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
 from tests.proxy.endpoints.ros1_net import Ear, Net, ros1_net

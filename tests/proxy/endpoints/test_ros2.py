@@ -11,7 +11,7 @@ from dataclasses import replace
 import pytest
 
 from gdp.errors import LocalError
-from proxy.endpoints.endpoint import EndpointError, MessageReceived, Role, TypeResolved
+from proxy.endpoints.core.endpoint import EndpointError, MessageReceived, Role, TypeResolved
 from proxy.endpoints.ros2.qos import filled
 from proxy.serial.channel import Channel
 from tests.proxy.endpoints.ros2_net import CONFINED, DOMAIN, NODE, Ears, Peer, endpoint_of_ours, needs, peer_of

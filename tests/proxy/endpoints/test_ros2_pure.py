@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from proxy.endpoints.endpoint import GraphEntity, Role
+from proxy.endpoints.core.endpoint import GraphEntity, Role
 from proxy.endpoints.ros2.loopback_filter import LoopbackFilter
 from proxy.endpoints.ros2.qos import conflict, filled, incompatibility
 from proxy.serial.channel import Channel, Qos

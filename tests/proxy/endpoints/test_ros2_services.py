@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from gdp.errors import LocalError
-from proxy.endpoints.endpoint import CallFailed, ResponseReceived, Role
+from proxy.endpoints.core.endpoint import CallFailed, ResponseReceived, Role
 from tests.proxy.endpoints.ros2_net import Ears, Peer, endpoint_of_ours, needs, peer_of
 
 needs("std_srvs", "test_msgs", "action_msgs")

@@ -36,7 +36,7 @@ def leave(sites: Sites, machine: Machine) -> float:
         member=machine.member,
         runtime=Steps(sites),
         is_leaving=True,
-        faults=machine.site.faults,
+        faults=machine.context.faults,
         tell_refusals=lambda: None,
     )
     bridge_node._work(cast(ProxyNode, node), machine.bridge, json=True)

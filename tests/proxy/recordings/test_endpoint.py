@@ -16,7 +16,7 @@ from proxy.bridge.context import BridgeContext
 from proxy.bridge.counters import Traffic
 from proxy.bridge.faults import Faults
 from proxy.config.recorded import RecordedRules
-from proxy.endpoints.endpoint import GraphChanged, MessageReceived, TypeResolved
+from proxy.endpoints.core.endpoint import GraphChanged, MessageReceived, TypeResolved
 from proxy.recordings.endpoint import RecordingEndpoint, ReplayEndpoint
 from proxy.recordings.reader import BagReader
 from proxy.recordings.writer import BagWriter
@@ -82,11 +82,11 @@ def join(
     sites.world.add_member(label, label.partition("/")[0])
     assert sites.world.run_until_attached()
     member, config = sites.world.members[label], sites.config(expose, imports)
-    site = BridgeContext(member, Traffic(), Faults())
+    context = BridgeContext(member, Traffic(), Faults())
     rules = RecordedRules.of(expose=config.expose, imports=config.imports)
-    bridge = Bridge(site, rules, [endpoint], sites.held(member, config))
+    bridge = Bridge(context, rules, [endpoint], sites.held(member, config))
     ends = [cast(FakeEndpoint, endpoint)]
-    machine = Machine(label, member, FakeGraph(endpoint.ros, {}), ends, site, bridge)
+    machine = Machine(label, member, FakeGraph(endpoint.ros, {}), ends, context, bridge)
     sites.machines.append(machine)
     return machine
 
@@ -268,7 +268,7 @@ def test_max_hz_leaves_out_no_message_of_a_recording(sites: Sites, replayed: Rep
     play(sites, replayed)
     sites.run(0.1)
     (stats,) = server.bridge.stats
-    assert (stats.received, robot.site.traffic.thinned) == (6, 0)
+    assert (stats.received, robot.context.traffic.thinned) == (6, 0)
 
 
 def test_a_replayed_topic_has_the_name_that_all_sides_know(sites: Sites, replayed: ReplayEndpoint) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gdp.nodes.config import RibConfig, SwitchConfig
+from gdp.config.config import RibConfig, SwitchConfig
 from gdp.simulation.topology import ring5
 from gdp.stores.keyring import load_delegations, load_identity
 from gdp.trust.right import Right

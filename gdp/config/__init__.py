@@ -1,0 +1,1 @@
+"""Configuration files of a node or a machine: every key, its bounds and its default. I/O: it reads files."""

@@ -1,0 +1,206 @@
+"""Joining a domain with a token: keys are made here, the domain's root is pinned, and memberships are fetched.
+
+I/O. Everything is written into a draft folder next to the target, which is renamed as the last step: a failure leaves
+nothing behind. Private keys never leave this machine.
+"""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from gdp.control.endpoint_record import EndpointRecord
+from gdp.crypto.cbor import encode
+from gdp.crypto.certificates import Role, Root
+from gdp.crypto.fields import Fields
+from gdp.crypto.identity import Identity, NodeKeys
+from gdp.crypto.keys import PublicKey
+from gdp.enrolment.channel import Channel, connect_any
+from gdp.enrolment.draft import draft_of, publish_draft, reserve_space
+from gdp.enrolment.member_setup import MachinePlan, record_file_name, write_configuration
+from gdp.errors import LocalError, RemoteError
+from gdp.host_port import split_host_port
+from gdp.links.endpoint_files import own_record
+from gdp.stores.files import public, read_public, write_all
+from gdp.stores.issue import install_membership, make_node_keys
+from gdp.stores.keyring import CARD, OWNER_PUBLIC
+from gdp.trust.bootstrap_ticket import MEMBERS_MAX, apply
+from gdp.trust.domain import Policy
+from gdp.trust.enrolment_wire import INSTANCE_BYTES, EnrolmentError, UnreachableError
+from gdp.trust.join_token import SERVERS_MAX, JoinToken, join_id, join_key, join_proof
+
+__all__ = ["JoinRequest", "Joined", "join_domain", "prefer_server"]
+
+log = logging.getLogger(__name__)
+
+_UNUSED: Final = "the token was not used"
+_TRUSTS_MAX: Final = 64
+_BORDERS_MAX: Final = 16
+_RETRY_S: Final = 30.0
+_RETRY_EACH_S: Final = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JoinRequest:
+    """What a machine wants to be.
+
+    Args:
+        directory: is made, with its parents; an empty one may exist.
+        uplinks: devices that each get a tunnel; none: routing decides.
+        listen: UDP port of the tunnels; 0: any.
+    """
+
+    token: JoinToken
+    label: str
+    directory: Path
+    uplinks: Sequence[str] = ()
+    listen: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Joined:
+    """What a machine has become."""
+
+    root: Root
+    label: str
+    role: str
+    directory: Path
+    identities: tuple[Identity, ...]  # the switch first
+    borders: tuple[EndpointRecord, ...]
+    server: str
+
+
+def prefer_server(token: JoinToken, server: str) -> JoinToken:
+    """Return a token that names a server first which answered: a firewall may block the others."""
+    return replace(token, servers=(server, *(each for each in token.servers if each != server)))
+
+
+def join_domain(
+    request: JoinRequest, *, clock: Callable[[], float] = time.time, wait: Callable[[float], None] = time.sleep
+) -> Joined:
+    """Join the token's domain and write the machine's directory; repeats a request whose response was lost.
+
+    Raises:
+        EnrolmentError: the server refused, is another domain's, or the clocks differ; nothing was left behind.
+        UnreachableError: no server answered for ``_RETRY_S``.
+        LocalError: the directory exists already, the label is not valid, or the disk is full.
+    """
+    if request.directory.exists() and (not request.directory.is_dir() or any(request.directory.iterdir())):
+        raise LocalError(
+            f"{request.directory}: is there already: this machine has joined; name another --directory, or remove it"
+        )
+    with draft_of(request.directory) as draft:
+        reserve_space(draft, _UNUSED).unlink()
+        members = [
+            (folder, make_node_keys(draft / folder, role, request.label)) for folder, role in request.token.role.nodes
+        ]
+        reserved = reserve_space(draft, _UNUSED)  # while the request is under way: what comes back then fits the disk
+        fields, root, server = _ask(request, [keys for _, keys in members], wait)
+        reserved.unlink()
+        request = replace(request, token=prefer_server(request.token, server))
+        identities, borders = _install(draft, request, members, fields, root, clock())
+        record = own_record(identities[0], max(len(request.uplinks), 1), ())
+        cards = [read_public(draft / folder / CARD) for folder, _ in members]
+        _announce(request.token, identities[-1], {"op": "install", "cards": cards, "record": record.wire}, wait)
+        publish_draft(draft, request.directory)
+    return Joined(
+        root=root,
+        label=request.label,
+        role=request.token.role.value,
+        directory=request.directory,
+        identities=identities,
+        borders=borders,
+        server=server,
+    )
+
+
+def _ask(request: JoinRequest, nodes: Sequence[NodeKeys], wait: Callable[[float], None]) -> tuple[Fields, Root, str]:
+    """Return the response of the domain, its root, and the server that answered."""
+    token = request.token
+    applications = [_application(token, each) for each in nodes]
+    untagged = {"op": "join", "id": join_id(token.secret), "nodes": applications}
+
+    def send(channel: Channel) -> Fields:
+        proof = join_proof(join_key(token.secret), channel.binding, channel.nonce, encode(untagged))
+        return channel.request({**untagged, "mac": proof})
+
+    return _repeated(token, send, wait)
+
+
+def _application(token: JoinToken, keys: NodeKeys) -> dict[str, object]:
+    """Return the application of one node, with the proof that its key wants this token."""
+    made = apply(join_id(token.secret), keys.key, keys.request(), keys.kem.public)
+    return {"request": made.request, "kem": made.kem.wire, "proof": made.proof}
+
+
+def _announce(token: JoinToken, identity: Identity, fields: dict[str, object], wait: Callable[[float], None]) -> None:
+    def send(channel: Channel) -> Fields:
+        channel.identify(identity, secrets.token_bytes(INSTANCE_BYTES))
+        return channel.request(fields)
+
+    _repeated(token, send, wait)
+
+
+def _repeated(
+    token: JoinToken, send: Callable[[Channel], Fields], wait: Callable[[float], None]
+) -> tuple[Fields, Root, str]:
+    """Send a request until a response comes; a first server that cannot be reached at all is not waited for."""
+    end_s, has_connected = time.monotonic() + _RETRY_S, False
+    while True:
+        try:
+            with connect_any(token.servers, token.root) as channel:
+                has_connected = True
+                return send(channel), channel.root, channel.server
+        except UnreachableError as error:
+            if not has_connected or time.monotonic() >= end_s:
+                raise
+            log.info("enrolment repeated reason=%s", error)
+            wait(_RETRY_EACH_S)
+
+
+def _install(
+    draft: Path,
+    request: JoinRequest,
+    nodes: Sequence[tuple[str, NodeKeys]],
+    fields: Fields,
+    root: Root,
+    unix_s: float,
+) -> tuple[tuple[Identity, ...], tuple[EndpointRecord, ...]]:
+    """Write everything that the response holds, verified, into the draft."""
+    try:
+        certificates = fields.byte_strings("members", MEMBERS_MAX)
+        owner = PublicKey.from_pem(fields.bytes_("owner"))
+        trusts = [Root.from_wire(each) for each in fields.byte_strings("trusts", _TRUSTS_MAX)]
+        policy = Policy(root, [])
+        wires = fields.byte_strings("borders", _BORDERS_MAX)
+        relays = fields.texts("relays", SERVERS_MAX)
+        for each in relays:
+            split_host_port(each)
+        borders = tuple(EndpointRecord.verified(each, policy, unix_s)[0] for each in wires)
+        if len(certificates) != len(nodes):
+            raise LocalError("another number of memberships")
+        identities = tuple(
+            install_membership(draft / folder, certificate, root, unix_s=unix_s)
+            for (folder, _), certificate in zip(nodes, certificates, strict=True)
+        )
+    except RemoteError as error:
+        raise EnrolmentError(None, f"the server's response is not valid: {error}") from error
+    files = {f"trusts-{number}.crt": public(each.to_pem()) for number, each in enumerate(trusts, 1)}
+    write_all(draft, {OWNER_PUBLIC: public(owner.to_pem()), **files})
+    plan = MachinePlan(
+        label=request.label,
+        role=request.token.role.value,
+        servers=request.token.servers,
+        listen=request.listen,
+        uplinks=request.uplinks,
+        relays={each.name: relays for each in borders},
+        has_proxy=any(role is Role.PROXY for _, role in request.token.role.nodes),
+    )
+    write_configuration(draft, plan, sorted(files))
+    write_all(draft / "peers", {record_file_name(each.name): public(each.wire) for each in borders})
+    return identities, borders

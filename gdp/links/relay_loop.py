@@ -1,0 +1,157 @@
+"""Event loop of a relay: descriptors with handlers, timers with millisecond precision, signals.
+
+I/O. One thread serves all connections without ever blocking on one, because the work for each frame is small and the
+system calls dominate it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import select
+import signal
+import socket
+import time
+from collections.abc import Callable, Iterator
+from types import FrameType
+from typing import Final, Protocol
+
+from gdp.runtime.memory_tuning import tune_memory
+
+__all__ = ["RelayLoop", "Timed"]
+
+log = logging.getLogger(__name__)
+
+_LONGEST_S: Final = 1.0
+
+
+class Timed(Protocol):
+    """A part of the relay with timers."""
+
+    def handle_timer(self, now_s: float) -> float:
+        """Do what is due at a monotonic second; return the second of the next call."""
+
+
+class _Periodic:
+    """Function that is called once in a period, however often the timers are."""
+
+    def __init__(self, period_s: float, look: Callable[[float], None]) -> None:
+        self._period_s = period_s
+        self._look = look
+        self._due_s = float("-inf")
+
+    def handle_timer(self, now_s: float) -> float:
+        """Call the function if it is due; return the second of the next call."""
+        if now_s >= self._due_s:
+            self._due_s = now_s + self._period_s
+            self._look(now_s)
+        return self._due_s
+
+
+class RelayLoop:
+    """The loop; ``close`` releases its descriptors."""
+
+    def __init__(self) -> None:
+        self._epoll = select.epoll()
+        self._handlers: dict[int, Callable[[int], None]] = {}
+        self._timed: list[Timed] = []
+        self._due_s = 0.0
+        self._is_stopped = False
+
+    def close(self) -> None:
+        """Release the loop's own descriptor."""
+        self._epoll.close()
+
+    def register(self, fd: int, events: int, handler: Callable[[int], None]) -> None:
+        """Call ``handler`` with the ``EPOLL`` events of a descriptor, until ``unregister``."""
+        self._handlers[fd] = handler
+        self._epoll.register(fd, events)
+
+    def modify(self, fd: int, events: int) -> None:
+        """Wait for other events of a descriptor."""
+        self._epoll.modify(fd, events)
+
+    def unregister(self, fd: int) -> None:
+        """Forget a descriptor, before it is closed."""
+        del self._handlers[fd]
+        self._epoll.unregister(fd)
+
+    def add_timed(self, part: Timed) -> None:
+        """Call a part's timers from now on, the first time at once."""
+        self._timed.append(part)
+        self._due_s = 0.0
+
+    def every(self, period_s: float, look: Callable[[float], None]) -> None:
+        """Call ``look`` with the monotonic second each ``period_s``, the first time at once."""
+        self.add_timed(_Periodic(period_s, look))
+
+    def remove_timed(self, part: Timed) -> None:
+        """Call a part's timers no more."""
+        self._timed.remove(part)
+
+    def wake_at(self, mono_s: float) -> None:
+        """Call the timers at this monotonic second at the latest."""
+        self._due_s = min(self._due_s, mono_s)
+
+    def stop(self) -> None:
+        """End ``run`` after the present step."""
+        self._is_stopped = True
+
+    def run(self, until: Callable[[], bool] = lambda: False) -> None:
+        """Work until ``stop``, or until ``until`` is true (checked after each step)."""
+        self._is_stopped = False
+        while not self._is_stopped and not until():
+            self.step()
+
+    def step(self) -> None:
+        """Call the timers that are due, and wait once for events."""
+        now_s = time.monotonic()
+        if now_s >= self._due_s:
+            self._due_s = now_s + _LONGEST_S
+            for part in list(self._timed):
+                self.wake_at(part.handle_timer(now_s))
+        handlers = self._handlers
+        for fd, events in self._epoll.poll(max(self._due_s - time.monotonic(), 0.0)):
+            handler = handlers.get(fd)
+            if handler is not None:  # an earlier event of this step may have closed it
+                handler(events)
+
+    @contextlib.contextmanager
+    def signals(self, reload: Callable[[], None]) -> Iterator[None]:
+        """End ``run`` on SIGINT and SIGTERM, and call ``reload`` on SIGHUP, until the context ends."""
+        reading, writing = socket.socketpair()
+        reading.setblocking(False)
+        writing.setblocking(False)
+
+        def stop(number: int, frame: FrameType | None) -> None:
+            """End ``run`` on a signal."""
+            del frame
+            log.info("stopping signal=%d", number)
+            self.stop()
+
+        def hang_up(number: int, frame: FrameType | None) -> None:
+            """Do nothing here: ``drain`` handles the number on the socket."""
+            del number, frame
+
+        def drain(events: int) -> None:
+            """Read the numbers of signals."""
+            del events
+            with contextlib.suppress(BlockingIOError):
+                while numbers := reading.recv(64):
+                    if signal.SIGHUP in numbers:
+                        reload()
+
+        tune_memory()
+        before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        before[signal.SIGHUP] = signal.signal(signal.SIGHUP, hang_up)
+        woken_before = signal.set_wakeup_fd(writing.fileno(), warn_on_full_buffer=False)
+        self.register(reading.fileno(), select.EPOLLIN, drain)
+        try:
+            yield
+        finally:
+            self.unregister(reading.fileno())
+            signal.set_wakeup_fd(woken_before)
+            for number, handler in before.items():
+                signal.signal(number, handler)
+            reading.close()
+            writing.close()

@@ -1,0 +1,81 @@
+"""Uplink device of a RIB or proxy: awaited, locked against a second node, and opened with advice in the error.
+
+I/O.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+from collections.abc import Iterable, Iterator
+
+from gdp.config.config import UplinkPlane
+from gdp.errors import LocalError
+from gdp.extras import require_extra
+from gdp.host.single_instance import own_devices
+from gdp.ports.netdev import NetdevPlane, NoDeviceError
+from gdp.ports.raw import RawPlane
+from gdp.ports.readiness import readable
+from gdp.ports.rtnetlink import LinkMonitor
+
+__all__ = ["load_plane", "open_uplink", "refuse_loopback", "wait_for_device"]
+
+log = logging.getLogger(__name__)
+
+
+@contextlib.contextmanager
+def open_uplink(ifname: str, data_plane: UplinkPlane = "raw") -> Iterator[NetdevPlane]:
+    """Open a node's device; close it on leaving.
+
+    Raises:
+        MissingExtraError: Scapy is requested and not installed.
+        LocalError: the device does not exist, another node uses it, or the process may not open raw sockets.
+    """
+    refuse_loopback([ifname])
+    with own_devices([ifname]):
+        try:
+            plane = load_plane(data_plane)([ifname])
+        except NoDeviceError as error:
+            raise LocalError(
+                f"{ifname}: no such device; start gdp-switch with attach: [{ifname}] first, or wait for it with"
+                " --await-iface SECONDS"
+            ) from error
+        try:
+            yield plane
+        finally:
+            plane.close()
+
+
+def load_plane(data_plane: UplinkPlane) -> type[RawPlane] | type[NetdevPlane]:
+    """Return the class of a data plane. A confined process calls this before, because Scapy reads files when loaded.
+
+    Raises:
+        MissingExtraError: Scapy is requested and not installed.
+    """
+    if data_plane == "raw":
+        return RawPlane
+    require_extra("scapy", ("scapy",), "data plane scapy")
+    from gdp.ports.scapy_plane import ScapyPlane
+
+    return ScapyPlane
+
+
+def refuse_loopback(ifnames: Iterable[str]) -> None:
+    """Refuse the loopback device as a port, with a ``LocalError``."""
+    if "lo" in ifnames:
+        raise LocalError("lo is the loopback device, which leads to no neighbour; name a network device such as eth0")
+
+
+def wait_for_device(ifname: str, patience_s: float) -> None:
+    """Return when a device of this name exists, or after ``patience_s``; opening it then reports its absence."""
+    end_s = time.monotonic() + patience_s
+    with contextlib.closing(LinkMonitor()) as links:
+        found = links.all()
+        while not any(link.ifname == ifname and not link.gone for link in found):
+            rest_s = end_s - time.monotonic()
+            if rest_s <= 0:
+                return
+            log.debug("waiting for device ifname=%s", ifname)
+            readable([links], rest_s)
+            found = links.poll()

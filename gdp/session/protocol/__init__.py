@@ -1,0 +1,1 @@
+"""Session protocol: sans-I/O cores of both ends, their messages and errors."""

@@ -1,0 +1,188 @@
+"""Server of one name in a session: requests in order, and responses to the clients that sent them.
+
+Sans-I/O; time comes in as ``now_s`` (monotonic seconds). ``gdp/service/serving.py`` keeps the order, and repeats the
+response of a duplicate request.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Final
+
+from gdp.client.participant import Message, Participant, Topic
+from gdp.client.send_options import DEFAULT_OPTIONS, SendOptions
+from gdp.errors import LocalError
+from gdp.names import Name
+from gdp.service.serving import Asked, Serving, Turn
+from gdp.session.protocol.wire import (
+    LEAVING,
+    PAYLOAD_MAX_BYTES,
+    SERVING,
+    RequestFrame,
+    ResponseFrame,
+    StopFrame,
+    read_request,
+)
+
+__all__ = ["ServerCore"]
+
+_GRACE_S: Final = 0.5  # the client ends a call; the server only drops it this much later
+_CALL_MAX_S: Final = 3_600.0
+_CHECK_CLIENTS_S: Final = 0.5
+_CLIENT_AWAY_S: Final = 30.0  # a client that is silent for so long has ended its wait
+_PART: Final = 0
+
+
+class ServerCore:
+    """Server of one name.
+
+    Args:
+        start: number of the first call here, random in 64 bits.
+        at_once: most requests that handlers process at the same time.
+        is_session: a session secret authenticates streams with one client, if that client asks for it too.
+
+    Attributes:
+        turns: requests for handlers, in order; a driver removes them.
+        unsent: number of responses that could not be sent, because their client had gone.
+
+    Raises:
+        LocalError: no delegation, or the name is in use in this session.
+    """
+
+    def __init__(
+        self,
+        member: Participant,
+        topic: Topic,
+        *,
+        start: int,
+        at_once: int | None,
+        is_global: bool,
+        urgent: bool,
+        options: SendOptions = DEFAULT_OPTIONS,
+        paths: int = 1,
+        is_session: bool = False,
+    ) -> None:
+        self._member = member
+        self._name = topic.name
+        self._serving: Serving[bytes] = Serving(start, at_once)
+        self._publisher = member.serve(
+            topic, SERVING, is_global=is_global, urgent=urgent, options=options, paths=paths, is_session=is_session
+        )
+        self._seen_s: dict[Name, float] = {}  # when the clients of active calls were last alive
+        self._check_at_s: float | None = None  # when clients are checked next; None: no call is active
+        self._is_leaving = False
+        self.turns: deque[Turn[bytes]] = deque()
+        self.unsent = 0
+
+    @property
+    def clients(self) -> int:
+        """Return the number of clients."""
+        return len(self._member.peers(self._name))
+
+    @property
+    def is_idle(self) -> bool:
+        """Return whether no request is active, and the clients have confirmed their responses."""
+        return not self._serving and self._member.is_acknowledged(self._name)
+
+    def receive(self, message: Message, now_s: float) -> None:
+        """Process a client's request, or its notice that calls have ended.
+
+        Raises:
+            RemoteError: MALFORMED or BAD_VERSION.
+        """
+        client = Name(message.delivered.publisher)
+        frame = read_request(message.delivered.message)
+        if isinstance(frame, StopFrame):
+            for call in frame.calls:
+                self._serving.stop(Asked(client, _PART, call))
+        else:
+            self._begin(client, frame, now_s)
+        self._give(now_s)
+
+    def finish(self, number: int, outcome: bytes | str, now_s: float) -> None:
+        """Respond to a request.
+
+        Args:
+            number: of the turn.
+            outcome: the payload, or as text the reason for the failure.
+        """
+        asked = self._serving.end(number)
+        if asked is not None:
+            if len(outcome) > PAYLOAD_MAX_BYTES:
+                outcome = f"the response has {len(outcome)} bytes; at most {PAYLOAD_MAX_BYTES} can be sent"
+            if isinstance(outcome, str):
+                self._respond(asked, ResponseFrame.failed(asked.call, outcome))
+            else:
+                self._respond(asked, ResponseFrame(asked.call, False, outcome))
+        self._give(now_s)
+
+    def leave(self) -> None:
+        """Accept no new requests: clients learn to use other servers, and active requests finish."""
+        self._is_leaving = True
+        self._publisher.describe(LEAVING)
+
+    def close(self, now_s: float) -> None:
+        """Stop serving the name; active calls fail."""
+        for asked in self._serving.fail_all():
+            self._respond(asked, ResponseFrame.failed(asked.call, "the server was closed"))
+        self.turns.clear()
+        self._member.flush(now_s)  # the responses must leave before their stream ends
+        self._member.withdraw(self._name)
+
+    def handle_timer(self, now_s: float) -> None:
+        """Drop requests that no client waits for."""
+        for each in self._serving.expired(now_s):
+            if each.asked is not None:
+                self._respond(each.asked, ResponseFrame.failed(each.asked.call, "the server did not respond in time"))
+        if self._check_at_s is not None and now_s >= self._check_at_s:
+            self._check_clients(now_s)
+            self._check_at_s = now_s + _CHECK_CLIENTS_S if self._serving else None
+        self._give(now_s)
+
+    def get_timer(self) -> float | None:
+        """Return the monotonic second of the next timer, or None."""
+        times = [self._serving.get_timer(), self._check_at_s]
+        return min((time for time in times if time is not None), default=None)
+
+    def _begin(self, client: Name, frame: RequestFrame, now_s: float) -> None:
+        asked = Asked(client, _PART, frame.call)
+        before = self._serving.answer_of(asked)
+        if before is not None or asked in self._serving:
+            if before:
+                self._send(client, before)
+            return
+        if self._is_leaving:
+            self._respond(asked, ResponseFrame.failed(frame.call, "the server is leaving"))
+            return
+        patience_s = min(frame.patience_ms / 1e3 + _GRACE_S, _CALL_MAX_S) if frame.patience_ms else _CALL_MAX_S
+        try:
+            self._serving.begin(now_s, patience_s, asked, frame.payload)
+        except LocalError as error:
+            self._respond(asked, ResponseFrame.failed(frame.call, str(error)))
+            return
+        if self._check_at_s is None:
+            self._check_at_s = now_s + _CHECK_CLIENTS_S
+
+    def _give(self, now_s: float) -> None:
+        self.turns.extend(self._serving.poll_turns(now_s))
+
+    def _respond(self, asked: Asked, frame: ResponseFrame) -> None:
+        wire = frame.to_wire()
+        self._serving.remember(asked, wire)
+        self._send(asked.client, wire)
+
+    def _send(self, client: Name, wire: bytes) -> None:
+        try:
+            self._member.respond(self._name, client, wire)
+        except LocalError:
+            self.unsent += 1  # the client has gone; if it repeats the request, it gets the stored response
+
+    def _check_clients(self, now_s: float) -> None:
+        """Drop the calls of clients that have gone."""
+        here = set(self._member.connected_peers(self._name))
+        known = {writer_proxy.publisher for writer_proxy in self._member.writer_proxies_of(self._name)}
+        clients = self._serving.clients
+        self._seen_s = {each: now_s if each in here else self._seen_s.get(each, now_s) for each in clients}
+        for client, seen_s in self._seen_s.items():
+            if client not in here and (client not in known or now_s - seen_s >= _CLIENT_AWAY_S):
+                self._serving.remove_client(client)

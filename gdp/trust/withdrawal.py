@@ -1,0 +1,46 @@
+"""Withdrawal: a node's statement that it advertises a name no more.
+
+Sans-I/O. Source: BGP (RFC 4271, section 3.1, withdrawn routes). Its sequence number counts with those of the node's
+advertisements, so that a late one ends nothing newer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gdp.crypto.fields import check_sequence
+from gdp.crypto.identity import Identity
+from gdp.crypto.statements import Statement, StatementType
+from gdp.errors import DropReason, StatementError
+from gdp.limits import WITHDRAWAL_MAX_BYTES
+from gdp.names import Name
+from gdp.trust.right import Right
+
+__all__ = ["Withdrawal"]
+
+
+@dataclass(frozen=True, slots=True)
+class Withdrawal:
+    """The name and the right that its signer advertises no more."""
+
+    name: Name
+    right: Right
+    sequence: int
+
+    def to_wire(self, node: Identity) -> bytes:
+        """Return the signed statement."""
+        return node.sign(StatementType.WITHDRAW, {"n": self.name, "right": self.right.value, "s": self.sequence})
+
+    @classmethod
+    def from_statement(cls, statement: Statement, unix_s: float) -> Withdrawal:
+        """Read a parsed statement; no signature is checked.
+
+        Raises:
+            StatementError: MALFORMED, or TOO_BIG to be forwarded.
+        """
+        fields = statement.expect(StatementType.WITHDRAW)
+        if len(statement.wire) > WITHDRAWAL_MAX_BYTES:
+            raise StatementError(DropReason.TOO_BIG, "a withdrawal")
+        withdrawal = cls(fields.name("n"), Right.from_wire(fields.text("right")), fields.uint("s"))
+        check_sequence(withdrawal.sequence, unix_s)
+        return withdrawal

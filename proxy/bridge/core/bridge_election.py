@@ -1,0 +1,64 @@
+"""Bridge election: which of several proxies in one ROS graph carries a name.
+
+Sans-I/O. If two proxies carried a name, its messages would arrive twice, and one proxy would send out again what the
+other one brought in. So each name has one proxy. The virtual node of each proxy advertises the topic ``SIGN``; the
+proxies are ranked by the names of these nodes. The first begins at once. The others wait, and begin only where no
+proxy before them carries the name. If two have begun all the same, the later one in rank ends its flow. If the proxy
+that carries a name leaves, the next one takes over.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from proxy.endpoints.core.endpoint import Graph, Role
+from proxy.serial.channel import Channel, RosVersion
+
+__all__ = ["SIGN", "BridgeElection", "presence_of", "sign"]
+
+SIGN: Final = "/_gdp_proxy"
+_STEP_S: Final = 0.4  # longer than a graph takes to show a new entity
+_EMPTY: Final = "std_msgs/msg/Empty"
+
+
+class BridgeElection:
+    """Other proxies of a graph, as the graph shows them; ``me``: name of this proxy's virtual node."""
+
+    def __init__(self, me: str, graph: Graph) -> None:
+        self._me = me
+        others = [(end.name, _short(end.node), end.role) for end in graph if end.is_proxy]
+        nodes = {node for _, node, _ in others if node != me}
+        self._rank = sum(node < me for node in nodes)
+        self._carried: dict[str, set[str]] = {}
+        for name, node, role in others:
+            if node != me and role is not Role.CALLS:
+                self._carried.setdefault(name, set()).add(node)
+
+    @property
+    def patience_s(self) -> float:
+        """Return the seconds to wait before this proxy may carry a name."""
+        return self._rank * _STEP_S
+
+    def before_us(self, name: str, *, is_begun: bool) -> str:
+        """Return the proxy that carries a local name instead of this one, empty if there is none.
+
+        Args:
+            is_begun: whether this proxy carries it already; then only a proxy before it in rank counts.
+        """
+        nodes = self._carried.get(name, set())
+        return min((node for node in nodes if not is_begun or node < self._me), default="")
+
+
+def presence_of(service: str) -> str:
+    """Return the topic by which a proxy shows that it carries a local server: ROS 1 masters do not know clients."""
+    return SIGN + service
+
+
+def sign(topic: str, ros: RosVersion) -> Channel:
+    """Return the channel of a presence topic; nothing is ever published on it."""
+    md5 = "d41d8cd98f00b204e9800998ecf8427e" if ros == 1 else ""  # of an empty text: the message has no fields
+    return Channel(topic, _EMPTY, ros, hash=md5)
+
+
+def _short(node: str) -> str:
+    return node.rpartition("/")[2]

@@ -1,0 +1,146 @@
+"""Desired flows: the local names that are to cross, from the rules and the live graph.
+
+Sans-I/O. A name that no rule matches stays local. Concrete rules come before patterns; the first match applies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Final, NamedTuple
+
+from gdp.metadata import Metadata
+from gdp.names import Name
+from gdp.ros_names import Kind
+from proxy.bridge.core.action_interface import action_of, is_part
+from proxy.bridge.faults import Fault
+from proxy.config import matching
+from proxy.config.matching import choose
+from proxy.config.rule import Rule
+from proxy.endpoints.core.endpoint import Graph, GraphEntity, Role
+
+__all__ = ["ConfigProblem", "DeniedName", "FlowSpec", "denied", "exposed", "imported"]
+
+_SHOWS: Final[dict[Kind, Role]] = {"topic": Role.PUBLISHES, "service": Role.SERVES, "action": Role.SERVES}
+_WANTS: Final[dict[Kind, Role]] = {"topic": Role.SUBSCRIBES, "service": Role.CALLS, "action": Role.CALLS}
+
+_PLAIN: Final[tuple[Kind, ...]] = ("topic", "service")
+
+
+class FlowSpec(NamedTuple):
+    """One local name that is to cross, with its overlay name and its rule."""
+
+    is_exposed: bool
+    local: str
+    type_name: str
+    name: Name
+    rule: Rule
+
+    def has_short_queues(self, ros: int) -> bool:
+        """Return whether its local nodes drop requests or responses that come faster than they take them.
+
+        The services of ROS 2 do. The parts of an action have queues of their own, and few calls under way; results take
+        as long as they want.
+        """
+        return ros == 2 and self.rule.kind == "service"
+
+
+class ConfigProblem(NamedTuple):
+    """Reason why something that a rule names cannot cross at present."""
+
+    local: str
+    fault: Fault
+    detail: str
+
+
+class DeniedName(NamedTuple):
+    """Local name that a rule is about, and the pattern under ``deny`` because of which it stays local."""
+
+    is_exposed: bool
+    local: str
+    pattern: str
+
+
+def denied(rules: Sequence[Rule], graph: Graph, *, is_exposed: bool) -> Iterator[DeniedName]:
+    """Yield the denied names of one direction: those of the graph, and those that a rule states."""
+    shown = {(rule.kind, rule.local) for rule in rules if rule.is_denied}
+    shown |= _shown(graph, _SHOWS if is_exposed else _WANTS).keys()
+    for kind, local in sorted(shown):
+        meant = (rule.denied_by(local) for rule in rules if rule.kind == kind and rule.means(local))
+        pattern = next((each for each in meant if each is not None), None)
+        if pattern is not None:
+            yield DeniedName(is_exposed, local, pattern)
+
+
+def exposed(rules: Sequence[Rule], graph: Graph, complaints: list[ConfigProblem]) -> Iterator[FlowSpec]:
+    """Yield a flow for each local publisher or server that a rule exposes; problems are added to ``complaints``."""
+    for (kind, local), types in _shown(graph, _SHOWS).items():
+        first = choose(rules, kind, local)
+        if first is None:
+            continue
+        wanted: dict[int, tuple[str, Rule]] = {}  # first type of each rule: topics of a recording may have several
+        for type_name in sorted(types):
+            rule = choose(rules, kind, local, type_name)
+            if rule is not None:
+                wanted.setdefault(id(rule), (type_name, rule))
+        if len(wanted) < len(types):
+            said = f"; the rule says {first.type_name}" if first.type_name else ""
+            complaints.append(
+                ConfigProblem(local, Fault.OTHER_TYPE, f"local nodes use {', '.join(sorted(types))}{said}")
+            )
+        for type_name, rule in wanted.values():
+            yield FlowSpec(True, local, type_name, rule.overlay_name_of(local, type_name), rule)
+
+
+def imported(
+    rules: Sequence[Rule], graph: Graph, held: Iterable[tuple[Metadata, Name]], complaints: list[ConfigProblem]
+) -> Iterator[FlowSpec]:
+    """Yield a flow for each name to import: by concrete rules, by held delegations, by requests of local nodes."""
+    seen: set[Name] = set()
+    wanted = _shown(graph, _WANTS)
+    had: dict[tuple[Kind, str], set[str]] = {}
+    for flow_spec in _imported(rules, wanted, held):
+        had.setdefault((flow_spec.rule.kind, flow_spec.local), set()).add(flow_spec.type_name)
+        if flow_spec.name not in seen:
+            seen.add(flow_spec.name)
+            yield flow_spec
+    for (kind, local), types in wanted.items():
+        if has := had.get((kind, local)):
+            for other in sorted(types - has):
+                detail = f"local nodes ask for {other}; what comes is {', '.join(sorted(has))}"
+                complaints.append(ConfigProblem(local, Fault.OTHER_TYPE, detail))
+
+
+def _imported(
+    rules: Sequence[Rule], wanted: Mapping[tuple[Kind, str], set[str]], held: Iterable[tuple[Metadata, Name]]
+) -> Iterator[FlowSpec]:
+    for rule in rules:
+        if not rule.is_pattern and rule.type_name and not rule.is_denied:
+            yield FlowSpec(False, rule.local, rule.type_name, rule.overlay_name, rule)
+    for metadata, name in held:
+        found = matching.imported(rules, name, metadata)
+        if found is not None:
+            yield FlowSpec(False, found[1], str(metadata["type"]), name, found[0])
+    for (kind, local), types in wanted.items():
+        for type_name in sorted(types):
+            asked = choose(rules, kind, local, type_name)
+            if asked is not None:
+                yield FlowSpec(False, local, type_name, asked.overlay_name_of(local, type_name), asked)
+
+
+def _shown(graph: Graph, roles: Mapping[Kind, Role]) -> dict[tuple[Kind, str], set[str]]:
+    """Return the types that nodes other than proxies show, by kind and local name."""
+    shown: dict[tuple[Kind, str], set[str]] = {}
+    for end in sorted((end for end in graph if not end.is_proxy and end.type_name), key=lambda end: end.name):
+        for kind, name, type_name in _things(end, roles):
+            shown.setdefault((kind, name), set()).add(type_name)
+    return shown
+
+
+def _things(end: GraphEntity, roles: Mapping[Kind, Role]) -> Iterator[tuple[Kind, str, str]]:
+    action = action_of(end)
+    if action is not None and end.role is roles["action"]:
+        yield "action", *action
+    elif not is_part(end.name):
+        for kind in _PLAIN:
+            if end.role is roles[kind]:
+                yield kind, end.name, end.type_name

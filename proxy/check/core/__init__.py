@@ -1,0 +1,1 @@
+"""Sans-I/O core of the checks: findings, explanations and the delegations that rules need."""

@@ -1,0 +1,149 @@
+"""Node of a door: an ordinary member of the overlay, whose bridge carries what its delegations allow.
+
+I/O.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import orjson
+import typer
+from pydantic import ValidationError
+
+from gdp.cli.node import emit, emit_wait
+from gdp.errors import LocalError
+from gdp.nodes.delegation_store import DelegationStore
+from gdp.session.settings import SessionConfig, settings_of
+from proxy.bridge.bridge import Bridge
+from proxy.bridge.context import BridgeContext
+from proxy.bridge.core.flow_fields import flow_fields
+from proxy.bridge.core.topic_rows import flow_rows
+from proxy.config.config import ProxyConfig
+from proxy.doors.hub import Rights
+from proxy.doors.rules import DoorRules, rules_of
+from proxy.endpoints.door import DoorEndpoint
+from proxy.node.goodbye import say_goodbye
+from proxy.node.node import ProxyNode, run_node
+
+__all__ = ["OpenDoor", "door_config", "run_door"]
+
+log = logging.getLogger(__name__)
+
+OpenDoor = Callable[[Callable[[], Rights]], DoorEndpoint]
+
+_TICK_S: Final = 0.5
+_TURN_S: Final = 0.0002  # longest wait of the server's thread for the interpreter; Python's default is 5 ms
+
+
+def door_config(node: Path, iface: str | None, delegations: Path | None) -> tuple[ProxyConfig, Path]:
+    """Return the configuration of a door's member, and the directory of its delegations.
+
+    Args:
+        node: its directory, or its configuration file; rules and graphs in that are not used.
+
+    Raises:
+        LocalError: the node does not exist, or its files are wrong.
+    """
+    settings = settings_of(node, iface=iface, delegations=delegations)
+    directory = settings.delegation_directory
+    if not directory.is_dir():
+        raise LocalError(f"{directory}: no delegations; install one with 'gdp delegate install FILE --node {node}'")
+    try:
+        return ProxyConfig.model_validate_json(orjson.dumps(_values(settings, directory), default=os.fspath)), directory
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise LocalError(f"{node}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+
+
+def _values(settings: SessionConfig, directory: Path) -> dict[str, object]:
+    domain = settings.domain
+    return {
+        "identity": settings.identity,
+        "domain": {
+            "root": domain.root,
+            "trusts": list(domain.trusts),
+            "transit": None if domain.transit is None else list(domain.transit),
+        },
+        "iface": settings.iface,
+        "delegations": directory,
+        "state": settings.state,
+        "lease_s": settings.lease_s,
+        "busy_poll_us": settings.busy_poll_us,
+    }
+
+
+def run_door(config: ProxyConfig, open_door: OpenDoor, *, json: bool) -> None:
+    """Serve clients until stopped; SIGHUP or ``gdp reload`` reads the delegations again.
+
+    Raises:
+        LocalError: keys, delegations, the device or the address are not as stated.
+    """
+    sys.setswitchinterval(_TURN_S)
+    with run_node(config, emit_wait if json else None) as node:
+        held = DelegationStore(config.delegations, node.identity)
+        state = [rules_of(list(held))]
+        for name, reason in state[0].left_out:
+            log.warning("delegation not offered name=%s reason=%s", name, reason)
+        door = open_door(lambda: state[0])
+        try:
+            bridge = Bridge(BridgeContext(node.member, node.traffic, node.faults), state[0], [door], held)
+
+            def reload() -> None:
+                again = DelegationStore(config.delegations, node.identity)
+                state[0] = rules_of(list(again))
+                bridge.reload(state[0], again)
+
+            node.on_reload = reload
+            node.topics = lambda: flow_rows(bridge.flows, bridge.held, node.member)
+            node.flows = lambda: [flow_fields(*each) for each in bridge.flows]
+            node.runtime.watch(door)
+            try:
+                _work(node, bridge, door, state, json=json)
+            finally:
+                node.runtime.unwatch(door)
+            say_goodbye(node, bridge)
+        finally:
+            door.shut_down()
+        totals = {"sent": node.traffic.messages_out, "received": node.traffic.messages_in, "dropped": door.dropped}
+        if json:
+            emit("done", **totals, faults=dict(node.faults.counts))
+        else:
+            typer.echo(
+                "{received} messages read, {sent} published, {dropped} dropped for slow clients".format(**totals)
+            )
+
+
+def _work(node: ProxyNode, bridge: Bridge, door: DoorEndpoint, state: list[DoorRules], *, json: bool) -> None:
+    is_ready = False
+    tick_at_s = 0.0
+    while not node.runtime.is_stopped:
+        due_s = bridge.get_timer()
+        node.runtime.step(tick_at_s if due_s is None else min(due_s, tick_at_s))
+        now_s = time.monotonic()
+        bridge.work(now_s)
+        node.member.flush(now_s)
+        if now_s >= tick_at_s:
+            tick_at_s = now_s + _TICK_S
+        if not is_ready and node.member.attachment.is_attached and bridge.is_settled:
+            is_ready = True
+            node.tell_refusals()
+            _tell_ready(node, door, state[0], json=json)
+
+
+def _tell_ready(node: ProxyNode, door: DoorEndpoint, rules: DoorRules, *, json: bool) -> None:
+    if json:
+        host, port = door.address
+        reads, writes = [each.name for each in rules.imports], [each.name for each in rules.expose]
+        emit("ready", name=node.member.name.to_text(), host=host, port=port, reads=reads, publishes=writes)
+        return
+    typer.echo(f"door {node.member.name.short} is attached, at {door.label}; Ctrl-C ends it")
+    for verb, listed in (("offers", rules.imports), ("takes", rules.expose)):
+        for rule in listed:
+            typer.echo(f"  {verb} {rule.kind} {rule.name} [{rule.type_name}]")

@@ -1,0 +1,75 @@
+"""Loop of a node: what still leaves after a signal has stopped it."""
+
+from __future__ import annotations
+
+import time
+from types import SimpleNamespace
+from typing import Any, cast
+
+from gdp.ports.plane import Plane
+from gdp.runtime.runtime import Runtime
+from gdp.sansio import ProtocolCore, ReceivedFrame
+
+
+class Core:
+    """Core with frames to send, one at each call."""
+
+    def __init__(self, frames: int) -> None:
+        self.left = frames
+
+    def frames_to_send(self, now_s: float) -> list[tuple[int, bytes, list[bytes]]]:
+        del now_s
+        self.left -= 1
+        return [(1, b"", [b"frame"])] if self.left >= 0 else []
+
+    def __getattr__(self, name: str) -> Any:
+        del name
+        return lambda *_: None
+
+    def poll_neighbours(self) -> dict[int, frozenset[bytes]]:
+        return {}
+
+
+def loop(frames: int) -> tuple[Runtime, list[bytes]]:
+    """Return a loop over a device that keeps what it sends, and those frames."""
+    sent: list[bytes] = []
+
+    def poll(timeout_s: float | None) -> list[ReceivedFrame]:
+        time.sleep(min(timeout_s or 0.0, 0.001))
+        return []
+
+    plane = SimpleNamespace(
+        ports={},
+        frames_from=lambda _: 0,
+        on_link=lambda _: None,
+        poll=poll,
+        transmit=lambda port, mac, out: sent.extend(out),
+    )
+    return Runtime(cast(ProtocolCore, Core(frames)), cast(Plane, plane)), sent
+
+
+def test_a_stopped_loop_still_sends_its_goodbye() -> None:
+    runtime, sent = loop(3)
+    runtime.stop()
+    assert runtime.run()
+    assert sent == []
+    assert runtime.linger(time.monotonic() + 5, lambda: len(sent) == 3)
+
+
+def test_another_stop_ends_the_wait() -> None:
+    runtime, sent = loop(1)
+    runtime.stop()
+
+    def stopped() -> bool:
+        if sent:
+            runtime.stop()
+        return False
+
+    begun_s = time.monotonic()
+    assert not runtime.linger(begun_s + 60, stopped)
+    assert time.monotonic() < begun_s + 30
+
+
+def test_the_wait_ends_with_its_time() -> None:
+    runtime, _ = loop(0)
+    assert not runtime.linger(time.monotonic() + 0.02)
