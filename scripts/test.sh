@@ -65,4 +65,12 @@ elif [[ $ended -eq 1 ]]; then
     run "${lane[@]:0:2}" --last-failed --last-failed-no-failures none --junit-xml "$out/rerun.xml" || true
     .venv/bin/python scripts/rerun_check.py --first "$out/tests.xml" --rerun "$out/rerun.xml" || status=1
 fi
+if [[ ${GDP_DRAWS:-1} -gt 1 && $(id -u) -eq 0 ]]; then
+    printf 'fuzzing: ten minutes of all decoders\n'
+    .venv/bin/python scripts/fuzz.py --guided --total 600 || status=1
+    printf 'chaos: ten minutes of faults of every kind, two RIBs on a shared store\n'
+    # At the usual keepalives, twelve switches alone keep two slow cores busy; what is silent then says nothing of faults.
+    .venv/bin/python scripts/bench/chaos.py --seed 9 --seconds 600 --switches 12 --rate 0.25 --keepalive-ms 200 --limit-s 8 ||
+        status=1
+fi
 exit "$status"

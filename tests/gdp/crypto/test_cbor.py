@@ -136,7 +136,7 @@ def test_more_bytes_than_allowed_are_refused() -> None:
 
 @pytest.mark.parametrize(
     "value",
-    [object(), [object()], {1: 2}, {"a": {b"b": 1}}, {1, 2}, bytearray(b"a"), 1 << 64, -(1 << 64) - 1, "\ud800"],
+    [Ellipsis, [Ellipsis], {1: 2}, {"a": {b"b": 1}}, {1, 2}, bytearray(b"a"), 1 << 64, -(1 << 64) - 1, "\ud800"],
     ids=repr,
 )
 def test_what_has_no_place_in_a_statement_is_our_own_mistake(value: object) -> None:
