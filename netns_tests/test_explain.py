@@ -43,7 +43,6 @@ CROSSINGS = (
 _NODE = """
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
-from tests.waiting import until
 def beat(topic, hz):
     out = talk(String, topic)
     kept.append(node.create_timer(1 / hz, lambda: out.publish(String(data='beat'))))

@@ -25,7 +25,6 @@ STRING = "std_msgs/msg/String"
 PREFIX = "robot1"
 _NODE = """
 from std_msgs.msg import String
-from tests.waiting import until
 heard = {}
 def read(topic):
     found = heard[topic] = []

@@ -47,7 +47,6 @@ from std_srvs.srv import SetBool
 from test_msgs.action import Fibonacci
 from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from tests.waiting import until
 def read(kind, topic, depth=10, durability='volatile'):
     if topic in reads: node.destroy_subscription(reads.pop(topic))
     found = heard[topic] = []

@@ -38,7 +38,6 @@ from sensor_msgs.msg import Image
 from std_srvs.srv import SetBool
 from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
-from tests.waiting import until
 def read(kind, topic, **more):
     heard[topic] = []
     qos = QoSProfile(depth=100, **more)

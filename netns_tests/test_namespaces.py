@@ -18,6 +18,7 @@ from gdp.host.processes import Process
 from gdp.host.run_registry import Run, RunRegistry, in_first_user_namespace
 from gdp.simulation.namespaces import Namespaces
 from gdp.simulation.topology import chain, ring5
+from tests.waiting import until
 
 pytestmark = pytest.mark.netns
 
@@ -84,7 +85,7 @@ def test_a_cut_link_loses_its_carrier_at_both_ends_and_gets_it_back(run: Run) ->
     assert "NO-CARRIER" in links(namespaces, "nuc3")["nuc2"][2]
     assert "NO-CARRIER" not in links(namespaces, "nuc3")["nuc4"][2]
     namespaces.restore_link("nuc2", "nuc3")
-    assert "NO-CARRIER" not in links(namespaces, "nuc3")["nuc2"][2]
+    until(lambda: "NO-CARRIER" not in links(namespaces, "nuc3")["nuc2"][2], "the kernel announces the carrier")
 
 
 def test_a_link_that_is_not_there_cannot_be_cut(run: Run) -> None:

@@ -57,7 +57,6 @@ with gdp.open("server") as server:
 
 _PROBE = """
 from http.client import HTTPConnection
-from tests.waiting import until
 asking = HTTPConnection("127.0.0.1", 9107)
 asking.request("GET", "/readyz")
 answer = asking.getresponse()

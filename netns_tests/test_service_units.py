@@ -45,7 +45,6 @@ import sys
 sys.path.insert(0, "/usr/lib/gdp-ros/packages")
 {first}
 from {module} import main
-from tests.waiting import until
 main()
 """
 

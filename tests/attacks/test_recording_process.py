@@ -22,6 +22,7 @@ from typer.testing import CliRunner
 
 from gdp.errors import ConfigError, GdpError
 from gdp.ports.confine import landlock, seccomp
+from lab.zygote import Popen
 from proxy.cli import replay
 from proxy.config.config import ProxyConfig
 from proxy.recordings.limits import BagLimits
@@ -47,7 +48,8 @@ def recording(path: Path, count: int = 3, size: int = 100) -> Path:
 
 def child_of(process: int) -> int:
     """Return the only child process of a process."""
-    (child,) = Path(f"/proc/{process}/task/{process}/children").read_text().split()
+    forks = {str(Popen.zygote.pid)} if Popen.zygote else set()
+    (child,) = set(Path(f"/proc/{process}/task/{process}/children").read_text().split()) - forks
     return int(child)
 
 
