@@ -2,13 +2,12 @@
 
 Programs of the project are forked, not executed; ``GDP_REAL_PROGRAMS=1`` and coverage start the real ones. Workers of
 pytest-xdist take whole files, the longest first; a file of ``_SPLIT`` is divided into its tests. Processor seconds
-count the test's own process and all processes that it started and waited for. They are divided by the speed of this
-machine, a fixed piece of work before and after the run, so that budgets mean the same on a slower one.
+count the test's own process and all processes that it started and waited for. Machines differ in speed, and so does one
+machine under load; so a folder is compared with the median of all folders' ratios of seconds to budget.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import resource
@@ -74,7 +73,7 @@ def pytest_runtest_teardown(item: pytest.Item) -> Generator[None, None, None]:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Put the longest files first, where several workers share them."""
     if hasattr(config, "workerinput"):
-        known = _known()["files"]
+        known = _known()
         items.sort(key=lambda item: -known.get(_file_of(item.nodeid), (0.0, 0.0))[0])
 
 
@@ -98,7 +97,6 @@ class _Seconds:
     def __init__(self, config: pytest.Config) -> None:
         self._config = config
         self._files: defaultdict[str, list[float]] = defaultdict(lambda: [0.0, 0.0])
-        self._pace_s = [_pace_s()]
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Add the seconds of a test, which stand in its last report."""
@@ -112,20 +110,16 @@ class _Seconds:
     @pytest.hookimpl(wrapper=True)
     def pytest_sessionfinish(self, session: pytest.Session) -> Generator[None, None, None]:
         """Fail a run whose folders exceed their budgets; write and save the seconds."""
-        self._pace_s.append(_pace_s())
-        known = _known()
-        scale = known["pace_s"] / statistics.mean(self._pace_s)
-        files = {file: [wall, processor * scale] for file, (wall, processor) in sorted(self._files.items())}
-        option = self._config.option
+        known, option = _known(), self._config.option
+        pace = _pace(_folders(self._files), _folders(known))
+        files = {file: [wall / pace, processor / pace] for file, (wall, processor) in sorted(self._files.items())}
         if option.seconds:
             option.seconds.parent.mkdir(parents=True, exist_ok=True)
-            _write(option.seconds, known["pace_s"], files)
-        self._rows = [
-            (folder, spent, _folders(known["files"]).get(folder)) for folder, spent in _folders(files).items()
-        ]
+            _write(option.seconds, files)
+        self._rows = [(folder, spent, _folders(known).get(folder)) for folder, spent in _folders(files).items()]
         self._over = [each[0] for each in self._rows if _is_over(each[1], each[2])] if option.budgets else []
         if option.save_budgets:
-            _write(SECONDS, known["pace_s"], _lesser(known["files"], files))
+            _write(SECONDS, _lesser(known, files))
         if self._over and session.exitstatus == pytest.ExitCode.OK:
             session.exitstatus = OVER_BUDGET
         yield
@@ -166,14 +160,20 @@ def _is_over(spent_s: float, budget_s: float | None) -> bool:
     return budget_s is not None and spent_s > _EXCESS * max(budget_s, _LEAST_S)
 
 
-def _known() -> dict[str, Any]:
-    content: dict[str, Any] = json.loads(SECONDS.read_text(encoding="utf-8"))
+def _pace(spent: Mapping[str, float], budgets: Mapping[str, float]) -> float:
+    """Return how many of this machine's seconds one second of a budget is: the median of large folders."""
+    ratios = [spent[folder] / budget for folder, budget in budgets.items() if budget >= _LEAST_S and spent.get(folder)]
+    return statistics.median(ratios) if ratios else 1.0
+
+
+def _known() -> dict[str, list[float]]:
+    content: dict[str, list[float]] = json.loads(SECONDS.read_text(encoding="utf-8"))
     return content
 
 
-def _write(path: Path, pace_s: float, files: Mapping[str, list[float]]) -> None:
+def _write(path: Path, files: Mapping[str, list[float]]) -> None:
     rows = ",\n".join(f"  {json.dumps(name)}: [{wall:.1f}, {spent:.1f}]" for name, (wall, spent) in files.items())
-    path.write_text(f'{{\n "pace_s": {pace_s},\n "files": {{\n{rows}\n }}\n}}\n', encoding="utf-8")
+    path.write_text(f"{{\n{rows}\n}}\n", encoding="utf-8")
 
 
 def _file_of(nodeid: str) -> str:
@@ -183,20 +183,6 @@ def _file_of(nodeid: str) -> str:
 def _processor_s() -> float:
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(each.ru_utime + each.ru_stime for each in used)
-
-
-def _pace_s() -> float:
-    """Return the processor seconds of a fixed piece of work, the median of five."""
-
-    def work() -> float:
-        began = time.process_time()
-        table: dict[bytes, int] = {}
-        for number in range(20_000):
-            table[hashlib.sha256(number.to_bytes(4, "big")).digest()] = number
-        assert len(sorted(table)) == 20_000
-        return time.process_time() - began
-
-    return statistics.median(work() for _ in range(5))
 
 
 _BEGAN: Final = pytest.StashKey[tuple[float, float]]()
