@@ -22,7 +22,6 @@ from typer.testing import CliRunner
 
 from gdp.errors import ConfigError, GdpError
 from gdp.ports.confine import landlock, seccomp
-from lab.zygote import Popen
 from proxy.cli import replay
 from proxy.config.config import ProxyConfig
 from proxy.recordings.limits import BagLimits
@@ -47,9 +46,9 @@ def recording(path: Path, count: int = 3, size: int = 100) -> Path:
 
 
 def child_of(process: int) -> int:
-    """Return the only child process of a process."""
-    forks = {str(Popen.zygote.pid)} if Popen.zygote else set()
-    (child,) = set(Path(f"/proc/{process}/task/{process}/children").read_text().split()) - forks
+    """Return the only decoder of a process, which may have other children."""
+    children = Path(f"/proc/{process}/task/{process}/children").read_text().split()
+    (child,) = (each for each in children if b"proxy.recordings" in Path(f"/proc/{each}/cmdline").read_bytes())
     return int(child)
 
 
