@@ -149,7 +149,8 @@ def test_what_is_not_plainly_a_program_of_the_project_is_executed(argv: list[str
     assert Program.from_argv(argv) is None
 
 
-def test_another_copy_of_the_project_is_executed(forked: Zygote, tmp_path: Path) -> None:
+def test_another_copy_of_the_project_is_executed(tmp_path: Path) -> None:
+    forked = Zygote.start()  # earlier tests may have changed what that of the session was born into
     (tmp_path / "gdp").mkdir()
     program = Program.from_argv([sys.executable, "-m", "gdp.cli.gdp"])
     assert program is not None
@@ -157,3 +158,4 @@ def test_another_copy_of_the_project_is_executed(forked: Zygote, tmp_path: Path)
     assert not forked.can_run(program, dict(os.environ), tmp_path)
     assert not forked.can_run(program, {**os.environ, "PYTHONPATH": str(tmp_path)}, ROOT)
     assert not forked.can_run(program, {**os.environ, "PYTHONHASHSEED": "7"}, ROOT)
+    forked.close()
