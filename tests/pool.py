@@ -47,7 +47,7 @@ def pytest_configure(config: pytest.Config) -> None:
     """Start a zygote for the processes of this session, and the clock of its tests."""
     is_controller = bool(getattr(config.option, "numprocesses", None)) and not hasattr(config, "workerinput")
     is_measured = bool(config.getoption("--cov", None))
-    if not (zygote.is_installed() or is_controller or is_measured or os.environ.get(_REAL) == "1"):
+    if not (is_controller or is_measured or os.environ.get(_REAL) == "1"):
         zygote.install()
     if not hasattr(config, "workerinput"):
         config.pluginmanager.register(_Seconds(config), "seconds")

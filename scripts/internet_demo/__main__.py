@@ -10,8 +10,7 @@ from lab import zygote
 
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, lambda number, _: os._exit(128 + number))
-    if not zygote.is_installed():
-        zygote.install()
+    zygote.install()
     from internet_demo.cli import main
 
     main()

@@ -36,7 +36,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-__all__ = ["Popen", "Zygote", "install", "is_installed"]
+__all__ = ["Popen", "Zygote", "install"]
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 _PRELOADED: Final = (
@@ -60,7 +60,6 @@ _REQUEST_BYTES: Final = 1 << 18
 _FIRST_FD: Final = 512  # received descriptors wait above this number until each has its own
 _SET_PDEATHSIG, _SET_CHILD_SUBREAPER = 1, 36
 _PLACE_OF_NAME: Final = "-" * 4096  # an argument, which each forked process replaces with its own command line
-_CLONE_NEWNET: Final = 0x40000000
 _LIBC: Final = ctypes.CDLL(None, use_errno=True)
 
 
@@ -194,14 +193,13 @@ class Zygote:
 
 
 def install() -> None:
-    """Let ``subprocess`` fork what this process starts of the project; call this before there are threads."""
-    Popen.zygote = Zygote.start()
-    subprocess.Popen = Popen  # type: ignore[misc]
+    """Let ``subprocess`` fork what this process starts of the project; call this before there are threads.
 
-
-def is_installed() -> bool:
-    """Return whether ``subprocess`` forks the project's programs."""
-    return subprocess.Popen is Popen
+    A process whose zygote is installed already keeps it.
+    """
+    if Popen.zygote is None:
+        Popen.zygote = Zygote.start()
+        subprocess.Popen = Popen  # type: ignore[misc]
 
 
 class Popen(subprocess.Popen):  # type: ignore[type-arg]
@@ -213,50 +211,40 @@ class Popen(subprocess.Popen):  # type: ignore[type-arg]
         self, args: Any, executable: Any, preexec_fn: Any, close_fds: Any, pass_fds: Any, cwd: Any, env: Any, *rest: Any
     ) -> None:
         """Fork, or execute; the arguments are those of the standard library from 3.10 to 3.14."""
-        zygote, program = self.zygote, None
-        (_, _, shell, *pipes), others = rest[:9], rest[9:]
-        _, gid, gids, uid, umask, new_session, *group = others
-        plain = not (shell or executable or preexec_fn or gid is not None or gids is not None or uid is not None)
-        if (
-            zygote is not None
-            and plain
-            and close_fds
-            and not isinstance(args, (str, bytes))
-            and all(each == -1 for each in group)
-        ):
-            program = Program.from_argv(args)
-        if zygote is None or program is None:
+        (_, _, shell, *pipes), (_, gid, gids, uid, umask, new_session, *group) = rest[:9], rest[9:]
+        is_plain = close_fds and not (shell or executable or preexec_fn or isinstance(args, (str, bytes)))
+        is_ours = gid is None and gids is None and uid is None and all(each == -1 for each in group)
+        request = self._request(args, pass_fds, cwd, env, new_session, umask) if is_plain and is_ours else None
+        if self.zygote is None or request is None:
             super()._execute_child(args, executable, preexec_fn, close_fds, pass_fds, cwd, env, *rest)  # type: ignore[misc]
             return
-        environment = {**(os.environ if env is None else env), **dict(program.environment)}
-        environment = {os.fsdecode(name): os.fsdecode(value) for name, value in environment.items()}
-        folder = Path(os.getcwd() if cwd is None else os.fspath(cwd)).absolute()
-        if not folder.is_dir() or not zygote.can_run(program, environment, folder):
-            super()._execute_child(args, executable, preexec_fn, close_fds, pass_fds, cwd, env, *rest)  # type: ignore[misc]
-            return
-        fds = sorted(pass_fds)
-        request = Request(
-            asdict(program),
-            os.getpid(),
-            str(folder),
-            environment,
-            [list(resource.getrlimit(each)) for each in _LIMITS],
-            fds,
-            new_session,
-            umask,
-        )
         p2cread, _, _, c2pwrite, _, errwrite = pipes
         with open("/proc/thread-self/ns/net", "rb") as space:
             standard = [number if each == -1 else each for number, each in enumerate((p2cread, c2pwrite, errwrite))]
             begun, begins = os.pipe()
             try:
-                self.pid = zygote.fork(request, [*standard, space.fileno(), begins, *fds])
+                self.pid = self.zygote.fork(request, [*standard, space.fileno(), begins, *request.fds])
             finally:
                 os.close(begins)
                 with open(begun, "rb") as pipe:
                     pipe.read()
         self._child_created = True
         self._close_pipe_fds(*pipes)  # type: ignore[attr-defined]
+
+    def _request(self, args: Any, pass_fds: Any, cwd: Any, env: Any, new_session: bool, umask: int) -> Request | None:
+        """Return what to ask of the zygote; None: a forked process would be another than an executed one."""
+        program = None if self.zygote is None else Program.from_argv(args)
+        if self.zygote is None or program is None:
+            return None
+        environment = {**(os.environ if env is None else env), **dict(program.environment)}
+        environment = {os.fsdecode(name): os.fsdecode(value) for name, value in environment.items()}
+        folder = Path(os.getcwd() if cwd is None else os.fspath(cwd)).absolute()
+        if not folder.is_dir() or not self.zygote.can_run(program, environment, folder):
+            return None
+        limits = [list(resource.getrlimit(each)) for each in _LIMITS]
+        return Request(
+            asdict(program), os.getpid(), str(folder), environment, limits, sorted(pass_fds), new_session, umask
+        )
 
 
 def main() -> None:
@@ -295,6 +283,7 @@ def _serve(link: socket.socket, birth: _Birth) -> Program | None:
                 os.write(writes, str(child).encode())
                 os._exit(0)
             os.close(opens)
+            link.detach()  # its number is the program's from now on
             os.read(gate, 1)  # until the caller has adopted us
             return _become(Request(**json.loads(data)), descriptors, birth)
         for each in (gate, writes, *descriptors):
@@ -307,6 +296,8 @@ def _serve(link: socket.socket, birth: _Birth) -> Program | None:
 
 def _become(request: Request, descriptors: Sequence[int], birth: _Birth) -> Program:
     """Take over what the process inherits, and return its program."""
+    from pyroute2 import netns  # the zygote has loaded it
+
     program = Program(**request.program)
     if request.new_session:
         os.setsid()
@@ -317,11 +308,11 @@ def _become(request: Request, descriptors: Sequence[int], birth: _Birth) -> Prog
     space = waiting[3]
     for number, each in zip([0, 1, 2, *request.fds], [*waiting[:3], *waiting[5:]], strict=True):
         os.dup2(each, number, inheritable=True)
-    _enter(space)
+    netns.setns(space)
     os.chdir(request.cwd)
     if program.netns:
         with open(program.netns, "rb") as file:
-            _enter(file.fileno())
+            netns.setns(file.fileno())
     for which, limits in zip(_LIMITS, request.limits, strict=True):
         if list(resource.getrlimit(which)) != limits:
             resource.setrlimit(which, (limits[0], limits[1]))
@@ -364,13 +355,9 @@ def _open_streams(*, is_unbuffered: bool) -> None:
         setattr(sys, f"__{name}__", stream)
 
 
-def _enter(descriptor: int) -> None:
-    if _LIBC.setns(descriptor, _CLONE_NEWNET):
-        raise OSError(ctypes.get_errno(), "setns")
-
-
-def _prctl(option: int, value: int, more: int = 0) -> int:
-    return int(_LIBC.prctl(option, ctypes.c_ulong(value), ctypes.c_ulong(more), 0, 0))
+def _prctl(option: int, value: int) -> None:
+    if _LIBC.prctl(option, ctypes.c_ulong(value), 0, 0, 0):
+        raise OSError(ctypes.get_errno(), "prctl")
 
 
 def _name(argv: Sequence[str]) -> None:
