@@ -151,12 +151,13 @@ def written(page: str) -> str:
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; return its exit status."""
-    differ = [page for page in sorted((ROOT / "docs").rglob("*.md")) if written(page.read_text()) != page.read_text()]
-    for page in differ:
+    pages = {page: page.read_text() for page in sorted((ROOT / "docs").rglob("*.md"))}
+    differ = {page: new for page, text in pages.items() if (new := written(text)) != text}
+    for page, new in differ.items():
         if "--check" in argv:
             print(f"{page.relative_to(ROOT)}: a table differs from its source (run scripts/docs_reference.py)")
         else:
-            page.write_text(written(page.read_text()))
+            page.write_text(new)
     return 1 if differ and "--check" in argv else 0
 
 

@@ -32,10 +32,10 @@ run() {
 }
 
 case "${1:-}" in
-    "") lane=(-m "not nightly" --budgets) ;;
+    "") lane=change selected=(-m "not nightly") judged=(--budgets) ;;
     --nightly)
         export GDP_REAL_PROGRAMS=1 GDP_DRAWS=4
-        lane=()
+        lane=nightly selected=() judged=()
         shift
         ;;
     *)
@@ -49,7 +49,7 @@ scripts/check.sh >"$scratch/check.log" 2>&1 &
 checks=$!
 trap 'kill "$checks" 2>/dev/null || true; exit 130' INT TERM
 ended=0 status=0
-run -n "$(($(nproc) + 1))" "${lane[@]}" --seconds "$out/seconds.json" --durations 25 --junit-xml "$out/tests.xml" "$@" ||
+run -n "$(($(nproc) + 1))" "${selected[@]}" "${judged[@]}" --seconds "$out/seconds.json" --durations 25 --junit-xml "$out/tests.xml" "$@" ||
     ended=$?
 wait "$checks" || status=1
 cat "$scratch/check.log"
@@ -62,10 +62,10 @@ elif [[ $ended -eq 1 ]]; then
     # A failed test runs once more alone, to distinguish an unsteady test from a broken one. Both fail the run, unless
     # tests/quarantine.yaml lists the test.
     printf 'failed tests run once more alone\n'
-    run "${lane[@]:0:2}" --last-failed --last-failed-no-failures none --junit-xml "$out/rerun.xml" || true
+    run "${selected[@]}" --last-failed --last-failed-no-failures none --junit-xml "$out/rerun.xml" || true
     .venv/bin/python scripts/rerun_check.py --first "$out/tests.xml" --rerun "$out/rerun.xml" || status=1
 fi
-if [[ ${GDP_DRAWS:-1} -gt 1 && $(id -u) -eq 0 ]]; then
+if [[ $lane == nightly && $(id -u) -eq 0 ]]; then
     printf 'fuzzing: ten minutes of all decoders\n'
     .venv/bin/python scripts/fuzz.py --guided --total 600 || status=1
     printf 'chaos: ten minutes of faults of every kind, two RIBs on a shared store\n'

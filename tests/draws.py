@@ -7,17 +7,17 @@ from typing import Final
 
 from hypothesis import HealthCheck, Phase, settings
 
-__all__ = ["IS_LONG", "draws"]
+__all__ = ["IS_LONG", "TIMES", "draws"]
 
-_TIMES: Final = int(os.environ.get("GDP_DRAWS", "1"))
-IS_LONG: Final = _TIMES > 1
+TIMES: Final = int(os.environ.get("GDP_DRAWS", "1"))
+IS_LONG: Final = TIMES > 1
 
 
 def draws(usual: int) -> settings:
     """Return the settings of a test that draws ``usual`` cases, or as many times more as ``GDP_DRAWS`` asks for."""
     phases = (Phase.explicit, Phase.reuse, Phase.generate, Phase.shrink)
     return settings(
-        max_examples=usual * _TIMES,
+        max_examples=usual * TIMES,
         deadline=None,
         derandomize=not IS_LONG,
         print_blob=True,

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import os
-
 import pytest
 from faults.network import random_network
 from faults.schedule import make_schedule
 
+from tests.draws import TIMES
 from tests.scripts.simulated_chaos import SIMULATED, SimulatedChaos
 
-FIRST, COUNT = 1, 2 * int(os.environ.get("GDP_DRAWS", "1"))
+FIRST, COUNT = 1, 2 * TIMES
 SWITCHES, RATE, SECONDS = 12, 0.25, 40.0
 THIN_BITS_S, FIFO_S, IMAGE_SHARE = 4e6, 0.2, 2.0  # images offer so much of a link
 LIMIT_S, WELL_S = 8.0, 2.0
