@@ -23,6 +23,7 @@ from typing import Final
 from fog.bootstrap.responder import Responder
 from gdp.errors import GdpError, LocalError, StatementError
 from gdp.ports.listening import listen_tcp
+from gdp.token_bucket import TokenBucket
 from gdp.trust.bootstrap_ticket import REQUEST_MAX_BYTES, request_head
 
 __all__ = ["ACCEPTS_PER_S", "CONNECTIONS_MAX", "CONNECTION_S", "Listener", "bind_tcp", "bind_unix"]
@@ -88,7 +89,7 @@ class Listener:
         self._listening = listening
         self._responder = responder
         self._connections: dict[int, _Connection] = {}  # oldest first
-        self._allowance, self._seen_s = ACCEPTS_PER_S, time.monotonic()
+        self._accepts = TokenBucket(ACCEPTS_PER_S, ACCEPTS_PER_S)
         self._resume_s: float | None = None  # time at which accepting resumes
         self._flush_s = 0.0
         self._is_closed = False
@@ -142,9 +143,7 @@ class Listener:
     def _accept(self) -> None:
         for _ in range(_BURST):
             now_s = time.monotonic()
-            self._allowance = min(self._allowance + (now_s - self._seen_s) * ACCEPTS_PER_S, ACCEPTS_PER_S)
-            self._seen_s = now_s
-            if self._allowance < 1.0:
+            if self._accepts.left(now_s) < 1.0:
                 self._pause(now_s)
                 return
             try:
@@ -155,7 +154,7 @@ class Listener:
                 log.warning("enrolment not accepted reason=%s", error.strerror)
                 self._pause(now_s)
                 return
-            self._allowance -= 1.0
+            self._accepts.spend(now_s)
             host = address[0] if isinstance(address, tuple) else ""
             same = [each for each in self._connections.values() if each.host == host] if host else []
             if len(same) >= _EACH_MAX:

@@ -7,20 +7,16 @@ system calls dominate it.
 from __future__ import annotations
 
 import contextlib
-import logging
 import select
-import signal
-import socket
 import time
 from collections.abc import Callable, Iterator
-from types import FrameType
 from typing import Final, Protocol
 
 from gdp.runtime.memory_tuning import tune_memory
+from gdp.runtime.signals import handled_signals
 
 __all__ = ["RelayLoop", "Timed"]
 
-log = logging.getLogger(__name__)
 
 _LONGEST_S: Final = 1.0
 
@@ -119,39 +115,10 @@ class RelayLoop:
     @contextlib.contextmanager
     def signals(self, reload: Callable[[], None]) -> Iterator[None]:
         """End ``run`` on SIGINT and SIGTERM, and call ``reload`` on SIGHUP, until the context ends."""
-        reading, writing = socket.socketpair()
-        reading.setblocking(False)
-        writing.setblocking(False)
-
-        def stop(number: int, frame: FrameType | None) -> None:
-            """End ``run`` on a signal."""
-            del frame
-            log.info("stopping signal=%d", number)
-            self.stop()
-
-        def hang_up(number: int, frame: FrameType | None) -> None:
-            """Do nothing here: ``drain`` handles the number on the socket."""
-            del number, frame
-
-        def drain(events: int) -> None:
-            """Read the numbers of signals."""
-            del events
-            with contextlib.suppress(BlockingIOError):
-                while numbers := reading.recv(64):
-                    if signal.SIGHUP in numbers:
-                        reload()
-
         tune_memory()
-        before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-        before[signal.SIGHUP] = signal.signal(signal.SIGHUP, hang_up)
-        woken_before = signal.set_wakeup_fd(writing.fileno(), warn_on_full_buffer=False)
-        self.register(reading.fileno(), select.EPOLLIN, drain)
-        try:
-            yield
-        finally:
-            self.unregister(reading.fileno())
-            signal.set_wakeup_fd(woken_before)
-            for number, handler in before.items():
-                signal.signal(number, handler)
-            reading.close()
-            writing.close()
+        with handled_signals(self.stop, reload) as (reading, drain):
+            self.register(reading.fileno(), select.EPOLLIN, lambda _: drain())
+            try:
+                yield
+            finally:
+                self.unregister(reading.fileno())

@@ -9,19 +9,17 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import signal
-import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 
 from gdp.limits import COST_DEFAULT
 from gdp.management.control_socket import ControlHandlers, ControlServer
 from gdp.ports.plane import HasFileno, Plane
 from gdp.runtime.busy_poll import BusyPoll
 from gdp.runtime.memory_tuning import tune_memory
+from gdp.runtime.signals import handled_signals
 from gdp.sansio import ProtocolCore, ReceivedFrame, Timestamps
 
 __all__ = ["DRAIN_MAX_S", "Runtime", "now"]
@@ -262,41 +260,13 @@ class Runtime:
         Args:
             reload: called within the loop after a SIGHUP.
         """
-        reading, writing = socket.socketpair()
-        reading.setblocking(False)
-        writing.setblocking(False)
-
-        def stop(number: int, frame: FrameType | None) -> None:
-            """End ``run`` on a signal."""
-            del frame
-            log.info("stopping signal=%d", number)
-            self.stop()
-
-        def hang_up(number: int, frame: FrameType | None) -> None:
-            """Do nothing here: ``drain`` handles the number on the socket."""
-            del number, frame
-
-        def drain() -> None:
-            """Read the numbers of signals, and reload on SIGHUP."""
-            with contextlib.suppress(BlockingIOError):
-                while numbers := reading.recv(64):
-                    if signal.SIGHUP in numbers and reload is not None:
-                        reload()
-
         tune_memory()
-        before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-        before[signal.SIGHUP] = signal.signal(signal.SIGHUP, hang_up)
-        woken_before = signal.set_wakeup_fd(writing.fileno(), warn_on_full_buffer=False)
-        self._plane.watch(reading, drain)
-        try:
-            yield
-        finally:
-            self._plane.unwatch(reading)
-            signal.set_wakeup_fd(woken_before)
-            for number, handler in before.items():
-                signal.signal(number, handler)
-            reading.close()
-            writing.close()
+        with handled_signals(self.stop, reload) as (reading, drain):
+            self._plane.watch(reading, drain)
+            try:
+                yield
+            finally:
+                self._plane.unwatch(reading)
 
     def _add(self, index: int, moment: Timestamps) -> None:
         port = self._plane.ports[index]
