@@ -86,7 +86,7 @@ def a_refused_reload_says_why(nodes: Nodes) -> None:
 def test_running_nodes_show_their_status_and_links_and_reload_what_they_accept(nodes: Nodes) -> None:
     def is_measured() -> bool:
         shown = json.loads(nodes.gdp("status", "switch", "--json")[1])
-        return len(shown["link_quality"]) == shown["neighbours"] > 0
+        return bool(len(shown["link_quality"]) == shown["neighbours"] > 0)
 
     until(is_measured, "the switch has measured its links")
     for name in ("rib", "proxy", "switch"):

@@ -250,7 +250,8 @@ def test_a_type_that_is_not_installed_is_advertised_by_its_definition(net: Net, 
     assert listener.line() == f"{bytes(20).hex()} /{NODE} 0 c99a9440709e4d4a9716d55b8270d5e7"
 
 
-def test_an_unknown_type_is_refused_with_what_to_install(ear: Ear) -> None:
+def test_an_unknown_type_is_refused_with_what_to_install(monkeypatch: pytest.MonkeyPatch, ear: Ear) -> None:
+    monkeypatch.setattr("proxy.endpoints.ros1.endpoint._ANSWER_S", 30.0)  # the process imports the package to answer
     assert ear.endpoint.channel("/x", "sensor_msgs/msg/Image").hash == "060021388200f6f0f447d0fcd9c64743"
     with pytest.raises(LocalError, match="no_msgs/msg/Such is not known here"):
         ear.endpoint.channel("/x", "no_msgs/msg/Such")
