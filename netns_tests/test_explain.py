@@ -162,6 +162,7 @@ def test_the_command_says_it_in_json_and_by_its_exit_code(asked: Asked) -> None:
     assert (code, answer["cause"], answer["command"]) == (1, "no-reader-here", "ros2 topic echo /unread")
 
 
+@pytest.mark.nightly
 def test_a_ros_node_in_another_domain_or_with_shared_memory_alone_is_found(asked: Asked) -> None:
     words = asked.pair.spaces.command("b", ["env", "ROS_DOMAIN_ID=7", "FASTDDS_BUILTIN_TRANSPORTS=SHM"])
     apart = Peer("apart", words)
@@ -184,6 +185,7 @@ def test_a_cut_link_is_named_and_heals(asked: Asked) -> None:
             asked.pair.spaces.restore_link("a", "b")
 
 
+@pytest.mark.nightly
 def test_a_link_that_loses_all_our_frames_is_named_and_heals(asked: Asked) -> None:
     with healed(asked):
         asked.tc("a", "b", "add", "pfifo", "limit", "0")
@@ -196,6 +198,7 @@ def test_a_link_that_loses_all_our_frames_is_named_and_heals(asked: Asked) -> No
             asked.tc("b", "a", "del")
 
 
+@pytest.mark.nightly
 def test_a_killed_far_proxy_is_named_and_heals(asked: Asked) -> None:
     with healed(asked):
         asked.pair.proxy("a").end(signal.SIGKILL)
@@ -205,6 +208,7 @@ def test_a_killed_far_proxy_is_named_and_heals(asked: Asked) -> None:
             asked.pair.proxy("a")
 
 
+@pytest.mark.nightly
 def test_a_near_proxy_that_does_not_run_is_named(asked: Asked) -> None:
     with healed(asked):
         asked.pair.proxy("b").end()

@@ -126,6 +126,7 @@ def test_calls_go_on_while_machines_are_taken_and_killed_and_the_supervisor_is(f
     assert not left_of(fog)
 
 
+@pytest.mark.nightly
 def test_the_live_view_shows_machines_first_answers_and_a_loss(fog: Fog) -> None:
     fog.run("launch", str(_LAUNCH), "--detach")
     first, second = fog.serving()
@@ -249,6 +250,7 @@ class Shown:
         return {row[2]: row[4] for row in self._figures["replicas"] if row[0] in echo and row[4]}
 
 
+@pytest.mark.nightly
 def test_down_ends_everything_though_launch_and_supervisor_were_killed_and_the_journal_is_gone(fog: Fog) -> None:
     launch = subprocess.Popen(
         [sys.executable, "-m", "fog.cli.app", "launch", str(_LAUNCH), "--json"],

@@ -68,6 +68,7 @@ def test_a_nat_lets_in_whom_the_socket_wrote_to_and_a_full_cone_lets_in_all(
     assert arrived == [not TRAITS[access].is_filtering, not TRAITS[access].is_filtering, True]
 
 
+@pytest.mark.nightly
 def test_a_full_cone_has_no_mapping_for_a_socket_that_never_sent(
     laboratory: Laboratory, borders: tuple[Host, Host]
 ) -> None:
@@ -130,6 +131,7 @@ def test_a_public_host_is_reached_by_a_stranger_over_both_ip_versions(laboratory
             assert observe(a, b) == a.local
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("access", [Access.FULL_CONE, Access.DOUBLE_NAT], ids=lambda each: each.value)
 def test_a_nat_that_forgets_its_mappings_lets_its_peer_in_after_the_next_datagram_from_inside(
     laboratory: Laboratory, borders: tuple[Host, Host], access: Access
@@ -143,6 +145,7 @@ def test_a_nat_that_forgets_its_mappings_lets_its_peer_in_after_the_next_datagra
         assert observe(border, probe, after) is not None
 
 
+@pytest.mark.nightly
 def test_a_symmetric_nat_that_forgets_a_mapping_makes_another(
     laboratory: Laboratory, borders: tuple[Host, Host]
 ) -> None:
@@ -154,6 +157,7 @@ def test_a_symmetric_nat_that_forgets_a_mapping_makes_another(
         assert observe(probe, border) not in (before, None)
 
 
+@pytest.mark.nightly
 def test_mappings_end_after_the_timeout_of_the_site(laboratory: Laboratory, borders: tuple[Host, Host]) -> None:
     robot = attach(laboratory, Access.PORT_RESTRICTED)
     robot.site().set_mapping_timeout(1)
@@ -163,6 +167,7 @@ def test_mappings_end_after_the_timeout_of_the_site(laboratory: Laboratory, bord
         assert observe(border, probe, public, timeout_s=SILENCE_S) is None
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("access", [*NATS, Access.PUBLIC], ids=lambda each: each.value)
 def test_a_renumbered_site_shows_a_new_address_to_the_same_socket(
     laboratory: Laboratory, borders: tuple[Host, Host], access: Access
@@ -179,6 +184,7 @@ def test_a_renumbered_site_shows_a_new_address_to_the_same_socket(
         assert observe(border, probe, before, timeout_s=SILENCE_S) is None
 
 
+@pytest.mark.nightly
 def test_a_renumbered_ipv6_site_gives_its_hosts_another_prefix(
     laboratory: Laboratory, borders: tuple[Host, Host]
 ) -> None:
@@ -189,6 +195,7 @@ def test_a_renumbered_ipv6_site_gives_its_hosts_another_prefix(
         assert observe(probe, border) not in (before, None)
 
 
+@pytest.mark.nightly
 def test_a_new_lease_gives_a_host_another_address_behind_the_same_nat(
     laboratory: Laboratory, borders: tuple[Host, Host]
 ) -> None:
@@ -202,6 +209,7 @@ def test_a_new_lease_gives_a_host_another_address_behind_the_same_nat(
         assert seen.address == robot.site().address
 
 
+@pytest.mark.nightly
 def test_a_socket_outlives_the_move_of_its_host_to_another_site(
     laboratory: Laboratory, borders: tuple[Host, Host]
 ) -> None:
@@ -218,6 +226,7 @@ def test_a_socket_outlives_the_move_of_its_host_to_another_site(
         assert observe(probe, border) == probe.local
 
 
+@pytest.mark.nightly
 def test_a_host_with_two_uplinks_uses_the_first_and_may_choose(
     laboratory: Laboratory, borders: tuple[Host, Host]
 ) -> None:
@@ -232,6 +241,7 @@ def test_a_host_with_two_uplinks_uses_the_first_and_may_choose(
                 assert seen.address == address
 
 
+@pytest.mark.nightly
 def test_a_silent_cut_loses_datagrams_without_an_error_until_it_ends(
     laboratory: Laboratory, borders: tuple[Host, Host]
 ) -> None:
@@ -246,6 +256,7 @@ def test_a_silent_cut_loses_datagrams_without_an_error_until_it_ends(
         assert observe(probe, border) == public
 
 
+@pytest.mark.nightly
 def test_a_router_without_carrier_answers_that_the_network_is_unreachable(
     laboratory: Laboratory, borders: tuple[Host, Host]
 ) -> None:
@@ -263,6 +274,7 @@ def test_a_router_without_carrier_answers_that_the_network_is_unreachable(
         assert observe(probe, border) is not None
 
 
+@pytest.mark.nightly
 def test_an_unplugged_host_sees_its_carrier_go_and_come(laboratory: Laboratory) -> None:
     robot = attach(laboratory, Access.PORT_RESTRICTED)
     seen = []
@@ -273,6 +285,7 @@ def test_an_unplugged_host_sees_its_carrier_go_and_come(laboratory: Laboratory) 
     assert seen == [True, False]
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("access", [Access.SYMMETRIC, Access.DOUBLE_NAT, Access.IPV6_ONLY], ids=lambda each: each.value)
 def test_a_router_that_restarts_forgets_its_mappings_and_serves_again(
     laboratory: Laboratory, borders: tuple[Host, Host], access: Access
@@ -288,6 +301,7 @@ def test_a_router_that_restarts_forgets_its_mappings_and_serves_again(
         assert observe(probe, border) is not None
 
 
+@pytest.mark.nightly
 def test_a_delay_line_delays_both_directions_and_loses_nothing(
     laboratory: Laboratory, borders: tuple[Host, Host]
 ) -> None:
@@ -317,6 +331,7 @@ def test_a_delay_without_a_delay_line_is_refused(laboratory: Laboratory) -> None
         laboratory.add_site("home", Access.PUBLIC).set_delay(1.0)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("share", "least", "most"), [(0.0, 400, 400), (0.25, 200, 370), (1.0, 0, 0)])
 def test_a_site_loses_the_share_of_packets_that_is_set(
     laboratory: Laboratory, borders: tuple[Host, Host], share: float, least: int, most: int
@@ -331,6 +346,7 @@ def test_a_site_loses_the_share_of_packets_that_is_set(
     assert least <= len(border.sources) - 2 <= most
 
 
+@pytest.mark.nightly
 def test_a_limited_uplink_drops_what_exceeds_its_queue(laboratory: Laboratory, borders: tuple[Host, Host]) -> None:
     robot = attach(laboratory, Access.PUBLIC)
     with UdpProbe(robot) as probe, UdpProbe(borders[0]) as border:
@@ -343,6 +359,7 @@ def test_a_limited_uplink_drops_what_exceeds_its_queue(laboratory: Laboratory, b
             assert (len(border.sources) == 90) is is_whole
 
 
+@pytest.mark.nightly
 def test_the_pairs_that_reach_each_other_directly_are_those_that_the_traits_allow(
     laboratory: Laboratory, borders: tuple[Host, Host]
 ) -> None:

@@ -137,6 +137,7 @@ def test_a_ros_2_server_serves_a_ros_1_client_or_sends_it_the_reason(a: Peer, on
     until(lambda: one.tell("call(SetBool, '/gate', True)") == [True, "open"], "the next call")
 
 
+@pytest.mark.nightly
 def test_no_queue_of_a_node_loses_a_call_after_a_stall(a: Peer, b: Peer, pair: Pair) -> None:
     a.tell(
         "!asked = []\n"
@@ -222,6 +223,7 @@ def test_a_late_joiner_gets_what_was_latched(a: Peer, b: Peer) -> None:
     b.waits_for("heard['/map']", [["new"]])
 
 
+@pytest.mark.nightly
 def test_what_two_nodes_latched_in_one_topic_reaches_a_late_joiner(a: Peer, b: Peer, pair: Pair) -> None:
     other = node_of(pair, "a", "other")
     for node, frame in ((a, "arm"), (other, "base")):
@@ -244,6 +246,7 @@ def say(node: Peer, first: int, end: int) -> object:
     return node.tell(f"say('/twice', *range({first}, {end}))")
 
 
+@pytest.mark.nightly
 def test_of_two_proxies_in_one_graph_one_carries_and_the_other_takes_over(a: Peer, b: Peer, pair: Pair) -> None:
     proxies = [pair.proxy("b"), pair.proxy("twin")]
     until(lambda: any(proxy.faults("other-bridge") for proxy in proxies), "one gives way")
@@ -277,6 +280,7 @@ def test_flows_resume_when_a_killed_proxy_is_started_again(a: Peer, b: Peer, pai
     assert [number for number in said(b) if number > 1] == list(range(2, 102))
 
 
+@pytest.mark.nightly
 def test_what_comes_and_goes_leaves_memory_and_descriptors_where_they_were(a: Peer, b: Peer, pair: Pair) -> None:
     proxies = [pair.proxy("a"), pair.proxy("b")]
     for at in range(10):

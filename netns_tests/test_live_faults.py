@@ -100,6 +100,7 @@ def tells(proxy: Proxy, name: str, fault: str) -> str:
     return warnings[0].removeprefix(fault + ": ")
 
 
+@pytest.mark.nightly
 def test_a_type_that_the_far_machine_has_not(pair: Pair, a: Peer, b: Peer) -> None:
     a.tell("!diagnosis = talk(DiagnosticArray, '/diagnosis')")
     b.tell("read(DiagnosticArray, '/diagnosis')")
@@ -126,6 +127,7 @@ def test_definitions_that_differ(pair: Pair, a: Peer, b: Peer) -> None:
     flows(a, b)
 
 
+@pytest.mark.nightly
 def test_a_message_above_the_limit(pair: Pair, a: Peer, b: Peer) -> None:
     b.tell("read(String, '/long')")
     a.tell("!long, m = talk(String, '/long'), String(data='short')")
@@ -138,6 +140,7 @@ def test_a_message_above_the_limit(pair: Pair, a: Peer, b: Peer) -> None:
     assert b.tell("{text for text, in heard['/long']} == {'short'}") is True
 
 
+@pytest.mark.nightly
 def test_a_reader_that_wants_what_no_network_can_promise(pair: Pair, a: Peer, b: Peer) -> None:
     a.tell("!dead = talk(String, '/deadline')")
     b.tell("read(String, '/deadline', deadline=Duration(seconds=1))")
@@ -145,6 +148,7 @@ def test_a_reader_that_wants_what_no_network_can_promise(pair: Pair, a: Peer, b:
     flows(a, b)
 
 
+@pytest.mark.nightly
 def test_a_publisher_that_is_faster_than_the_path(pair: Pair, a: Peer, b: Peer) -> None:
     b.tell("read(Image, '/film')")
     a.tell("!film = talk(Image, '/film'); picture = Image(height=100, width=1000, step=3000, data=bytes(300_000))")
@@ -190,6 +194,7 @@ def test_a_server_that_leaves_or_dies_while_it_is_asked(pair: Pair, a: Peer, b: 
     flows(a, b)
 
 
+@pytest.mark.nightly
 def test_a_ros_1_server_that_dies_while_it_is_asked(pair: Pair, a: Peer, b: Peer) -> None:
     server = node_of(pair, "one", "server")
     server.tell("!import time; asked = []; serve(SetBool, '/lamp', lambda r: asked.append(1) or time.sleep(30))")

@@ -123,6 +123,7 @@ def test_a_machine_is_taken_at_the_moment_of_its_notice(provider: LocalProvider)
     assert (gone.state, gone.reason) == (MachineState.GONE, "preempted")
 
 
+@pytest.mark.nightly
 @pytest.mark.usefixtures("either")
 def test_a_frozen_machine_is_taken_at_the_moment_of_its_notice_too(provider: LocalProvider) -> None:
     machine = booted(provider)
@@ -161,6 +162,7 @@ def test_a_frozen_machine_does_nothing_until_it_is_thawed(provider: LocalProvide
     until(lambda: ticks(provider, machine) > before, "going on")
 
 
+@pytest.mark.nightly
 def test_a_slow_machine_has_to_wait_for_its_processor(provider: LocalProvider) -> None:
     machine = provider.create(spec("m1"), ticking("print('ready', flush=True)\nwhile True: pass"))
     if not find(provider.runs, machine).file.is_bounded:
@@ -188,6 +190,7 @@ def listen(device: str) -> socket.socket:
     return heard
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("away", [True, False])
 def test_no_frame_of_a_delayed_link_is_early(provider: LocalProvider, away: bool) -> None:
     machine = booted(provider)
@@ -297,6 +300,7 @@ def test_machines_of_another_mount_namespace_are_reached_and_given_back(folder: 
     assert not exists(None, "fog0")
 
 
+@pytest.mark.nightly
 def test_a_network_whose_mount_namespace_has_ended_is_removed(folder: Path) -> None:
     argv = ["unshare", "--mount", "--propagation", "private", sys.executable, "-c", _FROM_ANOTHER_MOUNT_NAMESPACE]
     subprocess.run([*argv, str(folder)], cwd=ROOT, timeout=PATIENCE_S, check=True)
@@ -309,6 +313,7 @@ def test_a_network_whose_mount_namespace_has_ended_is_removed(folder: Path) -> N
     assert leftovers(folder, runs) == []
 
 
+@pytest.mark.nightly
 def test_a_gateway_that_was_killed_runs_again_when_the_network_is_opened(provider: LocalProvider) -> None:
     (network,) = provider.runs.all()
     os.killpg(network.processes[0].pid, signal.SIGKILL)

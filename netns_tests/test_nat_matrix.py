@@ -19,6 +19,7 @@ pytestmark = pytest.mark.netns
 KINDS = (Access.PORT_RESTRICTED, Access.SYMMETRIC, Access.UDP_BLOCKED)
 
 
+@pytest.mark.nightly
 def test_switches_behind_nats_reach_each_other_and_directly_where_that_is_possible(laboratory: Laboratory) -> None:
     if shutil.which("wireguard-go") is None or not os.access("/dev/net/tun", os.R_OK | os.W_OK):
         pytest.skip("needs wireguard-go and /dev/net/tun")

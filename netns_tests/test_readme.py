@@ -19,7 +19,9 @@ TUTORIAL = blocks(ROOT / "docs/tutorials/two-machines.md")
 _TOPIC = "/camera/image"
 
 
-@pytest.mark.parametrize("page", [CABLE, TUTORIAL], ids=["cable", "tutorial"])
+@pytest.mark.parametrize(
+    "page", [pytest.param(CABLE, marks=pytest.mark.nightly, id="cable"), pytest.param(TUTORIAL, id="tutorial")]
+)
 def test_a_recording_goes_from_one_machine_to_the_other_by_the_commands_of_a_page(
     page: list[Block], space: Space, tmp_path: Path
 ) -> None:

@@ -140,6 +140,7 @@ def test_a_relay_answers_probes_and_is_ready_once_it_has_its_border(lab: RelayLa
     until(is_ready)
 
 
+@pytest.mark.nightly
 def test_a_change_of_address_is_followed_without_waiting_for_a_timeout(lab: RelayLab) -> None:
     lab.start_relay(lab.border, dead_ms=HEAL_S * 1_000)
     lab.start_relay(lab.member, dead_ms=HEAL_S * 1_000)
@@ -154,6 +155,7 @@ def test_a_change_of_address_is_followed_without_waiting_for_a_timeout(lab: Rela
     assert took_s < HEAL_S
 
 
+@pytest.mark.nightly
 def test_a_relay_on_standby_waits_for_a_tunnel_and_then_connects(lab: RelayLab) -> None:
     lab.start_relay(lab.border)
     lab.start_relay(lab.member, standby=True)
@@ -182,6 +184,7 @@ def test_where_udp_becomes_blocked_frames_go_through_tls(lab: RelayLab) -> None:
     assert lab.is_up(), "the relay stays until the tunnel has been stable"
 
 
+@pytest.mark.nightly
 def test_an_endpoint_may_be_a_host_name(lab: RelayLab) -> None:
     lab.start_relay(lab.border)
     border = {"peer": lab.border.name.to_text(), "endpoints": [f"localhost:{PORT}"], "standby": False}
@@ -193,6 +196,7 @@ def test_an_endpoint_may_be_a_host_name(lab: RelayLab) -> None:
         guest.end()
 
 
+@pytest.mark.nightly
 def test_a_port_that_the_configuration_names_is_not_added_twice(lab: RelayLab) -> None:
     lab.start_relays()
     lab.start_switch(lab.border)
@@ -202,6 +206,7 @@ def test_a_port_that_the_configuration_names_is_not_added_twice(lab: RelayLab) -
     assert lab.member.status(lab.home / "member-switch.sock")["ports"] == 1
 
 
+@pytest.mark.nightly
 def test_a_path_that_goes_silent_takes_the_carrier_away(lab: RelayLab) -> None:
     lab.start_relays()
     lab.border.ip("link", "set", "eth0", "down")

@@ -66,6 +66,7 @@ class Flow:
                 self.arrivals.append(time.monotonic())
 
 
+@pytest.mark.nightly
 def test_a_removed_machine_has_no_tunnel_and_no_frame_passes_a_second_later(laboratory: Laboratory) -> None:
     with Stage(laboratory, 0.0) as stage, contextlib.ExitStack() as stack:
         tokens = [stage.create_domain()]

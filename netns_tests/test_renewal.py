@@ -27,6 +27,7 @@ _RENEWALS = 4
 _TAKEN_UP_S = 4 * LOOK_S  # two reconcile periods of every node
 
 
+@pytest.mark.nightly
 def test_no_message_is_lost_while_memberships_and_the_root_are_replaced(space: Space, tmp_path: Path) -> None:
     machines = Machines(tmp_path)
     homes = {"robot": machines.robot, "server": machines.server}

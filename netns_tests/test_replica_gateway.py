@@ -80,6 +80,7 @@ def received_bytes(machine: str, provider: LocalProvider) -> int:
     return netns_files.inside(find(provider.runs, machine).gateway, look)
 
 
+@pytest.mark.nightly
 def test_a_group_without_machines_stands_until_it_is_closed(provider: LocalProvider) -> None:
     (network,) = provider.runs.all()
     assert provider.sweep() == []
@@ -87,6 +88,7 @@ def test_a_group_without_machines_stands_until_it_is_closed(provider: LocalProvi
     assert [each.run for each in provider.runs.all()] == [network.run]
 
 
+@pytest.mark.nightly
 def test_the_uplink_moves_from_machine_to_machine(provider: LocalProvider) -> None:
     first, second = (provider.create(spec(name), ticking()) for name in ("m1", "m2"))
     provider.attach_uplink(first)
@@ -104,6 +106,7 @@ def test_the_uplink_moves_from_machine_to_machine(provider: LocalProvider) -> No
     assert exists(lost.gateway, UP)
 
 
+@pytest.mark.nightly
 def test_behind_a_dedicated_gateway_no_machine_is_one(tmp_path: Path, space: Space) -> None:
     west = Gateway(gateway="west", replica=True, regions=("us-west-1",))
     provider = LocalProvider(tmp_path / "local", plain_gateway, Gateway(gateway="edge", children=(west,)))

@@ -100,6 +100,7 @@ def test_a_recording_crosses_three_switches_in_between_at_an_even_pace(demo: Pat
         assert received.count == sum(int(str(row["messages"])) for row in topics(result))
 
 
+@pytest.mark.nightly
 @pytest.mark.momentary(FAST)
 @pytest.mark.parametrize("encoding", ["cbor", "cdr"])
 def test_every_encoding_crosses(demo: Path, tmp_path: Path, encoding: str) -> None:
@@ -116,6 +117,7 @@ def test_a_ros_1_recording_comes_out_as_a_ros_1_bag(tmp_path: Path) -> None:
         assert {channel.ros for channel in received.channels} == {1}
 
 
+@pytest.mark.nightly
 @pytest.mark.momentary(FAST)
 def test_larger_frames_carry_an_image_in_fewer_parts(demo: Path, tmp_path: Path) -> None:
     small, large = (crossed(tmp_path, demo, "--rate", 0, "--mtu", mtu) for mtu in (1_500, 9_000))
@@ -123,6 +125,7 @@ def test_larger_frames_carry_an_image_in_fewer_parts(demo: Path, tmp_path: Path)
     assert parts[0] > 5 * parts[1]
 
 
+@pytest.mark.nightly
 @pytest.mark.momentary("this plane forwards like the others, a hundred times slower; leases are no matter of a plane")
 def test_the_scapy_plane_carries_the_same(tmp_path: Path) -> None:
     crossed(tmp_path, make_demo(tmp_path, 0.1, "--without-images"), "--data-plane", "scapy")
@@ -134,12 +137,15 @@ def test_with_a_link_cut_in_the_middle_all_still_arrives_by_the_other_way(longer
     assert imu["hops_seen"] in ([5, 2], [2, 5])
 
 
+@pytest.mark.nightly
 def test_what_fails_and_moves_one_after_the_other_costs_no_message(demo: Path, tmp_path: Path) -> None:
     faults = ["--cut", "nuc1-nuc2@1-3", "--kill", "rib:school@2", "--roam", "robot:nuc2@4.5", "--kill", "switch:nuc1@5"]
     crossed(tmp_path, demo, "--seconds", 12, "--lease", LEASE_S, *faults)
 
 
-@pytest.mark.parametrize("least", ["school", "backbone", "cloud"])
+@pytest.mark.parametrize(
+    "least", ["backbone", *(pytest.param(each, marks=pytest.mark.nightly) for each in ("school", "cloud"))]
+)
 def test_every_rib_dies_one_after_the_other_and_no_message_is_lost_whichever_has_the_least_name(
     least: str, demo: Path, tmp_path: Path
 ) -> None:

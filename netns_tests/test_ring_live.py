@@ -68,6 +68,7 @@ def test_what_real_nodes_say_is_heard_at_the_other_end(mode: str, tmp_path: Path
     assert settings["live"] == mode
 
 
+@pytest.mark.nightly
 def test_with_a_link_cut_in_the_middle_nodes_go_on_by_the_other_way(tmp_path: Path) -> None:
     needs("ros2")
     result = crossed(
@@ -80,6 +81,7 @@ def test_with_a_link_cut_in_the_middle_nodes_go_on_by_the_other_way(tmp_path: Pa
     assert chatter["hops_seen"] == [2, 5]
 
 
+@pytest.mark.nightly
 @pytest.mark.momentary("what is on the wire is looked at, not how long it lasts")
 def test_an_eavesdropper_learns_nothing_of_what_nodes_say(tmp_path: Path) -> None:
     needs("ros2")
@@ -89,6 +91,7 @@ def test_an_eavesdropper_learns_nothing_of_what_nodes_say(tmp_path: Path) -> Non
     assert [word for word in (b"/chatter", b"hello ", b"/camera", b"switched", b"std_msgs") if word in seen] == []
 
 
+@pytest.mark.nightly
 def test_kept_nodes_continue_and_the_ring_comes_down_on_command() -> None:
     needs("mixed")
     run = kept("mixed")

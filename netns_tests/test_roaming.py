@@ -142,6 +142,7 @@ def test_a_running_call_and_a_topic_outlive_changes_of_the_address_and_a_dead_ac
     assert roamer.requests == [b"a long plan"]
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("roamer", [LEASE_S], indirect=True)
 def test_a_topic_and_calls_over_a_direct_tunnel_outlive_a_killed_border(roamer: Field) -> None:
     roamer.release.set()
@@ -162,6 +163,7 @@ def test_a_topic_and_calls_over_a_direct_tunnel_outlive_a_killed_border(roamer: 
     assert roamer.requests == requests
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("roamer", [LEASE_S], indirect=True)
 def test_a_direct_tunnel_that_an_uplink_cut_ends_comes_back_without_the_border(roamer: Field) -> None:
     roamer.wait_for_tunnels("border", "server")

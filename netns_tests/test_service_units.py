@@ -135,6 +135,7 @@ def is_booted(machine: BootedMachine) -> bool:
         return False  # systemd has not begun, or its target is not reached
 
 
+@pytest.mark.nightly
 def test_each_node_runs_under_the_rights_of_its_unit_and_a_hung_one_is_restarted(machine: BootedMachine) -> None:
     until(lambda: is_booted(machine), "the machine boots", BOOT_S)
     names = [f"gdp-{each}" for each in NODES]

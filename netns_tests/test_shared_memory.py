@@ -54,6 +54,7 @@ def peer(lab: Lab, node: str, name: str) -> Peer:
     return made
 
 
+@pytest.mark.nightly
 def test_nothing_crosses_between_machines_while_their_cable_is_cut(lab: Lab) -> None:
     talker, listener = peer(lab, "s1", "talker"), peer(lab, "s2", "listener")
     try:
@@ -73,6 +74,7 @@ def test_nothing_crosses_between_machines_while_their_cable_is_cut(lab: Lab) -> 
         listener.end()
 
 
+@pytest.mark.nightly
 def test_nodes_of_one_machine_exchange_large_messages_through_shared_memory(lab: Lab) -> None:
     talker, listener = peer(lab, "s1", "talker"), peer(lab, "s1", "listener")
     try:
@@ -89,6 +91,7 @@ def test_nodes_of_one_machine_exchange_large_messages_through_shared_memory(lab:
         listener.end()
 
 
+@pytest.mark.nightly
 def test_files_in_shared_memory_appear_on_their_machine_alone(lab: Lab) -> None:
     write = "import pathlib; pathlib.Path('/dev/shm/gdp-test').touch()"
     look = "import os; print('gdp-test' in os.listdir('/dev/shm'))"
@@ -115,6 +118,7 @@ signal.pause()
 """
 
 
+@pytest.mark.nightly
 def test_the_memory_of_a_killed_run_is_swept_by_the_next(tmp_path: Path) -> None:
     bench = Path(__file__).resolve().parents[1] / "scripts" / "bench"
     argv = [sys.executable, "-c", ORPHAN, str(tmp_path), str(bench)]

@@ -100,6 +100,7 @@ def trace_once(node: Path) -> tuple[int, dict[str, Any], str]:
     return done.returncode, json.loads(done.stdout) if done.stdout else {}, done.stderr
 
 
+@pytest.mark.nightly
 def test_tools_tell_the_truth_while_links_fail_and_recover(tmp_path: Path) -> None:
     printed = tmp_path / "ping.jsonl"  # a pipe that is read at the end only would fill, and ping would stop
     cut, killed = (f"{begin}-{end}" for begin, end in (CUT, KILLED))

@@ -140,6 +140,7 @@ def test_every_table_is_kept_by_a_node_of_the_ring(ring: Path) -> None:
     assert sorted(row.split() for row in rows) == [["nuc1", "yes"], ["nuc3", "yes"], ["rib-s", "yes"]]
 
 
+@pytest.mark.nightly
 @pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="rclpy is not installed: setup.sh --ros2")
 def test_a_trace_in_a_fog_cluster_reaches_each_machine_that_serves() -> None:
     serving: set[str] = set()

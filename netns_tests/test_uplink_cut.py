@@ -23,6 +23,7 @@ PATIENCE_S = 300.0
 BEFORE_DETECTION_MS = 180  # three missed keepalives take 210 ms; a busy machine delays some messages by less
 
 
+@pytest.mark.nightly
 def test_a_cut_of_either_uplink_delays_no_message_over_two_paths_and_loses_none(tmp_path: Path) -> None:
     record = tmp_path / "record.json"
     bench = ROOT / "scripts" / "bench" / "uplink_cut.py"

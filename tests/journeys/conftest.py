@@ -15,7 +15,7 @@ from gdp.simulation.simulation import Simulation
 from tests.insiders.oracle import signing_oracle
 
 LEASES = 3
-_REAL_SIGNATURES = ("test_attacks", "test_policy", "test_revocation", "test_services", "test_session_authentication")
+_REAL_SIGNATURES = ("test_attacks", "test_policy", "test_revocation", "test_session_authentication")
 _WORLDS = pytest.StashKey[list[Simulation]]()
 
 
@@ -43,6 +43,7 @@ def _worlds_are_known(request: pytest.FixtureRequest, monkeypatch: pytest.Monkey
 def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
     yield
     complaint = too_short(item.stash.get(_WORLDS, []), item.get_closest_marker("momentary"))
+    del item.stash[_WORLDS]  # or all simulations would stay until the session ends
     if complaint:
         pytest.fail(complaint, pytrace=False)
 

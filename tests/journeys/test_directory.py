@@ -29,7 +29,7 @@ A_RIB_WAITS_FOR_A_SILENT_TIER = Plan(
 
 
 @pytest.mark.momentary("every trial runs for three leases after its last death; hypothesis also draws shorter attempts")
-@draws(8)
+@draws(4)
 @given(plans())
 @example(star(0, 0, 0, 0))
 @example(star(1, 0, 0, 0))

@@ -186,7 +186,7 @@ KILLED: Final = (Fault("border", 0.0, LEASES_S),)
 @pytest.mark.momentary(
     "every trial publishes for three leases after its last fault; hypothesis also draws shorter ones"
 )
-@draws(3)
+@draws(2)
 @given(_drawn())
 @example(Drawn((Nat.PORT, Nat.PORT, None), BORDER, KILLED))
 @example(Drawn((Nat.PORT, Nat.PORT, Nat.PORT), BORDER, KILLED, frozenset(SITES)))

@@ -9,7 +9,7 @@ from faults.schedule import make_schedule
 from tests.draws import TIMES
 from tests.scripts.simulated_chaos import SIMULATED, SimulatedChaos
 
-FIRST, COUNT = 1, 2 * TIMES
+FIRST, COUNT = 1, TIMES
 SWITCHES, RATE, SECONDS = 12, 0.25, 40.0
 THIN_BITS_S, FIFO_S, IMAGE_SHARE = 4e6, 0.2, 2.0  # images offer so much of a link
 LIMIT_S, WELL_S = 8.0, 2.0
