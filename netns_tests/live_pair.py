@@ -33,11 +33,11 @@ from gdp.crypto.certificates import Role
 from gdp.host import netns_files
 from gdp.host.run_registry import Run, RunRegistry
 from gdp.metadata import Metadata
-from gdp.simulation.namespaces import Namespaces
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
 from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE, load_identity
 from gdp.trust.right import Right
+from lab.namespaces import Namespaces
+from lab.topology import Attachment, DomainPlan, Link, Topology
 from netns_tests.lifetimes import LEASE_S, LEASES, Lifetime, noted
 from proxy.endpoints.core.endpoint import proxy_node_name
 from ring.plan import Credentials, rib_yaml, switch_yaml

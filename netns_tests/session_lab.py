@@ -16,11 +16,11 @@ from gdp.crypto.certificates import Role
 from gdp.host.processes import Process, end_all
 from gdp.host.run_registry import Run, RunRegistry
 from gdp.metadata import Metadata
-from gdp.simulation.namespaces import Namespaces
-from gdp.simulation.topology import DomainPlan, Topology
 from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
 from gdp.stores.keyring import CARD, ROOT_CERTIFICATE
 from gdp.trust.right import Right
+from lab.namespaces import Namespaces
+from lab.topology import DomainPlan, Topology
 from tests.pages import ROOT
 
 __all__ = ["EXAMPLES", "PATIENCE_S", "SessionLab", "lines_of", "session_lab"]

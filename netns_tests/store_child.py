@@ -12,7 +12,7 @@ from faults.store import StoreCluster
 from topologies import make_topology
 
 from gdp.host.run_registry import RunRegistry
-from gdp.simulation.namespaces import Namespaces
+from lab.namespaces import Namespaces
 
 __all__: list[str] = []
 

@@ -16,8 +16,8 @@ from gdp.errors import LocalError
 from gdp.host import netns_files
 from gdp.host.processes import Process
 from gdp.host.run_registry import Run, RunRegistry, in_first_user_namespace
-from gdp.simulation.namespaces import Namespaces
-from gdp.simulation.topology import chain, ring5
+from lab.namespaces import Namespaces
+from lab.topology import chain, ring5
 from tests.waiting import until
 
 pytestmark = pytest.mark.netns
@@ -129,10 +129,10 @@ def test_where_root_is_real_ip_netns_finds_the_namespaces(run: Run) -> None:
 ORPHAN = """
 import subprocess, sys, tempfile, signal
 from pathlib import Path
-from gdp.simulation.namespaces import Namespaces
+from lab.namespaces import Namespaces
 from gdp.host.processes import Process
 from gdp.host.run_registry import RunRegistry
-from gdp.simulation.topology import chain
+from lab.topology import chain
 tempfile.tempdir = sys.argv[1]
 run = RunRegistry(Path(sys.argv[1]) / "runs").start()
 namespaces = Namespaces(chain(2), run)

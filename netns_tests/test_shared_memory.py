@@ -20,7 +20,7 @@ from ros_environment import ros_environment
 from testbed import Lab
 
 from gdp.host.run_registry import RunRegistry
-from gdp.simulation.topology import chain
+from lab.topology import chain
 from tests.proxy.endpoints.ros2_net import Peer, needs
 
 needs("std_msgs")
@@ -110,7 +110,7 @@ from pathlib import Path
 sys.path.append(sys.argv[2])
 from testbed import Lab
 from gdp.host.run_registry import RunRegistry
-from gdp.simulation.topology import chain
+from lab.topology import chain
 tempfile.tempdir = sys.argv[1]
 lab = Lab(RunRegistry(Path(sys.argv[1]) / "runs").start(), chain(1), own_shared_memory=("s1",))
 print(lab.directory, flush=True)

@@ -22,11 +22,11 @@ from gdp.crypto.certificates import Role
 from gdp.host import netns_files
 from gdp.host.run_registry import Run, RunRegistry
 from gdp.metadata import Metadata
-from gdp.simulation.namespaces import Namespaces
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
 from gdp.stores.keyring import CARD, ROOT_CERTIFICATE
 from gdp.trust.right import Right
+from lab.namespaces import Namespaces
+from lab.topology import Attachment, DomainPlan, Link, Topology
 from ring.plan import Credentials, rib_yaml, switch_yaml
 from tests.pages import ROOT
 

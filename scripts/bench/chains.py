@@ -1,6 +1,6 @@
 """Chain of namespaces for the forwarding bench: a source, some switches, a sink, each in its own.
 
-I/O. ``gdp.simulation`` makes and removes the namespaces. ``baselines.py`` defines the switches.
+I/O. ``lab.namespaces`` makes and removes the namespaces. ``baselines.py`` defines the switches.
 ::
 
     s1 (source) -- s2 -- ... -- s(n+1) -- s(n+2) (sink)        a device has the name of the neighbour it leads to
@@ -23,7 +23,7 @@ from rate_search import Try
 from testbed import Lab
 
 from gdp.host.run_registry import RunRegistry
-from gdp.simulation.topology import chain
+from lab.topology import chain
 
 __all__ = ["ROLES", "Chain"]
 

@@ -40,8 +40,8 @@ from topologies import LEFT, MIDDLE, RIGHT, ROW, flat_topology
 
 from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
-from gdp.simulation.topology import DomainPlan, Link, Topology
 from gdp.trust.right import Right
+from lab.topology import DomainPlan, Link, Topology
 from proxy.config.config import Encoding
 
 __all__ = ["BUFFER_BYTES", "DIRECT_DOMAIN", "LEFT", "READY_S", "RIGHT", "Carried", "Row"]

@@ -23,7 +23,7 @@ from faults.overlay import Overlay
 from faults.plan import Flow, Plan
 from topologies import ends_of, make_topology
 
-from gdp.simulation.topology import Link
+from lab.topology import Link
 
 __all__ = ["NEW_TOPICS", "ROWS", "Row"]
 

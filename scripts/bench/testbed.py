@@ -19,11 +19,11 @@ from shared_memory import SharedMemory
 from gdp.host import netns_files
 from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
-from gdp.simulation.namespaces import Namespaces
-from gdp.simulation.topology import Topology
 from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC
 from gdp.trust.right import Right
+from lab.namespaces import Namespaces
+from lab.topology import Topology
 from ring.cores import MachineCores
 from ring.credentials import OverlayCredentials
 

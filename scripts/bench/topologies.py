@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain, pairwise
 from typing import Final
 
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from lab.topology import Attachment, DomainPlan, Link, Topology
 
 __all__ = ["LEFT", "MIDDLE", "RIGHT", "ROW", "ends_of", "flat_topology", "make_topology", "row", "single"]
 

@@ -30,8 +30,8 @@ from topologies import flat_topology
 
 from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
-from gdp.simulation.topology import Topology
 from gdp.trust.right import Right
+from lab.topology import Topology
 
 __all__ = ["READY_S", "ROBOT", "Field", "Served", "Server", "Work"]
 

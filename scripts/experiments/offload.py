@@ -30,7 +30,7 @@ from ros_row import DIRECT_DOMAIN, LEFT, READY_S, RIGHT, Carried, Row
 from skeleton import new_run
 
 from gdp.host.cgroups import Cgroup
-from gdp.simulation.topology import ring5
+from lab.topology import ring5
 from proxy.config.config import Encoding
 from ring.cores import CORES_HELP, cores_of
 

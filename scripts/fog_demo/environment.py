@@ -23,9 +23,9 @@ import yaml
 
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run, RunRegistry, outer_uid
-from gdp.simulation.namespaces import Namespaces
-from gdp.simulation.topology import Attachment, DomainPlan, Topology, ring5
 from gdp.stores.keyring import CARD, DELEGATIONS, ROOT_CERTIFICATE
+from lab.namespaces import Namespaces
+from lab.topology import Attachment, DomainPlan, Topology, ring5
 from ring.child import Child
 from ring.children import Children
 from ring.credentials import OverlayCredentials

@@ -1,1 +1,4 @@
-"""Laboratory: what demonstrations, tests and benches share to start, await, break and stop real processes."""
+"""Laboratory of tests, benches, experiments and demonstrations: topologies as data, in memory and in namespaces.
+
+Programs of the project are forked from a process that has imported them.
+"""

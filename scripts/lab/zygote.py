@@ -47,7 +47,7 @@ _PRELOADED: Final = (
     "proxy.cli.proxy",
     "proxy.cli.replay",
     "fog.cli.app",
-    "gdp.simulation.namespaces",
+    "lab.namespaces",
     "pyroute2.netns",
 )
 _STARTERS: Final = ("fog.cli.app", "fog.host.cli", "ring", "internet_demo", "fog_demo")  # these start many programs

@@ -11,7 +11,7 @@ from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 from typing import Final, TypeVar
 
 from gdp.host.run_registry import Run
-from gdp.simulation.namespaces import Namespaces
+from lab.namespaces import Namespaces
 from ring.child import Child
 from ring.events import Event
 

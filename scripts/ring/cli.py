@@ -22,7 +22,7 @@ from gdp.errors import GdpError, LocalError
 from gdp.host.interruption import Interrupted, interruptible, let_nothing_interrupt
 from gdp.host.run_registry import Run, RunRegistry
 from gdp.limits import ADVERTISEMENT_LEASE_S
-from gdp.simulation.topology import MTU_BYTES
+from lab.topology import MTU_BYTES
 from proxy.config.config import Encoding
 from ring.child import ChildError
 from ring.cores import CORES_HELP

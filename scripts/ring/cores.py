@@ -11,7 +11,7 @@ from typing import Final
 from gdp.errors import LocalError
 from gdp.host.cgroups import Cgroup
 from gdp.host.run_registry import Run
-from gdp.simulation.topology import Topology
+from lab.topology import Topology
 
 __all__ = ["CORES_HELP", "EDGE_CORES", "ROBOT_CORES", "MachineCores", "cores_of"]
 

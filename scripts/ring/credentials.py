@@ -21,10 +21,10 @@ from gdp.crypto.certificates import Role
 from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.metadata import Metadata
 from gdp.names import Name
-from gdp.simulation.topology import Attachment, Topology
 from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
 from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE
 from gdp.trust.right import Right
+from lab.topology import Attachment, Topology
 from proxy.config.config import Encoding
 from proxy.serial.channel import RosVersion
 from ring.live_plan import Carried, Side

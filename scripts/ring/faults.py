@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Final, Literal, TypeAlias, cast, get_args
 
 from gdp.errors import LocalError
-from gdp.simulation.topology import Attachment, Topology
+from lab.topology import Attachment, Topology
 
 __all__ = ["Cut", "Fault", "Kill", "KillRole", "Roam", "check_faults", "roamers"]
 

@@ -14,7 +14,7 @@ from typing import Final
 
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run
-from gdp.simulation.topology import Attachment
+from lab.topology import Attachment
 from proxy.endpoints.ros1.install import rospy_folder
 from ring.child import Child
 from ring.events import Event

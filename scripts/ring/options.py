@@ -12,7 +12,7 @@ from typing import Final, Literal
 
 from gdp.errors import LocalError
 from gdp.limits import ADVERTISEMENT_LEASE_S, LEASE_MAX_S, LEASE_MIN_S
-from gdp.simulation.topology import MTU_BYTES, Topology, ring5
+from lab.topology import MTU_BYTES, Topology, ring5
 from proxy.config.config import Encoding
 from ring.faults import Cut, Fault, Kill, Roam, check_faults
 from ring.nodes.content import CAMERA_HZ

@@ -13,7 +13,7 @@ from typing import Final
 
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run
-from gdp.simulation.namespaces import Namespaces
+from lab.namespaces import Namespaces
 from ring.child import Child
 from ring.children import READY_S, Children
 from ring.cores import EDGE_CORES, ROBOT_CORES, MachineCores, cores_of

@@ -13,7 +13,7 @@ from typing import Final, TypeAlias
 from gdp.config.config import UplinkPlane
 from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.names import Name
-from gdp.simulation.topology import Attachment, DomainPlan, Topology
+from lab.topology import Attachment, DomainPlan, Topology
 from proxy.config.config import Encoding
 from proxy.serial.channel import Channel
 

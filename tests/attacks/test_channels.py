@@ -7,7 +7,7 @@ from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import Kind
 from gdp.limits import HOPS_MAX
 from gdp.names import Name
-from gdp.simulation.simulation import Simulation
+from lab.simulation import Simulation
 from tests.journeys.flows import SERVER, Tap, advertise, flowing, ring
 from tests.journeys.test_attacks import mac_of, still_flows
 

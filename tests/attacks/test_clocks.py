@@ -17,10 +17,10 @@ from gdp.limits import LINK_STATE_AGE_MAX_S, LINK_STATE_LEASE_S, LINK_STATE_REFR
 from gdp.rib.core import RibCore, RibSettings
 from gdp.rib.store import MemoryStore
 from gdp.sansio import Timestamps
-from gdp.simulation.simulation import Simulation
 from gdp.switch.core import SwitchCore
 from gdp.switch.lsdb import PAST_S
 from gdp.switch.table import Table
+from lab.simulation import Simulation
 from tests.gdp.switch.net import known, link, state
 from tests.journeys.flows import SERVER, Flow, flowing, ring
 from tests.journeys.test_attacks import mac_of

@@ -10,9 +10,9 @@ from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
-from gdp.simulation.simulation import Simulation
 from gdp.switch.core import SwitchCore
 from gdp.switch.trees import Tree
+from lab.simulation import Simulation
 from tests.journeys.flows import SERVER, Flow, flowing, ring
 from tests.journeys.test_attacks import counted, still_flows
 

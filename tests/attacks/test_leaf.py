@@ -16,11 +16,11 @@ from gdp.crypto.validity import Validity
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
 from gdp.names import Name
-from gdp.simulation.network import SimLink
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
+from lab.network import SimLink
+from lab.simulation import Simulation
+from lab.topology import Attachment, DomainPlan, Link, Topology
 from tests.journeys.flows import Flow, Tap, flowing
 from tests.journeys.test_attacks import counted, mac_of
 

@@ -12,8 +12,8 @@ from gdp.crypto.validity import Validity
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
 from gdp.names import Name
-from gdp.simulation.simulation import Simulation
 from gdp.trust.rtcert import RtCert
+from lab.simulation import Simulation
 from tests.journeys.flows import ROBOT, flowing, ring
 from tests.journeys.test_attacks import mac_of, still_flows
 

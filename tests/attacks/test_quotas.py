@@ -25,12 +25,12 @@ from gdp.names import Name
 from gdp.rib.core import RibCore, RibSettings
 from gdp.rib.store import MemoryStore
 from gdp.sansio import Timestamps
-from gdp.simulation.simulation import Simulation
 from gdp.switch.local_advertisements import LocalAdvertisements
 from gdp.trust.advertisement import Advertisement, sign_advertisement
 from gdp.trust.domain import Policy
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
+from lab.simulation import Simulation
 from tests.gdp.trust.world import CLOUD, DAY, GATEWAY, NOW, ROBOT, SCHOOL, SWITCH, advertisement, verifier
 from tests.journeys.flows import ROBOT as ROBOT_AT
 from tests.journeys.flows import SERVER, Tap, advertise, flowing, ring

@@ -21,11 +21,11 @@ from gdp.frame.kinds import Kind
 from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.nodes.revocation_upkeep import RevocationUpkeep
-from gdp.simulation.simulation import Simulation
 from gdp.trust.advertisement import Advertisement
 from gdp.trust.revocation import Revocation
 from gdp.trust.revocations import hash_of
 from gdp.trust.right import Right
+from lab.simulation import Simulation
 from tests.journeys.flows import ROBOT, SERVER, Flow, flowing, ring
 from tests.journeys.test_attacks import mac_of, still_flows
 

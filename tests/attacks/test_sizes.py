@@ -16,10 +16,10 @@ from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import ADVERTISEMENT_MAX_BYTES, CONTROL_MAX_BYTES, HOPS_MAX, WITHDRAWAL_MAX_BYTES
 from gdp.names import ZERO, Name
-from gdp.simulation.simulation import Simulation
 from gdp.trust.advertisement import sign_advertisement
 from gdp.trust.right import Right
 from gdp.trust.rtcert import RtCert
+from lab.simulation import Simulation
 from tests.journeys.flows import ROBOT, flowing, ring
 from tests.journeys.test_attacks import control, mac_of, still_flows
 

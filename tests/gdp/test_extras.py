@@ -25,8 +25,8 @@ sys.meta_path.insert(0, Blocker())
 """
 
 _NETWORK = """
-from gdp.simulation.topology import ring5
-from gdp.simulation.simulation import Simulation
+from lab.topology import ring5
+from lab.simulation import Simulation
 assert Simulation(topology=ring5()).run_until_attached()
 """
 

@@ -21,8 +21,8 @@ from functools import partial
 from pathlib import Path
 from typing import IO, Final
 
-from gdp.simulation.simulation import Simulation
 from gdp.trust.right import Right
+from lab.simulation import Simulation
 from tests.insiders.oracle import signing_oracle
 from tests.journeys.flows import Flow, advertise
 from tests.journeys.networks import LEASE_S, Plan, short_leases

@@ -9,7 +9,7 @@ from typing import Any
 
 from gdp.frame.codec import ETHER_BYTES, HOPS_AT
 from gdp.sansio import OutgoingFrames
-from gdp.simulation.network import SimNetwork
+from lab.network import SimNetwork
 
 __all__ = ["Echo", "TracingNetwork"]
 

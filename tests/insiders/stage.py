@@ -20,12 +20,12 @@ from gdp.client.rib_host import RibHost
 from gdp.control.hello import ECHO_BYTES
 from gdp.control.hello_port import HelloPort
 from gdp.crypto.identity import Identity
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from gdp.switch.core import SwitchCore
 from gdp.trust.domain import Policy
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
+from lab.simulation import Simulation
+from lab.topology import Attachment, DomainPlan, Link, Topology
 from tests.journeys.flows import Flow
 
 __all__ = ["GOOD", "PARTS", "PERSONAS", "PROMISE_S", "Persona", "Place", "Stage"]

@@ -114,7 +114,7 @@ def prepared() -> Iterator[None]:
     """Prepare a stage with the signing oracle and a tracing network."""
     with ExitStack() as stack:
         stack.enter_context(signing_oracle())
-        stack.enter_context(mock.patch("gdp.simulation.simulation.SimNetwork", TracingNetwork))
+        stack.enter_context(mock.patch("lab.simulation.SimNetwork", TracingNetwork))
         yield
 
 

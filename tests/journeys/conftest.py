@@ -11,7 +11,7 @@ from contextlib import nullcontext
 
 import pytest
 
-from gdp.simulation.simulation import Simulation
+from lab.simulation import Simulation
 from tests.insiders.oracle import signing_oracle
 
 LEASES = 3

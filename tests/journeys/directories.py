@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from gdp.crypto.certificates import Role
 from gdp.crypto.identity import Identity, NodeKeys
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from lab.simulation import Simulation
+from lab.topology import Attachment, DomainPlan, Link, Topology
 from tests.journeys.flows import Flow, advertise
 from tests.journeys.networks import LEASE_S, PERIOD_S, SETTLE_S, draw_uppers
 

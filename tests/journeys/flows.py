@@ -13,9 +13,9 @@ from gdp.client.publisher import Publisher
 from gdp.frame.codec import ETHER_BYTES, Header, decode
 from gdp.limits import SCAPY_KEEPALIVE_MS
 from gdp.names import Name
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import ring5
 from gdp.trust.right import Right
+from lab.simulation import Simulation
+from lab.topology import ring5
 
 ROBOT, SERVER = "nuc1/robot", "nuc5/server"
 LEASE_S = 2.5  # of names; with it three leases outlast those of readers and of branches, too

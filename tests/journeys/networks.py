@@ -19,8 +19,8 @@ import networkx as nx
 from hypothesis import strategies as st
 
 from gdp.limits import DEAD_S, HELLO_S, JOIN_LEASE_S
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from lab.simulation import Simulation
+from lab.topology import Attachment, DomainPlan, Link, Topology
 from tests.journeys.flows import Flow, advertise
 
 SWITCHES_MAX: Final = 40

@@ -9,8 +9,8 @@ from math import ceil
 from gdp.client.participant import Message, Participant
 from gdp.client.publisher import Publisher
 from gdp.names import Name
-from gdp.simulation.simulation import Simulation
 from gdp.trust.right import Right
+from lab.simulation import Simulation
 from tests.journeys.flows import STEP_S
 
 SERVICE = "/add_two_ints"

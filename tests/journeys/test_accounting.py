@@ -17,13 +17,13 @@ from gdp.frame.codec import ETHER_BYTES, HOPS_AT, KIND_AT
 from gdp.frame.kinds import Kind
 from gdp.names import Name
 from gdp.sansio import ReceivedFrame
-from gdp.simulation import simulation as worlds
-from gdp.simulation.network import SimLink, SimNetwork
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import chain
 from gdp.switch.forwarder import Drop, Forward, decide
 from gdp.switch.pending_frames import PendingFrames
 from gdp.switch.unicast import Unicast
+from lab import simulation as worlds
+from lab.network import SimLink, SimNetwork
+from lab.simulation import Simulation
+from lab.topology import chain
 from tests.journeys.flows import Tap, advertise, flowing
 
 pytestmark = pytest.mark.momentary("the books close once the last frame has come to rest, before any lease ends")

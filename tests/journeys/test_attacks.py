@@ -21,9 +21,9 @@ from gdp.frame.kinds import Flag, Kind
 from gdp.limits import CONTROL_JOIN_BYTES, CONTROL_PATIENCE_S, HOPS_MAX
 from gdp.names import ZERO, Name
 from gdp.sansio import ReceivedFrame
-from gdp.simulation.simulation import Simulation
 from gdp.switch.core import SwitchCore
 from gdp.switch.name_queries import QUERIES_MAX
+from lab.simulation import Simulation
 from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
 
 Injector = Callable[[bytes], None]

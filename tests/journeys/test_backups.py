@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from gdp.frame.kinds import Kind
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from lab.simulation import Simulation
+from lab.topology import Attachment, DomainPlan, Link, Topology
 from tests.journeys.flows import LEASE_S, Flow, Tap, flowing
 
 P, R, NEAR, HERE = "s1/robot", "s4/reader", "s2/near", "s1/here"

@@ -10,11 +10,11 @@ from gdp.client.rib_host import RibHost
 from gdp.control.waiting import WaitReason
 from gdp.errors import DropReason
 from gdp.limits import ADVERTISEMENT_LEASE_S, DEAD_S
-from gdp.simulation.network import SimLink
-from gdp.simulation.simulation import Simulation
 from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table
 from gdp.trust.right import Right
+from lab.network import SimLink
+from lab.simulation import Simulation
 from tests.journeys.flows import ROBOT, SERVER, advertise, flowing, ring
 
 CONVERTER, ELSEWHERE = "twin", "nuc2"

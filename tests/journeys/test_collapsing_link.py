@@ -12,9 +12,9 @@ from typing import Final
 
 import pytest
 
-from gdp.simulation.network import SimLink
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from lab.network import SimLink
+from lab.simulation import Simulation
+from lab.topology import Attachment, DomainPlan, Link, Topology
 from tests.journeys.flows import Flow, advertise
 
 FIFO_BYTES: Final = 64_000

@@ -15,9 +15,9 @@ from gdp.frame.kinds import Kind
 from gdp.limits import DIAGNOSTICS_BURST, HOPS_MAX
 from gdp.names import ZERO, Name
 from gdp.sansio import Timestamps
-from gdp.simulation.simulation import Simulation
 from gdp.switch.core import SwitchCore
 from gdp.trust.domain import Policy
+from lab.simulation import Simulation
 from tests.journeys.flows import ROBOT, SERVER, Flow, flowing, ring
 
 pytestmark = pytest.mark.momentary("a request and its reply take milliseconds")

@@ -11,11 +11,11 @@ from gdp.control.endpoints import Endpoint
 from gdp.crypto.tunnel_key import TunnelKey
 from gdp.limits import ENDPOINT_LEASE_S, KEEPALIVE_MS
 from gdp.names import Name
-from gdp.simulation.network import SimLink
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from gdp.switch.direct_tunnels import Action, Close, Open, Retry
 from gdp.trust.revocation import Revocation
+from lab.network import SimLink
+from lab.simulation import Simulation
+from lab.topology import Attachment, DomainPlan, Link, Topology
 from tests.journeys.flows import LEASE_S, flowing
 
 POLL_S = 0.1

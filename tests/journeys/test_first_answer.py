@@ -19,8 +19,8 @@ from gdp.service.replication import ALL
 from gdp.session.protocol.client_core import Call
 from gdp.session.protocol.server_core import ServerCore
 from gdp.session.protocol.wire import message_to_wire
-from gdp.simulation.network import SimLink
 from gdp.trust.right import Right
+from lab.network import SimLink
 from tests.gdp.session.simulated import Simulated, world_of
 
 ROBOT, NEAR, OTHER, WATCH = "robot", "near", "other", "watch"

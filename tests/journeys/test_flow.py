@@ -6,9 +6,9 @@ import pytest
 
 from gdp.frame.kinds import Kind
 from gdp.limits import DEAD_S, JOIN_LEASE_S
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import ring5
 from gdp.trust.right import Right
+from lab.simulation import Simulation
+from lab.topology import ring5
 from tests.journeys.flows import LEASE_S, ROBOT, SERVER, Tap, advertise, flowing, ring
 
 LONG = frozenset(("nuc2", "nuc3"))

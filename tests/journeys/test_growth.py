@@ -10,9 +10,9 @@ import pytest
 
 from gdp.client.participant import Topic
 from gdp.client.publisher import Publisher
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import chain
 from gdp.trust.right import Right
+from lab.simulation import Simulation
+from lab.topology import chain
 
 pytestmark = pytest.mark.nightly
 

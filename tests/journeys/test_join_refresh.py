@@ -13,9 +13,9 @@ from gdp.errors import DropReason
 from gdp.frame.codec import ETHER_BYTES, HEADER_BYTES, decode
 from gdp.frame.kinds import Kind
 from gdp.limits import JOIN_LEASE_S, JOIN_PROOF_S, JOIN_REFRESH_S, JOINS_AGAIN_MAX
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology, chain
 from gdp.switch import multicast
+from lab.simulation import Simulation
+from lab.topology import Attachment, DomainPlan, Link, Topology, chain
 from tests.journeys.flows import Flow, advertise, flowing
 from tests.journeys.test_attacks import counted
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import chain
+from lab.simulation import Simulation
+from lab.topology import chain
 from tests.journeys.flows import flowing
 
 SOURCE, READER = "s1/left", "s3/right"

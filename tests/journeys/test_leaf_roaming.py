@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from gdp.frame.kinds import Kind
-from gdp.simulation.network import SimLink
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from lab.network import SimLink
+from lab.simulation import Simulation
+from lab.topology import Attachment, DomainPlan, Link, Topology
 from tests.journeys.flows import Flow, Tap, flowing
 
 LEASE_S = 2.5

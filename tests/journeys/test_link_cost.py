@@ -9,9 +9,9 @@ import pytest
 from gdp.frame.codec import ETHER_BYTES, decode
 from gdp.frame.kinds import Kind
 from gdp.limits import COST_AUTO
-from gdp.simulation.network import SimLink
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from lab.network import SimLink
+from lab.simulation import Simulation
+from lab.topology import Attachment, DomainPlan, Link, Topology
 from tests.journeys.flows import SERVER, flowing
 
 CABLES = ("s1", "left"), ("left", "s4"), ("s1", "right"), ("right", "s4")

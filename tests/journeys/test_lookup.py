@@ -9,9 +9,9 @@ import pytest
 
 from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.names import Name
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import ring5
 from gdp.state.name_lookup import SwitchLookups, rib_lookup
+from lab.simulation import Simulation
+from lab.topology import ring5
 from tests.journeys.flows import advertise
 
 pytestmark = pytest.mark.momentary("a lookup ends within seconds, no lease matters")

@@ -6,8 +6,8 @@ import pytest
 
 from gdp.limits import ADVERTISEMENT_LEASE_S, READER_GRACE_S, READER_LEASE_S
 from gdp.message.loss import LossReason
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import chain
+from lab.simulation import Simulation
+from lab.topology import chain
 from tests.journeys.flows import Flow, advertise, flowing
 
 SOURCE, READER = "s1/left", "s2/right"

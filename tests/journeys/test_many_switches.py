@@ -6,8 +6,8 @@ import random
 
 import pytest
 
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from lab.simulation import Simulation
+from lab.topology import Attachment, DomainPlan, Link, Topology
 from tests.journeys.flows import flowing
 
 DOMAINS = 8

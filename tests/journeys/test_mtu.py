@@ -12,8 +12,8 @@ from gdp.client.send_options import SendOptions
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
 from gdp.limits import MTU_HOLD_S, MTU_NARROWINGS
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import Topology, chain, ring5
+from lab.simulation import Simulation
+from lab.topology import Topology, chain, ring5
 from tests.journeys.flows import LEASE_S, ROBOT, SERVER, Flow, Tap, advertise, flowing, ring
 
 MIDDLE = frozenset(("nuc2", "nuc3"))

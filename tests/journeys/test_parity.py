@@ -13,8 +13,8 @@ from gdp.client.send_options import SendOptions
 from gdp.errors import DropReason
 from gdp.frame.codec import ETHER_BYTES, decode
 from gdp.frame.kinds import Kind
-from gdp.simulation.network import SimLink
 from gdp.trust.right import Right
+from lab.network import SimLink
 from tests.journeys.flows import Flow
 from tests.journeys.test_two_paths import site
 

@@ -6,9 +6,9 @@ import pytest
 
 from gdp.errors import DropReason, LocalError
 from gdp.frame.kinds import Kind
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import ring5
 from gdp.trust.right import Right
+from lab.simulation import Simulation
+from lab.topology import ring5
 from tests.journeys.flows import SERVER, Tap, advertise, flowing, ring
 
 SHORT = frozenset(("nuc5", "nuc1"))

@@ -9,9 +9,9 @@ import pytest
 
 from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import Kind
-from gdp.simulation.network import SimLink
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import DomainPlan, Link, Topology
+from lab.network import SimLink
+from lab.simulation import Simulation
+from lab.topology import DomainPlan, Link, Topology
 from tests.journeys.flows import LEASE_S
 
 SQUARE = Topology(

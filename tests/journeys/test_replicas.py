@@ -12,9 +12,9 @@ from gdp.errors import DropReason, LocalError
 from gdp.frame.kinds import Kind
 from gdp.limits import ADVERTISEMENT_LEASE_S, CALL_LAG_S, CALL_QUIET_S, PRIVATE_WAIT_BYTES
 from gdp.names import Name
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology, chain
 from gdp.trust.right import Right
+from lab.simulation import Simulation
+from lab.topology import Attachment, DomainPlan, Link, Topology, chain
 from tests.journeys.flows import LEASE_S, Tap
 from tests.journeys.services import Party, meet, outlive, work
 

@@ -7,10 +7,10 @@ import pytest
 from gdp.crypto.statements import parse
 from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from gdp.trust.delegation import Delegation
 from gdp.trust.revocation import Revocation
+from lab.simulation import Simulation
+from lab.topology import Attachment, DomainPlan, Link, Topology
 from tests.journeys.flows import LEASE_S, ROBOT, SERVER, Tap, flowing, ring
 
 HERE = "nuc3"  # where the operator inserts the revocation: neither end's domain

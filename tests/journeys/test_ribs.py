@@ -7,8 +7,8 @@ from functools import partial
 
 from gdp.control.query import Query
 from gdp.limits import ADVERTISEMENT_LEASE_S
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import Attachment, ring5
+from lab.simulation import Simulation
+from lab.topology import Attachment, ring5
 from tests.journeys.flows import ROBOT, SERVER, advertise, flowing
 
 LEASES_S = 3 * ADVERTISEMENT_LEASE_S

@@ -10,8 +10,8 @@ from gdp.crypto.statements import parse
 from gdp.frame.kinds import Kind
 from gdp.names import Name
 from gdp.rib.route import Route
-from gdp.simulation.simulation import Simulation
 from gdp.trust.advertisement import UnverifiedAdvertisement
+from lab.simulation import Simulation
 from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
 
 

@@ -10,11 +10,11 @@ from gdp.client.participant import Topic
 from gdp.crypto.keys import SigningKey
 from gdp.crypto.validity import Validity
 from gdp.limits import CLOCK_SKEW_S
-from gdp.simulation.simulation import Simulation
 from gdp.trust.domain import Policy
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.owner import Owner
 from gdp.trust.right import Right
+from lab.simulation import Simulation
 from tests.journeys.flows import ROBOT, SERVER, Flow, flowing, ring
 
 LASTS_S = 30  # of a short membership, clocks' differences included

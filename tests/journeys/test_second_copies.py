@@ -14,8 +14,8 @@ from gdp.errors import DropReason
 from gdp.frame.codec import ETHER_BYTES, HOPS_AT, SECOND_PATH, Header, decode, encode
 from gdp.frame.kinds import Kind
 from gdp.sansio import ReceivedFrame
-from gdp.simulation.network import SimLink
 from gdp.trust.right import Right
+from lab.network import SimLink
 from tests.journeys.flows import Flow
 from tests.journeys.services import Party, meet, work
 from tests.journeys.test_two_paths import Site, site

@@ -12,9 +12,9 @@ from gdp.errors import DropReason, LocalError
 from gdp.frame.kinds import Kind
 from gdp.limits import ADVERTISEMENT_LEASE_S, READER_LEASE_S
 from gdp.sansio import ReceivedFrame
-from gdp.simulation.simulation import Simulation
 from gdp.trust.adcert import AdCert
 from gdp.trust.right import Right
+from lab.simulation import Simulation
 from tests.journeys.flows import ROBOT, SERVER, Tap, ring
 from tests.journeys.services import SERVICE, Party, meet, outlive, work
 

@@ -19,9 +19,9 @@ from gdp.frame.kinds import Flag, Kind
 from gdp.limits import SEQUENCE_BYTES
 from gdp.names import Name
 from gdp.sansio import ReceivedFrame
-from gdp.simulation.simulation import Simulation
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.right import Right
+from lab.simulation import Simulation
 from tests.journeys.flows import ROBOT, SERVER, Tap, ring
 from tests.journeys.services import Party, meet, outlive, work
 

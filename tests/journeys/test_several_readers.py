@@ -8,8 +8,8 @@ from itertools import pairwise
 
 import pytest
 
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from lab.simulation import Simulation
+from lab.topology import Attachment, DomainPlan, Link, Topology
 from tests.journeys.flows import advertise
 
 SWITCHES = ("s0", "s1", "s2", "s3", "s4")

@@ -14,8 +14,8 @@ from gdp.frame.codec import decode
 from gdp.frame.kinds import CONTROL_FROM
 from gdp.limits import READER_LEASE_S, WINDOW_BYTES
 from gdp.sansio import OutgoingFrames, ReceivedFrame, Timestamps
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import chain
+from lab.simulation import Simulation
+from lab.topology import chain
 from tests.journeys.flows import LEASE_S, Flow, flowing
 
 SOURCE, NEAR, FAR, SLOW = "s1/left", "s1/near", "s3/right", "s2/slow"

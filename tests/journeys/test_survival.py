@@ -10,8 +10,8 @@ from gdp.control.waiting import WaitReason
 from gdp.frame.kinds import Kind
 from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.rib.upstream_advertisements import RETURN_S
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from lab.simulation import Simulation
+from lab.topology import Attachment, DomainPlan, Link, Topology
 from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, flowing, ring
 
 LONG_S = 3 * ADVERTISEMENT_LEASE_S + 8

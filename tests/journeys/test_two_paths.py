@@ -19,11 +19,11 @@ from gdp.frame.codec import ETHER_BYTES, SECOND_PATH, decode, second_path_key
 from gdp.frame.kinds import Kind
 from gdp.limits import JOIN_LEASE_S
 from gdp.names import ZERO, Name
-from gdp.simulation.network import SimLink
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from gdp.switch.trees import Tree
 from gdp.trust.right import Right
+from lab.network import SimLink
+from lab.simulation import Simulation
+from lab.topology import Attachment, DomainPlan, Link, Topology
 from tests.journeys.flows import Flow
 
 pytestmark = pytest.mark.momentary("a cut, and the seconds before and after it, are what these tests are about")

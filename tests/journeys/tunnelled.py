@@ -25,9 +25,9 @@ from gdp.links.endpoint_files import RECORD_SUFFIX, own_record, public_candidate
 from gdp.links.links import LINKS_LOOK_S, TunnelLinks
 from gdp.ports.tunnel.wireguard import PeerState, WireGuardDevice
 from gdp.runtime.runtime import Runtime
-from gdp.simulation.network import SimLink
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import Attachment, DomainPlan, Topology
+from lab.network import SimLink
+from lab.simulation import Simulation
+from lab.topology import Attachment, DomainPlan, Topology
 from tests.gdp.switch.nat import Gateway, Nat
 from tests.journeys.flows import LEASE_S
 

@@ -25,10 +25,10 @@ from gdp.client.participant import Participant
 from gdp.client.publisher import Publisher
 from gdp.message.loss import LossReason
 from gdp.names import Name
-from gdp.simulation.network import SimLink
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import Attachment, DomainPlan, Topology
 from gdp.trust.right import Right
+from lab.network import SimLink
+from lab.simulation import Simulation
+from lab.topology import Attachment, DomainPlan, Topology
 
 __all__ = ["SIMULATED", "SimulatedChaos"]
 

@@ -14,7 +14,7 @@ from skeleton import Outcome, command_line, finish, parse
 from topologies import ends_of, flat_topology, make_topology, single
 
 from gdp.host.run_registry import RunRegistry
-from gdp.simulation.topology import Link
+from lab.topology import Link
 
 COMMAND = "import sys; sys.path.insert(0, {!r}); from peers.jsonl import read_order, say; {}"
 BENCH = str(Path(__file__).resolve().parents[2] / "scripts" / "bench")

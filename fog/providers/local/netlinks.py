@@ -19,7 +19,7 @@ the robot up while the role moves::
     up ---- uplink (a bridge) ---- g-1f2e3d ==== up of the machine that is the gateway
 
 If both ends of a pair have the same index, Linux may report a lost carrier one second late, so one end has a high index
-(see ``gdp/simulation/namespaces.py``). Only the loopback device has an address.
+(see ``scripts/lab/namespaces.py``). Only the loopback device has an address.
 """
 
 from __future__ import annotations

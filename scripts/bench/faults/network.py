@@ -13,7 +13,7 @@ from typing import Final
 from topologies import make_topology
 
 from faults.plan import Flow, Plan, Service
-from gdp.simulation.topology import Link
+from lab.topology import Link
 
 __all__ = ["VICTIM", "random_network"]
 

@@ -1,6 +1,6 @@
 """Overlay of a plan: its real processes and links, and every fault that can be made there.
 
-I/O. Namespaces and processes through ``gdp.simulation``, the commands that robots run, and ``faults.member`` at the
+I/O. Namespaces and processes through ``lab.namespaces``, the commands that robots run, and ``faults.member`` at the
 ends. A process is called ``switch s1``, ``rib s1`` or ``member m1``. Each may be killed, restarted, frozen.
 """
 

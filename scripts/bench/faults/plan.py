@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from gdp.simulation.topology import Topology
+from lab.topology import Topology
 
 __all__ = ["Flow", "Plan", "Service"]
 

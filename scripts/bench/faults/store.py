@@ -26,7 +26,7 @@ from redis.exceptions import RedisError
 from gdp.errors import LocalError
 from gdp.host import netns_files
 from gdp.host.run_registry import Run
-from gdp.simulation.namespaces import Namespaces
+from lab.namespaces import Namespaces
 
 __all__ = ["StoreCluster", "critical_lines", "has_server"]
 

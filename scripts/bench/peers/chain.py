@@ -1,6 +1,6 @@
 """Five machines in a row, A - s1 - s2 - s3 - B, shared by all baselines: by names, by routers, by IPv4.
 
-I/O; namespaces through ``gdp.simulation``. Link ``n`` (from 0) has the network 10.99.n.0/24, its left end .1, its
+I/O; namespaces through ``lab.namespaces``. Link ``n`` (from 0) has the network 10.99.n.0/24, its left end .1, its
 right end .2; the three in the middle forward IPv4::
 
     a  .1 --10.99.0-- .2  s1  .1 --10.99.1-- .2  s2  .1 --10.99.2-- .2  s3  .1 --10.99.3-- .2  b

@@ -13,9 +13,9 @@ from gdp.errors import DropReason
 from gdp.frame.kinds import Kind
 from gdp.limits import ADVERTISEMENT_LEASE_S
 from gdp.metadata import Metadata
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import ring5
 from gdp.trust.right import Right
+from lab.simulation import Simulation
+from lab.topology import ring5
 from tests.journeys.flows import ROBOT, SERVER, Tap, advertise, ring
 
 

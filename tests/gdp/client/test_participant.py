@@ -11,8 +11,8 @@ from gdp.client.send_options import SendOptions
 from gdp.errors import DropReason, LocalError
 from gdp.frame.kinds import Kind
 from gdp.sansio import ReceivedFrame
-from gdp.simulation.simulation import Simulation
 from gdp.trust.right import Right
+from lab.simulation import Simulation
 from tests.journeys.flows import ROBOT, SERVER, Flow, Tap, advertise, flowing, ring
 
 ROUNDS = 2_000

@@ -10,9 +10,9 @@ from gdp.errors import LocalError
 from gdp.names import Name
 from gdp.session.protocol.core import SessionCore
 from gdp.session.session import Session
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import Attachment, DomainPlan, Topology
 from gdp.trust.right import Right
+from lab.simulation import Simulation
+from lab.topology import Attachment, DomainPlan, Topology
 
 __all__ = ["FOREVER_S", "Simulated", "world_of"]
 

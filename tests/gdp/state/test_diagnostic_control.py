@@ -12,10 +12,10 @@ from gdp.errors import LocalError
 from gdp.management.control_client import NodeConnection
 from gdp.management.control_socket import CONTROL_SOCKET, ControlHandlers, serve_control_in_thread
 from gdp.sansio import Timestamps
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from gdp.state.control_protocol import Respond, Response
 from gdp.state.diagnostic_control import DiagnosticCommands, as_json
+from lab.simulation import Simulation
+from lab.topology import Attachment, DomainPlan, Link, Topology
 
 ROWS = [{"number": number, "name": bytes([number % 256]) * 32, "none": None} for number in range(450)]
 

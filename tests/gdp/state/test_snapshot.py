@@ -7,7 +7,6 @@ from typing import Any
 
 from gdp.control.link_state import Scope
 from gdp.ports.port_counters import PortCounters
-from gdp.simulation.simulation import Simulation
 from gdp.state.snapshot import (
     ID_CHARS,
     member_snapshot,
@@ -19,6 +18,7 @@ from gdp.state.snapshot import (
 )
 from gdp.telemetry.sources import Sources
 from gdp.trust.right import Right
+from lab.simulation import Simulation
 from tests.journeys.flows import ROBOT, SERVER, Flow, flowing, ring
 
 

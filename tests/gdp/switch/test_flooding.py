@@ -11,7 +11,7 @@ from gdp.frame.codec import HEADER_BYTES, Header, encode
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import HOPS_MAX, LINK_STATE_LEASE_S, LINK_STATE_REFRESH_S
 from gdp.names import ZERO
-from gdp.simulation.simulation import Simulation
+from lab.simulation import Simulation
 from tests.journeys.flows import ring
 
 

@@ -7,9 +7,9 @@ from gdp.frame.codec import Header, encode
 from gdp.frame.kinds import Flag, Kind
 from gdp.limits import HOPS_MAX
 from gdp.names import Name
-from gdp.simulation.simulation import Simulation
 from gdp.switch.table import NOWHERE
 from gdp.switch.unicast import NEGATIVE_S, _Installed
+from lab.simulation import Simulation
 from tests.journeys.flows import ROBOT, SERVER, flowing, ring
 
 ABSENT = Name(b"?" * 32)

@@ -19,10 +19,10 @@ from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.ros_names import Kind
-from gdp.simulation.simulation import Simulation
-from gdp.simulation.topology import Topology, ring5
 from gdp.trust.owner import Owner
 from gdp.trust.right import Right
+from lab.simulation import Simulation
+from lab.topology import Topology, ring5
 from proxy.bridge.bridge import Bridge, BridgeRules
 from proxy.bridge.context import BridgeContext
 from proxy.bridge.counters import Traffic

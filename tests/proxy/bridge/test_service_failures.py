@@ -8,7 +8,7 @@ import pytest
 
 from gdp.limits import READER_LEASE_S
 from gdp.names import Name
-from gdp.simulation.network import SimLink
+from lab.network import SimLink
 from tests.proxy.bridge import known
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, switch, switched

@@ -17,9 +17,9 @@ from gdp.crypto.validity import Validity
 from gdp.diagnosis.answer import Cause
 from gdp.diagnosis.facts import Facts, RosProcess, TunnelFact, WaitFact
 from gdp.sansio import OutgoingFrames, ProtocolCore, ReceivedFrame, Timestamps
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
+from lab.topology import Attachment, DomainPlan, Link, Topology
 from proxy.endpoints.core.qos import default
 from tests.proxy.bridge import known
 from tests.proxy.bridge.clients import Client, LocalServer

@@ -27,8 +27,8 @@ from gdp.diagnosis.fields import from_fields, to_fields
 from gdp.diagnosis.survey import ROLES, Survey
 from gdp.names import Name
 from gdp.sansio import Timestamps
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
 from gdp.state.state_answers import answer_for_rib, answer_for_switch, answer_state
+from lab.topology import Attachment, DomainPlan, Link, Topology
 from proxy.bridge.name_facts import proxy_facts
 from proxy.serial.channel import Qos
 from tests.proxy.bridge.known import STRING, string

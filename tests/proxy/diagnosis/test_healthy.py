@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from gdp.diagnosis.answer import Cause
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology
+from lab.topology import Attachment, DomainPlan, Link, Topology
 from tests.proxy.bridge.clients import Client, LocalServer
 from tests.proxy.bridge.known import SET_BOOL, string, switch, switched
 from tests.proxy.bridge.sites import Ear

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gdp.errors import LocalError
-from gdp.simulation.topology import ring5
+from lab.topology import ring5
 from ring.faults import Cut, Fault, Kill, Roam, check_faults, roamers
 
 

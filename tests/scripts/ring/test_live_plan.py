@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from gdp.simulation.topology import ring5
 from gdp.stores.keyring import load_delegations
 from gdp.trust.right import Right
+from lab.topology import ring5
 from proxy.config.config import ProxyConfig
 from proxy.config.rule import DOMAIN_MAX
 from ring.credentials import OverlayCredentials

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from gdp.config.config import RibConfig, SwitchConfig
-from gdp.simulation.topology import ring5
 from gdp.stores.keyring import load_delegations, load_identity
 from gdp.trust.right import Right
+from lab.topology import ring5
 from proxy.config.config import ProxyConfig
 from proxy.serial.channel import Channel
 from ring.credentials import OverlayCredentials

@@ -18,7 +18,7 @@ from pyroute2 import IPRoute
 from gdp.errors import LocalError
 from gdp.host import netns_files
 from gdp.host.run_registry import Run, in_first_user_namespace
-from gdp.simulation.topology import Link, Topology
+from lab.topology import Link, Topology
 
 __all__ = ["Namespaces"]
 

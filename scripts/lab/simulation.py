@@ -25,14 +25,14 @@ from gdp.metadata import Metadata
 from gdp.names import Name
 from gdp.rib.core import RibCore, RibSettings
 from gdp.rib.store import MemoryStore
-from gdp.simulation.network import EPOCH_UNIX_S, SimLink, SimNetwork
-from gdp.simulation.topology import Attachment, Topology
 from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table
 from gdp.trust.domain import Policy
 from gdp.trust.node_descriptor import NodeDescriptor
 from gdp.trust.owner import Owner
 from gdp.trust.right import Right
+from lab.network import EPOCH_UNIX_S, SimLink, SimNetwork
+from lab.topology import Attachment, Topology
 
 __all__ = ["Simulation"]
 

@@ -8,7 +8,7 @@ import pytest
 
 from gdp.errors import DropReason, LocalError
 from gdp.sansio import BROADCAST, OutgoingFrames, ReceivedFrame, Timestamps
-from gdp.simulation.network import SimLink, SimNetwork
+from lab.network import SimLink, SimNetwork
 
 
 class Talker:

@@ -8,7 +8,7 @@ import networkx as nx
 import pytest
 
 from gdp.errors import LocalError
-from gdp.simulation.topology import Attachment, DomainPlan, Link, Topology, chain, ring5
+from lab.topology import Attachment, DomainPlan, Link, Topology, chain, ring5
 
 
 def cheapest(topology: Topology, a: str, b: str) -> list[str]:
