@@ -53,10 +53,8 @@ def run(in_clone: InClone, tmp_path: Path) -> Callable[[str], dict[str, Any]]:
     return run_one
 
 
-_OTHERS = ("fig4", "fig5", "fig6", "fig6 --compute", "fig7 --compute", "fig9")
-
-
-@pytest.mark.parametrize("name", ["fig7", *(pytest.param(each, marks=pytest.mark.nightly) for each in _OTHERS)])
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", ["fig4", "fig5", "fig6", "fig6 --compute", "fig7", "fig7 --compute", "fig9"])
 def test_an_experiment_runs_to_its_page_without_a_failed_request(
     name: str, run: Callable[[str], dict[str, Any]]
 ) -> None:

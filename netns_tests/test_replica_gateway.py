@@ -123,6 +123,7 @@ def test_behind_a_dedicated_gateway_no_machine_is_one(tmp_path: Path, space: Spa
         provider.close_network()
 
 
+@pytest.mark.nightly
 def test_the_uplink_carries_one_copy_of_a_request_whichever_machine_is_the_gateway(
     provider: LocalProvider, tmp_path: Path
 ) -> None:

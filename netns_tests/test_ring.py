@@ -34,7 +34,7 @@ RECORDINGS: Final = (
     pytest.param("rosbag2_test", marks=pytest.mark.nightly),
     pytest.param("ros_numpy_test.bag", marks=pytest.mark.nightly),
     pytest.param("event_camera.bag", marks=pytest.mark.nightly),
-    "ninety_four_types.mcap",
+    pytest.param("ninety_four_types.mcap", marks=pytest.mark.nightly),
     pytest.param("turtlesim.bag", marks=pytest.mark.nightly),
     pytest.param("aruco_compressed.bag", marks=pytest.mark.nightly),
 )
@@ -137,7 +137,6 @@ def test_with_a_link_cut_in_the_middle_all_still_arrives_by_the_other_way(longer
     assert imu["hops_seen"] in ([5, 2], [2, 5])
 
 
-@pytest.mark.nightly
 def test_what_fails_and_moves_one_after_the_other_costs_no_message(demo: Path, tmp_path: Path) -> None:
     faults = ["--cut", "nuc1-nuc2@1-3", "--kill", "rib:school@2", "--roam", "robot:nuc2@4.5", "--kill", "switch:nuc1@5"]
     crossed(tmp_path, demo, "--seconds", 12, "--lease", LEASE_S, *faults)
@@ -261,7 +260,9 @@ def left_of(run: str) -> list[str]:
     return files + [str(path) for path in commands if path.exists() and run in path.read_text(errors="replace")]
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.nightly)]
+)
 def test_an_interrupted_run_leaves_nothing(longer: Path, number: signal.Signals, code: int) -> None:
     process, run = started(longer)
     with process:

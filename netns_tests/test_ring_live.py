@@ -106,6 +106,7 @@ def test_kept_nodes_continue_and_the_ring_comes_down_on_command() -> None:
     assert left_of(run) == []
 
 
+@pytest.mark.nightly
 def test_an_interrupted_live_run_leaves_nothing() -> None:
     needs("ros2")
     argv = command("--live", "--seconds", 60)

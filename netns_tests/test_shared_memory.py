@@ -74,7 +74,6 @@ def test_nothing_crosses_between_machines_while_their_cable_is_cut(lab: Lab) -> 
         listener.end()
 
 
-@pytest.mark.nightly
 def test_nodes_of_one_machine_exchange_large_messages_through_shared_memory(lab: Lab) -> None:
     talker, listener = peer(lab, "s1", "talker"), peer(lab, "s1", "listener")
     try:

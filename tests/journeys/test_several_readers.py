@@ -30,7 +30,9 @@ def world_of() -> Simulation:
     return world
 
 
-@pytest.mark.parametrize(("mbit_s", "slow"), [(4.0, 1.0), (20.0, 1.0), (4.0, 0.5)])
+@pytest.mark.parametrize(
+    ("mbit_s", "slow"), [(4.0, 1.0), (4.0, 0.5), pytest.param(20.0, 1.0, marks=pytest.mark.nightly)]
+)
 def test_a_reliable_topic_and_images_to_three_readers_share_full_links(mbit_s: float, slow: float) -> None:
     """``slow``: rate of the link to one reader, as a share of the others'."""
     world = world_of()

@@ -252,6 +252,7 @@ def an_image(region: str, endpoint: str) -> str:
     return found
 
 
+@pytest.mark.nightly
 def test_the_real_package_takes_our_tasks_in_a_dry_run(home: Path) -> None:
     moto_server = pytest.importorskip("moto.server", reason="moto[ec2,server] of the extra `dev` is not installed")
     server = moto_server.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)

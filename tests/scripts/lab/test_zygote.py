@@ -57,7 +57,9 @@ def output(argv: Sequence[str], **more: Any) -> tuple[int, str, str]:
     return process.returncode, out, errors
 
 
-@pytest.mark.parametrize("script", SCRIPTS)
+@pytest.mark.parametrize(
+    "script", [each if each == "gdp-replay" else pytest.param(each, marks=pytest.mark.nightly) for each in SCRIPTS]
+)
 def test_each_command_says_the_same(script: str, forked: Zygote, monkeypatch: pytest.MonkeyPatch) -> None:
     argv = [str(_BIN / script), "--help"]
     monkeypatch.setattr(Popen, "zygote", forked)
