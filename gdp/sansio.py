@@ -75,5 +75,5 @@ class ProtocolCore(Protocol):
     def frames_to_send(self, now_s: float) -> list[OutgoingFrames]:
         """Return, once, the frames to send; call again until it returns none."""
 
-    def frames_leave(self, now_s: float) -> None:
+    def frames_sent(self, now_s: float) -> None:
         """Note that the frames returned last are sent now: preparing them took time."""

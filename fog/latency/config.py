@@ -23,7 +23,7 @@ from pydantic import AfterValidator, Field
 
 from gdp.config.schema import Section
 
-__all__ = ["Endpoint", "LatencyConfig"]
+__all__ = ["LatencyConfig", "ProbeEndpoint"]
 
 _FORM: Final = re.compile(r"(?:(tcp|udp)://)?(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._{}-]+):(\d{1,5})")
 _EVERY: Final = "*"
@@ -31,7 +31,7 @@ _AWS: Final = {_EVERY: "ec2.{region}.amazonaws.com:443"}  # every region's publi
 
 
 @dataclass(frozen=True, slots=True)
-class Endpoint:
+class ProbeEndpoint:
     """Endpoint of a probe.
 
     Args:
@@ -43,7 +43,7 @@ class Endpoint:
     port: int
 
     @classmethod
-    def from_text(cls, text: str) -> Endpoint:
+    def from_text(cls, text: str) -> ProbeEndpoint:
         """Read ``HOST:PORT``, ``tcp://HOST:PORT`` or ``udp://HOST:PORT``.
 
         Raises:
@@ -61,7 +61,7 @@ class Endpoint:
 
 
 def _readable(text: str) -> str:
-    Endpoint.from_text(text.replace("{region}", "region"))
+    ProbeEndpoint.from_text(text.replace("{region}", "region"))
     return text
 
 
@@ -84,7 +84,7 @@ class LatencyConfig(Section):
         """Return the section with EC2's public endpoint of each region, unless endpoints are stated."""
         return self if self.endpoints else self.model_copy(update={"endpoints": _AWS})
 
-    def endpoint(self, region: str) -> Endpoint | None:
+    def endpoint(self, region: str) -> ProbeEndpoint | None:
         """Return the endpoint of a region; None: there is none."""
         text = self.endpoints.get(region, self.endpoints.get(_EVERY))
-        return None if text is None else Endpoint.from_text(text.replace("{region}", region))
+        return None if text is None else ProbeEndpoint.from_text(text.replace("{region}", region))

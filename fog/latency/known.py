@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
-from fog.latency.config import Endpoint, LatencyConfig
+from fog.latency.config import LatencyConfig, ProbeEndpoint
 from fog.latency.probe import Probed, probe_all
 from fog.plan.duration import duration_text
 from gdp.errors import StoreError
@@ -58,7 +58,7 @@ class Latencies:
         folder: Path,
         config: LatencyConfig,
         stated: Mapping[str, float],
-        measure: Callable[[Mapping[str, Endpoint], float], dict[str, Probed]] = probe_all,
+        measure: Callable[[Mapping[str, ProbeEndpoint], float], dict[str, Probed]] = probe_all,
     ) -> None:
         self._path = folder / _FILE
         self._config = config
@@ -128,7 +128,7 @@ class Latencies:
             return Latency(None, f"too old: measured {ago}, {kept.endpoint}")
         return Latency(kept.ms, f"measured {ago}, {kept.endpoint}")
 
-    def _holds(self, kept: _Kept | None, endpoint: Endpoint, now_unix_s: float) -> bool:
+    def _holds(self, kept: _Kept | None, endpoint: ProbeEndpoint, now_unix_s: float) -> bool:
         if kept is None or kept.endpoint != endpoint.to_text() or kept.unix_s > now_unix_s:
             return False
         limit_s = _FAILED_S if kept.ms is None else self._config.lifetime_s * _EARLY

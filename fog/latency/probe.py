@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Final
 
-from fog.latency.config import Endpoint
+from fog.latency.config import ProbeEndpoint
 
 __all__ = ["TRIES", "Probed", "probe", "probe_all"]
 
@@ -30,7 +30,7 @@ class Probed:
     reason: str = ""
 
 
-def probe_all(endpoints: Mapping[str, Endpoint], timeout_s: float) -> dict[str, Probed]:
+def probe_all(endpoints: Mapping[str, ProbeEndpoint], timeout_s: float) -> dict[str, Probed]:
     """Probe one endpoint per region in parallel; a batch of 16 takes at most ``TRIES`` times ``timeout_s``."""
     if not endpoints:
         return {}
@@ -39,7 +39,7 @@ def probe_all(endpoints: Mapping[str, Endpoint], timeout_s: float) -> dict[str, 
         return dict(zip(endpoints, found, strict=True))
 
 
-def probe(endpoint: Endpoint, timeout_s: float) -> Probed:
+def probe(endpoint: ProbeEndpoint, timeout_s: float) -> Probed:
     """Measure one endpoint; a failed try ends the probe, unless an earlier try succeeded."""
     kind = socket.SOCK_STREAM if endpoint.protocol == "tcp" else socket.SOCK_DGRAM
     try:

@@ -22,7 +22,7 @@ from gdp.names import Name
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
-from gdp.nodes.node_log import LOOK_S
+from gdp.nodes.node_log import RECONCILE_PERIOD_S
 from gdp.ports.raw import RawPlane
 from gdp.runtime.runtime import Runtime
 from gdp.stores.keyring import DELEGATIONS, ROOT_CERTIFICATE
@@ -73,7 +73,7 @@ class Watch:
         reported = ""
         while not self._ended.is_set():
             try:
-                self._look()
+                self._watch()
             except (GdpError, OSError) as error:
                 if str(error) != reported:
                     log.warning("the overlay cannot be asked reason=%s", error)
@@ -82,7 +82,7 @@ class Watch:
                 self._tell(None)  # earlier results are no longer valid
             self._ended.wait(_AGAIN_S)
 
-    def _look(self) -> None:
+    def _watch(self) -> None:
         domain = Domain(root=self._identity / ROOT_CERTIFICATE, transit=None)
         identity, policy = load_member(self._identity, domain, Role.PROXY)
         member = Participant(
@@ -93,7 +93,7 @@ class Watch:
         plane = RawPlane([self._iface])
         try:
             runtime = Runtime(member, plane)
-            runtime.every(LOOK_S, Credentials(self._identity, domain, identity, policy).reload_changed)
+            runtime.every(RECONCILE_PERIOD_S, Credentials(self._identity, domain, identity, policy).reload_changed)
             called = self._call(member, DelegationStore(self._identity / DELEGATIONS, identity), [])
             attached_s: float | None = None
             while not self._ended.is_set() and any(port.up for port in plane.ports.values()):

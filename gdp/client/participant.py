@@ -462,9 +462,9 @@ class Participant:
             out = self.attachment.frames_to_send()
         return out
 
-    def frames_leave(self, now_s: float) -> None:
+    def frames_sent(self, now_s: float) -> None:
         """Note that the frames returned last are sent now: sealing them took time."""
-        self._publications.frames_leave(now_s)
+        self._publications.frames_sent(now_s)
 
     def poll_messages(self) -> list[Message]:
         """Return, once, the messages that arrived, in order within each writer proxy."""

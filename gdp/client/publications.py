@@ -236,10 +236,10 @@ class Publications:
             self.scheduler.resume()
         self.release_requests(now_s)
 
-    def frames_leave(self, now_s: float) -> None:
+    def frames_sent(self, now_s: float) -> None:
         """Count the frames polled last, which left at ``now_s``."""
         self.scheduler.count_sent()
-        self._reader_paths.frames_leave(now_s)
+        self._reader_paths.frames_sent(now_s)
 
     def attachment_changed(self, now_s: float) -> None:
         """Measure all paths again: frames leave by another switch."""

@@ -181,8 +181,8 @@ class Publisher:
         readers = self._readers
         return [] if self.mtu is None else sorted(readers, key=lambda name: readers.is_quiet(name, now_s))
 
-    def has_left(self, sequence: int) -> bool:
-        """Return whether a message has left whole."""
+    def is_sent(self, sequence: int) -> bool:
+        """Return whether all frames of a message are sent."""
         return self._queue.sequences[0] > sequence
 
     def cancel(self, sequence: int) -> None:

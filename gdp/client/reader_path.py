@@ -108,10 +108,10 @@ class ReaderPath:
         self.controller.sent(self._number, size, now_s, frames)
         return self._number
 
-    def frames_leave(self, now_s: float) -> None:
+    def frames_sent(self, now_s: float) -> None:
         """Note that what was counted since the last call leaves now."""
         for number in range(self._left + 1, self._number + 1):
-            self.controller.frames_leave(number, now_s)
+            self.controller.frames_sent(number, now_s)
         self._left = self._number
 
     def acknowledged(self, numbers: Iterable[int], lost: int, held_s: float | None, now_s: float) -> None:
@@ -305,10 +305,10 @@ class ReaderPaths:
         for path in self._paths.values():
             path.controller.path_changed(now_s)
 
-    def frames_leave(self, now_s: float) -> None:
+    def frames_sent(self, now_s: float) -> None:
         """Note that what was counted since the last call leaves now."""
         for path in self._paths.values():
-            path.frames_leave(now_s)
+            path.frames_sent(now_s)
 
     def handle_timer(self, now_s: float) -> bool:
         """Let silent paths start again, and forget unused ones; return whether any may carry more now."""

@@ -111,7 +111,7 @@ class RequestStreams:
 
     def _may_follow(self, request: _Request, now_s: float) -> bool:
         """Return whether the next copy may begin: those before have left, or the newest is late."""
-        if request.server is None or all(publisher.has_left(sequence) for publisher, sequence in request.copies):
+        if request.server is None or all(publisher.is_sent(sequence) for publisher, sequence in request.copies):
             return True
         if now_s < request.check_s:
             return False

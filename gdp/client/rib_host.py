@@ -111,7 +111,7 @@ class RibHost:
         del now_s  # nothing here is paced
         return self.attachment.frames_to_send()
 
-    def frames_leave(self, now_s: float) -> None:
+    def frames_sent(self, now_s: float) -> None:
         """Do nothing: no path is measured here."""
 
     def _receive_statement(self, arrival: ReceivedFrame, now: Timestamps) -> list[tuple[bytes, Name]]:

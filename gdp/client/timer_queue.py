@@ -44,7 +44,7 @@ class TimerQueue(Generic[T]):
 
     def next_due(self) -> float | None:
         """Return the monotonic second at which the first is due, or None."""
-        self._look()
+        self._refresh()
         while self._heap:
             at_s, _, each = self._heap[0]
             due_s = self._due_s.get(each)
@@ -67,7 +67,7 @@ class TimerQueue(Generic[T]):
         self._touched.update(dict.fromkeys(taken))
         return taken
 
-    def _look(self) -> None:
+    def _refresh(self) -> None:
         for each in self._touched:
             due_s = each.get_timer()
             if due_s is None or due_s == _NEVER:

@@ -77,10 +77,10 @@ def relative(path: Path, info: ValidationInfo) -> Path:
         raise ValueError(f"no such home directory: {str(path)[:_PATH_SHOWN]}") from error
 
 
-def _is_there(look: Callable[[], bool]) -> bool:
+def _is_there(exists: Callable[[], bool]) -> bool:
     """Return the result of a check on a path; a path that the system refuses, such as a too long one, is missing."""
     try:
-        return look()
+        return exists()
     except OSError:
         return False
 

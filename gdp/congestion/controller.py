@@ -203,7 +203,7 @@ class PathController:
         self._was_used = self._was_used or self.inflight + self._mtu > self.window
         self.charge(size, now_s)
 
-    def frames_leave(self, number: int, now_s: float) -> None:
+    def frames_sent(self, number: int, now_s: float) -> None:
         """Note when a flight really leaves: its frames are sealed after ``sent``."""
         flight = self._flights.get(number)
         if flight is not None:

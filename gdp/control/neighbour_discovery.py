@@ -706,11 +706,11 @@ class HelloProtocol:
     def get_timer(self) -> float | None:
         """Return a monotonic second that is no later than the next hello, keepalive or silence of a neighbour."""
         if self._next_s is None:
-            self._next_s = self._look_ahead()
+            self._next_s = self._find_next()
         self._due_s = self._next_s
         return None if self._due_s == float("inf") else self._due_s
 
-    def _look_ahead(self) -> float:
+    def _find_next(self) -> float:
         due_s, self._is_probing = self._reply_at_s, False
         for port in self.ports.values():
             if port.is_up:

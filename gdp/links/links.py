@@ -33,12 +33,12 @@ from gdp.switch.core import SwitchCore
 from gdp.switch.direct_tunnels import Close, Open, Retry
 from gdp.trust.domain import Policy
 
-__all__ = ["LINKS_LOOK_S", "TunnelLinks"]
+__all__ = ["LINKS_PERIOD_S", "TunnelLinks"]
 
 log = logging.getLogger(__name__)
 
-LINKS_LOOK_S: Final = 0.1
-_RECORDS_LOOK_S: Final = 0.3
+LINKS_PERIOD_S: Final = 0.1
+_RECORDS_PERIOD_S: Final = 0.3
 _RETRY_S: Final = 5.0
 _SILENT_S: Final = 5.0  # a border that is not up after this time is reported
 
@@ -89,13 +89,13 @@ class TunnelLinks:
         """Return the port indices of tunnels."""
         return frozenset(each.port for each in self._tunnels.all.values())
 
-    def look(self, now: Timestamps) -> None:
+    def handle_timer(self, now: Timestamps) -> None:
         """Follow the records, the endpoints of peers and the decisions of the switch."""
         if now.mono_s >= self._records_s:
-            self._records_s = now.mono_s + _RECORDS_LOOK_S
+            self._records_s = now.mono_s + _RECORDS_PERIOD_S
             self._read_records(now)
             self._follow_configured(now)
-        for tunnel in self._tunnels.look(now):
+        for tunnel in self._tunnels.handle_timer(now):
             self._switch.tunnel_answered(tunnel.peer, now)
         if self._config.direct:
             self._own.publish_changes(now)

@@ -25,7 +25,7 @@ __all__ = ["OwnEndpoints", "listed_candidates"]
 
 log = logging.getLogger(__name__)
 
-_ADDRESSES_LOOK_S: Final = 10.0  # where no notification comes, such as for a device that moves between namespaces
+_ADDRESSES_PERIOD_S: Final = 10.0  # where no notification comes, such as for a device that moves between namespaces
 
 
 def listed_candidates(
@@ -61,7 +61,7 @@ class OwnEndpoints:
     def publish_changes(self, now: Timestamps) -> None:
         """Publish a record if the candidates differ from the published ones, or the RIB keeps a later record."""
         if self._monitor.has_news() or now.mono_s >= self._hosts_s:
-            self._hosts_s = now.mono_s + _ADDRESSES_LOOK_S
+            self._hosts_s = now.mono_s + _ADDRESSES_PERIOD_S
             try:
                 self._hosts = self._host_candidates()
             except LocalError as error:

@@ -31,16 +31,16 @@ class Timed(Protocol):
 class _Periodic:
     """Function that is called once in a period, however often the timers are."""
 
-    def __init__(self, period_s: float, look: Callable[[float], None]) -> None:
+    def __init__(self, period_s: float, function: Callable[[float], None]) -> None:
         self._period_s = period_s
-        self._look = look
+        self._function = function
         self._due_s = float("-inf")
 
     def handle_timer(self, now_s: float) -> float:
         """Call the function if it is due; return the second of the next call."""
         if now_s >= self._due_s:
             self._due_s = now_s + self._period_s
-            self._look(now_s)
+            self._function(now_s)
         return self._due_s
 
 
@@ -77,9 +77,9 @@ class RelayLoop:
         self._timed.append(part)
         self._due_s = 0.0
 
-    def every(self, period_s: float, look: Callable[[float], None]) -> None:
-        """Call ``look`` with the monotonic second each ``period_s``, the first time at once."""
-        self.add_timed(_Periodic(period_s, look))
+    def every(self, period_s: float, function: Callable[[float], None]) -> None:
+        """Call a function with the monotonic second each ``period_s``, the first time at once."""
+        self.add_timed(_Periodic(period_s, function))
 
     def remove_timed(self, part: Timed) -> None:
         """Call a part's timers no more."""

@@ -19,13 +19,13 @@ from gdp.runtime.runtime import Runtime
 from gdp.sansio import Timestamps
 from gdp.switch.core import SwitchCore
 
-__all__ = ["RELAY_COST", "RELAY_LOOK_S", "VIA", "RelayPorts"]
+__all__ = ["RELAY_COST", "RELAY_PERIOD_S", "VIA", "RelayPorts"]
 
 log = logging.getLogger(__name__)
 
 RELAY_COST: Final = 1_000
 VIA: Final = "tls (slower)"
-RELAY_LOOK_S: Final = 0.1
+RELAY_PERIOD_S: Final = 0.1
 _FORGET_S: Final = 60.0  # after this time no tree and no table entry names a removed port
 
 
@@ -70,7 +70,7 @@ class RelayPorts:
             rows.append({"peer": peer, "device": ifname, "via": VIA, "cost": self._cost, "up": found is not None})
         return rows
 
-    def look(self, now: Timestamps) -> None:
+    def handle_timer(self, now: Timestamps) -> None:
         """Add ports for new devices of the relay, and remove those whose device is gone."""
         while self._closed and now.mono_s >= self._closed[0][0]:
             self._switch.hello_protocol.remove_port(self._closed.popleft()[1])

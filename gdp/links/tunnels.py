@@ -39,7 +39,7 @@ __all__ = ["Tunnel", "Tunnels", "open_underlays"]
 log = logging.getLogger(__name__)
 
 _OUTER_MTU: Final = 1_500  # until a route to an endpoint is known
-_DEVICE_LOOK_S: Final = 1.0
+_DEVICE_PERIOD_S: Final = 1.0
 _STATES_PAUSE_S: Final = 0.02  # between two reads of the states of all peers
 _HANDSHAKE_S: Final = 3.0  # states are read often for this time after a handshake was requested
 _FORGET_S: Final = 60.0  # after this time no tree and no table entry names a removed port
@@ -135,7 +135,7 @@ class Tunnels:
         self._underlays = underlays
         self._relay_rate = relay_rate
         self._tunnels: dict[TunnelId, Tunnel] = {}
-        self._device_look_s = float("-inf")
+        self._device_due_s = float("-inf")
         self._read_s = [float("-inf") for _ in underlays]  # when the states of peers were read
         self._answered: list[TunnelId] = []  # not returned by ``look`` yet
         self._is_read_due = [False for _ in underlays]
@@ -277,11 +277,11 @@ class Tunnels:
         for device in self._underlays:
             self._runtime.unwatch(device)
 
-    def look(self, now: Timestamps) -> list[TunnelId]:
+    def handle_timer(self, now: Timestamps) -> list[TunnelId]:
         """Follow where WireGuard hears each peer, and the MTU of the paths; return tunnels with a new handshake."""
-        is_device_due = now.mono_s >= self._device_look_s
+        is_device_due = now.mono_s >= self._device_due_s
         if is_device_due:
-            self._device_look_s = now.mono_s + _DEVICE_LOOK_S
+            self._device_due_s = now.mono_s + _DEVICE_PERIOD_S
             for uplink, device in enumerate(self._underlays):
                 self._read_s[uplink] = now.mono_s
                 if device.poll():

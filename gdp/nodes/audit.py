@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from gdp.errors import DropReason, LocalError
-from gdp.nodes.node_log import LOOK_S
+from gdp.nodes.node_log import RECONCILE_PERIOD_S
 from gdp.runtime.runtime import Runtime, now
 from gdp.sansio import Timestamps
 from gdp.stores.audit_log import AuditLog
@@ -101,6 +101,6 @@ def keep_audit(
     folder = audit_folder(configured)
     if folder is not None:
         audit = NodeAudit(folder, trail, drops)
-        runtime.every(LOOK_S, audit.write_pending)
+        runtime.every(RECONCILE_PERIOD_S, audit.write_pending)
         stack.callback(lambda: audit.write_pending(now()))
         log.info("audit log path=%s", folder)

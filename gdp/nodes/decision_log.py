@@ -12,7 +12,7 @@ from typing import Final
 
 from gdp.errors import DropReason
 from gdp.names import NAME_BYTES, Name
-from gdp.nodes.node_log import LOOK_S
+from gdp.nodes.node_log import RECONCILE_PERIOD_S
 from gdp.ports.plane import Port
 from gdp.runtime.runtime import Runtime
 from gdp.sansio import Timestamps
@@ -34,7 +34,7 @@ def log_decisions(
 ) -> None:
     """Log decisions from within the loop if debug lines are wanted."""
     if log.isEnabledFor(logging.DEBUG):
-        runtime.every(LOOK_S, DecisionLog(ports, drops, table).look)
+        runtime.every(RECONCILE_PERIOD_S, DecisionLog(ports, drops, table).log_changes)
 
 
 class DecisionLog:
@@ -54,7 +54,7 @@ class DecisionLog:
         self._routes: dict[bytes, str] = {}
         self._dropped: dict[DropReason, int] = {}
 
-    def look(self, _now: Timestamps) -> None:
+    def log_changes(self, _now: Timestamps) -> None:
         """Log what changed since the last call."""
         if self._table is not None:
             self._look_at_routes(self._table.entries)

@@ -21,11 +21,11 @@ from gdp.telemetry.health import Health
 from gdp.trust.audit import Action
 from gdp.trust.domain import Policy
 
-__all__ = ["LOOK_S", "NodeLog", "OnWait", "no_name"]
+__all__ = ["RECONCILE_PERIOD_S", "NodeLog", "OnWait", "no_name"]
 
 log = logging.getLogger(__name__)
 
-LOOK_S: Final = 0.5
+RECONCILE_PERIOD_S: Final = 0.5
 
 OnWait = Callable[[str, str], None]  # reason and text
 

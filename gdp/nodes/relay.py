@@ -32,7 +32,7 @@ from gdp.names import Name
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.membership import load_member
 from gdp.nodes.metrics import serve_metrics
-from gdp.nodes.node_log import LOOK_S
+from gdp.nodes.node_log import RECONCILE_PERIOD_S
 from gdp.nodes.rights import confine_relay
 from gdp.ports.host_addresses import AddressMonitor
 from gdp.ports.tap import TapDevice, tap_name
@@ -71,7 +71,7 @@ def run_relay(config: RelayConfig, ready: Callable[[Identity, Relay], None]) -> 
         relay = Relay(context)
         stack.callback(relay.close)
         credentials = Credentials(config.identity, config.domain, identity, policy)
-        relay.on_look(lambda: credentials.reload_changed(now()))
+        relay.every_period(lambda: credentials.reload_changed(now()))
 
         def reload() -> None:
             credentials.reload_changed(now())
@@ -105,7 +105,7 @@ class Relay:
         self._context = context
         self._loop = context.loop
         self._begun_s = time.monotonic()
-        self._looks: list[Callable[[], None]] = [self.check_members]
+        self._periodic: list[Callable[[], None]] = [self.check_members]
         self._health = Health()
         self._is_closed = False
         context.load_revocations(now())
@@ -135,19 +135,19 @@ class Relay:
         if self._watch is not None:
             self._watch.start()
 
-    def on_look(self, look: Callable[[], None]) -> None:
-        """Call ``look`` from within the loop each ``LOOK_S``, before the members are checked."""
-        self._looks.insert(0, look)
+    def every_period(self, function: Callable[[], None]) -> None:
+        """Call ``function`` from within the loop each ``RECONCILE_PERIOD_S``, before the members are checked."""
+        self._periodic.insert(0, function)
 
     def handle_timer(self, now_s: float) -> float:
         """Look at files and memberships; return the second of the next call."""
-        for look in self._looks:
-            look()
+        for function in self._periodic:
+            function()
         if self._watch is not None:
             for dialer in self.dialers:
                 dialer.follow_tunnel(now_s, is_up=dialer.peer.to_text() in self._watch.up)
         self._health = Health(now_s, tuple(filter(None, (dialer.waiting for dialer in self.dialers))))
-        return now_s + LOOK_S
+        return now_s + RECONCILE_PERIOD_S
 
     def check_members(self) -> None:
         """Read new revocations, and end connections of members that are no longer valid."""

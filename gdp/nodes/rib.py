@@ -24,7 +24,7 @@ from gdp.nodes.audit import audit_folder, keep_audit
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.decision_log import log_decisions
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
-from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
+from gdp.nodes.node_log import RECONCILE_PERIOD_S, NodeLog, OnWait
 from gdp.nodes.port_rows import port_rows
 from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.nodes.rib_upkeep import MemoryUpkeep, Upkeep
@@ -99,9 +99,9 @@ def run_rib(config: RibConfig, ready: Callable[[Name], None], on_wait: OnWait | 
             lambda now_s: [*attachment_waits(host.attachment, now_s), *rib.waits(now_s)],
             on_wait=on_wait,
         )
-        runtime.every(LOOK_S, node_log.log_changes)
+        runtime.every(RECONCILE_PERIOD_S, node_log.log_changes)
         credentials = Credentials(config.identity, config.domain, identity, policy)
-        runtime.every(LOOK_S, credentials.reload_changed)
+        runtime.every(RECONCILE_PERIOD_S, credentials.reload_changed)
         stack.enter_context(runtime.signals(lambda: credentials.reload_changed(now())))
         notifier.follow(runtime.every)
         sources, begun_s = _sources(host, plane, node_log, runtime), now().mono_s
@@ -156,7 +156,7 @@ def _upkeep(config: RibConfig, policy: Policy) -> Upkeep:
 def _sources(host: RibHost, plane: Plane, node_log: NodeLog, runtime: Runtime) -> Sources:
     counters, rib = plane.counters, host.rib
     links = LinkRows(host.attachment.hello_protocol, plane.ports)
-    runtime.every(LOOK_S, links.refresh)
+    runtime.every(RECONCILE_PERIOD_S, links.refresh)
     return Sources(
         frames=lambda: {"in": counters.frames_in, "out": counters.frames_out, "punted": counters.punted},
         drops=[lambda: counters.drops, lambda: count_list(host.drops())],

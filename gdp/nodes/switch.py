@@ -17,8 +17,8 @@ from gdp.crypto.identity import Identity
 from gdp.errors import LocalError, StatementError
 from gdp.host.service_notifier import service_notifier
 from gdp.host.single_instance import own_devices, run_alone
-from gdp.links.links import LINKS_LOOK_S, TunnelLinks
-from gdp.links.relay_ports import RELAY_LOOK_S, RelayPorts
+from gdp.links.links import LINKS_PERIOD_S, TunnelLinks
+from gdp.links.relay_ports import RELAY_PERIOD_S, RelayPorts
 from gdp.links.tunnels import open_underlays
 from gdp.links.uplink import refuse_loopback
 from gdp.links.veth import attach_pairs, switch_end
@@ -30,7 +30,7 @@ from gdp.nodes.data_plane import Chosen, choose_plane
 from gdp.nodes.decision_log import log_decisions
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
 from gdp.nodes.metrics import serve_metrics
-from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
+from gdp.nodes.node_log import RECONCILE_PERIOD_S, NodeLog, OnWait
 from gdp.nodes.port_rows import port_rows
 from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.nodes.rights import confine_switch
@@ -116,10 +116,10 @@ def run_switch(
             rib=lambda: switch.rib,
             on_wait=on_wait,
         )
-        runtime.every(LOOK_S, node_log.log_changes)
-        runtime.every(LOOK_S, lambda _: _end_if_displaced(switch))
+        runtime.every(RECONCILE_PERIOD_S, node_log.log_changes)
+        runtime.every(RECONCILE_PERIOD_S, lambda _: _end_if_displaced(switch))
         credentials = Credentials(config.identity, config.domain, identity, policy)
-        runtime.every(LOOK_S, credentials.reload_changed)
+        runtime.every(RECONCILE_PERIOD_S, credentials.reload_changed)
 
         def reload() -> None:
             credentials.reload_changed(now())
@@ -162,7 +162,7 @@ def _add_ports(config: SwitchConfig, plane: Plane, switch: SwitchCore) -> None:
 
 def _start_links(links: TunnelLinks | None, runtime: Runtime, stack: contextlib.ExitStack) -> None:
     if links is not None:
-        runtime.every(LINKS_LOOK_S, links.look)
+        runtime.every(LINKS_PERIOD_S, links.handle_timer)
         stack.callback(lambda: links.close(now().mono_s))
 
 
@@ -180,7 +180,7 @@ def _follow_relay(
     named = frozenset(port.iface for port in config.ports)
     relay = RelayPorts(name=identity.name, switch=switch, runtime=runtime, excluded=named)
     stack.callback(relay.close)
-    runtime.every(RELAY_LOOK_S, relay.look)
+    runtime.every(RELAY_PERIOD_S, relay.handle_timer)
     return relay
 
 
@@ -308,9 +308,9 @@ def _widest(ifaces: Sequence[str]) -> int:
 def _sources(switch: SwitchCore, chosen: Chosen, node_log: NodeLog, runtime: Runtime) -> Sources:
     plane = chosen.plane
     links = LinkRows(switch.hello_protocol, plane.ports)
-    runtime.every(LOOK_S, links.refresh)
+    runtime.every(RECONCILE_PERIOD_S, links.refresh)
     two_paths = switch.multicast.path_counts()
-    runtime.every(LOOK_S, lambda _now: two_paths.update(switch.multicast.path_counts()))
+    runtime.every(RECONCILE_PERIOD_S, lambda _now: two_paths.update(switch.multicast.path_counts()))
 
     def frames() -> dict[str, int]:
         """Return the frame counts by direction."""

@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 DRAIN_MAX_S = 2.0  # a draining switch or RIB ends after this time, finished or not
 _STREAK_MAX = 8
-_DRAIN_LOOK_S = 0.05  # between checks of the remaining work, if nothing else wakes the loop
+_DRAIN_PERIOD_S = 0.05  # between checks of the remaining work, if nothing else wakes the loop
 
 
 def now() -> Timestamps:
@@ -37,7 +37,7 @@ def now() -> Timestamps:
 
 
 @dataclass(slots=True)
-class _Look:
+class _Periodic:
     period_s: float
     call: Callable[[Timestamps], None]
     due_s: float = float("-inf")
@@ -62,7 +62,7 @@ class Runtime:
         self._is_woken = False  # by a watched source: the driver has work
         self._streak = 0  # consecutive steps with frames and without a check of the timers
         self._deadline_s: float | None = None
-        self._looks: list[_Look] = []
+        self._periodic: list[_Periodic] = []
         self._after_receive: list[Callable[[], None]] = []
         self._drain_until_s: float | None = None
         self._is_finished: Callable[[], bool] = lambda: True
@@ -92,7 +92,7 @@ class Runtime:
                 return True
             if deadline_s is not None and time.monotonic() >= deadline_s:
                 return False
-            self.step(time.monotonic() + _DRAIN_LOOK_S if self.is_draining else deadline_s)
+            self.step(time.monotonic() + _DRAIN_PERIOD_S if self.is_draining else deadline_s)
             self._end_when_drained()
         return until is None
 
@@ -169,13 +169,13 @@ class Runtime:
         """Return whether ``drain`` was called."""
         return self._drain_until_s is not None
 
-    def every(self, period_s: float, look: Callable[[Timestamps], None]) -> None:
-        """Call ``look`` from within the loop each ``period_s``, the first time at once."""
-        self._looks.append(_Look(period_s, look))
+    def every(self, period_s: float, function: Callable[[Timestamps], None]) -> None:
+        """Call ``function`` from within the loop each ``period_s``, the first time at once."""
+        self._periodic.append(_Periodic(period_s, function))
 
-    def after_receive(self, look: Callable[[], None]) -> None:
-        """Call ``look`` each time that the core has handled frames; it must be cheap."""
-        self._after_receive.append(look)
+    def after_receive(self, function: Callable[[], None]) -> None:
+        """Call ``function`` each time that the core has handled frames; it must be cheap."""
+        self._after_receive.append(function)
 
     def unwatch(self, source: HasFileno) -> None:
         """Undo ``watch``, before the source is closed."""
@@ -194,7 +194,7 @@ class Runtime:
         if not is_sending and not arrivals and not self._is_woken:
             self._deadline_s = self._machine.get_timer()
             times = [each for each in (self._deadline_s, latest_s) if each is not None]
-            times += [look.due_s for look in self._looks]
+            times += [each.due_s for each in self._periodic]
             arrivals = self._wait(max(min(times) - time.monotonic(), 0.0) if times else None)
         self._streak = self._streak + 1 if arrivals and self._streak < _STREAK_MAX else 0
         moment = now()
@@ -205,10 +205,10 @@ class Runtime:
         if self._deadline_s is not None and moment.mono_s >= self._deadline_s:
             self._machine.handle_timer(moment)
             self._deadline_s = self._machine.get_timer()
-        for look in self._looks:
-            if moment.mono_s >= look.due_s:
-                look.due_s = moment.mono_s + look.period_s
-                look.call(moment)
+        for each in self._periodic:
+            if moment.mono_s >= each.due_s:
+                each.due_s = moment.mono_s + each.period_s
+                each.call(moment)
 
     def _end_when_drained(self) -> None:
         if self._drain_until_s is None:
@@ -219,7 +219,7 @@ class Runtime:
 
     def next_due_s(self) -> float | None:
         """Return the monotonic second at which a step has work without frames, or None."""
-        times = [self._machine.get_timer(), *(look.due_s for look in self._looks)]
+        times = [self._machine.get_timer(), *(each.due_s for each in self._periodic)]
         return min((time for time in times if time is not None), default=None)
 
     def _wait(self, timeout_s: float | None) -> list[ReceivedFrame]:
@@ -247,10 +247,10 @@ class Runtime:
         transmits = self._machine.frames_to_send(time.monotonic())
         if not transmits:
             return False
-        left_s = time.monotonic()
+        sent_s = time.monotonic()
         for port, mac, frames in transmits:
             self._plane.transmit(port, mac, frames)
-        self._machine.frames_leave(left_s)
+        self._machine.frames_sent(sent_s)
         return True
 
     @contextlib.contextmanager

@@ -156,7 +156,7 @@ class Sequencer(Generic[A]):
         if server not in self._replicas:
             self._replicas[server] = Replica(quiet_until_s=0.0)
             self._election.restart(now_s)
-            self._look(now_s)
+            self._advance(now_s)
 
     def replica_leaving(self, server: Name) -> None:
         """Record that a replica goes soon: where others follow it is detached."""
@@ -167,7 +167,7 @@ class Sequencer(Generic[A]):
         """Remove a replica. Its calls stay pending, for later replicas get the log."""
         del reason
         self._let_go(server)
-        self._look(now_s)
+        self._advance(now_s)
 
     def positioned(self, server: Name, word: FollowerMessage, now_s: float) -> None:
         """Handle a replica's message about itself."""
@@ -178,7 +178,7 @@ class Sequencer(Generic[A]):
             self._handle_state(server, replica, word, now_s)
         else:
             self._handle_position(server, replica, word, now_s)
-        self._look(now_s)
+        self._advance(now_s)
 
     def answered(self, number: int, server: Name, answer: A, now_s: float) -> None:
         """Handle a replica's response: it has applied everything up to there."""
@@ -201,7 +201,7 @@ class Sequencer(Generic[A]):
     def handle_timer(self, now_s: float) -> None:
         """Run the timers that are due."""
         self._calls.fail_expired(now_s)
-        self._look(now_s)
+        self._advance(now_s)
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timeout of a call, or None; all else can wait for a tick."""
@@ -217,7 +217,7 @@ class Sequencer(Generic[A]):
         self._effects.clear()
         return effects
 
-    def _look(self, now_s: float) -> None:
+    def _advance(self, now_s: float) -> None:
         """Probe replicas that owe a position; begin the log when all have sent theirs."""
         for server, replica in self._replicas.items():
             is_behind = self._replication.is_behind(replica)

@@ -24,7 +24,7 @@ from gdp.names import Name
 from gdp.nodes.credentials import Credentials
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
-from gdp.nodes.node_log import LOOK_S, NodeLog
+from gdp.nodes.node_log import RECONCILE_PERIOD_S, NodeLog
 from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.ports.netdev import NetdevPlane
 from gdp.runtime.runtime import Runtime
@@ -104,8 +104,8 @@ def open_node(config: SessionConfig) -> SessionNode:
             conflict=lambda: member.attachment.conflict_at,
             local_name=lambda name: labels.get(name, name.short),
         )
-        runtime.every(LOOK_S, node_log.log_changes)
-        runtime.every(LOOK_S, Credentials(config.identity, config.domain, identity, policy).reload_changed)
+        runtime.every(RECONCILE_PERIOD_S, node_log.log_changes)
+        runtime.every(RECONCILE_PERIOD_S, Credentials(config.identity, config.domain, identity, policy).reload_changed)
         revocations.start(runtime)
         return SessionNode(
             config=config,

@@ -370,7 +370,7 @@ class SwitchCore:
         del now_s  # nothing here is paced
         return [] if self.is_displaced else self._outbox.poll_frames()
 
-    def frames_leave(self, now_s: float) -> None:
+    def frames_sent(self, now_s: float) -> None:
         """Do nothing: no path is measured here."""
 
     def _wake(self) -> None:

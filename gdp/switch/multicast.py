@@ -641,8 +641,8 @@ class MulticastTrees:
         self._show(tree, renews=not is_proof_due)
         if has_settled and self._paths.has_alternates:
             self._ask_for_backup(tree, renews=not is_proof_due)
-        if has_settled and tree.left:
-            tree.left.clear()
+        if has_settled and tree.former_ports:
+            tree.former_ports.clear()
             self._install(tree)
 
     def _restate(self, tree: Tree) -> None:
@@ -679,7 +679,7 @@ class MulticastTrees:
     def _leave_backup(self, tree: Tree) -> None:
         if tree.backup is not None:
             (at, name), tree.backup = tree.backup, None
-            tree.left.add(at[0])
+            tree.former_ports.add(at[0])
             if at != tree.upstream:
                 self._joins.send_leave(tree, at, name)
 
@@ -764,13 +764,13 @@ class MulticastTrees:
     def _leave_former(self, tree: Tree) -> None:
         if tree.former is not None:
             (at, name), tree.former = tree.former, None
-            tree.left.add(at[0])
+            tree.former_ports.add(at[0])
             if at != tree.upstream:
                 self._joins.send_leave(tree, at, name)
 
     def _leave(self, tree: Tree) -> None:
         if tree.upstream is not None and tree.upstream_name is not None:
-            tree.left.add(tree.upstream[0])
+            tree.former_ports.add(tree.upstream[0])
             self._joins.send_leave(tree, tree.upstream, tree.upstream_name)
         tree.upstream = tree.upstream_name = None
 

@@ -132,7 +132,7 @@ class NameCache:
                 for advertiser, location in known.items():
                     if location.expires_s < now_s + self._confirm_s < location.stale_until_s:
                         known[advertiser] = replace(location, expires_s=now_s + self._confirm_s)
-        self._look_ahead()
+        self._find_next()
 
     def expire(self, now_s: float) -> list[Location]:
         """Remove entries whose leases have ended; return the locations among them."""
@@ -143,14 +143,14 @@ class NameCache:
             self.remove(location.name, location.advertiser)
         for name in [name for name, until_s in self._negative.items() if until_s <= now_s]:
             del self._negative[name]
-        self._look_ahead()
+        self._find_next()
         return gone
 
     def next_expiry(self) -> float | None:
         """Return a monotonic second that is no later than the next expiry, or None."""
         return None if self._expire_at_s == float("inf") else self._expire_at_s
 
-    def _look_ahead(self) -> None:
+    def _find_next(self) -> None:
         ends = [self._ends_s(location) for known in self._locations.values() for location in known.values()]
         self._expire_at_s = min([*ends, *self._negative.values()], default=float("inf"))
 

@@ -70,7 +70,7 @@ class PathUpdates:
         self._unicast.refresh(now_s)
         self._multicast.reroute(now_s)
         self._rib_client.links_changed(now_s)
-        self._look_for_conflicts(now_s)
+        self._find_conflicts(now_s)
 
     def handle_timer(self, now_s: float, *, has_lost: bool) -> None:
         """Run the timers that are due.
@@ -89,7 +89,7 @@ class PathUpdates:
         if self._unicast.is_refreshing:
             self._unicast.refresh_more(now_s)
         if now_s >= self._conflicts_sought_s + _CONFLICTS_S:
-            self._look_for_conflicts(now_s)
+            self._find_conflicts(now_s)
 
     def get_timer(self) -> float | None:
         """Return the monotonic second of the next timer, or None."""
@@ -100,7 +100,7 @@ class PathUpdates:
             times.append(self._conflicts_sought_s + _CONFLICTS_S)
         return min((time for time in times if time is not None), default=None)
 
-    def _look_for_conflicts(self, now_s: float) -> None:
+    def _find_conflicts(self, now_s: float) -> None:
         """Drop RIBs with an older node's identity; notify nodes whose identity a younger node elsewhere copies."""
         self._conflicts_sought_s = now_s
         for neighbour in self._hello_protocol.all_up():

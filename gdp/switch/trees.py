@@ -107,7 +107,7 @@ class Tree:
     former_until_s: float = 0.0
     is_doubted: bool = False  # the evidence is invalid
     backup: tuple[Downstream, Name] | None = None  # the neighbour that received the request for a backup branch
-    left: set[int] = field(default_factory=set)  # ports that copies may still come from, until the tree has settled
+    former_ports: set[int] = field(default_factory=set)  # copies may still come from them, until all has settled
     protection: dict[Downstream, Downstream] = field(default_factory=dict)  # branch to the backup that replaces it
 
     @property
@@ -175,7 +175,7 @@ class Tree:
         """
         asked = [self.upstream] if self.upstream is not None else []
         asked += [each[0] for each in (self.former, self.backup) if each is not None]
-        return sides_of([*(port for port, _ in asked), *self.left])
+        return sides_of([*(port for port, _ in asked), *self.former_ports])
 
     def next_s(self) -> float:
         """Return when something is due: a renewal, or the end of a lease, an overlap or a backup's activity."""

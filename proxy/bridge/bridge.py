@@ -3,7 +3,7 @@
 I/O through endpoints and the participant. The loop that drives the bridge calls ``work`` after every step.
 
 Outgoing path: endpoint -> ``EndpointDispatcher.deliver`` -> flow -> ``Publisher.publish``.
-Incoming path: ``poll_messages`` -> the flow of the name -> ``Endpoint.publish``, ``call`` or ``answer``.
+Incoming path: ``poll_messages`` -> the flow of the name -> ``RosEndpoint.publish``, ``call`` or ``answer``.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from proxy.bridge.sent_stats import SentStats
 from proxy.bridge.status_topic import StatusTopic, open_status_topics
 from proxy.config.rule import Rule
 from proxy.config.status_topic import StatusTopicConfig
-from proxy.endpoints.core.endpoint import Endpoint, EndpointError, Event, Graph, GraphEntity, Role, proxy_node_name
+from proxy.endpoints.core.endpoint import EndpointError, Event, Graph, GraphEntity, Role, RosEndpoint, proxy_node_name
 
 __all__ = ["Bridge", "BridgeRules", "FlowChange"]
 
@@ -126,7 +126,7 @@ class Bridge:
         self,
         context: BridgeContext,
         config: BridgeRules,
-        endpoints: Sequence[Endpoint],
+        endpoints: Sequence[RosEndpoint],
         held: DelegationStore,
         *,
         look_s: float = 0.0,

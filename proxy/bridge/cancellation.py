@@ -12,7 +12,7 @@ from gdp.names import Name
 from gdp.service.serving import Asked, Serving
 from proxy.bridge.core.action_interface import RESULT
 from proxy.bridge.goal_calls import GoalCalls
-from proxy.endpoints.core.endpoint import Endpoint
+from proxy.endpoints.core.endpoint import RosEndpoint
 from proxy.wire.service import Stop
 
 __all__ = ["NO_FIELDS", "TRIGGER", "Cancellation"]
@@ -36,7 +36,7 @@ class Cancellation:
     def __init__(
         self,
         *,
-        endpoint: Endpoint,
+        endpoint: RosEndpoint,
         serving: Serving[bytes],
         goals: GoalCalls,
         servers: Sequence[int],

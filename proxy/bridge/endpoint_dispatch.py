@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from proxy.bridge.context import BridgeContext
-from proxy.endpoints.core.endpoint import Endpoint, EndpointError, Event, GraphChanged
+from proxy.endpoints.core.endpoint import EndpointError, Event, GraphChanged, RosEndpoint
 from proxy.serial.channel import Channel, Qos
 from proxy.serial.service import Service
 
@@ -25,7 +25,7 @@ class EventHandler(Protocol):
 class EndpointDispatcher:
     """Endpoint with the owners of its handles."""
 
-    def __init__(self, endpoint: Endpoint) -> None:
+    def __init__(self, endpoint: RosEndpoint) -> None:
         self.endpoint = endpoint
         self._owners: dict[int, tuple[str, EventHandler]] = {}  # with the local name
         self._faulted: list[EndpointError] = []
@@ -49,19 +49,19 @@ class EndpointDispatcher:
             self._deliver(event, context, now_s)
 
     def subscribe(self, owner: EventHandler, topic: str, type_name: str, qos: Qos | None) -> int:
-        """Subscribe to a topic, as ``Endpoint.subscribe``."""
+        """Subscribe to a topic, as ``RosEndpoint.subscribe``."""
         return self._own(self.endpoint.subscribe(topic, type_name, qos), topic, owner)
 
     def advertise(self, owner: EventHandler, channel: Channel) -> int:
-        """Create a publisher, as ``Endpoint.advertise``."""
+        """Create a publisher, as ``RosEndpoint.advertise``."""
         return self._own(self.endpoint.advertise(channel), channel.topic, owner)
 
     def serve(self, owner: EventHandler, service: Service) -> int:
-        """Create a server, as ``Endpoint.serve``."""
+        """Create a server, as ``RosEndpoint.serve``."""
         return self._own(self.endpoint.serve(service), service.name, owner)
 
     def create_client(self, owner: EventHandler, name: str, type_name: str) -> int:
-        """Create a client, as ``Endpoint.create_client``."""
+        """Create a client, as ``RosEndpoint.create_client``."""
         return self._own(self.endpoint.create_client(name, type_name), name, owner)
 
     def close(self, handle: int) -> None:

@@ -13,7 +13,7 @@ from functools import partial
 from typing import Final
 
 from gdp.token_bucket import TokenBucket
-from proxy.endpoints.core.endpoint import Endpoint
+from proxy.endpoints.core.endpoint import RosEndpoint
 
 __all__ = ["LocalResponses"]
 
@@ -34,7 +34,7 @@ class LocalResponses:
         last_s: monotonic second at which ``flush`` last passed on a response; minus infinity: it did not yet.
     """
 
-    def __init__(self, endpoint: Endpoint, *, is_paced: bool) -> None:
+    def __init__(self, endpoint: RosEndpoint, *, is_paced: bool) -> None:
         self._endpoint = endpoint
         self._is_paced = is_paced
         self._waiting: deque[Callable[[], None]] = deque()

@@ -14,13 +14,13 @@ from dataclasses import replace
 from gdp.errors import LocalError
 from gdp.ports.readiness import readable
 from proxy.check.suggestion import Offered, Traffic
-from proxy.endpoints.core.endpoint import Endpoint, Graph, MessageReceived, Role
+from proxy.endpoints.core.endpoint import Graph, MessageReceived, Role, RosEndpoint
 from proxy.endpoints.core.qos import request
 
 __all__ = ["measured"]
 
 
-def measured(endpoint: Endpoint, graph: Graph, offered: Sequence[Offered], seconds: float) -> list[Offered]:
+def measured(endpoint: RosEndpoint, graph: Graph, offered: Sequence[Offered], seconds: float) -> list[Offered]:
     """Return the same names, topics with their traffic; a topic whose type is unknown here has none."""
     handles = dict[int, int]()
     counted = dict[int, list[int]]()

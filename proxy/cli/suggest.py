@@ -21,7 +21,7 @@ from proxy.check.graph_snapshot import LOOK_S
 from proxy.check.suggestion import Offered, offered_names, suggested_file
 from proxy.check.traffic import measured
 from proxy.config.graph import RosGraphConfig
-from proxy.endpoints.core.endpoint import Endpoint, Graph, proxy_node_name
+from proxy.endpoints.core.endpoint import Graph, RosEndpoint, proxy_node_name
 from proxy.endpoints.live import open_endpoint
 from proxy.printable import printable
 
@@ -58,7 +58,7 @@ def suggest(directory: Path) -> Path:
     return path
 
 
-def _observed(endpoint: Endpoint) -> Graph:
+def _observed(endpoint: RosEndpoint) -> Graph:
     end_s = time.monotonic() + LOOK_S
     while (rest_s := end_s - time.monotonic()) > 0:
         readable([endpoint], rest_s)

@@ -9,12 +9,12 @@ import contextlib
 from collections.abc import Iterator, Sequence
 
 from proxy.config.graph import RosGraphConfig
-from proxy.endpoints.core.endpoint import Endpoint
+from proxy.endpoints.core.endpoint import RosEndpoint
 
 __all__ = ["open_endpoint", "open_endpoints"]
 
 
-def open_endpoint(end: RosGraphConfig, node: str) -> Endpoint:
+def open_endpoint(end: RosGraphConfig, node: str) -> RosEndpoint:
     """Join a graph as a node of this name.
 
     Raises:
@@ -34,10 +34,10 @@ def open_endpoint(end: RosGraphConfig, node: str) -> Endpoint:
 
 
 @contextlib.contextmanager
-def open_endpoints(ends: Sequence[RosGraphConfig], node: str) -> Iterator[list[Endpoint]]:
+def open_endpoints(ends: Sequence[RosGraphConfig], node: str) -> Iterator[list[RosEndpoint]]:
     """Join all graphs; leave them on leaving."""
     with contextlib.ExitStack() as stack:
-        opened = list[Endpoint]()
+        opened = list[RosEndpoint]()
         for end in ends:
             opened.append(open_endpoint(end, node))
             stack.callback(opened[-1].shut_down)

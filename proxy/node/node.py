@@ -32,7 +32,7 @@ from gdp.nodes.credentials import Credentials, watched_folders
 from gdp.nodes.decision_log import log_decisions
 from gdp.nodes.delegation_store import DelegationStore
 from gdp.nodes.membership import fresh_bytes, incarnation, load_member, wall_clock_ms
-from gdp.nodes.node_log import LOOK_S, NodeLog, OnWait
+from gdp.nodes.node_log import RECONCILE_PERIOD_S, NodeLog, OnWait
 from gdp.nodes.port_rows import port_rows
 from gdp.nodes.revocation_upkeep import load_revocations
 from gdp.nodes.rights import confine_proxy
@@ -273,11 +273,11 @@ def run_node(config: ProxyConfig, on_wait: OnWait | None = None) -> Iterator[Pro
             local_name=_local_names(config),
             on_wait=on_wait,
         )
-        runtime.every(LOOK_S, node_log.log_changes)
+        runtime.every(RECONCILE_PERIOD_S, node_log.log_changes)
         links = LinkRows(member.attachment.hello_protocol, plane.ports)
-        runtime.every(LOOK_S, links.refresh)
+        runtime.every(RECONCILE_PERIOD_S, links.refresh)
         credentials = Credentials(config.identity, config.domain, identity, policy)
-        runtime.every(LOOK_S, credentials.reload_changed)
+        runtime.every(RECONCILE_PERIOD_S, credentials.reload_changed)
         node = ProxyNode(
             identity=identity,
             policy=policy,

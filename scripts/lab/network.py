@@ -267,7 +267,7 @@ class SimNetwork:
     def _settle(self, name: str) -> None:
         node = self._nodes[name]
         while transmits := node.machine.frames_to_send(self._now_s):
-            node.machine.frames_leave(self._now_s)
+            node.machine.frames_sent(self._now_s)
             for transmit in transmits:
                 self._transmit(node, transmit)
         self._arm(name)

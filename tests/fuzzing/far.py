@@ -29,7 +29,7 @@ from proxy.bridge.imported_topic import ImportedTopic
 from proxy.bridge.remote_clients import RemoteClients
 from proxy.config.rule import Rule
 from proxy.doors.rosbridge_json import RosbridgeCodec
-from proxy.endpoints.core.endpoint import Endpoint
+from proxy.endpoints.core.endpoint import RosEndpoint
 from proxy.reduce.compression import BodyCompressor
 from proxy.serial.channel import Channel, Qos
 from proxy.serial.empty import NoAnswer
@@ -140,7 +140,7 @@ def _receive(data: bytes) -> object:
         member = SimpleNamespace(losses_of=lambda _: Losses())
         rule = SimpleNamespace(name="/t", max_hz=None, max_bytes=1 << 20, wants_latched=None)
         context = BridgeContext(cast(Participant, member), Traffic(), _Quiet(), boundary=_Reraising())
-        dispatcher = EndpointDispatcher(cast(Endpoint, _Endpoint(is_live=is_live)))
+        dispatcher = EndpointDispatcher(cast(RosEndpoint, _Endpoint(is_live=is_live)))
         flow_spec = FlowSpec(False, "/t", _type_of(described), _NAME, cast(Rule, rule))
         flow = ImportedTopic(context, dispatcher, flow_spec, cast(Topic, SimpleNamespace(name=_NAME)))
         for number in range(2):
@@ -163,7 +163,7 @@ def _serve(data: bytes) -> object:
     description = _packed({**described, **parts})
     assert isinstance(description, bytes)
     interface = ActionInterface.of("service", "/t", "a/srv/S")
-    endpoint = cast(Endpoint, _Endpoint(is_live=True))
+    endpoint = cast(RosEndpoint, _Endpoint(is_live=True))
     server = RemoteServer.set_description(1, description, interface, endpoint, "json")
     assert server.ours is not None
     empty = [NoAnswer.of(each) for each in server.ours.services]

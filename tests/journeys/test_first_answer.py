@@ -40,10 +40,10 @@ class Stalled:
         self._member = member
         self.add_port, self.port_changed = member.add_port, member.port_changed
         self.count_arrivals, self.poll_neighbours = member.count_arrivals, member.poll_neighbours
-        self.handle_timer, self.get_timer, self.frames_leave = (
+        self.handle_timer, self.get_timer, self.frames_sent = (
             member.handle_timer,
             member.get_timer,
-            member.frames_leave,
+            member.frames_sent,
         )
 
     def receive(self, arrivals: Sequence[ReceivedFrame], now: Timestamps) -> None:

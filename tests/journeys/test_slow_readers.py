@@ -76,8 +76,8 @@ class Behind:
     def frames_to_send(self, now_s: float) -> list[OutgoingFrames]:
         return self._member.frames_to_send(now_s)
 
-    def frames_leave(self, now_s: float) -> None:
-        self._member.frames_leave(now_s)
+    def frames_sent(self, now_s: float) -> None:
+        self._member.frames_sent(now_s)
 
 
 def world_with_a_slow_one(frames_s: float) -> tuple[Simulation, Behind]:

@@ -16,7 +16,7 @@ from typing import Final
 
 from gdp.dashboard.core.readings import Reading, flag_of, items_of, map_of, number_of, rows_of, text_of
 
-__all__ = ["Graph", "Link", "NameEntry", "Node", "Replica", "merge_readings"]
+__all__ = ["Graph", "Link", "NameEntry", "Node", "ServerSeen", "merge_readings"]
 
 _SWITCHES: Final = frozenset(("switch", "leaf"))
 _ENDS: Final = {"publish": "publishers", "read": "readers", "serve": "servers", "call": "clients"}
@@ -101,7 +101,7 @@ class NameEntry:
 
 
 @dataclass(frozen=True, slots=True)
-class Replica:
+class ServerSeen:
     """One server of a name as one client sees it; ``first``: calls that it answered first."""
 
     name: str
@@ -119,7 +119,7 @@ class Graph:
     domains: dict[str, str] = field(default_factory=dict)
     links: dict[tuple[str, str], Link] = field(default_factory=dict)
     names: dict[str, NameEntry] = field(default_factory=dict)
-    replicas: list[Replica] = field(default_factory=list)
+    replicas: list[ServerSeen] = field(default_factory=list)
     drops: dict[tuple[str, str], float] = field(default_factory=dict)  # node and reason
     counts: dict[str, float] = field(default_factory=dict)
     clusters: list[Mapping[str, object]] = field(default_factory=list)
@@ -217,7 +217,7 @@ def _add_flows(graph: Graph, reading: Reading) -> None:
         entry.type, entry.kind = text_of(each, "type"), text_of(each, "kind") or entry.kind
         for server in items_of(each, "servers"):
             there, first = flag_of(server, "is_there"), number_of(server, "first")
-            graph.replicas.append(Replica(entry.id, reading.id, text_of(server, "id"), there, first))
+            graph.replicas.append(ServerSeen(entry.id, reading.id, text_of(server, "id"), there, first))
     for key, attribute in (("sent", "sent"), ("received", "received")):
         for name, value in map_of(reading.fields, key).items():
             if isinstance(value, Mapping) and name in graph.names:

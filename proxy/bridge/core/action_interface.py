@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from proxy.endpoints.core.endpoint import Endpoint, GraphEntity
+from proxy.endpoints.core.endpoint import GraphEntity, RosEndpoint
 from proxy.endpoints.core.qos import default
 from proxy.serial.serializer import Encoding
 from proxy.wire.service import Exchange
@@ -49,7 +49,7 @@ class ActionInterface:
         )
         return cls(services, topics)
 
-    def known(self, endpoint: Endpoint, encoding: Encoding) -> Exchange:
+    def known(self, endpoint: RosEndpoint, encoding: Encoding) -> Exchange:
         """Return the descriptions of all parts, as the endpoint's machine has them.
 
         Raises:

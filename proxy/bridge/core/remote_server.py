@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from gdp.errors import LocalError
 from proxy.bridge.core.action_interface import ActionInterface
 from proxy.bridge.core.decoder import MessageDecoder
-from proxy.endpoints.core.endpoint import Endpoint
+from proxy.endpoints.core.endpoint import RosEndpoint
 from proxy.serial.channel import Channel
 from proxy.serial.converter import translated_channel
 from proxy.serial.serializer import Encoding
@@ -39,7 +39,7 @@ class RemoteServer:
 
     @classmethod
     def set_description(
-        cls, incarnation: int, description: bytes, parts: ActionInterface, endpoint: Endpoint, encoding: Encoding
+        cls, incarnation: int, description: bytes, parts: ActionInterface, endpoint: RosEndpoint, encoding: Encoding
     ) -> RemoteServer:
         """Prepare the decoders of a server's responses.
 
@@ -81,7 +81,7 @@ class RemoteServer:
         return self.exchange is not None and self.exchange.is_leaving
 
 
-def _ours(theirs: Exchange, parts: ActionInterface, endpoint: Endpoint, encoding: Encoding) -> Exchange:
+def _ours(theirs: Exchange, parts: ActionInterface, endpoint: RosEndpoint, encoding: Encoding) -> Exchange:
     """Return this machine's description of the service, built from the remote definitions where it has none."""
     services = list[Service]()
     for (name, type_name), their in zip(parts.services, theirs.services, strict=True):

@@ -20,7 +20,6 @@ from proxy.serial.service import Service
 
 __all__ = [
     "CallFailed",
-    "Endpoint",
     "EndpointError",
     "Event",
     "Graph",
@@ -30,6 +29,7 @@ __all__ = [
     "RequestReceived",
     "ResponseReceived",
     "Role",
+    "RosEndpoint",
     "TypeResolved",
     "is_proxy_node",
     "proxy_node_name",
@@ -142,7 +142,7 @@ Event: TypeAlias = (
 )
 
 
-class Endpoint(Protocol):
+class RosEndpoint(Protocol):
     """One ROS graph, with this process in it as one virtual node; an unknown type raises ``LocalError``."""
 
     @property

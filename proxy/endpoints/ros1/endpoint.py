@@ -282,7 +282,7 @@ class Ros1Endpoint:
         if kind in (Kind.KNOWN, Kind.UNKNOWN):
             self._answers[number] = payload if kind is Kind.KNOWN else None
         elif kind is Kind.GRAPH:
-            self._look(payload)
+            self._receive_graph(payload)
         elif kind is Kind.LOST:
             self._lost = number
         elif kind is Kind.ENDING or (kind is Kind.FAULTED and not handle):
@@ -311,7 +311,7 @@ class Ros1Endpoint:
             except RemoteError as error:
                 self._events.append(EndpointError(handle, f"its publisher describes it badly: {error}"))
 
-    def _look(self, payload: bytes) -> None:
+    def _receive_graph(self, payload: bytes) -> None:
         ends = frozenset(
             GraphEntity(Role(role), name, type_name, node, node, hash=md5)
             for role, name, type_name, node, md5 in cbor2.loads(payload)

@@ -157,7 +157,7 @@ class WaitThread:
             if is_holding or now_s >= due_s:
                 self._post([event for source in client_entity for event in source.tend(now_s)])
             if now_s >= due_s:
-                self._look()
+                self._refresh_graph()
                 due_s = time.monotonic() + LOOK_EVERY_S
         wait_set.destroy_when_not_in_use()
         return due_s
@@ -172,7 +172,7 @@ class WaitThread:
             events.insert(0, TypeResolved(source.number, source.described))
         return events
 
-    def _look(self) -> None:
+    def _refresh_graph(self) -> None:
         try:
             has_changed = self._survey.refresh()
         except RuntimeError as error:

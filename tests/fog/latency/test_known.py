@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fog.latency.config import Endpoint, LatencyConfig
+from fog.latency.config import LatencyConfig, ProbeEndpoint
 from fog.latency.known import Latencies
 from fog.latency.probe import Probed
 
@@ -21,7 +21,7 @@ class Probes:
         self.answers = answers
         self.asked: list[str] = []
 
-    def __call__(self, endpoints: Mapping[str, Endpoint], timeout_s: float) -> dict[str, Probed]:
+    def __call__(self, endpoints: Mapping[str, ProbeEndpoint], timeout_s: float) -> dict[str, Probed]:
         del timeout_s
         self.asked += [f"{region} {endpoint.to_text()}" for region, endpoint in endpoints.items()]
         return {region: self.answers[region] for region in endpoints}
@@ -80,5 +80,5 @@ def test_a_cache_that_cannot_be_read_is_an_empty_one(tmp_path: Path, probes: Pro
 
 def test_every_region_of_aws_has_an_endpoint_unless_others_are_stated() -> None:
     found = LatencyConfig().for_aws().endpoint("eu-west-1")
-    assert found == Endpoint("tcp", "ec2.eu-west-1.amazonaws.com", 443)
+    assert found == ProbeEndpoint("tcp", "ec2.eu-west-1.amazonaws.com", 443)
     assert CONFIG.for_aws() == CONFIG

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from fog.latency.config import Endpoint
+from fog.latency.config import ProbeEndpoint
 from fog.latency.probe import TRIES, probe, probe_all
 
 
@@ -40,7 +40,7 @@ def closed_port(kind: socket.SocketKind) -> int:
 
 def test_a_connect_is_timed() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
-        found = probe(Endpoint("tcp", "127.0.0.1", server.getsockname()[1]), 10.0)
+        found = probe(ProbeEndpoint("tcp", "127.0.0.1", server.getsockname()[1]), 10.0)
     assert found.ms is not None
     assert found.ms > 0
 
@@ -48,7 +48,7 @@ def test_a_connect_is_timed() -> None:
 @pytest.mark.parametrize("lies_first", [False, True])
 def test_an_echo_is_timed_and_only_our_own_datagram_counts(lies_first: bool) -> None:
     with echo(lies_first=lies_first) as port:
-        found = probe(Endpoint("udp", "127.0.0.1", port), 10.0)
+        found = probe(ProbeEndpoint("udp", "127.0.0.1", port), 10.0)
     assert found.ms is not None
     assert found.ms > 0
 
@@ -58,9 +58,9 @@ def test_an_endpoint_that_does_not_answer_is_unknown_and_says_why() -> None:
         mute.bind(("127.0.0.1", 0))
         found = probe_all(
             {
-                "refuses": Endpoint("tcp", "127.0.0.1", closed_port(socket.SOCK_STREAM)),
-                "refuses too": Endpoint("udp", "127.0.0.1", closed_port(socket.SOCK_DGRAM)),
-                "silent": Endpoint("udp", "127.0.0.1", mute.getsockname()[1]),
+                "refuses": ProbeEndpoint("tcp", "127.0.0.1", closed_port(socket.SOCK_STREAM)),
+                "refuses too": ProbeEndpoint("udp", "127.0.0.1", closed_port(socket.SOCK_DGRAM)),
+                "silent": ProbeEndpoint("udp", "127.0.0.1", mute.getsockname()[1]),
             },
             0.05,
         )
@@ -74,17 +74,17 @@ def test_an_endpoint_that_does_not_answer_is_unknown_and_says_why() -> None:
 @pytest.mark.parametrize(
     ("text", "endpoint"),
     [
-        ("127.0.0.1:80", Endpoint("tcp", "127.0.0.1", 80)),
-        ("udp://[::1]:7", Endpoint("udp", "::1", 7)),
-        ("tcp://a.example:443", Endpoint("tcp", "a.example", 443)),
+        ("127.0.0.1:80", ProbeEndpoint("tcp", "127.0.0.1", 80)),
+        ("udp://[::1]:7", ProbeEndpoint("udp", "::1", 7)),
+        ("tcp://a.example:443", ProbeEndpoint("tcp", "a.example", 443)),
     ],
 )
-def test_the_forms_of_an_endpoint_are_read(text: str, endpoint: Endpoint) -> None:
-    assert Endpoint.from_text(text) == endpoint
-    assert Endpoint.from_text(endpoint.to_text()) == endpoint
+def test_the_forms_of_an_endpoint_are_read(text: str, endpoint: ProbeEndpoint) -> None:
+    assert ProbeEndpoint.from_text(text) == endpoint
+    assert ProbeEndpoint.from_text(endpoint.to_text()) == endpoint
 
 
 @pytest.mark.parametrize("text", ["", "host", "host:0", "host:65536", "icmp://host:1", "ho st:1"])
 def test_what_is_no_endpoint_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="expected HOST:PORT"):
-        Endpoint.from_text(text)
+        ProbeEndpoint.from_text(text)

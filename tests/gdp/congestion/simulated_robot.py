@@ -235,7 +235,7 @@ class SimulatedRobot:
         self._turns.resume()
 
     def _transmit(self, frames: list[bytes]) -> None:
-        self._paths.frames_leave(self.now_s)
+        self._paths.frames_sent(self.now_s)
         self.at(self._switched_s("near switch"), lambda: self._forward(frames))
 
     def _forward(self, frames: list[bytes]) -> None:

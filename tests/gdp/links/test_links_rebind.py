@@ -17,7 +17,7 @@ from gdp.control.tunnel_plan import REBIND_MAX_S, REBIND_S, TunnelId
 from gdp.crypto.identity import Identity
 from gdp.crypto.tunnel_key import TunnelKey
 from gdp.links import tunnels as tunnels_module
-from gdp.links.links import LINKS_LOOK_S, TunnelLinks
+from gdp.links.links import LINKS_PERIOD_S, TunnelLinks
 from gdp.names import Name
 from gdp.switch.core import SwitchCore
 from gdp.switch.table import Table
@@ -75,9 +75,9 @@ class Robot:
         """Let time pass with these neighbours up; return how often each uplink took another port."""
         before = self.rebinds()
         self.up = {each.name for each in up}
-        for _ in range(round(duration_s / LINKS_LOOK_S)):
-            self.now_s += LINKS_LOOK_S
-            self.links.look(at(self.now_s))
+        for _ in range(round(duration_s / LINKS_PERIOD_S)):
+            self.now_s += LINKS_PERIOD_S
+            self.links.handle_timer(at(self.now_s))
         return [now - then for now, then in zip(self.rebinds(), before, strict=True)]
 
     def rebinds(self) -> list[int]:

@@ -92,7 +92,7 @@ class Bed:
         """Look so often, ten times a second; return how often states were read."""
         before = self.device.reads
         for number in range(count):
-            self.tunnels.look(at(number * LOOK_S))
+            self.tunnels.handle_timer(at(number * LOOK_S))
         return self.device.reads - before
 
 

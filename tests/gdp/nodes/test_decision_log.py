@@ -23,12 +23,12 @@ def test_routes_are_logged_when_they_change_with_device_names(caplog: pytest.Log
     table = Table()
     decisions = DecisionLog(_PORTS, [], table)
     table.install(_NAME, ((3, bytes(12)),), 10.0)
-    decisions.look(_NOW)
-    decisions.look(_NOW)
+    decisions.log_changes(_NOW)
+    decisions.log_changes(_NOW)
     table.install(_NAME, (), 10.0)
-    decisions.look(_NOW)
+    decisions.log_changes(_NOW)
     table.remove(_NAME)
-    decisions.look(_NOW)
+    decisions.log_changes(_NOW)
     short = Name(_NAME).short
     assert caplog.messages == [
         f"route set destination={short} source=any to=eth0",
@@ -41,8 +41,8 @@ def test_drops_are_logged_by_reason_when_there_are_more(caplog: pytest.LogCaptur
     caplog.set_level(logging.DEBUG)
     counts = [0] * len(DropReason)
     decisions = DecisionLog({}, [lambda: counts, lambda: counts])
-    decisions.look(_NOW)
+    decisions.log_changes(_NOW)
     counts[DropReason.WRONG_DOMAIN] = 2
-    decisions.look(_NOW)
-    decisions.look(_NOW)
+    decisions.log_changes(_NOW)
+    decisions.log_changes(_NOW)
     assert caplog.messages == ["dropped reason=wrong-domain frames=4 total=4"]

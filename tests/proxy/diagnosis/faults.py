@@ -579,8 +579,8 @@ class ClockAhead:
     def frames_to_send(self, now_s: float) -> list[OutgoingFrames]:
         return self._core.frames_to_send(now_s)
 
-    def frames_leave(self, now_s: float) -> None:
-        self._core.frames_leave(now_s)
+    def frames_sent(self, now_s: float) -> None:
+        self._core.frames_sent(now_s)
 
     def count_arrivals(self, frames_from: Callable[[int], int]) -> None:
         self._core.count_arrivals(frames_from)

@@ -49,7 +49,7 @@ class Talker:
         out, self.out = self.out, []
         return out
 
-    def frames_leave(self, now_s: float) -> None:
+    def frames_sent(self, now_s: float) -> None:
         pass
 
     def say(self, *frames: bytes) -> None:
