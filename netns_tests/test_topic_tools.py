@@ -24,11 +24,11 @@ if shutil.which("nsenter") is None or shutil.which("setpriv") is None:
 
 pytestmark = [pytest.mark.netns, pytest.mark.momentary("about tools, no lease matters")]
 
-STRING, SET_BOOL = "std_msgs/msg/String", "std_srvs/srv/SetBool"
-TYPES: Final = {"/chat": STRING, "/lamp": SET_BOOL, "/secret": STRING}
+STRING, SET_BOOL, TRIGGER = "std_msgs/msg/String", "std_srvs/srv/SetBool", "std_srvs/srv/Trigger"
+TYPES: Final = {"/chat": STRING, "/lamp": SET_BOOL, "/go": TRIGGER, "/secret": STRING}
 RIGHTS: Final = {
-    "robot": {"/chat": [Right.PUBLISH], "/secret": [Right.PUBLISH], "/lamp": [Right.SERVE]},
-    "viewer": {"/chat": [Right.READ], "/lamp": [Right.CALL]},
+    "robot": {"/chat": [Right.PUBLISH], "/secret": [Right.PUBLISH], "/lamp": [Right.SERVE], "/go": [Right.SERVE]},
+    "viewer": {"/chat": [Right.READ], "/lamp": [Right.CALL], "/go": [Right.CALL]},
 }
 DOMAIN: Final = 77
 HZ: Final = 20
@@ -37,13 +37,17 @@ ENVIRONMENT: Final = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "FASTDDS_BUILTI
 ROBOT: Final = f"""
 import rclpy
 from std_msgs.msg import String
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 rclpy.init(domain_id={DOMAIN})
 node = rclpy.create_node("robot")
 def answer(request, response):
     response.success, response.message = request.data, "lamp"
     return response
+def go(request, response):
+    response.success, response.message = True, "gone"
+    return response
 node.create_service(SetBool, "/lamp", answer)
+node.create_service(Trigger, "/go", go)
 publishers = [node.create_publisher(String, topic, 10) for topic in ("/chat", "/secret")]
 count = 0
 def tick():
@@ -184,6 +188,12 @@ def test_a_service_is_called_and_states_its_replica(lab: SessionLab) -> None:
     (answer,) = rows(out)
     assert answer["response"] == {"success": True, "message": "lamp"}
     assert answer["server"] == json.loads(gdp(lab, "status", "robot", "--json")[1])["name"]
+
+
+def test_a_service_whose_request_has_no_fields_is_called(lab: SessionLab) -> None:
+    code, out, errors = gdp(lab, "service", "call", "/go", TRIGGER, "{}", "--node", "viewer", "--json")
+    assert (code, errors) == (0, "")
+    assert rows(out)[0]["response"] == {"success": True, "message": "gone"}
 
 
 def test_a_call_that_cannot_be_made_says_why(lab: SessionLab) -> None:

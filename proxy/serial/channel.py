@@ -14,11 +14,12 @@ from gdp.errors import DropReason, LocalError, RemoteError
 from proxy.serial.cbor_bounds import check_bounds
 from proxy.serial.schema import DEFINITION_MAX_BYTES, definition_bytes
 
-__all__ = ["NEVER", "Channel", "DefinitionFormat", "Qos", "RosVersion"]
+__all__ = ["EMPTY_MD5", "NEVER", "Channel", "DefinitionFormat", "Qos", "RosVersion", "ros1_format"]
 
 RosVersion: TypeAlias = Literal[1, 2]
 DefinitionFormat: TypeAlias = Literal["msg", "idl", ""]
 
+EMPTY_MD5: Final = "d41d8cd98f00b204e9800998ecf8427e"  # of a ROS 1 type without fields and constants
 NEVER: Final = (9_223_372_036, 854_775_807)  # ROS 2's form of an infinite duration
 _ITEMS_MAX: Final = 4_096
 CHANNEL_MAX_BYTES: Final = 128 << 10
@@ -49,7 +50,8 @@ class Channel:
     Args:
         type_name: as ROS 2 writes it (``sensor_msgs/msg/Image``), for ROS 1 too.
         hash: md5 sum for ROS 1, ``RIHS01_...`` for ROS 2; empty where unknown.
-        definition: full text, used types included; empty where unknown, or for a type without fields.
+        definition: full text, used types included; empty for a type without fields.
+        definition_format: of ``definition``; empty where the definition is unknown.
         qos: offered profiles, ROS 2 only.
         latched: late joiners get the last message.
         callerid: the publishing node, ROS 1 only, where known.
@@ -127,6 +129,11 @@ class Channel:
             latched=_flag(fields.get("l")),
             callerid=None if callerid is None else _text(callerid),
         )
+
+
+def ros1_format(text: str, md5: str) -> DefinitionFormat:
+    """Return the format of a ROS 1 definition: an empty text is one where the md5 sum says that there are no fields."""
+    return "msg" if text or md5 == EMPTY_MD5 else ""
 
 
 def _qos(fields: object) -> Qos:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import Final
 
 from proxy.endpoints.core.endpoint import Graph, Role
-from proxy.serial.channel import Channel, RosVersion
+from proxy.serial.channel import EMPTY_MD5, Channel, RosVersion
 
 __all__ = ["SIGN", "BridgeElection", "presence_of", "sign"]
 
@@ -56,8 +56,7 @@ def presence_of(service: str) -> str:
 
 def sign(topic: str, ros: RosVersion) -> Channel:
     """Return the channel of a presence topic; nothing is ever published on it."""
-    md5 = "d41d8cd98f00b204e9800998ecf8427e" if ros == 1 else ""  # of an empty text: the message has no fields
-    return Channel(topic, _EMPTY, ros, hash=md5)
+    return Channel(topic, _EMPTY, ros, hash=EMPTY_MD5 if ros == 1 else "")
 
 
 def _short(node: str) -> str:

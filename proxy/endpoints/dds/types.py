@@ -19,16 +19,14 @@ def known_channel(topic: str, type_name: str) -> Channel | None:
     text = standard_definition(type_name)
     if text is None:
         return None
-    return Channel(
-        topic, type_name, 2, hash=_hash(type_name, text), definition=text, definition_format="msg" if text else ""
-    )
+    return Channel(topic, type_name, 2, hash=_hash(type_name, text), definition=text, definition_format="msg")
 
 
 def hash_of(channel: Channel) -> str:
     """Return the ROS 2 type hash of a channel: its own, or that of its definition; empty where it cannot be derived."""
     if channel.hash.startswith("RIHS01_"):
         return channel.hash
-    if channel.definition:
+    if channel.definition_format:
         return type_hash(channel.type_name, channel.definition, channel.definition_format)
     known = known_channel(channel.topic, channel.type_name)
     return known.hash if known is not None else ""

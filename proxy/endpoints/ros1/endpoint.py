@@ -141,7 +141,7 @@ class Ros1Endpoint:
 
     def advertise(self, channel: Channel) -> int:
         """Create a publisher; if a local node contradicts, ``EndpointError`` follows."""
-        if channel.ros != 1 or not (channel.hash or channel.definition):
+        if channel.ros != 1 or not (channel.hash or channel.definition_format):
             here = self.channel(channel.topic, channel.type_name)
             channel = replace(here, qos=channel.qos, latched=channel.latched, callerid=channel.callerid)
         depth = max(1, channel.qos[0].depth) if channel.qos else 1

@@ -38,7 +38,7 @@ from proxy.endpoints.ros1.raw import (
 )
 from proxy.endpoints.ros1.services import Client, Server, tickets
 from proxy.endpoints.ros1.topics import Publisher, Subscriber
-from proxy.serial.channel import Channel
+from proxy.serial.channel import Channel, ros1_format
 from proxy.serial.service import Service
 
 __all__ = ["Node"]
@@ -326,7 +326,7 @@ def _to_others(connect: Callable[[object, str, str], _Connected]) -> Callable[[o
 
 
 def _channel(topic: str, type_name: str, md5: str, text: str) -> Channel:
-    return Channel(topic, type_name, 1, hash=md5, definition=text, definition_format="msg" if text else "")
+    return Channel(topic, type_name, 1, hash=md5, definition=text, definition_format=ros1_format(text, md5))
 
 
 def _end(end: LocalEnd) -> list[str]:

@@ -19,7 +19,7 @@ from rospy.impl.registration import get_topic_manager
 from proxy.endpoints.core.endpoint import is_proxy_node
 from proxy.endpoints.ros1.ipc import IpcLink, Kind
 from proxy.endpoints.ros1.raw import KnownMessage, Raw, raw_class, ros2_name
-from proxy.serial.channel import Channel
+from proxy.serial.channel import Channel, ros1_format
 
 __all__ = ["Publisher", "Subscriber"]
 
@@ -109,7 +109,7 @@ class Subscriber:
             ros=1,
             hash=self._type[1],
             definition=text,
-            definition_format="msg" if text else "",
+            definition_format=ros1_format(text, self._type[1]),
             latched=any(header.get("latching") == "1" for header in headers),
             callerid=headers[0].get("callerid") if len(headers) == 1 else None,
         )

@@ -51,9 +51,7 @@ def channel_of(topic: str, type_name: str) -> Channel:
     """Return the local description of a topic's type, without any QoS."""
     interface = interface_of(type_name, class_of)
     text = definition_of(interface)
-    return Channel(
-        topic, type_name, 2, hash=type_hash_of(interface), definition=text, definition_format="msg" if text else ""
-    )
+    return Channel(topic, type_name, 2, hash=type_hash_of(interface), definition=text, definition_format="msg")
 
 
 @lru_cache(maxsize=1024)

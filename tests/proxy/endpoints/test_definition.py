@@ -75,9 +75,9 @@ def test_both_halves_of_services_and_parts_of_actions_are_described() -> None:
     assert service.hash == hashes_of("test_msgs")["test_msgs/action/Fibonacci_SendGoal"]
 
 
-def test_a_type_without_fields_has_no_text_but_a_hash() -> None:
+def test_a_type_without_fields_has_a_definition_without_text_and_a_hash() -> None:
     channel = channel_of("/empty", "std_msgs/msg/Empty")
-    assert (channel.definition, channel.definition_format) == ("", "")
+    assert (channel.definition, channel.definition_format) == ("", "msg")
     assert channel.hash == hashes_of("std_msgs")["std_msgs/msg/Empty"]
 
 
