@@ -25,6 +25,7 @@ __all__ = [
     "is_name",
     "is_pattern",
     "matches",
+    "resolved",
 ]
 
 Kind: TypeAlias = Literal["topic", "service", "action"]
@@ -49,6 +50,11 @@ _VISIBLE: Final = f"(?!_){_ANY}"
 def is_name(text: str) -> bool:
     """Return whether the text is one full name, such as ``/camera/image``."""
     return len(text) <= NAME_MAX_CHARS and re.fullmatch(NAME_FORM, text) is not None
+
+
+def resolved(text: str) -> str:
+    """Return the full name of a name that is relative to the root namespace, as ROS resolves it; others are kept."""
+    return text if text.startswith(("/", "~")) else f"/{text}"
 
 
 def is_pattern(text: str) -> bool:

@@ -14,6 +14,7 @@ from typing import Final, TypeAlias
 import orjson
 
 from gdp.errors import DropReason, RemoteError
+from gdp.ros_names import resolved
 from proxy.serial.channel import Channel
 from proxy.serial.service import Service
 
@@ -284,7 +285,7 @@ def _parse_text(data: str) -> ClientMessage:
 def _client_channel(fields: dict[str, object]) -> ClientChannel:
     return ClientChannel(
         number=_u32(fields, "id"),
-        topic=_word(fields, "topic"),
+        topic=resolved(_word(fields, "topic")),
         encoding=_word(fields, "encoding"),
         type_name=_word(fields, "schemaName"),
         schema=_word(fields, "schema", _SCHEMA_MAX, is_optional=True),

@@ -1,6 +1,7 @@
 """Messages as rosbridge writes them in JSON: octets as base64, and null for a float that JSON cannot express.
 
-Sans-I/O. Source: the rosbridge v2 protocol, section 3 (data encoding), and the conventions of rosbridge_library.
+Sans-I/O. Source: the rosbridge v2 protocol, section 3 (data encoding); ``message_conversion.py`` of rosbridge_library:
+stamps also as ``secs`` and ``nsecs`` or ``"now"``, and a header without a stamp has the present time.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from proxy.serial.serializer import Codec, native_codec
 __all__ = ["RosbridgeCodec", "cbor_raw"]
 
 _NAN: Final = {"f": 0x7FC00000, "d": 0x7FF8000000000000}
+_TIME, _DURATION, _HEADER = "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration", "std_msgs/msg/Header"
+_SPELLINGS: Final = (("sec", "secs"), ("nanosec", "nsecs"))  # ROS 2's and ROS 1's
 _DUMMY: Final = "structure_needs_at_least_one_member"  # rosidl's field of an empty type
 
 
@@ -91,14 +94,17 @@ class RosbridgeCodec:
             tree.pop(_DUMMY, None)
         return orjson.dumps(tree, option=orjson.OPT_SERIALIZE_NUMPY)
 
-    def to_raw(self, tree: object) -> bytes:
+    def to_raw(self, tree: object, now_ns: int = 0) -> bytes:
         """Return the CDR of a client's message; fields that it leaves out are zero, empty or false.
+
+        Args:
+            now_ns: the present time, Unix nanoseconds: of ``"now"`` and of headers without a stamp.
 
         Raises:
             RemoteError: it does not fit the definition.
         """
         try:
-            return self._codec.to_raw(_filled(self._record, tree, self._name))
+            return self._codec.to_raw(_filled(self._record, tree, self._name, now_ns))
         except (ArithmeticError, LookupError, TypeError, ValueError, struct.error, RecursionError) as error:
             raise RemoteError(DropReason.MALFORMED, f"{self._name}: {error}"[:300]) from error
 
@@ -109,21 +115,38 @@ def cbor_raw(topic: str, stamp_ns: int, raw: bytes) -> bytes:
     return cbor2.dumps({"op": "publish", "topic": topic, "msg": {"secs": secs, "nsecs": nsecs, "bytes": raw}})
 
 
-def _filled(kind: Type, value: object, where: str) -> object:
+def _filled(kind: Type, value: object, where: str, now_ns: int) -> object:
     """Return a client's value with every field that it left out."""
     if isinstance(kind, Record):
+        value = _stamped(kind, value, now_ns)
         if not isinstance(value, dict):
             raise MisfitError(f"{where}: an object was expected")
         names = [name for name, _ in kind.fields]
         if unknown := sorted(str(key) for key in value.keys() - set(names)):
             raise MisfitError(f"{where}: there is no field {unknown[0]}; it has {', '.join(names)}")
         return {
-            name: _filled(field, value[name], f"{where}.{name}") if name in value else _zero(field)
+            name: _filled(field, value[name], f"{where}.{name}", now_ns) if name in value else _zero(field)
             for name, field in kind.fields
         }
     if isinstance(kind, Array | Sequence) and isinstance(kind.item, Record) and isinstance(value, list):
-        return [_filled(kind.item, each, f"{where}[{index}]") for index, each in enumerate(value)]
+        return [_filled(kind.item, each, f"{where}[{index}]", now_ns) for index, each in enumerate(value)]
     return value
+
+
+def _stamped(kind: Record, value: object, now_ns: int) -> object:
+    """Return a time, a duration or a header in ROS 2's form; anything else as it is."""
+    if kind.name == _TIME and value == "now":
+        return _time(now_ns)
+    if kind.name in (_TIME, _DURATION) and isinstance(value, dict):
+        return {two: value[two if two in value else one] for two, one in _SPELLINGS if two in value or one in value}
+    if kind.name == _HEADER and isinstance(value, dict):
+        return {"stamp": _time(now_ns)} | {name: each for name, each in value.items() if name != "seq"}
+    return value
+
+
+def _time(now_ns: int) -> dict[str, int]:
+    sec, nanosec = divmod(now_ns, 1_000_000_000)
+    return {"sec": sec, "nanosec": nanosec}
 
 
 def _zero(kind: Type) -> object:

@@ -6,6 +6,7 @@ answers what lists names and types.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
@@ -13,6 +14,7 @@ from typing import Final
 import orjson
 
 from gdp.errors import DropReason, GdpError, LocalError, RemoteError
+from gdp.ros_names import resolved
 from proxy.doors.client_queue import ClientQueue, Pending
 from proxy.doors.hub import Hub, Publication, TopicType
 from proxy.doors.rosbridge_json import RosbridgeCodec, cbor_raw
@@ -35,9 +37,10 @@ _ROSAPI: Final = "/rosapi/"
 
 @dataclass(slots=True)
 class _Subscription:
-    """What a client wants of one topic, by one or several ``subscribe`` with different ids."""
+    """What a client wants of one topic as it writes its name, by one or several ``subscribe`` with different ids."""
 
     key: int
+    topic: str  # its full name
     type_name: str  # empty: whatever is offered
     wishes: dict[str, tuple[float, int, str]] = field(default_factory=dict)  # by id: period, queue length, compression
     throttle: Throttle = field(default_factory=lambda: Throttle(0.0, 0))
@@ -62,6 +65,7 @@ class _Subscription:
 @dataclass(frozen=True, slots=True)
 class _Call:
     service: Service
+    name: str  # as the client writes it
     number: object  # the client's id, whatever it is
 
 
@@ -75,8 +79,9 @@ class RosbridgeSession:
         self._now_s = now_s
         self._level = _LEVELS.index("error")
         self._offered: dict[str, Publication] = {}  # by topic
-        self._subscriptions: dict[str, _Subscription] = {}  # by topic
-        self._topics: dict[int, str] = {}  # of keys
+        self._subscriptions: dict[str, _Subscription] = {}  # by the name that the client writes
+        self._names: dict[int, str] = {}  # that, of keys
+        self._readers: defaultdict[str, list[_Subscription]] = defaultdict(list)  # by topic
         self._published: dict[str, tuple[str, set[str]]] = {}  # topic to type and ids
         self._keys = 0
         self._calls = 0
@@ -120,10 +125,11 @@ class RosbridgeSession:
 
     def encode(self, pending: Pending) -> str | bytes:
         """Return ``publish`` with a message of a subscription; clients share the JSON of the latest message."""
-        topic = self._topics.get(pending.key, "")
-        subscription, publication = self._subscriptions.get(topic), self._offered.get(topic)
+        topic = self._names.get(pending.key, "")
+        subscription = self._subscriptions.get(topic)
         if subscription is not None and subscription.is_raw:
             return cbor_raw(topic, pending.stamp_ns, pending.raw)
+        publication = None if subscription is None else self._offered.get(subscription.topic)
         if publication is None:
             return _text(op="status", level="warning", msg=f"{topic}: withdrawn; a message was left out")
         try:
@@ -145,11 +151,11 @@ class RosbridgeSession:
 
     def reads(self) -> Iterable[TopicType]:
         """Return the topics of the subscriptions whose type is known."""
-        for topic, each in self._subscriptions.items():
-            offered = self._offered.get(topic)
+        for each in self._subscriptions.values():
+            offered = self._offered.get(each.topic)
             type_name = each.type_name or (offered.channel.type_name if offered is not None else "")
             if type_name:
-                yield topic, type_name
+                yield each.topic, type_name
 
     def publishes(self) -> Iterable[TopicType]:
         """Return the topics that the client advertised."""
@@ -164,7 +170,7 @@ class RosbridgeSession:
         """Note a topic; a subscription to it begins now."""
         topic = publication.channel.topic
         self._offered[topic] = publication
-        if topic in self._subscriptions:
+        if topic in self._readers:
             self._hub.update_graph()
 
     def remove_publication(self, publication: Publication) -> None:
@@ -174,9 +180,9 @@ class RosbridgeSession:
 
     def queue_message(self, publication: Publication, stamp_ns: int, raw: bytes) -> None:
         """Queue a message for the client's subscription."""
-        each = self._subscriptions.get(publication.channel.topic)
-        if each is not None and each.throttle.offer(stamp_ns, raw, self._now_s()):
-            self.queue.put(each.key, stamp_ns, raw, depth=each.queue_length)
+        for each in self._readers.get(publication.channel.topic, ()):
+            if each.throttle.offer(stamp_ns, raw, self._now_s()):
+                self.queue.put(each.key, stamp_ns, raw, depth=each.queue_length)
 
     def add_service(self, handle: int, service: Service) -> None:
         """Do nothing: clients name services when they call them."""
@@ -191,18 +197,19 @@ class RosbridgeSession:
             try:
                 body = _codec(context.service.response).to_json(raw)
             except GdpError as error:
-                self._respond(context.service.name, context.number, str(error), result=False)
+                self._respond(context.name, context.number, str(error), result=False)
                 return
-            self._respond(context.service.name, context.number, orjson.Fragment(body), result=True)
+            self._respond(context.name, context.number, orjson.Fragment(body), result=True)
 
     def pass_refusal(self, context: object, reason: str) -> None:
         """Send the reason of a failed call."""
         if isinstance(context, _Call):
             self._calls -= 1
-            self._respond(context.service.name, context.number, reason, result=False)
+            self._respond(context.name, context.number, reason, result=False)
 
     def _subscribe(self, fields: dict[str, object]) -> None:
-        topic, number = _word(fields, "topic"), str(fields.get("id", ""))
+        name, number = _word(fields, "topic"), str(fields.get("id", ""))
+        topic = resolved(name)
         type_name = _type(_word(fields, "type", is_optional=True), "msg")
         period_s = _number(fields, "throttle_rate", _PERIOD_MAX_MS) / 1e3
         queue_length = _number(fields, "queue_length", _QUEUE_MAX)
@@ -211,13 +218,14 @@ class RosbridgeSession:
             raise LocalError(f"subscribe {topic}: compression {compression} is not supported; use none or cbor-raw")
         if reason := self._hub.rights().may_read(topic, type_name):
             raise LocalError(f"subscribe {topic}: {reason}")
-        each = self._subscriptions.get(topic)
+        each = self._subscriptions.get(name)
         if each is None:
             if len(self._subscriptions) >= SUBSCRIPTIONS_MAX:
                 raise LocalError(f"subscribe {topic}: more than {SUBSCRIPTIONS_MAX} topics")
             self._keys += 1
-            each = self._subscriptions[topic] = _Subscription(self._keys, type_name)
-            self._topics[each.key] = topic
+            each = self._subscriptions[name] = _Subscription(self._keys, topic, type_name)
+            self._names[each.key] = name
+            self._readers[topic].append(each)
         is_new = not each.wishes
         if len(each.wishes) >= SUBSCRIPTIONS_MAX:
             raise LocalError(f"subscribe {topic}: more than {SUBSCRIPTIONS_MAX} ids")
@@ -229,10 +237,10 @@ class RosbridgeSession:
         self._hub.update_graph()
 
     def _unsubscribe(self, fields: dict[str, object]) -> None:
-        topic = _word(fields, "topic")
-        each = self._subscriptions.get(topic)
+        name = _word(fields, "topic")
+        each = self._subscriptions.get(name)
         if each is None:
-            raise LocalError(f"unsubscribe {topic}: it is not subscribed")
+            raise LocalError(f"unsubscribe {name}: it is not subscribed")
         if "id" in fields:
             each.wishes.pop(str(fields["id"]), None)
         else:
@@ -240,12 +248,15 @@ class RosbridgeSession:
         if each.wishes:
             each.merge()
             return
-        del self._subscriptions[topic], self._topics[each.key]
+        del self._subscriptions[name], self._names[each.key]
+        self._readers[each.topic].remove(each)
+        if not self._readers[each.topic]:
+            del self._readers[each.topic]
         self.queue.forget(each.key)
         self._hub.update_graph()
 
     def _advertise(self, fields: dict[str, object]) -> None:
-        topic, type_name = _word(fields, "topic"), _type(_word(fields, "type"), "msg")
+        topic, type_name = resolved(_word(fields, "topic")), _type(_word(fields, "type"), "msg")
         if reason := self._hub.rights().may_publish(topic, type_name):
             raise LocalError(f"advertise {topic}: {reason}")
         if len(self._published) >= SUBSCRIPTIONS_MAX:
@@ -255,7 +266,7 @@ class RosbridgeSession:
         self._hub.update_graph()
 
     def _unadvertise(self, fields: dict[str, object]) -> None:
-        topic = _word(fields, "topic")
+        topic = resolved(_word(fields, "topic"))
         if topic not in self._published:
             raise LocalError(f"unadvertise {topic}: it is not advertised")
         numbers = self._published[topic][1]
@@ -265,7 +276,7 @@ class RosbridgeSession:
             self._hub.update_graph()
 
     def _publish(self, fields: dict[str, object]) -> None:
-        topic = _word(fields, "topic")
+        topic = resolved(_word(fields, "topic"))
         if topic not in self._published:
             type_name = _type(_word(fields, "type", is_optional=True), "msg") or self._hub.rights().type_of(topic)
             self._advertise({"topic": topic, "type": type_name or "unknown"})
@@ -273,50 +284,50 @@ class RosbridgeSession:
         channel = self._hub.channel_of(topic, type_name)
         if channel is None:
             raise LocalError(f"publish {topic}: the definition of {type_name} is not known here")
-        raw = _codec(channel).to_raw(fields.get("msg", {}))
+        raw = _codec(channel).to_raw(fields.get("msg", {}), self._received_ns)
         self._hub.input(topic, type_name, self._received_ns, raw)
 
     def _call(self, fields: dict[str, object]) -> None:
         name, number = _word(fields, "service"), fields.get("id")
-        args = fields.get("args", {})
-        if name.startswith(_ROSAPI):
-            self._rosapi(name.removeprefix(_ROSAPI), number, args if isinstance(args, dict) else {})
+        full, args = resolved(name), fields.get("args", {})
+        if full.startswith(_ROSAPI):
+            self._rosapi(name, full.removeprefix(_ROSAPI), number, args if isinstance(args, dict) else {})
             return
-        handle = next((handle for handle, each in self._hub.services.items() if each.name == name), None)
+        handle = next((handle for handle, each in self._hub.services.items() if each.name == full), None)
         if handle is None or self._calls >= CALLS_MAX:
-            reason = self._hub.rights().may_call(name) or f"{name}: no server is reachable"
+            reason = self._hub.rights().may_call(full) or f"{name}: no server is reachable"
             reason = reason if handle is None else f"{name}: more than {CALLS_MAX} calls are under way"
             self._respond(name, number, reason, result=False)
             return
         service = self._hub.services[handle]
         try:
-            raw = _codec(service.request).to_raw(_named_arguments(service.request, args))
+            raw = _codec(service.request).to_raw(_named_arguments(service.request, args), self._received_ns)
         except GdpError as error:
             self._respond(name, number, str(error), result=False)
             return
         self._calls += 1
-        self._hub.request(self, handle, _Call(service, number), raw)
+        self._hub.request(self, handle, _Call(service, name, number), raw)
 
-    def _rosapi(self, name: str, number: object, args: dict[str, object]) -> None:
+    def _rosapi(self, name: str, query: str, number: object, args: dict[str, object]) -> None:
         """Answer what lists names and types."""
         topics = {topic: each.channel.type_name for topic, each in self._offered.items()}
         services = {each.name: each.type_name for each in self._hub.services.values()}
         wanted = str(args.get("type", ""))
         answers: Mapping[str, Mapping[str, object]] = {
             "topics": {"topics": [*topics], "types": [*topics.values()]},
-            "topic_type": {"type": topics.get(str(args.get("topic")), "")},
+            "topic_type": {"type": topics.get(resolved(str(args.get("topic"))), "")},
             "topics_for_type": {"topics": [topic for topic, each in topics.items() if each == _type(wanted, "msg")]},
             "services": {"services": [*services]},
-            "service_type": {"type": services.get(str(args.get("service")), "")},
+            "service_type": {"type": services.get(resolved(str(args.get("service"))), "")},
             "services_for_type": {
                 "services": [each for each, kind in services.items() if kind == _type(wanted, "srv")]
             },
         }
-        values = answers.get(name)
+        values = answers.get(query)
         if values is None:
-            self._respond(f"{_ROSAPI}{name}", number, f"{_ROSAPI}{name} is not offered by this door", result=False)
+            self._respond(name, number, f"{name} is not offered by this door", result=False)
         else:
-            self._respond(f"{_ROSAPI}{name}", number, values, result=True)
+            self._respond(name, number, values, result=True)
 
     def _set_level(self, fields: dict[str, object]) -> None:
         level = _word(fields, "level")

@@ -82,6 +82,43 @@ def test_fields_that_a_client_leaves_out_are_zero() -> None:
     assert message["header"] == {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
 
 
+POSE = known_channel("/pose", "geometry_msgs/msg/PoseStamped")
+
+
+@pytest.mark.parametrize(
+    ("header", "expected"),
+    [
+        ({"stamp": {"sec": 5, "nanosec": 6}}, (5, 6)),
+        ({"stamp": {"secs": 5, "nsecs": 6}, "seq": 9}, (5, 6)),
+        ({"stamp": {"sec": 5, "secs": 7, "nsecs": 6}}, (5, 6)),
+        ({"stamp": {"secs": 5}}, (5, 0)),
+        ({"stamp": {}}, (0, 0)),
+        ({"stamp": "now"}, (1_700_000_000, 250)),
+        ({}, (1_700_000_000, 250)),
+        (None, (0, 0)),
+    ],
+)
+def test_stamps_are_read_as_rosbridge_suite_reads_them(header: object, expected: tuple[int, int]) -> None:
+    codec = RosbridgeCodec(POSE)
+    message = json.loads(
+        codec.to_json(codec.to_raw({} if header is None else {"header": header}, 1_700_000_000 * 10**9 + 250))
+    )
+    assert tuple(message["header"]["stamp"].values()) == expected
+
+
+def test_durations_and_stamps_within_lists_are_read_in_either_spelling() -> None:
+    codec = RosbridgeCodec(known_channel("/plan", "trajectory_msgs/msg/JointTrajectory"))
+    sent = {"points": [{"time_from_start": {"secs": 1, "nsecs": 2}}, {"time_from_start": {"sec": 3}}]}
+    points = json.loads(codec.to_json(codec.to_raw(sent)))["points"]
+    assert [each["time_from_start"] for each in points] == [{"sec": 1, "nanosec": 2}, {"sec": 3, "nanosec": 0}]
+
+
+@pytest.mark.parametrize("stamp", ["then", "now ", 5, [], {"secs": "x"}, {"secs": 1 << 40}])
+def test_a_stamp_that_is_none_is_refused(stamp: object) -> None:
+    with pytest.raises(RemoteError):
+        RosbridgeCodec(POSE).to_raw({"header": {"stamp": stamp}})
+
+
 @pytest.mark.parametrize("tree", [[], {"z": 1}, {"x": "one"}, {"octets": "?"}, {"octets": [300]}, {"s": 5}, {"on": 2}])
 def test_a_message_that_does_not_fit_is_refused(tree: object) -> None:
     with pytest.raises(RemoteError, match=r"own_msgs/msg/Numbers"):
@@ -115,6 +152,42 @@ def test_a_subscription_gets_messages_by_name() -> None:
     assert site.heard() == [{"op": "publish", "topic": "/chat", "msg": {"data": "hello"}}]
     site.say(op="unsubscribe", topic="/chat")
     assert not site.hub.graph
+
+
+def test_names_are_relative_to_the_root_and_come_back_as_the_client_wrote_them() -> None:
+    site = Site()
+    site.hub.offer_topic(1, known_channel("/chat", known.STRING))
+    site.say(op="subscribe", topic="chat")
+    site.say(op="subscribe", topic="/chat")
+    assert {each.name for each in site.hub.graph} == {"/chat"}
+    site.hub.pass_message(1, 5, known.string("hello"))
+    assert sorted(str(each["topic"]) for each in site.heard()) == ["/chat", "chat"]
+    site.say(op="unsubscribe", topic="/chat")
+    site.hub.pass_message(1, 6, known.string("again"))
+    assert [each["topic"] for each in site.heard()] == ["chat"]
+    site.say(op="unsubscribe", topic="chat")
+    assert not site.hub.graph
+    site.say(op="advertise", topic="out", type="std_msgs/String")
+    assert {(each.role, each.name) for each in site.hub.graph} == {(Role.PUBLISHES, "/out")}
+    assert site.say(op="publish", topic="/out", msg={"data": "x"}) == []
+    site.say(op="unadvertise", topic="out")
+    assert not site.hub.graph
+
+
+def test_a_relative_name_of_a_service_is_called_and_answered_by_that_name() -> None:
+    site = Site()
+    site.hub.offer_topic(1, known_channel("/chat", known.STRING))
+    site.hub.offer_service(4, replace(known.services()[known.SET_BOOL], name="/switch"))
+    site.say(op="call_service", service="switch", args={"data": True})
+    request = site.events[-1]
+    assert isinstance(request, RequestReceived)
+    site.hub.pass_answer(request.ticket, known.switched("done"))
+    (heard,) = site.heard()
+    assert (heard["service"], heard["result"]) == ("switch", True)
+    (heard,) = site.say(op="call_service", service="rosapi/topics")
+    assert (heard["service"], heard["values"]) == ("rosapi/topics", {"topics": ["/chat"], "types": [known.STRING]})
+    (heard,) = site.say(op="call_service", service="rosapi/topic_type", args={"topic": "chat"})
+    assert heard["values"] == {"type": known.STRING}
 
 
 def test_a_subscription_may_come_before_its_topic() -> None:
