@@ -82,8 +82,9 @@ def replay(
     """Replay a recording's exposed topics onto the overlay with the recorded timing.
 
     Exit 1: a message of a reliable topic was too large, had no reader, or was not confirmed by each reader; this
-    includes latched topics. Also if the overlay refused a topic, or the recording exceeds its memory or time. Best
-    effort is sent without confirmation; what was dropped here, and what a reader lost, is stated at the end.
+    includes latched topics. Also if the overlay refused a topic, if the recording gives less than it announces, or
+    if it exceeds its memory or time. Best effort is sent without confirmation; what was dropped here, and what a
+    reader lost, is stated at the end.
     """
     del columns, version  # their callbacks have done all
     set_up_logging(verbose=verbose, level=log_level, form=log_format)
@@ -145,7 +146,7 @@ def _replay(
         unconfirmed = replay.unconfirmed()
         _report(reader, replay, unconfirmed, json=json)
         node.leave()
-    return is_whole and not (unconfirmed or refused or replay.too_large)
+    return is_whole and not (unconfirmed or refused or replay.too_large or reader.missing)
 
 
 def _report_progress(replay: Replay, total: int | None) -> None:
@@ -179,6 +180,7 @@ def _report(reader: BagReader, replay: Replay, unconfirmed: Sequence[Unconfirmed
             unconfirmed=[asdict(each) for each in unconfirmed],
             topics=_topic_fields(replay),
             unread=reader.unread or None,
+            missing=reader.missing,
         )
         return
     confirming = [each for each in replay.topics if each.publisher.confirms]
@@ -191,7 +193,7 @@ def _report(reader: BagReader, replay: Replay, unconfirmed: Sequence[Unconfirmed
     for stats in best_effort:
         typer.echo(f"  {stats.words()}")
     if reader.unread:
-        typer.echo(f"the recording could not be read to its end: {reader.unread}", err=True)
+        typer.echo(f"not all of the recording could be read: {reader.unread}", err=True)
     for each in unconfirmed:
         typer.echo(each.words(), err=True)
 

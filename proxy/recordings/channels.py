@@ -5,6 +5,7 @@ Sans-I/O.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from enum import Enum
 from typing import TypeVar
@@ -26,12 +27,13 @@ from rosbags.rosbag2.metadata import parse_qos
 from ruamel.yaml.error import YAMLError
 
 from gdp.errors import LocalError
+from gdp.ros_names import resolved
 from proxy.recordings.plain_yaml import load_plain
 from proxy.recordings.unpacking import SalvageError
 from proxy.serial.channel import Channel, DefinitionFormat, Qos
 from proxy.serial.standard_types import standard_definition, type_hash
 
-__all__ = ["from_connection", "from_ros2", "offered_qos", "to_qos"]
+__all__ = ["from_connection", "from_ros2", "offered_qos", "ros2_type", "to_qos"]
 
 _QOS_TEXT_MAX = 64 << 10
 
@@ -53,7 +55,7 @@ def from_connection(connection: Connection) -> Channel:
     definition_format = _FORMATS[connection.msgdef.format]
     if isinstance(extra, ConnectionExtRosbag1):
         return Channel(
-            topic=connection.topic,
+            topic=resolved(connection.topic),
             type_name=connection.msgtype,
             ros=1,
             hash=connection.digest,
@@ -82,7 +84,11 @@ def from_ros2(
     definition_format: DefinitionFormat,
     profiles: Sequence[RosbagsQos],
 ) -> Channel:
-    """Return a ROS 2 channel, with the standard definition and the hash filled in where the recording has none."""
+    """Return a ROS 2 channel, with the standard definition and the hash filled in where the recording has none.
+
+    The topic gets its full name, the type its name in ROS 2.
+    """
+    topic, type_name = resolved(topic), ros2_type(type_name)
     if not definition_format:
         standard = standard_definition(type_name)
         if standard is not None:
@@ -97,6 +103,16 @@ def from_ros2(
         qos=tuple(_from_qos(profile) for profile in profiles),
         latched=any(profile.durability is QosDurability.TRANSIENT_LOCAL for profile in profiles),
     )
+
+
+def ros2_type(name: str) -> str:
+    """Return a message type as ROS 2 writes it, where DDS (``a::msg::B``, ``a::msg::dds_::B_``) or ROS 1 wrote it."""
+    parts = re.split("::|/", name)
+    if "dds_" in parts:
+        parts = [part.removesuffix("_") for part in parts if part != "dds_"]
+    if len(parts) == 2:
+        parts.insert(1, "msg")
+    return "/".join(parts)
 
 
 def offered_qos(profiles: object) -> list[RosbagsQos]:

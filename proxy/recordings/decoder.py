@@ -8,9 +8,12 @@ in ``unread``.
 
 from __future__ import annotations
 
+import shutil
 import struct
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Final
@@ -29,7 +32,7 @@ from gdp.errors import ConfigError, LocalError
 from proxy.recordings import salvage_mcap, salvage_ros1, salvage_sqlite
 from proxy.recordings.channels import from_connection
 from proxy.recordings.plain_yaml import BoundedYaml, load_plain
-from proxy.recordings.source import JoinedSource, Message, Source, UnpackedSource
+from proxy.recordings.source import ZSTD, JoinedSource, Message, Source, UnpackedSource
 from proxy.recordings.sqlite_guard import guarded
 from proxy.recordings.unpacking import bound_rosbags, check_file
 from proxy.serial.channel import Channel
@@ -63,7 +66,7 @@ _FOREIGN: Final = (
     zstd.ZstdError,
 )
 _METADATA_MAX_BYTES: Final = 1 << 20
-_STORAGE: Final = ("*.mcap", "*.db3")
+_STORAGE: Final = ("*.mcap", "*.db3", "*.mcap.zstd", "*.db3.zstd")
 
 
 class BagDecoder:
@@ -82,17 +85,15 @@ class BagDecoder:
             self._source = _open(self.path)
         except _FOREIGN as error:
             raise ConfigError(str(self.path), "", f"cannot be read: {_reason(error)}") from error
-        try:
-            for channel in self._source.channels:
-                _check(self.path, channel)
-        except ConfigError:
-            self._source.close()
-            raise
+        checked = [_checked(channel) for channel in self._source.channels]
+        self._channels = [channel for channel, _ in checked]
+        self._opaque = [reason for _, reason in checked if reason]
+        self._missing: list[str] = []
 
     @property
     def channels(self) -> list[Channel]:
         """Return every topic of every publisher, in the recording's order."""
-        return self._source.channels
+        return self._channels
 
     @property
     def count(self) -> int:
@@ -102,7 +103,7 @@ class BagDecoder:
     @property
     def counts(self) -> list[int] | None:
         """Return the messages of each channel; None where the recording has no index with them."""
-        return self._source.counts if isinstance(self._source, _IndexedSource) else None
+        return self._source.counts
 
     @property
     def unread(self) -> str:
@@ -110,7 +111,7 @@ class BagDecoder:
 
         The text is final after ``messages``.
         """
-        return self._source.unread
+        return "; ".join(filter(None, (self._source.unread, *self._missing, *self._opaque)))
 
     def messages(self) -> Iterator[Message]:
         """Yield (channel index, stamp in ns, bytes) in time order; a file that ends early is no error.
@@ -118,10 +119,15 @@ class BagDecoder:
         Raises:
             ConfigError: there is not enough memory; ``MemoryError`` is its cause.
         """
+        given = 0
         try:
-            yield from self._source.messages()
+            for message in self._source.messages():
+                yield message
+                given += 1
         except MemoryError as error:
             raise ConfigError(str(self.path), "", f"cannot be read: {_reason(error)}") from error
+
+        self._missing = [] if given >= self.count else [f"{given} of {self.count} announced messages are given"]
 
     def close(self) -> None:
         """Close the files."""
@@ -136,14 +142,16 @@ class BagDecoder:
         self.close()
 
 
-def _check(path: Path, channel: Channel) -> None:
-    """Refuse a definition that cannot be read; an absent or unusual one only makes its messages opaque."""
+def _checked(channel: Channel) -> tuple[Channel, str]:
+    """Return a channel, without a definition that cannot be read, and the reason; its messages are then opaque."""
     try:
         parse(channel.type_name, channel.definition, channel.definition_format, channel.ros)
     except UnparsedError as error:
-        raise ConfigError(str(path), "", f"cannot be read: topic {channel.topic}: {error}") from error
+        bare = replace(channel, definition="", definition_format="")
+        return bare, f"topic {channel.topic} is carried unread: {error}"
     except DefinitionError:
-        return
+        pass  # an absent or unusual one
+    return channel, ""
 
 
 def _reason(error: BaseException) -> str:
@@ -161,47 +169,90 @@ def _open(path: Path) -> Source:
     if magic.startswith(b"#ROSBAG"):
         return _open_ros1(path)
     if magic.startswith(salvage_mcap.MAGIC):
-        if path.suffix == ".mcap" and salvage_mcap.is_indexed(path):
-            return _Rosbag2Source(path)
-        return salvage_mcap.scan(path)
+        return UnpackedSource(_open_mcap(path))
     if magic.startswith(salvage_sqlite.MAGIC):
-        if path.suffix == ".db3" and salvage_sqlite.is_whole(path):
-            return _Rosbag2Source(path)
-        return salvage_sqlite.SqliteSource(path)
+        return UnpackedSource(salvage_sqlite.SqliteSource(path))
+    if magic.startswith(ZSTD):
+        return _UnpackedFile(path)
     raise LocalError("neither a ROS 1 bag nor MCAP nor sqlite3")
 
 
 def _open_folder(path: Path) -> Source:
-    storage = sorted(file for pattern in _STORAGE for file in path.glob(pattern))
-    compression = _compression(path / "metadata.yaml")
-    if compression == "message":  # each message is unpacked here, within bounds
-        return UnpackedSource(JoinedSource([_open(file) for file in storage]))
-    if compression == "file":
-        for file in path.glob("*.zstd"):
-            check_file(file)
-    if (path / "metadata.yaml").exists() and all(map(_is_whole, storage)):
-        return _Rosbag2Source(path)
+    """Open the storage files of a folder, whatever its metadata.yaml says: that is written last, and is edited."""
+    storage = sorted(file for pattern in _STORAGE for file in path.glob(pattern) if file.stat().st_size)
     if not storage:
-        raise LocalError("the folder has neither metadata.yaml nor a storage file")
-    return JoinedSource([_open(file) for file in storage])
+        raise LocalError("the folder has no storage file (.mcap or .db3) with anything in it")
+    parts: list[Source] = []
+    lacking = _lacking(path / "metadata.yaml", {file.name for file in storage})
+    for file in storage:
+        try:
+            parts.append(_open(file))
+        except _FOREIGN as error:
+            lacking.append(f"{file.name} cannot be read: {_reason(error)}")
+    if not parts:
+        raise LocalError("; ".join(lacking))
+    return JoinedSource(parts, lacking)
 
 
-def _compression(metadata: Path) -> str:
-    """Return the compression that a folder states: ``message``, ``file``, or anything else for none."""
+def _lacking(metadata: Path, there: set[str]) -> list[str]:
+    """Return what a folder states that it has, and has not."""
     if not metadata.exists():
-        return ""
-    if metadata.stat().st_size > _METADATA_MAX_BYTES:
-        raise LocalError(f"{metadata.name} has more than {_METADATA_MAX_BYTES} bytes")
-    match load_plain(metadata.read_text()):
-        case {"rosbag2_bagfile_information": {"compression_mode": str(mode)}}:
-            return mode.lower()
-    return ""
+        return []
+    try:
+        if metadata.stat().st_size > _METADATA_MAX_BYTES:
+            raise LocalError(f"more than {_METADATA_MAX_BYTES} bytes")
+        match load_plain(metadata.read_text(encoding="utf-8", errors="replace")):
+            case {"rosbag2_bagfile_information": {"relative_file_paths": list(names)}}:
+                files = [Path(str(name)).name for name in names]
+                return [f"{name}, which {metadata.name} names, is not there" for name in files if name not in there]
+    except _FOREIGN as error:
+        return [f"{metadata.name} cannot be read ({_reason(error)}); all storage files are"]
+    return [f"{metadata.name} states no files; all storage files are read"]
 
 
-def _is_whole(storage: Path) -> bool:
-    if storage.suffix == ".mcap":
-        return salvage_mcap.is_indexed(storage)
-    return salvage_sqlite.is_whole(storage)
+class _UnpackedFile:
+    """A storage file that is compressed as a whole, unpacked into a folder of its own."""
+
+    def __init__(self, path: Path) -> None:
+        check_file(path)
+        self._folder = tempfile.TemporaryDirectory(prefix="unpacked-")
+        try:
+            unpacked = Path(self._folder.name) / path.stem
+            with zstd.open(path, "rb") as packed, unpacked.open("wb") as file:
+                shutil.copyfileobj(packed, file, 1 << 20)
+            self._source = _open(unpacked)
+        except BaseException:
+            self._folder.cleanup()
+            raise
+        self.channels = self._source.channels
+
+    @property
+    def count(self) -> int:
+        return self._source.count
+
+    @property
+    def counts(self) -> list[int] | None:
+        return self._source.counts
+
+    @property
+    def unread(self) -> str:
+        return self._source.unread
+
+    def messages(self) -> Iterator[Message]:
+        return self._source.messages()
+
+    def close(self) -> None:
+        self._source.close()
+        self._folder.cleanup()
+
+
+def _open_mcap(path: Path) -> Source:
+    if path.suffix == ".mcap" and salvage_mcap.is_indexed(path):
+        try:
+            return _McapSource(path)
+        except _FOREIGN:
+            pass  # a profile or an encoding that rosbags does not read
+    return salvage_mcap.scan(path)
 
 
 def _open_ros1(path: Path) -> Source:
@@ -217,7 +268,7 @@ class _IndexedSource:
     def __init__(self, connections: list[Connection], count: int) -> None:
         self.channels = [from_connection(connection) for connection in connections]
         self.count = count
-        self.counts = [connection.msgcount for connection in connections]
+        self.counts: list[int] | None = [connection.msgcount for connection in connections]
         self.unread = ""
         self._index = {_key(connection): index for index, connection in enumerate(connections)}
 
@@ -248,7 +299,7 @@ class _Rosbag1Source(_IndexedSource):
         self._reader.close()
 
 
-class _Rosbag2Source(_IndexedSource):
+class _McapSource(_IndexedSource):
     def __init__(self, path: Path) -> None:
         self._reader = Reader2(path)
         with guarded():

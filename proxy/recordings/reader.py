@@ -20,7 +20,7 @@ from gdp.errors import ConfigError, LocalError, RemoteError
 from proxy.printable import printable
 from proxy.recordings.limits import BagLimits
 from proxy.recordings.process import BagProcess, Cost, RecordingError, StoppedError
-from proxy.recordings.source import Message
+from proxy.recordings.source import ZSTD, Message
 from proxy.recordings.stream import FailedError, FrameReader, RefusedError
 from proxy.recordings.unpacking import file_max_bytes
 from proxy.serial.channel import Channel
@@ -42,6 +42,7 @@ class BagReader:
         counts: messages of each channel; None where the recording has no index with them.
         unread: why some messages could not be read, and about how many; empty where all could. Final after
             ``messages``.
+        missing: messages that were announced and not given. Final after ``messages``.
 
     Raises:
         ConfigError: it cannot be read.
@@ -51,6 +52,7 @@ class BagReader:
     def __init__(self, path: Path | str, limits: BagLimits | None = None) -> None:
         self.path = Path(path)
         self.unread = ""
+        self.missing = 0
         self._frames = FrameReader()
         self._is_stopped = False
         with contextlib.ExitStack() as stack:
@@ -93,6 +95,7 @@ class BagReader:
                 self._frames.skip(take)
                 self._process.request_messages()
                 self.unread = printable((yield from self._frames.messages(take)))
+                self.missing = max(0, self.count - self._frames.given)
         except StoppedError:
             self._is_stopped = True
 
@@ -144,6 +147,6 @@ def _scratch(path: Path, stack: contextlib.ExitStack) -> Path | None:
     """Return a folder for copies of databases and of compressed files, where the decoder may need one."""
     if not path.is_dir():
         with path.open("rb") as file:
-            if file.read(len(_SQLITE)) != _SQLITE:
+            if not file.read(len(_SQLITE)).startswith((_SQLITE, ZSTD)):
                 return None
     return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="gdp-recording-")))

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import BinaryIO, Final
 
 from proxy.recordings.channels import from_ros2, offered_qos
+from proxy.recordings.salvage_ros1 import channel_of
 from proxy.recordings.source import Chunk, Place, Scan, ScannedSource
 from proxy.recordings.unpacking import SalvageError, unpack
 from proxy.serial.channel import DefinitionFormat
@@ -30,7 +31,7 @@ _COUNT: Final = struct.Struct("<I")
 _MESSAGE_HEAD: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _CHUNK_HEAD: Final = struct.Struct("<QQQI")  # first time, last time, unpacked bytes, crc
 _LENGTH: Final = struct.Struct("<Q")
-_FORMATS: Final[dict[str, DefinitionFormat]] = {"ros2msg": "msg", "ros2idl": "idl", "omgidl": "idl"}
+_FORMATS: Final[dict[str, DefinitionFormat]] = {"ros2msg": "msg", "ros2idl": "idl", "omgidl": "idl", "ros1msg": "msg"}
 
 
 def is_indexed(path: Path) -> bool:
@@ -105,6 +106,8 @@ class _Found(Scan):
 
     def _message(self, head: bytes, chunk: int, start: int, length: int) -> None:
         channel, _, stamp_ns, _ = _MESSAGE_HEAD.unpack(head)
+        if channel in self._omitted:
+            return
         if channel not in self._index or length < _MESSAGE_HEAD.size:
             raise SalvageError(f"a message of an unknown channel {channel}")
         size = length - _MESSAGE_HEAD.size
@@ -118,30 +121,36 @@ class _Found(Scan):
             (number,) = _ID.unpack_from(record)
             name, at = _string(record, _ID.size)
             encoding, at = _string(record, at)
-            text, _ = _string(record, at)
+            text, _ = _string(record, at, "replace")  # its comments need not be UTF-8
             self._schemas[number] = (name, _FORMATS.get(encoding, ""), text)
             return
         number, schema = _IDS.unpack_from(record)
-        if number in self._index:
+        if number in self._index or number in self._omitted:
             return
         topic, at = _string(record, _IDS.size)
         encoding, at = _string(record, at)
-        if encoding != "cdr":
-            raise SalvageError(f"topic {topic} is in {encoding}, not CDR")
+        if encoding not in ("cdr", "ros1"):
+            self._omitted.add(number)
+            self.left_out.append(f"topic {topic} is left out: it is in {encoding}, not CDR")
+            return
         name, definition_format, definition = self._schemas.get(schema, ("", "", ""))
         metadata = _map(record, at)
+        self._index[number] = len(self.channels)
+        if encoding == "ros1":
+            about = {"type": name, "message_definition": definition} | metadata
+            self.channels.append(channel_of(topic, {key.encode(): value.encode() for key, value in about.items()}))
+            return
         profiles = offered_qos(metadata.get("offered_qos_profiles", ""))
         digest = metadata.get("topic_type_hash", "")
-        self._index[number] = len(self.channels)
         self.channels.append(from_ros2(topic, name, digest, definition, definition_format, profiles))
 
 
-def _string(record: bytes, at: int) -> tuple[str, int]:
+def _string(record: bytes, at: int, errors: str = "strict") -> tuple[str, int]:
     (size,) = _COUNT.unpack_from(record, at)
     end = at + _COUNT.size + size
     if end > len(record):
         raise SalvageError("a text longer than its record")
-    return record[at + _COUNT.size : end].decode(), end
+    return record[at + _COUNT.size : end].decode("utf-8", errors), end
 
 
 def _map(record: bytes, at: int) -> dict[str, str]:

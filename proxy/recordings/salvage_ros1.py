@@ -7,16 +7,18 @@ Source: ROS 1 bag format 2.0, http://wiki.ros.org/Bags/Format/2.0 (records of a 
 from __future__ import annotations
 
 import struct
+from collections.abc import Mapping
 from pathlib import Path
 from typing import BinaryIO, Final
 
 from rosbags.typesys.msg import normalize_msgtype
 
+from gdp.ros_names import resolved
 from proxy.recordings.source import Chunk, Place, Scan, ScannedSource
 from proxy.recordings.unpacking import SalvageError, unpack
 from proxy.serial.channel import Channel
 
-__all__ = ["MAGIC", "scan"]
+__all__ = ["MAGIC", "channel_of", "scan"]
 
 MAGIC: Final = b"#ROSBAG V2.0\n"
 
@@ -28,7 +30,7 @@ _TIME: Final = struct.Struct("<II")
 
 def scan(path: Path) -> ScannedSource:
     """Return the readable part; errors as of ``Scan.source``."""
-    return _Found().source(path, MAGIC, "the recording was never closed")
+    return _Found().source(path, MAGIC)
 
 
 class _Found(Scan):
@@ -49,6 +51,7 @@ class _Found(Scan):
                 code = _code(header)
                 if code == _BAG:
                     (index_at,) = _LENGTH.unpack(header.get(b"index_pos", bytes(8)))
+                    self.unclosed = "" if index_at else "the recording was never closed"
                     self.stats.missing_bytes = max(0, index_at - size)
                     self.stats.scanned_bytes = size
                 elif code == _CHUNK:
@@ -95,20 +98,21 @@ class _Found(Scan):
             self.places.append(Place(stamp_ns, len(self.places), self._index[number], chunk, start, len(data)))
         elif number not in self._index:
             self._index[number] = len(self.channels)
-            self.channels.append(_channel(header[b"topic"].decode(), _fields(data)))
+            self.channels.append(channel_of(header[b"topic"].decode(), _fields(data)))
 
 
-def _channel(topic: str, about: dict[bytes, bytes]) -> Channel:
+def channel_of(topic: str, about: Mapping[bytes, bytes]) -> Channel:
+    """Return a channel from a connection's header. Comments of its definition need not be UTF-8."""
     callerid = about.get(b"callerid")
     return Channel(
-        topic=topic,
+        topic=resolved(topic),
         type_name=normalize_msgtype(about[b"type"].decode()),
         ros=1,
-        hash=about[b"md5sum"].decode(),
-        definition=about[b"message_definition"].decode(),
+        hash=about.get(b"md5sum", b"").decode(),
+        definition=about[b"message_definition"].decode("utf-8", "replace"),
         definition_format="msg",
         latched=about.get(b"latching") == b"1",
-        callerid=None if callerid is None else callerid.decode(),
+        callerid=None if callerid is None else callerid.decode("utf-8", "replace"),
     )
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -23,7 +24,7 @@ from proxy.recordings.sqlite_guard import check_schema, guard
 from proxy.recordings.unpacking import SalvageError
 from proxy.serial.channel import Channel, DefinitionFormat
 
-__all__ = ["MAGIC", "SqliteSource", "is_whole"]
+__all__ = ["MAGIC", "SqliteSource"]
 
 MAGIC: Final = b"SQLite format 3\0"
 _FORMATS: Final[dict[str, DefinitionFormat]] = {"ros2msg": "msg", "ros2idl": "idl"}
@@ -73,12 +74,6 @@ def _journal(path: Path) -> Path:
     return path.with_name(path.name + "-wal")
 
 
-def is_whole(path: Path) -> bool:
-    """Return whether the file has all its pages and no pending journal."""
-    journal = _journal(path)
-    return not _missing_bytes(path) and not (journal.exists() and journal.stat().st_size)
-
-
 class SqliteSource:
     """The readable part of a database.
 
@@ -89,6 +84,7 @@ class SqliteSource:
     def __init__(self, path: Path) -> None:
         self.channels: list[Channel] = []
         self.unread = ""
+        self._left_out: list[str] = []
         self._index: dict[int, int] = {}  # topic id to index
         self._order: list[tuple[int, int, int]] = []  # stamp, row, topic id
         self._stats = Tally()
@@ -119,6 +115,12 @@ class SqliteSource:
     def count(self) -> int:
         """Return the number of messages found."""
         return len(self._order)
+
+    @property
+    def counts(self) -> list[int] | None:
+        """Return the messages found of each channel."""
+        found = Counter(topic for _, _, topic in self._order)
+        return [found[topic] for topic in self._index]
 
     def messages(self) -> Iterator[Message]:
         """Yield messages in time order."""
@@ -156,7 +158,8 @@ class SqliteSource:
         query = f"SELECT id, name, type, serialization_format, {qos}, {digest} FROM topics ORDER BY id"
         for number, topic, type_name, form, profiles, type_hash in self._db.execute(query):
             if form != "cdr":
-                raise SalvageError(f"topic {topic} is in {form}, not CDR")
+                self._left_out.append(f"topic {topic} is left out: it is in {form}, not CDR")
+                continue
             definition_format, definition = definitions.get(type_name, ("", ""))
             self._index[int(number)] = len(self.channels)
             self.channels.append(
@@ -177,5 +180,4 @@ class SqliteSource:
         self._order.sort()
         if self._stats.missing_bytes and not reason:
             reason = "the file ends in the middle"
-        if reason:
-            self.unread = self._stats.text(reason)
+        self.unread = "; ".join([*([self._stats.text(reason)] if reason else []), *self._left_out])

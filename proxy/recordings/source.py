@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 import os
 from abc import ABC, abstractmethod
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple, Protocol
@@ -17,8 +17,20 @@ from typing import BinaryIO, Final, NamedTuple, Protocol
 from proxy.recordings.unpacking import CHUNK_MAX_BYTES, SalvageError, unpack
 from proxy.serial.channel import Channel
 
-__all__ = ["Chunk", "JoinedSource", "Message", "Place", "Scan", "ScannedSource", "Source", "Tally", "UnpackedSource"]
+__all__ = [
+    "ZSTD",
+    "Chunk",
+    "JoinedSource",
+    "Message",
+    "Place",
+    "Scan",
+    "ScannedSource",
+    "Source",
+    "Tally",
+    "UnpackedSource",
+]
 
+ZSTD: Final = b"\x28\xb5\x2f\xfd"
 _CHUNKS_KEPT: Final = 4  # unpacked at a time; messages close in time are close in the file
 
 
@@ -38,6 +50,10 @@ class Source(Protocol):
     @property
     def count(self) -> int:
         """Return the number of readable messages, as far as known."""
+
+    @property
+    def counts(self) -> list[int] | None:
+        """Return the messages of each channel, as far as known; None where they are not."""
 
     @property
     def unread(self) -> str:
@@ -103,6 +119,12 @@ class ScannedSource:
         """Return the number of messages found."""
         return len(self._places)
 
+    @property
+    def counts(self) -> list[int] | None:
+        """Return the messages found of each channel."""
+        found = Counter(place.channel for place in self._places)
+        return [found[index] for index in range(len(self.channels))]
+
     def messages(self) -> Iterator[Message]:
         """Yield messages in time order."""
         for place in self._places:
@@ -139,14 +161,17 @@ class Scan(ABC):
         self.chunks: list[Chunk] = []
         self.places: list[Place] = []
         self.stats = Tally()
+        self.unclosed = ""  # why even a file that is read to its end lacks something
+        self.left_out: list[str] = []  # topics that cannot be carried, each with the reason
         self._index: dict[int, int] = {}  # the format's number of a channel, to its index
+        self._omitted: set[int] = set()  # the numbers of channels that are left out
 
     @abstractmethod
     def traverse(self, file: BinaryIO, size: int) -> str:
         """Read every record; return why it ended early, empty where it did not."""
 
-    def source(self, path: Path, magic: bytes, unclosed: str = "") -> ScannedSource:
-        """Return the readable part of a file; ``unclosed``: why even a file that is read to its end lacks something.
+    def source(self, path: Path, magic: bytes) -> ScannedSource:
+        """Return the readable part of a file.
 
         Raises:
             SalvageError: nothing can be read.
@@ -159,15 +184,18 @@ class Scan(ABC):
                 raise SalvageError(f"not {self.form}")
             reason = self.traverse(file, size)
         if not self.channels:
-            raise SalvageError(reason or self.empty)
+            raise SalvageError(reason or "; ".join(self.left_out) or self.empty)
         source = ScannedSource(path, self.channels, self.chunks, self.places)
-        if reason or unclosed:
-            source.unread = self.stats.text(reason or unclosed)
+        lacking = [self.stats.text(reason or self.unclosed)] if reason or self.unclosed else []
+        source.unread = "; ".join([*lacking, *self.left_out])
         return source
 
 
 class UnpackedSource:
-    """Messages unpacked as they are read; one that cannot be unpacked is omitted and reported."""
+    """Messages of a ROS 2 recording, those that are compressed one by one unpacked as they are read.
+
+    A frame of zstd is no CDR, which begins with a zero byte. What cannot be unpacked is omitted and reported.
+    """
 
     def __init__(self, packed: Source) -> None:
         self.channels = packed.channels
@@ -180,6 +208,11 @@ class UnpackedSource:
         return self._packed.count
 
     @property
+    def counts(self) -> list[int] | None:
+        """Return the messages of each channel, as far as known."""
+        return self._packed.counts
+
+    @property
     def unread(self) -> str:
         """Return why some could not be read or unpacked."""
         return "; ".join(text for text in (self._packed.unread, self._refused) if text)
@@ -187,6 +220,9 @@ class UnpackedSource:
     def messages(self) -> Iterator[Message]:
         """Yield messages in time order."""
         for message in self._packed.messages():
+            if not message.raw.startswith(ZSTD):
+                yield message
+                continue
             try:
                 raw = unpack("zstd", message.raw)
             except SalvageError as error:
@@ -200,11 +236,12 @@ class UnpackedSource:
 
 
 class JoinedSource:
-    """The parts of a split recording; equal channels become one."""
+    """The parts of a split recording; equal channels become one. ``missing``: what is known to lack."""
 
-    def __init__(self, parts: Sequence[Source]) -> None:
+    def __init__(self, parts: Sequence[Source], missing: Sequence[str] = ()) -> None:
         self.channels: list[Channel] = []
         self._parts = parts
+        self._missing = missing
         self._indexes: list[list[int]] = []
         known: dict[Channel, int] = {}
         for part in parts:
@@ -222,9 +259,20 @@ class JoinedSource:
         return sum(part.count for part in self._parts)
 
     @property
+    def counts(self) -> list[int] | None:
+        """Return the messages of each channel in all parts; None where a part does not know its own."""
+        sums = [0] * len(self.channels)
+        for part, indexes in zip(self._parts, self._indexes, strict=True):
+            if part.counts is None:
+                return None
+            for index, count in zip(indexes, part.counts, strict=True):
+                sums[index] += count
+        return sums
+
+    @property
     def unread(self) -> str:
-        """Return the reports of the parts."""
-        return "; ".join(part.unread for part in self._parts if part.unread)
+        """Return what is missing, and the reports of the parts."""
+        return "; ".join([*self._missing, *(part.unread for part in self._parts if part.unread)])
 
     def messages(self) -> Iterator[Message]:
         """Yield messages in time order."""

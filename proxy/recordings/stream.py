@@ -129,11 +129,13 @@ class FrameReader:
     Attributes:
         channels: of the recording; empty before ``open``.
         is_giving: whether messages follow, up to END.
+        given: messages so far.
     """
 
     def __init__(self) -> None:
         self.channels: list[Channel] = []
         self.is_giving = False
+        self.given = 0
 
     def open(self, take: Take) -> tuple[int, list[int] | None]:
         """Read the channels; return the number of messages, and that of each channel where it is known.
@@ -166,7 +168,7 @@ class FrameReader:
             RefusedError, FailedError: the decoder reports why it ends.
             LocalError: an unexpected frame.
         """
-        self.is_giving = True
+        self.is_giving, self.given = True, 0
         while True:
             kind, size = self._head(take)
             if kind == Kind.END:
@@ -174,10 +176,10 @@ class FrameReader:
                 return _text(take(size))
             if kind != Kind.BLOCK:
                 raise LocalError(f"{kind.name} among messages")
-            if size > BLOCK_BYTES:
-                yield self._large(take, size - _MESSAGE.size)
-            else:
-                yield from self._small(take(size))
+            found = [self._large(take, size - _MESSAGE.size)] if size > BLOCK_BYTES else self._small(take(size))
+            for message in found:
+                self.given += 1
+                yield message
 
     def _head(self, take: Take) -> tuple[Kind, int]:
         number, size = _HEAD.unpack(take(_HEAD.size))

@@ -142,7 +142,9 @@ class _Parser:
             if kind[1] not in _BASES or kind[3]:
                 raise ValueError(f"a constant of such a type: {_short(line)}")
             if kind[1] != "wstring":
-                constants.append((name[0], _BASES[kind[1]], _value(line[at + 1 :], line)))
+                text = line[at + 1 :]
+                value = "" if kind[1] == "string" and not text.strip() else _value(text, line)  # legal in ROS 1
+                constants.append((name[0], _BASES[kind[1]], value))
             return
         if at < len(line) and line[at] != "#" and at == name.end():
             raise ValueError(f"not the name of a field: {_short(line)}")

@@ -7,6 +7,7 @@ Source: the ROS 2 interface definition article; ROS 1 ``msg`` wiki page.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
@@ -39,6 +40,7 @@ _KEPT_MAX: Final = 256  # parsed definitions
 _DEPTH_MAX: Final = 32  # records within records
 _FIELDS_MAX: Final = 4_096  # of a type with all nested ones: each record counts as often as it occurs
 _RULE: Final = "=" * 80 + "\n"
+_ODD_BLANKS: Final = re.compile(r"[^\S\n\t ]")  # such as a form feed; ROS takes them for blanks
 
 
 class DefinitionError(LocalError):
@@ -171,7 +173,7 @@ def parsed(type_name: str, definition: str, definition_format: str) -> Typesdict
     text = definition.replace("\r\n", "\n")
     try:
         if definition_format == "msg":
-            return parse_msg(text, msg_name(type_name, "msg"))
+            return parse_msg(_ODD_BLANKS.sub(" ", text), msg_name(type_name, "msg"))
         if not text.startswith(f"{_RULE}IDL: "):
             return parse_idl(text)
         return parse_idl("".join(section.partition("\n")[2] for section in text.split(_RULE)[1:]))

@@ -32,6 +32,7 @@ from proxy.recordings.writer import BagWriter
 from proxy.serial.channel import Channel
 from tests.attacks.test_recordings import BOMB_BYTES, MESSAGES, TOPICS, database, mcap, packed, ros1
 from tests.pages import ROOT
+from tests.waiting import until
 
 TOPIC = Channel("/t", "a/msg/B", 2, hash="", definition="int8 a\n", definition_format="msg")
 ENDS_S = 20.0
@@ -46,10 +47,22 @@ def recording(path: Path, count: int = 3, size: int = 100) -> Path:
 
 
 def child_of(process: int) -> int:
-    """Return the only decoder of a process, which may have other children."""
-    children = Path(f"/proc/{process}/task/{process}/children").read_text().split()
-    (child,) = (each for each in children if b"proxy.recordings" in Path(f"/proc/{each}/cmdline").read_bytes())
+    """Return the only decoder of a process, which may have other children, and may just have been started."""
+    children = Path(f"/proc/{process}/task/{process}/children")
+
+    def decoders() -> list[str]:
+        return [each for each in children.read_text().split() if b"proxy.recordings" in _command_line(each)]
+
+    until(decoders)
+    (child,) = decoders()
     return int(child)
+
+
+def _command_line(process: str) -> bytes:
+    try:
+        return Path(f"/proc/{process}/cmdline").read_bytes()
+    except OSError:
+        return b""  # it has ended
 
 
 def has_ended(process: int) -> bool:
