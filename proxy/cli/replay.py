@@ -61,6 +61,10 @@ def replay(
     bag: Annotated[Path, typer.Argument(help="A ROS 1 bag, an MCAP file, a .db3 file or a rosbag2 folder.")],
     config: Config,
     rate: Annotated[float, typer.Option(min=0.0, help="1: as recorded; 0: as fast as readers confirm.")] = 1.0,
+    skip_empty: Annotated[
+        float | None,
+        typer.Option(min=0.0, metavar="SECONDS", help="Skip what a time without messages has more than this."),
+    ] = None,
     wait_readers: Annotated[float, typer.Option(min=0.0, help="Seconds to wait for a reader of every topic.")] = 15.0,
     memory: Annotated[
         int | None,
@@ -97,7 +101,7 @@ def replay(
             if check:
                 raise typer.Exit(1 if check_proxy(config, settings, json=json) else 0)
             with run_node(settings, emit_wait if json else None) as node:
-                is_complete = _replay(node, reader, settings, rate, wait_readers, json=json)
+                is_complete = _replay(node, reader, settings, rate, skip_empty, wait_readers, json=json)
     raise typer.Exit(0 if is_complete else 1)
 
 
@@ -113,7 +117,14 @@ def _failing_decoder() -> Iterator[None]:
 
 
 def _replay(
-    node: ProxyNode, reader: BagReader, settings: ProxyConfig, rate: float, wait_s: float, *, json: bool
+    node: ProxyNode,
+    reader: BagReader,
+    settings: ProxyConfig,
+    rate: float,
+    skip_empty: float | None,
+    wait_s: float,
+    *,
+    json: bool,
 ) -> bool:
     endpoint = ReplayEndpoint(reader)
     rules = RecordedRules.of(expose=settings.expose)
@@ -128,7 +139,7 @@ def _replay(
                 said_s = now_s
                 log.info("progress sent=%d of=%s confirmed=%d", replay.sent, total or "?", replay.confirmed)
 
-        replay = Replay(node, bridge, endpoint, rate, report)
+        replay = Replay(node, bridge, endpoint, rate, report, skip_empty)
         total = _exposed_total(reader, endpoint)
         if not replay.topics:
             raise LocalError(f"{reader.path}: no topic of it is exposed by the configuration")

@@ -5,6 +5,7 @@ I/O; drives the node's loop between messages.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -19,7 +20,9 @@ from proxy.node.node import ProxyNode
 from proxy.node.recording_bridge import work
 from proxy.recordings.endpoint import ReplayEndpoint
 
-__all__ = ["Replay", "ReplayedTopic", "Unconfirmed"]
+__all__ = ["Pace", "Replay", "ReplayedTopic", "Unconfirmed"]
+
+log = logging.getLogger(__name__)
 
 STALL_S: Final = 20.0  # after this time without any acknowledgement, readers are given up
 REPORT_S: Final = 5.0  # after this time, what readers of best-effort topics have not reported is unknown
@@ -71,16 +74,59 @@ class ReplayedTopic:
     indexes: tuple[int, ...]
 
 
+class Pace:
+    """When messages are due, in seconds after the beginning of a replay; see ``Replay`` for the arguments."""
+
+    def __init__(self, rate: float, empty_max_s: float | None) -> None:
+        self._rate = rate
+        self._empty_max_s = empty_max_s
+        self._last_ns: int | None = None
+        self._recorded_s = 0.0  # of the replay so far, as recorded, without what was skipped
+
+    def due_s(self, stamp_ns: int) -> tuple[float, str]:
+        """Return when a message is due, and what to say of the time before it; empty: nothing."""
+        if self._rate == 0:
+            return 0.0, ""
+        gap_s = 0.0 if self._last_ns is None else max(0, stamp_ns - self._last_ns) / 1e9
+        self._last_ns, said = stamp_ns, ""
+        if self._empty_max_s is not None and gap_s > self._empty_max_s:
+            said = f"no message for {_span(gap_s)} in the recording: {_span(gap_s - self._empty_max_s)} are skipped"
+            gap_s = self._empty_max_s
+        elif gap_s / self._rate > STALL_S:
+            said = f"no message for {_span(gap_s)} in the recording: waiting; --skip-empty SECONDS skips such times"
+        self._recorded_s += gap_s
+        return self._recorded_s / self._rate, said
+
+
+def _span(seconds: float) -> str:
+    """Return a length of time with the largest unit of which it has two."""
+    for unit, length_s in (("years", 31_557_600), ("days", 86_400), ("hours", 3_600), ("minutes", 60)):
+        if seconds >= 2 * length_s:
+            return f"{seconds / length_s:.0f} {unit}"
+    return f"{seconds:.0f} s"
+
+
 class Replay:
-    """One replay of a recording; ``rate`` 1: as recorded, 2: twice as fast, 0: as fast as readers confirm."""
+    """One replay of a recording.
+
+    Args:
+        rate: 1: as recorded, 2: twice as fast, 0: as fast as readers confirm.
+        empty_max_s: of a longer time without a message, the rest is skipped; None: it is waited for.
+    """
 
     def __init__(
-        self, node: ProxyNode, bridge: Bridge, endpoint: ReplayEndpoint, rate: float, report: Callable[[], None]
+        self,
+        node: ProxyNode,
+        bridge: Bridge,
+        endpoint: ReplayEndpoint,
+        rate: float,
+        report: Callable[[], None],
+        empty_max_s: float | None = None,
     ) -> None:
         self._node = node
         self._bridge = bridge
         self._endpoint = endpoint
-        self._rate = rate
+        self._pace = Pace(rate, empty_max_s)
         self._report = report
         self._tick_at_s = 0.0
         self.topics = [
@@ -143,11 +189,11 @@ class Replay:
     def run(self) -> bool:
         """Replay to the end; return False when the node was stopped before."""
         runtime, begun_s = self._node.runtime, time.monotonic()
-        first_ns: int | None = None
         for message in self._endpoint.messages(self._continue):
-            first_ns = message.stamp_ns if first_ns is None else first_ns
-            if self._rate > 0:
-                self._step_until(begun_s + (message.stamp_ns - first_ns) / 1e9 / self._rate)
+            due_s, said = self._pace.due_s(message.stamp_ns)
+            if said:
+                log.warning("%s", said)
+            self._step_until(begun_s + due_s)
             flow = self._flows[message.handle]
             while not flow.has_space() and not runtime.is_stopped:
                 self._step(None)

@@ -1,7 +1,7 @@
 """Decoder of a recording: ROS 1 bag, sqlite3, MCAP, alone or as a rosbag2 folder; also a truncated one.
 
-I/O, reading only. rosbags reads complete files; ``salvage_*`` scans incomplete ones from the beginning. It runs in a
-process of its own (``child``), because a recording may come from anyone.
+I/O, reading only. rosbags reads bags and MCAP with an index; ``salvage_*`` read all other files from the beginning. It
+runs in a process of its own (``child``), because a recording may come from anyone.
 Errors: a recording that cannot be read at all raises ``ConfigError`` with the file and the reason; a loss is reported
 in ``unread``.
 """
@@ -33,7 +33,6 @@ from proxy.recordings import salvage_mcap, salvage_ros1, salvage_sqlite
 from proxy.recordings.channels import from_connection
 from proxy.recordings.plain_yaml import BoundedYaml, load_plain
 from proxy.recordings.source import ZSTD, JoinedSource, Message, Source, UnpackedSource
-from proxy.recordings.sqlite_guard import guarded
 from proxy.recordings.unpacking import bound_rosbags, check_file
 from proxy.serial.channel import Channel
 from proxy.serial.schema import DefinitionError, UnparsedError, parse
@@ -302,8 +301,7 @@ class _Rosbag1Source(_IndexedSource):
 class _McapSource(_IndexedSource):
     def __init__(self, path: Path) -> None:
         self._reader = Reader2(path)
-        with guarded():
-            self._reader.open()
+        self._reader.open()
         try:
             super().__init__(self._reader.connections, self._reader.message_count)
         except _FOREIGN:

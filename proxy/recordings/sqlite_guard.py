@@ -6,16 +6,14 @@ header states. Source: "Defense Against The Dark Arts", https://www.sqlite.org/s
 
 from __future__ import annotations
 
-import contextlib
 import os
-from collections.abc import Iterator
 from typing import Final
 
 import apsw
 
 from proxy.recordings.unpacking import CHUNK_MAX_BYTES, SalvageError
 
-__all__ = ["check_schema", "guard", "guarded"]
+__all__ = ["check_schema", "guard"]
 
 _STEPS_FREE: Final = 20_000_000  # steps of SQLite's virtual machine for one statement, about a second
 _STEPS_PER_BYTE: Final = 16  # ... and this many for each byte of the file
@@ -73,21 +71,6 @@ def check_schema(connection: apsw.Connection) -> None:
             raise SalvageError("the database has views, triggers or virtual tables, which no recording has")
     if len(rows) > _TABLES_MAX:
         raise SalvageError(f"the database has more than {_TABLES_MAX} tables and indexes")
-
-
-@contextlib.contextmanager
-def guarded() -> Iterator[None]:
-    """Guard every connection that is opened meanwhile, including those of rosbags."""
-
-    def hook(connection: apsw.Connection) -> None:
-        guard(connection)
-        check_schema(connection)
-
-    apsw.connection_hooks.append(hook)
-    try:
-        yield
-    finally:
-        apsw.connection_hooks.remove(hook)
 
 
 def _authorize(action: int, first: str | None, second: str | None, database: str | None, view: str | None) -> int:

@@ -14,7 +14,7 @@ from proxy.bridge.sent_stats import SentStats
 from proxy.cli.replay import _report
 from proxy.node import recording_bridge, replayer
 from proxy.node.node import ProxyNode
-from proxy.node.replayer import Replay
+from proxy.node.replayer import Pace, Replay
 from proxy.recordings.endpoint import RecordingEndpoint, ReplayEndpoint
 from proxy.recordings.reader import BagReader
 from proxy.recordings.writer import BagWriter
@@ -116,3 +116,36 @@ def test_the_proxy_lists_exposed_best_effort_topics(sites: Sites) -> None:
     robot.graph.publish("/talker", "/chatter", STRING)
     sites.run(1)
     assert robot.bridge.best_effort == [SentStats.of("/chatter", robot.stream)]
+
+
+YEARS_NS = 53 * 31_557_600 * 10**9
+
+
+@pytest.mark.parametrize(
+    ("rate", "empty_max_s", "due_s", "said"),
+    [
+        (
+            1.0,
+            None,
+            [0.0, 53 * 31_557_600.0, 53 * 31_557_600.0 + 1],
+            ["no message for 53 years", "--skip-empty SECONDS"],
+        ),
+        (1.0, 2.0, [0.0, 2.0, 3.0], ["no message for 53 years", "53 years are skipped"]),
+        (2.0, 2.0, [0.0, 1.0, 1.5], ["53 years are skipped"]),
+        (0.0, None, [0.0, 0.0, 0.0], []),
+    ],
+)
+def test_a_time_without_messages_is_named_with_its_length_or_skipped(
+    rate: float, empty_max_s: float | None, due_s: list[float], said: list[str]
+) -> None:
+    pace = Pace(rate, empty_max_s)
+    found = [pace.due_s(stamp_ns) for stamp_ns in (0, YEARS_NS, YEARS_NS + 10**9)]
+    assert [due for due, _ in found] == pytest.approx(due_s)
+    assert found[0][1] == found[2][1] == ""
+    assert all(text in found[1][1] for text in said)
+    assert bool(found[1][1]) == bool(said)
+
+
+def test_stamps_that_go_back_delay_nothing() -> None:
+    pace = Pace(1.0, None)
+    assert [pace.due_s(stamp_ns)[0] for stamp_ns in (5 * 10**9, 3 * 10**9, 4 * 10**9)] == [0.0, 0.0, 1.0]

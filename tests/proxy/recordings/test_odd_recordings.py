@@ -1,4 +1,4 @@
-"""Recordings as other tools and accidents leave them: what is there is read, and what is not is told."""
+"""Recordings as other tools and accidents leave them: what is there is read, and what is not is said."""
 
 from __future__ import annotations
 
@@ -248,7 +248,7 @@ def test_a_bag_with_odd_text_in_a_definition_is_read_whole(tmp_path: Path, const
     "name",
     [STRING, "std_msgs/String", "std_msgs::msg::String", "std_msgs::msg::dds_::String_", "std_msgs/msg/dds_/String_"],
 )
-def test_a_type_has_its_name_in_ros_2_whoever_recorded_it(name: str) -> None:
+def test_a_type_has_its_name_in_ros_2_whichever_tool_recorded_it(name: str) -> None:
     assert ros2_type(name) == STRING
 
 
