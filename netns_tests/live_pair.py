@@ -30,7 +30,6 @@ from typing import Final
 import yaml
 
 from gdp.crypto.certificates import Role
-from gdp.host import netns_files
 from gdp.host.run_registry import Run, RunRegistry
 from gdp.metadata import Metadata
 from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
@@ -177,7 +176,7 @@ class Proxy:
     def metric(self, name: str) -> float:
         """Return the value of a metric, zero where it is not there."""
         ask = partial(_metrics, self._port)
-        text = netns_files.inside(self._pair.spaces.path(self.machine), ask)
+        text = self._pair.spaces[self.machine].inside(ask)
         found = re.search(rf"^{re.escape(name)} (\S+)$", text, re.MULTILINE)
         return float(found[1]) if found else 0.0
 
@@ -244,7 +243,7 @@ class Pair:
         """Limit the traffic from machine "a" to "b", such as ``20mbit``; empty: no limit."""
         words = ["add", "dev", "b", "root", "tbf", "rate", rate, "burst", "32kb", "latency", "50ms"]
         change = words if rate else ["del", "dev", "b", "root"]
-        subprocess.run(self.spaces.command("a", ["tc", "qdisc", *change]), check=True)
+        subprocess.run(self.spaces["a"].command(["tc", "qdisc", *change]), check=True)
 
     def start_master(self) -> None:
         """Start the ROS 1 master, if it does not run."""
@@ -264,7 +263,7 @@ class Pair:
         self, machine: str, argv: Sequence[str], log: Path, sign: str, graph: str = ""
     ) -> subprocess.Popen[bytes]:
         """Start a command of ours on a machine; return it when it reports that it is ready."""
-        words = [*self.spaces.command(machine, []), *self._environment(graph)]
+        words = [*self.spaces[machine].command([]), *self._environment(graph)]
         if graph in self._hidden:
             words.append(f"PYTHONPATH={self._hide(self._hidden[graph])}{os.pathsep}{PYTHON_PATH}")
         with log.open("ab") as errors:
@@ -333,7 +332,7 @@ class Pair:
 
     def _make_node(self, graph: str, name: str) -> Peer:
         machine = "a" if graph == "a" else "b"
-        words = [*self.spaces.command(machine, []), *self._environment(graph)]
+        words = [*self.spaces[machine].command([]), *self._environment(graph)]
         if graph == "one":
             logs = {"ROS_LOG_DIR": str(self.folder / "ros"), "PYTHONPATH": f"{need_ros1()}{os.pathsep}{PYTHON_PATH}"}
             node: Peer = Ros1Node(name, words, {**_ENVIRONMENT, **logs})

@@ -23,6 +23,7 @@ from gdp.ports.tap import tap_name
 from gdp.state.control_protocol import Command
 from gdp.stores.issue import make_domain, make_node
 from gdp.stores.keyring import load_card
+from lab.namespace import wait_for_carrier
 from netns_tests.spaces import Space
 from tests.waiting import until
 
@@ -204,7 +205,7 @@ def relay_lab(space: Space, home: Path) -> Iterator[RelayLab]:
         for node, address in ((lab.border, BORDER_ADDRESS), (lab.member, MEMBER_ADDRESS)):
             node.ip("addr", "add", f"{address}/24", "dev", "eth0")
             node.ip("link", "set", "eth0", "up")
-        space.ready("eth0")
+        wait_for_carrier("eth0")
         yield lab
     finally:
         if lab is not None:

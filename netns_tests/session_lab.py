@@ -65,7 +65,7 @@ class SessionLab:
         path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1", "PATH": path}
         process = subprocess.Popen(
-            self._spaces.command(_MACHINE, argv),
+            self._spaces[_MACHINE].command(argv),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

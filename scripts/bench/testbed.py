@@ -16,7 +16,6 @@ import yaml
 from peers.process import FailedError, Started
 from shared_memory import SharedMemory
 
-from gdp.host import netns_files
 from gdp.host.run_registry import Run
 from gdp.metadata import Metadata
 from gdp.stores.issue import delegate, install_delegation
@@ -62,13 +61,13 @@ class Lab:
 
     def inside(self, node: str, work: Callable[[], T]) -> T:
         """Call ``work`` in a machine's namespace."""
-        return netns_files.inside(self.namespaces.path(node), work)
+        return self.namespaces[node].inside(work)
 
     def command(self, node: str, argv: Sequence[str], environment: Sequence[str] = ()) -> list[str]:
         """Return the command line that runs ``argv`` on a machine; ``environment`` holds ``KEY=value``."""
         inner = ["env", *environment, *argv] if environment else list(argv)
         memory = self._memories.get(node)
-        return self.namespaces.command(node, memory.command(inner) if memory else inner)
+        return self.namespaces[node].command(memory.command(inner) if memory else inner)
 
     def start(
         self,

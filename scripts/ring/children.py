@@ -58,7 +58,7 @@ class Children:
     ) -> Child:
         """Start Python with these arguments in the namespace of a switch; ``environment`` extends the present one."""
         prefix = ["env", *(f"{name}={value}" for name, value in environment.items())] if environment else []
-        argv = namespaces.command(node, [*prefix, sys.executable, *arguments], dies_with_us=not self._kept)
+        argv = namespaces[node].command([*prefix, sys.executable, *arguments], dies_with_us=not self._kept)
         child = self.start(f"{role} {node}", argv, heard=heard)
         if self._started is not None:
             self._started(node, child.pid)

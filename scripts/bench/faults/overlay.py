@@ -257,12 +257,12 @@ class Overlay:
     def disturb(self, a: str, b: str, faults: FrameFaults) -> None:
         """Apply faults to the frames of a link, both ways."""
         for own, other in ((a, b), (b, a)):
-            self._links.set(self.spaces.path(own), other, faults)
+            self._links.set(self.spaces[own].path, other, faults)
 
     def calm(self, a: str, b: str) -> None:
         """Remove the faults of a link."""
         for own, other in ((a, b), (b, a)):
-            self._links.clear(self.spaces.path(own), other)
+            self._links.clear(self.spaces[own].path, other)
 
     def make_thin(self, a: str, b: str, bits_s: float, fifo_s: float) -> None:
         """Give a link a rate and a plain FIFO, both ways, to the end of the run."""
@@ -279,7 +279,7 @@ class Overlay:
 
     def move(self, mover: str, to: str) -> None:
         """Pull the cable of a mover at its switch and plug it into another one; the mover keeps its device."""
-        there = os.open(self.spaces.path(to), os.O_RDONLY | os.O_CLOEXEC)
+        there = os.open(self.spaces[to].path, os.O_RDONLY | os.O_CLOEXEC)
         try:
             self._lab.inside(self._at[mover], partial(hand_over, mover, there))
         finally:
