@@ -6,14 +6,14 @@ lab. ``run.end()`` removes namespaces and processes of a lab.
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Final, TypeVar
 
 import yaml
-from peers.process import FailedError, Started
 from shared_memory import SharedMemory
 
 from gdp.host.run_registry import Run
@@ -22,9 +22,12 @@ from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC
 from gdp.trust.right import Right
 from lab.namespaces import Namespaces
+from lab.process import FailedError, LabProcess
 from lab.topology import Topology
 from ring.cores import MachineCores
 from ring.credentials import OverlayCredentials
+
+_BENCH: Final = Path(__file__).resolve().parent
 
 T = TypeVar("T")
 
@@ -77,11 +80,11 @@ class Lab:
         environment: Sequence[str] = (),
         *,
         has_orders: bool = False,
-    ) -> Started:
+    ) -> LabProcess:
         """Start Python on a machine; ``what`` names its log, ``environment`` holds ``KEY=value``."""
-
-        command = partial(self.command, node, environment=environment)
-        started = Started(self.run, f"{what} at {node}", command, arguments, has_orders=has_orders)
+        argv = self.command(node, [sys.executable, *arguments], environment)
+        paths = {"PYTHONPATH": os.pathsep.join(filter(None, (str(_BENCH), os.getenv("PYTHONPATH"))))}
+        started = LabProcess(self.run, f"{what} at {node}", argv, environment=paths, has_orders=has_orders)
         if self._cores is not None:
             self._cores.add(node, started.pid)
         return started

@@ -22,7 +22,7 @@ from fog_demo.scenario import Outcome, Pace, run_scenario
 from gdp.errors import GdpError
 from gdp.host.interruption import Interrupted, interruptible, let_nothing_interrupt
 from gdp.host.run_registry import Run
-from ring.child import ChildError
+from lab.process import FailedError
 
 __all__ = ["main"]
 
@@ -66,7 +66,7 @@ def demo(
             errors.print(f"took down what run {swept} had left behind")
         run = runs.start()
         code = _run(run, launch_file.absolute(), Pace(rate, calm, notice), console, as_json=as_json)
-    except ChildError as error:
+    except FailedError as error:
         errors.print(f"[bold red]failed[/bold red]: {escape(str(error))}")
         code = _FAILED
     except GdpError as error:

@@ -24,10 +24,10 @@ import yaml
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run, RunRegistry, outer_uid
 from gdp.stores.keyring import CARD, DELEGATIONS, ROOT_CERTIFICATE
+from lab.child import Child
+from lab.children import Children
 from lab.namespaces import Namespaces
 from lab.topology import Attachment, DomainPlan, Topology, ring5
-from ring.child import Child
-from ring.children import Children
 from ring.credentials import OverlayCredentials
 
 __all__ = ["ENVIRONMENT", "SITE", "STATE", "Environment", "end_all_of", "fog_command", "standing_runs", "sweep"]
@@ -91,7 +91,7 @@ class Environment:
         """Run a command of ``fog`` on the host of the far switch until it ends.
 
         Raises:
-            ChildError: it failed; the text has its last output.
+            FailedError: it failed; the text has its last output.
         """
         argv = fog_command(self._run, words)
         child = self._start(FAR, f"fog-{words[0]}", argv, heard=False)

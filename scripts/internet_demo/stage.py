@@ -14,7 +14,6 @@ environment of ROS is left out: sessions of this process take its place, with it
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import time
@@ -29,7 +28,6 @@ from gdp.enrolment.member_files import MemberFiles
 from gdp.enrolment.member_setup import LISTEN_PORT
 from gdp.enrolment.programs import programs_of
 from gdp.errors import GdpError, LocalError
-from gdp.host.processes import Process, end_all
 from gdp.management.control_client import ask_node, find_control_socket
 from gdp.metadata import Metadata
 from gdp.state.control_protocol import Command
@@ -40,6 +38,7 @@ from internet.access import Access
 from internet.host import Host
 from internet.laboratory import Laboratory
 from internet.site import Site
+from lab.process import LabProcess, end_processes, python_environment
 
 __all__ = ["WIFI", "WWAN", "Link", "Machine", "Stage"]
 
@@ -50,7 +49,6 @@ _PATIENCE_S: Final = 60.0
 _LOOK_S: Final = 0.2
 _STATUS_S: Final = 2.0
 _SHOWN: Final = 40  # characters of a word
-_SCRIPTS: Final = Path(__file__).resolve().parent.parent
 _StageT = TypeVar("_StageT", bound="Stage")
 
 
@@ -92,7 +90,7 @@ class Stage:
         self._laboratory = laboratory
         self._folder = laboratory.run.directory
         self._delay_ms = delay_ms
-        self._processes: list[subprocess.Popen[bytes]] = []
+        self._processes: list[LabProcess] = []
         self.machines: dict[str, Machine] = {}
         self.typed: list[str] = []
         self.environments: dict[str, Mapping[str, str]] = {}
@@ -111,9 +109,7 @@ class Stage:
         return self
 
     def __exit__(self, *_: object) -> None:
-        end_all([Process.from_pid(each.pid) for each in self._processes if each.poll() is None], _PATIENCE_S / 6)
-        for process in self._processes:
-            process.wait()
+        end_processes(self._processes, _PATIENCE_S / 6)
 
     def add_site(self, label: str, access: Access) -> Site:
         """Attach one more network."""
@@ -214,26 +210,15 @@ class Stage:
 
     def _run(self, host: Host, *words: str) -> str:
         argv = host.command([sys.executable, "-m", "gdp.cli.gdp", *words])
-        done = subprocess.run(argv, capture_output=True, check=False, text=True, env=self._environment(host))
+        environment = python_environment(self.environments.get(host.label, {}))
+        done = subprocess.run(argv, capture_output=True, check=False, text=True, env=environment)
         if done.returncode:
             raise LocalError(f"{host.label}: gdp {words[0]}: {done.stderr.strip()}")
         return done.stdout
 
-    def start_program(self, host: Host, argv: Sequence[str], output: int | None = None) -> subprocess.Popen[bytes]:
-        """Start a program of a machine; without ``output`` it goes to the machine's log, as its errors do."""
-        with (self._folder / f"{host.label}.log").open("ab") as log:
-            process = subprocess.Popen(
-                host.command(argv),
-                stdin=subprocess.DEVNULL,
-                stdout=log if output is None else output,
-                stderr=log,
-                env=self._environment(host),
-                start_new_session=True,
-            )
+    def start_program(self, host: Host, argv: Sequence[str], *, heard: bool = False) -> LabProcess:
+        """Start a program of a machine; what is not heard goes to the machine's log, as its errors do."""
+        environment = self.environments.get(host.label)
+        process = LabProcess(self._laboratory.run, host.label, host.command(argv), environment=environment, heard=heard)
         self._processes.append(process)
-        self._laboratory.run.note_process(process.pid)
         return process
-
-    def _environment(self, host: Host) -> dict[str, str]:
-        path = os.pathsep.join((str(_SCRIPTS.parent), str(_SCRIPTS)))
-        return {**os.environ, "PYTHONPATH": path, **self.environments.get(host.label, {})}

@@ -22,9 +22,9 @@ from gdp.errors import GdpError, LocalError
 from gdp.host.interruption import Interrupted, interruptible, let_nothing_interrupt
 from gdp.host.run_registry import Run, RunRegistry
 from gdp.limits import ADVERTISEMENT_LEASE_S
+from lab.process import FailedError
 from lab.topology import MTU_BYTES
 from proxy.config.config import Encoding
-from ring.child import ChildError
 from ring.cores import CORES_HELP
 from ring.faults import Cut, Kill, Roam
 from ring.hints import hints, live_hints
@@ -143,7 +143,7 @@ def ring(
         for swept in runs.sweep():
             errors.print(f"took down what run {swept} had left behind", highlight=False)
         code = _run(options, runs.start(), errors)
-    except ChildError as error:
+    except FailedError as error:
         errors.print(f"[bold red]failed[/bold red]: {escape(str(error))}", highlight=False, soft_wrap=True)
         code = _FAILED
     except GdpError as error:

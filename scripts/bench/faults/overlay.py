@@ -19,7 +19,6 @@ from typing import Final
 
 import yaml
 from devices import hand_over, received, set_up
-from peers.process import Started
 from pyroute2 import IPRoute
 from testbed import Lab
 
@@ -36,6 +35,7 @@ from gdp.stores.issue import delegate, install_delegation
 from gdp.stores.keyring import CARD, ROOT_CERTIFICATE, load_domain, load_identity
 from gdp.trust.revocation import Revocation
 from gdp.trust.right import Right
+from lab.process import LabProcess
 from ring.credentials import OverlayCredentials
 
 __all__ = ["Overlay"]
@@ -81,7 +81,7 @@ class Overlay:
         self._more = more or {}
         self._at = {mover: plan.home(mover) for mover in (*plan.homes, *plan.members)}
         self._incarnation_ids: dict[str, int] = {}
-        self._processes: dict[str, Started] = {}
+        self._processes: dict[str, LabProcess] = {}
         self._frozen: set[str] = set()
         self._records: dict[tuple[str, int], RecordReader] = {}
         self.spaces = self._lab.namespaces

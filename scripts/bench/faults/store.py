@@ -18,7 +18,6 @@ from typing import Final
 
 import yaml
 from devices import add_address, add_bridge, set_up
-from peers.process import FailedError, until
 from pyroute2 import IPRoute
 from redis import Redis
 from redis.exceptions import RedisError
@@ -28,6 +27,7 @@ from gdp.host import netns_files
 from gdp.host.run_registry import Run
 from lab.namespace import Namespace
 from lab.namespaces import Namespaces
+from lab.process import FailedError, until
 
 __all__ = ["StoreCluster", "critical_lines", "has_server"]
 

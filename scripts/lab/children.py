@@ -6,14 +6,15 @@ I/O.
 from __future__ import annotations
 
 import asyncio
+import signal
 import sys
 from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 from typing import Final, TypeVar
 
 from gdp.host.run_registry import Run
+from lab.child import Child
+from lab.events import Event
 from lab.namespaces import Namespaces
-from ring.child import Child
-from ring.events import Event
 
 __all__ = ["READY_S", "Children", "cancel", "gathered"]
 
@@ -40,9 +41,8 @@ class Children:
         self._changed = asyncio.Event()  # set when the set of required processes changes
 
     def start(self, label: str, argv: Sequence[str], *, heard: bool = True) -> Child:
-        """Start a process; its log is named after its label."""
-        child = Child(label, argv, self._run.directory / f"{label.replace(' ', '-')}.log", heard=heard)
-        self._run.note_process(child.pid)
+        """Start a process."""
+        child = Child(self._run, label, argv, heard=heard)
         self._all.append(child)
         return child
 
@@ -79,7 +79,7 @@ class Children:
     async def kill(self, child: Child) -> None:
         """Kill a required process; return when it has ended."""
         self.may_end(child)
-        child.kill()
+        child.send(signal.SIGKILL)
         await child.ended
 
     async def guarded(self, work: Coroutine[None, None, T]) -> T:
