@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import os
 import re
-import select
 import signal
 import subprocess
 import sys
@@ -36,6 +35,7 @@ from gdp.stores.issue import delegate, install_delegation, make_domain, make_nod
 from gdp.stores.keyring import CARD, DELEGATIONS, OWNER_PUBLIC, ROOT_CERTIFICATE, load_identity
 from gdp.trust.right import Right
 from lab.namespaces import Namespaces
+from lab.process import LabProcess, end_processes
 from lab.topology import Attachment, DomainPlan, Link, Topology
 from netns_tests.lifetimes import LEASE_S, LEASES, Lifetime, noted
 from proxy.endpoints.core.endpoint import proxy_node_name
@@ -124,7 +124,7 @@ class Proxy:
         self._pair = pair
         self._label = label
         self._log = pair.folder / f"proxy-{label}.log"
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: LabProcess | None = None
         self._port = 9_110 + list(_GRAPHS).index(label)
 
     @property
@@ -162,8 +162,8 @@ class Proxy:
         """End it, by signal or kill; idempotent."""
         process, self._process = self._process, None
         if process is not None:
-            process.send_signal(how)
-            process.communicate(timeout=PATIENCE_S)
+            process.send(how)
+            process.reap(PATIENCE_S)
 
     def warnings(self, name: str) -> list[str]:
         """Return its warnings about a local name: fault and detail."""
@@ -202,7 +202,7 @@ class Pair:
         self._crossings = crossings
         self._hidden = hidden
         self._proxies = {label: Proxy(self, label) for label in _GRAPHS}
-        self._master: subprocess.Popen[bytes] | None = None
+        self._master: LabProcess | None = None
         self._nodes: dict[str, Peer] = {}
         make_domain(self.folder / "pair", "pair")
         make_owner(self.folder / "owner")
@@ -256,28 +256,18 @@ class Pair:
         """Kill the ROS 1 master."""
         process, self._master = self._master, None
         assert process is not None
-        process.kill()
-        process.communicate()
+        process.kill_group()
 
-    def start(
-        self, machine: str, argv: Sequence[str], log: Path, sign: str, graph: str = ""
-    ) -> subprocess.Popen[bytes]:
-        """Start a command of ours on a machine; return it when it reports that it is ready."""
+    def start(self, machine: str, argv: Sequence[str], log: Path, sign: str, graph: str = "") -> LabProcess:
+        """Start a command of ours on a machine; return it when it has printed this."""
         words = [*self.spaces[machine].command([]), *self._environment(graph)]
         if graph in self._hidden:
             words.append(f"PYTHONPATH={self._hide(self._hidden[graph])}{os.pathsep}{PYTHON_PATH}")
-        with log.open("ab") as errors:
-            process = subprocess.Popen(
-                [*words, sys.executable, "-m", *argv],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=errors,
-                env={**os.environ, **_ENVIRONMENT},
-                start_new_session=True,
-            )
-        self._run.note_process(process.pid)
-        self._undo.callback(_end, process)
-        _await(process, sign, log)
+        words += [sys.executable, "-m", *argv]
+        process = LabProcess(self._run, argv[0], words, environment=_ENVIRONMENT, log=log)
+        self._undo.callback(end_processes, [process], PATIENCE_S)
+        while sign.encode() not in process.read_line(PATIENCE_S):
+            pass
         return process
 
     def write_proxy(self, label: str, port: int) -> Path:
@@ -355,27 +345,6 @@ def pair_of(*crossings: Crossing, hidden: Mapping[str, str] | None = None) -> It
     with ExitStack() as undo:
         undo.callback(run.end)
         yield Pair(run, undo, crossings, hidden or {})
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    if process.poll() is None:
-        process.terminate()
-    try:
-        process.communicate(timeout=PATIENCE_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.communicate()
-
-
-def _await(process: subprocess.Popen[bytes], sign: str, log: Path) -> None:
-    """Return when a process has printed this on its standard output."""
-    assert process.stdout is not None
-    said, end_s = b"", time.monotonic() + PATIENCE_S
-    while sign.encode() not in said:
-        ready = select.select([process.stdout], [], [], max(end_s - time.monotonic(), 0.0))[0]
-        piece = os.read(process.stdout.fileno(), 1 << 16) if ready else b""
-        assert piece, f"{sign!r} was not said, but {said!r}; {log.read_text()[-2_000:]}"
-        said += piece
 
 
 def _metrics(port: int) -> str:

@@ -48,17 +48,18 @@ class LabProcess:
     """Running process; a context manager that ends it, and its group with it.
 
     Args:
+        run: records it, so that the clean-up of the run ends it; None: the caller alone ends it.
         label: display name, such as ``switch nuc1``; it names the log.
         argv: the command line; inherited by exec, so that the process id stays.
         environment: extends the present one, in which the project can be imported.
-        log: file to append to; None: one of the run's directory.
+        log: file to append to; None: one in the run's directory.
         heard: its standard output is read, and does not go to the log.
         has_orders: it reads commands, and ends by itself when there are no more.
     """
 
     def __init__(
         self,
-        run: Run,
+        run: Run | None,
         label: str,
         argv: Sequence[str],
         *,
@@ -68,7 +69,8 @@ class LabProcess:
         has_orders: bool = False,
     ) -> None:
         self.label = label
-        self.log = log or run.directory / f"{label.replace(' ', '-')}.log"
+        folder = Path() if run is None else run.directory
+        self.log = log or folder / f"{label.replace(' ', '-')}.log"
         self._unread = b""
         with self.log.open("ab") as errors:
             self._process = subprocess.Popen(
@@ -79,7 +81,8 @@ class LabProcess:
                 env=python_environment(environment or {}),
                 start_new_session=True,
             )
-        run.note_process(self.pid)
+        if run is not None:
+            run.note_process(self.pid)
 
     @property
     def pid(self) -> int:
@@ -120,9 +123,12 @@ class LabProcess:
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(_CLOSE_S)
 
-    def reap(self) -> None:
-        """Return when the process has ended and its pipes are closed."""
-        self._process.communicate()
+    def reap(self, timeout_s: float | None = None) -> None:
+        """Return when the process has ended and its pipes are closed; harmless where they are."""
+        if self._process.stdout is None or self._process.stdout.closed:
+            self._process.wait(timeout_s)
+        else:
+            self._process.communicate(timeout=timeout_s)
 
     def read(self, patience_s: float) -> dict[str, object]:
         """Return the next line that it prints, a JSON object.
