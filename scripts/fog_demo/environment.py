@@ -23,7 +23,7 @@ import yaml
 
 from gdp.errors import LocalError
 from gdp.host.run_registry import Run, RunRegistry, outer_uid
-from gdp.stores.keyring import CARD, DELEGATIONS, ROOT_CERTIFICATE
+from gdp.stores.keyring import DELEGATIONS
 from lab.child import Child
 from lab.children import Children
 from lab.namespaces import Namespaces
@@ -108,13 +108,14 @@ class Environment:
 
     def _write_proxy(self) -> Path:
         """Write the robot's ``proxy.yaml``, without a rule: ``fog`` adds them."""
-        keys = self._keys("proxy", ROBOT)
-        (keys / DELEGATIONS).mkdir(mode=0o700, exist_ok=True)
+        credentials = self._materials.of_proxy(ROBOT)
+        delegations = credentials.identity / DELEGATIONS
+        delegations.mkdir(mode=0o700, exist_ok=True)
         (at,) = (each for each in self._topology.attached("proxy") if each.switch == ROBOT)
         content = {
-            **self._who(keys),
+            **credentials.to_yaml(),
             "iface": at.ifname,
-            "delegations": str(keys / DELEGATIONS),
+            "delegations": str(delegations),
             "ros": {"endpoint": "ros2", "domain": _DOMAIN},
         }
         return self._write("proxy.yaml", content)
@@ -139,15 +140,6 @@ class Environment:
             "uplink": uplink,
         }
         self._write(SITE, content)
-
-    def _who(self, keys: Path) -> dict[str, object]:
-        if not (keys / CARD).exists():
-            raise LocalError(f"{keys}: not admitted")
-        root = self._run.directory / "domains" / "ring" / ROOT_CERTIFICATE
-        return {"identity": str(keys), "domain": {"root": str(root)}}
-
-    def _keys(self, role: str, node: str) -> Path:
-        return self._run.directory / "nodes" / f"{role}-{node}"
 
     def _write(self, name: str, content: Mapping[str, object]) -> Path:
         path = self._run.directory / name

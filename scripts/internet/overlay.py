@@ -18,15 +18,15 @@ from gdp.control.endpoints import Endpoint
 from gdp.crypto.certificates import Role
 from gdp.links.endpoint_files import RECORD_SUFFIX, own_record, public_candidates
 from gdp.management.control_client import ask_node, find_control_socket
-from gdp.metadata import Metadata
 from gdp.state.control_protocol import Command
 from gdp.stores.files import public, write_all
-from gdp.stores.issue import delegate, install_delegation, make_domain, make_node, make_owner
-from gdp.stores.keyring import CARD, ROOT_CERTIFICATE
+from gdp.stores.issue import make_domain, make_node, make_owner
+from gdp.stores.keyring import ROOT_CERTIFICATE
 from gdp.trust.right import Right
 from internet.host import Host
 from internet.laboratory import Laboratory
 from lab.process import LabProcess, end_processes
+from lab.rights import grant
 
 __all__ = ["LISTEN", "Overlay"]
 
@@ -148,10 +148,7 @@ class Overlay:
         """Make the keys of the host's node, with rights on names; return its directory."""
         node = self.folder / f"{host.label}-{_NODE}"
         make_node(node, Role.PROXY, node.name, self._domain)
-        for name, given in rights.items():
-            kind = "service" if {Right.SERVE, Right.CALL} & set(given) else "topic"
-            metadata = Metadata({"kind": kind, "name": name})
-            install_delegation(node, delegate(self._owner, node / CARD, metadata, list(given)))
+        grant(self._owner, node, rights)
         return node
 
     def open_session(self, host: Host, node: Path, lease_s: float | None = None) -> gdp.Session:

@@ -16,9 +16,9 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final, TypeVar
 
@@ -29,16 +29,16 @@ from gdp.enrolment.member_setup import LISTEN_PORT
 from gdp.enrolment.programs import programs_of
 from gdp.errors import GdpError, LocalError
 from gdp.management.control_client import ask_node, find_control_socket
-from gdp.metadata import Metadata
 from gdp.state.control_protocol import Command
-from gdp.stores.issue import delegate, install_delegation, make_owner
+from gdp.stores.issue import make_owner
 from gdp.stores.keyring import CARD, load_card
 from gdp.trust.right import Right
 from internet.access import Access
 from internet.host import Host
 from internet.laboratory import Laboratory
 from internet.site import Site
-from lab.process import LabProcess, end_processes, python_environment
+from lab.process import LabProcess, end_processes, python_environment, until
+from lab.rights import grant
 
 __all__ = ["WIFI", "WWAN", "Link", "Machine", "Stage"]
 
@@ -46,7 +46,6 @@ WIFI: Final = "wlan0"
 WWAN: Final = "wwan0"
 _DOMAIN: Final = "lab"
 _PATIENCE_S: Final = 60.0
-_LOOK_S: Final = 0.2
 _STATUS_S: Final = 2.0
 _SHOWN: Final = 40  # characters of a word
 _StageT = TypeVar("_StageT", bound="Stage")
@@ -150,12 +149,9 @@ class Stage:
                     self.start_program(host, program.argv)
 
     def wait_until_joined(self) -> None:
-        """Return when each machine has a tunnel to the border. Raises ``LocalError``: one has none in time."""
-        deadline_s = time.monotonic() + _PATIENCE_S
-        while waiting := [label for label, each in self.machines.items() if not self.links(each)]:
-            if time.monotonic() > deadline_s:
-                raise LocalError(f"no tunnel at {', '.join(waiting)}: {self.log(waiting[0])[-2_000:]}")
-            time.sleep(_LOOK_S)
+        """Return when each machine has a tunnel to the border. Raises ``FailedError``: one has none in time."""
+        for label, machine in self.machines.items():
+            until(partial(self.links, machine), partial(self._missing_tunnel, label), _PATIENCE_S)
 
     def links(self, machine: Machine) -> list[Link]:
         """Return the tunnels of a machine that are up; none while its switch starts."""
@@ -179,11 +175,7 @@ class Stage:
         owner = self._folder / "owner"
         make_owner(owner)
         for label, names in rights.items():
-            node = self.machines[label].directory / "proxy"
-            for name, given in names.items():
-                kind = "service" if {Right.SERVE, Right.CALL} & set(given) else "topic"
-                metadata = Metadata({"kind": kind, "name": name})
-                install_delegation(node, delegate(owner, node / CARD, metadata, list(given)))
+            grant(owner, self.machines[label].directory / "proxy", names)
 
     def open_session(self, machine: Machine) -> gdp.Session:
         """Open a session of this process on a machine."""
@@ -192,6 +184,9 @@ class Stage:
     def log(self, label: str) -> str:
         """Return what the programs of a machine have logged."""
         return (self._folder / f"{label}.log").read_text(encoding="utf-8", errors="replace")
+
+    def _missing_tunnel(self, label: str) -> str:
+        return f"{self.log(label)[-2_000:]}\na tunnel at {label}"
 
     def _directory(self, host: Host) -> Path:
         return self._folder / host.label

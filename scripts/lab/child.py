@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import os
 import signal
-from collections.abc import AsyncGenerator, Sequence
+from collections.abc import AsyncGenerator, Mapping, Sequence
 from typing import Final
 
 from gdp.errors import LocalError
@@ -27,8 +27,10 @@ _TAIL_LINES: Final = 12
 class Child(LabProcess):
     """One process; every method that waits for it may raise ``FailedError``, with its last lines."""
 
-    def __init__(self, run: Run, label: str, argv: Sequence[str], *, heard: bool = True) -> None:
-        super().__init__(run, label, argv, heard=heard)
+    def __init__(
+        self, run: Run, label: str, argv: Sequence[str], *, heard: bool, environment: Mapping[str, str] | None
+    ) -> None:
+        super().__init__(run, label, argv, heard=heard, environment=environment)
         self.ended: asyncio.Future[int] = asyncio.get_running_loop().create_future()
         self._lines: asyncio.StreamReader | None = None
         self._transport: asyncio.BaseTransport | None = None

@@ -40,9 +40,16 @@ class Children:
         self._standing: list[Child] = []
         self._changed = asyncio.Event()  # set when the set of required processes changes
 
-    def start(self, label: str, argv: Sequence[str], *, heard: bool = True) -> Child:
-        """Start a process."""
-        child = Child(self._run, label, argv, heard=heard)
+    def start(
+        self,
+        label: str,
+        argv: Sequence[str],
+        *,
+        heard: bool = True,
+        environment: Mapping[str, str] | None = None,
+    ) -> Child:
+        """Start a process; ``environment`` extends the present one."""
+        child = Child(self._run, label, argv, heard=heard, environment=environment)
         self._all.append(child)
         return child
 
@@ -57,9 +64,8 @@ class Children:
         environment: Mapping[str, str] | None = None,
     ) -> Child:
         """Start Python with these arguments in the namespace of a switch; ``environment`` extends the present one."""
-        prefix = ["env", *(f"{name}={value}" for name, value in environment.items())] if environment else []
-        argv = namespaces[node].command([*prefix, sys.executable, *arguments], dies_with_us=not self._kept)
-        child = self.start(f"{role} {node}", argv, heard=heard)
+        argv = namespaces[node].command([sys.executable, *arguments], dies_with_us=not self._kept)
+        child = self.start(f"{role} {node}", argv, heard=heard, environment=environment)
         if self._started is not None:
             self._started(node, child.pid)
         return child
